@@ -1,0 +1,1 @@
+"""Ingest: recordings become labelled transitions. Imports nothing of `replay` or `train`."""

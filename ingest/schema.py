@@ -1,0 +1,91 @@
+"""The columns of the transition table: names, types, units and meanings.
+
+A row is one transition and stands alone: the observation after it is in the row, so rows stay
+whole under any filter, sort or engine.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pyarrow as pa
+
+from restock.ingest.signals import STORED_SIGNALS
+
+# transition_id = (a number from the recording's id) << STEP_BITS | (step of the recording)
+STEP_BITS = 25
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of the table. `observation` types get their length from the task."""
+
+    name: str
+    type: pa.DataType
+    meaning: str
+    nullable: bool = False
+
+
+_F32_LIST = pa.list_(pa.float32())
+
+IDENTITY: tuple[Column, ...] = (
+    Column("transition_id", pa.int64(), "unique in the store; the same after a re-ingest"),
+    Column("recording_id", pa.string(), "hash of the recording's content, 16 hex digits"),
+    Column("episode_id", pa.string(), "<recording_id>/<episode_index>"),
+    Column("episode_index", pa.int32(), "of the episode in its recording, from 0"),
+    Column("step_index", pa.int32(), "of the step in its episode, from 0"),
+)
+TRANSITION: tuple[Column, ...] = (
+    Column("observation", _F32_LIST, "what the robot knew at t; float32[D], see the task"),
+    Column("action", pa.int16(), "index of the discrete action in force over [t, t + 1)"),
+    Column("reward", pa.float32(), "of [t, t + 1)"),
+    Column("next_observation", _F32_LIST, "what the robot knew at t + 1; float32[D]"),
+    Column("terminated", pa.bool_(), "the episode ended for good at t + 1: do not bootstrap"),
+    Column("truncated", pa.bool_(), "the episode was cut at t + 1 (time, gap, end of recording)"),
+)
+COVERAGE: tuple[Column, ...] = (
+    Column("condition", pa.string(), "the one condition of highest priority, or 'nominal'"),
+    Column("conditions", pa.list_(pa.string()), "every condition that holds; empty if nominal"),
+    Column("true_condition", pa.string(), "from the simulator, to score labels", nullable=True),
+    Column("zone", pa.string(), "named part of the map, or 'elsewhere'"),
+    Column("behaviour_policy", pa.string(), "who acted: planner, operator, dqn, …"),
+    Column("behaviour_version", pa.string(), "version of that policy", nullable=True),
+    Column("action_probability", pa.float32(), "behaviour policy's, of the action", nullable=True),
+    Column("action_residual", pa.float32(), "from the command to the discrete action, scaled"),
+    Column("progress_m", pa.float32(), "how much shorter the plan became over [t, t + 1)"),
+)
+PROVENANCE: tuple[Column, ...] = (
+    Column("ingest_id", pa.string(), "the ingest that wrote this row; joins `recordings`"),
+    Column("source_file", pa.string(), "path of the recording as it was given"),
+    Column("profile_hash", pa.string(), "of the profile that read it, 12 hex digits"),
+    Column("task_hash", pa.string(), "of the definition of observation, action and reward"),
+    Column("labels_version", pa.string(), "of the conditions that labelled it"),
+    Column("restock_version", pa.string(), "of the software that wrote the row"),
+)
+
+
+def _signal_type(dtype: str) -> pa.DataType:
+    return {"int64": pa.int64(), "bool": pa.bool_()}.get(dtype, pa.float32())
+
+
+# float32 holds a millimetre up to 16 km from the map's origin; stamps stay int64.
+SIGNAL_COLUMNS: tuple[Column, ...] = tuple(
+    Column(signal.name, _signal_type(signal.dtype), signal.meaning) for signal in STORED_SIGNALS
+)
+
+COLUMNS: tuple[Column, ...] = IDENTITY + TRANSITION + COVERAGE + SIGNAL_COLUMNS + PROVENANCE
+
+
+def transition_schema(observation_size: int) -> pa.Schema:
+    """The Arrow schema of rows whose observations have `observation_size` entries."""
+    sized = pa.list_(pa.field("element", pa.float32()), observation_size)
+    return pa.schema(
+        [
+            pa.field(
+                column.name,
+                sized if column.type == _F32_LIST else column.type,
+                nullable=column.nullable,
+            )
+            for column in COLUMNS
+        ]
+    )

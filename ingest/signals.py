@@ -1,0 +1,92 @@
+"""The signals: the named columns, with units, that logs and the twin both fill.
+
+One row of signals is one step of the control clock, at time t. A profile says how a robot's
+topics fill them; the twin fills them from MuJoCo. Everything after this point (task, conditions,
+store) sees only signals, and so cannot tell a log from a simulation.
+
+`Columns` maps a signal's name to an array whose leading axis is the step (in a log) or the
+environment (in the twin).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Columns = Mapping[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One column: its name (which ends in its unit), shape per step, type and meaning."""
+
+    name: str
+    meaning: str
+    dtype: str = "float64"
+    per_sector: bool = False  # shape (sectors,) instead of ()
+    stored: bool = True  # kept as a column of the transition table
+
+
+SIGNALS: tuple[Signal, ...] = (
+    Signal("stamp_ns", "time of the step on the alignment clock", "int64"),
+    Signal("pose_x_m", "localised position in the map frame, x"),
+    Signal("pose_y_m", "localised position in the map frame, y"),
+    Signal("pose_yaw_rad", "localised heading in the map frame, in (-pi, pi]"),
+    Signal("pose_stamp_ns", "when that pose was measured; at or before stamp_ns", "int64"),
+    Signal("wheel_speed_mps", "forward speed from the wheel encoders"),
+    Signal("wheel_yaw_rate_radps", "yaw rate from the wheel encoders"),
+    Signal("gyro_yaw_rate_radps", "yaw rate from the gyroscope"),
+    Signal("accel_x_mps2", "forward acceleration from the accelerometer"),
+    Signal(
+        "sector_clearance_m",
+        "per sector of bearing, nearest lidar return minus the body's extent that way",
+        per_sector=True,
+        stored=False,
+    ),
+    Signal("clearance_m", "the smallest sector clearance"),
+    Signal("clearance_ahead_m", "the smallest sector clearance toward the near waypoint"),
+    Signal("waypoint_near_x_m", "near look-ahead point of the plan, body frame, forward"),
+    Signal("waypoint_near_y_m", "near look-ahead point of the plan, body frame, left"),
+    Signal("waypoint_far_x_m", "far look-ahead point of the plan, body frame, forward"),
+    Signal("waypoint_far_y_m", "far look-ahead point of the plan, body frame, left"),
+    Signal("route_remaining_m", "length of the plan from the nearest point on it to its end"),
+    Signal("goal_distance_m", "straight distance from the pose to the goal"),
+    Signal("localised_speed_mps", "forward speed from the last two localised poses"),
+    Signal("localised_lateral_mps", "sideways speed (left) from the last two localised poses"),
+    Signal("bumped", "the bumper was pressed since the step before", "bool"),
+    Signal("command_speed_mps", "commanded forward speed in force until the next step"),
+    Signal("command_yaw_rate_radps", "commanded yaw rate in force until the next step"),
+)
+
+STORED_SIGNALS: tuple[Signal, ...] = tuple(signal for signal in SIGNALS if signal.stored)
+
+
+def localised_velocity(
+    now: Columns, before: Columns
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Forward and lateral speed (m/s) from two localised poses, in the body frame of `now`.
+
+    Where no new pose has arrived since the step before there is no evidence of motion beyond
+    the wheels', and the wheel speed is returned (so that it never looks like slip).
+    """
+    elapsed_s = (now["pose_stamp_ns"] - before["pose_stamp_ns"]) * 1e-9
+    fresh = elapsed_s > 1e-6
+    elapsed_s = np.where(fresh, elapsed_s, 1.0)
+    vx = (now["pose_x_m"] - before["pose_x_m"]) / elapsed_s
+    vy = (now["pose_y_m"] - before["pose_y_m"]) / elapsed_s
+    # The heading half-way between the poses: a turn in place must not read as sideways motion.
+    turn = wrap_angle(now["pose_yaw_rad"] - before["pose_yaw_rad"])
+    heading = now["pose_yaw_rad"] - turn / 2
+    cos, sin = np.cos(heading), np.sin(heading)
+    forward = np.where(fresh, cos * vx + sin * vy, now["wheel_speed_mps"])
+    lateral = np.where(fresh, -sin * vx + cos * vy, 0.0)
+    return forward, lateral
+
+
+def wrap_angle(angle_rad: NDArray[Any]) -> NDArray[Any]:
+    """The same angle in [-pi, pi)."""
+    return (angle_rad + np.pi) % (2 * np.pi) - np.pi

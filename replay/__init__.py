@@ -1,0 +1,1 @@
+"""Replay: what is in the store, what is missing, and what a learner is fed from it."""

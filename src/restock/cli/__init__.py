@@ -1,0 +1,93 @@
+"""The front door: `restock VERB …`. One module a verb; each is imported only when it is called.
+
+A verb's module holds one dataclass, named like the verb: its docstring is the help, its fields
+are the flags, and `run()` does the work and returns an exit code. stdout is data, stderr is
+progress and messages.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+
+from restock.errors import ExitCode, RestockError
+
+# verb -> what it does, in the order of the work; the module is restock.cli.<verb>
+VERBS = {
+    "record": "drive the simulated stand-in and write what a real robot would log",
+    "info": "what is in these recordings?",
+    "ingest": "recordings -> labelled Parquet transitions in a store",
+    "sql": "any question to a store (or a run), in SQL",
+    "audit": "is the coverage good enough? exit 1 if not",
+    "mix": "a pinned replay panel with quotas per stratum",
+    "train": "offline warm-up on the panel, then online in the twin",
+    "eval": "success per condition, clean and perturbed",
+    "report": "one HTML page with all of it",
+    "demo": "all of the above, on sample_logs/",
+}
+
+
+def usage() -> str:
+    width = max(map(len, VERBS))
+    verbs = "\n".join(f"  {name:<{width}}  {summary}" for name, summary in VERBS.items())
+    return f"""usage: restock VERB [--help] …
+
+Turns robot logs into labelled transitions, shows in SQL what is missing, mixes a replay diet
+that keeps the rare conditions stocked, and fine-tunes a DQN in a MuJoCo twin.
+
+{verbs}
+
+`restock VERB --help` explains one. Exit codes: 0 done, 1 an audit failed or a comparison was
+refused, 2 wrong usage or bad input (nothing written), 3 written but data was lost or skipped,
+130 interrupted."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command line; returns the exit code."""
+    args = list(sys.argv[1:] if argv is None else argv)
+    try:
+        return _dispatch(args)
+    except RestockError as error:
+        _complain(str(error))
+        return int(error.exit_code)
+    except KeyboardInterrupt:
+        _complain("interrupted; nothing is left half-written")
+        return int(ExitCode.INTERRUPTED)
+    except BrokenPipeError:
+        # The reader of our stdout went away (`| head`): no complaint, and none at exit either.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return int(ExitCode.OK)
+
+
+def _dispatch(args: list[str]) -> int:
+    if not args or args[0] in ("-h", "--help", "help"):
+        sys.stdout.write(usage() + "\n")
+        return int(ExitCode.OK if args else ExitCode.USAGE)
+    if args[0] in ("-V", "--version"):
+        from restock import __version__
+
+        sys.stdout.write(f"restock {__version__}\n")
+        return int(ExitCode.OK)
+    verb = args[0]
+    if verb not in VERBS:
+        from difflib import get_close_matches
+
+        near = get_close_matches(verb, VERBS, n=1)
+        hint = f"did you mean `restock {near[0]}`?" if near else "see `restock --help`"
+        raise RestockError(f"no verb named {verb!r}", remedy=hint)
+
+    import tyro
+
+    command = getattr(importlib.import_module(f"restock.cli.{verb}"), verb.capitalize())
+    try:
+        parsed = tyro.cli(command, prog=f"restock {verb}", args=args[1:], use_underscores=False)
+    except SystemExit as stop:  # tyro has printed its help (0) or its complaint (2)
+        return int(stop.code or 0) if isinstance(stop.code, int | None) else int(ExitCode.USAGE)
+    code: int | None = parsed.run()
+    return int(code or ExitCode.OK)
+
+
+def _complain(message: str) -> None:
+    sys.stderr.write(f"restock: {message}\n")

@@ -1,0 +1,126 @@
+"""Printing: tables on a terminal, the same rows as JSON or CSV for programs, progress on stderr."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+Row = Mapping[str, Any]
+
+
+def stdout() -> Console:
+    """The console for data. As wide as it needs to be when it is not a terminal."""
+    return Console(file=sys.stdout, highlight=False, width=None if sys.stdout.isatty() else 240)
+
+
+def stderr() -> Console:
+    """The console for progress and messages."""
+    return Console(file=sys.stderr, highlight=False)
+
+
+def say(message: str) -> None:
+    """One line of progress, to stderr."""
+    stderr().print(message)
+
+
+def plain(value: Any) -> Any:
+    """A value that JSON can hold: NaN and infinities become null, numpy scalars numbers."""
+    if hasattr(value, "item") and not hasattr(value, "__len__"):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set):
+        return [plain(item) for item in value]
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, bytes):
+        return value.hex()
+    return str(value)
+
+
+def print_json(value: Any) -> None:
+    """One JSON document, to stdout."""
+    sys.stdout.write(json.dumps(plain(value), indent=1, ensure_ascii=False) + "\n")
+
+
+def print_csv(rows: Sequence[Row], columns: Sequence[str] | None = None) -> None:
+    """A header and a line a row, to stdout."""
+    names = list(columns if columns is not None else rows[0] if rows else ())
+    writer = csv.writer(sys.stdout, lineterminator="\n")
+    writer.writerow(names)
+    writer.writerows([plain(row[name]) for name in names] for row in rows)
+
+
+def print_table(
+    rows: Sequence[Row], columns: Sequence[str] | None = None, *, title: str | None = None
+) -> None:
+    """A table on stdout; numbers to the right."""
+    names = list(columns if columns is not None else rows[0] if rows else ())
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    for name in names:
+        numeric = any(_is_number(row[name]) for row in rows)
+        table.add_column(name, justify="right" if numeric else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*(cell(row[name]) for name in names))
+    stdout().print(table)
+
+
+def cell(value: Any) -> str:
+    """A value as a table shows it."""
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, int):
+        return f"{value:,}" if abs(value) < 1_000_000_000 else str(value)
+    if isinstance(value, list | tuple):
+        return ", ".join(cell(item) for item in value)
+    return str(value).replace("[", r"\[")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+@contextmanager
+def progress(description: str, total: float | None) -> Iterator[Any]:
+    """A progress bar on a terminal, silence elsewhere. Yields `advance(amount, note="")`."""
+    bar = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+        console=stderr(),
+        transient=True,
+        disable=not sys.stderr.isatty(),
+    )
+    with bar:
+        task = bar.add_task(description, total=total, note="")
+
+        def advance(amount: float = 1.0, note: str = "") -> None:
+            bar.update(task, advance=amount, note=note)
+
+        yield advance

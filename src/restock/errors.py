@@ -1,0 +1,66 @@
+"""The one tree of errors: each says what is wrong, where, and what to do about it.
+
+The command line turns any of them into one message on stderr and the error's exit code; from
+Python they are ordinary exceptions, all below `RestockError`.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class ExitCode(IntEnum):
+    """Exit codes of every verb."""
+
+    OK = 0
+    FAILED = 1  # an audit failed, or a comparison was refused
+    USAGE = 2  # wrong usage or bad input: nothing was written
+    LOSSY = 3  # written, but data was lost or skipped (and the output says what)
+    INTERRUPTED = 130  # Ctrl-C
+
+
+class RestockError(Exception):
+    """Something the user can mend. `what` is wrong, `where`, and the `remedy`."""
+
+    exit_code = ExitCode.USAGE
+
+    def __init__(self, what: str, *, where: str | None = None, remedy: str | None = None) -> None:
+        self.what, self.where, self.remedy = what, where, remedy
+        parts = [f"{where}: {what}" if where else what]
+        if remedy:
+            parts.append(remedy)
+        super().__init__("\n  ".join(parts))
+
+
+class ConfigError(RestockError):
+    """A profile, mixture or other TOML file that says something Restock cannot use."""
+
+
+class RecordingError(RestockError):
+    """A file that is no recording, is empty, is damaged, or lacks what a profile needs."""
+
+
+class StoreError(RestockError):
+    """A store that is missing, is not one, or changed under a writer."""
+
+
+class QueryError(RestockError):
+    """SQL that DuckDB refused."""
+
+
+class MixtureError(RestockError):
+    """A mixture that the store cannot fill, where the mixture says to refuse."""
+
+
+class PanelError(RestockError):
+    """A panel that is missing, damaged, or made for another task."""
+
+
+class RunError(RestockError):
+    """A run directory that is missing, incomplete, or already there."""
+
+
+class ComparisonRefused(RestockError):
+    """Two runs that were fed differently."""
+
+    exit_code = ExitCode.FAILED
