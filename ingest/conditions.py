@@ -109,7 +109,7 @@ def label(steps: pa.Table, conditions: Sequence[Condition]) -> dict[str, NDArray
 
 def _query(connection: duckdb.DuckDBPyConnection, conditions: Sequence[Condition]) -> pa.Table:
     columns = ",\n".join(f'({c.sql}\n) AS "{c.name}"' for c in conditions)
-    return connection.execute(
+    return connection.sql(
         f"SELECT {columns} FROM steps"
         " WINDOW episode AS (PARTITION BY episode_index ORDER BY step_index)"
         " ORDER BY row_"

@@ -54,7 +54,7 @@ class SectorMap:
         ranges = np.asarray(ranges_m, np.float64)
         valid = (ranges >= range_min_m) & (ranges <= range_max_m)  # False for NaN and inf
         free = np.where(valid, np.maximum(ranges - self.reach_m, 0.0), range_max_m)
-        clearance = np.full((len(ranges), self.sectors), range_max_m)
+        clearance = np.full((len(ranges), self.sectors), float(range_max_m))
         if len(self.filled):
             clearance[:, self.filled] = np.minimum.reduceat(
                 free[:, self.order], self.starts, axis=1
