@@ -1,0 +1,124 @@
+"""Checkpoints: one file, tensors and JSON only, written so that a kill leaves the old or the new.
+
+A checkpoint is a safetensors file whose metadata carries a JSON document. Loading one executes
+nothing. State is a nested mapping whose leaves are tensors, numpy arrays, numbers, strings,
+booleans, None or lists of those; `save` takes the arrays out into tensors named by their path and
+`load` puts them back.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from restock.errors import RunError
+
+FORMAT = "restock-checkpoint/1"
+_ARRAY, _STRINGS, _NUMPY = "__array__", "__strings__", "numpy"
+
+
+def save(path: Path, state: Mapping[str, Any]) -> None:
+    """Write `state` to `path`, replacing what is there in one step.
+
+    Raises:
+        TypeError: a leaf that is none of the kinds above; names its path.
+    """
+    tensors: dict[str, torch.Tensor] = {}
+    document = _take_apart(state, "", tensors)
+    metadata = {"format": FORMAT, "state": json.dumps(document)}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        save_file(tensors, temporary, metadata=metadata)
+        with temporary.open("rb") as written:
+            os.fsync(written.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def load(path: Path) -> dict[str, Any]:
+    """What `save` was given: arrays as numpy where they were numpy, else as CPU tensors.
+
+    Raises:
+        RunError: no such file, or none that `save` wrote.
+    """
+    if not path.is_file():
+        raise RunError(
+            "there is no checkpoint",
+            where=str(path),
+            remedy="was the run stopped before its first?",
+        )
+    try:
+        with safe_open(path, framework="pt") as opened:
+            metadata = opened.metadata() or {}
+            if metadata.get("format") != FORMAT:
+                raise RunError("is not a checkpoint of Restock", where=str(path))
+            tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise RunError(f"is damaged: {error}", where=str(path)) from error
+    restored = _put_together(json.loads(metadata["state"]), tensors)
+    if not isinstance(restored, dict):
+        raise RunError("holds no state", where=str(path))
+    return restored
+
+
+def _take_apart(value: Any, path: str, tensors: dict[str, torch.Tensor]) -> Any:
+    if isinstance(value, torch.Tensor):
+        # A copy: safetensors refuses tensors that share memory.
+        tensors[path] = value.detach().to("cpu", copy=True).contiguous()
+        return {_ARRAY: path}
+    if isinstance(value, np.ndarray):
+        if value.dtype == np.bool_ or value.dtype.kind in "iuf":
+            tensors[path] = torch.from_numpy(np.array(value, order="C", copy=True))
+            return {_ARRAY: path, _NUMPY: True}
+        if value.dtype.kind == "U":
+            return {_STRINGS: value.tolist(), _NUMPY: value.dtype.str}
+        raise TypeError(f"{path}: arrays of {value.dtype} cannot be kept in a checkpoint")
+    if isinstance(value, Mapping):
+        for key in value:
+            if not isinstance(key, str) or key in (_ARRAY, _STRINGS):
+                raise TypeError(f"{path}: keys must be strings, got {key!r}")
+        return {
+            key: _take_apart(item, f"{path}/{key}" if path else key, tensors)
+            for key, item in value.items()
+        }
+    if isinstance(value, list | tuple):
+        return [_take_apart(item, f"{path}/{index}", tensors) for index, item in enumerate(value)]
+    if isinstance(value, np.generic):
+        return value.item()
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise TypeError(f"{path}: {type(value).__name__} cannot be kept in a checkpoint")
+
+
+def _put_together(value: Any, tensors: Mapping[str, torch.Tensor]) -> Any:
+    if isinstance(value, dict):
+        if _ARRAY in value:
+            tensor = tensors[value[_ARRAY]]
+            return tensor.numpy() if value.get(_NUMPY) else tensor
+        if _STRINGS in value:
+            return np.array(value[_STRINGS], dtype=value[_NUMPY])
+        return {key: _put_together(item, tensors) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_put_together(item, tensors) for item in value]
+    return value
+
+
+def generator_state(rng: np.random.Generator) -> dict[str, Any]:
+    """A numpy generator's state, JSON only."""
+    state: dict[str, Any] = json.loads(json.dumps(rng.bit_generator.state))
+    return state
+
+
+def restore_generator(rng: np.random.Generator, state: Mapping[str, Any]) -> None:
+    """Puts a generator where `generator_state` found it."""
+    rng.bit_generator.state = dict(state)

@@ -1,0 +1,213 @@
+"""The configuration of a training run: one typed struct, read from TOML, unknown keys refused.
+
+A run's directory keeps the resolved one, so that nothing about a run is a default that may change
+later. Every field has its meaning in a comment; `docs/train.md` explains the choices.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from restock.errors import ConfigError
+from restock.train.explore import LinearEpsilon
+from restock.train.target import Polyak, TargetRule
+
+# Shares of true conditions among the episodes of the twin.
+DEFAULT_CONDITIONS = {
+    "nominal": 0.4,
+    "wheel_slip": 0.2,
+    "blocked_aisle": 0.2,
+    "near_collision": 0.2,
+}
+
+
+class NetworkConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    hidden: tuple[int, ...] = (256, 256)
+    layer_norm: bool = True
+    dueling: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.hidden or min(self.hidden) < 1:
+            raise ValueError(f"network.hidden must be positive widths, got {list(self.hidden)}")
+
+
+class LossConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    discount: float = 0.97  # a step; a panel brings its own, which must agree
+    n_step: int = 3  # of fresh rows; the panel's rows bring their own
+    double: bool = True
+    huber_delta: float = 1.0
+    conservative: float = 0.0  # weight of the CQL term on rows from logs, while offline
+    conservative_online: float = 0.0  # … and its weight at the end of the online phase
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.discount < 1:
+            raise ValueError(f"loss.discount must be in [0, 1), got {self.discount}")
+        if self.n_step < 1:
+            raise ValueError(f"loss.n_step must be at least 1, got {self.n_step}")
+        if self.huber_delta <= 0:
+            raise ValueError(f"loss.huber_delta must be above 0, got {self.huber_delta}")
+        if min(self.conservative, self.conservative_online) < 0:
+            raise ValueError("loss.conservative and loss.conservative_online must be at least 0")
+
+
+class OptimizerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    learning_rate: float = 3e-4
+    max_grad_norm: float = 10.0
+
+    def __post_init__(self) -> None:
+        if self.learning_rate <= 0 or self.max_grad_norm <= 0:
+            raise ValueError("optimizer.learning_rate and optimizer.max_grad_norm must be above 0")
+
+
+class ReplayConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    batch_size: int = 128
+    logs_share: float = 0.5  # of each online batch, from the panel
+    ring_capacity: int = 100_000  # fresh rows kept
+
+    def __post_init__(self) -> None:
+        if self.batch_size < 1:
+            raise ValueError(f"replay.batch_size must be at least 1, got {self.batch_size}")
+        if not 0 <= self.logs_share <= 1:
+            raise ValueError(f"replay.logs_share must be in [0, 1], got {self.logs_share}")
+        if self.ring_capacity < self.batch_size:
+            raise ValueError("replay.ring_capacity must hold at least a batch")
+
+
+class ScheduleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    env_steps: int = 160_000  # the budget, in environment steps of all environments together
+    seconds: float | None = None  # stop earlier, after this much training time
+    offline_updates: int = 4_000  # on the panel alone, before the first environment step
+    warmup_env_steps: int = 2_000  # rollouts before the first online update
+    updates_per_env_step: float = 0.25
+
+    def __post_init__(self) -> None:
+        if self.env_steps < 0 or self.offline_updates < 0 or self.warmup_env_steps < 0:
+            raise ValueError(
+                "schedule.env_steps, offline_updates and warmup_env_steps must be at least 0"
+            )
+        if self.seconds is not None and self.seconds <= 0:
+            raise ValueError(f"schedule.seconds must be above 0, got {self.seconds}")
+        if self.updates_per_env_step <= 0:
+            raise ValueError("schedule.updates_per_env_step must be above 0")
+
+
+class EnvConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    num_envs: int = 16
+    conditions: dict[str, float] = msgspec.field(default_factory=lambda: dict(DEFAULT_CONDITIONS))
+    overlap: bool = True  # simulate on one thread while learning on another; same result
+
+    def __post_init__(self) -> None:
+        if self.num_envs < 1:
+            raise ValueError(f"env.num_envs must be at least 1, got {self.num_envs}")
+        if not self.conditions or min(self.conditions.values()) < 0:
+            raise ValueError("env.conditions must be shares, none below 0")
+        if sum(self.conditions.values()) <= 0:
+            raise ValueError("env.conditions must have a share above 0")
+
+
+class EvaluationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    every_env_steps: int = 16_000
+    episodes: int = 8  # per condition
+    seed: int = 90_000  # of the first fixed episode; kept away from training seeds
+
+    def __post_init__(self) -> None:
+        if self.every_env_steps < 1 or self.episodes < 1:
+            raise ValueError("evaluation.every_env_steps and evaluation.episodes must be above 0")
+
+
+class RecordConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    every_updates: int = 500  # one logging interval
+    audit_share: float = 0.01  # of all batches, every row of which is recorded
+    probe_rows: int = 64  # per condition, held fixed for the whole run
+    checkpoint_every_env_steps: int = 40_000
+    tensorboard: bool = True
+
+    def __post_init__(self) -> None:
+        if self.every_updates < 1 or self.checkpoint_every_env_steps < 1:
+            raise ValueError("record.every_updates and checkpoint_every_env_steps must be above 0")
+        if not 0 <= self.audit_share <= 1:
+            raise ValueError(f"record.audit_share must be in [0, 1], got {self.audit_share}")
+        if self.probe_rows < 0:
+            raise ValueError(f"record.probe_rows must be at least 0, got {self.probe_rows}")
+
+
+class TrainConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Everything that decides a run, besides the panel."""
+
+    seed: int = 0
+    device: Literal["cpu", "cuda"] = "cpu"
+    threads: int = 1  # of torch, on the CPU
+    profile: str = "warehouse_amr"  # the robot: its task, conditions and zones
+    network: NetworkConfig = NetworkConfig()
+    loss: LossConfig = LossConfig()
+    target: TargetRule = Polyak()
+    optimizer: OptimizerConfig = OptimizerConfig()
+    replay: ReplayConfig = ReplayConfig()
+    schedule: ScheduleConfig = ScheduleConfig()
+    epsilon: LinearEpsilon = LinearEpsilon()
+    env: EnvConfig = msgspec.field(default_factory=EnvConfig)
+    evaluation: EvaluationConfig = EvaluationConfig()
+    record: RecordConfig = RecordConfig()
+
+
+def load_config(path: Path | None, overrides: Sequence[str] = ()) -> TrainConfig:
+    """A config from a TOML file (or the defaults), then `key.path=value` overrides.
+
+    Raises:
+        ConfigError: no such file, no TOML, an unknown key or a value out of range; names the key.
+    """
+    document: dict[str, Any] = {}
+    if path is not None:
+        try:
+            document = tomllib.loads(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise ConfigError(
+                f"cannot be read: {error.strerror}",
+                where=str(path),
+                remedy="give --config the path of a TOML file",
+            ) from error
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise ConfigError(f"is not TOML: {error}", where=str(path)) from error
+    for override in overrides:
+        _apply(document, override)
+    return parse_config(document, where=str(path) if path is not None else "--set")
+
+
+def parse_config(document: dict[str, Any], *, where: str) -> TrainConfig:
+    """A typed config from plain values; errors name the key."""
+    try:
+        return msgspec.convert(document, TrainConfig)
+    except msgspec.ValidationError as error:
+        raise ConfigError(
+            str(error).replace("$.", "").replace("Object ", ""),
+            where=where,
+            remedy="docs/train.md lists every key with its meaning",
+        ) from error
+
+
+def _apply(document: dict[str, Any], override: str) -> None:
+    key, separator, text = override.partition("=")
+    if not separator or not key.strip():
+        raise ConfigError(
+            f"{override!r} is not key=value",
+            where="--set",
+            remedy="write for example --set optimizer.learning_rate=1e-4",
+        )
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text  # a bare word is a string
+    *sections, last = key.strip().split(".")
+    for section in sections:
+        document = document.setdefault(section, {})
+        if not isinstance(document, dict):
+            raise ConfigError(f"{key!r} goes below a value", where="--set")
+    document[last] = value
+
+
+__all__ = ["DEFAULT_CONDITIONS", "TrainConfig", "load_config", "parse_config"]

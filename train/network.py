@@ -1,0 +1,73 @@
+"""The Q network: observation to one value per action.
+
+A LayerNorm MLP. LayerNorm bounds how far values can extrapolate away from the data, which is what
+keeps off-policy learning on logs and fresh experience together stable (RLPD, arXiv:2302.02948).
+`dueling` splits the head into a value and advantages (arXiv:1511.06581).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+
+class QNetwork(nn.Module):
+    """Observations (B, D) float32 to action values (B, A) float32."""
+
+    def __init__(
+        self,
+        observation_size: int,
+        actions: int,
+        *,
+        hidden: Sequence[int] = (256, 256),
+        layer_norm: bool = True,
+        dueling: bool = False,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__()
+        self.observation_size, self.actions = observation_size, actions
+        layers: list[nn.Module] = []
+        width = observation_size
+        for size in hidden:
+            layers.append(nn.Linear(width, size))
+            if layer_norm:
+                layers.append(nn.LayerNorm(size))
+            layers.append(nn.ReLU())
+            width = size
+        self.body = nn.Sequential(*layers)
+        self.advantage = nn.Linear(width, actions)
+        self.value = nn.Linear(width, 1) if dueling else None
+        self._initialise(generator)
+
+    def _initialise(self, generator: torch.Generator | None) -> None:
+        """PyTorch's own initialisation of a Linear layer, but from a generator of ours."""
+        for module in self.modules():
+            if isinstance(module, nn.Linear):
+                bound = module.in_features**-0.5
+                with torch.no_grad():
+                    module.weight.uniform_(-bound, bound, generator=generator)
+                    module.bias.uniform_(-bound, bound, generator=generator)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        features = self.body(observation)
+        advantage: Tensor = self.advantage(features)
+        if self.value is None:
+            return advantage
+        value: Tensor = self.value(features)
+        return value + advantage - advantage.mean(dim=1, keepdim=True)
+
+    @property
+    def parameter_count(self) -> int:
+        return sum(parameter.numel() for parameter in self.parameters())
+
+
+def clone(network: QNetwork) -> QNetwork:
+    """A copy that takes no gradients: the target network."""
+    import copy
+
+    copied = copy.deepcopy(network)
+    for parameter in copied.parameters():
+        parameter.requires_grad_(False)
+    return copied

@@ -1,0 +1,103 @@
+"""The target network's clock: how the slow copy follows the online network.
+
+Two clocks run in DQN: the online network moves at every update, the target network by its own
+rule. The rule decides how old the values are that the critic learns from, so it is a typed value
+that the run's config, metrics and checkpoints all carry.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import torch
+from torch import nn
+
+
+class Hard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="rule", tag="hard"):
+    """Copy the online network at every `every`-th update (arXiv:1312.5602)."""
+
+    every: int = 1000
+
+    def __post_init__(self) -> None:
+        if self.every < 1:
+            raise ValueError(f"target.every must be at least 1, got {self.every}")
+
+    @property
+    def effective_lag(self) -> float:
+        """The mean age of the target in updates: C / 2."""
+        return self.every / 2
+
+    def syncs_at(self, gradient_step: int) -> bool:
+        """Whether the target is copied after update number `gradient_step` (from 1)."""
+        return gradient_step % self.every == 0
+
+    def __str__(self) -> str:
+        return f"hard every {self.every}"
+
+
+class Polyak(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="rule", tag="polyak"
+):
+    """target += tau * (online - target), after every update (arXiv:1509.02971)."""
+
+    tau: float = 0.005
+
+    def __post_init__(self) -> None:
+        if not 0 < self.tau <= 1:
+            raise ValueError(f"target.tau must be in (0, 1], got {self.tau}")
+
+    @property
+    def effective_lag(self) -> float:
+        """The mean age of what the target holds, in updates: 1 / tau."""
+        return 1 / self.tau
+
+    def syncs_at(self, gradient_step: int) -> bool:
+        return True
+
+    def __str__(self) -> str:
+        return f"polyak tau {self.tau:g}"
+
+
+TargetRule = Hard | Polyak
+
+
+def describe(rule: TargetRule) -> dict[str, Any]:
+    """The rule as the run's config states it."""
+    return {**msgspec.to_builtins(rule), "effective_lag_updates": rule.effective_lag}
+
+
+class TargetUpdate:
+    """Applies a rule to a pair of networks."""
+
+    def __init__(self, rule: TargetRule, online: nn.Module, target: nn.Module) -> None:
+        self.rule = rule
+        self.last_sync = 0  # the update after which the target last moved
+        self._online = list(online.parameters())
+        self._target = list(target.parameters())
+
+    @torch.no_grad()
+    def after(self, gradient_step: int) -> bool:
+        """Call after update number `gradient_step` (from 1); returns whether the target moved."""
+        if not self.rule.syncs_at(gradient_step):
+            return False
+        if isinstance(self.rule, Polyak):
+            torch._foreach_lerp_(self._target, self._online, self.rule.tau)
+        else:
+            torch._foreach_copy_(self._target, self._online)
+        self.last_sync = gradient_step
+        return True
+
+    @torch.no_grad()
+    def distance(self) -> float:
+        """|online - target| / |online|, over all parameters together (Euclidean)."""
+        apart = torch._foreach_norm(torch._foreach_sub(self._online, self._target))
+        size = torch._foreach_norm(self._online)
+        total = torch.stack(list(size)).norm()
+        return float(torch.stack(list(apart)).norm() / total.clamp_min(1e-12))
+
+
+@torch.no_grad()
+def value_lag(online_q: torch.Tensor, target_q: torch.Tensor) -> float:
+    """mean |Q - Q_target| / mean |Q| over values (B, A): how far apart the two clocks are."""
+    return float((online_q - target_q).abs().mean() / online_q.abs().mean().clamp_min(1e-12))
