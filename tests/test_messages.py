@@ -16,6 +16,7 @@ from rosbags.highlevel import AnyReader
 from restock.errors import RecordingError
 from restock.train.bag_writer import Format, Message, Topic, recording_sink
 from restock.train.messages import MessageLayout, build, serialise, stamp, typestore
+from restock.train.robot_topics import plan
 
 STAMP_NS = 1_760_000_000_123_456_789
 
@@ -77,6 +78,16 @@ def test_any_shape_packs_as_rosbags_serialises_it(
         assert layout.pack(columns, rows=1) == [serialise(shape)]
         again = typestore().deserialize_cdr(layout.exemplar, layout.type_name)
         assert serialise(again) == layout.exemplar
+
+
+def test_one_path_fills_every_item_of_a_sequence() -> None:
+    points = np.array([[0.0, 1.0], [2.0, 3.0], [2.0, 4.0]])
+    path = typestore().deserialize_cdr(plan(STAMP_NS, points), "nav_msgs/msg/Path")
+    assert [(p.pose.position.x, p.pose.position.y) for p in path.poses] == points.tolist()
+    assert {(p.header.stamp.sec, p.header.stamp.nanosec) for p in path.poses} == {
+        divmod(STAMP_NS, 10**9)
+    }
+    assert path.poses[1].pose.orientation.z == pytest.approx(np.sin(np.pi / 4))
 
 
 def test_a_column_of_the_wrong_shape_is_refused() -> None:

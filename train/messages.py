@@ -66,7 +66,8 @@ class MessageLayout:
     """A message shape: the exemplar's bytes, and the place of every number in them.
 
     Places are named by path: `pose.pose.position.x`, `ranges` (the whole run),
-    `transforms[0].header.stamp` (a time is one place: int64 nanoseconds).
+    `transforms[0].header.stamp` (a time is one place: int64 nanoseconds). When packing, `[]`
+    names that number of every item: `poses[].pose.position.x`.
     """
 
     type_name: str
@@ -86,7 +87,7 @@ class MessageLayout:
     def pack(self, columns: Mapping[str, NDArray[Any]], rows: int) -> list[bytes]:
         """`rows` messages: the exemplar with the places in `columns` overwritten.
 
-        Each column is (rows,), or (rows, count) for a run.
+        Each column is (rows,), or (rows, count) for a run and for `[]`.
 
         Raises:
             KeyError: the message has no such place.
@@ -94,27 +95,40 @@ class MessageLayout:
         """
         table = np.tile(np.frombuffer(self.exemplar, np.uint8), (rows, 1))  # (rows, bytes)
         for path, column in columns.items():
-            place = self.places[path]
+            offsets, dtype = self._slots(path)
             values = np.asarray(column)
-            if place.dtype == _STAMP:
-                values = split_stamps(values)
-            wanted = (rows, place.count) if place.count > 1 or values.ndim > 1 else (rows,)
+            wanted = (rows, len(offsets)) if len(offsets) > 1 or values.ndim > 1 else (rows,)
             if values.shape != wanted:
                 raise ValueError(f"{self.type_name}.{path}: {values.shape}, not {wanted}")
-            raw = np.ascontiguousarray(values.astype(place.dtype)).view(np.uint8)
-            size = place.dtype.itemsize * place.count
-            table[:, place.offset : place.offset + size] = raw.reshape(rows, size)
+            values = split_stamps(values) if dtype == _STAMP else values.astype(dtype)
+            raw = np.ascontiguousarray(values).view(np.uint8)
+            where = offsets[:, None] + np.arange(dtype.itemsize)
+            table[:, where.ravel()] = raw.reshape(rows, where.size)
         size = table.shape[1]
         whole = table.tobytes()
         return [whole[start : start + size] for start in range(0, len(whole), size)]
+
+    def _slots(self, path: str) -> tuple[NDArray[np.intp], np.dtype[Any]]:
+        """The offset of every number that a path names, and their type."""
+        if "[]" not in path:
+            place = self.places[path]
+            step = place.dtype.itemsize
+            return place.offset + step * np.arange(place.count), place.dtype
+        before, _, after = path.partition("[]")
+        places = []
+        while (place_of_item := self.places.get(f"{before}[{len(places)}]{after}")) is not None:
+            places.append(place_of_item)
+        if not places:
+            raise KeyError(path)
+        return np.array([place.offset for place in places]), places[0].dtype
 
 
 _STAMP = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])
 
 
 def split_stamps(stamp_ns: NDArray[Any]) -> NDArray[Any]:
-    """Nanoseconds (N,) int64 to `builtin_interfaces/Time` records (N,)."""
-    stamps = np.empty(len(stamp_ns), _STAMP)
+    """Nanoseconds (…) int64 to `builtin_interfaces/Time` records of the same shape."""
+    stamps = np.empty(stamp_ns.shape, _STAMP)
     stamps["sec"], stamps["nanosec"] = np.divmod(stamp_ns, 1_000_000_000)
     return stamps
 
