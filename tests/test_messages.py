@@ -83,7 +83,7 @@ def test_any_shape_packs_as_rosbags_serialises_it(
 def test_one_path_fills_every_item_of_a_sequence() -> None:
     points = np.array([[0.0, 1.0], [2.0, 3.0], [2.0, 4.0]])
     path = typestore().deserialize_cdr(plan(STAMP_NS, points), "nav_msgs/msg/Path")
-    assert [(p.pose.position.x, p.pose.position.y) for p in path.poses] == points.tolist()
+    assert [[p.pose.position.x, p.pose.position.y] for p in path.poses] == points.tolist()
     assert {(p.header.stamp.sec, p.header.stamp.nanosec) for p in path.poses} == {
         divmod(STAMP_NS, 10**9)
     }

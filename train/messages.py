@@ -115,7 +115,7 @@ class MessageLayout:
             step = place.dtype.itemsize
             return place.offset + step * np.arange(place.count), place.dtype
         before, _, after = path.partition("[]")
-        places = []
+        places: list[Place] = []
         while (place_of_item := self.places.get(f"{before}[{len(places)}]{after}")) is not None:
             places.append(place_of_item)
         if not places:
