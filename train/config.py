@@ -57,11 +57,13 @@ class LossConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 class OptimizerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     learning_rate: float = 3e-4
-    max_grad_norm: float = 10.0
+    max_grad_norm: float | None = None  # Huber bounds each row's gradient already
 
     def __post_init__(self) -> None:
-        if self.learning_rate <= 0 or self.max_grad_norm <= 0:
-            raise ValueError("optimizer.learning_rate and optimizer.max_grad_norm must be above 0")
+        if self.learning_rate <= 0:
+            raise ValueError(f"optimizer.learning_rate must be above 0, got {self.learning_rate}")
+        if self.max_grad_norm is not None and self.max_grad_norm <= 0:
+            raise ValueError(f"optimizer.max_grad_norm must be above 0, got {self.max_grad_norm}")
 
 
 class ReplayConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -73,8 +73,8 @@ class TargetUpdate:
     def __init__(self, rule: TargetRule, online: nn.Module, target: nn.Module) -> None:
         self.rule = rule
         self.last_sync = 0  # the update after which the target last moved
-        self._online = list(online.parameters())
-        self._target = list(target.parameters())
+        self._online: list[torch.Tensor] = list(online.parameters())
+        self._target: list[torch.Tensor] = list(target.parameters())
 
     @torch.no_grad()
     def after(self, gradient_step: int) -> bool:

@@ -1,0 +1,155 @@
+"""One update: a batch of packed rows to a loss, a step of Adam, a tick of the target's clock."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from restock.errors import ConfigError
+from restock.train.config import LossConfig, TrainConfig
+from restock.train.loss import Loss, conservative_penalty, dqn_loss, td_target
+from restock.train.network import QNetwork, clone
+from restock.train.target import TargetUpdate
+
+
+class Learner:
+    """The online network, its target, its optimizer and how many updates they have seen.
+
+    Batches are packed rows (B, 2D + 3) float32 as `restock.replay.layout` says:
+    `[observation | next_observation | action | reward | discount]`.
+    """
+
+    def __init__(self, config: TrainConfig, observation_size: int, actions: int) -> None:
+        self.device = open_device(config.device)
+        self.loss: LossConfig = config.loss
+        self.max_grad_norm = config.optimizer.max_grad_norm
+        self.network = QNetwork(
+            observation_size,
+            actions,
+            hidden=config.network.hidden,
+            layer_norm=config.network.layer_norm,
+            dueling=config.network.dueling,
+            generator=torch.Generator().manual_seed(config.seed),
+        ).to(self.device)
+        self.target_network = clone(self.network)
+        self.target = TargetUpdate(config.target, self.network, self.target_network)
+        self.optimizer = torch.optim.Adam(
+            self.network.parameters(), lr=config.optimizer.learning_rate, fused=True
+        )
+        self.gradient_steps = 0
+
+    def update(
+        self,
+        rows: Tensor,
+        *,
+        weight: Tensor | None = None,
+        logged: int = 0,
+        conservative: float = 0.0,
+    ) -> Loss:
+        """One gradient step on `rows`; the target's clock is ticked by `self.target` afterwards.
+
+        Args:
+            rows: (B, 2D + 3) float32, on the learner's device.
+            weight: (B,) importance weights, or None for ones.
+            logged: how many of the first rows are from logs; the conservative term sees only those.
+            conservative: the weight of that term.
+        """
+        observation, next_observation, action, reward, discount = unpack(
+            rows, self.network.observation_size
+        )
+        with torch.no_grad():
+            next_q = self.network(next_observation) if self.loss.double else None
+            target = td_target(reward, discount, self.target_network(next_observation), next_q)
+        q = self.network(observation)
+        loss = dqn_loss(q, action, target, weight=weight, huber_delta=self.loss.huber_delta)
+        value = loss.value
+        if conservative > 0 and logged:
+            penalty = conservative_penalty(q[:logged], action[:logged])
+            value = value + conservative * penalty * (logged / len(rows))
+        self.optimizer.zero_grad(set_to_none=True)
+        value.backward()  # type: ignore[no-untyped-call]
+        if self.max_grad_norm is not None:
+            torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.max_grad_norm)
+        self.optimizer.step()
+        self.gradient_steps += 1
+        return loss
+
+    @torch.no_grad()
+    def td_error(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Of rows, without learning: Q(s, a) - y (B,), Q(s) (B, A), Q_target(s) (B, A)."""
+        observation, next_observation, action, reward, discount = unpack(
+            rows, self.network.observation_size
+        )
+        next_q = self.network(next_observation) if self.loss.double else None
+        target = td_target(reward, discount, self.target_network(next_observation), next_q)
+        q: Tensor = self.network(observation)
+        return dqn_loss(q, action, target).td, q, self.target_network(observation)
+
+    def greedy(self, observation: NDArray[np.float32]) -> NDArray[np.int64]:
+        """The best action (N,) of each observation (N, D)."""
+        return greedy_actions(self.network, observation)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Tensors and JSON values, for a checkpoint."""
+        optimizer = self.optimizer.state_dict()["state"]
+        return {
+            "network": dict(self.network.state_dict()),
+            "target_network": dict(self.target_network.state_dict()),
+            "optimizer": {str(index): dict(entry) for index, entry in optimizer.items()},
+            "gradient_steps": self.gradient_steps,
+            "last_sync": self.target.last_sync,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Puts the learner where `state_dict` found it."""
+        self.network.load_state_dict(state["network"])
+        self.target_network.load_state_dict(state["target_network"])
+        self.optimizer.load_state_dict(
+            {
+                "state": {int(index): dict(entry) for index, entry in state["optimizer"].items()},
+                "param_groups": self.optimizer.state_dict()["param_groups"],
+            }
+        )
+        self.gradient_steps = int(state["gradient_steps"])
+        self.target.last_sync = int(state["last_sync"])
+
+
+def unpack(rows: Tensor, observation_size: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Packed rows to observation, next observation, action (int64), reward and discount."""
+    size = observation_size
+    return (
+        rows[:, :size],
+        rows[:, size : 2 * size],
+        rows[:, 2 * size].long(),
+        rows[:, 2 * size + 1],
+        rows[:, 2 * size + 2],
+    )
+
+
+@torch.inference_mode()
+def greedy_actions(network: QNetwork, observation: NDArray[np.float32]) -> NDArray[np.int64]:
+    """The best action (N,) of each observation (N, D), on the network's device."""
+    device = next(network.parameters()).device
+    values = network(torch.from_numpy(np.ascontiguousarray(observation)).to(device))
+    best: NDArray[np.int64] = values.argmax(dim=1).cpu().numpy()
+    return best
+
+
+def open_device(name: str) -> torch.device:
+    """The device, checked.
+
+    Raises:
+        ConfigError: `cuda` where this PyTorch sees none.
+    """
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ConfigError(
+            f"this PyTorch ({torch.__version__}) sees no CUDA device",
+            where="--device cuda",
+            remedy="use --device cpu, or install a CUDA build of torch on a machine with a GPU",
+        )
+    return torch.device(name)
