@@ -1,0 +1,1 @@
+-- Table macros: questions with parameters.

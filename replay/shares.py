@@ -1,0 +1,153 @@
+"""Shares of strata: what the mixture wants, within floors, caps and what the rows can bear."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from restock.errors import MixtureError
+from restock.replay.layout import F64, Bools, Ints
+from restock.replay.mixture import Mixture, Share, StratumRule
+
+
+@dataclass(frozen=True)
+class SharePlan:
+    """Shares of the logs' part of a batch, (S,) each."""
+
+    wanted: F64  # after floors and caps
+    got: F64  # sums to 1
+    limit: F64  # the most a stratum's rows can bear
+    scale: float  # of the logs' part of a batch: below 1 only where the mixture shrinks
+    notes: tuple[str, ...]  # per stratum, why it got less or more than wanted
+
+
+def plan_shares(
+    mixture: Mixture, rules: Sequence[StratumRule], rows: Ints, episodes: Ints
+) -> SharePlan:
+    """Shares from the mixture's rules and how many rows (S,) and episodes (S,) there are.
+
+    Raises:
+        MixtureError: shares that cannot sum to 1, or a shortfall where the mixture refuses one.
+    """
+    wanted = wanted_shares(rules, rows)
+    limit = _limits(mixture, rules, rows, episodes)
+    granted = np.minimum(wanted, limit)
+    missing = 1.0 - granted.sum()
+    short = wanted > limit + 1e-12
+    if missing <= 1e-9:
+        return SharePlan(wanted, wanted, limit, 1.0, ("",) * len(rules))
+    if mixture.shortfall == "refuse":
+        raise MixtureError(
+            "not enough rows: " + "; ".join(_complaints(rules, wanted, limit, rows, episodes)),
+            remedy='lower the shares, raise max_replays_per_row, or set shortfall = "redistribute"',
+        )
+    if granted.sum() <= 0:
+        raise MixtureError(
+            "no stratum has rows that may be drawn",
+            remedy="`restock audit` shows what the store holds; lower min_rows or the conditions",
+        )
+    notes = np.where(short, "short of rows", "")
+    if mixture.shortfall == "shrink":
+        return SharePlan(
+            wanted, granted / granted.sum(), limit, float(granted.sum()), tuple(notes.tolist())
+        )
+    caps = np.array([rule.cap for rule in rules])
+    roof = np.maximum(granted, np.minimum(limit, caps))
+    if roof.sum() < 1.0 - 1e-9:
+        raise MixtureError(
+            "not enough rows even when redistributed: "
+            + "; ".join(_complaints(rules, wanted, limit, rows, episodes)),
+            remedy='raise max_replays_per_row, plan fewer updates, or set shortfall = "shrink"',
+        )
+    got = scaled_within(granted, granted, roof)
+    more = (got > granted + 1e-9) & ~short
+    return SharePlan(
+        wanted, got, limit, 1.0, tuple(np.where(more, "took the surplus", notes).tolist())
+    )
+
+
+def wanted_shares(rules: Sequence[StratumRule], rows: Ints) -> F64:
+    """Given shares as they are; the rest to "equal" and "natural" strata, within floor and cap."""
+    given = np.array([0.0 if isinstance(rule.share, str) else rule.share for rule in rules])
+    flexible = np.array([isinstance(rule.share, str) for rule in rules], np.bool_)
+    rest = 1.0 - float(given.sum())
+    if rest < -1e-6 or (rest > 1e-6 and not flexible.any()):
+        raise MixtureError(
+            f"the shares of the strata sum to {given.sum():g}, not 1",
+            remedy='give one stratum share = "natural" to take what is left',
+        )
+    if not flexible.any():
+        return np.asarray(given / given.sum(), np.float64)
+    base = _flexible_parts([rule.share for rule in rules], flexible, rows)
+    low = np.array([rule.floor for rule in rules]) * flexible
+    high = np.where(flexible, [rule.cap for rule in rules], 0.0)
+    if low.sum() > rest + 1e-9 or high.sum() < rest - 1e-9:
+        raise MixtureError(
+            f"floors ({low.sum():g}) and caps ({high.sum():g}) leave no way to share out {rest:g}"
+        )
+    return given + rest_within(base, low, high, max(rest, 0.0))
+
+
+def _flexible_parts(shares: Sequence[Share], flexible: Bools, rows: Ints) -> F64:
+    """Relative sizes: an equal part each, the natural strata's parts pooled and split by rows."""
+    natural = np.array([share == "natural" for share in shares], np.bool_)
+    parts = flexible.astype(np.float64)
+    if natural.any():
+        pool = natural.sum() if (flexible & ~natural).any() else 1.0
+        held = np.where(natural, rows, 0)
+        parts[natural] = pool * held[natural] / max(int(held.sum()), 1)
+    return parts
+
+
+def rest_within(base: F64, low: F64, high: F64, total: float) -> F64:
+    """Shares proportional to `base`, each within [low, high], that sum to `total`."""
+    if total <= 0:
+        return np.zeros(len(base))
+    return total * scaled_within(base / max(base.sum(), 1e-12), low / total, high / total)
+
+
+def scaled_within(base: F64, low: F64, high: F64) -> F64:
+    """clip(factor * base, low, high) with the factor for which it sums to 1, by bisection.
+
+    Where even `high` on every positive part of the base is below 1, the others take the rest.
+    """
+    usable = np.where(base > 0, high, low)
+    if usable.sum() < 1.0:
+        short, room = 1.0 - usable.sum(), high - usable
+        return usable + (room * (short / room.sum()) if room.sum() > 0 else 0.0)
+    below, above = 0.0, 1.0
+    while np.clip(above * base, low, high).sum() < 1.0 and above < 1e15:
+        above *= 2.0
+    for _ in range(200):
+        middle = (below + above) / 2
+        if np.clip(middle * base, low, high).sum() < 1.0:
+            below = middle
+        else:
+            above = middle
+    shares = np.clip(above * base, low, high)
+    return np.asarray(shares / shares.sum(), np.float64)
+
+
+def _limits(mixture: Mixture, rules: Sequence[StratumRule], rows: Ints, episodes: Ints) -> F64:
+    """The largest share each stratum's rows can bear, (S,)."""
+    limit = np.where(rows > 0, 1.0, 0.0)
+    if mixture.max_replays_per_row is not None:
+        draws = mixture.planned.updates * mixture.planned.batch_size * mixture.sources.logs
+        limit = np.minimum(limit, mixture.max_replays_per_row * rows / draws)
+    for index, rule in enumerate(rules):
+        if rows[index] < rule.min_rows or episodes[index] < rule.min_episodes:
+            limit[index] = 0.0
+    return limit
+
+
+def _complaints(
+    rules: Sequence[StratumRule], wanted: F64, limit: F64, rows: Ints, episodes: Ints
+) -> list[str]:
+    return [
+        f"{rule.name} wants {wanted[index]:.1%}, its {rows[index]} rows in {episodes[index]}"
+        f" episodes can bear {limit[index]:.1%}"
+        for index, rule in enumerate(rules)
+        if wanted[index] > limit[index] + 1e-12
+    ]

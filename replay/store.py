@@ -1,0 +1,178 @@
+"""A store, open for reading: DuckDB over the Parquet of one version of its Delta tables.
+
+The views of `views.sql` and the macros of `macros.sql` are there; queries are read-only.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import duckdb
+import msgspec
+import pyarrow as pa
+from deltalake import DeltaTable
+from deltalake.exceptions import DeltaError, TableNotFoundError
+
+from restock.errors import StoreError
+from restock.ingest.conditions import Condition
+from restock.ingest.task import Task
+from restock.replay.query import install, query
+
+TRANSITIONS, RECORDINGS = "transitions", "recordings"
+
+
+class Store:
+    """A store at one version. Close it, or use it as a context manager.
+
+    Args:
+        path: the store's directory.
+        version: of its transitions table; default the newest.
+        memory_limit: what DuckDB may hold in memory, e.g. "4GB"; default DuckDB's own (80 %).
+
+    Raises:
+        StoreError: nothing there, not a store, or no such version.
+    """
+
+    def __init__(
+        self, path: str | Path, *, version: int | None = None, memory_limit: str | None = None
+    ) -> None:
+        self.path = Path(path)
+        transitions = _open(self.path, TRANSITIONS, version)
+        recordings = _open(self.path, RECORDINGS, None)
+        self.version: int = transitions.version()
+        self._spill = tempfile.TemporaryDirectory(prefix="restock-")
+        self.connection = duckdb.connect(
+            config={"temp_directory": self._spill.name, "autoinstall_known_extensions": False}
+        )
+        if memory_limit is not None:
+            self._set_memory(memory_limit)
+        _present(self.connection, "stored_recordings", recordings)
+        _present(self.connection, "stored_transitions", transitions)
+        self._tasks = self._read_tasks()
+        install(self.connection, self._observation_type())
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<Store {self.path} version {self.version}>"
+
+    def close(self) -> None:
+        """Close the connection and remove its temporary files."""
+        self.connection.close()
+        self._spill.cleanup()
+
+    def sql(self, text: str) -> duckdb.DuckDBPyRelation:
+        """The result of a query: `.to_arrow_table()`, `.df()`, `.pl()`, `.fetchall()`.
+
+        Raises QueryError with DuckDB's message, or where the query would write.
+        """
+        return query(self.connection, text, where=str(self.path))
+
+    def conditions(self) -> tuple[Condition, ...]:
+        """The conditions that labelled the store's rows, of the newest ingest.
+
+        Only what the table keeps of them: name, timing, priority and SQL.
+        """
+        found = self.connection.execute(
+            "SELECT conditions_json FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1"
+        ).fetchone()
+        if found is None:
+            return ()
+        return tuple(msgspec.json.decode(found[0], type=list[Condition], strict=False))
+
+    def task_json(self, task_hash: str | None = None) -> str:
+        """The task of the store's rows as JSON.
+
+        Raises StoreError where the rows are of several tasks and none, or no such, is named.
+        """
+        if task_hash is None and len(self._tasks) == 1:
+            return next(iter(self._tasks.values()))
+        if task_hash is not None and task_hash in self._tasks:
+            return self._tasks[task_hash]
+        raise StoreError(
+            "it holds no recording"
+            if not self._tasks
+            else f"it holds transitions of the tasks {', '.join(sorted(self._tasks))}"
+            + (f", not of {task_hash}" if task_hash else ""),
+            where=str(self.path),
+            remedy="ingest recordings" if not self._tasks else "name one of them",
+        )
+
+    def task(self, task_hash: str | None = None) -> Task:
+        """The task of the store's rows. Raises StoreError as `task_json` does."""
+        return msgspec.json.decode(self.task_json(task_hash), type=Task)
+
+    def _read_tasks(self) -> dict[str, str]:
+        rows = self.connection.sql(
+            "SELECT DISTINCT task_hash, task_json FROM stored_recordings"
+            " WHERE ingest_id IN (SELECT ingest_id FROM stored_transitions) ORDER BY ALL"
+        ).fetchall()
+        return dict(rows)
+
+    def _observation_type(self) -> str:
+        """Fixed-size where all tasks agree on the size: DuckDB reads Delta's lists as FLOAT[]."""
+        sizes = {
+            msgspec.json.decode(text, type=Task).observation_size for text in self._tasks.values()
+        }
+        return f"FLOAT[{sizes.pop()}]" if len(sizes) == 1 else "FLOAT[]"
+
+    def _set_memory(self, limit: str) -> None:
+        try:
+            self.connection.execute(f"SET memory_limit = '{limit}'")
+        except duckdb.Error as error:
+            raise StoreError(
+                f"no memory limit {limit!r}", remedy='write it like "4GB" or "512MB"'
+            ) from error
+
+
+def is_store(path: str | Path) -> bool:
+    """Whether there is a store at `path`."""
+    return all((Path(path) / name / "_delta_log").is_dir() for name in (TRANSITIONS, RECORDINGS))
+
+
+def _open(path: Path, name: str, version: int | None) -> DeltaTable:
+    if not is_store(path):
+        raise StoreError(
+            "not a store" if path.exists() else "no such store",
+            where=str(path),
+            remedy=f"`restock ingest RECORDINGS --store {path}` makes one",
+        )
+    try:
+        return DeltaTable(str(path / name), version=version)
+    except (TableNotFoundError, DeltaError, ValueError) as error:
+        raise StoreError(
+            f"its table `{name}` cannot be opened"
+            + (f" at version {version}" if version is not None else "")
+            + f": {str(error).splitlines()[0]}",
+            where=str(path),
+        ) from error
+
+
+def _present(connection: duckdb.DuckDBPyConnection, view: str, table: DeltaTable) -> None:
+    files = [_local(uri) for uri in table.file_uris()]
+    if files:
+        read_parquet(connection, view, files)
+    else:
+        connection.register(view, pa.schema(table.schema().to_arrow()).empty_table())
+
+
+def read_parquet(
+    connection: duckdb.DuckDBPyConnection, view: str, files: Sequence[str | os.PathLike[str]]
+) -> None:
+    """A view over Parquet files; columns that only some have are null in the others."""
+    quoted = ", ".join("'" + str(file).replace("'", "''") + "'" for file in files)
+    connection.execute(
+        f'CREATE OR REPLACE VIEW "{view}" AS'
+        f" SELECT * FROM read_parquet([{quoted}], union_by_name = true)"
+    )
+
+
+def _local(uri: str) -> str:
+    return uri.removeprefix("file://")
