@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from restock import __version__
-from restock.errors import PanelError
+from restock.errors import PanelError, StoreError
 from restock.ingest.conditions import NOMINAL, Condition, labels_version, shipped
 from restock.ingest.task import Task
 from restock.replay.layout import PACKING_VERSION, Ints, n_step_return, row_columns, row_width
@@ -47,7 +47,7 @@ class Source:
     connection: duckdb.DuckDBPyConnection
     name: str
     version: int
-    task_json: str
+    task_json: Callable[[str], str]  # task hash -> the task as JSON; "" where nothing is known
     conditions: tuple[Condition, ...]
 
 
@@ -57,7 +57,6 @@ def open_source(
     *,
     task: Task | None = None,
     conditions: Sequence[Condition] | None = None,
-    task_hash: str | None = None,
 ) -> Iterator[Source]:
     """A store, or a table with the columns of `ingest.schema`, as a source of a panel.
 
@@ -69,7 +68,7 @@ def open_source(
             transitions.connection,
             str(transitions.path),
             transitions.version,
-            transitions.task_json(task_hash),
+            transitions.task_json,
             found,
         )
         return
@@ -81,8 +80,15 @@ def open_source(
             conditions = [
                 known.get(name) or Condition(name, "post", "false") for (name,) in sorted(named)
             ]
-        json = msgspec.json.encode(task).decode() if task is not None else ""
-        yield Source(connection, "table in memory", -1, json, tuple(conditions))
+
+        def task_json(task_hash: str) -> str:
+            if task is None:
+                return ""
+            if task.hash != task_hash:
+                raise StoreError(f"its rows are of task {task_hash}, the task given is {task.hash}")
+            return msgspec.json.encode(task).decode()
+
+        yield Source(connection, "table in memory", -1, task_json, tuple(conditions))
 
 
 def build_panel(
@@ -173,8 +179,7 @@ def _pack(
     sorted_ids, sorted_last = wanted[by_id], last_ids[by_last]
     needed = np.union1d(wanted, last_ids)
     of_task = f"FROM transitions WHERE task_hash = '{plan.task_hash}'"
-    first = connection.execute(f"SELECT len(observation) {of_task} LIMIT 1").fetchone()
-    size = int(first[0]) if first else 0
+    ((size,),) = connection.sql(f"SELECT len(observation) {of_task} LIMIT 1").fetchall()
     query = f"SELECT transition_id, observation, next_observation {of_task}"
     rows = np.memmap(path, np.dtype("<f4"), "w+", shape=(len(chosen), row_width(size)))
     part = row_columns(size)
@@ -261,7 +266,7 @@ def _header(source: Source, plan: Plan, observation_size: int, partial: Path) ->
         store=source.name,
         store_version=source.version,
         task_hash=plan.task_hash,
-        task_json=source.task_json,
+        task_json=source.task_json(plan.task_hash),
         labels_version=labels_version(source.conditions),
         observation_size=observation_size,
         rows=len(plan.panel_rows),

@@ -55,12 +55,9 @@ def plan_shares(
         )
     caps = np.array([rule.cap for rule in rules])
     roof = np.maximum(granted, np.minimum(limit, caps))
-    if roof.sum() < 1.0 - 1e-9:
-        raise MixtureError(
-            "not enough rows even when redistributed: "
-            + "; ".join(_complaints(rules, wanted, limit, rows, episodes)),
-            remedy='raise max_replays_per_row, plan fewer updates, or set shortfall = "shrink"',
-        )
+    scale = min(float(roof.sum()), 1.0)
+    if scale < 1.0 - 1e-9:  # every stratum is at its limit: what is left cannot come from the logs
+        return SharePlan(wanted, roof / scale, limit, scale, ("short of rows",) * len(rules))
     got = scaled_within(granted, granted, roof)
     more = (got > granted + 1e-9) & ~short
     return SharePlan(

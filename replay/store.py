@@ -80,12 +80,12 @@ class Store:
 
         Only what the table keeps of them: name, timing, priority and SQL.
         """
-        found = self.connection.execute(
+        found = self.connection.sql(
             "SELECT conditions_json FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1"
-        ).fetchone()
-        if found is None:
+        ).fetchall()
+        if not found:
             return ()
-        return tuple(msgspec.json.decode(found[0], type=list[Condition], strict=False))
+        return tuple(msgspec.json.decode(found[0][0], type=list[Condition], strict=False))
 
     def task_json(self, task_hash: str | None = None) -> str:
         """The task of the store's rows as JSON.

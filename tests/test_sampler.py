@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from restock.errors import MixtureError
-from restock.replay.sampler import QuotaSampler, Quotas, uniform_sampler
+from restock.replay.sampler import Quotas, QuotaSampler, uniform_sampler
 
 SHARES = st.lists(st.integers(0, 1000), min_size=1, max_size=9).filter(lambda s: sum(s) > 0)
 
