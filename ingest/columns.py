@@ -1,0 +1,139 @@
+"""Columns of messages: what a reader hands over. Payload batches in, arrays per field out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+I64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Ragged:
+    """Rows of different lengths: row i is `values[offsets[i]:offsets[i + 1]]`.
+
+    `values` is an array (total, …), or Ragged again where a sequence holds sequences
+    (`status[].values[].key`). `offsets` is (N + 1,) int64 and starts at 0.
+    """
+
+    values: NDArray[Any] | Ragged
+    offsets: I64  # (N + 1,)
+
+    def __len__(self) -> int:
+        return len(self.offsets) - 1
+
+    def __getitem__(self, row: int) -> NDArray[Any] | Ragged:
+        """One row's values (an array), or one row's rows (Ragged)."""
+        index = range(len(self))[row]
+        return cut(self.values, int(self.offsets[index]), int(self.offsets[index + 1]))
+
+    @property
+    def lengths(self) -> I64:
+        """How many values each row holds, (N,)."""
+        return np.diff(self.offsets)
+
+    def take(self, rows: NDArray[np.intp]) -> Ragged:
+        """These rows, in this order."""
+        lengths = self.lengths[rows]
+        offsets = offsets_of(lengths)
+        # Element j of the output comes from where its row starts, plus its place in the row.
+        source = np.repeat(self.offsets[:-1][rows] - offsets[:-1], lengths) + np.arange(offsets[-1])
+        return Ragged(take(self.values, source), offsets)
+
+
+FieldColumn: TypeAlias = "NDArray[Any] | Ragged"  # leading axis: the message
+
+
+def offsets_of(lengths: NDArray[Any]) -> I64:
+    """Lengths (N,) to offsets (N + 1,)."""
+    offsets = np.zeros(len(lengths) + 1, np.int64)
+    np.cumsum(lengths, out=offsets[1:])
+    return offsets
+
+
+def cut(column: FieldColumn, start: int, stop: int) -> FieldColumn:
+    """Rows `start` to `stop` of a column."""
+    if isinstance(column, Ragged):
+        low, high = int(column.offsets[start]), int(column.offsets[stop])
+        return Ragged(cut(column.values, low, high), column.offsets[start : stop + 1] - low)
+    return column[start:stop]
+
+
+def take(column: FieldColumn, rows: NDArray[Any]) -> FieldColumn:
+    """These rows of a column, in this order."""
+    return column.take(rows) if isinstance(column, Ragged) else column[rows]
+
+
+def join(columns: Sequence[FieldColumn]) -> FieldColumn:
+    """Columns of the same field, one after the other."""
+    if len(columns) == 1:
+        return columns[0]
+    ragged = [column for column in columns if isinstance(column, Ragged)]
+    if not ragged:
+        return np.concatenate([column for column in columns if not isinstance(column, Ragged)])
+    return Ragged(
+        join([column.values for column in ragged]),
+        offsets_of(np.concatenate([column.lengths for column in ragged])),
+    )
+
+
+def equal(left: FieldColumn, right: FieldColumn) -> bool:
+    """Whether two columns hold the same values (NaN equal to NaN), shapes and types."""
+    if isinstance(left, Ragged) or isinstance(right, Ragged):
+        return (
+            isinstance(left, Ragged)
+            and isinstance(right, Ragged)
+            and np.array_equal(left.offsets, right.offsets)
+            and equal(left.values, right.values)
+        )
+    if left.dtype != right.dtype or left.shape != right.shape:
+        return False
+    return np.array_equal(left, right, equal_nan=left.dtype.kind == "f")
+
+
+@dataclass(frozen=True)
+class TopicColumns:
+    """The decoded messages of one topic, in the order of their log time."""
+
+    log_time_ns: I64  # (N,) when the recorder received it
+    publish_time_ns: I64  # (N,) when the sender sent it; the log time where that is not kept
+    fields: dict[str, FieldColumn] = field(default_factory=dict)  # by field path
+
+    def __len__(self) -> int:
+        return len(self.log_time_ns)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Serialised messages of one channel: slices of one buffer, in file order."""
+
+    buffer: NDArray[np.uint8]
+    start: I64  # (N,) first byte of each payload in `buffer`
+    stop: I64  # (N,) one past its last
+    log_time_ns: I64  # (N,)
+    publish_time_ns: I64  # (N,)
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    def payloads(self) -> list[bytes]:
+        """Each message's bytes."""
+        view = self.buffer.data
+        bounds = zip(self.start.tolist(), self.stop.tolist(), strict=True)
+        return [bytes(view[start:stop]) for start, stop in bounds]
+
+    @classmethod
+    def of(cls, payloads: Sequence[bytes], log_time_ns: Any, publish_time_ns: Any) -> Batch:
+        """Payloads laid one after the other."""
+        offsets = offsets_of(np.fromiter(map(len, payloads), np.int64, len(payloads)))
+        return cls(
+            np.frombuffer(b"".join(payloads), np.uint8),
+            offsets[:-1],
+            offsets[1:],
+            np.asarray(log_time_ns, np.int64),
+            np.asarray(publish_time_ns, np.int64),
+        )

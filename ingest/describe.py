@@ -1,0 +1,58 @@
+"""What a recording says about itself, as plain data: the content of `restock info`."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from restock.ingest.readers import open_recording
+
+NANOSECONDS = 1_000_000_000
+
+
+def describe(
+    path: Path | str, *, typestore: str | None = None, salvage: bool = False
+) -> dict[str, Any]:
+    """Format, size, time span and topics of one recording; nothing is decoded.
+
+    Times are log times. `rate_hz` is the messages of a topic over the recording's duration.
+
+    Raises:
+        RecordingError: it cannot be opened; see `open_recording`.
+    """
+    with open_recording(path, typestore=typestore, salvage=salvage) as recording:
+        span = recording.span_ns
+        duration_s = (span[1] - span[0]) / NANOSECONDS if span else None
+        return {
+            "path": str(path),
+            "format": recording.format,
+            "files": [str(file) for file in recording.files],
+            "size_bytes": recording.size_bytes,
+            "start_ns": span[0] if span else None,
+            "end_ns": span[1] if span else None,
+            "start": _date(span[0]) if span else None,
+            "duration_s": duration_s,
+            "messages": recording.messages,
+            "topics": {
+                topic.name: {
+                    "type": topic.type,
+                    "messages": topic.expected,
+                    "rate_hz": topic.expected / duration_s if duration_s else None,
+                    "encoding": topic.encoding,
+                    "definition": topic.definition,
+                    "skipped": topic.skipped,
+                }
+                for topic in recording.topics.values()
+            },
+            "notes": list(recording.notes),
+            "damage": [item.what for item in recording.damage],
+        }
+
+
+def _date(stamp_ns: int) -> str:
+    try:
+        moment = datetime.fromtimestamp(stamp_ns // NANOSECONDS, UTC)
+    except (OverflowError, ValueError, OSError):
+        return f"{stamp_ns} ns, which is no date"
+    return moment.isoformat().replace("+00:00", "Z")

@@ -1,0 +1,227 @@
+"""One MCAP chunk: bounded decompression, and where its messages are."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, field
+from typing import Any
+
+import lz4.frame
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from restock.ingest.columns import I64
+from restock.ingest.mcap_records import PREFIX, Malformed, Op, parse, walk
+
+# A chunk's uncompressed size is the file's word: beyond these it is refused, not allocated.
+LARGEST_CHUNK = 4 << 30
+PLAUSIBLE_SIZE = 64 << 20
+PLAUSIBLE_RATIO = 1000
+
+_HEAD = np.dtype(  # a message record up to its data
+    [
+        ("op", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("publish_time", "<u8"),
+    ]
+)
+HEAD_SIZE = _HEAD.itemsize  # 31
+_INDEX = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
+
+
+class BadChunk(Exception):
+    """A chunk whose content cannot be had."""
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Where a chunk is in the file, and what its record and its message index say."""
+
+    at: int  # of its record in the file
+    start: int  # of its (compressed) records
+    stop: int
+    size: int  # uncompressed
+    crc: int  # of the uncompressed records; 0 says unchecked
+    compression: str
+    span_ns: tuple[int, int]
+    index: dict[int, tuple[int, int]] = field(default_factory=dict)  # channel -> entries in file
+
+    @property
+    def indexed(self) -> bool:
+        """Whether message index records follow it."""
+        return bool(self.index)
+
+    def counts(self) -> dict[int, int]:
+        """Messages per channel, by the message index."""
+        return {
+            channel: (stop - start) // _INDEX.itemsize
+            for channel, (start, stop) in self.index.items()
+        }
+
+
+@dataclass
+class Messages:
+    """Messages of one channel in one buffer."""
+
+    start: I64
+    stop: I64
+    log_time_ns: I64
+    publish_time_ns: I64
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+
+def inflate(chunk: Chunk, file: Any) -> bytes:
+    """The chunk's records, uncompressed and checked against its CRC.
+
+    Raises:
+        BadChunk: unknown compression, an implausible size, damaged data or a wrong CRC.
+    """
+    stored = file[chunk.start : chunk.stop]
+    limit = max(PLAUSIBLE_SIZE, PLAUSIBLE_RATIO * len(stored))
+    if chunk.size > min(limit, LARGEST_CHUNK):
+        raise BadChunk(f"{len(stored):,} bytes that claim to hold {chunk.size:,}")
+    data = _decompress(chunk.compression, stored, chunk.size)
+    if len(data) != chunk.size:
+        raise BadChunk(f"{len(data):,} bytes uncompressed, where it claims {chunk.size:,}")
+    if chunk.crc and zlib.crc32(data) != chunk.crc:
+        raise BadChunk("its CRC does not match")
+    return data
+
+
+def inflate_what_is_there(chunk: Chunk, file: Any) -> bytes:
+    """The part of a cut or damaged chunk that still decompresses; unchecked."""
+    stored = file[chunk.start : chunk.stop]
+    limit = min(chunk.size, max(PLAUSIBLE_SIZE, PLAUSIBLE_RATIO * len(stored)), LARGEST_CHUNK)
+    parts: list[bytes] = []
+    size = 0
+    step = 1 << 12  # small, so that damage costs no more than what is near it
+    if chunk.compression == "":
+        return bytes(stored[:limit])
+    decoder: Any
+    if chunk.compression == "zstd":
+        decoder = zstandard.ZstdDecompressor().decompressobj()
+    elif chunk.compression == "lz4":
+        decoder = lz4.frame.LZ4FrameDecompressor()
+    else:
+        return b""
+    for position in range(0, len(stored), step):
+        try:
+            part = decoder.decompress(stored[position : position + step])
+        except (zstandard.ZstdError, RuntimeError, EOFError, OSError):
+            break
+        parts.append(part)
+        size += len(part)
+        if size >= limit:
+            break
+    return b"".join(parts)[:limit]
+
+
+def _decompress(compression: str, stored: bytes, size: int) -> bytes:
+    if compression == "":
+        return stored
+    try:
+        if compression == "zstd":
+            if zstandard.frame_content_size(stored) > size:
+                raise BadChunk("it would decompress to more than it claims")
+            return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
+        if compression == "lz4":
+            data: bytes = lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=size + 1)
+            return data
+    except (zstandard.ZstdError, RuntimeError, EOFError, OSError) as error:
+        raise BadChunk(f"its {compression} data is damaged ({error})") from error
+    raise BadChunk(f"compression {compression!r} is not known")
+
+
+def indexed_messages(
+    buffer: NDArray[np.uint8], base: int, size: int, entries: bytes, channel: int
+) -> Messages | None:
+    """A channel's messages by its index entries, in a chunk at buffer[base:base + size].
+
+    None where the index does not fit what is there: then the chunk is to be walked.
+    """
+    if len(entries) % _INDEX.itemsize:
+        return None
+    offset = np.frombuffer(entries, _INDEX)["offset"]
+    if not len(offset):
+        none = np.zeros(0, np.int64)
+        return Messages(none, none, none, none)
+    if size < HEAD_SIZE or int(offset.max()) > size - HEAD_SIZE:
+        return None
+    at = np.sort(offset.astype(np.int64)) + base  # file order: entries are sorted by time
+    head = gather(buffer, at, _HEAD)
+    length = head["length"]
+    if (
+        (head["op"] != Op.MESSAGE).any()
+        or (head["channel"] != channel).any()
+        or (length > size).any()
+        or (length < HEAD_SIZE - PREFIX).any()
+    ):
+        return None
+    stop = at + PREFIX + length.astype(np.int64)
+    if (stop > base + size).any():
+        return None
+    return Messages(
+        at + HEAD_SIZE,
+        stop,
+        head["log_time"].astype(np.int64),
+        head["publish_time"].astype(np.int64),
+    )
+
+
+def gather(buffer: NDArray[np.uint8], at: I64, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """The records of `dtype` at these byte positions of a buffer, (N,). Positions must fit."""
+    room = len(buffer) - dtype.itemsize + 1
+    raw = np.dtype((np.void, dtype.itemsize))
+    view: NDArray[Any] = np.ndarray((room,), raw, buffer, strides=(1,))
+    return view[at].view(dtype)
+
+
+def walked_messages(
+    buffer: Any, start: int, stop: int
+) -> tuple[dict[int, list[int]], Malformed | None]:
+    """Positions of the message records per channel in buffer[start:stop], up to what is cut."""
+    found: dict[int, list[int]] = {}
+    try:
+        for opcode, at, end in walk(buffer, start, stop):
+            if opcode == Op.MESSAGE and end - at >= HEAD_SIZE - PREFIX:
+                channel = buffer[at] | buffer[at + 1] << 8
+                found.setdefault(channel, []).append(at - PREFIX)
+    except Malformed as cut:
+        return found, cut
+    return found, None
+
+
+def messages_at(buffer: NDArray[np.uint8], positions: Any) -> Messages:
+    """Messages whose records start at these positions (which were walked, and so fit)."""
+    at = np.asarray(positions, np.int64)
+    head = gather(buffer, at, _HEAD)
+    return Messages(
+        at + HEAD_SIZE,
+        at + PREFIX + head["length"].astype(np.int64),
+        head["log_time"].astype(np.int64),
+        head["publish_time"].astype(np.int64),
+    )
+
+
+def definitions(buffer: Any, start: int, stop: int) -> tuple[dict[int, Any], dict[int, Any]]:
+    """The schema and channel records in buffer[start:stop], by id, up to what is cut."""
+    schemas: dict[int, Any] = {}
+    channels: dict[int, Any] = {}
+    try:
+        for opcode, at, end in walk(buffer, start, stop):
+            if opcode == Op.SCHEMA:
+                schema = parse(Op.SCHEMA, buffer, at, end)
+                low, high = schema["data"]
+                schemas[schema["id"]] = {**schema, "data": bytes(buffer[low:high])}
+            elif opcode == Op.CHANNEL:
+                channel = parse(Op.CHANNEL, buffer, at, end)
+                channels[channel["id"]] = channel
+    except Malformed:
+        pass
+    return schemas, channels

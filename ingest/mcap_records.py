@@ -1,0 +1,187 @@
+"""MCAP's records: one table of their fields and one bounded parser. See https://mcap.dev/spec."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from enum import IntEnum
+from typing import Any
+
+MAGIC = b"\x89MCAP0\r\n"
+PREFIX = 9  # every record: opcode (1 byte), length of its content (8 bytes)
+
+
+class Malformed(Exception):
+    """A record that says it holds more than there is. `at` is its position in the buffer."""
+
+    def __init__(self, what: str, at: int) -> None:
+        super().__init__(what)
+        self.what, self.at = what, at
+
+
+class Op(IntEnum):
+    """Opcodes. Others are to be skipped."""
+
+    HEADER = 0x01
+    FOOTER = 0x02
+    SCHEMA = 0x03
+    CHANNEL = 0x04
+    MESSAGE = 0x05
+    CHUNK = 0x06
+    MESSAGE_INDEX = 0x07
+    CHUNK_INDEX = 0x08
+    ATTACHMENT = 0x09
+    ATTACHMENT_INDEX = 0x0A
+    STATISTICS = 0x0B
+    METADATA = 0x0C
+    METADATA_INDEX = 0x0D
+    SUMMARY_OFFSET = 0x0E
+    DATA_END = 0x0F
+
+
+# name and kind of each field. "span32"/"span64"/"rest" are (start, stop) in the buffer: not copied.
+FIELDS: dict[Op, tuple[tuple[str, str], ...]] = {
+    Op.HEADER: (("profile", "text"), ("library", "text")),
+    Op.FOOTER: (("summary_start", "Q"), ("summary_offset_start", "Q"), ("summary_crc", "I")),
+    Op.SCHEMA: (("id", "H"), ("name", "text"), ("encoding", "text"), ("data", "span32")),
+    Op.CHANNEL: (
+        ("id", "H"),
+        ("schema_id", "H"),
+        ("topic", "text"),
+        ("message_encoding", "text"),
+        ("metadata", "texts"),
+    ),
+    Op.MESSAGE: (
+        ("channel_id", "H"),
+        ("sequence", "I"),
+        ("log_time", "Q"),
+        ("publish_time", "Q"),
+        ("data", "rest"),
+    ),
+    Op.CHUNK: (
+        ("message_start_time", "Q"),
+        ("message_end_time", "Q"),
+        ("uncompressed_size", "Q"),
+        ("uncompressed_crc", "I"),
+        ("compression", "text"),
+        ("records", "span64"),
+    ),
+    Op.MESSAGE_INDEX: (("channel_id", "H"), ("records", "span32")),
+    Op.CHUNK_INDEX: (
+        ("message_start_time", "Q"),
+        ("message_end_time", "Q"),
+        ("chunk_start_offset", "Q"),
+        ("chunk_length", "Q"),
+        ("message_index_offsets", "HQ"),
+        ("message_index_length", "Q"),
+        ("compression", "text"),
+        ("compressed_size", "Q"),
+        ("uncompressed_size", "Q"),
+    ),
+    Op.ATTACHMENT: (
+        ("log_time", "Q"),
+        ("create_time", "Q"),
+        ("name", "text"),
+        ("media_type", "text"),
+        ("data", "span64"),
+        ("crc", "I"),
+    ),
+    Op.ATTACHMENT_INDEX: (
+        ("offset", "Q"),
+        ("length", "Q"),
+        ("log_time", "Q"),
+        ("create_time", "Q"),
+        ("data_size", "Q"),
+        ("name", "text"),
+        ("media_type", "text"),
+    ),
+    Op.STATISTICS: (
+        ("message_count", "Q"),
+        ("schema_count", "H"),
+        ("channel_count", "I"),
+        ("attachment_count", "I"),
+        ("metadata_count", "I"),
+        ("chunk_count", "I"),
+        ("message_start_time", "Q"),
+        ("message_end_time", "Q"),
+        ("channel_message_counts", "HQ"),
+    ),
+    Op.METADATA: (("name", "text"), ("metadata", "texts")),
+    Op.METADATA_INDEX: (("offset", "Q"), ("length", "Q"), ("name", "text")),
+    Op.SUMMARY_OFFSET: (("group_opcode", "B"), ("group_start", "Q"), ("group_length", "Q")),
+    Op.DATA_END: (("data_section_crc", "I"),),
+}
+
+
+def walk(buffer: Any, start: int, stop: int) -> Iterator[tuple[int, int, int]]:
+    """Each record's opcode and the (start, stop) of its content, from `start` to `stop`.
+
+    Raises:
+        Malformed: a record ends beyond `stop`; whatever came before it was whole.
+    """
+    unpack = struct.Struct("<BQ").unpack_from
+    position = start
+    while position < stop:
+        if position + PREFIX > stop:
+            raise Malformed("cut within a record's first bytes", position)
+        opcode, length = unpack(buffer, position)
+        end = position + PREFIX + length
+        if end > stop:
+            raise Malformed(
+                f"a record of {length:,} bytes, {end - stop:,} more than there are", position
+            )
+        yield opcode, position + PREFIX, end
+        position = end
+
+
+def parse(op: Op, buffer: Any, start: int, stop: int) -> dict[str, Any]:
+    """The fields of the record whose content is buffer[start:stop]. Bytes after them are padding.
+
+    Raises:
+        Malformed: a field reaches beyond the record.
+    """
+    cursor = _Cursor(buffer, start, stop)
+    return {name: cursor.read(kind) for name, kind in FIELDS[op]}
+
+
+class _Cursor:
+    """Reads fields one after the other, never beyond `stop`."""
+
+    def __init__(self, buffer: Any, start: int, stop: int) -> None:
+        self.buffer, self.position, self.stop = buffer, start, stop
+
+    def read(self, kind: str) -> Any:
+        if kind in ("B", "H", "I", "Q"):
+            return self._number(kind)
+        if kind == "text":
+            return self._text()
+        if kind == "rest":
+            return self._span(self.stop - self.position)
+        if kind in ("span32", "span64"):
+            return self._span(self._number("I" if kind == "span32" else "Q"))
+        return self._pairs(kind)
+
+    def _pairs(self, kind: str) -> dict[Any, Any]:
+        start, stop = self._span(self._number("I"))
+        inner = _Cursor(self.buffer, start, stop)
+        key, value = ("text", "text") if kind == "texts" else (kind[0], kind[1])
+        pairs = {}
+        while inner.position < stop:
+            name = inner.read(key)
+            pairs[name] = inner.read(value)
+        return pairs
+
+    def _number(self, kind: str) -> int:
+        start, stop = self._span(struct.calcsize("<" + kind))
+        return int.from_bytes(self.buffer[start:stop], "little")
+
+    def _text(self) -> str:
+        start, stop = self._span(self._number("I"))
+        return bytes(self.buffer[start:stop]).decode("utf-8", errors="backslashreplace")
+
+    def _span(self, length: int) -> tuple[int, int]:
+        start = self.position
+        if start + length > self.stop:
+            raise Malformed(f"a field of {length:,} bytes reaches beyond its record", start)
+        self.position = start + length
+        return start, self.position

@@ -1,0 +1,190 @@
+"""rosbag2's sqlite3 storage: one `.db3` file."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from urllib.parse import quote
+
+from restock.errors import RecordingError
+from restock.ingest.columns import Batch
+from restock.ingest.storage import Channel, Damage, Integrity
+
+MAGIC = b"SQLite format 3\x00"
+ROWS_PER_FETCH = 1000
+BYTES_PER_BATCH = 32 << 20
+
+
+class SqliteFile:
+    """One sqlite3 storage file, read only. rosbag2 keeps no checksums: it is never verified.
+
+    Rows that a writer left in a `-wal` or `-journal` file beside it count too: such a file is
+    read from a private copy, so that nothing beside the user's recording is ever written.
+    """
+
+    def __init__(self, path: Path, *, salvage: bool = False) -> None:
+        self.path, self.salvage = path, salvage
+        self.integrity: Integrity = "unverified"
+        self.damage: list[Damage] = []
+        self.notes: list[str] = []
+        self._copy: tempfile.TemporaryDirectory[str] | None = None
+        self._refuse_short()
+        self._connection = self._connect()
+        try:
+            self.channels = self._read_channels()
+            self.counts, self.span_ns = self._count()
+        except sqlite3.DatabaseError as error:
+            self.close()
+            raise RecordingError(
+                f"not a rosbag2 recording: {error}",
+                where=str(path),
+                remedy="rosbag2's sqlite3 files have the tables `topics` and `messages`",
+            ) from error
+
+    def _refuse_short(self) -> None:
+        size = self.path.stat().st_size
+        with self.path.open("rb") as file:
+            head = file.read(100)
+        page = int.from_bytes(head[16:18], "big")
+        page = 65536 if page == 1 else page
+        # The page count in the header is only right when the two change counters agree.
+        pages = int.from_bytes(head[28:32], "big") if head[24:28] == head[92:96] else 0
+        if len(head) == 100 and size >= page * pages:
+            return
+        what = f"cut short: {size:,} bytes of {page * pages:,}"
+        if not self.salvage or len(head) < 100:
+            raise RecordingError(
+                what, where=str(self.path), remedy="`--salvage` reads what can still be read of it"
+            )
+        self.damage.append(Damage(what))
+        self.integrity = "damaged"
+
+    def _connect(self) -> sqlite3.Connection:
+        path = self.path
+        sidecars = [path.with_name(path.name + end) for end in ("-wal", "-journal")]
+        sidecars = [item for item in sidecars if item.is_file() and item.stat().st_size]
+        immutable = "&immutable=1"
+        if sidecars:
+            self._copy = tempfile.TemporaryDirectory(prefix="restock-")
+            for item in (path, *sidecars):
+                shutil.copyfile(item, Path(self._copy.name) / item.name)
+            path, immutable = Path(self._copy.name) / path.name, ""
+            names = ", ".join(item.name for item in sidecars)
+            self.notes.append(f"{names}: read too, the writer had not folded it in")
+        mode = "ro" if immutable else "rw"
+        uri = f"file:{quote(str(path.absolute()))}?mode={mode}{immutable}"
+        try:
+            return sqlite3.connect(uri, uri=True, check_same_thread=False)
+        except sqlite3.DatabaseError as error:
+            raise RecordingError(str(error), where=str(self.path)) from error
+
+    def _read_channels(self) -> dict[int, Channel]:
+        definitions: dict[str, tuple[str, bytes]] = {}
+        if self._connection.execute(
+            "SELECT 1 FROM sqlite_master WHERE name = 'message_definitions'"
+        ).fetchone():
+            rows = self._connection.execute(
+                "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+            )
+            definitions = {
+                str(name): (str(form), text if isinstance(text, bytes) else str(text).encode())
+                for name, form, text in rows
+            }
+        rows = self._connection.execute("SELECT id, name, type, serialization_format FROM topics")
+        return {
+            number: Channel(
+                number,
+                str(name),
+                str(kind),
+                str(encoding),
+                *definitions.get(str(kind), ("", b"")),
+            )
+            for number, name, kind, encoding in rows
+        }
+
+    def _count(self) -> tuple[dict[int, int], tuple[int, int] | None]:
+        counts = dict.fromkeys(self.channels, 0)
+        low: list[int] = []
+        high: list[int] = []
+        try:
+            for number, count, first, last in self._connection.execute(
+                "SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages GROUP BY 1"
+            ):
+                if number not in self.channels:
+                    what = f"{count} messages of topic id {number}, which no topic has"
+                    self.damage.append(Damage(what, {number: count}))
+                    continue
+                counts[number] = count
+                low.append(first)
+                high.append(last)
+        except sqlite3.DatabaseError:
+            if not self.salvage:
+                raise
+            # Which rows are whole is only known by reading them one after the other.
+            for number, stamp in self._whole_rows("topic_id, timestamp"):
+                if number in counts:
+                    counts[number] += 1
+                    low.append(stamp)
+                    high.append(stamp)
+        return counts, ((min(low), max(high)) if low else None)
+
+    def _whole_rows(self, columns: str) -> Iterator[tuple[int, int]]:
+        cursor = self._connection.execute(f"SELECT {columns} FROM messages NOT INDEXED ORDER BY id")
+        while True:
+            try:
+                row = cursor.fetchone()
+            except sqlite3.DatabaseError as error:
+                self._damaged(f"rows after the damage are lost: {error}")
+                return
+            if row is None:
+                return
+            yield row
+
+    def _damaged(self, what: str) -> None:
+        self.integrity = "damaged"
+        if all(item.what != what for item in self.damage):
+            self.damage.append(Damage(what))
+
+    def batches(self, channels: Collection[int]) -> Iterator[tuple[int, Batch]]:
+        """One pass in rowid order, which is the order of arrival."""
+        wanted = [channel for channel in channels if channel in self.channels]
+        marks = ",".join("?" * len(wanted))
+        cursor = self._connection.execute(
+            "SELECT topic_id, timestamp, data FROM messages NOT INDEXED"
+            f" WHERE topic_id IN ({marks}) AND typeof(timestamp) = 'integer' ORDER BY id",
+            wanted,
+        )
+        held: dict[int, list[tuple[int, bytes]]] = {}
+        size = 0
+        while rows := self._fetch(cursor):
+            for channel, stamp, data in rows:
+                payload = data if isinstance(data, bytes) else str(data or "").encode()
+                held.setdefault(channel, []).append((stamp, payload))
+                size += len(payload) + 64
+            if size >= BYTES_PER_BATCH:
+                yield from _batches(held)
+                held, size = {}, 0
+        yield from _batches(held)
+
+    def _fetch(self, cursor: sqlite3.Cursor) -> list[tuple[int, int, bytes | None]]:
+        # A failing fetch loses all its rows: where damage is expected, one row at a time.
+        try:
+            return cursor.fetchmany(1 if self.salvage else ROWS_PER_FETCH)
+        except sqlite3.DatabaseError as error:
+            self._damaged(f"rows after the damage are lost: {error}")
+            return []
+
+    def close(self) -> None:
+        """Close the file and remove the private copy, if there was one."""
+        self._connection.close()
+        if self._copy:
+            self._copy.cleanup()
+
+
+def _batches(held: dict[int, list[tuple[int, bytes]]]) -> Iterator[tuple[int, Batch]]:
+    for channel, rows in held.items():
+        stamps = [stamp for stamp, _ in rows]
+        yield channel, Batch.of([data for _, data in rows], stamps, stamps)

@@ -1,0 +1,93 @@
+"""`restock info`: what is in these recordings?"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import tyro
+
+from restock.errors import ExitCode, RecordingError
+
+
+@dataclass
+class Info:
+    """What is in these recordings: format, duration, topics, types, counts and rates.
+
+    PATH is an MCAP file, a rosbag2 folder or one of its files, a ROS 1 bag, a folder of many
+    recordings, or a quoted glob. Nothing is decoded and nothing is written. A recording that
+    cannot be read is said so on stderr and makes the exit code 2; the others are still shown.
+    """
+
+    paths: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
+    """Recordings, folders of recordings, or globs."""
+    typestore: str | None = None
+    """Distribution whose message definitions serve recordings without their own (humble)."""
+    salvage: bool = False
+    """Look into files that are cut short, too (exit code 3)."""
+    json: bool = False
+    """Print one JSON document: {"recordings": [{"path", "format", "messages", "topics", …}]}."""
+
+    def run(self) -> int:
+        """Describe each recording; the exit code of the worst of them."""
+        from restock.cli import output
+        from restock.ingest.describe import describe
+        from restock.ingest.readers import recordings_in
+
+        if not self.paths:
+            raise RecordingError("no path given", remedy="restock info PATH [PATH …]")
+        found: list[dict[str, Any]] = []
+        code = ExitCode.OK
+        for name in self.paths:
+            try:
+                paths = recordings_in(name)
+            except RecordingError as error:
+                sys.stderr.write(f"restock: {error}\n")
+                code = ExitCode.USAGE
+                continue
+            for path in paths:
+                try:
+                    entry = describe(path, typestore=self.typestore, salvage=self.salvage)
+                except RecordingError as error:
+                    sys.stderr.write(f"restock: {error}\n")
+                    code = ExitCode.USAGE
+                    continue
+                if entry["damage"] and code == ExitCode.OK:
+                    code = ExitCode.LOSSY
+                found.append(entry)
+                if not self.json:
+                    _print(entry)
+        if self.json:
+            output.print_json({"recordings": found})
+        return code
+
+
+def _print(entry: dict[str, Any]) -> None:
+    from restock.cli import output
+
+    rows = [
+        {
+            "topic": name,
+            "type": topic["type"],
+            "messages": topic["messages"],
+            "rate Hz": topic["rate_hz"],
+            "": f"skipped: {topic['skipped']}" if topic["skipped"] else "",
+        }
+        for name, topic in entry["topics"].items()
+    ]
+    about = (
+        entry["path"],
+        entry["format"],
+        f"{entry['messages']:,} messages",
+        f"{entry['duration_s']:.1f} s" if entry["duration_s"] is not None else "",
+        f"from {entry['start']}" if entry["start"] else "",
+        f"{entry['size_bytes'] / 1e6:.1f} MB",
+    )
+    sys.stdout.write("  ".join(part for part in about if part) + "\n")
+    output.print_table(rows, ["topic", "type", "messages", "rate Hz", ""])
+    sys.stdout.flush()
+    for line in entry["damage"]:
+        sys.stderr.write(f"{entry['path']}: damaged: {line}\n")
+    for line in entry["notes"]:
+        sys.stderr.write(f"{entry['path']}: {line}\n")
