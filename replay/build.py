@@ -179,7 +179,8 @@ def _pack(
     sorted_ids, sorted_last = wanted[by_id], last_ids[by_last]
     needed = np.union1d(wanted, last_ids)
     of_task = f"FROM transitions WHERE task_hash = '{plan.task_hash}'"
-    ((size,),) = connection.sql(f"SELECT len(observation) {of_task} LIMIT 1").fetchall()
+    first = connection.sql(f"SELECT len(observation) {of_task} LIMIT 1").fetchall()
+    size = int(first[0][0])
     query = f"SELECT transition_id, observation, next_observation {of_task}"
     rows = np.memmap(path, np.dtype("<f4"), "w+", shape=(len(chosen), row_width(size)))
     part = row_columns(size)

@@ -1,4 +1,4 @@
-"""Panels: rows equal to the store's, n-step cut where it must be, pinned, checked, all or nothing."""
+"""Panels: rows equal to the store's, n-step returns, pinned, checked, all or nothing."""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -75,7 +76,7 @@ def test_without_replacement_no_row_is_drawn_twice_more_than_another(
     sizes: list[int], batch_size: int, seed: int
 ) -> None:
     starts = np.cumsum([0, *sizes])
-    rows = [np.arange(a, b) for a, b in zip(starts[:-1], starts[1:], strict=True)]
+    rows = [np.arange(a, b) for a, b in pairwise(starts)]
     shares = np.full(len(sizes), 1 / len(sizes))
     sampler = QuotaSampler(rows, shares, batch_size, np.random.default_rng(seed), replacement=False)
     counts = np.zeros(int(starts[-1]))
