@@ -48,6 +48,11 @@ _CONFIG = {
 }
 
 
+def plot(rows: Sequence[Row]) -> Any:
+    """A chart over rows that travel in the page itself."""
+    return alt.Chart(alt.InlineData(values=[dict(row) for row in rows]))
+
+
 def svg(chart: Any) -> str:
     """A chart as SVG that scales with the page."""
     chart = chart.configure(**_CONFIG)
@@ -80,7 +85,7 @@ def success(rows: Sequence[Row]) -> str:
     policies = ordered(rows, "policy", POLICY_COLOURS)
     cells = list(dict.fromkeys(row["cell"] for row in rows))
     perturbations = list(dict.fromkeys(row["perturbation"] for row in rows))
-    base = alt.Chart(alt.Data(values=list(rows))).encode(
+    base = plot(rows).encode(
         y=alt.Y("cell:N", sort=cells, title=None, axis=alt.Axis(grid=False, ticks=False)),
         yOffset=alt.YOffset("policy:N", sort=policies),
         color=alt.Color("policy:N", scale=scale(policies, POLICY_COLOURS), sort=policies),
@@ -104,7 +109,7 @@ def shares(rows: Sequence[Row]) -> str:
     strata = list(dict.fromkeys(row["stratum"] for row in rows))
     kinds = ordered(rows, "kind", SHARE_COLOURS)
     chart = (
-        alt.Chart(alt.Data(values=list(rows)))
+        plot(rows)
         .mark_bar(cornerRadiusEnd=2)
         .encode(
             y=alt.Y("stratum:N", sort=strata, title=None, axis=alt.Axis(grid=False, ticks=False)),
@@ -140,7 +145,7 @@ def lines(
     axis = alt.Axis(format="%") if percent else alt.Axis(format="~g")
     y_scale = alt.Scale(domain=[0, 1]) if percent else alt.Scale(type="log" if log else "linear")
     line = (
-        alt.Chart(alt.Data(values=list(rows)))
+        plot(rows)
         .mark_line(strokeWidth=2, point={"size": 28, "filled": True} if points else False)
         .encode(
             x=alt.X(f"{x}:Q", title=x_title, axis=alt.Axis(format="~s", grid=False)),
@@ -151,12 +156,12 @@ def lines(
     chart: Any = line
     if marker is not None:
         rule = (
-            alt.Chart(alt.Data(values=[{"at": marker, "text": "kept"}]))
+            plot([{"at": marker, "text": "kept"}])
             .mark_rule(strokeDash=[4, 3], color="#0f172a")
             .encode(x="at:Q")
         )
         text = (
-            alt.Chart(alt.Data(values=[{"at": marker, "text": "kept"}]))
+            plot([{"at": marker, "text": "kept"}])
             .mark_text(align="left", dx=4, dy=6, baseline="top", fontSize=11)
             .encode(x="at:Q", y=alt.value(0), text="text:N")
         )
@@ -169,7 +174,7 @@ def ages(rows: Sequence[Row]) -> str:
     sources = ordered(rows, "source", SOURCE_COLOURS)
     buckets = [row["bucket"] for row in sorted(rows, key=lambda row: row["order"])]
     chart = (
-        alt.Chart(alt.Data(values=list(rows)))
+        plot(rows)
         .mark_bar(cornerRadiusEnd=2)
         .encode(
             x=alt.X(
@@ -190,7 +195,7 @@ def stacked(rows: Sequence[Row], *, group: str, part: str, value: str) -> str:
     parts = list(dict.fromkeys(row[part] for row in rows))
     groups = list(dict.fromkeys(row[group] for row in rows))
     chart = (
-        alt.Chart(alt.Data(values=list(rows)))
+        plot(rows)
         .mark_bar()
         .encode(
             y=alt.Y(f"{group}:N", sort=groups, title=None, axis=alt.Axis(grid=False, ticks=False)),

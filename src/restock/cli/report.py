@@ -1,0 +1,42 @@
+"""`restock report`: one HTML page about a run."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from restock.cli.output import print_json
+
+
+@dataclass
+class Report:
+    """Write one self-contained HTML page about a run; it opens without a network.
+
+    What the critic was fed (intended, drawn and available share per stratum, ages, behaviour
+    policies), learning curves, TD error by condition, target lag, success per condition with
+    intervals against planner and random (run `restock eval RUN` first), a map of where the logs
+    have been and where the agent failed, and where all of it comes from.
+
+    Example: `restock report runs/a`
+    """
+
+    run_directory: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """The directory that `restock train --out` wrote."""
+    out: Path | None = None
+    """Where to write the page; default RUN/report.html. Replaces what is there."""
+    json: bool = False
+    """Print {"report": PATH, "bytes": N} instead of the path."""
+
+    def run(self) -> int | None:
+        from restock.report import build_report
+
+        path = build_report(self.run_directory, self.out)
+        if self.json:
+            print_json({"report": str(path), "bytes": path.stat().st_size})
+        else:
+            sys.stdout.write(f"{path}\n")
+        return None

@@ -1,0 +1,103 @@
+"""The warehouse from above, as SVG: where the logs have been, and where the agent failed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+from restock.report.charts import CONDITION_COLOURS, SPARE_COLOURS, words
+
+Row = Mapping[str, Any]
+Box = tuple[float, float, float, float]  # x0, y0, x1, y1 in metres
+SCALE = 40  # SVG units a metre
+
+
+@dataclass(frozen=True)
+class Floor:
+    """The extent of the map and what stands on it, in metres in the map frame."""
+
+    width_m: float
+    depth_m: float
+    racks: Sequence[Box]
+
+    def box(self, box: Box, style: str) -> str:
+        x0, y0, x1, y1 = box
+        return (
+            f'<rect x="{x0 * SCALE:.1f}" y="{(self.depth_m - y1) * SCALE:.1f}"'
+            f' width="{(x1 - x0) * SCALE:.1f}" height="{(y1 - y0) * SCALE:.1f}" {style}/>'
+        )
+
+    def at(self, x_m: float, y_m: float) -> tuple[float, float]:
+        return x_m * SCALE, (self.depth_m - y_m) * SCALE
+
+    def draw(self, marks: Sequence[str], label: str) -> str:
+        """The floor with marks between the ground and the racks."""
+        width, height = self.width_m * SCALE, self.depth_m * SCALE
+        ground = f'<rect width="{width:.0f}" height="{height:.0f}" fill="#f8fafc"/>'
+        racks = [self.box(rack, 'fill="#cbd5e1" stroke="#94a3b8"') for rack in self.racks]
+        frame = (
+            f'<rect width="{width:.0f}" height="{height:.0f}" fill="none" stroke="#94a3b8"'
+            ' stroke-width="3"/>'
+        )
+        bar = (
+            f'<g font-size="15" fill="#475569"><path d="M10 {height + 16:.0f} h{SCALE * 2}"'
+            f' stroke="#475569" stroke-width="3"/><text x="{SCALE * 2 + 18}"'
+            f' y="{height + 21:.0f}">2 m</text></g>'
+        )
+        body = "".join([ground, *marks, *racks, frame, bar])
+        return (
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="-2 -2 {width + 4:.0f}'
+            f' {height + 30:.0f}" role="img" aria-label="{escape(label)}"'
+            f' font-family="Helvetica, Arial, sans-serif">{body}</svg>'
+        )
+
+
+def visited(floor: Floor, cells: Sequence[Row], cell_m: float) -> str:
+    """Cells of x_m, y_m (their south-west corner) and rows, darker where the logs have more."""
+    most = max((row["rows"] for row in cells), default=1)
+    marks = []
+    for row in cells:
+        depth = 0.12 + 0.88 * math.log1p(row["rows"]) / math.log1p(most)
+        box = (row["x_m"], row["y_m"], row["x_m"] + cell_m, row["y_m"] + cell_m)
+        marks.append(floor.box(box, f'fill="#0f766e" fill-opacity="{depth:.2f}"'))
+    return floor.draw(marks, "where the logs have been")
+
+
+def events(floor: Floor, logged: Sequence[Row], failures: Sequence[Row]) -> str:
+    """Dots where a rare condition was logged, crosses where the agent's episodes failed."""
+    marks = []
+    for row in logged:
+        x, y = floor.at(row["x_m"], row["y_m"])
+        marks.append(
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.2" fill="{colour(row["condition"])}"'
+            ' fill-opacity="0.55"/>'
+        )
+    crosses = []
+    for row in failures:
+        x, y = floor.at(row["end_x_m"], row["end_y_m"])
+        crosses.append(
+            f'<path d="M{x - 7:.1f} {y - 7:.1f} l14 14 m0 -14 l-14 14" stroke="white"'
+            ' stroke-width="7"/>'
+            f'<path d="M{x - 7:.1f} {y - 7:.1f} l14 14 m0 -14 l-14 14"'
+            f' stroke="{colour(row["condition"])}" stroke-width="3.4"/>'
+        )
+    drawn = floor.draw(marks, "rare conditions in the logs, and where the agent failed")
+    # Crosses lie above the racks: a robot may end right at their face.
+    return drawn.replace("</svg>", "".join(crosses) + "</svg>")
+
+
+def legend(conditions: Sequence[str]) -> str:
+    """Swatches, as HTML."""
+    return " ".join(
+        f'<span style="white-space:nowrap;margin-right:14px"><span class="swatch"'
+        f' style="background:{colour(name)}"></span>{escape(words(name))}</span>'
+        for name in conditions
+    )
+
+
+def colour(condition: str) -> str:
+    spare = SPARE_COLOURS[sum(map(ord, condition)) % len(SPARE_COLOURS)]
+    return CONDITION_COLOURS.get(condition, spare)

@@ -1,0 +1,94 @@
+"""The page: facts to headline, cards and sections. The template only lays them out."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any
+
+from restock.report.blocks import clean_cells, mean, target_rule
+from restock.report.charts import words
+from restock.report.facts import Facts, span
+from restock.report.feed import fed
+from restock.report.sections import critic, floor_map, learning, provenance, success
+
+
+def page(facts: Facts) -> dict[str, Any]:
+    """Everything the template asks for."""
+    sections = [
+        success(facts),
+        fed(facts),
+        learning(facts),
+        critic(facts),
+        floor_map(facts),
+        provenance(facts),
+    ]
+    return {
+        "title": facts.run.name,
+        "headline": _headline(facts),
+        "lead": _lead(facts),
+        "cards": _cards(facts),
+        "sections": [section for section in sections if section is not None],
+        "footer": f"restock {facts.config.get('versions', {}).get('restock', '')} · written"
+        f" {datetime.now(UTC):%Y-%m-%d %H:%M} UTC from {facts.run}",
+    }
+
+
+def _headline(facts: Facts) -> str:
+    cells = clean_cells(facts)
+    if not cells:
+        return f"Run {facts.run.name}: trained, not yet evaluated"
+    average = mean(cells)
+    worst = min(cells, key=lambda row: row["success"])
+    return (
+        f"Success {average:.0%} on average over {len(cells)} kinds of episode, "
+        f"{worst['success']:.0%} in the hardest, {words(worst['cell'])}"
+    )
+
+
+def _lead(facts: Facts) -> str:
+    last = facts.loss[-1]
+    fed = "logs and fresh experience" if facts.panel is not None else "fresh experience alone"
+    text = (
+        f"A DQN trained on {fed} for {last['env_steps']:,} environment steps and"
+        f" {last['gradient_steps']:,} updates in {span(last['wall_s'])}."
+    )
+    planner, random = clean_cells(facts, policy="planner"), clean_cells(facts, policy="random")
+    if planner and random:
+        text += (
+            f" On the same episodes the scripted planner reaches {mean(planner):.0%}"
+            f" and a random policy {mean(random):.0%}."
+        )
+    return text
+
+
+def _cards(facts: Facts) -> list[dict[str, str]]:
+    config = facts.config.get("config", {})
+    replay, kept = config.get("replay", {}), facts.kept
+    cards = []
+    if facts.panel is not None:
+        header = facts.panel.header
+        cards.append({"value": f"{header.rows:,}", "label": f"logged rows in panel {header.id}"})
+    cards += [
+        {
+            "value": f"{replay.get('ring_capacity', 0):,}",
+            "label": "capacity of the fresh ring, rows",
+        },
+        {"value": _sampling(facts), "label": "of each online batch from logs, by quotas"},
+        {"value": target_rule(facts), "label": "target rule"},
+        {"value": f"{facts.loss[-1]['env_steps']:,}", "label": "environment steps"},
+    ]
+    if kept is not None:
+        cards.append(
+            {
+                "value": f"{kept['success']:.0%} at {kept['env_steps']:,}",
+                "label": "kept checkpoint: greedy success, at environment step",
+            }
+        )
+    return cards
+
+
+def _sampling(facts: Facts) -> str:
+    share = facts.config.get("config", {}).get("replay", {}).get("logs_share")
+    if facts.panel is None:
+        return "0 %"
+    return "?" if share is None else f"{share:.0%}"

@@ -1,0 +1,91 @@
+-- What the report shows of a run, one statement a fact, named by the comment before it.
+-- The run's tables are views of the same names; `panel_strata` is the panel's.
+
+-- name: fed
+-- Over the whole run, per source and stratum: what was there, intended, drawn.
+SELECT source,
+       stratum,
+       any_value(timing) AS timing,
+       last(available_share ORDER BY gradient_steps) AS available_share,
+       last(available_rows ORDER BY gradient_steps) AS available_rows,
+       last(quota_share ORDER BY gradient_steps) AS quota_share,
+       sum(drawn_rows) AS drawn_rows,
+       sum(drawn_rows) / sum(sum(drawn_rows)) OVER (PARTITION BY source) AS drawn_share,
+       sum(effective_share * drawn_rows) / nullif(sum(drawn_rows), 0) AS effective_share,
+       last(td_abs_mean ORDER BY gradient_steps) AS td_abs_mean,
+       sum(reward_mean * drawn_rows) / nullif(sum(drawn_rows), 0) AS reward_mean,
+       sum(terminal_share * drawn_rows) / nullif(sum(drawn_rows), 0) AS terminal_share
+FROM strata
+GROUP BY source, stratum
+ORDER BY source DESC, available_share DESC NULLS LAST, stratum;
+
+-- name: ages
+-- Age histogram per source: days for logs, environment steps for fresh rows.
+SELECT source, unit, bucket, sum(count) AS rows,
+       sum(count) / sum(sum(count)) OVER (PARTITION BY source, unit) AS share
+FROM ages
+WHERE unit IN ('days', 'env_steps')
+GROUP BY source, unit, bucket
+ORDER BY source DESC, bucket;
+
+-- name: policies
+-- Whose experience was drawn.
+SELECT source, behaviour_policy, sum(rows) AS rows,
+       sum(rows) / sum(sum(rows)) OVER (PARTITION BY source) AS share
+FROM policies
+GROUP BY source, behaviour_policy
+ORDER BY source DESC, rows DESC;
+
+-- name: learning
+-- Success per condition at each periodic greedy evaluation on fixed episodes.
+SELECT env_steps, CASE WHEN block IN ('partial', 'full') THEN condition || ' (' || block || ')' ELSE condition END AS condition,
+       avg(success::INT) AS success, avg("return") AS mean_return, bool_or(best) AS best, count(*) AS episodes
+FROM evaluations
+GROUP BY ALL
+ORDER BY env_steps, condition;
+
+-- name: kept
+-- The evaluation whose checkpoint was kept.
+SELECT env_steps, gradient_steps, avg(success::INT) AS success
+FROM evaluations
+WHERE best
+GROUP BY env_steps, gradient_steps
+ORDER BY gradient_steps DESC
+LIMIT 1;
+
+-- name: td
+-- TD error by condition on the fixed probe.
+SELECT gradient_steps, condition, sum(td_abs_mean * rows) / sum(rows) AS td_abs_mean
+FROM probe
+WHERE td_abs_mean IS NOT NULL
+GROUP BY gradient_steps, condition
+ORDER BY gradient_steps, condition;
+
+-- name: lag
+-- How far the target network is behind.
+SELECT gradient_steps, target_q_lag, target_param_distance
+FROM progress
+WHERE gradient_steps > 0
+ORDER BY gradient_steps;
+
+-- name: loss
+SELECT gradient_steps, env_steps, phase, loss, q_mean, epsilon, wall_s
+FROM progress
+WHERE updates > 0
+ORDER BY gradient_steps;
+
+-- name: cells
+-- `restock eval`: success per policy, perturbation and condition, blocks apart.
+SELECT policy, perturbation,
+       CASE WHEN block IN ('partial', 'full') THEN condition || ' (' || block || ')' ELSE condition END AS cell,
+       count(*) AS episodes, sum(success::INT) AS successes, avg(bumps) AS bumps,
+       avg(CASE WHEN success THEN time_s END) AS time_s, avg("return") AS mean_return
+FROM evaluated
+GROUP BY ALL
+ORDER BY ALL;
+
+-- name: failures
+-- Where the agent's episodes ended that did not reach the goal.
+SELECT condition, perturbation, end_x_m, end_y_m, failure
+FROM evaluated
+WHERE policy = 'agent' AND NOT success;
