@@ -9,6 +9,8 @@ from __future__ import annotations
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
+import gymnasium
+
 try:
     __version__ = version("restock")
 except PackageNotFoundError:  # running from a source tree that was never installed
@@ -18,6 +20,12 @@ if TYPE_CHECKING:
     from restock.replay.store import Store
 
 __all__ = ["__version__", "open"]
+
+gymnasium.register(
+    id="restock/Warehouse-v0",
+    entry_point="restock.train.single_env:WarehouseEnv",
+    vector_entry_point="restock.train.vector_env:WarehouseVectorEnv",
+)
 
 
 def open(store: str) -> Store:

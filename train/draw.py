@@ -1,0 +1,105 @@
+"""A top-down drawing of the warehouse without GL: as pixels, or as SVG for reports."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.train.friction import PATCHES
+from restock.train.layout import Warehouse
+from restock.train.model import FORKLIFT_HALF_M, PALLET_HALF_M, PEOPLE, PERSON_RADIUS_M
+
+if TYPE_CHECKING:
+    from restock.train.vector_env import WarehouseVectorEnv
+
+PIXELS_PER_M = 40
+FLOOR, RACK, PALLET, PERSON = (238, 238, 236), (92, 108, 132), (176, 130, 80), (45, 110, 200)
+FORKLIFT, ICE, ROUTE, ROBOT, GOAL = (
+    *((225, 180, 20), (150, 205, 235), (120, 180, 120)),
+    *((240, 130, 30), (30, 150, 60)),
+)
+
+
+def draw_map(env: WarehouseVectorEnv, index: int) -> NDArray[np.uint8]:
+    """One environment now, (H, W, 3) uint8, north up."""
+    canvas = _Canvas(env.warehouse)
+    sim = env.simulation
+    for row in range(PATCHES):
+        x, y, half_x, half_y, _ = sim.patches[index, row]
+        canvas.box(x, y, half_x, half_y, 0.0, ICE)
+    for rack in env.warehouse.racks:
+        canvas.box(*rack.center, *rack.half_size, 0.0, RACK)
+    for x, y in _dense(env.navigation.plans_m[index]):
+        canvas.disc(x, y, 0.03, ROUTE)
+    canvas.disc(*env.navigation.goals_m[index], env.task.goal_radius_m, GOAL)
+    for x, y, yaw in sim.pallets[index]:
+        canvas.box(x, y, *PALLET_HALF_M[:2], yaw, PALLET)
+    for agent, (x, y) in enumerate(sim.traffic.position_m[index]):
+        if agent < PEOPLE:
+            canvas.disc(x, y, PERSON_RADIUS_M, PERSON)
+        else:
+            yaw = sim.traffic.heading_rad[index, agent]
+            canvas.box(x, y, *FORKLIFT_HALF_M[:2], yaw, FORKLIFT)
+    x, y, yaw = sim.pose()[index]
+    body = env.task.body
+    canvas.box(x, y, body.length_m / 2, body.width_m / 2, yaw, ROBOT)
+    nose = body.length_m / 2 - 0.1
+    canvas.disc(x + nose * np.cos(yaw), y + nose * np.sin(yaw), 0.06, (60, 40, 20))
+    return canvas.pixels()
+
+
+def map_svg(warehouse: Warehouse, marks: str = "", *, pixels_per_m: float = 40.0) -> str:
+    """The floor and racks as SVG, with `marks` (SVG in map metres, y up) drawn on top."""
+    width, depth = warehouse.width_m, warehouse.depth_m
+    racks = "".join(
+        f'<rect x="{r.x_min:g}" y="{r.y_min:g}" width="{r.x_max - r.x_min:g}"'
+        f' height="{r.y_max - r.y_min:g}" class="rack"/>'
+        for r in warehouse.racks
+    )
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {depth:g}"'
+        f' width="{width * pixels_per_m:g}" height="{depth * pixels_per_m:g}" class="map">'
+        "<style>.floor{fill:#eeeeec}.rack{fill:#5c6c84}</style>"
+        f'<g transform="translate(0 {depth:g}) scale(1 -1)">'
+        f'<rect width="{width:g}" height="{depth:g}" class="floor"/>{racks}{marks}</g></svg>'
+    )
+
+
+class _Canvas:
+    def __init__(self, warehouse: Warehouse) -> None:
+        height = round(warehouse.depth_m * PIXELS_PER_M)
+        width = round(warehouse.width_m * PIXELS_PER_M)
+        self._image = np.empty((height, width, 3), np.uint8)
+        self._image[:] = FLOOR
+        self._x = (np.arange(width) + 0.5) / PIXELS_PER_M
+        self._y = (np.arange(height) + 0.5) / PIXELS_PER_M
+
+    def box(
+        self, x: float, y: float, half_x: float, half_y: float, yaw: float, color: tuple[int, ...]
+    ) -> None:
+        window, dx, dy = self._window(x, y, float(np.hypot(half_x, half_y)))
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        inside = (np.abs(cos * dx + sin * dy) <= half_x) & (np.abs(cos * dy - sin * dx) <= half_y)
+        self._image[window][inside] = color
+
+    def disc(self, x: float, y: float, radius: float, color: tuple[int, ...]) -> None:
+        window, dx, dy = self._window(x, y, radius)
+        self._image[window][dx * dx + dy * dy <= radius * radius] = color
+
+    def _window(
+        self, x: float, y: float, reach: float
+    ) -> tuple[tuple[slice, slice], NDArray[np.float64], NDArray[np.float64]]:
+        columns = slice(*np.searchsorted(self._x, [x - reach, x + reach]))
+        rows = slice(*np.searchsorted(self._y, [y - reach, y + reach]))
+        return (rows, columns), self._x[None, columns] - x, self._y[rows, None] - y
+
+    def pixels(self) -> NDArray[np.uint8]:
+        return np.ascontiguousarray(self._image[::-1])
+
+
+def _dense(plan_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A polyline with three points more in every segment."""
+    share = np.arange(4)[None, :, None] / 4
+    return (plan_m[:-1, None] * (1 - share) + plan_m[1:, None] * share).reshape(-1, 2)

@@ -1,0 +1,107 @@
+"""A perturbation: how the floor, the robot and its sensors differ from the nominal twin.
+
+Every field is a number with a unit and a range; the defaults are the nominal twin, which has
+small noise as every robot has.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from restock.errors import ConfigError
+
+RANGES: dict[str, tuple[float, float]] = {
+    "friction_scale": (0.05, 2.0),
+    "patch_friction_scale": (0.05, 20.0),
+    "payload_kg": (0.0, 150.0),
+    "wheel_radius_scale": (0.9, 1.1),
+    "latency_s": (0.0, 0.5),
+    "gain": (0.5, 1.5),
+    "lidar_noise_m": (0.0, 0.2),
+    "lidar_dropout": (0.0, 0.9),
+    "localisation_noise_m": (0.0, 0.2),
+    "localisation_drift_m": (0.0, 0.5),
+    "localisation_yaw_noise_rad": (0.0, 0.2),
+    "encoder_noise_radps": (0.0, 2.0),
+    "gyro_noise_radps": (0.0, 0.5),
+    "gyro_bias_radps": (-0.5, 0.5),
+    "accel_noise_mps2": (0.0, 2.0),
+    "timestep_s": (0.0005, 0.02),
+}
+
+
+class Perturbation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One set of effective parameters. `Perturbation()` is the nominal twin."""
+
+    name: str = "nominal"
+    friction_scale: float = 1.0  # times the floor's friction of .8
+    patch_friction_scale: float = 1.0  # times the friction of each slippery patch
+    payload_kg: float = 0.0  # on top of the chassis
+    wheel_radius_scale: float = 1.0  # the controller and the odometry do not know it
+    latency_s: float = 0.05  # from a command to the wheels' set point
+    gain: float = 1.0  # of the wheel set points
+    lidar_noise_m: float = 0.01  # standard deviation of a range
+    lidar_dropout: float = 0.005  # share of beams without a return
+    localisation_noise_m: float = 0.004  # standard deviation, anew at every step
+    localisation_drift_m: float = 0.02  # standard deviation of an error that wanders over 3 s
+    localisation_yaw_noise_rad: float = 0.004
+    encoder_noise_radps: float = 0.03  # of a wheel's speed
+    gyro_noise_radps: float = 0.005
+    gyro_bias_radps: float = 0.0
+    accel_noise_mps2: float = 0.05
+    timestep_s: float = 0.01  # of the physics; the same for every environment of a vector
+
+    def __post_init__(self) -> None:
+        for field, (low, high) in RANGES.items():
+            value = getattr(self, field)
+            if not low <= value <= high:
+                raise ValueError(f"{field} must be in [{low}, {high}], got {value}")
+
+
+def load_perturbation(path: Path) -> Perturbation:
+    """Read a perturbation from TOML: one `field = number` a line.
+
+    Raises:
+        ConfigError: no such file, a field that does not exist, or a value out of its range.
+    """
+    try:
+        return msgspec.toml.decode(path.read_bytes(), type=Perturbation)
+    except OSError as error:
+        raise ConfigError(
+            f"cannot be read: {error.strerror}", where=str(path), remedy="check the path"
+        ) from error
+    except (msgspec.ValidationError, msgspec.DecodeError) as error:
+        raise ConfigError(
+            str(error), where=str(path), remedy=f"the fields are name, {', '.join(RANGES)}"
+        ) from error
+
+
+def to_dict(perturbation: Perturbation) -> dict[str, Any]:
+    """As plain names and numbers, for JSON and metadata columns."""
+    return dict(msgspec.structs.asdict(perturbation))
+
+
+# Ready-made ones for evaluation: each changes one thing, by about what a fleet shows.
+PERTURBATIONS: dict[str, Perturbation] = {
+    item.name: item
+    for item in (
+        Perturbation(),
+        Perturbation(name="friction", friction_scale=0.5, patch_friction_scale=0.8),
+        Perturbation(name="latency", latency_s=0.2),
+        Perturbation(name="payload", payload_kg=60.0),
+        Perturbation(name="wheels", wheel_radius_scale=0.95, gain=0.95),
+        Perturbation(
+            name="sensors",
+            lidar_noise_m=0.04,
+            lidar_dropout=0.1,
+            localisation_noise_m=0.01,
+            localisation_drift_m=0.06,
+            encoder_noise_radps=0.1,
+            gyro_noise_radps=0.03,
+            gyro_bias_radps=0.03,
+        ),
+    )
+}

@@ -1,0 +1,350 @@
+"""The physics of N warehouses at once: one `mujoco.batch.Batch`, and what is written into it.
+
+A control period is driven in blocks of .1 s. Before each block, friction is looked up under every
+wheel and traffic moves; within it the base controller's ramp and the actuators' latency act at
+every substep. Results do not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+from numpy.typing import NDArray
+
+from restock.errors import ConfigError
+from restock.ingest.task import Task
+from restock.train.episode import Episode
+from restock.train.friction import NO_PATCH, PATCHES, SLIPPERY_BELOW, friction_at
+from restock.train.layout import Warehouse
+from restock.train.model import (
+    CHASSIS_KG,
+    FLOOR_FRICTION,
+    LIDAR_Z_M,
+    OBSTACLE_GROUP,
+    PALLET_HALF_M,
+    PALLETS,
+    PARKED_M,
+    TRACK_M,
+    WHEEL_RADIUS_M,
+    build_model,
+    wheel_commands,
+    yaw_of,
+)
+from restock.train.perturbation import Perturbation
+from restock.train.traffic import Traffic
+
+F64 = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+BLOCK_S = 0.1
+ACCEL_LIMIT = np.array([4.0, 10.0])  # of the base controller: m/s2 and rad/s2
+REST_Z_M = 0.09756  # of the chassis frame, standing still
+_HISTORY = 5  # commands kept: enough for the longest latency at the shortest period
+LIDAR_BEAMS = 72
+
+
+@dataclass(frozen=True)
+class Live:
+    """The true state of every environment at an instant between two blocks, for recorders."""
+
+    time_s: F64  # (N,) since the episode began
+    x_m: F64
+    y_m: F64
+    yaw_rad: F64
+    speed_mps: F64  # (N,) over ground, forward
+    lateral_mps: F64  # (N,) over ground, to the left
+    yaw_rate_radps: F64
+    wheel_angle_rad: F64  # (N, 2) left, right
+    wheel_speed_radps: F64  # (N, 2)
+    accel_mps2: F64  # (N, 3) of the accelerometer, mean since the call before
+    bumped: NDArray[np.bool_]  # (N,) at any substep since the call before
+    set_point: F64  # (N, 2) speed and yaw rate asked of the wheels now
+
+
+class Simulation:
+    """N robots in N warehouses. Arrays lead with the environment."""
+
+    def __init__(
+        self, num_envs: int, task: Task, warehouse: Warehouse, timestep_s: float, nthread: int
+    ) -> None:
+        self.num_envs, self.task, self.warehouse = num_envs, task, warehouse
+        self.timestep_s = timestep_s
+        self.substeps = round(BLOCK_S / timestep_s)
+        self.blocks = round(task.control_period_s / BLOCK_S)
+        _check_times(task, timestep_s, self.substeps, self.blocks)
+        self.model, self.handles = build_model(warehouse, task.body, timestep_s)
+        self.batch = Batch(self.model, num_envs, nthread)
+        self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
+        self._ctrl = self.batch.bind("ctrl")
+        self._mocap_pos = self.batch.bind("mocap_pos")
+        self._mocap_quat = self.batch.bind("mocap_quat")
+        self._friction = self.batch.expand("geom_friction")
+        self._masses = self._radii = False  # fields made per-simulation when first needed
+
+        self.traffic = Traffic(num_envs, (task.body.length_m / 2, task.body.width_m / 2))
+        self.patches = np.tile(NO_PATCH, (num_envs, PATCHES, 1)).astype(np.float64)
+        self.pallets = np.full((num_envs, PALLETS, 3), PARKED_M[0])
+        self.commands = np.zeros((num_envs, _HISTORY, 2))  # newest first
+        self.set_point = np.zeros((num_envs, 2))
+        self.time_s = np.zeros(num_envs)
+        self.bumped = np.zeros(num_envs, np.bool_)  # in the last control period
+        self.accel = np.zeros((num_envs, 3))  # mean over the last half block
+        self.slipped = np.zeros(num_envs, np.bool_)  # on a patch, in the last control period
+        self.blown_up = np.zeros(num_envs, np.bool_)
+        self.base_friction = np.full(num_envs, FLOOR_FRICTION)
+        self.latency_s = np.zeros(num_envs)
+        self.gain = np.ones(num_envs)
+        self.radius_m = np.full(num_envs, WHEEL_RADIUS_M)
+
+        bearings = np.arange(LIDAR_BEAMS) * (2 * np.pi / LIDAR_BEAMS) - np.pi
+        self.bearings_rad = bearings + np.pi / LIDAR_BEAMS
+        self._beam = np.stack([np.cos(self.bearings_rad), np.sin(self.bearings_rad)], axis=-1)
+        self._groups = np.zeros(6, np.uint8)
+        self._groups[OBSTACLE_GROUP] = 1
+        self.callback: Callable[[Live], None] | None = None
+        self.callback_period_s = 0.02
+
+    # -- layout ---------------------------------------------------------------------------------
+
+    def reset(self, env: int, episode: Episode, perturbation: Perturbation) -> None:
+        """Put one environment at the start of an episode."""
+        ids = np.array([env])
+        self.batch.reset(ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+        self.batch.warning[env] = 0
+        self.place_robot(env, *episode.start)
+        self.apply(env, perturbation)
+        patches = episode.patches.copy()
+        patches[:, 4] *= perturbation.patch_friction_scale
+        self.patches[env] = patches
+        self.pallets[env] = episode.pallets
+        self._mocap_pos[env, :, :] = PARKED_M
+        self._mocap_quat[env, :, :] = (1.0, 0.0, 0.0, 0.0)
+        span = self.handles.pallets
+        self._mocap_pos[env, span, :2] = episode.pallets[:, :2]
+        self._mocap_pos[env, span, 2] = PALLET_HALF_M[2]
+        self._mocap_quat[env, span] = _quat(episode.pallets[:, 2])
+        self.traffic.reset(env, episode.walks)
+        self._show_traffic(ids)
+        self.commands[env] = self.set_point[env] = self.accel[env] = 0.0
+        self.time_s[env] = 0.0
+        self.bumped[env] = self.slipped[env] = self.blown_up[env] = False
+
+    def place_robot(self, env: int, x_m: float, y_m: float, yaw_rad: float) -> None:
+        """Stand the robot still at a pose."""
+        self.qpos[env] = 0.0
+        self.qpos[env, :3] = x_m, y_m, REST_Z_M
+        self.qpos[env, 3:7] = _quat(np.array([yaw_rad]))[0]
+        self.qvel[env] = 0.0
+        self._ctrl[env] = 0.0
+
+    def apply(self, env: int, perturbation: Perturbation) -> None:
+        """Write a perturbation's physics into one environment."""
+        self.base_friction[env] = FLOOR_FRICTION * perturbation.friction_scale
+        self.latency_s[env] = perturbation.latency_s
+        self.gain[env] = perturbation.gain
+        if perturbation.payload_kg or self._masses:
+            self._masses = True
+            body = self.handles.chassis_body
+            mass, inertia = self.batch.expand("body_mass"), self.batch.expand("body_inertia")
+            scale = 1.0 + perturbation.payload_kg / CHASSIS_KG
+            mass[env, body] = self.model.body_mass[body] * scale
+            inertia[env, body] = self.model.body_inertia[body] * scale
+        if perturbation.wheel_radius_scale != 1.0 or self._radii:
+            self._radii = True
+            radius = WHEEL_RADIUS_M * perturbation.wheel_radius_scale
+            self.radius_m[env] = radius
+            size, bound = self.batch.expand("geom_size"), self.batch.expand("geom_rbound")
+            place = self.batch.expand("body_pos")
+            for geom, body in zip(self.handles.wheel_geoms, self.handles.wheel_bodies, strict=True):
+                size[env, geom, 0] = bound[env, geom] = radius
+            for body in self.handles.wheel_bodies:  # so that the casters keep their share of load
+                place[env, body, 2] = radius - WHEEL_RADIUS_M
+        if self._masses or self._radii:
+            self.batch.set_const(np.array([env]))
+
+    # -- motion ---------------------------------------------------------------------------------
+
+    def drive(self, command: F64) -> None:
+        """Drive one control period under commands (N, 2): forward speed, yaw rate."""
+        self.commands[:, 1:] = self.commands[:, :-1]
+        self.commands[:, 0] = command
+        self.bumped[:] = False
+        self.slipped[:] = False
+        touched = self.bumped.copy()
+        for block in range(self.blocks):
+            pose = self.pose()
+            moved = self.traffic.advance(pose, touched, BLOCK_S)
+            self._show_traffic(moved)
+            slippery = self._write_friction(pose)
+            control = self._wheel_set_points(block)
+            touched = self._run(control)
+            self.bumped |= touched
+            self.slipped |= self._slipping(slippery)
+        self.blown_up = (np.asarray(self.batch.warning) > 0).reshape(self.num_envs, -1).any(axis=1)
+
+    def _run(self, control: F64) -> NDArray[np.bool_]:
+        """One block of substeps; returns whose bumper was pressed."""
+        touched = np.zeros(self.num_envs, np.bool_)
+        if self.callback is None:
+            parts = [(0, self.substeps)]
+        else:
+            stride = max(round(self.callback_period_s / self.timestep_s), 1)
+            starts = range(0, self.substeps, stride)
+            parts = [(start, min(start + stride, self.substeps)) for start in starts]
+        records = []
+        for start, stop in parts:
+            part = control[:, start:stop]
+            sensed = self.batch.rollout(stop - start, part, record=("sensordata",))["sensordata"]
+            pressed = (sensed[:, :, self.handles.bumper] > 0).any(axis=1)
+            touched |= pressed
+            self.time_s += (stop - start) * self.timestep_s
+            records.append(sensed[:, :, self.handles.accelerometer])
+            if self.callback is not None:
+                self.callback(self.live(records[-1].mean(axis=1), pressed))
+        accel = records[0] if len(records) == 1 else np.concatenate(records, axis=1)
+        self.accel = accel[:, self.substeps // 2 :].mean(axis=1)
+        return touched
+
+    def live(self, accel: F64, pressed: NDArray[np.bool_]) -> Live:
+        """The true state now."""
+        pose = self.pose()
+        cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+        vx, vy = self.qvel[:, 0], self.qvel[:, 1]
+        return Live(
+            time_s=self.time_s.copy(),
+            x_m=pose[:, 0],
+            y_m=pose[:, 1],
+            yaw_rad=pose[:, 2],
+            speed_mps=cos * vx + sin * vy,
+            lateral_mps=-sin * vx + cos * vy,
+            yaw_rate_radps=self.qvel[:, 5].copy(),
+            wheel_angle_rad=self.qpos[:, 7:9].copy(),
+            wheel_speed_radps=self.qvel[:, 6:8].copy(),
+            accel_mps2=accel,
+            bumped=pressed,
+            set_point=self.set_point.copy(),
+        )
+
+    def pose(self) -> F64:
+        """True x, y and heading, (N, 3)."""
+        return np.column_stack([self.qpos[:, :2], yaw_of(self.qpos[:, 3:7])])
+
+    def _wheel_set_points(self, block: int) -> F64:
+        """Wheel speeds asked for at each substep of a block, (N, substeps, 2).
+
+        The command in force reaches the base controller `latency_s` late, which ramps toward it.
+        Within a block the command changes at most once, which gives the ramp in closed form.
+        """
+        step = np.arange(self.substeps)
+        since = block * BLOCK_S + step * self.timestep_s - self.latency_s[:, None] + 1e-9
+        age = np.clip(-np.floor(since / self.task.control_period_s), 0, _HISTORY - 1)
+        age = age.astype(np.int64)  # (N, S) how many ticks old the command in force is
+        first, last = age[:, 0], age[:, -1]
+        rows = np.arange(self.num_envs)
+        old, new = self.commands[rows, first][:, None], self.commands[rows, last][:, None]
+        switch = (age == first[:, None]).sum(axis=1)[:, None, None]  # substeps under `old`
+        switch = np.where(first[:, None, None] == last[:, None, None], self.substeps, switch)
+        reach = ACCEL_LIMIT * self.timestep_s
+        begin = self.set_point[:, None]
+        count = (step + 1)[None, :, None]
+        under_old = begin + _limit(old - begin, reach * np.minimum(count, switch))
+        turned = begin + _limit(old - begin, reach * switch)
+        under_new = turned + _limit(new - turned, reach * np.maximum(count - switch, 0))
+        asked = np.where(count <= switch, under_old, under_new)
+        self.set_point = asked[:, -1].copy()
+        left, right = wheel_commands(asked[..., 0], asked[..., 1])
+        control: F64 = np.stack([left, right], axis=-1) * self.gain[:, None, None]
+        return control
+
+    def _write_friction(self, pose: F64) -> NDArray[np.bool_]:
+        """Friction under each wheel, into the model; returns (N, 2) which stand on a patch."""
+        friction = friction_at(self._wheel_points(pose), self.patches, self.base_friction)
+        for side, geom in enumerate(self.handles.wheel_geoms):
+            self._friction[:, geom, 0] = friction[:, side]
+        return friction < np.minimum(SLIPPERY_BELOW, self.base_friction[:, None] - 1e-9)
+
+    def _wheel_points(self, pose: F64) -> F64:
+        across = np.stack([-np.sin(pose[:, 2]), np.cos(pose[:, 2])], axis=-1) * (TRACK_M / 2)
+        return np.stack([pose[:, :2] + across, pose[:, :2] - across], axis=1)
+
+    def _slipping(self, slippery: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Whose wheel is on a patch and moves over the floor by more than .15 m/s."""
+        heading = yaw_of(self.qpos[:, 3:7])
+        forward = np.cos(heading) * self.qvel[:, 0] + np.sin(heading) * self.qvel[:, 1]
+        lateral = -np.sin(heading) * self.qvel[:, 0] + np.cos(heading) * self.qvel[:, 1]
+        turn = self.qvel[:, 5] * (TRACK_M / 2)
+        ground = np.stack([forward - turn, forward + turn], axis=-1)
+        slip = np.hypot(self.qvel[:, 6:8] * self.radius_m[:, None] - ground, lateral[:, None])
+        return (slippery & (slip > 0.15)).any(axis=1)
+
+    def _show_traffic(self, ids: Ids) -> None:
+        if len(ids):
+            people = slice(self.handles.people.start, self.handles.forklifts.stop)
+            self._mocap_pos[ids, people, :2] = self.traffic.position_m[ids]
+            self._mocap_quat[ids, people] = _quat(self.traffic.heading_rad[ids])
+
+    # -- sensing --------------------------------------------------------------------------------
+
+    def cast(self, ids: Ids) -> F64:
+        """True lidar ranges (n, LIDAR_BEAMS) in metres now; inf where nothing is hit."""
+        heading = yaw_of(self.qpos[ids, 3:7])
+        cos, sin = np.cos(heading), np.sin(heading)
+        rays = np.zeros((len(ids), LIDAR_BEAMS, 3))
+        rays[..., 0] = cos[:, None] * self._beam[:, 0] - sin[:, None] * self._beam[:, 1]
+        rays[..., 1] = sin[:, None] * self._beam[:, 0] + cos[:, None] * self._beam[:, 1]
+        origin = np.full((len(ids), 1, 3), LIDAR_Z_M)
+        ahead = self.task.body.lidar_x_m
+        origin[:, 0, 0] = self.qpos[ids, 0] + cos * ahead
+        origin[:, 0, 1] = self.qpos[ids, 1] + sin * ahead
+        distance = self.batch.ray(origin, rays, self._groups, ids=ids)[0]
+        return np.where(distance < 0, np.inf, distance)
+
+    # -- state ----------------------------------------------------------------------------------
+
+    _ARRAYS = ("commands", "set_point", "time_s", "bumped", "slipped", "accel", "blown_up")
+    _TRAFFIC = ("state", "travelled_m", "waited_s", "position_m", "heading_rad")
+
+    def get_state(self) -> dict[str, NDArray[Any]]:
+        """Everything that changes during an episode, as arrays."""
+        state = {name: getattr(self, name).copy() for name in self._ARRAYS}
+        state |= {f"traffic_{name}": getattr(self.traffic, name).copy() for name in self._TRAFFIC}
+        return state | {"physics": self.batch.state.copy()}
+
+    def set_state(self, state: dict[str, NDArray[Any]]) -> None:
+        """Undo to a state of `get_state`; layouts must have been reset to the same episodes."""
+        for name in self._ARRAYS:
+            setattr(self, name, state[name].copy())
+        for name in self._TRAFFIC:
+            setattr(self.traffic, name, state[f"traffic_{name}"].copy())
+        self.batch.state[:] = state["physics"]
+
+
+def _limit(change: F64, most: F64) -> F64:
+    return np.minimum(np.maximum(change, -most), most)
+
+
+def _quat(yaw_rad: F64) -> F64:
+    """Unit quaternions (..., 4), w first, of headings (...)."""
+    half = yaw_rad / 2
+    zero = np.zeros_like(half)
+    return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)
+
+
+def _check_times(task: Task, timestep_s: float, substeps: int, blocks: int) -> None:
+    if abs(substeps * timestep_s - BLOCK_S) > 1e-9:
+        raise ConfigError(
+            f"timestep_s = {timestep_s} does not divide {BLOCK_S} s",
+            where="perturbation",
+            remedy="use .01, .005, .002 or .001",
+        )
+    if abs(blocks * BLOCK_S - task.control_period_s) > 1e-9 or blocks < 1:
+        raise ConfigError(
+            f"control_period_s = {task.control_period_s} is no multiple of {BLOCK_S} s",
+            where="task",
+            remedy="the twin drives in blocks of .1 s",
+        )

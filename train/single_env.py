@@ -1,0 +1,60 @@
+"""`restock/Warehouse-v0`: one warehouse as a plain Gymnasium environment, without autoreset."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from restock.train.vector_env import WarehouseVectorEnv
+
+
+class WarehouseEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
+    """The vector environment with N = 1; `info` holds its values without the leading axis.
+
+    Takes the vector environment's keyword arguments. The one inside is `self.vector`.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 5}
+
+    def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
+        self.render_mode = render_mode
+        self.vector = WarehouseVectorEnv(
+            1, render_mode=render_mode, autoreset_mode=AutoresetMode.DISABLED, **arguments
+        )
+        self.observation_space = self.vector.single_observation_space
+        self.action_space = self.vector.single_action_space
+        self._seeded = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin the next episode; a seed begins the sequence of episodes it names anew."""
+        super().reset(seed=seed)
+        if seed is None and not self._seeded:  # unseeded environments differ, as Gymnasium's do
+            seed = int(self.np_random.integers(2**31))
+        self._seeded = True
+        observation, info = self.vector.reset(seed=seed)
+        return observation[0], _first(info)
+
+    def step(
+        self, action: np.int64
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """One control period."""
+        observation, reward, terminated, truncated, info = self.vector.step(np.array([action]))
+        return (
+            *(observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0])),
+            _first(info),
+        )
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """A top-down map, (H, W, 3) uint8."""
+        frames = self.vector.render()
+        return frames[0] if frames else None
+
+
+def _first(info: dict[str, Any]) -> dict[str, Any]:
+    return {k: _first(v) if isinstance(v, dict) else v[0] for k, v in info.items()}

@@ -1,0 +1,331 @@
+"""The twin as a Gymnasium vector environment: N warehouses stepped in one native call.
+
+    env = WarehouseVectorEnv(16, conditions={"nominal": 0.55, "wheel_slip": 0.15, ...}, seed=1)
+    observation, info = env.reset(seed=1)
+    observation, reward, terminated, truncated, info = env.step(actions)
+
+Autoreset is SAME_STEP (in the metadata): where an episode ends, `observation` is already the next
+episode's first, and the last one is in `info["final_obs"]`. Bootstrap on truncation, never on
+termination.
+
+`info` holds arrays (N,) about the step just taken, whole even where an episode ended:
+
+- `signals`: the stored signals at t + 1, before any autoreset (`env.signals`: after it). Its
+  `command_*` columns are the commands of [t, t + 1); `progress_m` along the plan in force at t;
+- `true_condition`: what was physically so over [t, t + 1); `episode_condition`, `block` (none,
+  partial, full), `episode_seed`, `episode_number` (place in `set_episodes`, or -1);
+- `success` (at the goal without any bump, at the episode's end), `bumps` (steps with a bump so
+  far), `episode_steps`, `true_pose` (N, 3);
+- `invalid`: the physics blew up: the episode is truncated and the step must not enter replay;
+- `final_obs`, with the mask `_final_obs`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from restock.errors import ConfigError
+from restock.ingest.profile import load_profile
+from restock.ingest.task import Task, observe, reached_goal, reward, terminated
+from restock.train.draw import draw_map
+from restock.train.episode import KINDS, Episode, EpisodeSpec, draw_episode
+from restock.train.layout import Warehouse, default_warehouse
+from restock.train.navigation import Navigation
+from restock.train.perturbation import Perturbation
+from restock.train.sensing import Sensing, Signals, add_motion, add_route
+from restock.train.simulation import Live, Simulation
+from restock.train.truth import Truth
+
+DEFAULT_CONDITIONS: Mapping[str, float] = {
+    "nominal": 0.55,
+    "wheel_slip": 0.15,
+    "blocked_aisle": 0.15,
+    "near_collision": 0.15,
+}
+OBSERVATION_LIMIT = 20.0  # no sensor of this robot gives more; holds the space's bounds
+
+
+class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[Any]]):
+    """N warehouses. See the module for what `info` holds."""
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "render_modes": ["rgb_array"],
+        "render_fps": 5,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        conditions: Mapping[str, float] | None = None,
+        perturbation: Perturbation | None = None,
+        seed: int = 0,
+        nthread: int = 1,
+        render_mode: str | None = None,
+        task: Task | None = None,
+        warehouse: Warehouse | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+    ) -> None:
+        """`conditions` are shares of episodes per kind; `nthread` 0 uses every core.
+
+        Raises:
+            ConfigError: an unknown condition, shares that are no shares, no environments, or an
+                autoreset mode other than SAME_STEP and DISABLED.
+        """
+        if num_envs < 1:
+            raise ConfigError(f"num_envs must be 1 or more, got {num_envs}", where="the twin")
+        self.num_envs = num_envs
+        self.render_mode = render_mode
+        self.task = task or load_profile("warehouse_amr").task
+        self.warehouse = warehouse or default_warehouse()
+        self.perturbation = perturbation or Perturbation()
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
+            raise ConfigError("autoreset is SameStep or Disabled", where="the twin")
+        self.metadata = {**type(self).metadata, "autoreset_mode": self.autoreset_mode}
+        self.set_conditions(conditions or DEFAULT_CONDITIONS)
+
+        limit = np.full(self.task.observation_size, OBSERVATION_LIMIT, np.float32)
+        self.single_observation_space = gymnasium.spaces.Box(-limit, limit, dtype=np.float32)
+        self.single_action_space = gymnasium.spaces.Discrete(len(self.task.actions))
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+
+        timestep = self.perturbation.timestep_s
+        self.simulation = Simulation(num_envs, self.task, self.warehouse, timestep, nthread)
+        self.sensing = Sensing(self.simulation, self.task)
+        self.truth = Truth(self.task, num_envs)
+        self.navigation = Navigation(self.warehouse, num_envs, self.task)
+        self._actions = np.asarray(self.task.actions, np.float64)
+        self.episodes: list[Episode | None] = [None] * num_envs
+        self.specs: list[EpisodeSpec] = [EpisodeSpec("nominal", 0)] * num_envs
+        self._fixed: list[EpisodeSpec] = []
+        self._next_fixed = 0
+        self._seed = seed
+        self._drawn = np.zeros(num_envs, np.int64)  # episodes drawn so far, per environment
+        self.blown_up = 0  # episodes that ended in a NaN or a blow-up
+        self.signals: Signals = {}
+        self.observation = np.zeros((num_envs, self.task.observation_size), np.float32)
+        self.previous_action = np.zeros(num_envs, np.int64)
+        self.steps = np.zeros(num_envs, np.int64)  # of the running episodes
+        self.bumps = np.zeros(num_envs, np.int64)
+        self.episode_number = np.full(num_envs, -1)
+        self.episode_seed = np.zeros(num_envs, np.int64)
+        self.episode_condition = np.full(num_envs, "nominal", "U16")
+        self.block = np.full(num_envs, "none", "U8")
+
+    # -- episodes -------------------------------------------------------------------------------
+
+    def set_conditions(self, conditions: Mapping[str, float]) -> None:
+        """Shares per kind of episode, for episodes that begin from now on."""
+        unknown = set(conditions) - set(KINDS)
+        total = sum(conditions.values())
+        if unknown or min(conditions.values(), default=-1) < 0 or total <= 0:
+            raise ConfigError(
+                f"conditions {dict(conditions)} are not shares per kind of episode",
+                where="the twin",
+                remedy=f"give numbers of at least 0, not all 0, for {', '.join(KINDS)}",
+            )
+        shares = np.array([conditions.get(kind, 0.0) for kind in KINDS])
+        self.conditions = {k: float(conditions[k]) for k in KINDS if k in conditions}
+        self._cumulative = np.cumsum(shares) / total
+
+    def set_episodes(self, specs: Iterable[EpisodeSpec]) -> None:
+        """Run these episodes, in order, from the next reset on; then episodes drawn as usual.
+
+        `info["episode_number"]` names them by their place; -1 is an episode beyond their end.
+        """
+        self._fixed, self._next_fixed = list(specs), 0
+
+    def _next_spec(self, env: int) -> EpisodeSpec:
+        if self._next_fixed < len(self._fixed):
+            spec = self._fixed[self._next_fixed]
+            self.episode_number[env] = self._next_fixed
+            self._next_fixed += 1
+            return spec
+        self.episode_number[env] = -1
+        draw = np.random.SeedSequence([self._seed, env, int(self._drawn[env])]).generate_state(3)
+        self._drawn[env] += 1
+        kind = np.searchsorted(self._cumulative, draw[0] / 2**32, side="right")
+        return EpisodeSpec(KINDS[int(kind)], int(draw[1]) << 20 ^ int(draw[2]))
+
+    def _begin(self, ids: NDArray[np.int64]) -> None:
+        """Start the next episode of each environment in `ids`."""
+        for env in ids.tolist():
+            self._lay_out(env, self._next_spec(env))
+        self.steps[ids] = self.bumps[ids] = self.previous_action[ids] = 0
+        first = self.sensing.sense(ids, self.steps[ids])
+        add_motion(first, None)
+        add_route(self.task, first, self.navigation.plans_m[ids], self.navigation.goals_m[ids])
+        observed = observe(self.task, first, first, self.previous_action[ids])
+        self.observation[ids] = _bounded(observed)
+        if self.signals:
+            for name, column in self.signals.items():
+                column[ids] = first[name]
+        else:
+            self.signals = first
+
+    def _lay_out(self, env: int, spec: EpisodeSpec) -> None:
+        perturbation = spec.perturbation or self.perturbation
+        if perturbation.timestep_s != self.simulation.timestep_s:
+            raise ConfigError(
+                f"an episode asks for timestep_s = {perturbation.timestep_s}, the environment"
+                f" runs at {self.simulation.timestep_s}",
+                where=f"episode {spec.condition}/{spec.seed}",
+                remedy="make the environment with that perturbation",
+            )
+        episode = draw_episode(spec, self.warehouse, self.navigation.planner)
+        self.episodes[env], self.specs[env] = episode, spec
+        self.simulation.reset(env, episode, perturbation)
+        self.sensing.reset(env, episode.noise, perturbation)
+        self.navigation.reset(env, episode)
+        self.truth.reset(np.array([env]))
+        self.episode_condition[env], self.block[env] = spec.condition, episode.block
+        self.episode_seed[env] = spec.seed
+
+    # -- gymnasium ------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin an episode everywhere, or where `options["reset_mask"]` (N,) says."""
+        super().reset(seed=seed)
+        ids = np.arange(self.num_envs)
+        mask = (options or {}).get("reset_mask")
+        if mask is not None and self.signals:
+            ids = np.flatnonzero(mask)
+        if seed is not None:
+            self._seed = seed
+            self._drawn[ids] = 0
+        if len(ids) == self.num_envs:
+            self.signals = {}
+        else:
+            self.signals = {name: column.copy() for name, column in self.signals.items()}
+        self._begin(ids)
+        return self.observation.copy(), self._info_now()
+
+    def step(
+        self, actions: NDArray[np.int64]
+    ) -> tuple[
+        NDArray[np.float32],
+        NDArray[np.float32],
+        NDArray[np.bool_],
+        NDArray[np.bool_],
+        dict[str, Any],
+    ]:
+        """One control period everywhere. `actions` (N,) index the task's actions."""
+        action = np.asarray(actions, np.int64).reshape(self.num_envs)
+        now, sim, task = self.signals, self.simulation, self.task
+        everyone = np.arange(self.num_envs)
+        self.truth.look(sim.pose(), self.navigation.plans_m, sim.pallets, everyone)
+        sim.drive(self._actions[action])
+        self.steps += 1
+
+        after = self.sensing.sense(everyone, self.steps)
+        add_motion(after, now)
+        plans, goals = self.navigation.plans_m, self.navigation.goals_m
+        offset = add_route(task, after, plans, goals)
+        progress = now["route_remaining_m"] - after["route_remaining_m"]
+        earned = reward(task, now, after, progress, action, self.previous_action)
+        over = terminated(task, after)
+        invalid = sim.blown_up
+        self.bumps += sim.bumped
+        changed = self.navigation.update(after, offset, self.sensing)
+        if len(changed):  # a new plan counts from t + 1 on: it never makes progress jump
+            self._see_new_plans(after, changed)
+
+        over &= ~invalid
+        cut = ((self.steps >= task.time_limit_steps) & ~over) | invalid
+        observed = _bounded(observe(task, after, now, action))
+        info = self._info_after(after, progress, over, invalid)
+        if invalid.any():
+            self.blown_up += int(invalid.sum())
+            earned = np.where(invalid, np.float32(0), earned)
+            observed[invalid] = self.observation[invalid]
+        self.observation, self.signals, self.previous_action = observed, after, action.copy()
+        done = over | cut
+        if done.any() and self.autoreset_mode is AutoresetMode.SAME_STEP:
+            info["final_obs"], info["_final_obs"] = observed.copy(), done.copy()
+            self.signals = {name: column.copy() for name, column in after.items()}
+            self._begin(np.flatnonzero(done))
+        return self.observation.copy(), earned, over, cut, info
+
+    def _see_new_plans(self, after: Signals, ids: NDArray[np.int64]) -> None:
+        rows: Signals = {name: column[ids] for name, column in after.items()}
+        add_route(self.task, rows, self.navigation.plans_m[ids], self.navigation.goals_m[ids])
+        for name, column in rows.items():
+            after[name][ids] = column
+
+    def _info_now(self) -> dict[str, Any]:
+        return {
+            "signals": {name: column.copy() for name, column in self.signals.items()},
+            "episode_condition": self.episode_condition.copy(),
+            "block": self.block.copy(),
+            "episode_seed": self.episode_seed.copy(),
+            "episode_number": self.episode_number.copy(),
+            "episode_steps": self.steps.copy(),
+            "bumps": self.bumps.copy(),
+            "true_pose": self.simulation.pose(),
+        }
+
+    def _info_after(
+        self,
+        after: Signals,
+        progress_m: NDArray[np.float64],
+        over: NDArray[np.bool_],
+        invalid: NDArray[np.bool_],
+    ) -> dict[str, Any]:
+        sim = self.simulation
+        condition = self.truth.conclude(sim.slipped, sim.bumped, self.sensing.true_clearance_m)
+        return self._info_now() | {
+            "signals": after,
+            "progress_m": progress_m,
+            "true_condition": condition,
+            "success": over & reached_goal(self.task, after) & (self.bumps == 0),
+            "invalid": invalid.copy(),
+        }
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """A top-down map of every environment, (H, W, 3) uint8 each; needs no GL."""
+        if self.render_mode is None:
+            return None
+        return tuple(draw_map(self, env) for env in range(self.num_envs))
+
+    # -- recorders ------------------------------------------------------------------------------
+
+    def set_block_callback(
+        self, callback: Callable[[Live], None] | None, period_s: float = 0.02
+    ) -> None:
+        """Call back every `period_s` of simulated time within steps, with the true state.
+
+        The physics is the same with and without. `period_s` is rounded to whole substeps and
+        must divide .1 s to be evenly spaced. Called before any autoreset of the step.
+        """
+        self.simulation.callback = callback
+        self.simulation.callback_period_s = period_s
+
+    # -- state ----------------------------------------------------------------------------------
+
+    def get_state(self) -> dict[str, Any]:
+        """Everything a bit-exact continuation needs: {"arrays": {name: array}, "json": {...}}."""
+        from restock.train.env_state import get_state
+
+        return get_state(self)
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Continue from a state of `get_state` of an environment made with the same arguments."""
+        from restock.train.env_state import set_state
+
+        set_state(self, state)
+
+
+def _bounded(observation: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.clip(np.nan_to_num(observation), -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
