@@ -212,17 +212,24 @@ def message_type(channel: Channel, distro: str) -> MessageType:
     if embedded and (channel.definition or name not in types):
         if len(channel.definition) > LONGEST_DEFINITION:
             raise CannotDecode(f"its definition has {len(channel.definition):,} bytes")
-        return _embedded(name, channel.definition_format, channel.definition)
+        return _embedded(name, channel.definition_format, channel.definition, distro)
     if name not in types:
         raise CannotDecode(
             f"unknown type {channel.type or '(unnamed)'}: not defined in the recording"
             f" nor in {distro!r}"
         )
-    return MessageType(name, distro, types)
+    return _from_distro(name, distro)
 
 
 @cache
-def _embedded(name: str, form: str, definition: bytes) -> MessageType:
+def _from_distro(name: str, distro: str) -> MessageType:
+    found = MessageType(name, distro, distro_types(distro))
+    found.leaves()  # refuses what cannot be read
+    return found
+
+
+@cache
+def _embedded(name: str, form: str, definition: bytes, distro: str) -> MessageType:
     try:
         text = definition.decode()
         types: dict[str, Any] = {}
@@ -238,7 +245,20 @@ def _embedded(name: str, form: str, definition: bytes) -> MessageType:
         raise CannotDecode(f"its definition cannot be parsed: {_first_line(error)}") from error
     if form == "ros1msg":  # time and duration are primitives there
         types = {**distro_types("ros1_noetic"), **types}
-    return MessageType(name, "embedded", types)
+    source = "embedded"
+    missing = _named(types) - types.keys()
+    if missing:  # some writers leave out the messages inside; their sizes will tell if they differ
+        types = {**distro_types(distro), **types}
+        source = f"embedded, and {distro}"
+    found = MessageType(name, source, types)
+    found.leaves()  # refuses what cannot be read
+    return found
+
+
+def _named(types: dict[str, Any]) -> set[str]:
+    """The messages that fields of these types are made of."""
+    fields = [_field(*item) for _, items in types.values() for item in items]
+    return {field.message for field in fields if field.message}
 
 
 def _first_line(error: Exception) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sqlite3
 import tempfile
@@ -16,6 +17,7 @@ from restock.ingest.storage import Channel, Damage, Integrity
 MAGIC = b"SQLite format 3\x00"
 ROWS_PER_FETCH = 1000
 BYTES_PER_BATCH = 32 << 20
+LONGEST_GAP = 64 << 30  # of a short file, filled with holes in a private copy
 
 
 class SqliteFile:
@@ -31,7 +33,7 @@ class SqliteFile:
         self.damage: list[Damage] = []
         self.notes: list[str] = []
         self._copy: tempfile.TemporaryDirectory[str] | None = None
-        self._refuse_short()
+        self._full_size = self._refuse_short()
         self._connection = self._connect()
         try:
             self.channels = self._read_channels()
@@ -44,7 +46,8 @@ class SqliteFile:
                 remedy="rosbag2's sqlite3 files have the tables `topics` and `messages`",
             ) from error
 
-    def _refuse_short(self) -> None:
+    def _refuse_short(self) -> int:
+        """How long the file should be, by its own header."""
         size = self.path.stat().st_size
         with self.path.open("rb") as file:
             head = file.read(100)
@@ -53,7 +56,7 @@ class SqliteFile:
         # The page count in the header is only right when the two change counters agree.
         pages = int.from_bytes(head[28:32], "big") if head[24:28] == head[92:96] else 0
         if len(head) == 100 and size >= page * pages:
-            return
+            return size
         what = f"cut short: {size:,} bytes of {page * pages:,}"
         if not self.salvage or len(head) < 100:
             raise RecordingError(
@@ -61,19 +64,24 @@ class SqliteFile:
             )
         self.damage.append(Damage(what))
         self.integrity = "damaged"
+        return min(page * pages, LONGEST_GAP + size)
 
     def _connect(self) -> sqlite3.Connection:
         path = self.path
         sidecars = [path.with_name(path.name + end) for end in ("-wal", "-journal")]
         sidecars = [item for item in sidecars if item.is_file() and item.stat().st_size]
         immutable = "&immutable=1"
-        if sidecars:
+        short = self._full_size > path.stat().st_size
+        if sidecars or short:
             self._copy = tempfile.TemporaryDirectory(prefix="restock-")
             for item in (path, *sidecars):
                 shutil.copyfile(item, Path(self._copy.name) / item.name)
             path, immutable = Path(self._copy.name) / path.name, ""
-            names = ", ".join(item.name for item in sidecars)
-            self.notes.append(f"{names}: read too, the writer had not folded it in")
+            if short:  # sqlite refuses a short file outright: give it the pages, as holes
+                os.truncate(path, self._full_size)
+            if sidecars:
+                names = ", ".join(item.name for item in sidecars)
+                self.notes.append(f"{names}: read too, the writer had not folded it in")
         mode = "ro" if immutable else "rw"
         uri = f"file:{quote(str(path.absolute()))}?mode={mode}{immutable}"
         try:
