@@ -33,7 +33,8 @@ def draw_map(env: WarehouseVectorEnv, index: int) -> NDArray[np.uint8]:
         canvas.box(*rack.center, *rack.half_size, 0.0, RACK)
     for x, y in _dense(env.navigation.plans_m[index]):
         canvas.disc(x, y, 0.03, ROUTE)
-    canvas.disc(*env.navigation.goals_m[index], env.task.goal_radius_m, GOAL)
+    goal_x, goal_y = env.navigation.goals_m[index]
+    canvas.disc(goal_x, goal_y, env.task.goal_radius_m, GOAL)
     for x, y, yaw in sim.pallets[index]:
         canvas.box(x, y, *PALLET_HALF_M[:2], yaw, PALLET)
     for agent, (x, y) in enumerate(sim.traffic.position_m[index]):

@@ -24,4 +24,5 @@ def friction_at(points_m: F64, patches: F64, base: F64) -> F64:
     gap = np.abs(points_m[:, :, None, :] - patches[:, None, :, 0:2])  # (N, K, P, 2)
     inside = (gap <= patches[:, None, :, 2:4]).all(axis=-1)
     slippery = np.where(inside, patches[:, None, :, 4], np.inf).min(axis=-1)
-    return np.minimum(slippery, base[:, None])
+    friction: F64 = np.minimum(slippery, base[:, None])
+    return friction

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,7 +93,7 @@ class Planner:
         found = np.argwhere(np.isfinite(window))
         if not len(found):
             return -1
-        gap = ((found + [low_i - i, low_j - j]) ** 2).sum(axis=1)
+        gap = ((found + np.array([low_i - i, low_j - j])) ** 2).sum(axis=1)
         best = found[np.argmin(gap)]
         return int((low_i + best[0]) * self.shape[1] + low_j + best[1])
 
@@ -163,7 +164,7 @@ def _rack_clearance(warehouse: Warehouse, shape: tuple[int, int]) -> F64:
     return inner
 
 
-def _smooth(way: F64, half_window: int = 4) -> F64:
+def _smooth(way: NDArray[Any], half_window: int = 4) -> F64:
     """A moving average over the cells of a way, which takes off the grid's corners."""
     if len(way) < 3:
         return way
@@ -172,7 +173,7 @@ def _smooth(way: F64, half_window: int = 4) -> F64:
     )
     total = np.cumsum(np.concatenate([np.zeros((1, 2)), padded]), axis=0)
     width = 2 * half_window + 1
-    smooth = (total[width:] - total[:-width]) / width
+    smooth: F64 = (total[width:] - total[:-width]) / width
     smooth[0], smooth[-1] = way[0], way[-1]
     return smooth
 

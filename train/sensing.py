@@ -8,6 +8,7 @@ noise of a perturbation. All noise of an episode is drawn when it begins, from i
 from __future__ import annotations
 
 from statistics import NormalDist
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,7 @@ from restock.train.simulation import LIDAR_BEAMS, Simulation
 
 F64 = NDArray[np.float64]
 Ids = NDArray[np.int64]
-Signals = dict[str, NDArray[np.generic]]
+Signals = dict[str, NDArray[Any]]
 
 FIRST_STAMP_NS = 1_000_000_000  # of an episode's first step: stamps are never 0
 DRIFT_TIME_S = 3.0
@@ -114,7 +115,7 @@ def add_motion(signals: Signals, before: Signals | None) -> None:
 
 
 def add_route(task: Task, signals: Signals, plans_m: F64, goals_m: F64) -> F64:
-    """What the robots see of their plans (n, P, 2) and goals (n, 2); returns how far off they are."""
+    """What robots see of plans (n, P, 2) and goals (n, 2); returns how far off plan they are."""
     x, y, yaw = signals["pose_x_m"], signals["pose_y_m"], signals["pose_yaw_rad"]
     view = view_route(plans_m, x, y, yaw, (task.near_m, task.far_m))
     near, far = view.look_ahead_m[:, 0], view.look_ahead_m[:, 1]

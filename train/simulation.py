@@ -160,7 +160,7 @@ class Simulation:
             self.radius_m[env] = radius
             size, bound = self.batch.expand("geom_size"), self.batch.expand("geom_rbound")
             place = self.batch.expand("body_pos")
-            for geom, body in zip(self.handles.wheel_geoms, self.handles.wheel_bodies, strict=True):
+            for geom in self.handles.wheel_geoms:
                 size[env, geom, 0] = bound[env, geom] = radius
             for body in self.handles.wheel_bodies:  # so that the casters keep their share of load
                 place[env, body, 2] = radius - WHEEL_RADIUS_M
@@ -185,7 +185,8 @@ class Simulation:
             touched = self._run(control)
             self.bumped |= touched
             self.slipped |= self._slipping(slippery)
-        self.blown_up = (np.asarray(self.batch.warning) > 0).reshape(self.num_envs, -1).any(axis=1)
+        warnings = np.asarray(self.batch.warning).reshape(self.num_envs, -1)
+        self.blown_up = np.asarray((warnings > 0).any(axis=1), np.bool_)
 
     def _run(self, control: F64) -> NDArray[np.bool_]:
         """One block of substeps; returns whose bumper was pressed."""
@@ -280,7 +281,7 @@ class Simulation:
         turn = self.qvel[:, 5] * (TRACK_M / 2)
         ground = np.stack([forward - turn, forward + turn], axis=-1)
         slip = np.hypot(self.qvel[:, 6:8] * self.radius_m[:, None] - ground, lateral[:, None])
-        return (slippery & (slip > 0.15)).any(axis=1)
+        return np.asarray((slippery & (slip > 0.15)).any(axis=1), np.bool_)
 
     def _show_traffic(self, ids: Ids) -> None:
         if len(ids):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -18,7 +18,10 @@ class WarehouseEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
     Takes the vector environment's keyword arguments. The one inside is `self.vector`.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 5}
+    metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium declares it
+        "render_modes": ["rgb_array"],
+        "render_fps": 5,
+    }
 
     def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
         self.render_mode = render_mode
@@ -50,7 +53,7 @@ class WarehouseEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
             _first(info),
         )
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """A top-down map, (H, W, 3) uint8."""
         frames = self.vector.render()
         return frames[0] if frames else None

@@ -70,4 +70,5 @@ def _blocked(pose: F64, plans_m: F64, pallets: F64) -> NDArray[np.bool_]:
     points = view.look_ahead_m + pose[:, None, :2]  # heading 0: offsets in the map frame
     gap = np.abs(points[:, :, None] - pallets[:, None, :, :2])
     half = np.array(PALLET_HALF_M[:2]) + BODY_MARGIN_M
-    return (gap <= half).all(axis=-1).any(axis=(1, 2))
+    inside = (gap <= half).all(axis=-1).reshape(len(pose), -1)
+    return np.asarray(inside.any(axis=1), np.bool_)

@@ -23,7 +23,7 @@ termination.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -55,7 +55,7 @@ OBSERVATION_LIMIT = 20.0  # no sensor of this robot gives more; holds the space'
 class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[Any]]):
     """N warehouses. See the module for what `info` holds."""
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium declares it
         "render_modes": ["rgb_array"],
         "render_fps": 5,
         "autoreset_mode": AutoresetMode.SAME_STEP,
