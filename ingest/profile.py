@@ -97,6 +97,7 @@ class Episodes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     max_pose_jump_m: float = 1.0  # between two steps: the robot was carried, or relocalised
     goal_moved_m: float = 0.01  # a goal further than this from the last one is a new one
+    plan_goal_tolerance_m: float = 0.5  # a plan that ends further from the goal is for another
 
 
 class Zone(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -89,3 +89,65 @@ def transition_schema(observation_size: int) -> pa.Schema:
             for column in COLUMNS
         ]
     )
+
+
+def _rows_of(**fields: pa.DataType) -> pa.DataType:
+    return pa.list_(pa.struct(list(fields.items())))
+
+
+# One row an ingest: what was read, by which definitions, and what became of it.
+RECORDING_COLUMNS: tuple[Column, ...] = (
+    Column("recording_id", pa.string(), "hash of the recording's content, 16 hex digits"),
+    Column("ingest_id", pa.string(), "of this ingest; joins `transitions`"),
+    Column("ingested_at", pa.timestamp("us", "UTC"), "when it was ingested"),
+    Column("source_file", pa.string(), "path of the recording as it was given"),
+    Column("format", pa.string(), "of its container: mcap, rosbag2-sqlite3, rosbag2-mcap, …"),
+    Column("integrity", pa.string(), "checksums: verified, unverified or damaged"),
+    Column("duration_s", pa.float64(), "from its first message to its last, by log time"),
+    Column("start_stamp_ns", pa.int64(), "of its first step, on the alignment clock"),
+    Column("end_stamp_ns", pa.int64(), "of its last step, on the alignment clock"),
+    Column("clock", pa.string(), "the alignment clock: header.stamp or log_time"),
+    Column("clock_offset_ns", pa.int64(), "log time less alignment clock"),
+    Column("clock_jumps", pa.int32(), "times that the alignment clock was set"),
+    Column("profile", pa.string(), "name of the profile that read it"),
+    Column("profile_hash", pa.string(), "of the profile, 12 hex digits"),
+    Column("task_hash", pa.string(), "of the definition of observation, action and reward"),
+    Column("labels_version", pa.string(), "of the conditions that labelled it"),
+    Column("restock_version", pa.string(), "of the software that wrote it"),
+    Column("ticks", pa.int64(), "of the control clock = transitions + episode_ends + drops"),
+    Column("steps", pa.int64(), "ticks that belong to an episode"),
+    Column("episodes", pa.int64(), "of one transition or more"),
+    Column("transitions", pa.int64(), "rows in `transitions`"),
+    Column("episode_ends", pa.int64(), "ticks that only end an episode"),
+    Column("drops", _rows_of(reason=pa.string(), count=pa.int64()), "ticks in no episode"),
+    Column(
+        "topics",
+        _rows_of(
+            topic=pa.string(), type=pa.string(), expected=pa.int64(), decoded=pa.int64(),
+            skipped=pa.int64(), reason=pa.string(),
+        ),
+        "messages by the container's count, rows decoded, and why the rest were not",
+    ),
+    Column(
+        "stand_ins",
+        _rows_of(input=pa.string(), instead=pa.string()),
+        "inputs that the recording does not fill, and what was used instead",
+    ),
+    Column(
+        "label_scores",
+        _rows_of(
+            condition=pa.string(), precision=pa.float64(), recall=pa.float64(),
+            labelled=pa.int64(), support=pa.int64(),
+        ),
+        "of the labels against the true condition; empty where that is not known",
+    ),
+    Column("task_json", pa.string(), "the task, as JSON"),
+    Column("conditions_json", pa.string(), "the conditions: name, timing, priority, sql, as JSON"),
+)  # fmt: skip
+
+
+def recording_schema() -> pa.Schema:
+    """The Arrow schema of the `recordings` table."""
+    return pa.schema(
+        [pa.field(column.name, column.type, column.nullable) for column in RECORDING_COLUMNS]
+    )

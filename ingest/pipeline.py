@@ -1,0 +1,281 @@
+"""One recording, end to end: columns, steps, episodes, labels, rows, and the commit.
+
+profile = load_profile("warehouse_amr")
+outcome = ingest(Path("logs/run.mcap"), profile, store=StoreWriter("store"))
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import uuid
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+
+from restock.errors import RecordingError
+from restock.ingest.conditions import NOMINAL
+from restock.ingest.episodes import Split, split
+from restock.ingest.profile import Profile
+from restock.ingest.readers import open_recording
+from restock.ingest.recording import Recording
+from restock.ingest.schema import recording_schema
+from restock.ingest.scores import LabelScore, score
+from restock.ingest.sources import stand_ins, wanted_fields
+from restock.ingest.steps import Steps, steps_of
+from restock.ingest.store import StoreWriter
+from restock.ingest.transitions import EpisodeRows, Provenance, episode_rows, transitions
+
+Status = Literal["written", "unchanged", "dry run"]
+UNUSED = "not used by the profile"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one recording: the counts of its manifest, and what else is worth saying."""
+
+    path: str
+    status: Status
+    manifest: dict[str, Any]  # the row of `recordings`, as plain values
+    conditions: dict[str, int] = field(default_factory=dict)  # transitions per label, and nominal
+    scores: list[LabelScore] = field(default_factory=list)
+    losses: list[str] = field(default_factory=list)  # messages or bytes that could not be had
+    notes: list[str] = field(default_factory=list)
+    version: int | None = None  # of the store's transitions, where they were written
+
+    @property
+    def lossy(self) -> bool:
+        """Whether data of the topics used was lost."""
+        return bool(self.losses)
+
+
+def ingest(
+    path: Path | str,
+    profile: Profile,
+    *,
+    store: StoreWriter | None,
+    force: bool = False,
+    salvage: bool = False,
+    typestore: str | None = None,
+) -> Outcome:
+    """Read one recording and put its transitions in the store (None: a dry run).
+
+    A recording that is in the store as this profile, these conditions and this software would
+    put it there is left alone, unless `force`.
+
+    Raises:
+        RecordingError: no recording, damaged (unless `salvage`), not of this profile, or it
+            gives no transition. The store is as it was.
+        StoreError: the store cannot be written.
+    """
+    with open_recording(path, typestore=typestore, salvage=salvage) as recording:
+        if store is not None and not force:
+            same = _unchanged(store, recording, profile)
+            if same is not None:
+                return Outcome(str(path), "unchanged", same)
+        try:
+            return _Ingest(str(path), recording, profile).run(store)
+        except RecordingError as error:
+            if error.where:
+                raise
+            raise RecordingError(error.what, where=str(path), remedy=error.remedy) from error
+
+
+def software_version() -> str:
+    """Restock's version."""
+    try:
+        return version("restock")
+    except PackageNotFoundError:  # running from a source tree that was never installed
+        return "0.0.0+unknown"
+
+
+def _definitions(profile: Profile) -> dict[str, str]:
+    """What rows depend on beside the recording."""
+    return {
+        "profile_hash": profile.hash,
+        "task_hash": profile.task.hash,
+        "labels_version": profile.labels_version,
+        "restock_version": software_version(),
+    }
+
+
+def _unchanged(store: StoreWriter, recording: Recording, profile: Profile) -> dict[str, Any] | None:
+    """The manifest row of the same recording ingested by the same definitions, if it is there."""
+    key = {"recording_id": recording.recording_id, **_definitions(profile)}
+    for row in store.live().to_pylist():
+        if all(row[name] == value for name, value in key.items()):
+            return dict(row)
+    return None
+
+
+class _Ingest:
+    """The stages over one open recording."""
+
+    def __init__(self, path: str, recording: Recording, profile: Profile) -> None:
+        self.path, self.recording, self.profile = path, recording, profile
+        self.ingest_id = uuid.uuid4().hex[:16]
+
+    def run(self, store: StoreWriter | None) -> Outcome:
+        columns = self._columns()
+        steps = steps_of(self.profile, columns)
+        episodes = split(self.profile.task, steps)
+        if not episodes.transitions:
+            raise RecordingError(
+                f"gives no transition with the profile {self.profile.name!r}: "
+                f"{_why(steps, episodes)}",
+                remedy="choose another --profile, or mend its maximum ages; see docs/ingest.md",
+            )
+        rows = episode_rows(self.profile, steps, episodes)
+        provenance = Provenance(
+            self.recording.recording_id, self.ingest_id, self.path, software_version()
+        )
+        table = transitions(self.profile, steps, episodes, rows, provenance)
+        labels = {name: holds[rows.starts] for name, holds in rows.labels.items()}
+        scores = score(labels, [steps.truth[tick] for tick in rows.tick[rows.starts]])
+        manifest = self._manifest(steps, episodes, rows, columns, scores)
+        at = (
+            store.write(pa.Table.from_pylist([manifest], recording_schema()), table)
+            if store
+            else None
+        )
+        counts = {name: int(holds.sum()) for name, holds in labels.items()}
+        counts[NOMINAL] = table["condition"].to_pylist().count(NOMINAL)
+        return Outcome(
+            self.path,
+            "written" if store else "dry run",
+            manifest,
+            counts,
+            scores,
+            self._losses(),
+            self._notes(steps, table),
+            at,
+        )
+
+    def _columns(self) -> dict[str, Any]:
+        recording = self.recording
+        readable = {n: info for n, info in recording.topics.items() if info.skipped is None}
+        stamped = {
+            source.topic: "header.stamp" in recording.leaves(source.topic)
+            for _, source in self.profile.inputs.items()
+            if source.topic in readable
+        }
+        return recording.read(wanted_fields(self.profile, readable, stamped))
+
+    def _manifest(
+        self,
+        steps: Steps,
+        episodes: Split,
+        rows: EpisodeRows,
+        columns: dict[str, Any],
+        scores: list[LabelScore],
+    ) -> dict[str, Any]:
+        recording, profile, stamps = self.recording, self.profile, steps.signals["stamp_ns"]
+        span = recording.span_ns or (0, 0)
+        instead = stand_ins(profile, columns)
+        conditions = [
+            {"name": c.name, "timing": c.timing, "priority": c.priority, "sql": c.sql}
+            for c in profile.conditions
+        ]
+        return {
+            "recording_id": recording.recording_id,
+            "ingest_id": self.ingest_id,
+            "ingested_at": dt.datetime.now(dt.UTC),
+            "source_file": self.path,
+            "format": recording.format,
+            "integrity": recording.integrity,
+            "duration_s": (span[1] - span[0]) * 1e-9,
+            "start_stamp_ns": int(stamps.min()),
+            "end_stamp_ns": int(stamps.max()),
+            "clock": steps.clock.alignment,
+            "clock_offset_ns": steps.clock.offset_ns,
+            "clock_jumps": steps.clock.jumps,
+            "profile": profile.name,
+            **_definitions(profile),
+            "ticks": len(steps),
+            "steps": len(np.unique(rows.tick)),
+            "episodes": len(episodes.episodes),
+            "transitions": episodes.transitions,
+            "episode_ends": episodes.ends,
+            "drops": [
+                {"reason": reason, "count": count}
+                for reason, count in sorted(episodes.dropped.items(), key=lambda item: -item[1])
+            ],
+            "topics": self._topics(),
+            "stand_ins": [{"input": name, "instead": how} for name, how in instead.items()],
+            "label_scores": [
+                {
+                    "condition": s.condition,
+                    "precision": s.precision,
+                    "recall": s.recall,
+                    "labelled": s.labelled,
+                    "support": s.support,
+                }
+                for s in scores
+            ],
+            "task_json": msgspec.json.encode(profile.task).decode(),
+            "conditions_json": msgspec.json.encode(conditions).decode(),
+        }
+
+    def _topics(self) -> list[dict[str, Any]]:
+        """Every topic: the messages the container counts, those decoded, and why not the rest."""
+        found = []
+        for name, info in self.recording.topics.items():
+            account = self.recording.accounts.get(name)
+            reason = info.skipped or UNUSED
+            if account is not None:
+                reason = "; ".join(f"{why}: {n}" for why, n in account.reasons.items() if n)
+            decoded = account.decoded if account is not None else 0
+            found.append(
+                {
+                    "topic": name,
+                    "type": info.type,
+                    "expected": info.expected,
+                    "decoded": decoded,
+                    "skipped": max(info.expected - decoded, 0),
+                    "reason": reason,
+                }
+            )
+        return found
+
+    def _losses(self) -> list[str]:
+        return [
+            f"{loss.topic or 'the file'}: {loss.reason}"
+            + (f" ({loss.messages:,} messages)" if loss.messages is not None else "")
+            for loss in self.recording.losses
+        ]
+
+    def _notes(self, steps: Steps, table: pa.Table) -> list[str]:
+        clock = steps.clock
+        notes = list(self.recording.notes)
+        if clock.alignment == "header.stamp":
+            notes.append(
+                f"clock: log time is {clock.offset_ns * 1e-9:,.3f} s ahead of header stamps, "
+                f"within {clock.spread_ns * 1e-6:.1f} ms (1st to 99th percentile)"
+            )
+        if clock.jumps:
+            notes.append(f"the alignment clock was set {clock.jumps} times; each cuts an episode")
+        for topic, count in clock.off_clock.items():
+            notes.append(f"{topic}: {count} messages left out, their stamps are off the clock")
+        for topic, count in clock.restamped.items():
+            notes.append(f"{topic}: {count} messages older than the recording, put at log time")
+        if steps.commands_between:
+            notes.append(f"{steps.commands_between} commands closer than a control period: no step")
+        residual = table["action_residual"].to_numpy()
+        far = int((residual > 0.25).sum())
+        if far:
+            notes.append(
+                f"{far} of {len(residual)} commands are more than .25 from the nearest action "
+                f"(median {np.median(residual):.2f}, largest {residual.max():.2f}, scaled)"
+            )
+        return notes
+
+
+def _why(steps: Steps, episodes: Split) -> str:
+    if not len(steps):
+        return "it holds no command, so the control clock has no tick"
+    reasons = sorted(episodes.dropped.items(), key=lambda item: -item[1])
+    return "; ".join(f"{reason}: {count} of {len(steps)} ticks" for reason, count in reasons)

@@ -1,0 +1,327 @@
+"""Topics to steps: every signal at every tick of the control clock, causally held.
+
+What makes a tick unusable (an input that is stale, a plan for another goal, a value that is not
+finite) is kept beside it as a reason, so that everything left out can be counted.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.ingest.align import NS, ClockReport, Held, Samples, Segment, align, ticks_of
+from restock.ingest.columns import Ragged, TopicColumns, take
+from restock.ingest.profile import Profile
+from restock.ingest.routing import LARGEST, Routing, plan_ends, plan_problems, same_goals
+from restock.ingest.scan import SectorMap
+from restock.ingest.signals import localised_velocity
+from restock.ingest.sources import Sources
+from restock.ingest.task import nearest_action
+
+F64 = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+_CHUNK = 4096  # scans at a time: bounds memory whatever the recording's length
+
+# A handover is said on the tick it takes force; its message may arrive a moment later. Used for
+# provenance alone, never for what the robot knew.
+PROVENANCE_LEAD_S = 0.1
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Every tick of a recording (T of them), with all that is known at it."""
+
+    signals: dict[str, NDArray[Any]]  # every signal, leading axis T
+    segment: Ints  # (T,) of the clock
+    follows: Bools  # (T,) comes directly after the tick before, and both are usable
+    cut: list[str]  # (T,) why it does not follow, or ""
+    problem: list[str]  # (T,) why the tick is unusable whatever its route, or ""
+    route_problem: list[str]  # (T,) why its route is unusable, or ""
+    routing: Routing
+    action: Ints  # (T,)
+    residual: F64  # (T,) from the command to that action
+    policy: list[str]  # (T,)
+    policy_version: list[str | None]  # (T,)
+    probability: list[float | None]  # (T,)
+    truth: list[str | None]  # (T,) true condition, where a simulator said it
+    clock: ClockReport
+    commands_between: int  # commands that got no tick of their own
+
+    def __len__(self) -> int:
+        return len(self.segment)
+
+
+def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
+    """All steps of a recording from its topics' columns (those `wanted_fields` asks for).
+
+    Raises:
+        RecordingError: the alignment clock is `header.stamp` and no topic has one, or a field is
+            not what its input needs.
+    """
+    sources = Sources(profile, topics)
+    latched = {s.topic for s in sources.inputs.values() if s.max_age_s is None}
+    latched -= {s.topic for s in sources.inputs.values() if s.max_age_s is not None}
+    segments, report = align(topics, profile.clock, frozenset(latched))
+    ticks, between = [], 0
+    for segment in segments:
+        end = max((int(s.stamp_ns[-1]) for s in segment.topics.values() if len(s.row)), default=0)
+        command = segment.topics[profile.inputs.command.topic]
+        stamps, extra = ticks_of(command, profile.clock, profile.task.control_period_s, end)
+        ticks.append(stamps)
+        between += extra
+    filling = _Filling(profile, sources, segments, ticks)
+    signals = filling.fill()
+    follows, cut = filling.continuity()
+    before = np.arange(len(follows)) - follows  # the tick before, or itself
+    forward, lateral = localised_velocity(
+        signals, {name: column[before] for name, column in signals.items()}
+    )
+    signals |= {"localised_speed_mps": forward, "localised_lateral_mps": lateral}
+    action, residual = nearest_action(
+        profile.task, signals["command_speed_mps"], signals["command_yaw_rate_radps"]
+    )
+    policy, version, probability = filling.behaviour()
+    return Steps(
+        signals,
+        filling.segment,
+        follows,
+        cut,
+        list(filling.problem),
+        list(filling.route_problem),
+        filling.routing,
+        action,
+        residual,
+        policy,
+        version,
+        probability,
+        filling.truth(),
+        report,
+        between,
+    )
+
+
+class _Filling:
+    """Fills the signals of one recording, input by input; the first problem of a tick stays."""
+
+    def __init__(
+        self,
+        profile: Profile,
+        sources: Sources,
+        segments: Sequence[Segment],
+        ticks: Sequence[Ints],
+    ) -> None:
+        self.profile, self.task, self.sources = profile, profile.task, sources
+        self.segments, self.ticks = segments, ticks
+        self.tick_ns = np.concatenate(ticks)
+        self.segment = np.repeat(np.arange(len(ticks)), [len(stamps) for stamps in ticks])
+        self.problem = np.full(len(self.tick_ns), "", object)
+        self.route_problem = np.full(len(self.tick_ns), "", object)
+        self.signals: dict[str, NDArray[Any]] = {"stamp_ns": self.tick_ns}
+        self.routing = Routing.none(len(self.tick_ns))
+
+    def fill(self) -> dict[str, NDArray[Any]]:
+        """Every signal but the localised velocity, which needs to know the tick before."""
+        self._command()
+        self._numbers("pose", x_m="pose_x_m", y_m="pose_y_m", yaw_rad="pose_yaw_rad")
+        self.signals["pose_stamp_ns"] = self.tick_ns - self._hold("pose").age_ns
+        self._numbers("wheels", speed_mps="wheel_speed_mps", yaw_rate_radps="wheel_yaw_rate_radps")
+        if self.sources.present("imu"):
+            self._numbers("imu", yaw_rate_radps="gyro_yaw_rate_radps", accel_x_mps2="accel_x_mps2")
+        else:
+            self.signals["gyro_yaw_rate_radps"] = self.signals["wheel_yaw_rate_radps"].copy()
+            self.signals["accel_x_mps2"] = np.zeros(len(self.tick_ns))
+        self._scan()
+        self._bumper()
+        if self.task.goal == "route":
+            self._route()
+        routing = self.routing
+        self.signals |= routing.signals(self.task, routing.goal, routing.plan, self.signals)
+        return self.signals
+
+    def continuity(self) -> tuple[Bools, list[str]]:
+        """Whether each tick follows the one before, and why not."""
+        count = len(self.tick_ns)
+        cut = np.full(count, "", object)
+        if count:
+            cut[0] = "start of the recording"
+        x, y = self.signals["pose_x_m"], self.signals["pose_y_m"]
+        jump = np.hypot(np.diff(x), np.diff(y)) > self.profile.episodes.max_pose_jump_m
+        gap = np.diff(self.tick_ns) > round(self.profile.clock.max_gap_s * NS)
+        unusable = (self.problem[1:] != "") | (self.problem[:-1] != "")
+        for bad, reason in (
+            (np.diff(self.segment) != 0, "clock jump"),
+            (gap, "gap"),
+            (unusable, "unusable step"),
+            (jump, "pose jump"),
+        ):
+            cut[1:][bad & (cut[1:] == "")] = reason
+        return np.asarray(cut == "", np.bool_), list(cut)
+
+    def behaviour(self) -> tuple[list[str], list[str | None], list[float | None]]:
+        """Who acted at each tick: policy, version, probability of the action."""
+        count = len(self.tick_ns)
+        default = self.profile.behaviour_policy
+        if not self.sources.present("behaviour_policy"):
+            return [default] * count, [None] * count, [None] * count
+        said = [parse_policy(text) for text in self.sources.texts("behaviour_policy")]
+        held = self._hold("behaviour_policy", lead_s=PROVENANCE_LEAD_S)
+        rows = zip(held.row, held.fresh, strict=True)
+        acted = [said[row] if known else (default, None, None) for row, known in rows]
+        return [a[0] for a in acted], [a[1] for a in acted], [a[2] for a in acted]
+
+    def truth(self) -> list[str | None]:
+        """The simulator's own condition at each tick: the message nearest to it."""
+        if not self.sources.present("true_condition"):
+            return [None] * len(self.tick_ns)
+        said = self.sources.texts("true_condition")
+        held = self._hold("true_condition", lead_s=self.task.control_period_s / 2)
+        rows = zip(held.row, held.fresh, strict=True)
+        return [said[row] if known else None for row, known in rows]
+
+    def _hold(self, name: str, *, lead_s: float = 0.0) -> Held:
+        """An input's latest message at every tick (or a lead after it), segment by segment."""
+        source = self.sources.inputs[name]
+        lead_ns = round(lead_s * NS)
+        parts = [
+            segment.topics[source.topic].hold(ticks + lead_ns, source.max_age_s)
+            for segment, ticks in zip(self.segments, self.ticks, strict=True)
+        ]
+        return Held(
+            np.concatenate([part.row for part in parts]),
+            np.concatenate([part.age_ns for part in parts]),
+            np.concatenate([part.known for part in parts]),
+            np.concatenate([part.fresh for part in parts]),
+        )
+
+    def _blame(self, bad: Bools, reason: str, *, route: bool = False) -> None:
+        problems = self.route_problem if route else self.problem
+        problems[bad & (problems == "")] = reason
+
+    def _required(self, name: str, *, lead_s: float = 0.0, route: bool = False) -> Held:
+        held = self._hold(name, lead_s=lead_s)
+        self._blame(~held.known, f"{name}: not yet received", route=route)
+        self._blame(~held.fresh, f"{name}: stale", route=route)
+        return held
+
+    def _numbers(self, name: str, *, lead_s: float = 0.0, **signal_of: str) -> None:
+        """Fields of a required input straight into signals; 0 where the tick is unusable."""
+        held = self._required(name, lead_s=lead_s)
+        for key, signal in signal_of.items():
+            values = self.sources.numbers(name, key)
+            column = values[held.row] if len(values) else np.zeros(len(held.row))
+            sane = np.abs(column) <= LARGEST  # False for NaN
+            self._blame(~sane, f"{name}: not finite")
+            self.signals[signal] = np.where(sane & held.known, column, 0.0)
+
+    def _command(self) -> None:
+        # At a fixed rate a command lands anywhere in the interval: the one in force for most of
+        # it is the one in force at its middle. On the command clock it opens the interval.
+        middle = self.task.control_period_s / 2 if self.profile.clock.steps == "rate" else 0.0
+        self._numbers(
+            "command",
+            lead_s=middle,
+            speed_mps="command_speed_mps",
+            yaw_rate_radps="command_yaw_rate_radps",
+        )
+
+    def _scan(self) -> None:
+        held = self._required("scan")
+        sectors = np.full((len(self.tick_ns), self.task.sectors), float(self.task.range_max_m))
+        used, inverse = np.unique(held.row[held.fresh], return_inverse=True)
+        if len(used):
+            beams = np.zeros(len(self.tick_ns), np.int64)
+            beams[held.fresh] = self.sources.beams(used)[inverse]
+            self._blame(held.fresh & (beams == 0), "scan: no beams")
+            sectors[held.fresh] = self._sectors(used)[inverse]
+        self.signals["sector_clearance_m"] = sectors
+        self.signals["clearance_m"] = sectors.min(axis=1)
+
+    def _sectors(self, rows: NDArray[np.intp]) -> F64:
+        """Clearance per sector (N, K) of these scans; one sector map a lidar geometry."""
+        task, beams = self.task, self.sources.beams(rows)
+        angles = [self.sources.numbers("scan", f"angle_{n}_rad") for n in ("min", "increment")]
+        geometry = np.stack([angles[0][rows], angles[1][rows], beams], axis=1)
+        clearance = np.full((len(rows), task.sectors), float(task.range_max_m))
+        kinds, kind = np.unique(geometry, axis=0, return_inverse=True)
+        for index, (first, increment, count) in enumerate(kinds):
+            if count == 0 or not np.isfinite(first + increment):
+                continue
+            bearings = first + increment * np.arange(int(count))
+            sector_map = SectorMap.build(bearings, task.sectors, task.body)
+            same = np.flatnonzero(kind == index)
+            for start in range(0, len(same), _CHUNK):
+                part = same[start : start + _CHUNK]
+                ranges = take(self.sources.column("scan", "ranges_m"), rows[part])
+                values = ranges.values if isinstance(ranges, Ragged) else ranges
+                table = np.asarray(values).reshape(len(part), int(count))
+                clearance[part] = sector_map.clearance(table, task.range_min_m, task.range_max_m)
+        return clearance
+
+    def _bumper(self) -> None:
+        bumped = [np.zeros(len(self.tick_ns), np.bool_)]
+        source = self.sources.present("bumper")
+        if source is not None:
+            self._required("bumper")
+            pressed = self.sources.numbers("bumper", "pressed") > 0
+            bumped = [
+                pressed_since(segment.topics[source.topic], pressed, ticks)
+                for segment, ticks in zip(self.segments, self.ticks, strict=True)
+            ]
+        self.signals["bumped"] = np.concatenate(bumped)
+
+    def _route(self) -> None:
+        held_goal = self._required("goal", route=True)
+        held_plan = self._required("plan", route=True)
+        axes = [self.sources.numbers("goal", axis) for axis in ("x_m", "y_m")]
+        goals, plans = np.stack(axes, axis=1), self.sources.plans
+        settings = self.profile.episodes
+        goal, plan = (np.where(held.known, held.row, -1) for held in (held_goal, held_plan))
+        if len(goals):
+            goal = np.where(goal >= 0, same_goals(goals, settings.goal_moved_m)[goal], -1)
+            sane = (np.abs(goals[goal]) <= LARGEST).all(axis=1)
+            self._blame((goal >= 0) & ~sane, "goal: not finite", route=True)
+        if len(plans):
+            problems = np.array(plan_problems(plans), object)[plan]
+            for reason in set(problems) - {""}:
+                self._blame((plan >= 0) & (problems == reason), reason, route=True)
+        usable = self.route_problem == ""
+        if usable.any():
+            away = np.linalg.norm(plan_ends(plans)[plan[usable]] - goals[goal[usable]], axis=-1)
+            other = np.zeros(len(usable), np.bool_)
+            other[usable] = away > settings.plan_goal_tolerance_m
+            self._blame(other, "plan: for another goal", route=True)
+        usable = self.route_problem == ""
+        self.routing = Routing(goals, plans, np.where(usable, goal, -1), np.where(usable, plan, -1))
+
+
+def pressed_since(bumper: Samples, pressed: Bools, tick_ns: Ints) -> Bools:
+    """Whether the bumper was pressed since the tick before (or is), (T,)."""
+    if not len(bumper.row) or not len(tick_ns):
+        return np.zeros(len(tick_ns), np.bool_)
+    counts = np.concatenate([[0], np.cumsum(pressed[bumper.row])])
+    upto = counts[np.searchsorted(bumper.stamp_ns, tick_ns, "right")]
+    since = np.diff(upto, prepend=upto[:1])
+    held = bumper.hold(tick_ns, None)
+    return (since > 0) | (pressed[held.row] & held.known)
+
+
+def parse_policy(text: str) -> tuple[str, str | None, float | None]:
+    """`{"policy": …, "version": …, "probability": …}`, or a bare name, to the three."""
+    try:
+        said = json.loads(text)
+    except json.JSONDecodeError:
+        return text.strip() or "unknown", None, None
+    if not isinstance(said, dict):
+        return str(said), None, None
+    version, probability = said.get("version"), said.get("probability")
+    return (
+        str(said.get("policy", "unknown")),
+        None if version is None else str(version),
+        float(probability) if isinstance(probability, int | float) else None,
+    )

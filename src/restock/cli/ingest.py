@@ -1,0 +1,198 @@
+"""`restock ingest`: recordings -> labelled Parquet transitions in a store."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from restock.errors import ConfigError, ExitCode, RecordingError, RestockError
+
+if TYPE_CHECKING:
+    from restock.ingest.pipeline import Outcome
+
+
+@dataclass
+class Ingest:
+    """Turn recordings into labelled transitions in a store, one atomic commit a recording.
+
+    PATH is an MCAP file, a rosbag2 folder or one of its files, a ROS 1 bag, a folder of many
+    recordings, or a quoted glob. A recording that is in the store already, as it would be put
+    there now, is left alone; one that has changed definitions replaces its old rows. A recording
+    that cannot be used is named on stderr, leaves the store as it was, and the others go on.
+
+    Exit codes: 0 all ingested (or unchanged), 2 nothing was written, 3 written, but a recording
+    failed or messages of the topics used were lost.
+    """
+
+    paths: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
+    """Recordings, folders of recordings, or globs."""
+    store: Path | None = None
+    """The store's folder; made where there is none. Needed unless --dry-run."""
+    profile: str = "warehouse_amr"
+    """How topics become signals: a profile that comes with Restock, or a TOML file."""
+    dry_run: bool = False
+    """Do all but write: say what would be."""
+    force: bool = False
+    """Ingest again what has not changed."""
+    salvage: bool = False
+    """Take what is whole of files that are cut short or damaged (exit code 3)."""
+    typestore: str | None = None
+    """Distribution whose message definitions serve recordings without their own (humble)."""
+    json: bool = False
+    """Print one JSON document: {"recordings": [{"path", "status", "transitions", …}]}."""
+
+    def run(self) -> int:
+        """Ingest each recording; the exit code for them all."""
+        from restock.cli import output
+        from restock.ingest.pipeline import ingest
+        from restock.ingest.profile import load_profile
+        from restock.ingest.store import StoreWriter
+
+        if not self.paths:
+            raise RecordingError("no path given", remedy="restock ingest PATH --store STORE")
+        if self.store is None and not self.dry_run:
+            raise ConfigError("no store given", remedy="say --store STORE, or --dry-run")
+        profile = load_profile(self.profile)
+        writer = None if self.dry_run or self.store is None else StoreWriter(self.store)
+        paths, failures = self._recordings()
+        outcomes: list[dict[str, Any]] = []
+        lossy = False
+        with output.progress("ingest", len(paths)) as advance:
+            for path in paths:
+                advance(0, path.name)
+                try:
+                    outcome = ingest(
+                        path,
+                        profile,
+                        store=writer,
+                        force=self.force,
+                        salvage=self.salvage,
+                        typestore=self.typestore,
+                    )
+                except RestockError as error:
+                    failures.append({"path": str(path), "status": "failed", "error": str(error)})
+                    sys.stderr.write(f"restock: {error}\n")
+                else:
+                    lossy |= outcome.lossy
+                    outcomes.append(as_json(outcome))
+                    if not self.json:
+                        show(outcome)
+                advance(1)
+        if writer is not None and outcomes:
+            writer.clean()
+        if self.json:
+            output.print_json({"recordings": outcomes + failures})
+        if not outcomes:
+            return ExitCode.USAGE
+        return ExitCode.LOSSY if failures or lossy else ExitCode.OK
+
+    def _recordings(self) -> tuple[list[Path], list[dict[str, Any]]]:
+        """The recordings of all paths, each once, and the paths that have none."""
+        from restock.ingest.readers import recordings_in
+
+        found: dict[Path, None] = {}
+        failures: list[dict[str, Any]] = []
+        for name in self.paths:
+            try:
+                found.update(dict.fromkeys(recordings_in(name)))
+            except RecordingError as error:
+                sys.stderr.write(f"restock: {error}\n")
+                failures.append({"path": name, "status": "failed", "error": str(error)})
+        return list(found), failures
+
+
+def as_json(outcome: Outcome) -> dict[str, Any]:
+    """An outcome as `--json` prints it."""
+    from restock.ingest.scores import GOOD
+
+    row = {
+        key: value
+        for key, value in outcome.manifest.items()
+        if key not in ("task_json", "conditions_json", "source_file", "label_scores")
+    }
+    messages = sum(topic["expected"] for topic in row["topics"])
+    return {
+        "path": outcome.path,
+        "status": outcome.status,
+        "version": outcome.version,
+        "messages": {
+            "expected": messages,
+            "decoded": sum(topic["decoded"] for topic in row["topics"]),
+        },
+        "conditions": outcome.conditions,
+        "label_scores": [
+            {**score, "good": None not in (p, r) and min(p, r) >= GOOD}
+            for score in outcome.manifest["label_scores"]
+            for p, r in [(score["precision"], score["recall"])]
+        ],
+        "losses": outcome.losses,
+        "notes": outcome.notes,
+        **row,
+    }
+
+
+def show(outcome: Outcome) -> None:
+    """One recording's counts, as tables on stdout."""
+    from restock.cli import output
+
+    row = outcome.manifest
+    console = output.stdout()
+    console.print(
+        f"{outcome.path}  {row['format']}  {row['duration_s']:.1f} s  "
+        f"recording {row['recording_id']}",
+        markup=False,
+        soft_wrap=True,
+    )
+    episodes = f"{_count(row['transitions'], 'transition')} in {_count(row['episodes'], 'episode')}"
+    if outcome.status == "unchanged":
+        console.print(f"unchanged: {episodes} are in the store already (--force does it again)\n")
+        return
+    into = f"{outcome.status}: {episodes}, profile {row['profile']} {row['profile_hash']}"
+    console.print(into + (f", store version {outcome.version}" if outcome.version else ""))
+    used = [
+        topic
+        for topic in row["topics"]
+        if topic["decoded"] or topic["reason"] != "not used by the profile"
+    ]
+    rest = len(row["topics"]) - len(used)
+    output.print_table(used, ["topic", "type", "expected", "decoded", "skipped", "reason"])
+    if rest:
+        unused = sum(t["expected"] for t in row["topics"] if t not in used)
+        console.print(f"{rest} further topics ({unused:,} messages) are not used by the profile")
+    scores = {score.condition: score for score in outcome.scores}
+    output.print_table(
+        [
+            {
+                "condition": name,
+                "transitions": count,
+                "share": count / max(row["transitions"], 1),
+                "precision": scores[name].precision if name in scores else None,
+                "recall": scores[name].recall if name in scores else None,
+                "truly": scores[name].support if name in scores else None,
+                "": scores[name].shortfall if name in scores else "",
+            }
+            for name, count in outcome.conditions.items()
+        ]
+    )
+    console.print(
+        f"{row['ticks']:,} ticks = {row['transitions']:,} transitions"
+        f" + {row['episode_ends']:,} episode ends"
+        f" + {sum(drop['count'] for drop in row['drops']):,} dropped"
+    )
+    if row["drops"]:
+        output.print_table([{"dropped": d["reason"], "ticks": d["count"]} for d in row["drops"]])
+    for item in row["stand_ins"]:
+        console.print(f"no {item['input']}: {item['instead']}", markup=False)
+    for note in outcome.notes:
+        console.print(note, markup=False, soft_wrap=True)
+    for loss in outcome.losses:
+        console.print(f"lost: {loss}", markup=False, soft_wrap=True)
+    console.print()
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
