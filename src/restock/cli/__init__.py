@@ -82,7 +82,13 @@ def _dispatch(args: list[str]) -> int:
 
     command = getattr(importlib.import_module(f"restock.cli.{verb}"), verb.capitalize())
     try:
-        parsed = tyro.cli(command, prog=f"restock {verb}", args=args[1:], use_underscores=False)
+        parsed = tyro.cli(
+            command,
+            prog=f"restock {verb}",
+            args=args[1:],
+            use_underscores=False,
+            config=(tyro.conf.FlagCreatePairsOff,),  # --json, without a --no-json beside it
+        )
     except SystemExit as stop:  # tyro has printed its help (0) or its complaint (2)
         return int(stop.code or 0) if isinstance(stop.code, int | None) else int(ExitCode.USAGE)
     code: int | None = parsed.run()
