@@ -81,7 +81,13 @@ def print_table(
         table.add_column(name, justify="right" if numeric else "left", overflow="fold")
     for row in rows:
         table.add_row(*(cell(row[name]) for name in names))
-    stdout().print(table)
+    console = stdout()
+    with console.capture() as captured:
+        console.print(table)
+    # rich pads every line to the table's width; a pipe has no use for that.
+    lines = captured.get().splitlines()
+    text = "\n".join(lines if sys.stdout.isatty() else [line.rstrip() for line in lines])
+    sys.stdout.write(text.strip("\n") + "\n")
 
 
 def cell(value: Any) -> str:
