@@ -1,0 +1,362 @@
+"""The training loop on a corridor: it learns, repeats itself, resumes bit for bit, and says what
+the critic was fed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+from toy_twin import CELLS, CONDITIONS, TASK, ToyTwin
+
+from restock.replay.layout import row_width
+from restock.train import checkpoint
+from restock.train.batches import Coded, Logs
+from restock.train.config import TrainConfig, parse_config
+from restock.train.learner import Learner
+from restock.train.loop import TrainingInterrupted, train
+from restock.train.run import Run
+from restock.train.run_tables import TABLES
+from restock.train.session import Session, open_session
+
+SMALL: dict[str, Any] = {
+    "network": {"hidden": [32, 32]},
+    "loss": {"discount": 0.9},
+    "optimizer": {"learning_rate": 3e-3},
+    "target": {"rule": "polyak", "tau": 0.05},
+    "replay": {"batch_size": 32, "ring_capacity": 2000},
+    "schedule": {"env_steps": 1600, "warmup_env_steps": 200, "offline_updates": 60},
+    "epsilon": {"start": 1.0, "end": 0.1, "steps": 800},
+    "env": {"num_envs": 4, "conditions": {"nominal": 0.5, "wheel_slip": 0.5}},
+    "evaluation": {"every_env_steps": 800, "episodes": 3},
+    "record": {
+        "every_updates": 50,
+        "audit_share": 0.1,
+        "probe_rows": 8,
+        "checkpoint_every_env_steps": 400,
+        "tensorboard": False,
+    },
+}
+CLOCKED = {"wall_s", "env_steps_per_s", "updates_per_s"}  # the only columns that time decides
+
+
+def config(**changes: Any) -> TrainConfig:
+    document = {**SMALL, **changes}
+    for key, value in changes.items():
+        if isinstance(value, dict) and isinstance(SMALL.get(key), dict) and "rule" not in value:
+            document[key] = {**SMALL[key], **value}
+    return parse_config(document, where="test")
+
+
+def logs(rows: int = 200) -> Logs:
+    """Logged steps of someone who mostly drives forward, a few of them slipping."""
+    rng = np.random.default_rng(0)
+    size = TASK.observation_size
+    packed = np.zeros((rows, row_width(size)), np.float32)
+    cell = rng.integers(CELLS - 1, size=rows)
+    action = rng.choice(3, size=rows, p=[0.1, 0.7, 0.2])
+    slips = (rng.random(rows) < 0.2) & (action == 1)
+    following = np.clip(cell + np.where(slips, 0, np.array([0, 1, -1])[action]), 0, CELLS - 1)
+    packed[np.arange(rows), cell] = 1
+    packed[np.arange(rows), size + following] = 1
+    arrived = following == CELLS - 1
+    packed[:, -3:] = np.stack([action, np.where(arrived, 1.0, -0.05), 0.9 * ~arrived], axis=1)
+    names = np.where(slips, "wheel_slip", "nominal")
+    return Logs(
+        rows=torch.from_numpy(packed),
+        strata=["nominal", "wheel_slip"],
+        timings=["pre", "post"],
+        stratum_rows=[np.flatnonzero(~slips), np.flatnonzero(slips)],
+        shares=np.array([0.75, 0.25]),
+        weights=None,
+        as_of_ns=10 * 86_400_000_000_000,
+        transition_id=np.arange(rows) + 1000,
+        stamp_ns=np.arange(rows, dtype=np.int64) * 86_400_000_000_000 // 100,
+        condition=Coded.of(pa.chunked_array([names.tolist()])),
+        behaviour_policy=Coded.of(pa.chunked_array([["planner", "operator"] * (rows // 2)])),
+        behaviour_version=Coded.of(pa.chunked_array([pa.nulls(rows, pa.string())])),
+        episode=Coded.of(pa.chunked_array([["a/0"] * rows])),
+    )
+
+
+def session(path: Path, settings: TrainConfig, *, resume: bool = False, **parts: Any) -> Session:
+    run = Run.open(path) if resume else Run.create(path, {})
+    return open_session(
+        run,
+        settings,
+        task=TASK,
+        conditions=CONDITIONS,
+        env=ToyTwin(settings.env.num_envs, settings.env.conditions),
+        evaluation_env=ToyTwin(3),
+        logs=parts.get("logs", logs()),
+        resume=resume,
+    )
+
+
+def run_to_end(path: Path, settings: TrainConfig, **parts: Any) -> Session:
+    live = session(path, settings, **parts)
+    train(live)
+    live.close()
+    return live
+
+
+def tables(path: Path) -> dict[str, pa.Table]:
+    return {
+        name: pq.read_table(path / f"{name}.parquet").drop_columns(
+            [column for column in schema.names if column in CLOCKED]
+        )
+        for name, schema in TABLES.items()
+    }
+
+
+def assert_same_run(first: Session, second: Session) -> None:
+    for a, b in (
+        (first.learner.network, second.learner.network),
+        (first.learner.target_network, second.learner.target_network),
+    ):
+        for name, value in a.state_dict().items():
+            assert torch.equal(value, b.state_dict()[name]), name
+    np.testing.assert_array_equal(first.ring.rows, second.ring.rows)
+    one, two = tables(first.run.path), tables(second.run.path)
+    for name in one:
+        assert one[name].equals(two[name]), name
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Session:
+    return run_to_end(tmp_path_factory.mktemp("runs") / "undisturbed", config())
+
+
+def test_the_corridor_is_solved_online_without_logs(tmp_path: Path) -> None:
+    live = run_to_end(tmp_path / "a", config(schedule={"env_steps": 6000}), logs=None)
+    assert live.best is not None
+    assert live.best.success == {"nominal": 1.0, "wheel_slip": 1.0}
+    # Forward is the best action of every cell, and the value of the last cell before the goal 1.
+    cells = np.zeros((CELLS - 1, TASK.observation_size), np.float32)
+    cells[np.arange(CELLS - 1), np.arange(CELLS - 1)] = 1
+    assert live.learner.greedy(cells).tolist() == [1] * (CELLS - 1)
+    assert live.learner.gradient_steps > 1000
+
+
+def test_offline_learning_alone_agrees_with_value_iteration(tmp_path: Path) -> None:
+    """Rows of a corridor that never slips: Q of the logged actions is known in closed form."""
+    shelf = logs(600)
+    keep = shelf.condition.codes == shelf.condition.names.index("nominal")
+    live = session(
+        tmp_path / "a",
+        config(schedule={"offline_updates": 3000, "env_steps": 0}),
+        logs=msgspec_replace(shelf, stratum_rows=[np.flatnonzero(keep)], shares=np.ones(1)),
+    )
+    train(live)
+    live.close()
+    value = np.zeros(CELLS)  # of the state; the last cell is terminal
+    for cell in range(CELLS - 2, -1, -1):
+        value[cell] = 1.0 if cell == CELLS - 2 else -0.05 + 0.9 * value[cell + 1]
+    cells = torch.zeros(CELLS - 1, TASK.observation_size)
+    cells[torch.arange(CELLS - 1), torch.arange(CELLS - 1)] = 1
+    q = live.learner.network(cells).detach().numpy()
+    back = np.array([-0.05 + 0.9 * value[max(cell - 1, 0)] for cell in range(CELLS - 1)])
+    stop = -0.05 + 0.9 * value[: CELLS - 1]
+    np.testing.assert_allclose(q, np.stack([stop, value[: CELLS - 1], back], axis=1), atol=0.04)
+
+
+def msgspec_replace(shelf: Logs, **changes: Any) -> Logs:
+    import dataclasses
+
+    return dataclasses.replace(shelf, strata=["nominal"], timings=["pre"], **changes)
+
+
+def test_the_same_seed_gives_the_same_run(undisturbed: Session, tmp_path: Path) -> None:
+    assert_same_run(undisturbed, run_to_end(tmp_path / "again", config()))
+
+
+def test_simulating_on_another_thread_changes_nothing(undisturbed: Session, tmp_path: Path) -> None:
+    assert_same_run(undisturbed, run_to_end(tmp_path / "alone", config(env={"overlap": False})))
+
+
+@pytest.mark.parametrize("calls", [20, 61, 150, 333])
+def test_interrupted_and_resumed_is_bit_exact(
+    undisturbed: Session, tmp_path: Path, calls: int
+) -> None:
+    asked = iter(range(calls))
+    path = tmp_path / "a"
+    live = session(path, config())
+    with pytest.raises(TrainingInterrupted, match="restock train --resume"):
+        train(live, stop=lambda: next(asked, None) is None)
+    live.close()
+
+    again = session(path, config(), resume=True)
+    train(again)
+    again.close()
+    assert_same_run(undisturbed, again)
+
+
+def test_killed_after_a_checkpoint_and_resumed_is_bit_exact(
+    undisturbed: Session, tmp_path: Path
+) -> None:
+    class Killed(Exception):
+        pass
+
+    path = tmp_path / "a"
+    live = session(path, config())
+    rows = iter(range(6))
+
+    def kill(event: str, values: dict[str, Any]) -> None:
+        if event == "progress" and next(rows, None) is None:
+            raise Killed
+
+    with pytest.raises(Killed):
+        train(live, notify=kill)
+    live.close()
+    assert 0 < checkpoint.load(live.run.latest)["clock"]["env_steps"] < live.clock.env_steps
+    again = session(path, config(), resume=True)
+    train(again)
+    again.close()
+    assert_same_run(undisturbed, again)
+
+
+def test_half_of_each_online_batch_is_from_logs_by_quota(undisturbed: Session) -> None:
+    strata = pq.read_table(undisturbed.run.path / "strata.parquet").to_pylist()
+    offline = [row for row in strata if row["phase"] == "offline"]
+    assert {row["source"] for row in offline} == {"logs"}
+    online = [row for row in strata if row["phase"] == "online"]
+    for clock in {row["gradient_steps"] for row in online}:
+        here = [row for row in online if row["gradient_steps"] == clock]
+        drawn = {
+            source: sum(row["drawn_rows"] for row in here if row["source"] == source)
+            for source in ("logs", "fresh")
+        }
+        assert drawn["logs"] == drawn["fresh"] > 0
+        slip = next(r for r in here if r["source"] == "logs" and r["stratum"] == "wheel_slip")
+        assert slip["drawn_share"] == pytest.approx(0.25, abs=1e-3)
+        assert slip["quota_share"] == 0.25
+        assert slip["timing"] == "post"
+
+
+def test_every_drawn_row_is_counted(undisturbed: Session) -> None:
+    path = undisturbed.run.path
+    steps = undisturbed.learner.gradient_steps
+    drawn = pq.read_table(path / "strata.parquet")
+    assert sum(drawn["drawn_rows"].to_pylist()) == steps * 32
+    last = {(row["source"], row["stratum"]): row["total_drawn_rows"] for row in drawn.to_pylist()}
+    assert sum(last.values()) == steps * 32
+    assert sum(pq.read_table(path / "policies.parquet")["rows"].to_pylist()) == steps * 32
+    ages = pq.read_table(path / "ages.parquet").to_pylist()
+    by_unit = {
+        unit: sum(r["count"] for r in ages if r["unit"] == unit) for unit in ("days", "env_steps")
+    }
+    assert sum(by_unit.values()) == steps * 32
+    assert sum(pq.read_table(path / "progress.parquet")["updates"].to_pylist()) == steps
+
+
+def test_audit_rows_hold_what_the_row_was(undisturbed: Session) -> None:
+    audit = pq.read_table(undisturbed.run.path / "audit.parquet").to_pylist()
+    batches = {row["gradient_step"] for row in audit}
+    assert len(audit) == 32 * len(batches)
+    assert 0.05 < len(batches) / undisturbed.learner.gradient_steps < 0.2
+    shelf = logs()
+    for row in audit:
+        assert row["last_target_sync"] == row["gradient_step"] - 1  # Polyak: after every update
+        if row["source"] == "logs":
+            packed = shelf.rows[row["transition_id"] - 1000]
+            assert row["action"] == int(packed[-3])
+            assert row["reward"] == pytest.approx(float(packed[-2]))
+            assert row["behaviour_policy"] in ("planner", "operator")
+            stamp = shelf.stamp_ns[row["transition_id"] - 1000] / 86_400e9
+            assert row["age_days"] == pytest.approx(10 - stamp)
+        else:
+            assert row["behaviour_policy"] == "dqn"
+            assert row["age_env_steps"] >= 0
+            assert row["age_gradient_steps"] >= 0
+            assert row["ring_slot"] is not None
+
+
+def test_finished_episodes_are_labelled_in_the_ring(undisturbed: Session) -> None:
+    episodes = pq.read_table(undisturbed.run.path / "episodes.parquet").to_pylist()
+    slipping = [row for row in episodes if row["true_condition"] == "wheel_slip"]
+    assert slipping
+    assert not any("wheel_slip" in r["conditions"] for r in episodes if r not in slipping)
+    assert sum("wheel_slip" in row["conditions"] for row in slipping) > 0.8 * len(slipping)
+    ring = undisturbed.ring
+    names = ring.conditions
+    slip_rows = ring.rows[: len(ring)][
+        ring.condition(np.arange(len(ring))) == names.index("wheel_slip")
+    ]
+    # Only a forward command can slip, and a slipping robot is where it was.
+    assert len(slip_rows)
+    assert set(slip_rows[:, -3].tolist()) == {1.0}
+
+
+def test_the_run_says_its_target_rule_and_lag(undisturbed: Session, tmp_path: Path) -> None:
+    progress = pq.read_table(undisturbed.run.path / "progress.parquet").to_pylist()
+    learning = [row for row in progress if row["updates"]]
+    assert {row["target_rule"] for row in learning} == {"polyak tau 0.05"}
+    assert all(row["target_param_distance"] > 0 and row["target_q_lag"] > 0 for row in learning)
+    assert {row["steps_since_sync"] for row in learning} == {0}
+    probe = pq.read_table(undisturbed.run.path / "probe.parquet").to_pylist()
+    assert {row["condition"] for row in probe} == {"nominal", "wheel_slip"}
+    assert len({row["probe_hash"] for row in probe}) == 1
+
+    hard = run_to_end(tmp_path / "hard", config(target={"rule": "hard", "every": 25}))
+    rows = pq.read_table(hard.run.path / "progress.parquet").to_pylist()
+    full = [row for row in rows if row["updates"] == 50]
+    # Every interval ends on a sync, where the distance is 0: what is logged is from just before.
+    assert {row["target_sampled"] for row in full} == {"before_sync"}
+    assert all(row["target_param_distance"] > 0 and row["target_q_lag"] > 0 for row in full)
+    assert {row["steps_since_sync"] for row in full} == {0}
+
+
+def test_the_best_checkpoint_is_by_evaluation_not_the_last(undisturbed: Session) -> None:
+    best = checkpoint.load(undisturbed.run.best)
+    rows = pq.read_table(undisturbed.run.path / "evaluations.parquet").to_pylist()
+    marked = {row["env_steps"] for row in rows if row["best"]}
+    assert best["env_steps"] == max(marked)
+    means = {
+        step: np.mean([row["success"] for row in rows if row["env_steps"] == step])
+        for step in {row["env_steps"] for row in rows}
+    }
+    assert means[best["env_steps"]] == max(means.values())
+    assert {row["episode_seed"] for row in rows} == {90_000, 90_001, 90_002}
+
+
+def test_warmup_collects_without_learning(tmp_path: Path) -> None:
+    live = run_to_end(
+        tmp_path / "a", config(schedule={"env_steps": 400, "warmup_env_steps": 400}), logs=None
+    )
+    assert live.learner.gradient_steps == 0
+    assert len(live.ring) > 300
+
+
+def test_updates_keep_the_asked_ratio(undisturbed: Session) -> None:
+    clock = undisturbed.clock
+    assert clock.online_from == 200
+    assert clock.online_updates == int((clock.env_steps - 200) * 0.25)
+    assert undisturbed.learner.gradient_steps == 60 + clock.online_updates
+
+
+def test_a_learner_fits_a_batch_it_sees_again_and_again() -> None:
+    learner = Learner(config(), TASK.observation_size, 3)
+    rows = logs().rows[:32].clone()
+    rows[:, -1] = 0  # terminal: the target is the reward
+    for _ in range(400):
+        loss = learner.update(rows)
+    assert float(loss.td.abs().max()) < 0.9
+    expected = rows[:, -2]
+    td, q, _ = learner.td_error(rows)
+    chosen = q.gather(1, rows[:, -3:-2].long()).squeeze(1)
+    assert torch.allclose(td, chosen - expected, atol=1e-5)
+
+
+def test_the_config_refuses_unknown_keys_with_their_path() -> None:
+    from restock.errors import ConfigError
+
+    with pytest.raises(ConfigError, match=r"unknown field `taw`.*target"):
+        parse_config({"target": {"rule": "polyak", "taw": 1}}, where="x.toml")
+    with pytest.raises(ConfigError, match=r"logs_share must be in \[0, 1\], got 2"):
+        parse_config({"replay": {"logs_share": 2.0}}, where="x.toml")
+    assert msgspec.to_builtins(TrainConfig())["target"] == {"rule": "polyak", "tau": 0.005}

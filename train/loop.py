@@ -1,0 +1,273 @@
+"""The training loop: offline on the logs, then online in the twin on logs and fresh experience.
+
+Double DQN (arXiv:1509.06461) with n-step returns and half of each online batch from logs (RLPD,
+arXiv:2302.02948), after an offline phase on the logs and warm-up rollouts without updates (WSRL,
+arXiv:2412.07762). Read `train` from top to bottom: it is the whole of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from restock.errors import ExitCode, RestockError
+from restock.train.batches import Batch
+from restock.train.evaluate import (
+    GreedyPolicy,
+    Score,
+    fixed_episodes,
+    run_episodes,
+    score,
+)
+from restock.train.explore import epsilon_greedy
+from restock.train.probe import Probe
+from restock.train.session import Interval, Session
+from restock.train.target import Hard
+
+Notify = Callable[[str, dict[str, Any]], None]  # an event's name ("progress", "evaluation"), values
+
+
+class TrainingInterrupted(RestockError):
+    """Ctrl-C; a checkpoint was written."""
+
+    exit_code = ExitCode.INTERRUPTED
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended."""
+
+    env_steps: int
+    gradient_steps: int
+    wall_s: float
+    best: Score | None
+    last: Score | None
+
+
+def train(
+    session: Session,
+    *,
+    stop: Callable[[], bool] = lambda: False,
+    notify: Notify = lambda event, values: None,
+) -> Outcome:
+    """Run a session to the end of its budget.
+
+    Args:
+        stop: asked between steps; True ends the run with a checkpoint.
+        notify: told of every row of `progress` and every evaluation.
+
+    Raises:
+        TrainingInterrupted: `stop` said so.
+    """
+    config, clock, learner = session.config, session.clock, session.learner
+    schedule, epsilon_at = config.schedule, config.epsilon.at
+    offline_updates = schedule.offline_updates if session.logs is not None else 0
+
+    # 1. Offline: the logs alone.
+    while learner.gradient_steps < offline_updates and _time_left(session):
+        _interrupt(session, stop)
+        _update(session, session.batches.draw_offline(), "offline", notify)
+    if clock.evaluated_at < 0 and offline_updates:
+        _evaluate(session, notify)
+
+    while clock.env_steps < schedule.env_steps and _time_left(session):
+        _interrupt(session, stop)
+        # 2. Warm-up: the offline policy drives, and nothing is learnt from its rows yet.
+        warm = clock.env_steps >= schedule.warmup_env_steps
+        if clock.online_from is None and warm and len(session.ring) >= config.replay.batch_size:
+            clock.online_from = clock.env_steps
+            _close_interval(session, "warmup", notify)
+
+        # 3. Act, epsilon-greedy; the twin steps on its own thread …
+        greedy = learner.greedy(session.collector.observation)
+        epsilon = epsilon_at(clock.env_steps)
+        action, probability = epsilon_greedy(
+            greedy, learner.network.actions, epsilon, session.exploration
+        )
+        acting_step = learner.gradient_steps
+        session.collector.start(action, probability)
+
+        # 4. … while the learner learns from what the ring held before this step.
+        for _ in range(_updates_due(session)):
+            _update(session, session.batches.draw_online(), "online", notify)
+            clock.online_updates += 1
+
+        # 5. The step's transitions go into the ring; ended episodes get their labels.
+        ended = session.collector.finish(
+            env_steps=clock.env_steps,
+            gradient_steps=learner.gradient_steps,
+            acting_step=acting_step,
+        )
+        clock.env_steps += session.env.num_envs
+        for episode in ended:
+            session.interval.episodes += 1
+            session.interval.successes += episode.success
+            session.interval.returns += episode.undiscounted_return
+        session.run.append("episodes", session.collector.label())
+
+        # 6. Every so often: the fixed episodes, greedily; and a checkpoint.
+        if clock.env_steps - max(clock.evaluated_at, 0) >= config.evaluation.every_env_steps:
+            _evaluate(session, notify)
+        if (
+            clock.env_steps - clock.checkpointed_at >= config.record.checkpoint_every_env_steps
+            and clock.env_steps < schedule.env_steps
+        ):
+            session.save()
+
+    session.run.append("episodes", session.collector.label(all_of_them=True))
+    if session.interval.updates or clock.env_steps > session.interval.env_steps_before:
+        _close_interval(session, "warmup" if clock.online_from is None else "online", notify)
+    if clock.evaluated_at != clock.env_steps:
+        _evaluate(session, notify)
+    session.save()
+    return Outcome(
+        clock.env_steps, learner.gradient_steps, session.wall_s, session.best, session.last
+    )
+
+
+def _updates_due(session: Session) -> int:
+    clock = session.clock
+    if clock.online_from is None:
+        return 0
+    collected = clock.env_steps + session.env.num_envs - clock.online_from
+    return int(collected * session.config.schedule.updates_per_env_step) - clock.online_updates
+
+
+def _update(session: Session, batch: Batch, phase: str, notify: Notify) -> None:
+    """One gradient step, its record, and the target's clock."""
+    learner, interval = session.learner, session.interval
+    loss = learner.update(
+        batch.rows,
+        weight=batch.weight,
+        logged=batch.logged,
+        conservative=_conservative_weight(session, phase),
+    )
+    step = learner.gradient_steps
+    session.feed.batch(step, session.clock.env_steps, batch, loss, learner.target.last_sync)
+    interval.updates += 1
+    interval.loss += float(loss.value.detach())
+    every = session.config.record.every_updates
+    rule = learner.target.rule
+    last_of_interval = (step - 1) // every != (step - 1 + getattr(rule, "every", 1)) // every
+    if isinstance(rule, Hard) and rule.syncs_at(step) and last_of_interval:
+        # At a hard sync the distance is 0 by definition: what it was just before is what counts.
+        interval.distance_before_sync = learner.target.distance()
+        if session.probe is not None:
+            interval.lag_before_sync = session.probe.measure(learner)[1]
+    learner.target.after(step)
+    if step % every == 0:
+        _close_interval(session, phase, notify)
+
+
+def _conservative_weight(session: Session, phase: str) -> float:
+    """The CQL term's weight: constant offline, then linear to its online end."""
+    loss, schedule, clock = session.config.loss, session.config.schedule, session.clock
+    if phase == "offline" or clock.online_from is None:
+        return loss.conservative
+    part = (clock.env_steps - clock.online_from) / max(schedule.env_steps - clock.online_from, 1)
+    return loss.conservative + min(part, 1.0) * (loss.conservative_online - loss.conservative)
+
+
+def _close_interval(session: Session, phase: str, notify: Notify) -> None:
+    """One row of `progress`, with the feed's sums and the probe's measures."""
+    clock, learner, interval = session.clock, session.learner, session.interval
+    clocks = {"env_steps": clock.env_steps, "gradient_steps": learner.gradient_steps}
+    means = session.feed.flush(clock.env_steps, learner.gradient_steps, phase)
+    if session.probe is None and phase == "online":
+        session.probe = Probe.of_ring(session.ring, session.config.record.probe_rows)
+    lag = None
+    if session.probe is not None:
+        measured, lag = session.probe.measure(learner)
+        session.run.append("probe", [{**clocks, **row} for row in measured])
+    before_sync = interval.distance_before_sync is not None
+    wall_s = session.wall_s
+    elapsed_s = max(wall_s - interval.wall_s_before, 1e-9)
+    steps = clock.env_steps - interval.env_steps_before
+    episodes = interval.episodes
+    row = {
+        **clocks,
+        **means,
+        "wall_s": wall_s,
+        "phase": phase,
+        "updates": interval.updates,
+        "loss": interval.loss / interval.updates if interval.updates else None,
+        "epsilon": session.config.epsilon.at(clock.env_steps) if phase != "offline" else None,
+        "target_rule": str(learner.target.rule),
+        "target_param_distance": interval.distance_before_sync
+        if before_sync
+        else learner.target.distance(),
+        "target_q_lag": interval.lag_before_sync if before_sync else lag,
+        "target_sampled": "before_sync" if before_sync else "now",
+        "last_sync": learner.target.last_sync,
+        "steps_since_sync": learner.gradient_steps - learner.target.last_sync,
+        "ring_rows": len(session.ring),
+        "episodes": episodes,
+        "success": interval.successes / episodes if episodes else None,
+        "return_mean": interval.returns / episodes if episodes else None,
+        "env_steps_per_s": steps / elapsed_s,
+        "updates_per_s": interval.updates / elapsed_s,
+    }
+    session.run.append("progress", [row])
+    session.run.flush()
+    session.events.scalars(clock.env_steps, "train", row)
+    session.interval = Interval(env_steps_before=clock.env_steps, wall_s_before=wall_s)
+    notify("progress", row)
+
+
+def _evaluate(session: Session, notify: Notify) -> None:
+    """The fixed episodes, greedily; the policy is kept if it is the best so far."""
+    config, clock, learner = session.config, session.clock, session.learner
+    names = [name for name, share in config.env.conditions.items() if share > 0]
+    specs = fixed_episodes(names, config.evaluation.episodes, config.evaluation.seed)
+    results = run_episodes(
+        session.evaluation_env,
+        GreedyPolicy(learner.network),
+        specs,
+        control_period_s=session.task.control_period_s,
+        time_limit_steps=session.task.time_limit_steps,
+    )
+    clock.evaluated_at = clock.env_steps
+    session.last = score(results)
+    best = session.last.beats(session.best)
+    if best:
+        session.best = session.last
+        session.save_best(session.last)
+    session.run.append(
+        "evaluations",
+        [
+            {
+                "env_steps": clock.env_steps,
+                "gradient_steps": learner.gradient_steps,
+                "condition": result.condition,
+                "block": result.block,
+                "episode_seed": result.episode_seed,
+                "success": result.success,
+                "bumps": result.bumps,
+                "time_s": result.time_s,
+                "return": result.undiscounted_return,
+                "best": best,
+            }
+            for result in results
+        ],
+    )
+    session.run.flush()
+    summary = {**session.last.success, "mean": session.last.success_mean}
+    session.events.scalars(clock.env_steps, "evaluation", summary)
+    notify("evaluation", {"env_steps": clock.env_steps, "best": best, **summary})
+
+
+def _time_left(session: Session) -> bool:
+    seconds = session.config.schedule.seconds
+    return seconds is None or session.wall_s < seconds
+
+
+def _interrupt(session: Session, stop: Callable[[], bool]) -> None:
+    if stop():
+        session.save()
+        raise TrainingInterrupted(
+            f"interrupted after {session.clock.env_steps:,} environment steps and"
+            f" {session.learner.gradient_steps:,} updates; a checkpoint was written",
+            where=str(session.run.path),
+            remedy=f"go on with `restock train --resume {session.run.path}`",
+        )

@@ -1,0 +1,300 @@
+"""What the critic was fed: exact sums over every batch, and every row of a seeded few.
+
+A batch's rows, strata, TD errors and values are kept as they are drawn (no statistics inside the
+update loop) and summed once an interval. The sums go to the run's tables `strata`, `ages` and
+`policies`; the rows of audited batches to `audit`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.replay.ring import FreshRing
+from restock.train.batches import Batch, Logs
+from restock.train.checkpoint import generator_state, restore_generator
+from restock.train.loss import Loss
+from restock.train.run import Run
+
+UNLABELLED = "unlabelled"
+_NS_PER_DAY = 86_400e9
+
+
+class FeedRecord:
+    """Records the batches of a run.
+
+    Args:
+        audit_share: of all batches, chosen by `seed`.
+    """
+
+    def __init__(
+        self,
+        run: Run,
+        logs: Logs | None,
+        ring: FreshRing,
+        *,
+        audit_share: float,
+        seed: int,
+    ) -> None:
+        self.run, self.logs, self.ring = run, logs, ring
+        self.audit_share = audit_share
+        self._rng = np.random.default_rng([seed, 4])
+        self._age_days = (
+            np.maximum(logs.as_of_ns - logs.stamp_ns, 0) / _NS_PER_DAY if logs is not None else None
+        )
+        self._fresh_strata = [*ring.conditions, UNLABELLED]
+        self._drawn: dict[str, int] = {}  # "source/stratum" -> rows since the run began
+        self._kept: dict[str, list[NDArray[Any]]] = {}
+
+    def batch(self, step: int, env_steps: int, batch: Batch, loss: Loss, last_sync: int) -> None:
+        """Keep the batch of gradient step `step` (from 1), and its audit rows if it is chosen."""
+        ring, slots, logged = self.ring, batch.slots, batch.logged
+        tail = batch.rows[:, -2:].cpu().numpy().copy()  # reward, discount
+        td, q = loss.td.cpu().numpy(), loss.q.cpu().numpy()
+        weight = (
+            np.ones(len(td), np.float32) if batch.weight is None else batch.weight.cpu().numpy()
+        )
+        code = ring.condition(slots) if len(slots) else np.empty(0, np.int16)
+        meta = ring.meta
+        columns = {
+            "log_row": batch.log_rows,
+            "log_stratum": batch.log_stratum,
+            "fresh_stratum": np.where(code < 0, len(ring.conditions), code),
+            "fresh_key": (meta["episode"][slots] << 20) | meta["episode_step"][slots],
+            "fresh_policy": meta["behaviour_policy"][slots],
+            "age_env_steps": env_steps - meta["env_step"][slots],
+            "age_gradient_steps": step - meta["gradient_step"][slots],
+        }
+        both = {"td": td, "q": q, "weight": weight, "reward": tail[:, 0], "discount": tail[:, 1]}
+        columns |= {f"log_{name}": values[:logged] for name, values in both.items()}
+        columns |= {f"fresh_{name}": values[logged:] for name, values in both.items()}
+        for name, values in columns.items():
+            self._kept.setdefault(name, []).append(values)
+        if self._rng.random() < self.audit_share:
+            self._audit(step, batch, columns, last_sync)
+
+    def flush(self, env_steps: int, gradient_steps: int, phase: str) -> dict[str, float | None]:
+        """Write the interval's sums; returns its means, for `progress`."""
+        clocks = {"env_steps": env_steps, "gradient_steps": gradient_steps}
+        kept = {name: np.concatenate(parts) for name, parts in self._kept.items()}
+        self._kept = {}
+        if not kept:
+            return dict.fromkeys(
+                ("td_abs_mean", "q_mean", "q_abs_max", "reward_mean", "logs_share")
+            )
+        if self.logs is not None and len(kept["log_row"]):
+            self._log_tables(kept, clocks, phase, self.logs)
+        if len(kept["fresh_stratum"]):
+            self._fresh_tables(kept, clocks, phase)
+        td = np.concatenate([kept["log_td"], kept["fresh_td"]])
+        q = np.concatenate([kept["log_q"], kept["fresh_q"]])
+        reward = np.concatenate([kept["log_reward"], kept["fresh_reward"]])
+        return {
+            "td_abs_mean": float(np.abs(td).mean()),
+            "q_mean": float(q.mean()),
+            "q_abs_max": float(np.abs(q).max()),
+            "reward_mean": float(reward.mean()),
+            "logs_share": len(kept["log_row"]) / len(td),
+        }
+
+    def _log_tables(
+        self, kept: dict[str, NDArray[Any]], clocks: dict[str, int], phase: str, logs: Logs
+    ) -> None:
+        available = np.array([len(rows) for rows in logs.stratum_rows])
+        self._strata(
+            "logs",
+            logs.strata,
+            kept["log_stratum"],
+            kept["log_row"],
+            {name: kept[f"log_{name}"] for name in ("td", "q", "weight", "reward", "discount")},
+            available,
+            {**clocks, "phase": phase},
+            timing=logs.timings,
+            quota=list(logs.shares),
+        )
+        if self._age_days is not None:
+            self._ages("logs", "days", self._age_days[kept["log_row"]], clocks)
+        policy = logs.behaviour_policy
+        counts = np.bincount(policy.codes[kept["log_row"]], minlength=len(policy.names))
+        self._policies("logs", policy.names, counts, clocks)
+
+    def _fresh_tables(
+        self, kept: dict[str, NDArray[Any]], clocks: dict[str, int], phase: str
+    ) -> None:
+        ring, names = self.ring, self._fresh_strata
+        labelled = ring.strata.counts
+        self._strata(
+            "fresh",
+            names,
+            kept["fresh_stratum"],
+            kept["fresh_key"],
+            {name: kept[f"fresh_{name}"] for name in ("td", "q", "weight", "reward", "discount")},
+            np.append(labelled, len(ring) - labelled.sum()),
+            {**clocks, "phase": phase},
+            timing=[None] * len(names),
+            quota=[None] * len(names),
+        )
+        for unit in ("env_steps", "gradient_steps"):
+            self._ages("fresh", unit, kept[f"age_{unit}"].astype(np.float64), clocks)
+        counts = np.bincount(kept["fresh_policy"], minlength=len(ring.behaviour_policies))
+        self._policies("fresh", ring.behaviour_policies, counts, clocks)
+
+    def _strata(
+        self,
+        source: str,
+        names: list[str],
+        stratum: NDArray[Any],
+        row: NDArray[Any],
+        values: dict[str, NDArray[Any]],
+        available: NDArray[Any],
+        clocks: dict[str, Any],
+        *,
+        timing: list[Any],
+        quota: list[Any],
+    ) -> None:
+        size = len(names)
+        drawn = np.bincount(stratum, minlength=size)
+        weight = np.bincount(stratum, values["weight"], minlength=size)
+        first = np.unique(row, return_index=True)[1]
+        unique = np.bincount(stratum[first], minlength=size)
+        of_drawn = np.maximum(drawn, 1)
+        means = {
+            "td_abs_mean": np.bincount(stratum, np.abs(values["td"]), minlength=size) / of_drawn,
+            "q_mean": np.bincount(stratum, values["q"], minlength=size) / of_drawn,
+            "reward_mean": np.bincount(stratum, values["reward"], minlength=size) / of_drawn,
+            "terminal_share": np.bincount(stratum, values["discount"] == 0, minlength=size)
+            / of_drawn,
+        }
+        rows = []
+        for index, name in enumerate(names):
+            key = f"{source}/{name}"
+            self._drawn[key] = self._drawn.get(key, 0) + int(drawn[index])
+            seen = bool(drawn[index])
+            rows.append(
+                {
+                    **clocks,
+                    "source": source,
+                    "stratum": name,
+                    "timing": timing[index],
+                    "quota_share": quota[index],
+                    "available_rows": int(available[index]),
+                    "available_share": float(available[index] / max(available.sum(), 1)),
+                    "drawn_rows": int(drawn[index]),
+                    "drawn_share": float(drawn[index] / len(stratum)),
+                    "effective_share": float(weight[index] / max(weight.sum(), 1e-12)),
+                    "unique_rows": int(unique[index]),
+                    "replays_per_row": float(drawn[index] / unique[index]) if seen else None,
+                    "total_drawn_rows": self._drawn[key],
+                    **{k: float(v[index]) if seen else None for k, v in means.items()},
+                }
+            )
+        self.run.append("strata", rows)
+
+    def _ages(
+        self, source: str, unit: str, age: NDArray[np.float64], clocks: dict[str, int]
+    ) -> None:
+        bucket = np.where(age < 1, -1, np.floor(np.log2(np.maximum(age, 1)))).astype(np.int32)
+        buckets, counts = np.unique(bucket, return_counts=True)
+        p50, p90, p99 = (float(value) for value in np.quantile(age, [0.5, 0.9, 0.99]))
+        self.run.append_columns(
+            "ages",
+            {
+                **clocks,
+                "source": source,
+                "unit": unit,
+                "bucket": buckets,
+                "count": counts,
+                "p50": p50,
+                "p90": p90,
+                "p99": p99,
+            },
+        )
+
+    def _policies(
+        self, source: str, names: Any, counts: NDArray[Any], clocks: dict[str, int]
+    ) -> None:
+        rows = [
+            {**clocks, "source": source, "behaviour_policy": name, "rows": int(count)}
+            for name, count in zip(names, counts, strict=True)
+            if count
+        ]
+        self.run.append("policies", rows)
+
+    def _audit(
+        self, step: int, batch: Batch, columns: Mapping[str, NDArray[Any]], last_sync: int
+    ) -> None:
+        packed = batch.rows.cpu().numpy()
+        action = packed[:, -3].astype(np.int16)
+        hashes = [hashlib.blake2b(row.tobytes(), digest_size=8).hexdigest() for row in packed]
+        rows: list[dict[str, Any]] = []
+        for place in range(len(packed)):
+            logged = place < batch.logged
+            side, at = ("log", place) if logged else ("fresh", place - batch.logged)
+            own = self._log_row(columns, at) if logged else self._fresh_row(batch, columns, at)
+            rows.append(
+                {
+                    "gradient_step": step,
+                    "batch_row": place,
+                    **own,
+                    "action": int(action[place]),
+                    **{
+                        name: float(columns[f"{side}_{name}"][at])
+                        for name in ("reward", "discount", "weight", "q", "td")
+                    },
+                    "last_target_sync": last_sync,
+                    "row_hash": hashes[place],
+                }
+            )
+        self.run.append("audit", rows)
+
+    def _log_row(self, columns: Mapping[str, NDArray[Any]], at: int) -> dict[str, Any]:
+        logs, row = self.logs, int(columns["log_row"][at])
+        if logs is None or self._age_days is None:
+            raise RuntimeError("a batch of logs without logs")
+        return {
+            "source": "logs",
+            "transition_id": int(logs.transition_id[row]),
+            "ring_slot": None,
+            "episode": logs.episode.name(row),
+            "age_days": float(self._age_days[row]),
+            "age_env_steps": None,
+            "age_gradient_steps": None,
+            "stratum": logs.strata[columns["log_stratum"][at]],
+            "condition": logs.condition.name(row),
+            "behaviour_policy": logs.behaviour_policy.name(row),
+            "behaviour_version": logs.behaviour_version.name(row),
+        }
+
+    def _fresh_row(
+        self, batch: Batch, columns: Mapping[str, NDArray[Any]], at: int
+    ) -> dict[str, Any]:
+        ring, slot = self.ring, int(batch.slots[at])
+        stratum = self._fresh_strata[columns["fresh_stratum"][at]]
+        return {
+            "source": "fresh",
+            "transition_id": None,
+            "ring_slot": slot,
+            "episode": str(int(ring.meta["episode"][slot])),
+            "age_days": None,
+            "age_env_steps": int(columns["age_env_steps"][at]),
+            "age_gradient_steps": int(columns["age_gradient_steps"][at]),
+            "stratum": stratum,
+            "condition": None if stratum == UNLABELLED else stratum,
+            "behaviour_policy": ring.behaviour_policies[columns["fresh_policy"][at]],
+            "behaviour_version": str(int(ring.meta["policy_version"][slot])),
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """Arrays and JSON values: the totals, the audit's generator and the open interval."""
+        kept = {name: np.concatenate(parts) for name, parts in self._kept.items()}
+        return {"rng": generator_state(self._rng), "drawn": dict(self._drawn), "kept": kept}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Puts the record where `state_dict` found it."""
+        restore_generator(self._rng, state["rng"])
+        self._drawn = {name: int(count) for name, count in state["drawn"].items()}
+        self._kept = {name: [values] for name, values in state["kept"].items()}

@@ -1,0 +1,212 @@
+"""All that is alive in a training run: its parts, its clocks, and how they are saved and restored.
+
+Every random draw comes from a generator that belongs to one of the parts, and every part is in the
+checkpoint, so a run that is resumed goes on exactly as it would have.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+import torch
+
+from restock.ingest.conditions import Condition
+from restock.ingest.task import Task
+from restock.replay.ring import FreshRing
+from restock.train import checkpoint
+from restock.train.batches import Batches, Logs
+from restock.train.collector import Collector, ring_conditions
+from restock.train.config import TrainConfig
+from restock.train.evaluate import Score, Twin
+from restock.train.events import Events
+from restock.train.learner import Learner
+from restock.train.probe import Probe
+from restock.train.record import FeedRecord
+from restock.train.run import Run
+
+
+@dataclass
+class Clock:
+    """Where the run is. Gradient steps are the learner's."""
+
+    env_steps: int = 0
+    online_from: int | None = None  # environment steps when online updates began
+    online_updates: int = 0
+    evaluated_at: int = -1  # environment steps of the last evaluation
+    checkpointed_at: int = 0
+    wall_s: float = 0.0  # of training, before this process
+
+
+@dataclass
+class Interval:
+    """Sums since the last row of `progress`."""
+
+    updates: int = 0
+    loss: float = 0.0
+    episodes: int = 0
+    successes: int = 0
+    returns: float = 0.0
+    env_steps_before: int = 0
+    wall_s_before: float = 0.0
+    lag_before_sync: float | None = None
+    distance_before_sync: float | None = None
+
+
+@dataclass
+class Session:
+    """The parts of one run. `open_session` puts them together."""
+
+    run: Run
+    config: TrainConfig
+    task: Task
+    env: Twin
+    evaluation_env: Twin
+    learner: Learner
+    ring: FreshRing
+    batches: Batches
+    collector: Collector
+    feed: FeedRecord
+    events: Events
+    probe: Probe | None
+    exploration: np.random.Generator
+    executor: ThreadPoolExecutor | None
+    logs: Logs | None
+    clock: Clock = field(default_factory=Clock)
+    interval: Interval = field(default_factory=Interval)
+    best: Score | None = None
+    last: Score | None = None
+    _started: float = field(default_factory=time.monotonic)
+
+    @property
+    def wall_s(self) -> float:
+        """Seconds of training, over all processes of the run."""
+        return self.clock.wall_s + time.monotonic() - self._started
+
+    def save(self) -> None:
+        """Write all state to the run's latest checkpoint, and the tables to match it."""
+        self.clock.checkpointed_at = self.clock.env_steps
+        self.run.flush()
+        self.events.flush()
+        clock = asdict(self.clock) | {"wall_s": self.wall_s}
+        checkpoint.save(
+            self.run.latest,
+            {
+                "clock": clock,
+                "interval": asdict(self.interval),
+                "best": asdict(self.best) if self.best else None,
+                "last": asdict(self.last) if self.last else None,
+                "learner": self.learner.state_dict(),
+                "batches": self.batches.state_dict(),
+                "ring": self.ring.state_dict(),
+                "collector": self.collector.state_dict(),
+                "env": self.env.get_state(),
+                "feed": self.feed.state_dict(),
+                "probe": self.probe.state_dict() if self.probe else None,
+                "exploration": checkpoint.generator_state(self.exploration),
+                "tables": self.run.row_counts(),
+            },
+        )
+
+    def restore(self) -> None:
+        """Go on from the run's latest checkpoint."""
+        state = checkpoint.load(self.run.latest)
+        self.clock = Clock(**state["clock"])
+        self.interval = Interval(**state["interval"])
+        self.best = Score(**state["best"]) if state["best"] else None
+        self.last = Score(**state["last"]) if state["last"] else None
+        self.learner.load_state_dict(state["learner"])
+        self.batches.load_state_dict(state["batches"])
+        self.ring.load_state_dict(state["ring"])
+        self.env.set_state(state["env"])
+        self.collector.load_state_dict(state["collector"])
+        self.feed.load_state_dict(state["feed"])
+        self.probe = Probe.from_state(state["probe"]) if state["probe"] else None
+        checkpoint.restore_generator(self.exploration, state["exploration"])
+        self.run.truncate(state["tables"])
+        self._started = time.monotonic()
+
+    def save_best(self, results: Score) -> None:
+        """Keep the policy as it is now as the run's best."""
+        checkpoint.save(
+            self.run.best,
+            {
+                "network": dict(self.learner.network.state_dict()),
+                "observation_size": self.learner.network.observation_size,
+                "actions": self.learner.network.actions,
+                "task_hash": self.task.hash,
+                "env_steps": self.clock.env_steps,
+                "gradient_steps": self.learner.gradient_steps,
+                "score": asdict(results),
+            },
+        )
+
+    def close(self) -> None:
+        """Release the thread and the event files."""
+        if self.executor is not None:
+            self.executor.shutdown()
+        self.events.close()
+
+
+def open_session(
+    run: Run,
+    config: TrainConfig,
+    *,
+    task: Task,
+    conditions: Sequence[Condition],
+    env: Twin,
+    evaluation_env: Twin,
+    logs: Logs | None,
+    resume: bool = False,
+) -> Session:
+    """Put the parts of a run together, new or as its latest checkpoint left them."""
+    torch.set_num_threads(config.threads)
+    seed = config.seed
+    learner = Learner(config, task.observation_size, len(task.actions))
+    ring = FreshRing(
+        config.replay.ring_capacity,
+        env.num_envs,
+        task.observation_size,
+        discount=config.loss.discount,
+        n_step=config.loss.n_step,
+        conditions=ring_conditions(conditions),
+    )
+    batches = Batches(
+        logs,
+        ring,
+        batch_size=config.replay.batch_size,
+        logs_share=config.replay.logs_share,
+        seed=seed,
+        device=learner.device,
+    )
+    executor = ThreadPoolExecutor(1, "twin") if config.env.overlap else None
+    session = Session(
+        run=run,
+        config=config,
+        task=task,
+        env=env,
+        evaluation_env=evaluation_env,
+        learner=learner,
+        ring=ring,
+        batches=batches,
+        collector=Collector(env, ring, conditions, task, executor),
+        feed=FeedRecord(run, logs, ring, audit_share=config.record.audit_share, seed=seed),
+        events=Events(run.path / "tensorboard", enabled=False),
+        probe=Probe.of_logs(logs, config.record.probe_rows) if logs is not None else None,
+        exploration=np.random.default_rng([seed, 5]),
+        executor=executor,
+        logs=logs,
+    )
+    if resume:
+        session.restore()
+    else:
+        session.collector.reset(seed)
+    session.events = Events(
+        run.path / "tensorboard",
+        enabled=config.record.tensorboard,
+        from_step=session.clock.env_steps if resume else None,
+    )
+    return session
