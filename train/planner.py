@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, sparse
+from scipy import sparse
 from scipy.sparse import csgraph
 
 from restock.train.layout import Warehouse
@@ -68,6 +68,34 @@ class Planner:
             start = cell if np.isfinite(distance[cell]) else self._nearest(cell, distance)
             if start >= 0:
                 break
+        return self._read_off(start, before, goal)
+
+    def plan_around(
+        self,
+        x_m: float,
+        y_m: float,
+        goal: tuple[float, float],
+        boxes: F64,
+        half_m: tuple[float, float],
+    ) -> F64 | None:
+        """A plan past boxes (K, 3) (x, y, yaw) that the map does not know; None: no way.
+
+        For those who see more than the robot does. Not cached.
+        """
+        clearance = self._clearance_m
+        for x, y, yaw in boxes:
+            gap = box_distance(*_cell_middles(self.shape), (x, y), half_m, yaw)
+            clearance = np.minimum(clearance, gap)
+        graph = self._build_graph(clearance)
+        distance, before = csgraph.dijkstra(
+            graph, indices=self.cell(*goal), return_predecessors=True
+        )
+        cell = self.cell(x_m, y_m)
+        start = cell if np.isfinite(distance[cell]) else self._nearest(cell, distance)
+        return self._read_off(start, before, goal) if start >= 0 else None
+
+    def _read_off(self, start: int, before: NDArray[np.int32], goal: tuple[float, float]) -> F64:
+        """From a cell along the tree to the goal, smoothed and resampled."""
         cells = [start]
         while before[cells[-1]] >= 0:
             cells.append(int(before[cells[-1]]))
@@ -151,17 +179,32 @@ class Planner:
 
 def _rack_clearance(warehouse: Warehouse, shape: tuple[int, int]) -> F64:
     """From every cell's middle to the nearest rack or wall, in metres."""
-    free = np.ones((shape[0] + 2, shape[1] + 2), np.bool_)
-    free[[0, -1], :] = free[:, [0, -1]] = False
-    x = (np.arange(shape[0]) + 0.5) * CELL_M
-    y = (np.arange(shape[1]) + 0.5) * CELL_M
+    x, y = _cell_middles(shape)
+    clearance = np.minimum(
+        np.minimum(x, warehouse.width_m - x), np.minimum(y, warehouse.depth_m - y)
+    )
     for rack in warehouse.racks:
-        inside_x = (rack.x_min <= x) & (x <= rack.x_max)
-        inside_y = (rack.y_min <= y) & (y <= rack.y_max)
-        free[1:-1, 1:-1] &= ~(inside_x[:, None] & inside_y[None, :])
-    distance = ndimage.distance_transform_edt(free) * CELL_M - CELL_M / 2
-    inner: F64 = distance[1:-1, 1:-1]
-    return inner
+        gap = box_distance(x, y, rack.center, rack.half_size, 0.0)
+        clearance = np.minimum(clearance, gap)
+    return clearance
+
+
+def _cell_middles(shape: tuple[int, int]) -> tuple[F64, F64]:
+    x = (np.arange(shape[0]) + 0.5)[:, None] * CELL_M
+    y = (np.arange(shape[1]) + 0.5)[None, :] * CELL_M
+    return np.broadcast_to(x, shape), np.broadcast_to(y, shape)
+
+
+def box_distance(
+    x_m: F64, y_m: F64, center: tuple[float, float], half: tuple[float, float], yaw_rad: float
+) -> F64:
+    """From points to a box, in metres; 0 inside."""
+    dx, dy = x_m - center[0], y_m - center[1]
+    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    outside_x = np.maximum(np.abs(cos * dx + sin * dy) - half[0], 0.0)
+    outside_y = np.maximum(np.abs(cos * dy - sin * dx) - half[1], 0.0)
+    distance: F64 = np.hypot(outside_x, outside_y)
+    return distance
 
 
 def _smooth(way: NDArray[Any], half_window: int = 4) -> F64:

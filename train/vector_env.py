@@ -117,6 +117,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArr
         self.previous_action = np.zeros(num_envs, np.int64)
         self.steps = np.zeros(num_envs, np.int64)  # of the running episodes
         self.bumps = np.zeros(num_envs, np.int64)
+        self.episodes_begun = np.zeros(num_envs, np.int64)  # rises with every episode
         self.episode_number = np.full(num_envs, -1)
         self.episode_seed = np.zeros(num_envs, np.int64)
         self.episode_condition = np.full(num_envs, "nominal", "U16")
@@ -190,6 +191,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArr
         self.truth.reset(np.array([env]))
         self.episode_condition[env], self.block[env] = spec.condition, episode.block
         self.episode_seed[env] = spec.seed
+        self.episodes_begun[env] += 1
 
     # -- gymnasium ------------------------------------------------------------------------------
 
