@@ -164,12 +164,16 @@ def _present(connection: duckdb.DuckDBPyConnection, view: str, table: DeltaTable
 
 
 def read_parquet(
-    connection: duckdb.DuckDBPyConnection, view: str, files: Sequence[str | os.PathLike[str]]
+    connection: duckdb.DuckDBPyConnection,
+    view: str,
+    files: Sequence[str | os.PathLike[str]],
+    *,
+    schema: str = "main",
 ) -> None:
     """A view over Parquet files; columns that only some have are null in the others."""
     quoted = ", ".join("'" + str(file).replace("'", "''") + "'" for file in files)
     connection.execute(
-        f'CREATE OR REPLACE VIEW "{view}" AS'
+        f'CREATE OR REPLACE VIEW "{schema}"."{view}" AS'
         f" SELECT * FROM read_parquet([{quoted}], union_by_name = true)"
     )
 

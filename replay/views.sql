@@ -1,5 +1,6 @@
 -- The views of a store, over stored_transitions and stored_recordings (its Parquet as it lies).
--- Every column is documented in columns.toml, and a test holds that.
+-- Every column is documented in columns.toml (those of `transitions` in ingest/schema.py), and a
+-- test holds that.
 
 -- A recording's manifest row is committed before its transitions: an ingest that was cut between
 -- the two is in stored_recordings and in no view.
@@ -11,3 +12,239 @@ CREATE OR REPLACE VIEW transitions AS
 SELECT * REPLACE (observation::FLOAT[] AS observation, next_observation::FLOAT[] AS next_observation)
 FROM stored_transitions
 WHERE ingest_id IN (SELECT ingest_id FROM stored_recordings);
+
+-- The discrete actions of each task, from the definition the recordings carry.
+CREATE OR REPLACE VIEW actions AS
+SELECT
+    task_hash,
+    action,
+    (commands[action + 1] ->> 0)::DOUBLE AS speed_mps,
+    (commands[action + 1] ->> 1)::DOUBLE AS yaw_rate_radps
+FROM (
+    SELECT DISTINCT task_hash, (task_json::JSON -> 'actions')::JSON[] AS commands FROM recordings
+), LATERAL (SELECT unnest(range(len(commands)))::SMALLINT AS action);
+
+-- The conditions that labelled the store, of the newest ingest, and nominal: none of them holds.
+CREATE OR REPLACE VIEW conditions AS
+SELECT
+    spec ->> 'name' AS condition,
+    spec ->> 'timing' AS timing,
+    (spec ->> 'priority')::INTEGER AS priority,
+    spec ->> 'sql' AS sql,
+    labels_version
+FROM (
+    SELECT labels_version, unnest(conditions_json::JSON::JSON[]) AS spec
+    FROM (FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1)
+)
+UNION ALL
+SELECT 'nominal', 'pre', 1000, 'none of the others', labels_version
+FROM (FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1);
+
+CREATE OR REPLACE VIEW episodes AS
+SELECT
+    recording_id,
+    episode_id,
+    any_value(episode_index) AS episode_index,
+    any_value(task_hash) AS task_hash,
+    min(stamp_ns) AS start_ns,
+    max(stamp_ns) AS end_ns,
+    count(*) AS steps,
+    max(step_index) - min(step_index) + 1 - count(*) AS missing_steps,
+    (max(stamp_ns) - min(stamp_ns)) / 1e9 AS duration_s,
+    sum(reward) AS return,
+    CASE
+        WHEN bool_or(terminated) THEN 'terminated'
+        WHEN bool_or(truncated) THEN 'truncated'
+        ELSE 'open'
+    END AS ended,
+    -- Terminated with the goal's reward: a bump may terminate too, and is no success.
+    CASE WHEN any_value(has_goal)
+        THEN bool_or(terminated AND reward > goal_reward / 2)
+    END AS success,
+    sum(progress_m) AS progress_m,
+    count(*) FILTER (bumped) AS bumped_steps,
+    min(clearance_m) AS clearance_min_m,
+    list_sort(list_distinct(flatten(list(conditions)))) AS conditions,
+    list_sort(list(DISTINCT behaviour_policy)) AS behaviour_policies,
+    arg_min(behaviour_policy, step_index) AS first_policy,
+    count(*) FILTER (handover) AS handovers,
+    list_sort(list(DISTINCT zone)) AS zones
+FROM (
+    SELECT
+        transitions.*,
+        behaviour_policy IS DISTINCT FROM lag(behaviour_policy, 1, behaviour_policy) OVER (
+            PARTITION BY transitions.episode_id ORDER BY transitions.step_index
+        ) AS handover,
+        goal_reward,
+        has_goal
+    FROM transitions
+    LEFT JOIN (
+        SELECT DISTINCT
+            task_hash,
+            (task_json::JSON -> 'rewards' ->> 'goal')::DOUBLE AS goal_reward,
+            task_json::JSON ->> 'goal' = 'route' AS has_goal
+        FROM recordings
+    ) AS tasks USING (task_hash)
+)
+GROUP BY recording_id, episode_id;
+
+-- Each cell of what was seen. Cells never seen are in missing_cells: GROUP BY cannot show them.
+CREATE OR REPLACE VIEW coverage AS
+SELECT
+    condition,
+    action,
+    zone,
+    behaviour_policy,
+    count(*) AS rows,
+    count(*) / sum(count(*)) OVER () AS share,
+    count(DISTINCT episode_id) AS episodes,
+    avg(reward) AS reward_mean,
+    avg(terminated::INTEGER) AS terminal_fraction,
+    (count(DISTINCT episode_id) FILTER (success)) / count(DISTINCT episode_id) FILTER (success IS NOT NULL)
+        AS success_share
+FROM transitions
+JOIN (SELECT episode_id, success FROM episodes) USING (episode_id)
+GROUP BY ALL
+ORDER BY ALL;
+
+-- One line a condition, those never seen included.
+CREATE OR REPLACE VIEW coverage_by_condition AS
+WITH seen AS (
+    SELECT
+        condition,
+        count(*) AS rows,
+        count(DISTINCT recording_id) AS recordings,
+        count(DISTINCT action) AS actions,
+        count(DISTINCT zone) AS zones,
+        list_sort(list(DISTINCT behaviour_policy)) AS behaviour_policies,
+        avg(reward) AS reward_mean,
+        avg(terminated::INTEGER) AS terminal_fraction
+    FROM transitions
+    GROUP BY condition
+), by_episode AS (
+    SELECT
+        condition,
+        count(*) AS episodes,
+        sum(n) ^ 2 / sum(n ^ 2) AS effective_episodes,
+        avg(success::INTEGER) AS success_share,
+        avg(return) AS return_mean
+    FROM (SELECT condition, episode_id, count(*) AS n FROM transitions GROUP BY ALL)
+    JOIN episodes USING (episode_id)
+    GROUP BY condition
+)
+SELECT
+    condition,
+    timing,
+    coalesce(rows, 0) AS rows,
+    coalesce(rows, 0) / sum(rows) OVER () AS share,
+    coalesce(episodes, 0) AS episodes,
+    coalesce(effective_episodes, 0) AS effective_episodes,
+    success_share,
+    return_mean,
+    reward_mean,
+    terminal_fraction,
+    coalesce(recordings, 0) AS recordings,
+    coalesce(actions, 0) AS actions,
+    coalesce(zones, 0) AS zones,
+    coalesce(behaviour_policies, []) AS behaviour_policies
+FROM conditions
+FULL JOIN seen USING (condition)
+FULL JOIN by_episode USING (condition)
+ORDER BY rows DESC, condition;
+
+-- Condition x action cells without a single row; cells_below(n) for those with fewer than n.
+CREATE OR REPLACE VIEW missing_cells AS
+SELECT condition, action, speed_mps, yaw_rate_radps
+FROM (SELECT DISTINCT condition FROM (SELECT condition FROM conditions UNION SELECT condition FROM transitions))
+CROSS JOIN (SELECT DISTINCT action, speed_mps, yaw_rate_radps FROM actions)
+ANTI JOIN (SELECT DISTINCT condition, action FROM transitions) USING (condition, action)
+ORDER BY condition, action;
+
+CREATE OR REPLACE VIEW reward_mix AS
+SELECT
+    condition,
+    count(*) AS rows,
+    avg(reward) AS reward_mean,
+    min(reward) AS reward_min,
+    quantile_cont(reward, 0.5) AS reward_median,
+    max(reward) AS reward_max,
+    avg((reward > 0)::INTEGER) AS positive_share,
+    avg((reward < -0.5)::INTEGER) AS penalty_share,
+    avg(terminated::INTEGER) AS terminal_fraction,
+    avg(truncated::INTEGER) AS truncated_fraction
+FROM transitions
+GROUP BY condition
+ORDER BY rows DESC, condition;
+
+-- Calendar age today; ages_at(when) for another day.
+CREATE OR REPLACE VIEW ages AS
+SELECT
+    condition,
+    count(*) AS rows,
+    make_timestamp_ns(min(stamp_ns)) AS oldest,
+    make_timestamp_ns(max(stamp_ns)) AS newest,
+    (epoch_ns(now()) - max(stamp_ns)) / 86400e9 AS age_min_days,
+    (epoch_ns(now()) - quantile_disc(stamp_ns, 0.5)) / 86400e9 AS age_median_days,
+    (epoch_ns(now()) - min(stamp_ns)) / 86400e9 AS age_max_days
+FROM transitions
+GROUP BY condition
+ORDER BY rows DESC, condition;
+
+-- Which conditions hold at the same time: a row can have several, and one of them wins.
+CREATE OR REPLACE VIEW label_overlap AS
+WITH held AS (SELECT transition_id, unnest(conditions) AS condition FROM transitions),
+counts AS (SELECT condition, count(*) AS n FROM held GROUP BY condition)
+SELECT
+    a.condition AS condition,
+    b.condition AS other,
+    count(*) AS rows,
+    count(*) / any_value(counts.n) AS share
+FROM held AS a
+JOIN held AS b ON a.transition_id = b.transition_id AND a.condition <> b.condition
+JOIN counts ON counts.condition = a.condition
+GROUP BY a.condition, b.condition
+ORDER BY ALL;
+
+-- Definitions in use: more than one line means that rows were made or labelled in different ways.
+CREATE OR REPLACE VIEW versions AS
+SELECT
+    task_hash,
+    labels_version,
+    profile_hash,
+    restock_version,
+    count(*) AS rows,
+    count(DISTINCT recording_id) AS recordings
+FROM transitions
+GROUP BY ALL
+ORDER BY rows DESC;
+
+-- What an ingest left out, and why.
+CREATE OR REPLACE VIEW drops AS
+SELECT recording_id, source_file, dropped.reason AS reason, dropped.count AS count
+FROM (SELECT recording_id, source_file, unnest(drops) AS dropped FROM recordings)
+ORDER BY ALL;
+
+-- How good the labels are, where the recording knew the true condition.
+CREATE OR REPLACE VIEW label_scores AS
+SELECT
+    recording_id,
+    score.condition AS condition,
+    score.precision AS precision,
+    score.recall AS recall,
+    score.labelled AS labelled,
+    score.support AS support
+FROM (SELECT recording_id, unnest(label_scores) AS score FROM recordings)
+ORDER BY ALL;
+
+-- Topics of each recording: expected against decoded messages.
+CREATE OR REPLACE VIEW topics AS
+SELECT
+    recording_id,
+    topic.topic AS topic,
+    topic.type AS type,
+    topic.expected AS expected,
+    topic.decoded AS decoded,
+    topic.skipped AS skipped,
+    topic.reason AS reason
+FROM (SELECT recording_id, unnest(topics) AS topic FROM recordings)
+ORDER BY ALL;

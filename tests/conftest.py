@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from pathlib import Path
 
 import msgspec
@@ -12,7 +13,7 @@ from deltalake import write_deltalake
 
 from restock.ingest.conditions import labels_version, primary, shipped
 from restock.ingest.scan import Body
-from restock.ingest.schema import STEP_BITS, transition_schema
+from restock.ingest.schema import STEP_BITS, recording_schema, transition_schema
 from restock.ingest.task import Task
 
 TASK = Task(
@@ -90,7 +91,7 @@ def manifest(transitions: pa.Table, *, task: Task = TASK) -> pa.Table:
     row = {
         "recording_id": first["recording_id"],
         "ingest_id": first["ingest_id"],
-        "ingested_at": "2026-01-01T00:00:00Z",
+        "ingested_at": datetime(2026, 1, 1, tzinfo=UTC),
         "source_file": first["source_file"],
         "format": "mcap",
         "duration_s": len(transitions) * 0.2,
@@ -103,10 +104,21 @@ def manifest(transitions: pa.Table, *, task: Task = TASK) -> pa.Table:
         "episodes": len(transitions["episode_id"].unique()),
         "transitions": len(transitions),
         "drops": [{"reason": "stale scan", "count": 3}],
+        "topics": [
+            {"topic": "/odom", "type": "nav_msgs/msg/Odometry", "expected": 900, "decoded": 900}
+            | {"skipped": 0, "reason": ""}
+        ],
+        "label_scores": [
+            {"condition": "wheel_slip", "precision": 0.9, "recall": 0.8, "support": 40}
+            | {"labelled": 36}
+        ],
         "task_json": msgspec.json.encode(task).decode(),
         "conditions_json": msgspec.json.encode(conditions).decode(),
     }
-    return pa.Table.from_pylist([row])
+    schema = recording_schema()
+    blank = {pa.string(): "", pa.int64(): 0, pa.int32(): 0, pa.float64(): 0.0}
+    row = {field.name: row.get(field.name, blank.get(field.type, [])) for field in schema}
+    return pa.Table.from_pylist([row], schema=schema)
 
 
 def write_store(path: Path, recordings: list[pa.Table], *, task: Task = TASK) -> Path:

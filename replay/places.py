@@ -1,0 +1,95 @@
+"""What can be queried: a store, a run directory or a panel, each as views of one connection."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import duckdb
+import msgspec
+import pyarrow as pa
+
+from restock.errors import StoreError
+from restock.replay.panel import HEADER, HELD_OUT, META, Panel
+from restock.replay.store import Store, is_store, read_parquet
+
+RUN_CONFIG = "config.json"
+
+
+@contextmanager
+def open_place(
+    path: str | Path,
+    *,
+    beside: Mapping[str, str | Path] | None = None,
+    memory_limit: str | None = None,
+) -> Iterator[duckdb.DuckDBPyConnection]:
+    """A connection with the views of a store, a run or a panel.
+
+    Args:
+        path: the place.
+        beside: more places, each under a schema of its own: `{"run": "runs/a"}` gives
+            `run.audit`. Runs and panels only.
+        memory_limit: of DuckDB, for a store.
+
+    Raises:
+        StoreError: there is nothing that can be queried.
+    """
+    path = Path(path)
+    if is_store(path):
+        with Store(path, memory_limit=memory_limit) as store:
+            _add_all(store.connection, beside)
+            yield store.connection
+        return
+    with duckdb.connect() as connection:
+        if not _add(connection, path, "main"):
+            raise StoreError(
+                "neither a store, a run nor a panel" if path.exists() else "nothing is there",
+                where=str(path),
+                remedy=f"`restock ingest RECORDINGS --store {path}` makes a store",
+            )
+        _add_all(connection, beside)
+        _list_columns(connection)
+        yield connection
+
+
+def _add_all(
+    connection: duckdb.DuckDBPyConnection, beside: Mapping[str, str | Path] | None
+) -> None:
+    for schema, path in (beside or {}).items():
+        connection.execute(f'CREATE SCHEMA "{schema}"')
+        if not _add(connection, Path(path), schema):
+            raise StoreError(f"not a {schema}", where=str(path))
+
+
+def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> bool:
+    """Views of a run or a panel in a schema; False where it is neither."""
+    if (path / HEADER).is_file():
+        panel = Panel.open(path)
+        read_parquet(connection, "rows", [path / META], schema=schema)
+        read_parquet(connection, "held_out", [path / HELD_OUT], schema=schema)
+        strata = pa.Table.from_pylist([msgspec.structs.asdict(s) for s in panel.strata])
+        _keep(connection, schema, "strata", strata)
+        return True
+    tables = sorted(path.glob("*.parquet"))
+    if not tables or not (path / RUN_CONFIG).is_file():
+        return False
+    for file in tables:
+        read_parquet(connection, file.stem, [file], schema=schema)
+    for file in sorted(path.glob("eval/*.parquet")):
+        read_parquet(connection, f"eval_{file.stem}", [file], schema=schema)
+    return True
+
+
+def _keep(connection: duckdb.DuckDBPyConnection, schema: str, name: str, table: pa.Table) -> None:
+    connection.register("passed_in", table)
+    connection.execute(f'CREATE TABLE "{schema}"."{name}" AS FROM passed_in')
+    connection.unregister("passed_in")
+
+
+def _list_columns(connection: duckdb.DuckDBPyConnection) -> None:
+    """The view `columns` of a run or panel: names and types."""
+    connection.execute(
+        'CREATE VIEW columns AS SELECT table_name AS "view", column_name AS "column",'
+        ' data_type AS "type" FROM duckdb_columns() WHERE NOT internal'
+    )
