@@ -6,8 +6,9 @@ later. Every field has its meaning in a comment; `docs/train.md` explains the ch
 
 from __future__ import annotations
 
+import copy
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -68,13 +69,13 @@ class OptimizerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 class ReplayConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     batch_size: int = 128
-    logs_share: float = 0.5  # of each online batch, from the panel
+    logs_share: float | None = None  # of each online batch; None: what the panel's mixture says
     ring_capacity: int = 100_000  # fresh rows kept
 
     def __post_init__(self) -> None:
         if self.batch_size < 1:
             raise ValueError(f"replay.batch_size must be at least 1, got {self.batch_size}")
-        if not 0 <= self.logs_share <= 1:
+        if self.logs_share is not None and not 0 <= self.logs_share <= 1:
             raise ValueError(f"replay.logs_share must be in [0, 1], got {self.logs_share}")
         if self.ring_capacity < self.batch_size:
             raise ValueError("replay.ring_capacity must hold at least a batch")
@@ -175,9 +176,16 @@ def load_config(path: Path | None, overrides: Sequence[str] = ()) -> TrainConfig
             ) from error
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise ConfigError(f"is not TOML: {error}", where=str(path)) from error
-    for override in overrides:
-        _apply(document, override)
+    document = apply_overrides(document, overrides)
     return parse_config(document, where=str(path) if path is not None else "--set")
+
+
+def apply_overrides(document: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+    """A copy of plain values with `key.path=value` applied; values are TOML, or bare strings."""
+    changed = copy.deepcopy(dict(document))
+    for override in overrides:
+        _apply(changed, override)
+    return changed
 
 
 def parse_config(document: dict[str, Any], *, where: str) -> TrainConfig:
@@ -212,4 +220,4 @@ def _apply(document: dict[str, Any], override: str) -> None:
     document[last] = value
 
 
-__all__ = ["DEFAULT_CONDITIONS", "TrainConfig", "load_config", "parse_config"]
+__all__ = ["DEFAULT_CONDITIONS", "TrainConfig", "apply_overrides", "load_config", "parse_config"]

@@ -159,8 +159,8 @@ class FeedRecord:
         size = len(names)
         drawn = np.bincount(stratum, minlength=size)
         weight = np.bincount(stratum, values["weight"], minlength=size)
-        first = np.unique(row, return_index=True)[1]
-        unique = np.bincount(stratum[first], minlength=size)
+        # Per stratum: a fresh row moves from "unlabelled" to its stratum when its episode ends.
+        unique = np.bincount(np.unique(row * size + stratum) % size, minlength=size)
         of_drawn = np.maximum(drawn, 1)
         means = {
             "td_abs_mean": np.bincount(stratum, np.abs(values["td"]), minlength=size) / of_drawn,

@@ -178,7 +178,7 @@ def open_session(
         logs,
         ring,
         batch_size=config.replay.batch_size,
-        logs_share=config.replay.logs_share,
+        logs_share=config.replay.logs_share or 0.0,
         seed=seed,
         device=learner.device,
     )

@@ -1,0 +1,185 @@
+"""From flags to a run: config, panel and twin are checked against each other first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from restock.errors import PanelError, RunError
+from restock.ingest.profile import Profile, load_profile
+from restock.replay.panel import Panel
+from restock.train.batches import Logs
+from restock.train.config import TrainConfig, apply_overrides, load_config, parse_config
+from restock.train.evaluate import Twin
+from restock.train.learner import open_device
+from restock.train.run import Run, check_free, now_ns, software_versions
+from restock.train.session import Session, open_session
+from restock.train.target import describe
+
+_EVALUATION_ENVS = 32
+
+
+@dataclass
+class Prepared:
+    """A run that can begin, or go on: everything was checked, nothing was written."""
+
+    path: Path
+    config: TrainConfig
+    profile: Profile
+    panel: Panel | None
+    document: dict[str, Any]  # config.json
+    resumed: Run | None = None
+
+    def open(self) -> Session:
+        """Make the run directory (or take up the old one), the twin and the learner."""
+        run = self.resumed or Run.create(self.path, self.document)
+        return open_session(
+            run,
+            self.config,
+            task=self.profile.task,
+            conditions=self.profile.conditions,
+            env=make_twin(self.config, self.profile, self.config.env.num_envs),
+            evaluation_env=make_twin(self.config, self.profile, _EVALUATION_ENVS),
+            logs=Logs.of_panel(self.panel) if self.panel is not None else None,
+            resume=self.resumed is not None,
+        )
+
+    def describe(self) -> str:
+        """What is about to happen, for people."""
+        config, schedule = self.config, self.config.schedule
+        fed = "no panel: online only"
+        if self.panel is not None:
+            share = config.replay.logs_share or 0.0
+            fed = f"panel {self.panel.id} ({len(self.panel):,} rows), {share:.0%} of each batch"
+        return (
+            f"run {self.path}: {fed}; target {config.target}; up to"
+            f" {schedule.env_steps:,} environment steps"
+            + (f" or {schedule.seconds:g} s" if schedule.seconds is not None else "")
+            + f"; seed {config.seed}, {config.device}"
+        )
+
+
+def prepare_new(
+    out: Path, panel_path: Path | None, config_path: Path | None, overrides: Sequence[str] = ()
+) -> Prepared:
+    """A new run, checked.
+
+    Raises:
+        RunError: `out` is there already.
+        ConfigError: a config that cannot be used, or no such device.
+        PanelError: a panel made for another task or discount than the twin's.
+    """
+    check_free(out)
+    config = load_config(config_path, overrides)
+    open_device(config.device)
+    profile = load_profile(config.profile)
+    panel = open_panel(panel_path, config, profile) if panel_path is not None else None
+    if panel is not None:
+        config = _with_panel(config, panel)
+    return Prepared(out, config, profile, panel, _document(config, profile, panel))
+
+
+def prepare_resumed(path: Path, overrides: Sequence[str] = ()) -> Prepared:
+    """A run to go on with; `overrides` may extend its budget or move it to another device.
+
+    Raises:
+        RunError: no such run, or its panel or task changed since.
+    """
+    run = Run.open(path)
+    stored = run.document["config"]
+    config = parse_config(apply_overrides(stored, overrides), where=str(path / "config.json"))
+    open_device(config.device)
+    profile = load_profile(config.profile)
+    if profile.task.hash != run.document["task_hash"]:
+        raise RunError(
+            f"was trained on task {run.document['task_hash']}, profile {config.profile!r} now"
+            f" defines {profile.task.hash}",
+            where=str(path),
+            remedy="start a new run: values of one task mean nothing in another",
+        )
+    panel = None
+    if (fed := run.document["panel"]) is not None:
+        panel = open_panel(Path(fed["path"]), config, profile)
+        if panel.id != fed["id"]:
+            raise RunError(
+                f"was fed panel {fed['id']}, at {fed['path']} there now is {panel.id}",
+                where=str(path),
+                remedy="put the old panel back, or start a new run",
+            )
+    return Prepared(path, config, profile, panel, run.document, resumed=run)
+
+
+def open_panel(path: Path, config: TrainConfig, profile: Profile) -> Panel:
+    """A panel, checked against the twin's task and the config's discount.
+
+    Raises:
+        PanelError: it does not fit; says which side says what.
+    """
+    panel = Panel.open(path)
+    if panel.task_hash != profile.task.hash:
+        raise PanelError(
+            f"its rows are of task {panel.task_hash}, the twin's ({profile.name}) is"
+            f" {profile.task.hash}: observation, action or reward differ",
+            where=str(path),
+            remedy=f"ingest the logs again with `--profile {profile.name}` and mix anew",
+        )
+    if abs(panel.discount - config.loss.discount) > 1e-9:
+        raise PanelError(
+            f"its returns are discounted by {panel.discount}, loss.discount is"
+            f" {config.loss.discount}",
+            where=str(path),
+            remedy=f"use --set loss.discount={panel.discount}, or mix with that discount",
+        )
+    return panel
+
+
+def make_twin(config: TrainConfig, profile: Profile, num_envs: int, nthread: int = 1) -> Twin:
+    """The warehouse, as training uses it."""
+    from restock.train.vector_env import WarehouseVectorEnv
+
+    twin: Twin = WarehouseVectorEnv(
+        num_envs,
+        conditions=config.env.conditions,
+        seed=config.seed,
+        nthread=nthread,
+        task=profile.task,
+    )
+    return twin
+
+
+def _with_panel(config: TrainConfig, panel: Panel) -> TrainConfig:
+    """The mixture says which share of a batch is from logs, unless the config does."""
+    if config.replay.logs_share is not None:
+        return config
+    replay = msgspec.structs.replace(config.replay, logs_share=panel.header.logs_share)
+    return msgspec.structs.replace(config, replay=replay)
+
+
+def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dict[str, Any]:
+    fed = None
+    if panel is not None:
+        fed = {
+            "path": str(panel.path.resolve()),
+            "id": panel.id,
+            "store_version": panel.store_version,
+            "rows": len(panel),
+            "n_step": panel.n_step,
+            "discount": panel.discount,
+            "labels_version": panel.header.labels_version,
+            "strata": {stratum.name: stratum.share for stratum in panel.strata},
+        }
+    return {
+        "created_ns": now_ns(),
+        "config": msgspec.to_builtins(config),
+        "panel": fed,
+        "target": describe(config.target),
+        "task_hash": profile.task.hash,
+        "labels_version": profile.labels_version,
+        "profile": {"name": profile.name, "hash": profile.hash},
+        "seeds": {"run": config.seed, "evaluation": config.evaluation.seed},
+        "versions": software_versions(),
+    }
