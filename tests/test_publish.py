@@ -56,7 +56,7 @@ def _drive(rng: np.random.Generator) -> Drive:
         ranges_m=rng.uniform(0.3, 9, (41, 90)),
         command=np.tile([0.5, 0.5], (20, 1)),
         true_condition=["nominal"] * 20,
-        policy=[("planner", "1")] * 12 + [("operator", "1")] * 8,
+        policy=[("planner", "1", 0.98)] * 12 + [("operator", "1", 0.97)] * 8,
         plans=[(0, np.zeros((5, 2))), (10, np.ones((7, 2)))],
     )
 

@@ -234,9 +234,10 @@ def text(content: str) -> bytes:
     return serialise(build("std_msgs/msg/String", data=content))
 
 
-def behaviour_policy(name: str, version: str) -> bytes:
-    """Who drives from here on."""
-    return text(json.dumps({"policy": name, "version": version}))
+def behaviour_policy(name: str, version: str, probability: float) -> bytes:
+    """Who drives from here on, and with what probability it chose what it commands."""
+    content = {"policy": name, "version": version, "probability": round(probability, 4)}
+    return text(json.dumps(content))
 
 
 def goal(stamp_ns: int, x_m: float, y_m: float) -> bytes:
