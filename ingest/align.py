@@ -114,7 +114,7 @@ def align(
     for index in range(len(edges) + 1):
         segments.append(_segment(topics, delay, reference, edges, index, clock, latched, report))
     report.offset_ns = segments[0].offset_ns
-    low, high = np.percentile(delay[reference] - np.median(delay[reference]), [1, 99])
+    low, high = np.percentile(delay[reference] - _median(delay[reference]), [1, 99])
     report.spread_ns = int(high - low)
     _carry_latched(segments, latched)
     return segments, report
@@ -145,6 +145,11 @@ def _ordered(stamp_ns: I64, row: NDArray[np.intp]) -> Samples:
     return Samples(np.asarray(stamp_ns, np.int64)[order], row[order])
 
 
+def _median(delay_ns: I64) -> int:
+    """The (upper) median; in integers, for float64 holds a time of day to 256 ns only."""
+    return int(np.sort(delay_ns)[len(delay_ns) // 2])
+
+
 def _jumps(log_time_ns: I64, delay_ns: I64, jump_ns: int) -> I64:
     """The log times at which a topic's clock jumps.
 
@@ -153,7 +158,7 @@ def _jumps(log_time_ns: I64, delay_ns: I64, jump_ns: int) -> I64:
     if len(delay_ns) >= 5:
         padded = np.pad(delay_ns, 2, mode="edge")
         windows = np.lib.stride_tricks.sliding_window_view(padded, 5)
-        delay_ns = np.median(windows, axis=1).astype(np.int64)
+        delay_ns = np.sort(windows, axis=1)[:, 2]
     at = np.flatnonzero(np.abs(np.diff(delay_ns)) > jump_ns) + 1
     return log_time_ns[at]
 
@@ -173,8 +178,8 @@ def _segment(
         for name, columns in topics.items()
     }
     jump_ns = round(clock.jump_s * NS)
-    middle = int(np.median(delay[reference][inside[reference]]))
-    medians = [int(np.median(delay[name][inside[name]])) for name in delay if len(inside[name])]
+    middle = _median(delay[reference][inside[reference]])
+    medians = [_median(delay[name][inside[name]]) for name in delay if len(inside[name])]
     # Latency only ever adds to the clocks' offset, so the least delayed topic shows it best.
     offset = min(median for median in medians if abs(median - middle) <= jump_ns)
     samples = {}

@@ -101,35 +101,31 @@ class _Walk:
     def walk(self) -> Split:
         follows = self.steps.follows.tolist()
         for tick in range(len(self.steps)):
-            if self.first is not None:
-                self._go_on(tick, self.first, follows[tick])
-                if self.first is not None or self._used(tick):
-                    continue
-            self._begin(tick)
+            if self.first is None or not self._goes_on(tick, self.first, follows[tick]):
+                self._begin(tick)
         if self.first is not None:
             self._close(len(self.steps) - 1, "end of the recording")
         return Split(self.episodes, dict(self.dropped))
 
-    def _go_on(self, tick: int, first: int, follows: bool) -> None:
-        """Close the open episode if it ends at this tick or before it."""
+    def _goes_on(self, tick: int, first: int, follows: bool) -> bool:
+        """Whether the open episode uses this tick up; closes it if it ends here or before."""
         if not follows:
             self._close(tick - 1, self.steps.problem[tick] or self.steps.cut[tick])
-        elif self.goal[tick] != self.goal[first]:
+            return False
+        if self.goal[tick] != self.goal[first]:
             over = bool(self.over_old[tick])
             cut = "new goal" if self.goal[tick] >= 0 else "no route"
             self._close(tick, "goal or bump" if over else cut, terminated=over, shared=True)
-        elif self.over[tick]:
+            return False
+        if self.over[tick]:
             reached = self._at_goal(tick)
             self.done_with = self.goal[tick] if reached else None
             self._close(tick, "goal" if reached else "bump", terminated=True)
-        elif tick - first >= self.task.time_limit_steps:
+            return True
+        if tick - first >= self.task.time_limit_steps:
             self._close(tick, "time limit", shared=True)
-
-    def _used(self, tick: int) -> bool:
-        """Whether this tick was used up as the end of the episode just closed."""
-        return (
-            bool(self.episodes) and self.episodes[-1].last == tick and not self.episodes[-1].shared
-        )
+            return False
+        return True
 
     def _begin(self, tick: int) -> None:
         """Open an episode at this tick, or drop the tick."""
@@ -139,6 +135,7 @@ class _Walk:
             self.dropped[problem] += 1
             return
         if goal >= 0 and (goal == self.done_with or self._at_goal(tick)):
+            self.done_with = goal
             self.dropped["goal already reached"] += 1
             return
         self.done_with, self.first = None, tick

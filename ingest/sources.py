@@ -74,7 +74,8 @@ class Sources:
         fields = self.topics[source.topic].fields
         path = source.fields["orientation"]
         x, y, z, w = (np.asarray(fields[f"{path}.{axis}"], np.float64) for axis in "xyzw")
-        return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        with np.errstate(over="ignore", invalid="ignore"):  # what is no number stays none
+            return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 def wanted_fields(

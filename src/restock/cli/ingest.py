@@ -179,8 +179,8 @@ def show(outcome: Outcome) -> None:
         ]
     )
     console.print(
-        f"{row['ticks']:,} ticks = {row['transitions']:,} transitions"
-        f" + {row['episode_ends']:,} episode ends"
+        f"{_count(row['ticks'], 'tick')} = {_count(row['transitions'], 'transition')}"
+        f" + {_count(row['episode_ends'], 'episode end')}"
         f" + {sum(drop['count'] for drop in row['drops']):,} dropped"
     )
     if row["drops"]:

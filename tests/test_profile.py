@@ -1,0 +1,106 @@
+"""Profiles: what ships, what a stranger's file may get wrong, and where each error points."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+
+import numpy as np
+import pytest
+
+from restock.errors import ConfigError
+from restock.ingest.profile import load_profile, parse_profile, shipped_profiles
+
+TEXT = (files("restock.ingest") / "profiles" / "warehouse_amr.toml").read_text("utf-8")
+
+
+def test_the_shipped_profiles_load():
+    assert shipped_profiles() == ["turtlebot3", "warehouse_amr"]
+    for name in shipped_profiles():
+        profile = load_profile(name)
+        assert profile.name == name
+        assert {c.name for c in profile.conditions} >= {"wheel_slip", "blocked_aisle"}
+
+
+def test_the_hash_names_all_that_a_profile_says():
+    assert parse_profile(TEXT, where="a").hash == load_profile("warehouse_amr").hash
+    changed = parse_profile(TEXT.replace("max_gap_s = 0.5", "max_gap_s = 0.6"), where="a")
+    assert changed.hash != load_profile("warehouse_amr").hash
+    assert changed.task.hash == load_profile("warehouse_amr").task.hash
+
+
+def test_zones_are_looked_up_in_order():
+    profile = load_profile("warehouse_amr")
+    first = profile.zones[0]
+    x = np.array([(first.box_m[0] + first.box_m[2]) / 2, -5.0])
+    y = np.array([(first.box_m[1] + first.box_m[3]) / 2, -5.0])
+    assert profile.zone_of(x, y) == [first.name, "elsewhere"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("sectors = 36", "sectrs = 36", "unknown key `task.sectrs`"),
+        ("length_m = 0.70", "length = 0.7", "unknown key `task.body.length`"),
+        ("[clock]", "[klock]", "unknown key `klock`"),
+        ('topic = "/scan"', "topic = 3", "`inputs.scan.topic`: Expected `str`, got `int`"),
+        ("sectors = 36", "sectors = 3", "sectors must be even and at least 4, got 3"),
+        ("  [0.0, 0.0],", "  [0.1, 0.0],", "actions must start with the stop action [0, 0]"),
+        ('"recovery"', '"recvery"', "no condition named 'recvery'"),
+        ('"recovery"', '"recovery", "recovery"', "recovery given twice"),
+        (
+            '{ x_m = "pose.pose',
+            '{ x = "pose.pose',
+            "`inputs.pose.fields`: unknown 'x', missing 'x_m'",
+        ),
+        ("[inputs.goal]", "[inputs.gaol]", "unknown key `inputs.gaol`"),
+        ('name = "warehouse_amr"', "", "missing key `name`"),
+        ('goal = "route"', 'goal = "rout"', "`task.goal`: Invalid enum value 'rout'"),
+        ("[task]", "[task", "is not TOML"),
+    ],
+)
+def test_an_error_names_the_file_and_the_key(old, new, said):
+    assert old in TEXT
+    with pytest.raises(ConfigError) as error:
+        parse_profile(TEXT.replace(old, new, 1), where="mine.toml")
+    assert said in str(error.value)
+    assert str(error.value).startswith("mine.toml: ")
+
+
+def test_what_nothing_can_stand_in_for_is_not_optional():
+    text = TEXT.replace("[inputs.scan]", "[inputs.scan]\noptional = true")
+    with pytest.raises(ConfigError, match="nothing can stand in for scan"):
+        parse_profile(text, where="mine.toml")
+
+
+def test_a_route_needs_a_goal_and_a_plan():
+    start, end = TEXT.index("[inputs.plan]"), TEXT.index("[inputs.bumper]")
+    with pytest.raises(ConfigError, match=r"`inputs\.plan` is missing"):
+        parse_profile(TEXT[:start] + TEXT[end:], where="mine.toml")
+
+
+def test_a_condition_of_ones_own():
+    own = '\n[[condition]]\nname = "dark"\ntiming = "pre"\nsql = "clearance_m < 1"\npriority = 5\n'
+    profile = parse_profile(TEXT + own, where="mine.toml")
+    assert profile.conditions[-1].name == "dark"
+    assert profile.labels_version != load_profile("warehouse_amr").labels_version
+
+
+def test_a_name_that_is_nearly_one(tmp_path):
+    with pytest.raises(ConfigError, match="did you mean 'turtlebot3'"):
+        load_profile("turtlebot")
+    with pytest.raises(ConfigError, match="shipped are: turtlebot3, warehouse_amr"):
+        load_profile(tmp_path / "none.toml")
+
+
+def test_a_file_that_is_not_text(tmp_path):
+    file = tmp_path / "p.toml"
+    file.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError, match="cannot be read as UTF-8"):
+        load_profile(file)
+
+
+def test_what_stands_in_is_said():
+    assert load_profile("warehouse_amr").fallbacks == {}
+    assert set(load_profile("turtlebot3").fallbacks) == {
+        "bumper", "behaviour_policy", "true_condition", "goal", "plan",
+    }  # fmt: skip

@@ -1,0 +1,198 @@
+"""The store's writer: whole or not at all, replaced in one commit, whoever else is writing."""
+
+from __future__ import annotations
+
+import datetime as dt
+import multiprocessing
+import os
+import signal
+import time
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from conftest import manifest as small_manifest
+from conftest import recording_transitions
+from deltalake import DeltaTable
+
+from restock.errors import StoreError
+from restock.ingest.schema import recording_schema
+from restock.ingest.store import StoreWriter
+from restock.replay.store import Store
+
+
+def one(recording: int, ingest: str = "a", seed: int = 0) -> tuple[pa.Table, pa.Table]:
+    """A recording's manifest row and transitions."""
+    rows = recording_transitions(recording, ingest=ingest, seed=seed)
+    row = small_manifest(rows).to_pylist()[0]
+    row["ingested_at"] = dt.datetime(2026, 1, 1, tzinfo=dt.UTC)
+    for field in recording_schema():
+        empty = [] if pa.types.is_list(field.type) else "" if pa.types.is_string(field.type) else 0
+        row.setdefault(field.name, empty)
+    return pa.Table.from_pylist([row], schema=recording_schema()), rows
+
+
+def shown(path: Path) -> dict[str, int]:
+    """recording_id/ingest_id -> rows, as a reader sees the store."""
+    with Store(path) as store:
+        found = store.sql(
+            "SELECT ingest_id, count(*) FROM transitions JOIN recordings USING (ingest_id)"
+            " GROUP BY ALL ORDER BY ALL"
+        ).fetchall()
+    return dict(found)
+
+
+def test_what_is_written_is_read(tmp_path):
+    manifest, rows = one(1)
+    version = StoreWriter(tmp_path / "s").write(manifest, rows)
+    with Store(tmp_path / "s") as store:
+        assert store.version == version
+        found = store.sql("FROM transitions ORDER BY transition_id").to_arrow_table()
+    assert found["transition_id"].equals(rows["transition_id"])
+    assert found["observation"].to_pylist() == rows["observation"].to_pylist()
+
+
+def test_a_recording_written_again_replaces_its_rows_and_no_others(tmp_path):
+    writer = StoreWriter(tmp_path / "s")
+    writer.write(*one(1, "a"))
+    writer.write(*one(2, "b"))
+    writer.write(*one(1, "c", seed=9))
+    first, second = one(1, "c", seed=9)[1], one(2, "b")[1]
+    assert shown(tmp_path / "s") == {
+        first["ingest_id"][0].as_py(): len(first),
+        second["ingest_id"][0].as_py(): len(second),
+    }
+    assert sorted(writer.live()["ingest_id"].to_pylist()) == sorted(shown(tmp_path / "s"))
+
+
+def test_the_old_rows_can_still_be_read_at_the_old_version(tmp_path):
+    writer = StoreWriter(tmp_path / "s")
+    version = writer.write(*one(1, "a"))
+    writer.write(*one(1, "b"))
+    files = DeltaTable(str(tmp_path / "s" / "transitions"), version=version).file_uris()
+    assert pq.read_table(files[0].removeprefix("file://")).equals(one(1, "a")[1])
+
+
+def test_a_manifest_without_transitions_shows_nothing_and_is_cleared_away(tmp_path, monkeypatch):
+    """A kill between the two commits."""
+    writer = StoreWriter(tmp_path / "s")
+    writer.write(*one(1, "a"))
+    commit = StoreWriter._commit
+
+    def killed(self, name, *rest):
+        if name == "transitions":
+            raise KeyboardInterrupt
+        return commit(self, name, *rest)
+
+    monkeypatch.setattr(StoreWriter, "_commit", killed)
+    with pytest.raises(KeyboardInterrupt):
+        writer.write(*one(1, "b"))
+    monkeypatch.undo()
+    assert list(shown(tmp_path / "s")) == ["0000000000000001-a"]
+    writer.write(*one(1, "c"))
+    assert list(shown(tmp_path / "s")) == ["0000000000000001-c"]
+    kept = DeltaTable(str(tmp_path / "s" / "recordings")).get_add_actions(flatten=True)["path"]
+    assert not any("-b" in path for path in kept.to_pylist())
+
+
+def test_orphans_are_cleaned_after_the_retention_window_only(tmp_path):
+    writer = StoreWriter(tmp_path / "s")
+    writer.write(*one(1))
+    orphan = tmp_path / "s" / "transitions" / "00000000000000ff" / "x.parquet"
+    orphan.parent.mkdir()
+    orphan.write_bytes(b"left by a killed writer")
+    assert writer.clean() == []
+    assert orphan.exists()
+    old = time.time() - 8 * 24 * 3600
+    os.utime(orphan, (old, old))
+    version = DeltaTable(str(tmp_path / "s" / "transitions")).version()
+    assert writer.clean() == ["transitions/00000000000000ff/x.parquet"]
+    assert not orphan.exists()
+    assert len(shown(tmp_path / "s")) == 1
+    assert DeltaTable(str(tmp_path / "s" / "transitions")).version() == version
+
+
+def _write(path: Path, recording: int, ingest: str) -> None:
+    StoreWriter(path).write(*one(recording, ingest))
+
+
+def test_writers_at_the_same_time_lose_nothing_and_double_nothing(tmp_path):
+    path = tmp_path / "s"
+    context = multiprocessing.get_context("spawn")
+    # Two writers of the same recording among them: one replaces the other.
+    jobs = [(1, "a"), (1, "b"), (2, "a"), (3, "a")]
+    processes = [context.Process(target=_write, args=(path, *job)) for job in jobs]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+    assert [process.exitcode for process in processes] == [0] * len(jobs)
+    found = shown(path)
+    assert sorted(ingest.split("-")[0][-1] for ingest in found) == ["1", "2", "3"]
+    for ingest, count in found.items():
+        recording, name = ingest.split("-")
+        assert count == len(one(int(recording, 16), name)[1])
+
+
+def _write_for_ever(path: Path) -> None:
+    for turn in range(1000):
+        StoreWriter(path).write(*one(1, f"{turn}", seed=turn))
+
+
+@pytest.mark.parametrize("after_s", [0.05, 0.13, 0.21])
+def test_a_killed_writer_leaves_the_last_whole_commit(tmp_path, after_s):
+    path = tmp_path / "s"
+    StoreWriter(path).write(*one(1, "first"))
+    process = multiprocessing.get_context("fork").Process(target=_write_for_ever, args=(path,))
+    process.start()
+    time.sleep(after_s)
+    assert process.pid is not None
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    (ingest, count), *others = shown(path).items()
+    assert not others
+    name = ingest.split("-")[1]
+    seed = 0 if name == "first" else int(name)
+    assert count == len(one(1, name, seed=seed)[1])
+    StoreWriter(path).write(*one(1, "last"))
+    assert list(shown(path)) == ["0000000000000001-last"]
+
+
+def test_new_columns_are_added_and_old_rows_hold_null(tmp_path):
+    path, (manifest, rows) = tmp_path / "s", one(1)
+    StoreWriter(path).write(manifest, rows.drop_columns(["zone"]))
+    StoreWriter(path).write(*one(2))
+    with Store(path) as store:
+        found = store.sql(
+            "SELECT recording_id[-1:] AS r, count(zone) > 0 FROM stored_transitions"
+            " GROUP BY ALL ORDER BY ALL"
+        ).fetchall()
+    assert found == [("1", False), ("2", True)]
+
+
+def test_a_file_in_the_way_is_said_so(tmp_path):
+    (tmp_path / "s").write_text("hello")
+    with pytest.raises(StoreError, match="is a file, not a store"):
+        StoreWriter(tmp_path / "s").write(*one(1))
+
+
+def test_files_of_other_tools_are_refused_by_name(tmp_path):
+    path = tmp_path / "s"
+    StoreWriter(path).write(*one(1))
+    DeltaTable(str(path / "transitions")).optimize.compact()
+    StoreWriter(path).write(*one(2))
+    DeltaTable(str(path / "transitions")).optimize.compact()
+    with pytest.raises(StoreError, match="did not write"):
+        StoreWriter(path).write(*one(3))
+
+
+def test_floats_are_split_by_byte_and_compressed(tmp_path):
+    manifest, rows = one(1)
+    StoreWriter(tmp_path / "s").write(manifest, rows)
+    (file,) = (tmp_path / "s" / "transitions").glob("*/*.parquet")
+    group = pq.ParquetFile(file).metadata.row_group(0)
+    columns = {group.column(i).path_in_schema: group.column(i) for i in range(group.num_columns)}
+    assert {column.compression for column in columns.values()} == {"ZSTD"}
+    assert "BYTE_STREAM_SPLIT" in columns["observation.list.element"].encodings
+    assert "BYTE_STREAM_SPLIT" in columns["pose_x_m"].encodings
