@@ -42,7 +42,7 @@ class Policy(Protocol):
 
     def act(
         self, env: Any, observation: NDArray[np.float32]
-    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]: ...
+    ) -> tuple[NDArray[np.int64], NDArray[Any]]: ...
 
 
 class GreedyPolicy:

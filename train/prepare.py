@@ -20,7 +20,7 @@ from restock.train.run import Run, check_free, now_ns, software_versions
 from restock.train.session import Session, open_session
 from restock.train.target import describe
 
-_EVALUATION_ENVS = 32
+_EVALUATION_ENVS = 16
 
 
 @dataclass
@@ -43,7 +43,7 @@ class Prepared:
             task=self.profile.task,
             conditions=self.profile.conditions,
             env=make_twin(self.config, self.profile, self.config.env.num_envs),
-            evaluation_env=make_twin(self.config, self.profile, _EVALUATION_ENVS),
+            evaluation_env=make_twin(self.config, self.profile, _EVALUATION_ENVS, nthread=0),
             logs=Logs.of_panel(self.panel) if self.panel is not None else None,
             resume=self.resumed is not None,
         )

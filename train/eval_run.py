@@ -1,0 +1,207 @@
+"""Evaluating a finished run: its kept policy beside the planner and chance, on the same episodes.
+
+Every policy drives the same seeded episodes, clean and under each perturbation; blocked aisles are
+told apart by how much of the aisle is blocked. Seeds are apart from those that training drew its
+episodes from and from those that chose the checkpoint.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pyarrow as pa
+
+from restock.errors import ConfigError, RunError
+from restock.ingest.profile import load_profile
+from restock.train import checkpoint
+from restock.train.config import TrainConfig, parse_config
+from restock.train.episode import KINDS, EpisodeSpec
+from restock.train.evaluate import EpisodeResult, GreedyPolicy, Policy, run_episodes
+from restock.train.network import QNetwork
+from restock.train.perturbation import PERTURBATIONS, Perturbation
+from restock.train.run import Run, write_table
+from restock.train.run_tables import EVAL_EPISODES
+
+CLEAN = "none"
+POLICIES = ("agent", "planner", "random")
+FIRST_SEED = 10_000
+
+Results = dict[tuple[str, str], list[EpisodeResult]]  # (policy, perturbation) -> episodes
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to evaluate; every name was checked."""
+
+    run: Run
+    config: TrainConfig
+    policies: tuple[str, ...]
+    perturbations: tuple[str, ...]
+    episodes: int  # per kind of episode
+    first_seed: int = FIRST_SEED
+    num_envs: int = 32
+    nthread: int = 0  # all cores
+
+    @property
+    def total(self) -> int:
+        """Episodes to drive."""
+        return len(self.policies) * len(self.perturbations) * len(KINDS) * self.episodes
+
+
+def plan_evaluation(
+    path: Path,
+    *,
+    policies: Sequence[str] = POLICIES,
+    perturbations: Sequence[str] = (CLEAN,),
+    episodes: int = 20,
+    first_seed: int = FIRST_SEED,
+) -> Plan:
+    """Check a request.
+
+    Raises:
+        RunError: no such run, or it kept no policy yet.
+        ConfigError: a policy or perturbation that does not exist, or no episodes.
+    """
+    run = Run.open(path)
+    config = parse_config(run.document["config"], where=str(path / "config.json"))
+    known = [CLEAN, *(name for name in PERTURBATIONS if name != "nominal")]
+    for flag, asked, there in (
+        ("--policies", policies, list(POLICIES)),
+        ("--perturbations", perturbations, known),
+    ):
+        unknown = [name for name in asked if name not in there]
+        if unknown or not asked:
+            raise ConfigError(
+                f"there is no {', '.join(map(repr, unknown))}" if unknown else "names nothing",
+                where=flag,
+                remedy=f"choose from {', '.join(there)}",
+            )
+    if episodes < 1:
+        raise ConfigError(f"must be at least 1, got {episodes}", where="--episodes")
+    if "agent" in policies and not run.best.exists():
+        raise RunError(
+            "has kept no policy yet: its first evaluation is still to come",
+            where=str(path),
+            remedy=f"go on with `restock train --resume {path}`",
+        )
+    return Plan(
+        run,
+        config,
+        tuple(dict.fromkeys(policies)),
+        tuple(dict.fromkeys(perturbations)),
+        episodes,
+        first_seed,
+    )
+
+
+def evaluate(plan: Plan, progress: Callable[[int], None] | None = None) -> Results:
+    """Drive all episodes, and write them to the run's `eval/episodes.parquet`."""
+    from restock.train.vector_env import WarehouseVectorEnv
+
+    profile = load_profile(plan.config.profile)
+    task = profile.task
+    env = WarehouseVectorEnv(plan.num_envs, nthread=plan.nthread, task=task, seed=plan.first_seed)
+    # One queue a policy, over all perturbations: few environments then wait for the last episodes.
+    asked = [
+        (perturbation, EpisodeSpec(kind, plan.first_seed + index, _perturb(perturbation)))
+        for perturbation in plan.perturbations
+        for index in range(plan.episodes)
+        for kind in KINDS
+    ]
+    results: Results = {}
+    for policy in plan.policies:
+        driven = run_episodes(
+            env,
+            make_policy(policy, plan),
+            [spec for _, spec in asked],
+            control_period_s=task.control_period_s,
+            time_limit_steps=task.time_limit_steps,
+            progress=progress,
+        )
+        for (perturbation, _), result in zip(asked, driven, strict=True):
+            results.setdefault((policy, perturbation), []).append(result)
+    write_table(episodes_table(results), plan.run.path / "eval" / "episodes.parquet")
+    return results
+
+
+def _perturb(name: str) -> Perturbation | None:
+    return None if name == CLEAN else PERTURBATIONS[name]
+
+
+def make_policy(name: str, plan: Plan) -> Policy:
+    """The run's kept policy, or a scripted one."""
+    from restock.train.policies import PlannerFollower, RandomPolicy
+
+    if name == "agent":
+        return load_agent(plan.run)
+    if name == "planner":
+        return PlannerFollower(epsilon=0.0, seed=plan.first_seed)
+    return RandomPolicy(seed=plan.first_seed)
+
+
+def load_agent(run: Run) -> GreedyPolicy:
+    """The policy that a run kept as its best, greedy.
+
+    Raises:
+        RunError: no checkpoint, a damaged one, or one of a task that the profile no longer is.
+    """
+    config = parse_config(run.document["config"], where=str(run.path / "config.json"))
+    state = checkpoint.load(run.best)
+    task = load_profile(config.profile).task
+    if state["task_hash"] != task.hash:
+        raise RunError(
+            f"its policy was trained on task {state['task_hash']}, profile"
+            f" {config.profile!r} now defines {task.hash}",
+            where=str(run.best),
+            remedy="train again: observations or actions have changed their meaning",
+        )
+    network = QNetwork(
+        state["observation_size"],
+        state["actions"],
+        hidden=config.network.hidden,
+        layer_norm=config.network.layer_norm,
+        dueling=config.network.dueling,
+    )
+    network.load_state_dict(state["network"])
+    return GreedyPolicy(network.eval(), version=f"{run.path.name}@{state['gradient_steps']}")
+
+
+def episodes_table(results: Results) -> pa.Table:
+    """One row an episode."""
+    rows = [
+        {
+            "policy": policy,
+            "perturbation": perturbation,
+            "condition": result.condition,
+            "block": result.block,
+            "episode_seed": result.episode_seed,
+            "success": result.success,
+            "bumps": result.bumps,
+            "time_s": result.time_s,
+            "return": result.undiscounted_return,
+            "end_x_m": result.end_x_m,
+            "end_y_m": result.end_y_m,
+            "failure": result.failure,
+        }
+        for (policy, perturbation), episodes in results.items()
+        for result in episodes
+    ]
+    return pa.Table.from_pylist(rows, schema=EVAL_EPISODES)
+
+
+def settings(plan: Plan) -> dict[str, Any]:
+    """What was asked, for the JSON output."""
+    return {
+        "run": str(plan.run.path),
+        "policies": list(plan.policies),
+        "perturbations": {
+            name: msgspec.to_builtins(PERTURBATIONS["nominal" if name == CLEAN else name])
+            for name in plan.perturbations
+        },
+        "episodes_per_kind": plan.episodes,
+        "first_seed": plan.first_seed,
+    }
