@@ -68,5 +68,5 @@ def outline_reach(bearings_rad: NDArray[np.float64], body: Body) -> NDArray[np.f
     ahead = np.where(
         cos >= 0, body.length_m / 2 - body.lidar_x_m, body.length_m / 2 + body.lidar_x_m
     )
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", over="ignore"):  # along an axis the other side is far
         return np.minimum(np.maximum(ahead, 0.0) / np.abs(cos), (body.width_m / 2) / np.abs(sin))
