@@ -31,6 +31,7 @@ MOST_FIELDS = 20_000
 LONGEST_DEFINITION = 4 << 20
 LONGEST_ARRAY = 1 << 20
 
+EMPTY = "structure_needs_at_least_one_member"  # stands in a message without fields
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 DTYPES: dict[str, np.dtype[Any]] = {
     "bool": np.dtype(np.bool_),
@@ -101,7 +102,8 @@ class MessageType:
         """
         if name not in self.raw:
             raise CannotDecode(f"{name} is not defined in the recording or in {self.source!r}")
-        return [_field(field, description) for field, description in self.raw[name][1]]
+        fields = [_field(field, description) for field, description in self.raw[name][1]]
+        return [] if [field.name for field in fields] == [EMPTY] else fields
 
     def leaves(self) -> list[Leaf]:
         """Every field path of the type, in the order of its serialisation."""
@@ -164,7 +166,7 @@ def _field(name: str, description: Any) -> FieldType:
     if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
         (node, rest), length = rest
         fixed = description[0] == Nodetype.ARRAY
-        if fixed and length > LONGEST_ARRAY:
+        if fixed and not 0 < length <= LONGEST_ARRAY:
             raise CannotDecode(f"{name} is an array of {length:,}")
         many = Many(length if fixed else None)
     if node == Nodetype.NAME:

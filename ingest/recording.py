@@ -17,10 +17,10 @@ from typing import Self
 import numpy as np
 
 from restock.errors import RecordingError
+from restock.ingest.cdr import ColumnDecoder
 from restock.ingest.columns import I64, Batch, FieldColumn, TopicColumns, join, take
 from restock.ingest.compression import decompress_messages
 from restock.ingest.definitions import CannotDecode, MessageType, message_type
-from restock.ingest.rows import RowDecoder
 from restock.ingest.storage import Channel, Damage, Integrity, Storage
 
 
@@ -218,7 +218,7 @@ class Recording:
         wanted: Mapping[str, Sequence[str]],
         readings: Mapping[str, _Reading],
     ) -> None:
-        decoders: dict[int, RowDecoder] = {}
+        decoders: dict[int, ColumnDecoder] = {}
         topics: dict[int, str] = {}
         for topic, paths in wanted.items():
             for stream in self._streams[topic]:
@@ -235,7 +235,7 @@ class Recording:
         for channel, batch in storage.batches(list(decoders)):
             readings[topics[channel]].take(decoders[channel], batch)
 
-    def _decoder(self, topic: str, channel: Channel, paths: Sequence[str]) -> RowDecoder:
+    def _decoder(self, topic: str, channel: Channel, paths: Sequence[str]) -> ColumnDecoder:
         kind = self._type(channel)
         if channel.type != self.topics[topic].type:
             raise CannotDecode(f"it also carries {channel.type}, beside {self.topics[topic].type}")
@@ -245,7 +245,7 @@ class Recording:
             raise RecordingError(
                 error.what, where=f"{self.path}, {topic}", remedy=error.remedy
             ) from None
-        return RowDecoder(kind, leaves, ros1=channel.encoding == "ros1")
+        return ColumnDecoder(kind, leaves, ros1=channel.encoding == "ros1")
 
     def _lost(self, topic: str) -> dict[str, int]:
         """Messages of a topic that damage is known to have cost, by reason."""
@@ -284,7 +284,7 @@ class _Reading:
         self._fields: dict[str, list[FieldColumn]] = {}
         self.decodable = False
 
-    def use(self, decoder: RowDecoder) -> None:
+    def use(self, decoder: ColumnDecoder) -> None:
         """Make columns for the decoder's fields, even if no message comes."""
         self.decodable = True
         for path, column in decoder.empty().items():
@@ -294,7 +294,7 @@ class _Reading:
         """Messages that are not read at all."""
         self._add({reason: count})
 
-    def take(self, decoder: RowDecoder, batch: Batch) -> None:
+    def take(self, decoder: ColumnDecoder, batch: Batch) -> None:
         """Decode a batch and keep its columns."""
         self._account.read += len(batch)
         batch, damaged = decompress_messages(batch)
