@@ -268,13 +268,8 @@ def test_a_text_that_is_none_is_counted() -> None:
 
 def test_a_count_that_cannot_be_is_refused_before_anything_is_allocated() -> None:
     rule = "=" * 80
-    point = "MSG: geometry_msgs/Point
-float64 x
-float64 y
-float64 z"
-    message = one("pkg/msg/T", f"geometry_msgs/Point[] p
-{rule}
-{point}")
+    point = "MSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z"
+    message = one("pkg/msg/T", f"geometry_msgs/Point[] p\n{rule}\n{point}")
     rows = [bytes.fromhex("00010000 ffffffff") + bytes(28)]
     found = ColumnDecoder(message, message.leaves()).decode(batch(rows))
     assert not len(found.rows)
