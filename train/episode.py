@@ -82,7 +82,7 @@ def draw_episode(spec: EpisodeSpec, warehouse: Warehouse, planner: Planner) -> E
             patches = _draw_patches(rng, plan)
             return Episode(spec, start, goal, plan, patches=patches, noise=noise)
         if spec.condition == "blocked_aisle":
-            block = "partial" if rng.random() < 0.6 else "full"
+            block = "partial" if rng.random() < 0.5 else "full"
             pallets = _draw_block(rng, warehouse, plan, full=block == "full")
             if pallets is not None:
                 return Episode(spec, start, goal, plan, block, pallets=pallets, noise=noise)
@@ -163,7 +163,7 @@ def _draw_block(
     arc = np.arange(len(plan)) * spacing
     segment = warehouse.segment_of(plan[:, 0], plan[:, 1])
     half_x, half_y = PALLET_HALF_M[:2]
-    room = (arc >= 1.9) & (arc <= arc[-1] - (0.8 if full else 1.3)) & (segment >= 0)
+    room = (arc >= 1.9) & (arc <= arc[-1] - 1.5) & (segment >= 0)
     edges = warehouse.segment_edges[np.maximum(segment, 0)]
     room &= (plan[:, 0] > edges[:, 0] + half_x) & (plan[:, 0] < edges[:, 2] - half_x)
     places = np.flatnonzero(room)

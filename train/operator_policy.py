@@ -36,6 +36,8 @@ class Operator(SoftPolicy):
         super().__init__(epsilon=epsilon, seed=seed)
         self._ways = np.zeros((0, PLAN_POINTS, 2))
         self._episode = np.zeros(0, np.int64)
+        self._anchor = np.zeros((0, 3))
+        self._still = np.zeros(0, np.int64)
 
     def choose(self, env: WarehouseVectorEnv) -> Actions:
         """The action that comes farthest along the way without coming too near to anything."""
@@ -45,6 +47,8 @@ class Operator(SoftPolicy):
         count, actions = env.num_envs, len(table)
         ends = self._think(env, pose, table)  # (N, A, T, 3)
         room, people = self._room(env, ends)  # (N, A, T)
+        arrived = self._arrived(env, ends)
+        room[arrived] = people[arrived] = 9.0  # what comes after the goal does not matter
         flat = ends[:, :, -1].reshape(-1, 3)
         ways = np.repeat(self._ways, actions, axis=0)
         view = view_route(ways, flat[:, 0], flat[:, 1], flat[:, 2], (0.6,))
@@ -61,13 +65,37 @@ class Operator(SoftPolicy):
         icy = self._icy(env, pose)
         harsh = (np.abs(table[:, 0]) > GENTLE_MPS) | (np.abs(table[:, 1]) > 1.0)
         score -= np.where(icy[:, None] & harsh[None, :], 3.0, 0.0)
+        score += 1.0 * arrived.any(axis=2)
+        alone = people.min(axis=(1, 2)) > 1.0
+        score[alone, 0] -= 0.2  # nobody to wait for
+        # Whoever has stood for a while tries something else that does not touch.
+        tries = self._rng.random(score.shape) * 0.5 - 10.0 * hits
+        tries[:, 0] -= 1.0
+        stood = self._standing(env, pose) & alone
+        score[stood] = tries[stood]
         return np.asarray(score.argmax(axis=1), np.int64)
+
+    def _arrived(self, env: WarehouseVectorEnv, ends: F64) -> NDArray[np.bool_]:
+        """From which step on (N, A, T) the robot has been at its goal."""
+        gap = ends[..., :2] - env.navigation.goals_m[:, None, None]
+        there = np.hypot(gap[..., 0], gap[..., 1]) < env.task.goal_radius_m - 0.05
+        return np.asarray(np.logical_or.accumulate(there, axis=2), np.bool_)
+
+    def _standing(self, env: WarehouseVectorEnv, pose: F64) -> NDArray[np.bool_]:
+        """Who has not moved for two seconds."""
+        moved = (np.abs(pose - self._anchor) > (0.1, 0.1, 0.2)).any(axis=1) | (env.steps == 0)
+        self._anchor[moved] = pose[moved]
+        self._still = np.where(moved, 0, self._still + 1)
+        self._still[self._still > 13] = 0  # three steps of something else, then think again
+        return self._still > 10
 
     def _find_ways(self, env: WarehouseVectorEnv, pose: F64) -> None:
         """A way past the pallets at the start of each episode, and again where one has strayed."""
         if len(self._ways) != env.num_envs:
             self._ways = np.zeros((env.num_envs, PLAN_POINTS, 2))
             self._episode = np.full(env.num_envs, -1)
+            self._anchor = np.zeros((env.num_envs, 3))
+            self._still = np.zeros(env.num_envs, np.int64)
         serial = env.episodes_begun
         stale = self._episode != serial
         offset = view_route(self._ways, pose[:, 0], pose[:, 1], pose[:, 2], ()).offset_m

@@ -52,13 +52,18 @@ class SoftPolicy:
         """The action (N,) it would take without chance."""
         raise NotImplementedError
 
+    def certain(self, env: WarehouseVectorEnv) -> NDArray[np.bool_]:
+        """Where (N,) it leaves nothing to chance; nowhere, unless a policy says so."""
+        return np.zeros(env.num_envs, np.bool_)
+
     def act(self, env: WarehouseVectorEnv, observation: NDArray[np.float32]) -> tuple[Actions, F64]:
         """Actions (N,) and the probabilities (N,) they had."""
         chosen = self.choose(env)
         count = len(env.task.actions)
-        chance = self._rng.random(env.num_envs) < self.epsilon
+        epsilon = np.where(self.certain(env), 0.0, self.epsilon)
+        chance = self._rng.random(env.num_envs) < epsilon
         action = np.where(chance, self._rng.integers(count, size=env.num_envs), chosen)
-        probability = np.where(action == chosen, 1 - self.epsilon, 0.0) + self.epsilon / count
+        probability = np.where(action == chosen, 1 - epsilon, 0.0) + epsilon / count
         self.acting = np.full(env.num_envs, self.name, "U16")
         self.acting_version = np.full(env.num_envs, self.version, "U16")
         return action, probability
@@ -87,6 +92,7 @@ class PlannerFollower(SoftPolicy):
     name = "planner"
     stop_m = 0.30
     slow_m = 0.80
+    pivot_m = 0.14  # room that turning on the spot needs around the body
 
     def __init__(self, *, epsilon: float = 0.02, seed: int = 0) -> None:
         super().__init__(epsilon=epsilon, seed=seed)
@@ -96,10 +102,7 @@ class PlannerFollower(SoftPolicy):
         signals = env.signals
         near = np.arctan2(signals["waypoint_near_y_m"], signals["waypoint_near_x_m"])
         far = np.arctan2(signals["waypoint_far_y_m"], signals["waypoint_far_x_m"])
-        clearance = signals["sector_clearance_m"]
-        count = clearance.shape[1]
-        half = max(round(count * 30 / 360), 1)
-        front = clearance[:, count // 2 - half : count // 2 + half].min(axis=1)
+        front = self._front(env)
         left, right = near > 0, near < 0
         bend = np.abs(near)
 
@@ -115,8 +118,22 @@ class PlannerFollower(SoftPolicy):
         blocked = front < self.stop_m
         action[blocked] = 0
         for turning, side in ((left, 1.0), (right, -1.0)):
-            action[turning & (bend > 0.9)] = self._index(env, 0.0, side * 1.2)
+            pivot = turning & (bend > 0.9) & (signals["clearance_m"] > self.pivot_m)
+            action[pivot] = self._index(env, 0.0, side * 1.2)
         return action
+
+    def certain(self, env: WarehouseVectorEnv) -> NDArray[np.bool_]:
+        """Its safety stop leaves nothing to chance, nor does it where anything is near."""
+        near = env.signals["clearance_m"] < self.stop_m
+        return np.asarray(near | (self._front(env) < 2 * self.stop_m), np.bool_)
+
+    def _front(self, env: WarehouseVectorEnv) -> F64:
+        """The smallest clearance (N,) within 30 degrees of straight ahead."""
+        clearance = env.signals["sector_clearance_m"]
+        count = clearance.shape[1]
+        half = max(round(count * 30 / 360), 1)
+        front: F64 = clearance[:, count // 2 - half : count // 2 + half].min(axis=1)
+        return front
 
     def _index(self, env: WarehouseVectorEnv, speed_mps: float, yaw_rate_radps: float) -> int:
         table = np.asarray(env.task.actions)

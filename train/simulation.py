@@ -46,6 +46,8 @@ ACCEL_LIMIT = np.array([4.0, 10.0])  # of the base controller: m/s2 and rad/s2
 REST_Z_M = 0.09756  # of the chassis frame, standing still
 _HISTORY = 5  # commands kept: enough for the longest latency at the shortest period
 LIDAR_BEAMS = 72
+MOVING_MPS = 0.15  # faster than this a robot is said to drive
+_CONTROLLED = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_MOCAP_POS)
 
 
 @dataclass(frozen=True)
@@ -106,6 +108,8 @@ class Simulation:
         self._beam = np.stack([np.cos(self.bearings_rad), np.sin(self.bearings_rad)], axis=-1)
         self._groups = np.zeros(6, np.uint8)
         self._groups[OBSTACLE_GROUP] = 1
+        self._from = np.zeros_like(self._mocap_pos)  # where mocap bodies were a block ago
+        self._control = np.zeros((num_envs, self.substeps, 2 + 3 * self._mocap_pos.shape[1]))
         self.callback: Callable[[Live], None] | None = None
         self.callback_period_s = 0.02
 
@@ -178,18 +182,29 @@ class Simulation:
         touched = self.bumped.copy()
         for block in range(self.blocks):
             pose = self.pose()
-            moved = self.traffic.advance(pose, touched, BLOCK_S)
-            self._show_traffic(moved)
+            moving = np.hypot(self.qvel[:, 0], self.qvel[:, 1]) > MOVING_MPS
+            self._from[:] = self._mocap_pos
+            self._show_traffic(self.traffic.advance(pose, moving, touched, BLOCK_S))
             slippery = self._write_friction(pose)
-            control = self._wheel_set_points(block)
-            touched = self._run(control)
+            touched = self._run(self._wheel_set_points(block))
             self.bumped |= touched
             self.slipped |= self._slipping(slippery)
         warnings = np.asarray(self.batch.warning).reshape(self.num_envs, -1)
         self.blown_up = np.asarray((warnings > 0).any(axis=1), np.bool_)
 
-    def _run(self, control: F64) -> NDArray[np.bool_]:
-        """One block of substeps; returns whose bumper was pressed."""
+    def _run(self, wheels: F64) -> NDArray[np.bool_]:
+        """One block of substeps under wheel speeds (N, S, 2); returns whose bumper was pressed.
+
+        Traffic moves a little at every substep: a jump of a block's length would strike the robot
+        like a hammer.
+        """
+        control = self._control
+        control[:, :, :2] = wheels
+        last = self._mocap_pos[:, None]
+        share = ((np.arange(self.substeps) + 1) / self.substeps)[None, :, None, None]
+        move = self._from[:, None] + share * (last - self._from[:, None])
+        jumped = (np.abs(last - self._from[:, None]) > 1.0).any(axis=-1, keepdims=True)
+        control[:, :, 2:] = np.where(jumped, last, move).reshape(self.num_envs, self.substeps, -1)
         touched = np.zeros(self.num_envs, np.bool_)
         if self.callback is None:
             parts = [(0, self.substeps)]
@@ -200,7 +215,9 @@ class Simulation:
         records = []
         for start, stop in parts:
             part = control[:, start:stop]
-            sensed = self.batch.rollout(stop - start, part, record=("sensordata",))["sensordata"]
+            sensed = self.batch.rollout(stop - start, part, _CONTROLLED, ("sensordata",))[
+                "sensordata"
+            ]
             pressed = (sensed[:, :, self.handles.bumper] > 0).any(axis=1)
             touched |= pressed
             self.time_s += (stop - start) * self.timestep_s
@@ -308,7 +325,10 @@ class Simulation:
     # -- state ----------------------------------------------------------------------------------
 
     _ARRAYS = ("commands", "set_point", "time_s", "bumped", "slipped", "accel", "blown_up")
-    _TRAFFIC = ("state", "travelled_m", "waited_s", "position_m", "heading_rad")
+    _TRAFFIC = (
+        *("state", "travelled_m", "waited_s", "position_m", "heading_rad"),
+        "attentive",
+    )
 
     def get_state(self) -> dict[str, NDArray[Any]]:
         """Everything that changes during an episode, as arrays."""

@@ -1,8 +1,8 @@
 """People and forklifts: each walks a given way once the robot comes near, and may not look out.
 
-An attentive one stops some way off the robot and goes on when there is room, or after a while
-goes around (its way moves aside). An inattentive one walks into the robot; having touched it, it
-stops, then steps back. Movement is kinematic: traffic pushes the robot, not the reverse.
+An attentive one stops .5 m off the robot. An inattentive one walks on into the way of a robot that
+drives, and stops only before one that stands. Whoever has waited for 2 s, or was touched, steps
+back and lets the robot pass. Movement is kinematic: traffic pushes the robot, not the reverse.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ AGENTS = PEOPLE + FORKLIFTS  # the people first
 WAY_POINTS = 24
 FORKLIFT_RADIUS_M = 0.5  # of the circle that stands for it when it looks out
 YIELD_M = 0.5
+STANDING_M = 0.15  # how near an inattentive one comes to a robot that stands
 WAIT_S = 2.0
 HIDDEN, WAITING, WALKING, RETREATING = 0, 1, 2, 3
 
@@ -158,33 +159,36 @@ class Traffic:
                 self._place(np.array([env]))
 
     def advance(
-        self, robot: F64, touched: NDArray[np.bool_], elapsed_s: float
+        self, robot: F64, moving: NDArray[np.bool_], touched: NDArray[np.bool_], elapsed_s: float
     ) -> NDArray[np.int64]:
-        """Move the agents for `elapsed_s` given robots (N, 3) (x, y, yaw); returns who moved.
+        """Move the agents for `elapsed_s`; returns the environments that have any.
 
-        `touched` (N,) says whose bumper was pressed in the time before.
+        `robot` (N, 3) is x, y, yaw; `moving` (N,) says who drives, `touched` (N,) whose bumper was
+        pressed in the time before.
         """
         ids = np.flatnonzero(self.active)
         if not len(ids):
             return ids
-        pose = robot[ids]
-        state, travelled = self.state[ids], self.travelled_m[ids]
+        pose, state = robot[ids], self.state[ids]
         trigger = self.trigger[ids]
         near = np.hypot(trigger[..., 0] - pose[:, None, 0], trigger[..., 1] - pose[:, None, 1])
         state = np.where((state == WAITING) & (near <= trigger[..., 2]), WALKING, state)
-        gap, in_front = self._gap(ids, pose)
-        look_out = np.where(self.attentive[ids], YIELD_M, 0.02)
-        held = (state == WALKING) & in_front & (gap < look_out)
+        gap, toward = self._gap(ids, pose)
+        careless = np.where(moving[ids, None], 0.0, STANDING_M)
+        look_out = np.where(self.attentive[ids], YIELD_M, careless)
+        held = (state == WALKING) & toward & (gap < look_out)
         waited = np.where(held, self.waited_s[ids] + elapsed_s, 0.0)
-        hit = touched[ids][:, None] & (gap < 0.12) & (state == WALKING)
-        give_up = waited > WAIT_S
-        state = np.where(hit | give_up, RETREATING, state)
-        # One that stepped back far enough goes on its way again.
-        state = np.where((state == RETREATING) & (gap > 1.0), WALKING, state)
-        forward = np.where(state == WALKING, 1.0, np.where(state == RETREATING, -0.6, 0.0))
-        forward = np.where(held & (state == WALKING), 0.0, forward)
-        travelled = travelled + forward * self.speed_mps[ids] * elapsed_s
-        self.state[ids] = state
+        hit = touched[ids, None] & (gap < 0.2) & ((state == WALKING) | (state == RETREATING))
+        self.attentive[ids] |= hit  # having been touched, one looks out
+        state = np.where((hit & toward) | (waited > WAIT_S), RETREATING, state)
+        state = np.where((state == RETREATING) & ((gap > 1.0) | (hit & ~toward)), WALKING, state)
+        pace = np.where(state == RETREATING, -0.6, np.where((state == WALKING) & ~held, 1.0, 0.0))
+        travelled = self.travelled_m[ids] + pace * self.speed_mps[ids] * elapsed_s
+        # Who is back at the start or at the end of the way leaves the floor, out of sight.
+        left = ((travelled >= self.length_m[ids]) & (gap > 1.0)) | (
+            (travelled <= 0.0) & (state == RETREATING)
+        )
+        self.state[ids] = np.where(left, HIDDEN, state)
         self.waited_s[ids] = waited
         self.travelled_m[ids] = np.clip(travelled, 0.0, self.length_m[ids])
         self._place(ids)
