@@ -40,3 +40,21 @@ SELECT * EXCLUDE (observation, next_observation)
 FROM transitions
 WHERE episode_id = id
 ORDER BY step_index;
+
+-- Each episode with the one condition that best says what it was about: of those that held for at
+-- least `min_steps` steps, the one that held longest; else nominal. The true condition, where known.
+CREATE OR REPLACE MACRO episode_kinds(min_steps) AS TABLE
+WITH held AS (
+    SELECT episode_id, true_condition AS kind
+    FROM transitions
+    WHERE true_condition IS NOT NULL AND true_condition <> 'nominal'
+    UNION ALL
+    SELECT episode_id, unnest(conditions) FROM transitions WHERE true_condition IS NULL
+), longest AS (
+    SELECT episode_id, arg_max(kind, steps) AS kind
+    FROM (SELECT episode_id, kind, count(*) AS steps FROM held GROUP BY ALL HAVING count(*) >= min_steps)
+    GROUP BY episode_id
+)
+SELECT episode_id, coalesce(kind, 'nominal') AS kind, success, return, first_policy
+FROM episodes
+LEFT JOIN longest USING (episode_id);

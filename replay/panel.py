@@ -74,7 +74,7 @@ class Header(msgspec.Struct, frozen=True):
     logs_share: float  # of a batch
     conditions: list[str]  # by priority, nominal last
     left_out: dict[str, int]  # rows of the source that are not in the panel, by reason
-    effective_rows: float  # effective sample size of the weighted draw
+    effective_rows: float  # rows drawn equally often that the weighted draw is worth
     strata: list[Stratum]
     mixture: Mixture
     files: dict[str, FileRecord]

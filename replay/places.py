@@ -23,6 +23,7 @@ def open_place(
     *,
     beside: Mapping[str, str | Path] | None = None,
     memory_limit: str | None = None,
+    only_store: bool = False,
 ) -> Iterator[duckdb.DuckDBPyConnection]:
     """A connection with the views of a store, a run or a panel.
 
@@ -31,12 +32,13 @@ def open_place(
         beside: more places, each under a schema of its own: `{"run": "runs/a"}` gives
             `run.audit`. Runs and panels only.
         memory_limit: of DuckDB, for a store.
+        only_store: take nothing but a store.
 
     Raises:
         StoreError: there is nothing that can be queried.
     """
     path = Path(path)
-    if is_store(path):
+    if only_store or is_store(path):
         with Store(path, memory_limit=memory_limit) as store:
             _add_all(store.connection, beside)
             yield store.connection

@@ -73,7 +73,7 @@ class Plan:
     strata: tuple[StratumPlan, ...]
     logs_share: float  # of a batch
     left_out: dict[str, int]  # rows not in the panel, by reason
-    effective_rows: float  # effective sample size of the weighted draw / rows
+    effective_rows: float  # rows drawn equally often that the weighted draw is worth
     as_of_ns: int  # newest stamp of the store: ages are against this
 
     @property
@@ -158,7 +158,7 @@ def _finish(
         chosen, code = chosen[~never], code[~never]
     weight = importance_weights(code, state_code[chosen], strata, shares.got, mixture.correction)
     drawn = (shares.got / np.maximum(rows, 1))[code]
-    effective = float(1.0 / (drawn * weight.astype(np.float64) ** 2).sum())
+    effective = effective_count(drawn * weight)
     lines = _lines(mixture, strata, shares, rows, episodes, per_episode, code, weight)
     return Plan(
         mixture=mixture,

@@ -83,10 +83,10 @@ def fetch(
         except duckdb.Error as error:
             raise QueryError(_message(error), where=where, remedy=_hint(error)) from error
 
-    return _interruptible(connection, run)
+    return interruptible(connection, run)
 
 
-def _interruptible(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -> T:
+def interruptible(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -> T:
     """Run a job on a thread of its own: DuckDB does not look for Ctrl-C while it works."""
     with ThreadPoolExecutor(1) as pool:
         done = pool.submit(job)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import ConfigError
 from restock.ingest.conditions import NOMINAL, Condition
-from restock.replay.layout import F32, F64, Bools, Ints
+from restock.replay.layout import F32, F64, Bools
 from restock.replay.mixture import Correction, CorrectionRule, EachCondition, Mixture, StratumRule
 
 NO_STRATUM = -1
@@ -147,7 +147,7 @@ def effective_shares(code: NDArray[np.int16], weights: F32, shares: F64) -> F64:
     return np.asarray(total / max(total.sum(), 1e-12), np.float64)
 
 
-def effective_count(sizes: Ints | F64) -> float:
+def effective_count(sizes: NDArray[Any]) -> float:
     """(sum n)^2 / sum n^2: how many equal groups these would be worth."""
     total = float((np.asarray(sizes, np.float64) ** 2).sum())
     return float(np.asarray(sizes).sum()) ** 2 / total if total > 0 else 0.0

@@ -86,8 +86,8 @@ def _summary(document: dict[str, Any]) -> list[str]:
     lines = [
         f"{document['rows']:,} rows of store version {document['store_version']}; not in the panel:"
         f" {left_out or 'none'}",
-        f"{document['logs_share']:.1%} of a batch from the logs; unequal shares and weights leave an"
-        f" effective sample of {document['effective_rows']:,.0f} rows",
+        f"{document['logs_share']:.1%} of a batch from the logs, which after shares and weights are"
+        f" worth {document['effective_rows']:,.0f} rows drawn equally often",
     ]
     if "id" in document:
         lines.append(f"panel {document['id']} -> {document['panel']}")

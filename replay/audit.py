@@ -1,0 +1,224 @@
+"""Audits: queries that return offending rows, one a file, with a severity and advice.
+
+The header of an audit's file says what it is:
+
+    -- severity: error | warning | info
+    -- advice: what to do about the rows it returns
+    -- doc: what the rows are
+    -- needs: run | panel          (only where it looks at one)
+
+`$name` in the query is a threshold, from `audits.toml` or a file of the user's.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Any, Literal, cast
+from xml.etree import ElementTree
+
+import duckdb
+
+from restock.errors import ConfigError
+from restock.replay.query import interruptible
+
+Severity = Literal["error", "warning", "info"]
+Status = Literal["pass", "fail", "warn", "info", "skipped"]
+Thresholds = Mapping[str, Mapping[str, float | str]]
+
+SAMPLE_ROWS = 10
+_OFFENDED: dict[Severity, Status] = {"error": "fail", "warning": "warn", "info": "info"}
+
+
+@dataclass(frozen=True)
+class Audit:
+    """One query and what it says of itself."""
+
+    name: str
+    severity: Severity
+    advice: str
+    doc: str
+    needs: str | None  # "run" or "panel"
+    sql: str
+
+    @property
+    def parameters(self) -> set[str]:
+        """The thresholds that the query uses."""
+        return set(re.findall(r"\$([a-z_]+)", self.sql))
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one audit found."""
+
+    audit: Audit
+    status: Status
+    rows: int  # offending rows
+    columns: list[str]
+    sample: list[dict[str, Any]]  # the first of them
+    thresholds: Mapping[str, float | str]
+
+
+def shipped_audits() -> list[Audit]:
+    """The audits that come with Restock, by name."""
+    return _load((files("restock.replay") / "audits").iterdir(), "restock")
+
+
+def load_audits(folder: str | Path | None = None) -> list[Audit]:
+    """The shipped audits and those of a folder; one of the same name takes a shipped one's place.
+
+    Raises ConfigError for a folder without audits, or a file whose header is not as it must be.
+    """
+    found = {audit.name: audit for audit in shipped_audits()}
+    if folder is not None:
+        path = Path(folder)
+        if not path.is_dir() or not list(path.glob("*.sql")):
+            raise ConfigError("no audits (*.sql) in it", where=str(path))
+        found |= {audit.name: audit for audit in _load(path.iterdir(), str(path))}
+    return [found[name] for name in sorted(found)]
+
+
+def load_thresholds(file: str | Path | None = None) -> dict[str, dict[str, float | str]]:
+    """The shipped thresholds, with those of a file in their place.
+
+    Raises ConfigError for a file that is no TOML or holds anything but tables of values.
+    """
+    shipped = (files("restock.replay") / "audits.toml").read_text(encoding="utf-8")
+    found: dict[str, dict[str, float | str]] = tomllib.loads(shipped)
+    if file is None:
+        return found
+    try:
+        given = tomllib.loads(Path(file).read_text(encoding="utf-8"))
+    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot be read: {error}", where=str(file)) from error
+    for name, table in given.items():
+        if not isinstance(table, dict):
+            raise ConfigError(
+                f"{name!r} is no table", where=str(file), remedy="write [audit] tables of values"
+            )
+        found[name] = {**found.get(name, {}), **table}
+    return found
+
+
+def run_audits(
+    connection: duckdb.DuckDBPyConnection,
+    audits: Sequence[Audit],
+    thresholds: Thresholds,
+    *,
+    beside: Iterable[str] = (),
+) -> list[Finding]:
+    """Run audits over a connection with a store's views, worst findings first.
+
+    `beside` names the schemas that are there: "run", "panel". Audits that need another are
+    skipped.
+
+    Raises:
+        ConfigError: an audit does not run, a threshold is missing, or one is given that no audit
+            uses.
+    """
+    _check_thresholds(audits, thresholds)
+    there = set(beside)
+    findings = [
+        _run(connection, audit, thresholds.get(audit.name, {}))
+        if audit.needs is None or audit.needs in there
+        else Finding(audit, "skipped", 0, [], [], {})
+        for audit in audits
+    ]
+    order = ["fail", "warn", "info", "pass", "skipped"]
+    return sorted(findings, key=lambda finding: (order.index(finding.status), finding.audit.name))
+
+
+def junit_xml(findings: Sequence[Finding], suite: str) -> str:
+    """The findings as JUnit XML: failed audits fail, skipped ones are skipped."""
+    root = ElementTree.Element(
+        "testsuite",
+        name=suite,
+        tests=str(len(findings)),
+        failures=str(sum(finding.status == "fail" for finding in findings)),
+        skipped=str(sum(finding.status == "skipped" for finding in findings)),
+    )
+    for finding in findings:
+        case = ElementTree.SubElement(root, "testcase", classname=suite, name=finding.audit.name)
+        text = f"{finding.rows} rows. {finding.audit.advice}\n" + "\n".join(
+            str(row) for row in finding.sample
+        )
+        if finding.status == "fail":
+            ElementTree.SubElement(case, "failure", message=finding.audit.doc).text = text
+        elif finding.status == "skipped":
+            ElementTree.SubElement(case, "skipped", message=f"needs a {finding.audit.needs}")
+        elif finding.rows:
+            ElementTree.SubElement(case, "system-out").text = text
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _run(
+    connection: duckdb.DuckDBPyConnection, audit: Audit, thresholds: Mapping[str, float | str]
+) -> Finding:
+    where = f"audit {audit.name!r}"
+    if missing := sorted(audit.parameters - thresholds.keys()):
+        raise ConfigError(
+            f"no threshold {', '.join(missing)}",
+            where=where,
+            remedy=f"put it under [{audit.name}] in a file and give it with --thresholds",
+        )
+
+    def run() -> tuple[list[str], list[tuple[Any, ...]]]:
+        relation = connection.sql(audit.sql, params=dict(thresholds) or None)
+        return relation.columns, relation.fetchall()
+
+    try:
+        columns, values = interruptible(connection, run)
+    except duckdb.Error as error:
+        raise ConfigError(f"its SQL does not run: {error}", where=where) from error
+    sample = [dict(zip(columns, row, strict=True)) for row in values[:SAMPLE_ROWS]]
+    status: Status = _OFFENDED[audit.severity] if values else "pass"
+    return Finding(audit, status, len(values), columns, sample, thresholds)
+
+
+def _check_thresholds(audits: Sequence[Audit], thresholds: Thresholds) -> None:
+    used = {audit.name: audit.parameters for audit in audits}
+    for name, table in thresholds.items():
+        if name not in used:
+            raise ConfigError(
+                f"no audit named {name!r}", where="thresholds", remedy=f"there is {', '.join(used)}"
+            )
+        if unknown := sorted(table.keys() - used[name]):
+            raise ConfigError(
+                f"{name}.{unknown[0]} is no threshold of this audit",
+                where="thresholds",
+                remedy=f"it has {', '.join(sorted(used[name])) or 'none'}",
+            )
+
+
+def _load(entries: Iterable[Traversable], where: str) -> list[Audit]:
+    found = sorted((e for e in entries if e.name.endswith(".sql")), key=lambda entry: entry.name)
+    return [
+        _parse(entry.name.removesuffix(".sql"), entry.read_text(encoding="utf-8"), where)
+        for entry in found
+    ]
+
+
+def _parse(name: str, text: str, where: str) -> Audit:
+    header = dict(re.findall(r"^-- (severity|advice|doc|needs): (.+)$", text, re.MULTILINE))
+    for key in ("severity", "advice", "doc"):
+        if key not in header:
+            raise ConfigError(f"its header has no `-- {key}: …`", where=f"{where}/{name}.sql")
+    if header["severity"] not in _OFFENDED:
+        raise ConfigError(
+            f"severity {header['severity']!r} is none of error, warning, info",
+            where=f"{where}/{name}.sql",
+        )
+    return Audit(
+        name=name,
+        severity=cast(Severity, header["severity"]),
+        advice=header["advice"],
+        doc=header["doc"],
+        needs=header.get("needs"),
+        sql=text,
+    )

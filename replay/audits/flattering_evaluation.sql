@@ -1,0 +1,21 @@
+-- severity: warning
+-- needs: run
+-- advice: Report success per condition, or weigh each condition by its share of the logs; the mean over this evaluation is not what deployment will show.
+-- doc: Conditions that an evaluation of the run shows more often than the logs do.
+WITH deployed AS (
+    SELECT kind AS condition, count(*) / sum(count(*)) OVER () AS share_in_logs
+    FROM episode_kinds($min_steps)
+    GROUP BY kind
+), evaluated AS (
+    SELECT condition, count(*) / sum(count(*)) OVER () AS share, avg(success::INTEGER) AS success_share
+    FROM run.evaluations
+    WHERE env_steps = (SELECT max(env_steps) FROM run.evaluations)
+    GROUP BY condition
+)
+SELECT condition, share, coalesce(share_in_logs, 0) AS share_in_logs, success_share
+FROM evaluated
+LEFT JOIN deployed USING (condition)
+WHERE share > $max_ratio * coalesce(share_in_logs, 0)
+    -- Easier than the evaluation as a whole: it is this that makes the mean look better.
+    AND success_share > (SELECT sum(share * success_share) FROM evaluated)
+ORDER BY share DESC

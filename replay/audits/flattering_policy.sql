@@ -1,0 +1,33 @@
+-- severity: warning
+-- advice: Compare policies per condition, or weigh each condition as the whole fleet meets it.
+-- doc: Behaviour policies whose success looks better than it is, because they drove easier episodes than the fleet meets.
+WITH kinds AS (
+    SELECT first_policy AS behaviour_policy, kind, success
+    FROM episode_kinds($min_steps)
+    WHERE success IS NOT NULL
+), fleet AS (
+    SELECT kind, count(*) / sum(count(*)) OVER () AS share FROM kinds GROUP BY kind
+), by_kind AS (
+    SELECT behaviour_policy, kind, count(*) AS episodes, avg(success::INTEGER) AS success_share
+    FROM kinds
+    GROUP BY behaviour_policy, kind
+), by_policy AS (
+    SELECT
+        behaviour_policy,
+        sum(episodes) AS episodes,
+        sum(success_share * episodes) / sum(episodes) AS success_share,
+        -- As the fleet meets the kinds of episode that this policy drove at all.
+        sum(success_share * share) / sum(share) AS success_share_in_fleet_mix,
+        sum(share) AS kinds_driven_share
+    FROM by_kind
+    JOIN fleet USING (kind)
+    GROUP BY behaviour_policy
+)
+FROM by_policy
+WHERE success_share - success_share_in_fleet_mix > $max_flattery
+    -- It never drove the kinds that cost the fleet its failures.
+    OR (
+        kinds_driven_share < $min_kinds_share
+        AND success_share - (SELECT avg(success::INTEGER) FROM kinds) > $max_flattery
+    )
+ORDER BY behaviour_policy

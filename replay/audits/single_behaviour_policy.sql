@@ -1,0 +1,15 @@
+-- severity: warning
+-- advice: Only one way of acting is known here: what the others would have led to must come from the twin.
+-- doc: Conditions that one behaviour policy drove (almost) alone.
+SELECT condition, behaviour_policy, rows, rows / of_condition AS share
+FROM (
+    SELECT
+        condition,
+        behaviour_policy,
+        count(*) AS rows,
+        sum(count(*)) OVER (PARTITION BY condition) AS of_condition
+    FROM transitions
+    GROUP BY condition, behaviour_policy
+)
+WHERE rows / of_condition >= $max_share
+ORDER BY condition

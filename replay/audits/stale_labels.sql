@@ -1,0 +1,12 @@
+-- severity: warning
+-- advice: Ingest these recordings again, so that one condition means the same in all of them.
+-- doc: Recordings that were labelled, or read, by another version of the conditions or the profile than the newest ingest.
+WITH newest AS (FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1)
+SELECT recordings.recording_id, recordings.source_file, recordings.labels_version, recordings.profile_hash
+FROM recordings, newest
+WHERE recordings.profile = newest.profile
+    AND (
+        recordings.labels_version <> newest.labels_version
+        OR recordings.profile_hash <> newest.profile_hash
+    )
+ORDER BY recordings.source_file

@@ -1,0 +1,106 @@
+"""`restock audit`: is the coverage good enough?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from restock.errors import ExitCode
+
+if TYPE_CHECKING:
+    from restock.replay.audit import Finding
+
+
+@dataclass
+class Audit:
+    """Is what the store holds good enough to learn from? Exits 1 when an audit fails.
+
+    Each audit is a query that returns offending rows, with a severity: an error fails, a warning
+    warns, an info informs. Those that look at a panel or a run are skipped unless one is given.
+    The thresholds are in replay/audits.toml; docs/audit.md lists all audits.
+    """
+
+    store: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
+    """The store to audit."""
+    panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
+    """A panel made from it, to be audited too."""
+    run_dir: Annotated[Path | None, tyro.conf.arg(name="run", metavar="RUN")] = None
+    """A run whose evaluation is to be audited too."""
+    audits: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """A folder of audits (*.sql) of your own; one of the same name takes a shipped one's place."""
+    thresholds: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """A TOML file with thresholds in place of the shipped ones."""
+    strict: bool = False
+    """Let warnings fail, too."""
+    rows: int = 5
+    """Offending rows shown of each audit (at most 10)."""
+    json: bool = False
+    """Print one JSON document."""
+    junit: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Write JUnit XML as well, for continuous integration."""
+
+    def run(self) -> int:
+        """Run the audits, print them, and say with the exit code whether one failed."""
+        from restock.cli import output
+        from restock.replay.audit import junit_xml, load_audits, load_thresholds, run_audits
+        from restock.replay.places import open_place
+
+        beside = {"panel": self.panel, "run": self.run_dir}
+        given = {name: path for name, path in beside.items() if path is not None}
+        audits, thresholds = load_audits(self.audits), load_thresholds(self.thresholds)
+        with open_place(self.store, beside=given, only_store=True) as connection:
+            findings = run_audits(connection, audits, thresholds, beside=given)
+        failing = {"fail", "warn"} if self.strict else {"fail"}
+        failed = [finding for finding in findings if finding.status in failing]
+        if self.junit is not None:
+            self.junit.write_text(junit_xml(findings, f"audit {self.store}"), encoding="utf-8")
+        if self.json:
+            output.print_json(
+                {
+                    "store": str(self.store),
+                    "failed": len(failed),
+                    "audits": [_document(finding) for finding in findings],
+                }
+            )
+        else:
+            _print(findings, self.rows)
+        return int(ExitCode.FAILED if failed else ExitCode.OK)
+
+
+def _document(finding: Finding) -> dict[str, Any]:
+    return {
+        "audit": finding.audit.name,
+        "status": finding.status,
+        "severity": finding.audit.severity,
+        "rows": finding.rows,
+        "doc": finding.audit.doc,
+        "advice": finding.audit.advice,
+        "thresholds": dict(finding.thresholds),
+        "sample": finding.sample,
+    }
+
+
+def _print(findings: list[Finding], shown: int) -> None:
+    from restock.cli import output
+
+    output.print_table(
+        [
+            {
+                "audit": finding.audit.name,
+                "status": finding.status,
+                "rows": finding.rows,
+                "what it looks for": finding.audit.doc,
+            }
+            for finding in findings
+        ]
+    )
+    for finding in findings:
+        if not finding.rows:
+            continue
+        more = finding.rows - min(shown, len(finding.sample))
+        title = f"{finding.status}: {finding.audit.name}" + (f" ({more} more)" if more else "")
+        output.print_table(finding.sample[:shown], finding.columns, title=title)
+        output.stdout().print(f"  {finding.audit.advice}\n", markup=False)
