@@ -23,8 +23,9 @@ F64 = NDArray[np.float64]
 HORIZON = 6  # steps of the control period
 TOUCH_M = 0.05
 ROOMY_M = 0.20
-PERSON_MARGIN_M = 0.25
+PERSON_MARGIN_M = 0.4
 GENTLE_MPS = 0.45
+STANDING_MPS = 0.12
 
 
 class Operator(SoftPolicy):
@@ -45,8 +46,9 @@ class Operator(SoftPolicy):
         self._find_ways(env, pose)
         table = np.asarray(env.task.actions, np.float64)
         count, actions = env.num_envs, len(table)
-        ends = self._think(env, pose, table)  # (N, A, T, 3)
+        ends, speed = self._think(env, pose, table)  # (N, A, T, 3), (N, A, T)
         room, people = self._room(env, ends)  # (N, A, T)
+        people = np.where(np.abs(speed) < STANDING_MPS, 9.0, people)  # they stop before who stands
         arrived = self._arrived(env, ends)
         room[arrived] = people[arrived] = 9.0  # what comes after the goal does not matter
         flat = ends[:, :, -1].reshape(-1, 3)
@@ -58,7 +60,7 @@ class Operator(SoftPolicy):
         score = score.reshape(count, actions)
         nearest = room.min(axis=2)
         score -= 2.0 * np.clip(ROOMY_M - nearest, 0.0, ROOMY_M) / ROOMY_M * (room[:, :, 0] > 0)
-        score -= 4.0 * np.clip(PERSON_MARGIN_M - people.min(axis=2), 0.0, 1.0)
+        score -= 8.0 * np.clip(PERSON_MARGIN_M - people.min(axis=2), 0.0, 1.0)
         when = np.argmax(np.minimum(room, people) < TOUCH_M, axis=2)
         hits = (np.minimum(room, people) < TOUCH_M).any(axis=2)
         score -= np.where(hits, 20.0 + 5.0 * (HORIZON - when), 0.0)
@@ -66,7 +68,7 @@ class Operator(SoftPolicy):
         harsh = (np.abs(table[:, 0]) > GENTLE_MPS) | (np.abs(table[:, 1]) > 1.0)
         score -= np.where(icy[:, None] & harsh[None, :], 3.0, 0.0)
         score += 1.0 * arrived.any(axis=2)
-        alone = people.min(axis=(1, 2)) > 1.0
+        alone = people.min(axis=(1, 2)) > 0.6
         score[alone, 0] -= 0.2  # nobody to wait for
         # Whoever has stood for a while tries something else that does not touch.
         tries = self._rng.random(score.shape) * 0.5 - 10.0 * hits
@@ -74,6 +76,16 @@ class Operator(SoftPolicy):
         stood = self._standing(env, pose) & alone
         score[stood] = tries[stood]
         return np.asarray(score.argmax(axis=1), np.int64)
+
+    def sees_trouble(self, env: WarehouseVectorEnv) -> NDArray[np.bool_]:
+        """Where (N,) pallets, people or slippery floor are still about."""
+        pose = env.simulation.pose()
+        pallets = env.simulation.pallets[..., :2] - pose[:, None, :2]
+        traffic = env.simulation.traffic
+        people = traffic.position_m - pose[:, None, :2]
+        near = (np.hypot(pallets[..., 0], pallets[..., 1]) < 1.7).any(axis=1)
+        near |= (np.hypot(people[..., 0], people[..., 1]) < 1.5).any(axis=1)
+        return np.asarray(near | self._icy(env, pose), np.bool_)
 
     def _arrived(self, env: WarehouseVectorEnv, ends: F64) -> NDArray[np.bool_]:
         """From which step on (N, A, T) the robot has been at its goal."""
@@ -114,13 +126,14 @@ class Operator(SoftPolicy):
             self._ways[index] = planner.plan(x, y, target) if way is None else way
             self._episode[index] = serial[index]
 
-    def _think(self, env: WarehouseVectorEnv, pose: F64, table: F64) -> F64:
-        """Where each action, held, brings the robot: poses (N, A, HORIZON, 3)."""
+    def _think(self, env: WarehouseVectorEnv, pose: F64, table: F64) -> tuple[F64, F64]:
+        """Where each action, held, brings the robot: poses (N, A, T, 3) and speeds (N, A, T)."""
         period = env.task.control_period_s
         shape = (env.num_envs, len(table))
         x, y, yaw = (np.broadcast_to(pose[:, axis, None], shape) for axis in range(3))
         velocity = np.broadcast_to(env.simulation.set_point[:, None], (*shape, 2))
         ends = np.empty((*shape, HORIZON, 3))
+        speed = np.empty((*shape, HORIZON))
         for step in range(HORIZON):
             velocity = velocity + 0.8 * (table - velocity)
             middle = yaw + velocity[..., 1] * period / 2
@@ -128,7 +141,8 @@ class Operator(SoftPolicy):
             y = y + velocity[..., 0] * np.sin(middle) * period
             yaw = yaw + velocity[..., 1] * period
             ends[:, :, step] = np.stack([x, y, yaw], axis=-1)
-        return ends
+            speed[:, :, step] = velocity[..., 0]
+        return ends, speed
 
     def _room(self, env: WarehouseVectorEnv, ends: F64) -> tuple[F64, F64]:
         """Clearance (N, A, T) to racks, walls and pallets, and to people where they will be."""

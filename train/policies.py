@@ -21,6 +21,7 @@ Actions = NDArray[np.int64]
 
 STUCK_STEPS = 15
 SLIP_STEPS = 4
+MIN_HELD_STEPS = 15
 
 
 class Policy(Protocol):
@@ -33,6 +34,14 @@ class Policy(Protocol):
 
     def act(self, env: WarehouseVectorEnv, observation: NDArray[np.float32]) -> tuple[Actions, F64]:
         """Actions (N,) and the probabilities (N,) they had."""
+        ...
+
+
+class Overseer(Policy, Protocol):
+    """A policy that can be called in, and knows when it is no longer needed."""
+
+    def sees_trouble(self, env: WarehouseVectorEnv) -> NDArray[np.bool_]:
+        """Where (N,) it would not hand back yet."""
         ...
 
 
@@ -161,7 +170,7 @@ class Handover:
 
     version = "1"
 
-    def __init__(self, planner: Policy, operator: Policy) -> None:
+    def __init__(self, planner: Policy, operator: Overseer) -> None:
         self.planner, self.operator = planner, operator
         self.name = f"{planner.name}+{operator.name}"
         self.events: list[HandoverEvent] = []
@@ -221,12 +230,13 @@ class Handover:
             )
             self._pass(env, int(index), True, reason)
         clear = (
-            (signals["clearance_ahead_m"] > 1.2)
-            & (signals["clearance_m"] > 0.25)
+            (signals["clearance_m"] > 0.2)
             & (self._slipping == 0)
-            & (self._held >= 15)
+            & ~signals["bumped"]
+            & (self._held >= MIN_HELD_STEPS)
+            & ~self.operator.sees_trouble(env)
         )
-        for index in np.flatnonzero(clear & self._taken & ~trouble):
+        for index in np.flatnonzero(clear & self._taken):
             self._pass(env, int(index), False, "clear")
 
     def _pass(self, env: WarehouseVectorEnv, index: int, taken: bool, reason: str) -> None:
