@@ -20,6 +20,8 @@ CONDITION_COLOURS = {
     "nominal": "#6b7280",
     "wheel_slip": "#0072b2",
     "blocked_aisle": "#e69f00",
+    "blocked_aisle (partial)": "#e69f00",
+    "blocked_aisle (full)": "#8a5a00",
     "near_collision": "#d55e00",
     "recovery": "#cc79a7",
 }
@@ -162,8 +164,8 @@ def lines(
         )
         text = (
             plot([{"at": marker, "text": "kept"}])
-            .mark_text(align="left", dx=4, dy=6, baseline="top", fontSize=11)
-            .encode(x="at:Q", y=alt.value(0), text="text:N")
+            .mark_text(align="right", dx=-4, dy=-6, baseline="bottom", fontSize=11)
+            .encode(x="at:Q", y=alt.value(230), text="text:N")
         )
         chart = alt.layer(line, rule, text)
     return svg(chart.properties(width=430, height=230))

@@ -16,6 +16,7 @@ from restock.train.layout import default_warehouse
 def success(facts: Facts) -> Section | None:
     if not facts.cells:
         return None
+    cells = sorted(facts.cells, key=_cell_order)
     worst = "; ".join(_regressions(facts))
     rows = [
         {
@@ -29,7 +30,7 @@ def success(facts: Facts) -> Section | None:
             "time to goal": "" if row["time_s"] is None else f"{row['time_s']:.1f} s",
             "return": f"{row['mean_return']:.2f}",
         }
-        for row in facts.cells
+        for row in cells
     ]
     shown = [
         {
@@ -37,7 +38,7 @@ def success(facts: Facts) -> Section | None:
             "cell": words(row["cell"]),
             "perturbation": "clean" if row["perturbation"] == "none" else row["perturbation"],
         }
-        for row in sorted(facts.cells, key=_cell_order)
+        for row in cells
     ]
     return section(
         "success",
@@ -63,11 +64,11 @@ def success(facts: Facts) -> Section | None:
     )
 
 
-def _cell_order(row: dict[str, Any]) -> tuple[int, int, str]:
+def _cell_order(row: dict[str, Any]) -> tuple[str, int, str]:
     known = list(charts.CONDITION_COLOURS)
     condition = row["cell"].split(" (")[0]
     place = known.index(condition) if condition in known else len(known)
-    return (row["perturbation"] != "none", place, row["cell"])
+    return (row["perturbation"] if row["perturbation"] != "none" else "", place, row["cell"])
 
 
 def _regressions(facts: Facts) -> list[str]:
