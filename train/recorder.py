@@ -112,7 +112,7 @@ class Summary:
     plan: Plan
     missions: Counter[str] = field(default_factory=Counter)  # by kind
     succeeded: Counter[str] = field(default_factory=Counter)
-    steps: Counter[str] = field(default_factory=Counter)  # by true condition
+    steps: Counter[str] = field(default_factory=Counter)  # in which a true condition held
     policies: Counter[str] = field(default_factory=Counter)  # steps
     handovers: int = 0
     topics: Counter[str] = field(default_factory=Counter)  # messages
@@ -167,7 +167,8 @@ def record(
             kind = driven.mission.spec.condition
             summary.missions[kind] += 1
             summary.succeeded[kind] += driven.success
-            summary.steps.update(driven.drive.true_condition)
+            for truth in driven.drive.true_condition:
+                summary.steps.update(truth.split(","))
             who = [f"{name} {version}" for name, version, _ in driven.drive.policy]
             summary.policies.update(who)
             summary.handovers += sum(a != b for a, b in pairwise(who))
