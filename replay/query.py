@@ -55,7 +55,7 @@ def query(
             )
     try:
         for statement in statements[:-1]:
-            connection.execute(statement)
+            connection.execute(statement).fetchall()
         relation = connection.sql(statements[-1].query)
     except duckdb.Error as error:
         raise QueryError(_message(error), where=where, remedy=_hint(error)) from error

@@ -100,8 +100,8 @@ SELECT
     count(DISTINCT episode_id) AS episodes,
     avg(reward) AS reward_mean,
     avg(terminated::INTEGER) AS terminal_fraction,
-    (count(DISTINCT episode_id) FILTER (success)) / count(DISTINCT episode_id) FILTER (success IS NOT NULL)
-        AS success_share
+    (count(DISTINCT episode_id) FILTER (success))
+        / nullif(count(DISTINCT episode_id) FILTER (success IS NOT NULL), 0) AS success_share
 FROM transitions
 JOIN (SELECT episode_id, success FROM episodes) USING (episode_id)
 GROUP BY ALL
@@ -136,7 +136,7 @@ SELECT
     condition,
     timing,
     coalesce(rows, 0) AS rows,
-    coalesce(rows, 0) / sum(rows) OVER () AS share,
+    coalesce(rows, 0) / nullif(sum(rows) OVER (), 0) AS share,
     coalesce(episodes, 0) AS episodes,
     coalesce(effective_episodes, 0) AS effective_episodes,
     success_share,
