@@ -131,7 +131,7 @@ def test_floors_and_caps_hold_and_the_others_take_the_rest() -> None:
 @given(st.data())
 def test_scaling_keeps_within_bounds_and_sums_to_one(data: st.DataObject) -> None:
     count = data.draw(st.integers(1, 8))
-    part = st.floats(0, 1)
+    part = st.integers(0, 1000).map(lambda thousandths: thousandths / 1000)
     base = np.array(data.draw(st.lists(part, min_size=count, max_size=count)))
     low = np.array(data.draw(st.lists(part, min_size=count, max_size=count))) / count
     high = np.minimum(low + np.array(data.draw(st.lists(part, min_size=count, max_size=count))), 1)
