@@ -69,6 +69,8 @@ def train(
         _interrupt(session, stop)
         _update(session, session.batches.draw_offline(), "offline", notify)
     if clock.evaluated_at < 0 and offline_updates:
+        if session.interval.updates:
+            _close_interval(session, "offline", notify)
         _evaluate(session, notify)
 
     while clock.env_steps < schedule.env_steps and _time_left(session):

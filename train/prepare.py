@@ -14,6 +14,7 @@ from restock.ingest.profile import Profile, load_profile
 from restock.replay.panel import Panel
 from restock.train.batches import Logs
 from restock.train.config import TrainConfig, apply_overrides, load_config, parse_config
+from restock.train.episode import KINDS
 from restock.train.evaluate import Twin
 from restock.train.learner import open_device
 from restock.train.run import Run, check_free, now_ns, software_versions
@@ -43,7 +44,12 @@ class Prepared:
             task=self.profile.task,
             conditions=self.profile.conditions,
             env=make_twin(self.config, self.profile, self.config.env.num_envs),
-            evaluation_env=make_twin(self.config, self.profile, _EVALUATION_ENVS, nthread=0),
+            evaluation_env=make_twin(
+                self.config,
+                self.profile,
+                min(_EVALUATION_ENVS, self.config.evaluation.episodes * len(KINDS)),
+                nthread=0,
+            ),
             logs=Logs.of_panel(self.panel) if self.panel is not None else None,
             resume=self.resumed is not None,
         )
