@@ -81,7 +81,7 @@ def fed(facts: Facts) -> Section:
         "What was the critic fed?",
         intro="The replay mix is the training distribution. Intended is what the mixture asks for,"
         " drawn what the batches held, after weights what the gradient saw.",
-        callout=_flattery(facts),
+        callout=flattery(facts),
         figures=figures,
         two=True,
         tables=[
@@ -131,7 +131,7 @@ def _short(value: int) -> str:
     return f"{value / 1024:.0f}k" if value >= 1024 else str(value)
 
 
-def _flattery(facts: Facts) -> str:
+def flattery(facts: Facts) -> str:
     """The imbalance most likely to make the evaluation look better than deployment."""
     cells = clean_cells(facts)
     if not cells or not facts.logged:

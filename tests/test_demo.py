@@ -1,0 +1,72 @@
+"""The demo: stages in order, each a command that a user could type; `make test-slow` runs it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from restock import cli
+from restock.demo import MARKER, Stage, prepare, run_demo, stages
+from restock.errors import RestockError
+
+SILENT = lambda message: None  # noqa: E731
+
+
+def plan(tmp_path: Path) -> list[Stage]:
+    return stages(tmp_path / "logs", tmp_path / "out", seconds=5, episodes=1, device="cpu")
+
+
+def test_every_stage_is_a_verb_with_flags_that_exist(tmp_path: Path) -> None:
+    verbs = [stage.command[0] for stage in plan(tmp_path)]
+    assert verbs == ["info", "ingest", "sql", "audit", "mix", "train", "eval", "report"]
+    for stage in plan(tmp_path):
+        assert cli.main([*stage.command, "--help"]) == 0
+
+
+def test_an_unexpected_exit_code_stops_the_demo(tmp_path: Path) -> None:
+    ran: list[str] = []
+
+    def dispatch(command: list[str]) -> int:
+        ran.append(command[0])
+        return {"audit": 1, "mix": 2}.get(command[0], 0)
+
+    # A failed audit is expected on sample logs; a mixture that is refused is not.
+    assert run_demo(plan(tmp_path), dispatch, say=SILENT) == 2
+    assert ran[-1] == "mix"
+
+
+def test_an_earlier_demo_is_replaced_and_nothing_else(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    prepare(out)
+    (out / "old").write_text("old")
+    prepare(out)
+    assert sorted(path.name for path in out.iterdir()) == [MARKER]
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "thesis.tex").write_text("precious")
+    with pytest.raises(RestockError, match="not from a demo"):
+        prepare(mine)
+    assert (mine / "thesis.tex").read_text() == "precious"
+
+
+def test_a_dry_run_prints_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert cli.main(["demo", "--out", str(out), "--dry-run"]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[-1] == f"restock report {out / 'run'}"
+    assert not out.exists()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_demo_ends_with_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert (
+        cli.main(["demo", "--out", str(out), "--seconds", "20", "--episodes", "2", "--json"]) == 0
+    )
+    said = capsys.readouterr().out
+    parts = json.loads(said[said.rindex("{") :])
+    page = Path(parts["report"]).read_text(encoding="utf-8")
+    assert page.count("<svg") == 10
