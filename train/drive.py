@@ -57,7 +57,7 @@ class Drive:
     scan_s: F64  # (K,) when the lidar scanned; every tick is among them
     ranges_m: F64  # (K, B) as measured; inf where nothing came back
     command: F64  # (T, 2) speed_mps, yaw_rate_radps
-    true_condition: list[str]  # T; several at once are joined by commas
+    true_condition: list[str]  # T
     policy: list[tuple[str, str, float]]  # T of (name, version, probability of the action)
     plans: list[tuple[int, F64]]  # (tick from which it is in force, (P, 2) points)
     gyro_bias_radps: float = 0.0

@@ -18,7 +18,6 @@ from restock.train.episode import EpisodeSpec
 from restock.train.missions import Mission
 from restock.train.perturbation import Perturbation
 from restock.train.simulation import BLOCK_S, Live
-from restock.train.truth import NEAR_M
 from restock.train.vector_env import WarehouseVectorEnv
 
 F64 = NDArray[np.float64]
@@ -104,7 +103,6 @@ class Fleet:
         while any(log is not None for log in self._logs):
             action, policy, probability = crew.act(env)
             self._motion, self._scan = [], None
-            recovering = env.truth.aftermath_s > 0
             _, reward, terminated, truncated, info = env.step(action)
             ended = np.flatnonzero(terminated | truncated)
             for robot, log in enumerate(self._logs):
@@ -112,7 +110,7 @@ class Fleet:
                     log.action.append(int(action[robot]))
                     log.policy.append((*policy[robot], float(probability[robot])))
                     log.reward.append(float(reward[robot]))
-                    log.truth.append(_truth(env, robot, bool(recovering[robot])))
+                    log.truth.append(str(info["true_condition"][robot]))
                     self._note_step(log, robot, info)
             for robot in ended.tolist():
                 if (log := self._logs[robot]) is not None:
@@ -209,22 +207,6 @@ class Fleet:
             success=bool(info["success"][robot]),
             block=str(info["block"][robot]),
         )
-
-
-def _truth(env: WarehouseVectorEnv, robot: int, recovering: bool) -> str:
-    """All that was physically so over the step just taken, the first in rank first.
-
-    `info["true_condition"]` keeps only the first; a label is right whenever its condition holds,
-    whatever else does.
-    """
-    holds = {
-        "recovery": recovering,
-        "near_collision": env.simulation.bumped[robot]
-        or env.sensing.true_clearance_m[robot] < NEAR_M,
-        "wheel_slip": env.simulation.slipped[robot],
-        "blocked_aisle": env.truth.blocked[robot],
-    }
-    return ",".join(name for name, is_so in holds.items() if is_so) or "nominal"
 
 
 def _motion_of(lives: list[Live], robot: int) -> Motion:

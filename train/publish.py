@@ -34,7 +34,6 @@ GYRO_LSB_RADPS = 2.0**-10
 ACCEL_LSB_MPS2 = 2.0**-8
 LIDAR_LSB_M = 2.0**-9  # some 2 mm
 THINKING_S = (0.012, 0.016)  # from a tick to its command; longer than any sensor's delay
-PLAN_PERIOD_S = 1.0
 BUMPER_POLL_S = 0.02
 JITTER_S = 4e-4  # of a sensor's timer
 TICK_TOLERANCE_S = 1e-6
@@ -52,6 +51,7 @@ class Rates:
     tf: float = 20.0
     bumper: float = 10.0
     diagnostics: float = 1.0
+    plan: float = 1.0  # and whenever it changes
 
 
 @dataclass
@@ -109,7 +109,7 @@ class Robot:
         for start_s, until_s, (_, points) in zip(
             starts, [*starts[1:], end_s], drive.plans, strict=True
         ):
-            times = np.arange(start_s, max(until_s, start_s + 1e-6), PLAN_PERIOD_S)
+            times = np.arange(start_s, max(until_s, start_s + 1e-6), 1 / self.rates.plan)
             messages = [topics.plan(self._stamp(time), points) for time in times.tolist()]
             found += self._send("/plan", times, messages)
         changed = [

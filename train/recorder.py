@@ -77,6 +77,7 @@ class Plan:
     policy: Driver = "handover"
     rates: Rates = field(default_factory=Rates)
     hardware: Perturbation = HARDWARE
+    start_ns: int = FIRST_NS  # when the first mission starts
 
     def __post_init__(self) -> None:
         """Raises ConfigError where the recording would have no end, or nothing in it."""
@@ -112,7 +113,7 @@ class Summary:
     plan: Plan
     missions: Counter[str] = field(default_factory=Counter)  # by kind
     succeeded: Counter[str] = field(default_factory=Counter)
-    steps: Counter[str] = field(default_factory=Counter)  # in which a true condition held
+    steps: Counter[str] = field(default_factory=Counter)  # by true condition
     policies: Counter[str] = field(default_factory=Counter)  # steps
     handovers: int = 0
     topics: Counter[str] = field(default_factory=Counter)  # messages
@@ -153,7 +154,7 @@ def record(
     summary = Summary(path, plan)
     missions = schedule(plan.seed, plan.conditions, plan.policy, plan.hardware)
     crew = FleetCrew(fleet.env.num_envs, seed=plan.seed)
-    start_ns = FIRST_NS
+    start_ns = plan.start_ns
     with recording_sink(path, plan.format, TOPICS) as sink:
         static = robot.static(start_ns, _occupied(fleet.env.warehouse, MAP_CELL_M), MAP_CELL_M)
         sink.write(static)
@@ -167,8 +168,7 @@ def record(
             kind = driven.mission.spec.condition
             summary.missions[kind] += 1
             summary.succeeded[kind] += driven.success
-            for truth in driven.drive.true_condition:
-                summary.steps.update(truth.split(","))
+            summary.steps.update(driven.drive.true_condition)
             who = [f"{name} {version}" for name, version, _ in driven.drive.policy]
             summary.policies.update(who)
             summary.handovers += sum(a != b for a, b in pairwise(who))
@@ -201,12 +201,12 @@ def parse_rates(text: str) -> Rates:
             given[name] = float(number)
         except ValueError:
             given[name] = 0.0
-        allowed = given[name] in (5, 10) if name == "scan" else 0 < given[name] <= 500
+        allowed = given[name] in (5, 10) if name == "scan" else 0 < given[name] <= 200
         if not allowed:
             raise ConfigError(
                 f"{number!r} is no rate in Hz",
                 where=f"--rates {name}",
-                remedy="5 or 10" if name == "scan" else "above 0, at most 500",
+                remedy="5 or 10" if name == "scan" else "above 0, at most 200",
             )
     return replace(Rates(), **given)
 
