@@ -31,7 +31,7 @@ F64 = NDArray[np.float64]
 KINDS = ("nominal", "wheel_slip", "blocked_aisle", "near_collision")
 BLOCKS = ("none", "partial", "full")
 PATH_M = (4.0, 11.0)
-PATCH_FRICTION = (0.05, 0.10)
+PATCH_FRICTION = (0.015, 0.035)  # oil or wet ice on sealed concrete
 GAP_M = (0.70, 0.90)
 
 
@@ -123,25 +123,27 @@ def _draw_way(
 
 
 def _draw_patches(rng: np.random.Generator, plan: F64) -> F64:
-    """One to three patches: at the start, before a turn, before the goal; some on one side only."""
+    """Oily floor before and in the sharpest turn, and mostly where the robot starts or stops.
+
+    Some patches lie under the wheels of one side only, which turns a robot that pulls or brakes.
+    """
     patches = np.tile(NO_PATCH, (PATCHES, 1))
-    total = length_m(plan)
-    turn = _sharpest_turn(plan)
-    places = [turn, total - rng.uniform(0.3, 1.2), rng.uniform(0.5, 1.5)]
-    order = rng.permutation(3)[: rng.integers(1, 4)]
-    if 0 not in order:
-        order = np.append(order, 0)[-3:]
-    for row, index in enumerate(order):
-        at = point_along(plan, places[index])
-        ahead = point_along(plan, places[index] + 0.3) - point_along(plan, places[index] - 0.3)
-        mu = rng.uniform(*PATCH_FRICTION)
-        long, wide = rng.uniform(1.0, 1.8), rng.uniform(0.9, 1.5)
-        if rng.random() < 0.3:  # under the wheels of one side only
+    turn, total = _sharpest_turn(plan), length_m(plan)
+    places = [turn, turn - rng.uniform(0.6, 1.2)]
+    if rng.random() < 0.7:
+        places.append(total - rng.uniform(0.5, 1.5))
+    if rng.random() < 0.7:
+        places.append(rng.uniform(0.3, 1.2))
+    for row, place in enumerate(places):
+        at = point_along(plan, place)
+        ahead = point_along(plan, place + 0.3) - point_along(plan, place - 0.3)
+        long, wide = rng.uniform(1.2, 1.7), 1.5
+        if row > 0 and rng.random() < 0.35:  # under one side only: an edge along the plan
             normal = np.array([-ahead[1], ahead[0]]) / max(float(np.hypot(*ahead)), 1e-9)
-            wide = 0.45
-            at = at + normal * rng.choice([-1.0, 1.0]) * (wide + 0.02)
+            wide = 0.6
+            at = at + normal * rng.choice([-1.0, 1.0]) * wide
         half = (long, wide) if abs(ahead[0]) > abs(ahead[1]) else (wide, long)
-        patches[row] = (*at, *half, mu)
+        patches[row] = (*at, *half, rng.uniform(*PATCH_FRICTION))
     return patches
 
 

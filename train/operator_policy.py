@@ -20,9 +20,10 @@ from restock.train.vector_env import WarehouseVectorEnv
 
 F64 = NDArray[np.float64]
 
+BACK_STEPS = 7
 HORIZON = 6  # steps of the control period
 TOUCH_M = 0.05
-ROOMY_M = 0.20
+ROOMY_M = 0.12
 PERSON_MARGIN_M = 0.4
 GENTLE_MPS = 0.45
 STANDING_MPS = 0.12
@@ -39,6 +40,7 @@ class Operator(SoftPolicy):
         self._episode = np.zeros(0, np.int64)
         self._anchor = np.zeros((0, 3))
         self._still = np.zeros(0, np.int64)
+        self._backing = np.zeros(0, np.int64)
 
     def choose(self, env: WarehouseVectorEnv) -> Actions:
         """The action that comes farthest along the way without coming too near to anything."""
@@ -70,9 +72,10 @@ class Operator(SoftPolicy):
         score += 1.0 * arrived.any(axis=2)
         alone = people.min(axis=(1, 2)) > 0.6
         score[alone, 0] -= 0.2  # nobody to wait for
-        # Whoever has stood for a while tries something else that does not touch.
+        # Whoever has stood for a while backs off, or tries something else that does not touch.
         tries = self._rng.random(score.shape) * 0.5 - 10.0 * hits
         tries[:, 0] -= 1.0
+        tries[:, table[:, 0] < 0] += 1.0
         stood = self._standing(env, pose) & alone
         score[stood] = tries[stood]
         return np.asarray(score.argmax(axis=1), np.int64)
@@ -94,12 +97,13 @@ class Operator(SoftPolicy):
         return np.asarray(np.logical_or.accumulate(there, axis=2), np.bool_)
 
     def _standing(self, env: WarehouseVectorEnv, pose: F64) -> NDArray[np.bool_]:
-        """Who has not moved for two seconds."""
+        """Who has not moved for a second, and for BACK_STEPS after."""
         moved = (np.abs(pose - self._anchor) > (0.1, 0.1, 0.2)).any(axis=1) | (env.steps == 0)
         self._anchor[moved] = pose[moved]
         self._still = np.where(moved, 0, self._still + 1)
-        self._still[self._still > 13] = 0  # three steps of something else, then think again
-        return self._still > 10
+        self._backing = np.where(self._still > 5, BACK_STEPS, np.maximum(self._backing - 1, 0))
+        self._backing[env.steps == 0] = 0
+        return self._backing > 0
 
     def _find_ways(self, env: WarehouseVectorEnv, pose: F64) -> None:
         """A way past the pallets at the start of each episode, and again where one has strayed."""
@@ -108,6 +112,7 @@ class Operator(SoftPolicy):
             self._episode = np.full(env.num_envs, -1)
             self._anchor = np.zeros((env.num_envs, 3))
             self._still = np.zeros(env.num_envs, np.int64)
+            self._backing = np.zeros(env.num_envs, np.int64)
         serial = env.episodes_begun
         stale = self._episode != serial
         offset = view_route(self._ways, pose[:, 0], pose[:, 1], pose[:, 2], ()).offset_m
