@@ -8,11 +8,14 @@ The header of an audit's file says what it is:
     -- needs: run | panel          (only where it looks at one)
 
 `$name` in the query is a threshold, from `audits.toml` or a file of the user's.
+
+`python -m restock.replay.audit docs/audit.md` writes the table of the page anew.
 """
 
 from __future__ import annotations
 
 import re
+import sys
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -32,6 +35,8 @@ Status = Literal["pass", "fail", "warn", "info", "skipped"]
 Thresholds = Mapping[str, Mapping[str, float | str]]
 
 SAMPLE_ROWS = 10
+BEGIN = "<!-- audits: written by `python -m restock.replay.audit docs/audit.md` -->"
+END = "<!-- end of audits -->"
 _OFFENDED: dict[Severity, Status] = {"error": "fail", "warning": "warn", "info": "info"}
 
 
@@ -222,3 +227,23 @@ def _parse(name: str, text: str, where: str) -> Audit:
         needs=header.get("needs"),
         sql=text,
     )
+
+
+def rewrite(text: str) -> str:
+    """A page with the table between its two markers written anew."""
+    thresholds = load_thresholds()
+    lines = ["| audit | severity | finds | thresholds |", "| --- | --- | --- | --- |"]
+    for audit in shipped_audits():
+        values = thresholds.get(audit.name, {})
+        given = ", ".join(f"{name} = {value}" for name, value in values.items())
+        doc = audit.doc + (f" Needs `--{audit.needs}`." if audit.needs else "")
+        lines.append(
+            f"| {audit.name} | {audit.severity} | {doc} | {given} |".replace("|  |", "| |")
+        )
+    before, rest = text.split(BEGIN, 1)
+    return f"{before}{BEGIN}\n\n" + "\n".join(lines) + f"\n\n{END}{rest.split(END, 1)[1]}"
+
+
+if __name__ == "__main__":
+    page = Path(sys.argv[1])
+    page.write_text(rewrite(page.read_text(encoding="utf-8")), encoding="utf-8")

@@ -1,14 +1,27 @@
-"""What each column of each view means: the view `columns`, and the table in docs/sql.md."""
+"""What each column of each view means: the view `columns`, and the tables in docs/sql.md.
+
+`python -m restock.replay.column_docs docs/sql.md` writes the tables of the page anew.
+"""
 
 from __future__ import annotations
 
+import sys
 import tomllib
 from importlib.resources import files
+from pathlib import Path
 
 import duckdb
 import pyarrow as pa
 
-from restock.ingest.schema import COLUMNS, RECORDING_COLUMNS
+from restock.ingest.schema import (
+    COLUMNS,
+    RECORDING_COLUMNS,
+    recording_schema,
+    transition_schema,
+)
+
+BEGIN = "<!-- columns: written by `python -m restock.replay.column_docs docs/sql.md` -->"
+END = "<!-- end of columns -->"
 
 # A name's ending -> its unit. Longer endings first.
 UNITS = (
@@ -73,7 +86,41 @@ def install_columns(connection: duckdb.DuckDBPyConnection) -> None:
     connection.register("columns", pa.Table.from_pylist(rows, schema=schema))
 
 
+def markdown() -> str:
+    """The tables of docs/sql.md: every view and column."""
+    from restock.replay.query import install
+
+    with duckdb.connect() as connection:
+        connection.register("stored_transitions", transition_schema(2).empty_table())
+        connection.register("stored_recordings", recording_schema().empty_table())
+        install(connection, "FLOAT[]")
+        rows = connection.sql("FROM columns").fetchall()
+    parts = []
+    for view, doc in view_docs().items():
+        parts.append(f"### {view}\n\n{doc[0].upper() + doc[1:]}.\n")
+        parts.append("| column | type | unit | meaning |\n| --- | --- | --- | --- |")
+        for of_view, column, kind, of_unit, meaning in rows:
+            if of_view == view:
+                kind = "STRUCT(…)[]" if kind.startswith("STRUCT") else kind
+                kind = "FLOAT[D]" if column.endswith("observation") else kind
+                line = f"| {column} | {kind} | {of_unit} | {meaning} |"
+                parts.append(line.replace("|  |", "| |").replace("<", "&lt;"))
+        parts.append("")
+    return "\n".join(parts)
+
+
+def rewrite(text: str) -> str:
+    """A page with the tables between its two markers written anew."""
+    before, rest = text.split(BEGIN, 1)
+    return f"{before}{BEGIN}\n\n{markdown()}\n{END}{rest.split(END, 1)[1]}"
+
+
 def _read() -> dict[str, dict[str, str]]:
     text = (files("restock.replay") / "columns.toml").read_text(encoding="utf-8")
     tables: dict[str, dict[str, str]] = tomllib.loads(text)
     return tables
+
+
+if __name__ == "__main__":
+    page = Path(sys.argv[1])
+    page.write_text(rewrite(page.read_text(encoding="utf-8")), encoding="utf-8")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -18,6 +19,11 @@ from restock.ingest.conditions import Condition
 from restock.replay.build import build_panel, open_source
 from restock.replay.mixture import (
     CorrectionRule,
+    EachCondition,
+    HeldOut,
+    Mixture,
+    PlannedUse,
+    Sources,
     StratumRule,
     load_mixture,
     parse_mixture,
@@ -334,3 +340,12 @@ def test_the_same_store_and_mixture_give_the_same_bytes(
     for name in ("rows.f32", "meta.parquet", "held_out.parquet", "panel.json"):
         contents = [(panel.path / name).read_bytes() for panel in panels]
         assert contents[0] == contents[1], name
+
+
+def test_the_page_explains_every_key() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "mixture.md").read_text(encoding="utf-8")
+    structs = (Mixture, StratumRule, EachCondition, PlannedUse, HeldOut, Sources, CorrectionRule)
+    for struct in structs:
+        for field in msgspec.structs.fields(struct):
+            name = field.encode_name
+            assert any(f"`{form}`" in page for form in (name, f"[{name}]", f"[[{name}]]")), name

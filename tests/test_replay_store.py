@@ -14,7 +14,7 @@ from deltalake import write_deltalake
 import restock
 from restock.errors import QueryError, StoreError
 from restock.ingest.task import Task
-from restock.replay.column_docs import column_docs, view_docs
+from restock.replay.column_docs import column_docs, rewrite, view_docs
 from restock.replay.store import Store, is_store
 
 
@@ -249,3 +249,8 @@ def test_the_views_run_over_tables_in_memory_too(transitions: pa.Table) -> None:
         connection.execute(definitions())
         ((count,),) = connection.sql("SELECT count(*) FROM transitions").fetchall()
     assert count == len(recording_transitions(1))
+
+
+def test_the_page_lists_every_column_as_it_is() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "sql.md").read_text(encoding="utf-8")
+    assert rewrite(page) == page, "run: python -m restock.replay.column_docs docs/sql.md"
