@@ -1,7 +1,7 @@
 """Steps to episodes: where one begins, where it ends, and whether it terminated or was cut.
 
 - The goal is reached (or a bump, where the task says so): **terminated**. The steps after it,
-  until there is another goal, belong to no episode.
+  until there is another goal or the same one is ordered again, belong to no episode.
 - A new goal, a lost route, the time limit: **truncated**, on the tick at which that is so. That
   tick ends the old episode, seen with the old goal and plan, and is the first of the next one.
 - A gap, a clock jump, a pose jump, an unusable tick, the end: **truncated** on the tick before.
@@ -93,10 +93,11 @@ class _Walk:
     def __init__(self, task: Task, steps: Steps, over: Bools, over_old: Bools) -> None:
         self.task, self.steps, self.over, self.over_old = task, steps, over, over_old
         self.goal = steps.routing.goal.tolist()
+        self.order = steps.routing.order.tolist()
         self.episodes: list[Episode] = []
         self.dropped: Counter[str] = Counter()
         self.first: int | None = None  # of the open episode
-        self.done_with: int | None = None  # the goal that was reached, until there is another
+        self.done_with: tuple[int, int] | None = None  # the goal that was reached, and its order
 
     def walk(self) -> Split:
         follows = self.steps.follows.tolist()
@@ -119,7 +120,7 @@ class _Walk:
             return False
         if self.over[tick]:
             reached = self._at_goal(tick)
-            self.done_with = self.goal[tick] if reached else None
+            self.done_with = (self.goal[tick], self.order[tick]) if reached else None
             self._close(tick, "goal" if reached else "bump", terminated=True)
             return True
         if tick - first >= self.task.time_limit_steps:
@@ -134,8 +135,9 @@ class _Walk:
         if problem:
             self.dropped[problem] += 1
             return
-        if goal >= 0 and (goal == self.done_with or self._at_goal(tick)):
-            self.done_with = goal
+        wanted = (goal, self.order[tick])
+        if goal >= 0 and (wanted == self.done_with or self._at_goal(tick)):
+            self.done_with = wanted
             self.dropped["goal already reached"] += 1
             return
         self.done_with, self.first = None, tick

@@ -134,16 +134,18 @@ class _Ingest:
             self.recording.recording_id, self.ingest_id, self.path, software_version()
         )
         table = transitions(self.profile, steps, episodes, rows, provenance)
-        labels = {name: holds[rows.starts] for name, holds in rows.labels.items()}
-        scores = score(labels, [steps.truth[tick] for tick in rows.tick[rows.starts]])
+        named = np.array(table["condition"].to_pylist(), object)
+        scores = score(
+            {name: named == name for name in rows.labels}, table["true_condition"].to_pylist()
+        )
         manifest = self._manifest(steps, episodes, rows, columns, scores)
         at = (
             store.write(pa.Table.from_pylist([manifest], recording_schema()), table)
             if store
             else None
         )
-        counts = {name: int(holds.sum()) for name, holds in labels.items()}
-        counts[NOMINAL] = table["condition"].to_pylist().count(NOMINAL)
+        counts = {name: int(holds[rows.starts].sum()) for name, holds in rows.labels.items()}
+        counts[NOMINAL] = int((named == NOMINAL).sum())
         return Outcome(
             self.path,
             "written" if store else "dry run",

@@ -30,14 +30,15 @@ class Routing:
 
     goals_m: F64  # (G, 2)
     plans_m: Sequence[F64]  # each (P, 2), map frame
-    goal: Ints  # (T,) index of a goal; -1 is none
+    goal: Ints  # (T,) index of a goal, the same for the same place; -1 is none
     plan: Ints  # (T,) index of a plan; -1 is none
+    order: Ints  # (T,) the message that said so: a goal may be ordered again
 
     @classmethod
     def none(cls, ticks: int) -> Routing:
         """No goal and no plan, ever."""
         nowhere = np.full(ticks, -1, np.int64)
-        return cls(np.zeros((0, 2)), [], nowhere, nowhere)
+        return cls(np.zeros((0, 2)), [], nowhere, nowhere, nowhere)
 
     def view(self, task: Task, plan: Ints, pose: Columns) -> RouteView:
         """Along plan `plan[i]` from pose i, for N poses."""

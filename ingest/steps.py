@@ -297,7 +297,8 @@ class _Filling:
             other[usable] = away > settings.plan_goal_tolerance_m
             self._blame(other, "plan: for another goal", route=True)
         usable = self.route_problem == ""
-        self.routing = Routing(goals, plans, np.where(usable, goal, -1), np.where(usable, plan, -1))
+        goal, plan = np.where(usable, goal, -1), np.where(usable, plan, -1)
+        self.routing = Routing(goals, plans, goal, plan, held_goal.row.astype(np.int64))
 
 
 def pressed_since(bumper: Samples, pressed: Bools, tick_ns: Ints) -> Bools:

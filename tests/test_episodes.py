@@ -48,6 +48,13 @@ def test_a_goal_reached_on_the_tick_of_the_next_goal_still_terminates():
     ]
 
 
+def test_the_same_goal_ordered_again_after_it_was_reached_is_a_new_episode():
+    again = Drive(goals=[(0.0, 3.0, 1.0), (5.0, 3.0, 1.0)])  # it has driven 0.5 m past by then
+    found = episodes_of(again.topics())
+    assert [(e.first, e.last) for e in found.episodes] == [(0, 16), (25, 29)]
+    assert found.dropped == {"goal already reached": 8}
+
+
 def test_a_new_goal_truncates_and_shares_the_tick():
     found = episodes_of(Drive(goals=[(0.0, 11.0, 1.0), (2.0, 10.0, 1.0)]).topics())
     assert found.episodes == [
