@@ -28,7 +28,7 @@ from xml.etree import ElementTree
 import duckdb
 
 from restock.errors import ConfigError
-from restock.replay.query import interruptible
+from restock.replay.query import interruptible, values
 
 Severity = Literal["error", "warning", "info"]
 Status = Literal["pass", "fail", "warn", "info", "skipped"]
@@ -175,15 +175,15 @@ def _run(
 
     def run() -> tuple[list[str], list[tuple[Any, ...]]]:
         relation = connection.sql(audit.sql, params=dict(thresholds) or None)
-        return relation.columns, relation.fetchall()
+        return relation.columns, values(relation)
 
     try:
-        columns, values = interruptible(connection, run)
+        columns, found = interruptible(connection, run)
     except duckdb.Error as error:
         raise ConfigError(f"its SQL does not run: {error}", where=where) from error
-    sample = [dict(zip(columns, row, strict=True)) for row in values[:SAMPLE_ROWS]]
-    status: Status = _OFFENDED[audit.severity] if values else "pass"
-    return Finding(audit, status, len(values), columns, sample, thresholds)
+    sample = [dict(zip(columns, row, strict=True)) for row in found[:SAMPLE_ROWS]]
+    status: Status = _OFFENDED[audit.severity] if found else "pass"
+    return Finding(audit, status, len(found), columns, sample, thresholds)
 
 
 def _check_thresholds(audits: Sequence[Audit], thresholds: Thresholds) -> None:
@@ -234,8 +234,8 @@ def rewrite(text: str) -> str:
     thresholds = load_thresholds()
     lines = ["| audit | severity | finds | thresholds |", "| --- | --- | --- | --- |"]
     for audit in shipped_audits():
-        values = thresholds.get(audit.name, {})
-        given = ", ".join(f"{name} = {value}" for name, value in values.items())
+        table = thresholds.get(audit.name, {})
+        given = ", ".join(f"{name} = {value}" for name, value in table.items())
         doc = audit.doc + (f" Needs `--{audit.needs}`." if audit.needs else "")
         lines.append(
             f"| {audit.name} | {audit.severity} | {doc} | {given} |".replace("|  |", "| |")

@@ -73,7 +73,8 @@ def open_source(
         )
         return
     with duckdb.connect() as connection:
-        connection.register("transitions", transitions)
+        connection.register("given", transitions)
+        connection.execute("CREATE VIEW transitions AS SELECT *, stamp_ns AS logged_ns FROM given")
         if conditions is None:
             named = connection.sql("SELECT DISTINCT unnest(conditions) FROM transitions").fetchall()
             known = shipped()
@@ -275,7 +276,8 @@ def _header(source: Source, plan: Plan, observation_size: int, partial: Path) ->
         n_step=plan.mixture.n_step,
         packing_version=PACKING_VERSION,
         restock_version=__version__,
-        as_of_ns=plan.as_of_ns,
+        as_of_ns=int(plan.rows["stamp_ns"].to_numpy().max()),
+        newest_ns=plan.newest_ns,
         logs_share=plan.logs_share,
         conditions=[*(c.name for c in by_priority), NOMINAL],
         left_out=plan.left_out,

@@ -15,9 +15,9 @@ CREATE OR REPLACE MACRO ages_at(moment) AS TABLE
 SELECT
     condition,
     count(*) AS rows,
-    (epoch_ns(moment) - max(stamp_ns)) / 86400e9 AS age_min_days,
-    (epoch_ns(moment) - quantile_disc(stamp_ns, 0.5)) / 86400e9 AS age_median_days,
-    (epoch_ns(moment) - min(stamp_ns)) / 86400e9 AS age_max_days
+    (epoch_ns(moment) - max(logged_ns)) / 86400e9 AS age_min_days,
+    (epoch_ns(moment) - quantile_disc(logged_ns, 0.5)) / 86400e9 AS age_median_days,
+    (epoch_ns(moment) - min(logged_ns)) / 86400e9 AS age_max_days
 FROM transitions
 GROUP BY condition
 ORDER BY rows DESC, condition;

@@ -70,7 +70,8 @@ class Header(msgspec.Struct, frozen=True):
     n_step: int
     packing_version: int
     restock_version: str
-    as_of_ns: int  # newest stamp of the source: ages of log rows are against it
+    as_of_ns: int  # newest stamp of the source
+    newest_ns: int  # when its newest row was logged: ages of rows are against it, from logged_ns
     logs_share: float  # of a batch
     conditions: list[str]  # by priority, nominal last
     left_out: dict[str, int]  # rows of the source that are not in the panel, by reason
@@ -175,8 +176,9 @@ class Panel:
     @property
     def meta(self) -> pa.Table:
         """Beside each packed row (n,): transition_id, recording_id, episode_id, step_index,
-        stamp_ns, condition, zone, behaviour_policy, behaviour_version, action_probability,
-        action, reward (of one step), terminated, truncated, stratum, horizon, weight."""
+        stamp_ns, logged_ns, condition, zone, behaviour_policy, behaviour_version,
+        action_probability, action, reward (of one step), terminated, truncated, stratum,
+        stratum_code (its place in `strata`), horizon, weight."""
         if self._meta is None:
             self._meta = pq.read_table(self.path / META)
         return self._meta

@@ -33,8 +33,16 @@ from restock.replay.strata import (
 DAY_NS = 86_400 * 10**9
 
 META_COLUMNS = (
-    *("transition_id", "recording_id", "episode_id", "step_index", "stamp_ns", "condition"),
-    *("zone", "behaviour_policy", "behaviour_version", "action_probability", "action", "reward"),
+    *("transition_id", "recording_id", "episode_id", "step_index", "stamp_ns", "logged_ns"),
+    *(
+        "condition",
+        "zone",
+        "behaviour_policy",
+        "behaviour_version",
+        "action_probability",
+        "action",
+        "reward",
+    ),
     *("terminated", "truncated"),
 )
 _TEXT = ("recording_id", "episode_id", "condition", "zone", "behaviour_policy", "behaviour_version")
@@ -74,7 +82,7 @@ class Plan:
     logs_share: float  # of a batch
     left_out: dict[str, int]  # rows not in the panel, by reason
     effective_rows: float  # rows drawn equally often that the weighted draw is worth
-    as_of_ns: int  # newest stamp of the store: ages are against this
+    newest_ns: int  # when the newest row was logged
 
     @property
     def panel_rows(self) -> Ints:
@@ -105,7 +113,7 @@ def plan_panel(
         )
     member = np.stack([_bools(table, f"stratum_{i}") for i in range(len(strata))], axis=1)
     stratum = assign(member, strata)
-    stamp = table["stamp_ns"].to_numpy()
+    logged = table["logged_ns"].to_numpy()
     held_out = hold_out(table, mixture.held_out, mixture.seed)
     left_out: dict[str, int] = {}
     gone = np.zeros(len(table), np.bool_)
@@ -118,7 +126,7 @@ def plan_panel(
 
     leave_out("refused by the mixture's `where`", ~_bools(table, "admitted"))
     if mixture.max_age_days is not None:
-        leave_out("too old", stamp < int(stamp.max()) - int(mixture.max_age_days * DAY_NS))
+        leave_out("too old", logged < int(logged.max()) - int(mixture.max_age_days * DAY_NS))
     leave_out("held out", held_out)
     unlisted = (stratum == NO_STRATUM) & ~gone
     if unlisted.any() and mixture.unlisted == "refuse":
@@ -172,7 +180,7 @@ def _finish(
         logs_share=mixture.sources.logs * shares.scale,
         left_out=left_out,
         effective_rows=effective,
-        as_of_ns=int(table["stamp_ns"].to_numpy().max()),
+        newest_ns=int(table["logged_ns"].to_numpy().max()),
     )
 
 
@@ -287,7 +295,7 @@ def hold_out(table: pa.Table, rule: HeldOut, seed: int) -> Bools:
     rows = np.bincount(code, minlength=len(names))
     if rule.by == "time":
         newest = np.zeros(len(names), np.int64)
-        np.maximum.at(newest, code, table["stamp_ns"].to_numpy())
+        np.maximum.at(newest, code, table["logged_ns"].to_numpy())
         order = np.argsort(-newest, kind="stable")
     else:
         order = np.argsort([_hash(name, seed) for name in names], kind="stable")
@@ -296,7 +304,7 @@ def hold_out(table: pa.Table, rule: HeldOut, seed: int) -> Bools:
         raise MixtureError(
             f"one {rule.by if rule.by == 'recording' else 'episode'} cannot be split"
             " into a panel and held-out data",
-            remedy='set held_out.by to "episode" or "none"',
+            remedy='ingest more, or set [held_out] by = "none" in a mixture of your own',
         )
     wanted = rule.share * len(table)
     # At least one group, never all, and no more than needed.

@@ -79,11 +79,24 @@ def fetch(
     def run() -> tuple[list[str], list[tuple[Any, ...]]]:
         relation = query(connection, text, where=where)
         try:
-            return relation.columns, relation.fetchall()
+            return relation.columns, values(relation)
         except duckdb.Error as error:
             raise QueryError(_message(error), where=where, remedy=_hint(error)) from error
 
     return interruptible(connection, run)
+
+
+def values(relation: duckdb.DuckDBPyRelation) -> list[tuple[Any, ...]]:
+    """The rows of a relation; times with a zone as text in UTC."""
+    columns = [
+        f"timezone('UTC', #{place})::VARCHAR || 'Z' AS \"{name}\""
+        if str(kind) == "TIMESTAMP WITH TIME ZONE"
+        else f"#{place}"
+        for place, (name, kind) in enumerate(
+            zip(relation.columns, relation.types, strict=True), start=1
+        )
+    ]
+    return relation.project(", ".join(columns)).fetchall()
 
 
 def interruptible(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -> T:

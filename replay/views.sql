@@ -8,10 +8,14 @@ CREATE OR REPLACE VIEW recordings AS
 FROM stored_recordings
 WHERE ingest_id IN (SELECT ingest_id FROM stored_transitions);
 
+-- Stamps can be a simulator's, which begin at zero: logged_ns is the same moment by log time.
 CREATE OR REPLACE VIEW transitions AS
-SELECT * REPLACE (observation::FLOAT[] AS observation, next_observation::FLOAT[] AS next_observation)
+SELECT
+    * EXCLUDE (clock_offset_ns)
+    REPLACE (observation::FLOAT[] AS observation, next_observation::FLOAT[] AS next_observation),
+    stamp_ns + coalesce(clock_offset_ns, 0) AS logged_ns
 FROM stored_transitions
-WHERE ingest_id IN (SELECT ingest_id FROM stored_recordings);
+JOIN (SELECT ingest_id, clock_offset_ns FROM stored_recordings) USING (ingest_id);
 
 -- The discrete actions of each task, from the definition the recordings carry.
 CREATE OR REPLACE VIEW actions AS
@@ -181,11 +185,11 @@ CREATE OR REPLACE VIEW ages AS
 SELECT
     condition,
     count(*) AS rows,
-    make_timestamp_ns(min(stamp_ns)) AS oldest,
-    make_timestamp_ns(max(stamp_ns)) AS newest,
-    (epoch_ns(now()) - max(stamp_ns)) / 86400e9 AS age_min_days,
-    (epoch_ns(now()) - quantile_disc(stamp_ns, 0.5)) / 86400e9 AS age_median_days,
-    (epoch_ns(now()) - min(stamp_ns)) / 86400e9 AS age_max_days
+    make_timestamp_ns(min(logged_ns)) AS oldest,
+    make_timestamp_ns(max(logged_ns)) AS newest,
+    (epoch_ns(now()) - max(logged_ns)) / 86400e9 AS age_min_days,
+    (epoch_ns(now()) - quantile_disc(logged_ns, 0.5)) / 86400e9 AS age_median_days,
+    (epoch_ns(now()) - min(logged_ns)) / 86400e9 AS age_max_days
 FROM transitions
 GROUP BY condition
 ORDER BY rows DESC, condition;

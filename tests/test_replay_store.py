@@ -31,7 +31,7 @@ def rows(store: Store, query: str) -> list[dict[str, object]]:
 def test_transitions_are_those_that_were_written(store: Store, transitions: pa.Table) -> None:
     read = store.sql("FROM transitions ORDER BY transition_id").to_arrow_table()
     expected = transitions.sort_by("transition_id")
-    assert read.column_names == expected.column_names
+    assert read.column_names == [*expected.column_names, "logged_ns"]
     for name in expected.column_names:
         assert read[name].to_pylist() == expected[name].to_pylist(), name
     assert pa.types.is_fixed_size_list(read.schema.field("observation").type)
@@ -181,6 +181,22 @@ def test_ages_are_against_the_moment_asked_for(store: Store, transitions: pa.Tab
     day = "make_timestamp_ns(" + str(newest + 3 * 86400 * 10**9) + ")"
     ages = rows(store, f"FROM ages_at({day})")
     assert min(row["age_min_days"] for row in ages) == pytest.approx(3, abs=1e-3)  # type: ignore[type-var]
+
+
+def test_ages_are_by_log_time_where_stamps_are_a_simulators(tmp_path: Path) -> None:
+    table = recording_transitions(1)
+    place = table.schema.get_field_index("stamp_ns")
+    simulated = pa.array(np.arange(len(table)) * 200_000_000)
+    table = table.set_column(place, table.schema.field(place), simulated)
+    row = manifest(table)
+    place = row.schema.get_field_index("clock_offset_ns")
+    offset = pa.array([1_700_000_000 * 10**9])
+    row = row.set_column(place, row.schema.field(place), offset)
+    write_deltalake(str(tmp_path / "recordings"), row)
+    write_deltalake(str(tmp_path / "transitions"), table)
+    with Store(tmp_path) as store:
+        ((oldest,),) = store.sql("SELECT min(oldest)::VARCHAR FROM ages").fetchall()
+    assert oldest == "2023-11-14 22:13:20"
 
 
 def test_every_column_of_every_view_is_documented(store: Store) -> None:

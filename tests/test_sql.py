@@ -53,6 +53,14 @@ def test_json_is_a_list_of_row_objects(
     ]
 
 
+def test_times_with_a_zone_are_text_in_utc(
+    store_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    query = "SELECT ingested_at, ingested_at AS again FROM recordings LIMIT 1"
+    rows = json.loads(out_of(capsys, str(store_path), query, "--json"))
+    assert rows == [{"ingested_at": "2026-01-01 00:00:00Z", "again": "2026-01-01 00:00:00Z"}]
+
+
 def test_csv_has_a_header_even_without_rows(
     store_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -67,6 +75,14 @@ def test_a_table_is_for_people(store_path: Path, capsys: pytest.CaptureFixture[s
     text = out_of(capsys, str(store_path), "FROM coverage_by_condition")
     assert "behaviour_policies" in text
     assert "operator, planner" in text
+
+
+def test_rows_too_wide_for_a_table_are_printed_one_below_the_other(
+    store_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = out_of(capsys, str(store_path), "FROM recordings ORDER BY recording_id LIMIT 2")
+    assert "row 2" in text
+    assert "conditions_json" in text
 
 
 def test_a_query_comes_from_stdin(

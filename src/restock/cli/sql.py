@@ -5,11 +5,13 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from restock.errors import QueryError
+
+EXPANDED_ROWS = 20  # at most so many rows too wide for the terminal are printed one below the other
 
 
 @dataclass
@@ -56,5 +58,19 @@ class Sql:
             output.print_json(rows)
         elif self.csv:
             output.print_csv(rows, columns)
+        elif _too_wide(rows, columns) and len(rows) <= EXPANDED_ROWS:
+            for number, row in enumerate(rows, start=1):
+                lines = [{"column": name, "value": output.cell(row[name])} for name in columns]
+                output.print_table(lines, title=f"row {number}")
         else:
             output.print_table(rows, columns)
+
+
+def _too_wide(rows: list[dict[str, Any]], columns: list[str]) -> bool:
+    """Whether a table of these rows would not fit side by side."""
+    from restock.cli import output
+
+    widths = (
+        max([len(name), *(len(output.cell(row[name])) for row in rows)]) + 3 for name in columns
+    )
+    return sum(widths) > output.stdout().width
