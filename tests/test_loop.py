@@ -3,6 +3,7 @@ the critic was fed."""
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -150,7 +151,7 @@ def test_offline_learning_alone_agrees_with_value_iteration(tmp_path: Path) -> N
     live = session(
         tmp_path / "a",
         config(schedule={"offline_updates": 3000, "env_steps": 0}),
-        logs=msgspec_replace(shelf, stratum_rows=[np.flatnonzero(keep)], shares=np.ones(1)),
+        logs=one_stratum(shelf, stratum_rows=[np.flatnonzero(keep)], shares=np.ones(1)),
     )
     train(live)
     live.close()
@@ -165,9 +166,8 @@ def test_offline_learning_alone_agrees_with_value_iteration(tmp_path: Path) -> N
     np.testing.assert_allclose(q, np.stack([stop, value[: CELLS - 1], back], axis=1), atol=0.04)
 
 
-def msgspec_replace(shelf: Logs, **changes: Any) -> Logs:
-    import dataclasses
-
+def one_stratum(shelf: Logs, **changes: Any) -> Logs:
+    """The same logs with one stratum of other rows."""
     return dataclasses.replace(shelf, strata=["nominal"], timings=["pre"], **changes)
 
 
@@ -350,6 +350,30 @@ def test_a_learner_fits_a_batch_it_sees_again_and_again() -> None:
     td, q, _ = learner.td_error(rows)
     chosen = q.gather(1, rows[:, -3:-2].long()).squeeze(1)
     assert torch.allclose(td, chosen - expected, atol=1e-5)
+
+
+def test_the_conservative_term_lowers_what_the_logs_never_did(tmp_path: Path) -> None:
+    """Offline on rows that only drive forward: without it, "back" is worth what chance says."""
+    shelf = logs(400)
+    forward = np.flatnonzero(shelf.rows[:, -3].numpy() == 1)
+    shelf = one_stratum(shelf, stratum_rows=[forward], shares=np.ones(1))
+    cells = torch.zeros(CELLS - 1, TASK.observation_size)
+    cells[torch.arange(CELLS - 1), torch.arange(CELLS - 1)] = 1
+    gaps = []
+    for weight in (0.0, 0.5):
+        live = session(
+            tmp_path / str(weight),
+            config(
+                loss={"conservative": weight}, schedule={"offline_updates": 600, "env_steps": 0}
+            ),
+            logs=shelf,
+        )
+        train(live)
+        live.close()
+        q = live.learner.network(cells).detach()
+        gaps.append(float((q[:, 1] - q[:, [0, 2]].amax(dim=1)).min()))
+    assert gaps[1] > max(gaps[0], 0) + 0.2
+    assert q.argmax(dim=1).tolist() == [1] * (CELLS - 1)
 
 
 def test_the_config_refuses_unknown_keys_with_their_path() -> None:
