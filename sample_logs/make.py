@@ -1,0 +1,135 @@
+"""Records sample_logs/ anew: the same bytes from the same seeds.
+
+    make sample-logs                            # or: python sample_logs/make.py
+    python sample_logs/make.py --out elsewhere --check   # exit 1 where they differ from these
+
+Two things beside the seeds decide the bytes. The libraries that compute and compress: their
+versions are in manifest.json. And the vector instructions of the processor, whose sines differ in
+the last bit, which a robot that bumps into things soon shows: so numpy is kept to the
+instructions that every x86-64 processor has.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import platform
+import shutil
+import sqlite3
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+HERE = Path(__file__).parent
+NAMES = ("amr_monday.mcap", "amr_tuesday")
+LIBRARIES = ("mujoco", "numpy", "scipy", "mcap", "zstandard", "rosbags")
+DAY_NS = 86_400_000_000_000
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--out", type=Path, default=HERE, help="where to (default: here)")
+    parser.add_argument("--quick", action="store_true", help="two missions each, to try it")
+    parser.add_argument("--check", action="store_true", help="exit 1 where the bytes differ")
+    args = parser.parse_args()
+    if "NPY_DISABLE_CPU_FEATURES" not in os.environ:
+        return run_on_baseline()
+    args.out.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=".making-", dir=args.out) as scratch:
+        made = record_all(Path(scratch), quick=args.quick)
+        for name in NAMES:
+            target = args.out / name
+            if target.is_dir():
+                shutil.rmtree(target)
+            (Path(scratch) / name).replace(target)
+    manifest = {"files": digests(args.out), "libraries": libraries(), "recorded": made}
+    (args.out / "manifest.json").write_text(json.dumps(manifest, indent=1) + "\n")
+    for name, entry in manifest["files"].items():
+        sys.stdout.write(f"{entry['sha256']}  {entry['bytes']:>9,}  {name}\n")
+    if (
+        args.check
+        and digests(args.out) != json.loads((HERE / "manifest.json").read_text())["files"]
+    ):
+        sys.stderr.write("the bytes differ from those in sample_logs/manifest.json\n")
+        return 1
+    return 0
+
+
+def run_on_baseline() -> int:
+    """Run again with numpy's optional vector instructions off; they cannot be turned off later."""
+    from numpy._core import _multiarray_umath as umath
+
+    optional = [name for name in umath.__cpu_dispatch__ if umath.__cpu_features__.get(name)]
+    env = {**os.environ, "NPY_DISABLE_CPU_FEATURES": " ".join(optional)}
+    return subprocess.run([sys.executable, *sys.argv], env=env, check=False).returncode
+
+
+def record_all(folder: Path, *, quick: bool) -> dict[str, object]:
+    """Both recordings; returns what was recorded in each."""
+    from restock.train.publish import Rates
+    from restock.train.recorder import FIRST_NS, Plan, record
+
+    # Rates as a fleet thins its logs out to: the control clock's 5 Hz for most topics.
+    monday = Rates(odom=10, imu=10, joint_states=5, scan=5, amcl_pose=5, tf=5, bumper=5, plan=0.5)
+    tuesday = Rates(
+        odom=5,
+        imu=5,
+        joint_states=1,
+        scan=5,
+        amcl_pose=5,
+        tf=2,
+        bumper=5,
+        plan=0.2,
+        diagnostics=0.2,
+    )
+    plans = {
+        "amr_monday.mcap": Plan(format="mcap", minutes=24.0, seed=20260302, rates=monday),
+        "amr_tuesday": Plan(
+            format="rosbag2", minutes=2.4, seed=20260303, rates=tuesday, start_ns=FIRST_NS + DAY_NS
+        ),
+    }
+    made: dict[str, object] = {}
+    for name, plan in plans.items():
+        if quick:
+            plan = Plan(plan.format, None, 2, plan.seed, rates=plan.rates, start_ns=plan.start_ns)
+        done = record(folder / name, plan).describe()
+        made[name] = {
+            key: done[key]
+            for key in (
+                "seed",
+                "minutes",
+                "missions",
+                "succeeded",
+                "steps",
+                "policy_steps",
+                "handovers",
+            )
+        }
+    return made
+
+
+def digests(folder: Path) -> dict[str, dict[str, object]]:
+    """Every file of the recordings: its size and SHA-256."""
+    files = [file for name in NAMES for file in sorted([folder / name, *(folder / name).glob("*")])]
+    return {
+        file.relative_to(folder).as_posix(): {
+            "bytes": file.stat().st_size,
+            "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+        }
+        for file in files
+        if file.is_file()
+    }
+
+
+def libraries() -> dict[str, str]:
+    """The versions that decide the bytes."""
+    found = {name: version(name) for name in LIBRARIES}
+    return {**found, "sqlite": sqlite3.sqlite_version, "machine": platform.machine()}
+
+
+if __name__ == "__main__":
+    sys.exit(main())
