@@ -20,7 +20,8 @@ from restock.train.vector_env import WarehouseVectorEnv
 
 F64 = NDArray[np.float64]
 
-BACK_STEPS = 7
+BACK_STEPS = (8, 18)
+_LOOK_M = tuple(0.3 * step for step in range(14))
 HORIZON = 6  # steps of the control period
 TOUCH_M = 0.05
 ROOMY_M = 0.12
@@ -83,10 +84,14 @@ class Operator(SoftPolicy):
     def sees_trouble(self, env: WarehouseVectorEnv) -> NDArray[np.bool_]:
         """Where (N,) pallets, people or slippery floor are still about."""
         pose = env.simulation.pose()
-        pallets = env.simulation.pallets[..., :2] - pose[:, None, :2]
+        plans = env.navigation.plans_m
+        view = view_route(plans, pose[:, 0], pose[:, 1], np.zeros(len(pose)), _LOOK_M)
+        ahead = view.look_ahead_m + pose[:, None, :2]  # heading 0: offsets in the map frame
+        gap = np.abs(ahead[:, :, None] - env.simulation.pallets[:, None, :, :2])
+        in_way = (gap < np.array(PALLET_HALF_M[:2]) + 0.35).all(axis=-1)
         traffic = env.simulation.traffic
         people = traffic.position_m - pose[:, None, :2]
-        near = (np.hypot(pallets[..., 0], pallets[..., 1]) < 1.7).any(axis=1)
+        near = in_way.reshape(len(pose), -1).any(axis=1)
         near |= (np.hypot(people[..., 0], people[..., 1]) < 1.5).any(axis=1)
         return np.asarray(near | self._icy(env, pose), np.bool_)
 
@@ -97,11 +102,15 @@ class Operator(SoftPolicy):
         return np.asarray(np.logical_or.accumulate(there, axis=2), np.bool_)
 
     def _standing(self, env: WarehouseVectorEnv, pose: F64) -> NDArray[np.bool_]:
-        """Who has not moved for a second, and for BACK_STEPS after."""
+        """Who has not moved for a second, and for a few steps after."""
         moved = (np.abs(pose - self._anchor) > (0.1, 0.1, 0.2)).any(axis=1) | (env.steps == 0)
         self._anchor[moved] = pose[moved]
         self._still = np.where(moved, 0, self._still + 1)
-        self._backing = np.where(self._still > 5, BACK_STEPS, np.maximum(self._backing - 1, 0))
+        self._backing = np.where(
+            self._still > 5,
+            self._rng.integers(*BACK_STEPS, size=len(pose)),
+            np.maximum(self._backing - 1, 0),
+        )
         self._backing[env.steps == 0] = 0
         return self._backing > 0
 

@@ -1,0 +1,194 @@
+"""The twin's physics against hand physics, within 15 %, and against itself at a finer timestep."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from restock.ingest.profile import load_profile
+from restock.train.episode import Episode, EpisodeSpec, no_pallets
+from restock.train.friction import NO_PATCH, PATCHES, friction_at
+from restock.train.layout import default_warehouse
+from restock.train.model import CASTER_RADIUS_M, build_model
+from restock.train.perturbation import Perturbation
+from restock.train.simulation import BLOCK_S, Simulation
+
+TASK = load_profile("warehouse_amr").task
+GRAVITY = 9.81
+QUIET = {"latency_s": 0.0}
+
+
+@cache
+def simulation(timestep_s: float, num_envs: int = 1) -> Simulation:
+    return Simulation(num_envs, TASK, default_warehouse(), timestep_s, nthread=1)
+
+
+def start(
+    sim: Simulation,
+    pose: tuple[float, float, float],
+    perturbation: Perturbation,
+    *,
+    patches: NDArray[np.float64] | None = None,
+    pallets: NDArray[np.float64] | None = None,
+) -> None:
+    episode = Episode(
+        spec=EpisodeSpec("nominal", 0),
+        start=pose,
+        goal=(1.0, 1.0),
+        plan_m=np.zeros((2, 2)),
+        patches=np.tile(NO_PATCH, (PATCHES, 1)) if patches is None else patches,
+        pallets=no_pallets() if pallets is None else pallets,
+    )
+    sim.reset(0, episode, perturbation)
+
+
+def drive(sim: Simulation, speed: float, yaw_rate: float, seconds: float) -> None:
+    for _ in range(round(seconds / TASK.control_period_s)):
+        sim.drive(np.array([[speed, yaw_rate]]))
+
+
+def wheel_share() -> float:
+    """The share of the robot's weight that the driven wheels carry, standing."""
+    model, _ = build_model(default_warehouse(), TASK.body)
+    data = mujoco.MjData(model)
+    data.qpos[:3] = 6.0, 5.0, 0.1
+    mujoco.mj_step(model, data, 100)
+    force, wheels, total = np.zeros(6), 0.0, 0.0
+    for index in range(data.ncon):
+        mujoco.mj_contactForce(model, data, index, force)
+        total += force[0]
+        if model.geom_size[data.contact[index].geom2, 0] > CASTER_RADIUS_M:
+            wheels += force[0]
+    return wheels / total
+
+
+def test_the_driven_wheels_carry_most_of_the_load() -> None:
+    assert 0.85 < wheel_share() < 1.0
+
+
+@pytest.mark.parametrize("friction", [0.1, 0.2, 0.3])
+def test_a_stop_on_slippery_floor_takes_what_coulomb_says(friction: float) -> None:
+    # Wheels locked from 1 m/s: v^2 / (2 mu g), with the share of the weight that brakes.
+    sim = simulation(0.01)
+    start(sim, (6.0, 1.0, np.pi / 2), Perturbation(friction_scale=1.0, **QUIET))
+    drive(sim, 1.0, 0.0, 2.0)
+    sim.base_friction[0] = friction
+    before, speed = sim.pose()[0, 1], sim.qvel[0, 1]
+    sim.set_point[0] = 0.0  # a brake, not the base controller's ramp
+    drive(sim, 0.0, 0.0, 3.0)
+    expected = speed**2 / (2 * friction * GRAVITY * wheel_share())
+    assert sim.pose()[0, 1] - before == pytest.approx(expected, rel=0.15)
+    assert abs(sim.qvel[0, 1]) < 0.01
+
+
+@pytest.mark.parametrize("friction", [0.03, 0.06, 0.1])
+def test_acceleration_is_what_friction_gives(friction: float) -> None:
+    sim = simulation(0.01)
+    scale = friction / 0.8
+    floor = Perturbation(friction_scale=max(scale, 0.05), **QUIET)
+    start(sim, (6.0, 1.0, np.pi / 2), floor)
+    sim.base_friction[0] = friction
+    drive(sim, 1.0, 0.0, 0.4)  # wheels spin from here on
+    before = sim.qvel[0, 1]
+    drive(sim, 1.0, 0.0, 0.4)
+    gained = (sim.qvel[0, 1] - before) / 0.4
+    assert gained == pytest.approx(friction * GRAVITY * wheel_share(), rel=0.15)
+
+
+def test_slip_in_the_first_second_falls_with_friction() -> None:
+    slips = []
+    for friction in (0.8, 0.4, 0.2, 0.1, 0.05):
+        sim = simulation(0.01)
+        start(sim, (6.0, 1.0, np.pi / 2), Perturbation(**QUIET))
+        sim.base_friction[0] = friction
+        drive(sim, 1.0, 0.0, 1.0)
+        rolled = sim.qpos[0, 7:9].mean() * 0.1
+        slips.append(1 - (sim.pose()[0, 1] - 1.0) / rolled)
+    assert slips[0] < 0.06
+    assert slips == sorted(slips)
+    assert slips[-1] > 0.5
+
+
+def test_split_friction_turns_the_robot_toward_the_gripping_side() -> None:
+    patches = np.tile(NO_PATCH, (PATCHES, 1))
+    patches[0] = (4.0, 5.0, 2.0, 5.0, 0.02)  # west of x = 6: under the left wheel, driving north
+    sim = simulation(0.01)
+    start(sim, (6.0, 2.0, np.pi / 2), Perturbation(**QUIET), patches=patches)
+    drive(sim, 1.0, 0.0, 0.6)
+    assert sim.pose()[0, 2] > np.pi / 2 + 0.05  # the right wheel pulls, so it turns left
+    assert sim.slipped[0]
+
+
+def test_a_blocked_aisle_stops_the_robot_at_the_pallets_face() -> None:
+    pallets = no_pallets()
+    pallets[0] = (4.0, 3.2, 0.0)
+    pallets[1] = (4.0, 4.05, 0.0)
+    sim = simulation(0.01)
+    start(sim, (1.5, 3.63, 0.0), Perturbation(**QUIET), pallets=pallets)
+    drive(sim, 0.4, 0.0, 6.0)
+    face = 4.0 - 0.6 - TASK.body.length_m / 2
+    assert sim.pose()[0, 0] == pytest.approx(face, abs=0.02)
+    assert sim.bumped[0]
+
+
+def test_payload_lengthens_the_time_to_speed() -> None:
+    speeds = []
+    for payload in (0.0, 60.0, 120.0):
+        sim = simulation(0.01)
+        start(sim, (6.0, 1.0, np.pi / 2), Perturbation(payload_kg=payload, **QUIET))
+        drive(sim, 1.0, 0.0, 0.2)
+        speeds.append(sim.qvel[0, 1])
+    assert speeds[0] > speeds[1] > speeds[2]
+
+
+def test_a_smaller_wheel_drives_shorter_by_its_scale() -> None:
+    way = []
+    for scale in (1.0, 0.95):
+        sim = simulation(0.01)
+        start(sim, (6.0, 1.0, np.pi / 2), Perturbation(wheel_radius_scale=scale, **QUIET))
+        drive(sim, 0.4, 0.0, 4.0)
+        way.append(sim.pose()[0, 1] - 1.0)
+    assert way[1] / way[0] == pytest.approx(0.95, abs=0.01)
+
+
+def test_latency_delays_the_wheels_by_what_it_says() -> None:
+    sim = simulation(0.01)
+    for latency, still in ((0.0, 0), (0.13, 13), (0.3, 30)):
+        start(sim, (6.0, 1.0, np.pi / 2), Perturbation(latency_s=latency))
+        rows = []
+        for _ in range(3):
+            sim.commands[:, 1:] = sim.commands[:, :-1]
+            sim.commands[:, 0] = (1.0, 0.0)
+            rows += [sim._wheel_set_points(block)[0] for block in range(2)]
+        assert int((np.concatenate(rows)[:, 0] == 0).sum()) == still
+
+
+@pytest.mark.parametrize("friction", [0.8, 0.1, 0.03])
+def test_a_slalom_converges_as_the_timestep_shrinks(friction: float) -> None:
+    ends = {}
+    for timestep in (0.01, 0.005, 0.001):
+        sim = simulation(timestep)
+        start(sim, (6.0, 1.0, np.pi / 2), Perturbation(timestep_s=timestep))
+        sim.base_friction[0] = friction
+        for turn in (0.7, -0.7, 0.7, -0.7):
+            drive(sim, 0.8, turn, 1.0)
+        ends[timestep] = sim.pose()[0, :2]
+    gap = {timestep: np.hypot(*(end - ends[0.001])) for timestep, end in ends.items()}
+    assert gap[0.005] < 0.02
+    assert gap[0.01] < 0.07
+    assert gap[0.005] < gap[0.01]
+
+
+def test_friction_is_looked_up_by_place_and_the_slipperiest_patch_counts() -> None:
+    patches = np.array([[[1.0, 1.0, 0.5, 0.5, 0.1], [1.2, 1.0, 0.5, 0.5, 0.05]]])
+    points = np.array([[[0.6, 1.0], [1.0, 1.0], [3.0, 3.0]]])
+    np.testing.assert_allclose(friction_at(points, patches, np.array([0.8])), [[0.1, 0.05, 0.8]])
+
+
+def test_a_block_is_a_tenth_of_a_second() -> None:
+    sim = simulation(0.01)
+    assert sim.substeps * sim.timestep_s == pytest.approx(BLOCK_S)
