@@ -45,6 +45,28 @@ def test_rows_are_readable_by_others_after_a_flush(tmp_path: Path) -> None:
     assert total == [(100,)]
 
 
+def test_a_long_table_waits_until_it_has_grown(tmp_path: Path) -> None:
+    run = Run.create(tmp_path / "a", {})
+
+    def on_disk() -> int:
+        return pq.read_metadata(run.path / "policies.parquet").num_rows
+
+    def add(count: int) -> None:
+        run.append_columns("policies", {**policies(1, 0), "rows": np.zeros(count)})
+
+    add(5000)
+    run.flush(everything=False)
+    add(100)
+    run.flush(everything=False)
+    assert on_disk() == 5000
+    add(300)
+    run.flush(everything=False)
+    assert on_disk() == 5400
+    add(1)
+    run.flush()
+    assert on_disk() == 5401
+
+
 def test_a_row_with_a_missing_or_unknown_column_is_refused(tmp_path: Path) -> None:
     run = Run.create(tmp_path / "a", {})
     with pytest.raises(KeyError, match="row_count"):

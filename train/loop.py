@@ -211,7 +211,7 @@ def _close_interval(session: Session, phase: str, notify: Notify) -> None:
         "updates_per_s": interval.updates / elapsed_s,
     }
     session.run.append("progress", [row])
-    session.run.flush()
+    session.run.flush(everything=False)
     session.events.scalars(clock.env_steps, "train", row)
     session.interval = Interval(env_steps_before=clock.env_steps, wall_s_before=wall_s)
     notify("progress", row)
@@ -253,7 +253,7 @@ def _evaluate(session: Session, notify: Notify) -> None:
             for result in results
         ],
     )
-    session.run.flush()
+    session.run.flush(everything=False)
     summary = {**session.last.success, "mean": session.last.success_mean}
     session.events.scalars(clock.env_steps, "evaluation", summary)
     notify("evaluation", {"env_steps": clock.env_steps, "best": best, **summary})

@@ -24,6 +24,7 @@ from restock.errors import RunError
 from restock.train.run_tables import TABLES
 
 FORMAT = "restock-run/1"
+_LONG_TABLE = 4096  # rows
 Rows = Sequence[Mapping[str, Any]]
 
 
@@ -34,6 +35,7 @@ class Run:
         self.path, self.document = path, document
         self._written: dict[str, pa.Table] = {}
         self._pending: dict[str, list[pa.Table]] = {name: [] for name in TABLES}
+        self._on_disk: dict[str, int] = {}  # rows per table
 
     @classmethod
     def create(cls, path: Path, document: Mapping[str, Any]) -> Run:
@@ -80,6 +82,7 @@ class Run:
             run._written[name] = (
                 pq.read_table(file, schema=schema) if file.exists() else schema.empty_table()
             )
+            run._on_disk[name] = run._written[name].num_rows
         return run
 
     @property
@@ -116,12 +119,25 @@ class Run:
             self._pending[name] = []
         return self._written[name]
 
-    def flush(self) -> None:
-        """Write every table that has new rows, or is not there yet; each in one step."""
+    def flush(self, *, everything: bool = True) -> None:
+        """Write every table that has new rows, or is not there yet; each in one step.
+
+        Without `everything` a long table waits until it has grown by a sixteenth, so that a run
+        of any length spends little on writing; a checkpoint always writes everything.
+        """
         for name in TABLES:
             path = self.path / f"{name}.parquet"
-            if self._pending[name] or not path.exists():
-                write_table(self.table(name), path)
+            rows = self._written[name].num_rows + sum(part.num_rows for part in self._pending[name])
+            on_disk = self._on_disk.get(name, 0)
+            new = rows - on_disk
+            due = new and (everything or on_disk < _LONG_TABLE or new >= on_disk / 16)
+            if due or not path.exists():
+                self._write(name)
+
+    def _write(self, name: str) -> None:
+        table = self.table(name)
+        write_table(table, self.path / f"{name}.parquet")
+        self._on_disk[name] = table.num_rows
 
     def row_counts(self) -> dict[str, int]:
         """Rows per table, for a checkpoint."""
@@ -143,7 +159,7 @@ class Run:
                 )
             self._written[name] = table.slice(0, count)
             if table.num_rows != count:
-                write_table(self._written[name], self.path / f"{name}.parquet")
+                self._write(name)
 
 
 def check_free(path: Path) -> None:
