@@ -43,37 +43,36 @@ def view_route(
 
     A look-ahead point beyond the end of the plan is its end.
     """
-    position = np.stack([pose_x_m, pose_y_m], axis=-1)[:, None, :]  # (N, 1, 2)
-    start = plans_m[:, :-1]  # (N, P-1, 2)
-    step = plans_m[:, 1:] - start
-    squared = np.einsum("npd,npd->np", step, step)
+    # Coordinate by coordinate on contiguous arrays: this runs at every step of the twin.
+    x, y = np.ascontiguousarray(plans_m[..., 0]), np.ascontiguousarray(plans_m[..., 1])  # (N, P)
+    start_x, start_y = x[:, :-1], y[:, :-1]
+    step_x, step_y = x[:, 1:] - start_x, y[:, 1:] - start_y
+    squared = step_x * step_x + step_y * step_y
     length = np.sqrt(squared)
-    arc = np.concatenate([np.zeros((len(plans_m), 1)), np.cumsum(length, axis=1)], axis=1)
+    arc = np.zeros(x.shape)
+    np.cumsum(length, axis=1, out=arc[:, 1:])
 
-    along = np.einsum("npd,npd->np", position - start, step) / np.maximum(squared, 1e-12)
-    along = np.clip(along, 0.0, 1.0)
-    gap = position - (start + along[..., None] * step)
-    distance2 = np.einsum("npd,npd->np", gap, gap)
+    off_x, off_y = pose_x_m[:, None] - start_x, pose_y_m[:, None] - start_y
+    along = (off_x * step_x + off_y * step_y) / np.maximum(squared, 1e-12)
+    along = np.minimum(np.maximum(along, 0.0), 1.0)
+    gap_x, gap_y = off_x - along * step_x, off_y - along * step_y
+    distance2 = gap_x * gap_x + gap_y * gap_y
     nearest = np.argmin(distance2, axis=1)  # (N,)
     rows = np.arange(len(plans_m))
     here = arc[rows, nearest] + along[rows, nearest] * length[rows, nearest]
     total = arc[:, -1]
 
-    points = np.empty((len(plans_m), len(distances_m), 2))
+    cos, sin = np.cos(pose_yaw_rad), np.sin(pose_yaw_rad)
+    body = np.empty((len(plans_m), len(distances_m), 2))
     for column, ahead in enumerate(distances_m):
         target = np.minimum(here + ahead, total)
         # The last vertex at or before the target, then the rest of the way along its segment.
-        vertex = np.clip((arc[:, 1:] < target[:, None]).sum(axis=1), 0, step.shape[1] - 1)
+        vertex = np.count_nonzero(arc[:, 1:] < target[:, None], axis=1)
+        vertex = np.minimum(vertex, step_x.shape[1] - 1)
         part = (target - arc[rows, vertex]) / np.maximum(length[rows, vertex], 1e-9)
-        points[:, column] = start[rows, vertex] + np.clip(part, 0, 1)[:, None] * step[rows, vertex]
-
-    delta = points - position
-    cos, sin = np.cos(pose_yaw_rad)[:, None], np.sin(pose_yaw_rad)[:, None]
-    body = np.stack(
-        [
-            cos * delta[..., 0] + sin * delta[..., 1],
-            -sin * delta[..., 0] + cos * delta[..., 1],
-        ],
-        axis=-1,
-    )
+        part = np.minimum(np.maximum(part, 0.0), 1.0)
+        ahead_x = start_x[rows, vertex] + part * step_x[rows, vertex] - pose_x_m
+        ahead_y = start_y[rows, vertex] + part * step_y[rows, vertex] - pose_y_m
+        body[:, column, 0] = cos * ahead_x + sin * ahead_y
+        body[:, column, 1] = -sin * ahead_x + cos * ahead_y
     return RouteView(body, total - here, np.sqrt(distance2[rows, nearest]))
