@@ -18,10 +18,8 @@ from restock.errors import ExitCode, RestockError
 MARKER = ".restock-demo"
 
 COVERAGE = (
-    "SELECT condition, count(*) AS rows, round(100.0 * count(*) / sum(count(*)) OVER (), 2)"
-    " AS percent, count(DISTINCT episode_id) AS episodes,"
-    " string_agg(DISTINCT behaviour_policy, ', ' ORDER BY behaviour_policy) AS driven_by"
-    " FROM transitions GROUP BY condition ORDER BY rows DESC"
+    "SELECT condition, rows, share, episodes, success_share, behaviour_policies"
+    " FROM coverage_by_condition"
 )
 
 
