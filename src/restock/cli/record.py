@@ -71,7 +71,7 @@ class Record:
         refuse_existing(self.out)
         if self.dry_run:
             wanted = {"path": str(self.out), "dry_run": True, **plan.describe()}
-            output.print_json(wanted) if self.json else _print(wanted)
+            output.print_json(wanted) if self.json else _print_plan(wanted)
             return
         total = plan.minutes if plan.minutes is not None else float(plan.missions or 0)
         with output.progress(f"recording {self.out.name}", total) as advance:
@@ -79,21 +79,47 @@ class Record:
             def driven(missions: int, minutes: float) -> None:
                 advance(minutes if plan.minutes is not None else missions)
 
-            summary = record(self.out, plan, on_mission=driven)
-        done = summary.describe()
-        output.print_json(done) if self.json else _print(done)
+            done = record(self.out, plan, on_mission=driven).describe()
+        if self.json:
+            output.print_json(done)
+        else:
+            _print_recording(done)
 
 
-def _print(values: dict[str, Any]) -> None:
+def _print_recording(done: dict[str, Any]) -> None:
+    from restock.cli import output
+
+    kinds = [
+        {
+            "missions of": kind,
+            "driven": count,
+            "at the goal without a bump": done["succeeded"][kind],
+        }
+        for kind, count in done["missions"].items()
+    ]
+    title = (
+        f"{done['path']}  {done['format']}  {done['minutes']:.1f} min of driving  "
+        f"{done['messages']:,} messages  {done['size_bytes'] / 1e6:.1f} MB"
+    )
+    output.print_table(kinds, title=title)
+    for what, key in (("truly", "steps"), ("driven by", "policy_steps"), ("topic", "topics")):
+        unit = "messages" if key == "topics" else "steps"
+        output.print_table([{what: name, unit: count} for name, count in done[key].items()])
+    output.say(f"{done['handovers']} handovers; took {done['work_s']:.1f} s")
+
+
+def _print_plan(values: dict[str, Any]) -> None:
     from restock.cli import output
 
     rows = [
-        {
-            "what": key,
-            "": ", ".join(f"{name} {output.cell(item)}" for name, item in value.items())
-            if isinstance(value, dict)
-            else value,
-        }
+        {"": key, "would be": _in_words(value)}
         for key, value in values.items()
+        if value is not None
     ]
-    output.print_table(rows, ["what", ""])
+    output.print_table(rows, ["", "would be"])
+
+
+def _in_words(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {item:g}" for name, item in value.items())
+    return ", ".join(value) if isinstance(value, list) else str(value)
