@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from restock.errors import MixtureError
 from restock.replay.layout import F32, F64, Ints
 
+BLOCK = 64  # batches drawn at a time
+
 
 class Sampler(Protocol):
     """Draws the rows of a batch."""
@@ -42,24 +44,44 @@ class Quotas:
             raise MixtureError(f"shares must sum to 1, got {given.sum():.6g}")
         self.shares: F64 = given / given.sum()
         self.batch_size = batch_size
-        self.carry: F64 = np.zeros(len(given))
+        self._mean: list[float] = (self.shares * batch_size).tolist()
+        self._carry = [0.0] * len(self._mean)
+
+    @property
+    def carry(self) -> F64:
+        """Rows that each stratum is still owed, (S,)."""
+        return np.array(self._carry)
+
+    @carry.setter
+    def carry(self, owed: F64) -> None:
+        self._carry = np.asarray(owed, np.float64).tolist()
 
     def next(self) -> Ints:
         """Rows per stratum of the next batch, (S,); they sum to the batch size."""
-        owed = self.shares * self.batch_size + self.carry
-        quota = np.floor(np.maximum(owed, 0.0)).astype(np.int64)
-        short = self.batch_size - int(quota.sum())
+        if len(self.shares) == 1:
+            return np.array([self.batch_size], np.int64)
+        # Plain floats: for a handful of strata numpy's calls cost more than the work.
+        owed = [mean + carry for mean, carry in zip(self._mean, self._carry, strict=True)]
+        quota = [int(part) if part > 0 else 0 for part in owed]
+        rest = [part - whole for part, whole in zip(owed, quota, strict=True)]
+        short = self.batch_size - sum(quota)
         if short > 0:
-            quota[np.argsort(quota - owed, kind="stable")[:short]] += 1
+            for index in sorted(range(len(rest)), key=rest.__getitem__, reverse=True)[:short]:
+                quota[index] += 1
+                rest[index] -= 1.0
         for _ in range(-short):  # strata in debt can leave the others owed a row too many
-            over = np.where(quota > 0, quota - owed, -np.inf)
-            quota[int(np.argmax(over))] -= 1
-        self.carry = owed - quota
-        return quota
+            index = min((i for i, q in enumerate(quota) if q), key=rest.__getitem__)
+            quota[index] -= 1
+            rest[index] += 1.0
+        self._carry = rest
+        return np.array(quota, np.int64)
 
 
 class QuotaSampler:
     """Exact quotas per batch over strata of rows.
+
+    Batches are drawn BLOCK at a time and handed out one by one, which takes the cost of a draw from
+    about that of the gather to a tenth of it; what is drawn ahead is part of `state_dict`.
 
     Args:
         stratum_rows: the row numbers of each stratum, S arrays (n_s,). Strata may be empty where
@@ -94,18 +116,18 @@ class QuotaSampler:
                 f"stratum {stratum} has a share of {shares[stratum]:g} and no rows",
                 remedy="give it share 0, or let `restock mix` redistribute it",
             )
-        self.starts: Ints = np.concatenate([[0], np.cumsum(self.sizes)[:-1]]).astype(np.int64)
-        self.rows: Ints = np.concatenate([np.asarray(rows, np.int64) for rows in stratum_rows])
-        self.weights: F32 = (
-            np.ones(int(self.rows.max(initial=-1)) + 1, np.float32) if weights is None else weights
-        )
+        self._members = [np.array(rows, np.int64) for rows in stratum_rows]
+        last = max((int(rows.max(initial=-1)) for rows in self._members), default=-1)
+        self.weights: F32 = np.ones(last + 1, np.float32) if weights is None else weights
         self.rng = rng
         self.replacement = replacement
         self._cursor: Ints = np.zeros(len(self.sizes), np.int64)
-        self._order: Ints = self.rows.copy()
         if not replacement:
-            for stratum in range(len(self.sizes)):
-                self._shuffle(stratum)
+            for members in self._members:
+                self.rng.shuffle(members)
+        self._ahead_rows: Ints = np.zeros((0, batch_size), np.int64)
+        self._ahead_strata: Ints = np.zeros((0, batch_size), np.int64)
+        self._next = 0  # of those drawn ahead
 
     @property
     def batch_size(self) -> int:
@@ -117,75 +139,74 @@ class QuotaSampler:
 
     def draw(self) -> tuple[Ints, Ints]:
         """Row numbers (B,) and the stratum of each (B,), strata in order."""
-        quota = self.quotas.next()
-        stratum = np.repeat(np.arange(len(quota)), quota)
-        if self.replacement:
-            within = (self.rng.random(len(stratum)) * self.sizes[stratum]).astype(np.int64)
-            return self.rows[self.starts[stratum] + within], stratum
-        return self._draw_shuffled(quota, stratum), stratum
+        if self._next == len(self._ahead_rows):
+            self._draw_block()
+        self._next += 1
+        return self._ahead_rows[self._next - 1], self._ahead_strata[self._next - 1]
 
-    def _draw_shuffled(self, quota: Ints, stratum: Ints) -> Ints:
-        first = np.cumsum(quota) - quota  # where each stratum begins in the batch
-        place = self._cursor[stratum] + np.arange(len(stratum)) - first[stratum]
-        ends = self._cursor + quota
-        wraps = np.flatnonzero(ends > self.sizes)
-        if not len(wraps):
-            self._cursor = ends
-            return self._order[self.starts[stratum] + place]
+    def _draw_block(self) -> None:
+        quota = np.stack([self.quotas.next() for _ in range(BLOCK)])  # (BLOCK, S)
+        strata = np.tile(np.arange(len(self.sizes)), BLOCK)
+        stratum = np.repeat(strata, quota.ravel())  # (BLOCK * B,) batch by batch
         drawn = np.empty(len(stratum), np.int64)
-        calm = ~np.isin(stratum, wraps)
-        drawn[calm] = self._order[self.starts[stratum[calm]] + place[calm]]
-        self._cursor = np.where(ends > self.sizes, self._cursor, ends)
-        for index in wraps.tolist():
-            begin = int(first[index])
-            count = int(quota[index])
-            drawn[begin : begin + count] = self._go_round(index, count)
-        return drawn
+        # All that a stratum gives to the block is taken at once, and dealt out in order.
+        taken = [self._take(s, count) for s, count in enumerate(quota.sum(axis=0).tolist())]
+        drawn[np.argsort(stratum.astype(np.int16), kind="stable")] = np.concatenate(taken)
+        self._ahead_rows = drawn.reshape(BLOCK, -1)
+        self._ahead_strata = stratum.reshape(BLOCK, -1)
+        self._next = 0
 
-    def _go_round(self, stratum: int, count: int) -> Ints:
-        """The next `count` rows of a stratum whose shuffled order runs out on the way."""
-        start, size = int(self.starts[stratum]), int(self.sizes[stratum])
-        parts = []
+    def _take(self, stratum: int, count: int) -> Ints:
+        """The next `count` rows of a stratum."""
+        members, size = self._members[stratum], int(self.sizes[stratum])
+        if self.replacement:
+            return members[(self.rng.random(count) * size).astype(np.int64)]
+        parts = [np.empty(0, np.int64)]
         while count:
-            if self._cursor[stratum] == size:
-                self._shuffle(stratum)
-                self._cursor[stratum] = 0
             at = int(self._cursor[stratum])
-            taken = min(count, size - at)
-            parts.append(self._order[start + at : start + at + taken].copy())
-            self._cursor[stratum] += taken
-            count -= taken
+            if at == size:  # all have had their turn
+                self.rng.shuffle(members)
+                at = 0
+            some = min(count, size - at)
+            parts.append(members[at : at + some].copy())
+            self._cursor[stratum] = at + some
+            count -= some
         return np.concatenate(parts)
 
-    def _shuffle(self, stratum: int) -> None:
-        start, size = int(self.starts[stratum]), int(self.sizes[stratum])
-        self._order[start : start + size] = self.rng.permutation(self.rows[start : start + size])
-
     def state_dict(self) -> dict[str, Any]:
-        """Carried rounding, shuffled orders and the generator: arrays and plain JSON values."""
+        """Carried rounding, what is drawn ahead, orders, the generator: arrays and JSON values."""
         state: dict[str, Any] = {
             "carry": self.quotas.carry.copy(),
             "sizes": self.sizes.copy(),
+            "ahead_rows": self._ahead_rows[self._next :].copy(),
+            "ahead_strata": self._ahead_strata[self._next :].copy(),
             "rng": self.rng.bit_generator.state,
         }
         if not self.replacement:
-            state |= {"cursor": self._cursor.copy(), "order": self._order.copy()}
+            order = np.concatenate(self._members)
+            state |= {"cursor": self._cursor.copy(), "order": order}
         return state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Raises MixtureError when the state is of a sampler over other strata."""
-        if not np.array_equal(state["sizes"], self.sizes) or (
-            ("order" in state) == self.replacement
+        if (
+            not np.array_equal(state["sizes"], self.sizes)
+            or ("order" in state) == self.replacement
+            or state["ahead_rows"].shape[1:] != (self.batch_size,)
         ):
             raise MixtureError(
-                "the saved sampler drew from other strata",
+                "the saved sampler drew from other strata, or batches of another size",
                 remedy="resume with the panel and the settings the run began with",
             )
         self.quotas.carry = np.array(state["carry"], np.float64)
+        self._ahead_rows = np.array(state["ahead_rows"], np.int64)
+        self._ahead_strata = np.array(state["ahead_strata"], np.int64)
+        self._next = 0
         self.rng.bit_generator.state = state["rng"]
         if not self.replacement:
             self._cursor = np.array(state["cursor"], np.int64)
-            self._order = np.array(state["order"], np.int64)
+            ends = np.cumsum(self.sizes)[:-1]
+            self._members = [part.copy() for part in np.split(np.array(state["order"]), ends)]
 
 
 def uniform_sampler(rows: int, batch_size: int, rng: np.random.Generator) -> QuotaSampler:

@@ -102,11 +102,11 @@ def test_a_restored_sampler_goes_on_exactly(replacement: bool) -> None:
     state = first.state_dict()
     arrays = {name: value for name, value in state.items() if isinstance(value, np.ndarray)}
     plain = json.loads(json.dumps({k: v for k, v in state.items() if k not in arrays}))
-    expected = [first.draw() for _ in range(20)]
+    expected = [first.draw() for _ in range(200)]  # into blocks drawn later
     second = fresh(2)
     second.load_state_dict({**arrays, **plain})
     for (rows, strata), (again, strata_again) in zip(
-        expected, (second.draw() for _ in range(20)), strict=True
+        expected, (second.draw() for _ in range(200)), strict=True
     ):
         np.testing.assert_array_equal(rows, again)
         np.testing.assert_array_equal(strata, strata_again)

@@ -60,7 +60,10 @@ class Sql:
             output.print_csv(rows, columns)
         elif _too_wide(rows, columns) and len(rows) <= EXPANDED_ROWS:
             for number, row in enumerate(rows, start=1):
-                lines = [{"column": name, "value": output.cell(row[name])} for name in columns]
+                lines = [
+                    {"column": name, "value": output.cell(row[name]).replace(r"\[", "[")}
+                    for name in columns
+                ]
                 output.print_table(lines, title=f"row {number}")
         else:
             output.print_table(rows, columns)
