@@ -6,7 +6,8 @@
 Two things beside the seeds decide the bytes. The libraries that compute and compress: their
 versions are in manifest.json. And the vector instructions of the processor, whose sines differ in
 the last bit, which a robot that bumps into things soon shows: so numpy is kept to the
-instructions that every x86-64 processor has.
+instructions that every x86-64 processor has. (The C library's own sines still use FMA, which
+every one since 2013 has.)
 """
 
 from __future__ import annotations
@@ -128,7 +129,8 @@ def digests(folder: Path) -> dict[str, dict[str, object]]:
 def libraries() -> dict[str, str]:
     """The versions that decide the bytes."""
     found = {name: version(name) for name in LIBRARIES}
-    return {**found, "sqlite": sqlite3.sqlite_version, "machine": platform.machine()}
+    libc = "-".join(platform.libc_ver())
+    return {**found, "sqlite": sqlite3.sqlite_version, "libc": libc, "machine": platform.machine()}
 
 
 if __name__ == "__main__":
