@@ -76,7 +76,7 @@ def test_a_stop_on_slippery_floor_takes_what_coulomb_says(friction: float) -> No
     sim = simulation(0.01)
     start(sim, (6.0, 1.0, np.pi / 2), Perturbation(friction_scale=1.0, **QUIET))
     drive(sim, 1.0, 0.0, 2.0)
-    sim.base_friction[0] = friction
+    sim.set_floor_friction(0, friction)
     before, speed = sim.pose()[0, 1], sim.qvel[0, 1]
     sim.set_point[0] = 0.0  # a brake, not the base controller's ramp
     drive(sim, 0.0, 0.0, 3.0)
@@ -91,7 +91,7 @@ def test_acceleration_is_what_friction_gives(friction: float) -> None:
     scale = friction / 0.8
     floor = Perturbation(friction_scale=max(scale, 0.05), **QUIET)
     start(sim, (6.0, 1.0, np.pi / 2), floor)
-    sim.base_friction[0] = friction
+    sim.set_floor_friction(0, friction)
     drive(sim, 1.0, 0.0, 0.4)  # wheels spin from here on
     before = sim.qvel[0, 1]
     drive(sim, 1.0, 0.0, 0.4)
@@ -104,7 +104,7 @@ def test_slip_in_the_first_second_falls_with_friction() -> None:
     for friction in (0.8, 0.4, 0.2, 0.1, 0.05):
         sim = simulation(0.01)
         start(sim, (6.0, 1.0, np.pi / 2), Perturbation(**QUIET))
-        sim.base_friction[0] = friction
+        sim.set_floor_friction(0, friction)
         drive(sim, 1.0, 0.0, 1.0)
         rolled = sim.qpos[0, 7:9].mean() * 0.1
         slips.append(1 - (sim.pose()[0, 1] - 1.0) / rolled)
@@ -173,7 +173,7 @@ def test_a_slalom_converges_as_the_timestep_shrinks(friction: float) -> None:
     for timestep in (0.01, 0.005, 0.001):
         sim = simulation(timestep)
         start(sim, (6.0, 1.0, np.pi / 2), Perturbation(timestep_s=timestep))
-        sim.base_friction[0] = friction
+        sim.set_floor_friction(0, friction)
         for turn in (0.7, -0.7, 0.7, -0.7):
             drive(sim, 0.8, turn, 1.0)
         ends[timestep] = sim.pose()[0, :2]

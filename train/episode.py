@@ -5,7 +5,7 @@ in a table, and looked at again. Kinds of episode:
 
 - nominal: the known map and a dry floor;
 - wheel_slip: slippery patches on the way, where the robot starts, turns or stops;
-- blocked_aisle: pallets across an aisle on the way, partly (a gap of .75 to .95 m) or wholly;
+- blocked_aisle: pallets across an aisle on the way, partly (a gap of .8 to 1 m) or wholly;
 - near_collision: people and forklifts who cross the way or come toward the robot.
 """
 
@@ -32,7 +32,7 @@ KINDS = ("nominal", "wheel_slip", "blocked_aisle", "near_collision")
 BLOCKS = ("none", "partial", "full")
 PATH_M = (4.0, 11.0)
 PATCH_FRICTION = (0.02, 0.045)  # oil or wet ice on sealed concrete
-GAP_M = (0.75, 0.95)
+GAP_M = (0.80, 1.00)
 
 
 class EpisodeSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -20,7 +20,7 @@ from restock.train.vector_env import WarehouseVectorEnv
 
 F64 = NDArray[np.float64]
 
-BACK_STEPS = (8, 18)
+BACK_STEPS = (12, 16)
 _LOOK_M = tuple(0.3 * step for step in range(14))
 HORIZON = 6  # steps of the control period
 TOUCH_M = 0.05

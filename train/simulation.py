@@ -108,7 +108,8 @@ class Simulation:
         self._beam = np.stack([np.cos(self.bearings_rad), np.sin(self.bearings_rad)], axis=-1)
         self._groups = np.zeros(6, np.uint8)
         self._groups[OBSTACLE_GROUP] = 1
-        self._from = np.zeros_like(self._mocap_pos)  # where mocap bodies were a block ago
+        self._walked = np.zeros(0, np.int64)  # where traffic moved in the last block
+        self._has_patches = np.zeros(num_envs, np.bool_)
         self._control = np.zeros((num_envs, self.substeps, 2 + 3 * self._mocap_pos.shape[1]))
         self.callback: Callable[[Live], None] | None = None
         self.callback_period_s = 0.02
@@ -134,6 +135,8 @@ class Simulation:
         self._mocap_quat[env, span] = _quat(episode.pallets[:, 2])
         self.traffic.reset(env, episode.walks)
         self._show_traffic(ids)
+        self._control[env, :, 2:] = self._still(ids)[0]
+        self._has_patches[env] = (patches[:, 2] > 0).any()
         self.commands[env] = self.set_point[env] = self.accel[env] = 0.0
         self.time_s[env] = 0.0
         self.bumped[env] = self.slipped[env] = self.blown_up[env] = False
@@ -148,7 +151,7 @@ class Simulation:
 
     def apply(self, env: int, perturbation: Perturbation) -> None:
         """Write a perturbation's physics into one environment."""
-        self.base_friction[env] = FLOOR_FRICTION * perturbation.friction_scale
+        self.set_floor_friction(env, FLOOR_FRICTION * perturbation.friction_scale)
         self.latency_s[env] = perturbation.latency_s
         self.gain[env] = perturbation.gain
         if perturbation.payload_kg or self._masses:
@@ -171,6 +174,12 @@ class Simulation:
         if self._masses or self._radii:
             self.batch.set_const(np.array([env]))
 
+    def set_floor_friction(self, env: int, friction: float) -> None:
+        """The floor's friction coefficient where no patch lies."""
+        self.base_friction[env] = friction
+        for geom in self.handles.wheel_geoms:
+            self._friction[env, geom, 0] = friction
+
     # -- motion ---------------------------------------------------------------------------------
 
     def drive(self, command: F64) -> None:
@@ -183,28 +192,20 @@ class Simulation:
         for block in range(self.blocks):
             pose = self.pose()
             moving = np.hypot(self.qvel[:, 0], self.qvel[:, 1]) > MOVING_MPS
-            self._from[:] = self._mocap_pos
-            self._show_traffic(self.traffic.advance(pose, moving, touched, BLOCK_S))
-            slippery = self._write_friction(pose)
+            self._walk(self.traffic.advance(pose, moving, touched, BLOCK_S))
+            icy = np.flatnonzero(self._has_patches)
+            slippery = self._write_friction(icy, pose[icy])
             touched = self._run(self._wheel_set_points(block))
             self.bumped |= touched
-            self.slipped |= self._slipping(slippery)
+            if slippery.any():
+                self.slipped[icy] |= self._slipping(icy, slippery)
         warnings = np.asarray(self.batch.warning).reshape(self.num_envs, -1)
         self.blown_up = np.asarray((warnings > 0).any(axis=1), np.bool_)
 
     def _run(self, wheels: F64) -> NDArray[np.bool_]:
-        """One block of substeps under wheel speeds (N, S, 2); returns whose bumper was pressed.
-
-        Traffic moves a little at every substep: a jump of a block's length would strike the robot
-        like a hammer.
-        """
+        """One block of substeps under wheel speeds (N, S, 2); returns whose bumper was pressed."""
         control = self._control
         control[:, :, :2] = wheels
-        last = self._mocap_pos[:, None]
-        share = ((np.arange(self.substeps) + 1) / self.substeps)[None, :, None, None]
-        move = self._from[:, None] + share * (last - self._from[:, None])
-        jumped = (np.abs(last - self._from[:, None]) > 1.0).any(axis=-1, keepdims=True)
-        control[:, :, 2:] = np.where(jumped, last, move).reshape(self.num_envs, self.substeps, -1)
         touched = np.zeros(self.num_envs, np.bool_)
         if self.callback is None:
             parts = [(0, self.substeps)]
@@ -227,6 +228,29 @@ class Simulation:
         accel = records[0] if len(records) == 1 else np.concatenate(records, axis=1)
         self.accel = accel[:, self.substeps // 2 :].mean(axis=1)
         return touched
+
+    def _walk(self, ids: Ids) -> None:
+        """Show traffic in `ids` where it now is, at the end of the coming block.
+
+        On the way there it moves a little at every substep: a jump of a block's length would
+        strike the robot like a hammer.
+        """
+        self._control[self._walked, :, 2:] = self._still(self._walked)  # who stood still since
+        self._walked = ids
+        if not len(ids):
+            return
+        begin = self._mocap_pos[ids][:, None].copy()
+        self._show_traffic(ids)
+        end = self._mocap_pos[ids][:, None]
+        share = ((np.arange(self.substeps) + 1) / self.substeps)[None, :, None, None]
+        jumped = (np.abs(end - begin) > 1.0).any(axis=-1, keepdims=True)
+        path = np.where(jumped, end, begin + share * (end - begin))
+        self._control[ids, :, 2:] = path.reshape(len(ids), self.substeps, -1)
+
+    def _still(self, ids: Ids) -> F64:
+        """Mocap positions of `ids` as controls that keep them, (n, 1, 3 * nmocap)."""
+        still: F64 = self._mocap_pos[ids].reshape(len(ids), 1, 3 * self._mocap_pos.shape[1])
+        return still
 
     def live(self, accel: F64, pressed: NDArray[np.bool_]) -> Live:
         """The true state now."""
@@ -279,25 +303,27 @@ class Simulation:
         control: F64 = np.stack([left, right], axis=-1) * self.gain[:, None, None]
         return control
 
-    def _write_friction(self, pose: F64) -> NDArray[np.bool_]:
-        """Friction under each wheel, into the model; returns (N, 2) which stand on a patch."""
-        friction = friction_at(self._wheel_points(pose), self.patches, self.base_friction)
+    def _write_friction(self, ids: Ids, pose: F64) -> NDArray[np.bool_]:
+        """Friction under the wheels of `ids`; returns (n, 2) which of them stand on a patch."""
+        base = self.base_friction[ids]
+        friction = friction_at(self._wheel_points(pose), self.patches[ids], base)
         for side, geom in enumerate(self.handles.wheel_geoms):
-            self._friction[:, geom, 0] = friction[:, side]
-        return friction < np.minimum(SLIPPERY_BELOW, self.base_friction[:, None] - 1e-9)
+            self._friction[ids, geom, 0] = friction[:, side]
+        return friction < np.minimum(SLIPPERY_BELOW, base[:, None] - 1e-9)
 
     def _wheel_points(self, pose: F64) -> F64:
         across = np.stack([-np.sin(pose[:, 2]), np.cos(pose[:, 2])], axis=-1) * (TRACK_M / 2)
         return np.stack([pose[:, :2] + across, pose[:, :2] - across], axis=1)
 
-    def _slipping(self, slippery: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Whose wheel is on a patch and moves over the floor by more than .15 m/s."""
-        heading = yaw_of(self.qpos[:, 3:7])
-        forward = np.cos(heading) * self.qvel[:, 0] + np.sin(heading) * self.qvel[:, 1]
-        lateral = -np.sin(heading) * self.qvel[:, 0] + np.cos(heading) * self.qvel[:, 1]
-        turn = self.qvel[:, 5] * (TRACK_M / 2)
+    def _slipping(self, ids: Ids, slippery: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Whose wheel (n, 2) is on a patch and moves over the floor by more than .15 m/s."""
+        velocity, heading = self.qvel[ids], yaw_of(self.qpos[ids, 3:7])
+        cos, sin = np.cos(heading), np.sin(heading)
+        forward = cos * velocity[:, 0] + sin * velocity[:, 1]
+        lateral = cos * velocity[:, 1] - sin * velocity[:, 0]
+        turn = velocity[:, 5] * (TRACK_M / 2)
         ground = np.stack([forward - turn, forward + turn], axis=-1)
-        slip = np.hypot(self.qvel[:, 6:8] * self.radius_m[:, None] - ground, lateral[:, None])
+        slip = np.hypot(velocity[:, 6:8] * self.radius_m[ids, None] - ground, lateral[:, None])
         return np.asarray((slippery & (slip > 0.15)).any(axis=1), np.bool_)
 
     def _show_traffic(self, ids: Ids) -> None:
@@ -334,6 +360,7 @@ class Simulation:
         """Everything that changes during an episode, as arrays."""
         state = {name: getattr(self, name).copy() for name in self._ARRAYS}
         state |= {f"traffic_{name}": getattr(self.traffic, name).copy() for name in self._TRAFFIC}
+        state["walked"] = self._walked.copy()
         return state | {"physics": self.batch.state.copy()}
 
     def set_state(self, state: dict[str, NDArray[Any]]) -> None:
@@ -343,6 +370,8 @@ class Simulation:
         for name in self._TRAFFIC:
             setattr(self.traffic, name, state[f"traffic_{name}"].copy())
         self.batch.state[:] = state["physics"]
+        self._walked = state["walked"].copy()
+        self._control[:, :, 2:] = self._still(np.arange(self.num_envs))
 
 
 def _limit(change: F64, most: F64) -> F64:

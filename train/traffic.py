@@ -161,7 +161,7 @@ class Traffic:
     def advance(
         self, robot: F64, moving: NDArray[np.bool_], touched: NDArray[np.bool_], elapsed_s: float
     ) -> NDArray[np.int64]:
-        """Move the agents for `elapsed_s`; returns the environments that have any.
+        """Move the agents for `elapsed_s`; returns the environments where some are under way.
 
         `robot` (N, 3) is x, y, yaw; `moving` (N,) says who drives, `touched` (N,) whose bumper was
         pressed in the time before.
@@ -169,10 +169,16 @@ class Traffic:
         ids = np.flatnonzero(self.active)
         if not len(ids):
             return ids
-        pose, state = robot[ids], self.state[ids]
         trigger = self.trigger[ids]
-        near = np.hypot(trigger[..., 0] - pose[:, None, 0], trigger[..., 1] - pose[:, None, 1])
-        state = np.where((state == WAITING) & (near <= trigger[..., 2]), WALKING, state)
+        near = np.hypot(
+            trigger[..., 0] - robot[ids, None, 0], trigger[..., 1] - robot[ids, None, 1]
+        )
+        starts = (self.state[ids] == WAITING) & (near <= trigger[..., 2])
+        self.state[ids] = np.where(starts, WALKING, self.state[ids])
+        ids = ids[(self.state[ids] >= WALKING).any(axis=1)]
+        if not len(ids):
+            return ids
+        pose, state = robot[ids], self.state[ids]
         gap, toward = self._gap(ids, pose)
         careless = np.where(moving[ids, None], 0.0, STANDING_M)
         look_out = np.where(self.attentive[ids], YIELD_M, careless)

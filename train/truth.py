@@ -24,6 +24,7 @@ F64 = NDArray[np.float64]
 NAMES = np.array(["nominal", "blocked_aisle", "wheel_slip", "near_collision", "recovery"])
 NEAR_M, CLEAR_M, AFTERMATH_S = 0.15, 0.3, 2.0
 BLOCK_AHEAD_M = (0.2, 0.4, 0.6, 0.8, 1.0, 1.2)
+REACH_M = BLOCK_AHEAD_M[-1] + 1.5  # a pallet farther off than this is not just ahead
 BODY_MARGIN_M = 0.2  # how far beside the plan a pallet is still in the way
 
 
@@ -42,7 +43,8 @@ class Truth:
     def look(self, pose: F64, plans_m: F64, pallets: F64, ids: NDArray[np.int64]) -> None:
         """Note whose plan is blocked just ahead, at the start of a step, for `ids`."""
         self.blocked[ids] = False
-        with_pallets = ids[pallets[ids, 0, 0] > 0]
+        gap = np.abs(pallets[ids, :, :2] - pose[ids, None, :2]).max(axis=-1).min(axis=1)
+        with_pallets = ids[gap < REACH_M]
         if len(with_pallets):
             self.blocked[with_pallets] = _blocked(
                 pose[with_pallets], plans_m[with_pallets], pallets[with_pallets]
