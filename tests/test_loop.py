@@ -27,7 +27,7 @@ from restock.train.session import Session, open_session
 
 SMALL: dict[str, Any] = {
     "network": {"hidden": [32, 32]},
-    "loss": {"discount": 0.9},
+    "loss": {"discount": 0.9, "conservative": 0.0},
     "optimizer": {"learning_rate": 3e-3},
     "target": {"rule": "polyak", "tau": 0.05},
     "replay": {"batch_size": 32, "logs_share": 0.5, "ring_capacity": 2000},

@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -21,6 +22,7 @@ from restock.ingest.profile import load_profile
 from restock.replay.build import build_panel
 from restock.replay.mixture import parse_mixture
 from restock.train import checkpoint
+from restock.train.config import TrainConfig
 
 TINY = [
     *("--set", "env.num_envs=4", "--set", "schedule.warmup_env_steps=100"),
@@ -126,6 +128,38 @@ def test_ctrl_c_writes_a_checkpoint_and_says_how_to_go_on(tmp_path: Path) -> Non
     assert main(["train", "--resume", str(path), "--env-steps", str(stopped + 40)]) == 0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("rows", [3, 6, 9])
+def test_a_run_killed_at_any_instant_goes_on_bit_exactly(tmp_path: Path, rows: int) -> None:
+    settings = [*TINY, "--env-steps", "800", "--set", "record.checkpoint_every_env_steps=120"]
+    assert main(["train", "--out", str(tmp_path / "whole"), *settings]) == 0
+    path = tmp_path / "killed"
+    command = [sys.executable, "-m", "restock", "train", "--out", str(path), *settings]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+        progress = path / "progress.parquet"
+        while process.poll() is None:
+            written = pq.read_metadata(progress).num_rows if progress.exists() else 0
+            if written >= rows and (path / "checkpoints" / "latest.safetensors").exists():
+                break
+            time.sleep(0.01)
+        process.kill()  # SIGKILL
+    for table in path.glob("*.parquet"):
+        pq.read_table(table)  # readable, each of them
+    assert main(["train", "--resume", str(path)]) == 0
+    whole, killed = (
+        checkpoint.load(tmp_path / name / "checkpoints" / "latest.safetensors")
+        for name in ("whole", "killed")
+    )
+    for name, value in whole["learner"]["network"].items():
+        assert torch.equal(value, killed["learner"]["network"][name]), name
+    np.testing.assert_array_equal(whole["ring"]["rows"], killed["ring"]["rows"])
+    for name in ("strata", "audit", "evaluations", "episodes"):
+        one, two = (
+            pq.read_table(tmp_path / run / f"{name}.parquet") for run in ("whole", "killed")
+        )
+        assert one.equals(two), name
+
+
 def test_eval_drives_everyone_through_the_same_episodes(
     trained: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -213,3 +247,35 @@ def test_a_dry_run_writes_nothing(
     shown = json.loads(capsys.readouterr().out)
     assert shown["config"]["seed"] == 7
     assert not (tmp_path / "run").exists()
+
+
+def test_the_docs_list_every_key_of_the_config_and_no_other() -> None:
+    def keys(values: dict[str, object], prefix: str = "") -> set[str]:
+        found = set()
+        for name, value in values.items():
+            nested = isinstance(value, dict) and name != "conditions"
+            found |= keys(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}"}  # type: ignore[arg-type]
+        return found
+
+    known = keys(msgspec.to_builtins(TrainConfig())) | {"target.every"}
+    page = (Path(__file__).parents[1] / "docs" / "train.md").read_text(encoding="utf-8")
+    listed = {line.split("`")[1] for line in page.splitlines() if line.startswith("| `")}
+    files = {name for name in listed if "." in name and name.endswith((".json", ".parquet"))}
+    assert listed - files - {"checkpoints/", "tensorboard/"} == known
+
+
+def test_the_docs_state_the_defaults() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "train.md").read_text(encoding="utf-8")
+    defaults = msgspec.to_builtins(TrainConfig())
+    checked = 0
+    for line in page.splitlines():
+        if not line.startswith("| `"):
+            continue
+        key, default = line.split("`")[1], line.split("|")[2].strip()
+        value: object = defaults
+        for part in key.split("."):
+            value = value.get(part) if isinstance(value, dict) else None
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            assert float(default) == value, key
+            checked += 1
+    assert checked > 20

@@ -42,8 +42,9 @@ class LossConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     n_step: int = 3  # of fresh rows; the panel's rows bring their own
     double: bool = True
     huber_delta: float = 1.0
-    conservative: float = 0.0  # weight of the CQL term on rows from logs, while offline
-    conservative_online: float = 0.0  # … and its weight at the end of the online phase
+    conservative: float = 0.1  # weight of the CQL term on rows from logs, while offline
+    conservative_online: float = 0.0  # … and the weight it goes to, linearly, once online
+    conservative_steps: int = 20_000  # environment steps that this takes
 
     def __post_init__(self) -> None:
         if not 0 <= self.discount < 1:
@@ -54,10 +55,14 @@ class LossConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"loss.huber_delta must be above 0, got {self.huber_delta}")
         if min(self.conservative, self.conservative_online) < 0:
             raise ValueError("loss.conservative and loss.conservative_online must be at least 0")
+        if self.conservative_steps < 1:
+            raise ValueError(
+                f"loss.conservative_steps must be at least 1, got {self.conservative_steps}"
+            )
 
 
 class OptimizerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    learning_rate: float = 3e-4
+    learning_rate: float = 1e-3
     max_grad_norm: float | None = None  # Huber bounds each row's gradient already
 
     def __post_init__(self) -> None:
@@ -82,11 +87,11 @@ class ReplayConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ScheduleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    env_steps: int = 160_000  # the budget, in environment steps of all environments together
+    env_steps: int = 200_000  # the budget, in environment steps of all environments together
     seconds: float | None = None  # stop earlier, after this much training time
-    offline_updates: int = 4_000  # on the panel alone, before the first environment step
+    offline_updates: int = 2_000  # on the panel alone, before the first environment step
     warmup_env_steps: int = 2_000  # rollouts before the first online update
-    updates_per_env_step: float = 0.25
+    updates_per_env_step: float = 0.125
 
     def __post_init__(self) -> None:
         if self.env_steps < 0 or self.offline_updates < 0 or self.warmup_env_steps < 0:
@@ -114,8 +119,8 @@ class EnvConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class EvaluationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    every_env_steps: int = 16_000
-    episodes: int = 8  # per condition
+    every_env_steps: int = 20_000
+    episodes: int = 10  # per condition
     seed: int = 90_000  # of the first fixed episode; kept away from training seeds
 
     def __post_init__(self) -> None:

@@ -164,11 +164,11 @@ def _update(session: Session, batch: Batch, phase: str, notify: Notify) -> None:
 
 def _conservative_weight(session: Session, phase: str) -> float:
     """The CQL term's weight: constant offline, then linear to its online end."""
-    loss, schedule, clock = session.config.loss, session.config.schedule, session.clock
+    loss, clock = session.config.loss, session.clock
     if phase == "offline" or clock.online_from is None:
         return loss.conservative
-    part = (clock.env_steps - clock.online_from) / max(schedule.env_steps - clock.online_from, 1)
-    return loss.conservative + min(part, 1.0) * (loss.conservative_online - loss.conservative)
+    part = min((clock.env_steps - clock.online_from) / loss.conservative_steps, 1.0)
+    return loss.conservative + part * (loss.conservative_online - loss.conservative)
 
 
 def _close_interval(session: Session, phase: str, notify: Notify) -> None:

@@ -16,6 +16,7 @@ from restock.train.batches import Logs
 from restock.train.config import TrainConfig, apply_overrides, load_config, parse_config
 from restock.train.episode import KINDS
 from restock.train.evaluate import Twin
+from restock.train.explore import AFTER_LOGS
 from restock.train.learner import open_device
 from restock.train.run import Run, check_free, now_ns, software_versions
 from restock.train.session import Session, open_session
@@ -84,8 +85,7 @@ def prepare_new(
     open_device(config.device)
     profile = load_profile(config.profile)
     panel = open_panel(panel_path, config, profile) if panel_path is not None else None
-    if panel is not None:
-        config = _with_panel(config, panel)
+    config = _resolve(config, panel)
     return Prepared(out, config, profile, panel, _document(config, profile, panel))
 
 
@@ -157,12 +157,15 @@ def make_twin(config: TrainConfig, profile: Profile, num_envs: int, nthread: int
     return twin
 
 
-def _with_panel(config: TrainConfig, panel: Panel) -> TrainConfig:
-    """The mixture says which share of a batch is from logs, unless the config does."""
-    if config.replay.logs_share is not None:
-        return config
-    replay = msgspec.structs.replace(config.replay, logs_share=panel.header.logs_share)
-    return msgspec.structs.replace(config, replay=replay)
+def _resolve(config: TrainConfig, panel: Panel | None) -> TrainConfig:
+    """What the config leaves to the panel: its mixture's share of logs, and how to begin online."""
+    replay, epsilon = config.replay, config.epsilon
+    if replay.logs_share is None and panel is not None:
+        replay = msgspec.structs.replace(replay, logs_share=panel.header.logs_share)
+    if epsilon.start is None:
+        learns_first = panel is not None and config.schedule.offline_updates > 0
+        epsilon = msgspec.structs.replace(epsilon, start=AFTER_LOGS if learns_first else 1.0)
+    return msgspec.structs.replace(config, replay=replay, epsilon=epsilon)
 
 
 def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dict[str, Any]:
