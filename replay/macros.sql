@@ -58,3 +58,43 @@ WITH held AS (
 SELECT episode_id, coalesce(kind, 'nominal') AS kind, success, return, first_policy
 FROM episodes
 LEFT JOIN longest USING (episode_id);
+
+-- What a buffer of fewer rows would still cover, the newest rows kept: half of the rows, a quarter, …
+CREATE OR REPLACE MACRO capacity_curve() AS TABLE
+WITH ranked AS (
+    SELECT
+        condition,
+        zone,
+        action,
+        episode_id,
+        row_number() OVER (ORDER BY logged_ns DESC, transition_id DESC) AS place
+    FROM transitions
+), capacities AS (
+    SELECT DISTINCT ceil(rows / 2.0 ^ halvings)::BIGINT AS capacity
+    FROM (SELECT count(*) AS rows FROM transitions), range(0, 16) AS steps (halvings)
+    WHERE ceil(rows / 2.0 ^ halvings) >= 2
+), cells AS (
+    SELECT condition, zone, action, min(place) AS first_place FROM ranked GROUP BY ALL
+), covered AS (
+    SELECT
+        capacity,
+        count(*) FILTER (first_place <= capacity) AS cells,
+        count(*) FILTER (first_place <= capacity) / count(*) AS cells_share,
+        count(DISTINCT condition) FILTER (first_place <= capacity) AS conditions
+    FROM cells
+    CROSS JOIN capacities
+    GROUP BY capacity
+), kept AS (
+    SELECT capacity, count(*) AS episodes, sum(n) ^ 2 / sum(n ^ 2) AS effective_episodes
+    FROM (
+        SELECT capacity, episode_id, count(*) AS n
+        FROM ranked
+        JOIN capacities ON place <= capacity
+        GROUP BY ALL
+    )
+    GROUP BY capacity
+)
+SELECT capacity, cells, cells_share, conditions, episodes, effective_episodes
+FROM covered
+JOIN kept USING (capacity)
+ORDER BY capacity;

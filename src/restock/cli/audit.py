@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -33,6 +33,8 @@ class Audit:
     """A folder of audits (*.sql) of your own; one of the same name takes a shipped one's place."""
     thresholds: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A TOML file with thresholds in place of the shipped ones."""
+    capacity: bool = False
+    """Instead of auditing, say how coverage grows with the rows kept, and how many are enough."""
     strict: bool = False
     """Let warnings fail, too."""
     rows: int = 5
@@ -50,6 +52,8 @@ class Audit:
 
         beside = {"panel": self.panel, "run": self.run_dir}
         given = {name: path for name, path in beside.items() if path is not None}
+        if self.capacity:
+            return self._capacity()
         audits, thresholds = load_audits(self.audits), load_thresholds(self.thresholds)
         with open_place(self.store, beside=given, only_store=True) as connection:
             findings = run_audits(connection, audits, thresholds, beside=given)
@@ -68,6 +72,24 @@ class Audit:
         else:
             _print(findings, self.rows)
         return int(ExitCode.FAILED if failed else ExitCode.OK)
+
+    def _capacity(self) -> int:
+        from restock.cli import output
+        from restock.replay.capacity import recommend_capacity
+        from restock.replay.places import open_place
+
+        with open_place(self.store, only_store=True) as connection:
+            found = recommend_capacity(connection)
+        if self.json:
+            output.print_json({"store": str(self.store), "capacity": asdict(found)})
+            return int(ExitCode.OK)
+        output.print_table(found.curve, title="what the newest rows cover")
+        output.stdout().print(
+            f"{found.recommended:,} of {found.rows:,} rows keep {found.cells_share:.0%} of the"
+            f" {found.cells} condition x zone x action cells ever seen: with less, a buffer forgets"
+            " some that no sampling brings back"
+        )
+        return int(ExitCode.OK)
 
 
 def _document(finding: Finding) -> dict[str, Any]:
