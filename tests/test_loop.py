@@ -31,7 +31,12 @@ SMALL: dict[str, Any] = {
     "optimizer": {"learning_rate": 3e-3},
     "target": {"rule": "polyak", "tau": 0.05},
     "replay": {"batch_size": 32, "logs_share": 0.5, "ring_capacity": 2000},
-    "schedule": {"env_steps": 1600, "warmup_env_steps": 200, "offline_updates": 60},
+    "schedule": {
+        "env_steps": 1600,
+        "warmup_env_steps": 200,
+        "offline_updates": 60,
+        "updates_per_env_step": 0.25,
+    },
     "epsilon": {"start": 1.0, "end": 0.1, "steps": 800},
     "env": {"num_envs": 4, "conditions": {"nominal": 0.5, "wheel_slip": 0.5}},
     "evaluation": {"every_env_steps": 800, "episodes": 3},
