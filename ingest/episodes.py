@@ -56,13 +56,12 @@ class Split:
 
 def split(task: Task, steps: Steps) -> Split:
     """The episodes of a recording's steps."""
-    over = _over(task, steps, np.arange(len(steps)), steps.routing.goal, steps.routing.plan)
-    changed = changed_route(steps)
+    changed, routing = changed_route(steps), steps.routing
     over_old = np.zeros(len(steps), np.bool_)
-    over_old[changed] = _over(
-        task, steps, changed, steps.routing.goal[changed - 1], steps.routing.plan[changed - 1]
-    )
-    return _Walk(task, steps, over, over_old).walk()
+    if len(changed):  # seen with the goal and plan of the tick before
+        goal, plan = routing.goal[changed - 1], routing.plan[changed - 1]
+        over_old[changed] = terminated(task, with_route(task, steps, changed, goal, plan))
+    return _Walk(task, steps, terminated(task, steps.signals), over_old).walk()
 
 
 def changed_route(steps: Steps) -> Ints:
@@ -78,13 +77,6 @@ def with_route(
     """The signals at these ticks as they are with this goal and plan in force."""
     now = {name: column[ticks] for name, column in steps.signals.items()}
     return now | steps.routing.signals(task, goal, plan, now)
-
-
-def _over(task: Task, steps: Steps, ticks: Ints, goal: Ints, plan: Ints) -> Bools:
-    """Whether an episode with this goal terminates at these ticks."""
-    if not len(ticks):
-        return np.zeros(0, np.bool_)
-    return terminated(task, with_route(task, steps, ticks, goal, plan))
 
 
 class _Walk:

@@ -41,7 +41,9 @@ class Outcome:
     path: str
     status: Status
     manifest: dict[str, Any]  # the row of `recordings`, as plain values
-    conditions: dict[str, int] = field(default_factory=dict)  # transitions per label, and nominal
+    messages: dict[str, int] = field(default_factory=dict)  # of used topics; and of unused ones
+    conditions: dict[str, int] = field(default_factory=dict)  # transitions a label holds on
+    named: dict[str, int] = field(default_factory=dict)  # … and is the row's one condition
     scores: list[LabelScore] = field(default_factory=list)
     losses: list[str] = field(default_factory=list)  # messages or bytes that could not be had
     notes: list[str] = field(default_factory=list)
@@ -135,6 +137,7 @@ class _Ingest:
         )
         table = transitions(self.profile, steps, episodes, rows, provenance)
         named = np.array(table["condition"].to_pylist(), object)
+        first = {name: int((named == name).sum()) for name in (*rows.labels, NOMINAL)}
         scores = score(
             {name: named == name for name in rows.labels}, table["true_condition"].to_pylist()
         )
@@ -145,12 +148,14 @@ class _Ingest:
             else None
         )
         counts = {name: int(holds[rows.starts].sum()) for name, holds in rows.labels.items()}
-        counts[NOMINAL] = int((named == NOMINAL).sum())
+        counts[NOMINAL] = first[NOMINAL]
         return Outcome(
             self.path,
             "written" if store else "dry run",
             manifest,
+            self._messages(),
             counts,
+            first,
             scores,
             self._losses(),
             self._notes(steps, table),
@@ -242,6 +247,15 @@ class _Ingest:
                 }
             )
         return found
+
+    def _messages(self) -> dict[str, int]:
+        accounts = self.recording.accounts.values()
+        expected = sum(account.expected for account in accounts)
+        return {
+            "expected": expected,
+            "decoded": sum(account.decoded for account in accounts),
+            "unused": self.recording.messages - expected,
+        }
 
     def _losses(self) -> list[str]:
         return [

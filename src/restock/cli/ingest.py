@@ -114,16 +114,13 @@ def as_json(outcome: Outcome) -> dict[str, Any]:
         for key, value in outcome.manifest.items()
         if key not in ("task_json", "conditions_json", "source_file", "label_scores")
     }
-    messages = sum(topic["expected"] for topic in row["topics"])
     return {
         "path": outcome.path,
         "status": outcome.status,
         "version": outcome.version,
-        "messages": {
-            "expected": messages,
-            "decoded": sum(topic["decoded"] for topic in row["topics"]),
-        },
+        "messages": outcome.messages,
         "conditions": outcome.conditions,
+        "named": outcome.named,
         "label_scores": [
             {**score, "good": None not in (p, r) and min(p, r) >= GOOD}
             for score in outcome.manifest["label_scores"]
@@ -138,6 +135,7 @@ def as_json(outcome: Outcome) -> dict[str, Any]:
 def show(outcome: Outcome) -> None:
     """One recording's counts, as tables on stdout."""
     from restock.cli import output
+    from restock.ingest.pipeline import UNUSED
 
     row = outcome.manifest
     console = output.stdout()
@@ -153,23 +151,20 @@ def show(outcome: Outcome) -> None:
         return
     into = f"{outcome.status}: {episodes}, profile {row['profile']} {row['profile_hash']}"
     console.print(into + (f", store version {outcome.version}" if outcome.version else ""))
-    used = [
-        topic
-        for topic in row["topics"]
-        if topic["decoded"] or topic["reason"] != "not used by the profile"
-    ]
-    rest = len(row["topics"]) - len(used)
-    output.print_table(used, ["topic", "type", "expected", "decoded", "skipped", "reason"])
-    if rest:
-        unused = sum(t["expected"] for t in row["topics"] if t not in used)
-        console.print(f"{rest} further topics ({unused:,} messages) are not used by the profile")
+    told = [topic for topic in row["topics"] if topic["reason"] != UNUSED]
+    output.print_table(told, ["topic", "type", "expected", "decoded", "skipped", "reason"])
+    if len(told) < len(row["topics"]):
+        rest = [topic["expected"] for topic in row["topics"] if topic["reason"] == UNUSED]
+        topics = _count(len(rest), "further topic")
+        console.print(f"{topics} ({sum(rest):,} messages): not used by the profile")
     scores = {score.condition: score for score in outcome.scores}
     output.print_table(
         [
             {
                 "condition": name,
                 "transitions": count,
-                "share": count / max(row["transitions"], 1),
+                "named by it": outcome.named[name],
+                "share": outcome.named[name] / max(row["transitions"], 1),
                 "precision": scores[name].precision if name in scores else None,
                 "recall": scores[name].recall if name in scores else None,
                 "truly": scores[name].support if name in scores else None,
