@@ -32,6 +32,8 @@ class Store:
         version: of its transitions table; default the newest.
         memory_limit: what DuckDB may hold in memory, e.g. "4GB"; default DuckDB's own (80 %).
 
+    `version` is of the transitions table, `files` the Parquet files of each table.
+
     Raises:
         StoreError: nothing there, not a store, or no such version.
     """
@@ -49,10 +51,13 @@ class Store:
         )
         if memory_limit is not None:
             self._set_memory(memory_limit)
-        _present(self.connection, "stored_recordings", recordings)
-        _present(self.connection, "stored_transitions", transitions)
+        self.files = {
+            "stored_recordings": _present(self.connection, "stored_recordings", recordings),
+            "stored_transitions": _present(self.connection, "stored_transitions", transitions),
+        }
         self._tasks = self._read_tasks()
-        install(self.connection, self._observation_type())
+        self.observation_type = self._observation_type()
+        install(self.connection, self.observation_type)
 
     def __enter__(self) -> Store:
         return self
@@ -155,12 +160,14 @@ def _open(path: Path, name: str, version: int | None) -> DeltaTable:
         ) from error
 
 
-def _present(connection: duckdb.DuckDBPyConnection, view: str, table: DeltaTable) -> None:
+def _present(connection: duckdb.DuckDBPyConnection, view: str, table: DeltaTable) -> list[str]:
+    """A view of a Delta table at its version; returns the files it reads."""
     files = [_local(uri) for uri in table.file_uris()]
     if files:
         read_parquet(connection, view, files)
     else:
         connection.register(view, pa.schema(table.schema().to_arrow()).empty_table())
+    return files
 
 
 def read_parquet(
@@ -171,9 +178,17 @@ def read_parquet(
     schema: str = "main",
 ) -> None:
     """A view over Parquet files; columns that only some have are null in the others."""
+    connection.execute(parquet_view(view, files, schema=schema))
+
+
+def parquet_view(
+    view: str, files: Sequence[str | os.PathLike[str]], *, schema: str | None = None
+) -> str:
+    """The statement that makes such a view."""
     quoted = ", ".join("'" + str(file).replace("'", "''") + "'" for file in files)
-    connection.execute(
-        f'CREATE OR REPLACE VIEW "{schema}"."{view}" AS'
+    name = f'"{schema}"."{view}"' if schema else f'"{view}"'
+    return (
+        f"CREATE OR REPLACE VIEW {name} AS"
         f" SELECT * FROM read_parquet([{quoted}], union_by_name = true)"
     )
 

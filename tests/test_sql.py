@@ -12,6 +12,7 @@ import sys
 import time
 from pathlib import Path
 
+import duckdb
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -146,6 +147,47 @@ def test_wrong_places_are_refused(
     assert "not a run" in err
     err = out_of(capsys, str(store_path), "SELECT 1", "--json", "--csv", code=2)
     assert "choose one" in err
+
+
+def test_without_a_query_there_is_a_prompt(
+    store_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lines = iter(["SELECT 41 + 1", "AS answer;", "FROM nope;", "SELECT 7 AS seven;"])
+
+    def answer(prompt: str) -> str:
+        try:
+            return next(lines)
+        except StopIteration:
+            raise EOFError from None
+
+    monkeypatch.setattr("builtins.input", answer)
+    monkeypatch.setattr(sys, "stdin", type("Terminal", (), {"isatty": lambda self: True})())
+    assert cli.main(["sql", str(store_path), "--csv"]) == 0
+    captured = capsys.readouterr()
+    assert captured.out == "answer\n42\nseven\n7\n"
+    assert "nope" in captured.err
+
+
+@pytest.mark.parametrize("name", ["views.sql", "views.duckdb"])
+def test_any_duckdb_sees_the_exported_views(
+    store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    out = tmp_path / name
+    assert cli.main(["sql", str(store_path), "--export", str(out)]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    with Store(store_path) as store:
+        questions = ["FROM coverage", "FROM episodes ORDER BY ALL", "FROM cells_below(9)"]
+        questions += ["FROM columns", "SELECT typeof(observation) FROM transitions LIMIT 1"]
+        expected = [store.sql(question).fetchall() for question in questions]
+    with duckdb.connect(str(out) if name.endswith("duckdb") else ":memory:") as other:
+        if name.endswith("sql"):
+            other.execute(out.read_text())
+        assert [other.sql(question).fetchall() for question in questions] == expected
+    assert cli.main(["sql", str(store_path), "--export", str(out)]) == 2
+    assert cli.main(["sql", str(store_path), "--export", str(tmp_path / "views.db")]) == 2
+    err = capsys.readouterr().err
+    assert "already there" in err
+    assert "no export to .db" in err
 
 
 def test_ctrl_c_stops_a_query_at_once(store_path: Path) -> None:

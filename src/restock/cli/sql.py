@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from restock.errors import QueryError
+
+if TYPE_CHECKING:
+    import duckdb
 
 EXPANDED_ROWS = 20  # at most so many rows too wide for the terminal are printed one below the other
 
@@ -22,37 +26,49 @@ class Sql:
     missing_cells, reward_mix, ages, label_overlap, versions, conditions, actions, drops, topics
     and label_scores; `restock sql STORE "FROM columns"` lists every column with its meaning. A run
     has its tables (progress, strata, ages, audit, …), a panel `rows`, `strata` and `held_out`.
-    Queries are read-only, and Ctrl-C stops one.
+    Queries are read-only, and Ctrl-C stops one. Without a query there is a prompt.
     """
 
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     """A store, a run directory or a panel."""
-    query: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="QUERY")]
-    """The query, or - to read it from stdin."""
+    query: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[QUERY]")] = None
+    """The query, or - to read it from stdin; a prompt without one."""
     run_dir: Annotated[Path | None, tyro.conf.arg(name="run", metavar="RUN")] = None
     """A run whose tables are to be had beside, as run.audit, run.strata, …"""
-    panel: Path | None = None
+    panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
     """A panel whose tables are to be had beside, as panel.rows, panel.strata."""
     json: bool = False
     """Print a list of row objects."""
     csv: bool = False
     """Print CSV with a header."""
-    memory_limit: str | None = None
+    memory_limit: Annotated[str | None, tyro.conf.arg(metavar="SIZE")] = None
     """What DuckDB may hold in memory, e.g. 4GB; beyond that it spills to a temporary folder."""
+    export: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Write a store's views for any DuckDB: an init file (.sql) or a database (.duckdb)."""
 
     def run(self) -> None:
         """Run the query and print its rows."""
-        from restock.cli import output
         from restock.replay.places import open_place
-        from restock.replay.query import fetch
 
         if self.json and self.csv:
             raise QueryError("--json and --csv are both given", remedy="choose one")
-        text = sys.stdin.read() if self.query == "-" else self.query
+        if self.export is not None:
+            self._export(self.export)
+            return
         beside = {"run": self.run_dir, "panel": self.panel}
         given = {name: path for name, path in beside.items() if path is not None}
         with open_place(self.path, beside=given, memory_limit=self.memory_limit) as connection:
-            columns, values = fetch(connection, text, where=str(self.path))
+            if self.query is None and sys.stdin.isatty():
+                self._prompt(connection)
+            else:
+                text = sys.stdin.read() if self.query in (None, "-") else self.query
+                self._answer(connection, text or "")
+
+    def _answer(self, connection: duckdb.DuckDBPyConnection, text: str) -> None:
+        from restock.cli import output
+        from restock.replay.query import fetch
+
+        columns, values = fetch(connection, text, where=str(self.path))
         rows = [dict(zip(columns, row, strict=True)) for row in values]
         if self.json:
             output.print_json(rows)
@@ -67,6 +83,37 @@ class Sql:
                 output.print_table(lines, title=f"row {number}")
         else:
             output.print_table(rows, columns)
+
+    def _prompt(self, connection: duckdb.DuckDBPyConnection) -> None:
+        """Questions one after the other: each ends with a semicolon, Ctrl-D ends it all."""
+        from restock.cli import output
+
+        with contextlib.suppress(ImportError):
+            import readline  # noqa: F401  (gives the prompt a history)
+        output.say('A query ends with ";". FROM columns; lists what there is. Ctrl-D to leave.')
+        text = ""
+        while True:
+            try:
+                text += input("restock> " if not text else "      -> ") + "\n"
+                if text.strip().endswith(";"):
+                    question, text = text, ""
+                    self._answer(connection, question)
+            except EOFError:
+                return
+            except KeyboardInterrupt:  # of this query, not of the prompt
+                text = ""
+                output.say("stopped")
+            except QueryError as error:
+                sys.stderr.write(f"{error}\n")
+
+    def _export(self, out: Path) -> None:
+        from restock.cli import output
+        from restock.replay.export import export_views
+        from restock.replay.store import Store
+
+        with Store(self.path) as store:
+            export_views(store, out)
+            output.say(f"views of {self.path}, version {store.version} -> {out}")
 
 
 def _too_wide(rows: list[dict[str, Any]], columns: list[str]) -> bool:
