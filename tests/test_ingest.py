@@ -218,3 +218,24 @@ def test_a_recording_of_another_robot_is_refused_with_its_topics(tmp_path, run):
     assert code == 2
     assert "/amcl_pose (pose)" in err
     assert "its topics are /clock, /cmd_vel" in err
+
+
+def test_the_page_names_every_input_and_what_stands_in_for_it():
+    from restock.ingest.conditions import shipped
+    from restock.ingest.profile import FALLBACKS, INPUT_FIELDS, shipped_profiles
+
+    page = (Path(__file__).parents[1] / "docs" / "ingest.md").read_text()
+    for name in (*INPUT_FIELDS, *shipped(), *shipped_profiles()):
+        assert f"`{name}`" in page, name
+    for fallback in FALLBACKS.values():
+        assert fallback in page
+
+
+def test_the_scores_on_the_page_are_those_of_the_sample_log(run):
+    root = Path(__file__).parents[1]
+    code, said, _ = run(root / "sample_logs" / "amr_monday.mcap", "--dry-run")
+    assert code == 0
+    page = (root / "docs" / "ingest.md").read_text()
+    for s in said["recordings"][0]["label_scores"]:
+        line = f"| `{s['condition']}` | {s['precision']:.2f} | {s['recall']:.2f} | {s['support']} |"
+        assert line in page, line
