@@ -238,4 +238,4 @@ def test_the_scores_on_the_page_are_those_of_the_sample_log(run):
     page = (root / "docs" / "ingest.md").read_text()
     for s in said["recordings"][0]["label_scores"]:
         line = f"| `{s['condition']}` | {s['precision']:.2f} | {s['recall']:.2f} | {s['support']} |"
-        assert line in page, line
+        assert line in page, f"docs/ingest.md should say: {line}"
