@@ -119,6 +119,18 @@ def test_who_drove_and_what_was_true_come_through(trip: Trip) -> None:
     assert len(set(truth)) > 2
 
 
+def test_missions_come_in_their_order_each_with_its_driver(trip: Trip) -> None:
+    wanted = list(islice(schedule(trip.plan.seed, EQUAL, "handover", trip.plan.hardware), 5))
+    assert [driven.mission for driven in trip.driven] == wanted
+    assert len({len(driven.action) for driven in trip.driven}) > 1  # they did not end in order
+    for driven in trip.driven:
+        drivers = {(name, version) for name, version, _ in driven.drive.policy}
+        assert (driven.mission.driver, driven.mission.version) in drivers
+        assert drivers <= {(driven.mission.driver, driven.mission.version), ("operator", "1")}
+        assert np.unique(driven.drive.command, axis=0).shape[0] > 1
+        assert driven.drive.plans[0][1][-1] == pytest.approx(driven.drive.goal_m)
+
+
 def test_the_summary_counts_what_is_in_the_file(trip: Trip) -> None:
     summary = trip.summary.describe()
     with AnyReader([trip.path]) as reader:
