@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -201,7 +202,10 @@ def test_fixed_episodes_are_numbered_and_then_run_out() -> None:
     assert sorted(made.episode_number.tolist()) == [-1, 2]
 
 
-def test_a_blow_up_truncates_the_episode_and_is_counted(env: WarehouseVectorEnv) -> None:
+def test_a_blow_up_truncates_the_episode_and_is_counted(
+    env: WarehouseVectorEnv, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warning to MUJOCO_LOG.TXT where it runs
     env.reset(seed=8)
     count = env.blown_up
     env.simulation.qvel[3, 0] = np.nan

@@ -46,7 +46,6 @@ ACCEL_LIMIT = np.array([4.0, 10.0])  # of the base controller: m/s2 and rad/s2
 REST_Z_M = 0.09756  # of the chassis frame, standing still
 _HISTORY = 5  # commands kept: enough for the longest latency at the shortest period
 LIDAR_BEAMS = 72
-MOVING_MPS = 0.15  # faster than this a robot is said to drive
 _CONTROLLED = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_MOCAP_POS)
 
 
@@ -191,8 +190,7 @@ class Simulation:
         touched = self.bumped.copy()
         for block in range(self.blocks):
             pose = self.pose()
-            moving = np.hypot(self.qvel[:, 0], self.qvel[:, 1]) > MOVING_MPS
-            self._walk(self.traffic.advance(pose, moving, touched, BLOCK_S))
+            self._walk(self.traffic.advance(pose, self.qvel[:, :2], touched, BLOCK_S))
             icy = np.flatnonzero(self._has_patches)
             slippery = self._write_friction(icy, pose[icy])
             touched = self._run(self._wheel_set_points(block))

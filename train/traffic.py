@@ -1,8 +1,9 @@
 """People and forklifts: each walks a given way once the robot comes near, and may not look out.
 
 An attentive one stops .5 m off the robot. An inattentive one walks on into the way of a robot that
-drives, and stops only before one that stands. Whoever has waited for 2 s, or was touched, steps
-back and lets the robot pass. Movement is kinematic: traffic pushes the robot, not the reverse.
+drives at them, and stops only before one that stands, turns or backs off. Whoever has waited for
+2 s, or was touched, steps back and lets the robot pass. Movement is kinematic: traffic pushes the
+robot, not the reverse.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ AGENTS = PEOPLE + FORKLIFTS  # the people first
 WAY_POINTS = 24
 FORKLIFT_RADIUS_M = 0.5  # of the circle that stands for it when it looks out
 YIELD_M = 0.5
-STANDING_M = 0.15  # how near an inattentive one comes to a robot that stands
+STANDING_M = 0.15  # how near an inattentive one comes to a robot that stands or backs off
+DRIVEN_AT_MPS = 0.15  # closing speed by which a robot is said to drive at someone
 WAIT_S = 2.0
 HIDDEN, WAITING, WALKING, RETREATING = 0, 1, 2, 3
 
@@ -159,12 +161,12 @@ class Traffic:
                 self._place(np.array([env]))
 
     def advance(
-        self, robot: F64, moving: NDArray[np.bool_], touched: NDArray[np.bool_], elapsed_s: float
+        self, robot: F64, velocity: F64, touched: NDArray[np.bool_], elapsed_s: float
     ) -> NDArray[np.int64]:
         """Move the agents for `elapsed_s`; returns the environments where some are under way.
 
-        `robot` (N, 3) is x, y, yaw; `moving` (N,) says who drives, `touched` (N,) whose bumper was
-        pressed in the time before.
+        `robot` (N, 3) is x, y, yaw, `velocity` (N, 2) in the map frame; `touched` (N,) says whose
+        bumper was pressed in the time before.
         """
         ids = np.flatnonzero(self.active)
         if not len(ids):
@@ -180,7 +182,7 @@ class Traffic:
             return ids
         pose, state = robot[ids], self.state[ids]
         gap, toward = self._gap(ids, pose)
-        careless = np.where(moving[ids, None], 0.0, STANDING_M)
+        careless = np.where(self._driven_at(ids, pose, velocity[ids]), 0.0, STANDING_M)
         look_out = np.where(self.attentive[ids], YIELD_M, careless)
         held = (state == WALKING) & toward & (gap < look_out)
         waited = np.where(held, self.waited_s[ids] + elapsed_s, 0.0)
@@ -212,6 +214,15 @@ class Traffic:
         point = here + (share - first)[..., None] * step
         self.position_m[ids] = np.where(shown[..., None], point, PARKED_M[0])
         self.heading_rad[ids] = np.where(shown, np.arctan2(step[..., 1], step[..., 0]), 0.0)
+
+    def _driven_at(self, ids: NDArray[np.int64], pose: F64, velocity: F64) -> NDArray[np.bool_]:
+        """Which agents (n, AGENTS) the robot comes nearer to by driving."""
+        delta = self.position_m[ids] - pose[:, None, :2]
+        distance = np.maximum(np.hypot(delta[..., 0], delta[..., 1]), 1e-9)
+        closing = (
+            delta[..., 0] * velocity[:, None, 0] + delta[..., 1] * velocity[:, None, 1]
+        ) / distance
+        return np.asarray(closing > DRIVEN_AT_MPS, np.bool_)
 
     def _gap(self, ids: NDArray[np.int64], pose: F64) -> tuple[F64, NDArray[np.bool_]]:
         """From each agent's circle to the robot's outline, and whether it walks toward it."""
