@@ -155,6 +155,26 @@ def test_a_smaller_wheel_drives_shorter_by_its_scale() -> None:
     assert way[1] / way[0] == pytest.approx(0.95, abs=0.01)
 
 
+def test_a_wider_track_turns_slower_by_its_scale() -> None:
+    turned = []
+    for scale in (1.0, 1.08):
+        sim = simulation(0.01)
+        start(sim, (6.0, 5.0, 0.0), Perturbation(track_scale=scale, **QUIET))
+        drive(sim, 0.0, 0.6, 1.0)
+        begin = sim.pose()[0, 2]
+        drive(sim, 0.0, 0.6, 2.0)
+        turned.append(sim.pose()[0, 2] - begin)
+    assert turned[0] / turned[1] == pytest.approx(1.08, abs=0.02)
+
+
+def test_a_worn_left_wheel_turns_a_robot_that_brakes_on_a_wet_floor() -> None:
+    sim = simulation(0.01)
+    start(sim, (6.0, 2.0, np.pi / 2), Perturbation(left_friction_scale=0.3, **QUIET))
+    sim.set_floor_friction(0, 0.1)
+    drive(sim, 1.0, 0.0, 0.6)
+    assert sim.pose()[0, 2] > np.pi / 2 + 0.05  # the right wheel pulls harder
+
+
 def test_latency_delays_the_wheels_by_what_it_says() -> None:
     sim = simulation(0.01)
     for latency, still in ((0.0, 0), (0.13, 13), (0.3, 30)):

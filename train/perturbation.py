@@ -16,8 +16,10 @@ from restock.errors import ConfigError
 RANGES: dict[str, tuple[float, float]] = {
     "friction_scale": (0.05, 2.0),
     "patch_friction_scale": (0.05, 20.0),
+    "left_friction_scale": (0.05, 20.0),
     "payload_kg": (0.0, 150.0),
     "wheel_radius_scale": (0.9, 1.1),
+    "track_scale": (0.9, 1.1),
     "latency_s": (0.0, 0.5),
     "gain": (0.5, 1.5),
     "lidar_noise_m": (0.0, 0.2),
@@ -39,8 +41,10 @@ class Perturbation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: str = "nominal"
     friction_scale: float = 1.0  # times the floor's friction of .8
     patch_friction_scale: float = 1.0  # times the friction of each slippery patch
+    left_friction_scale: float = 1.0  # times the friction under the left wheel (a worn tyre)
     payload_kg: float = 0.0  # on top of the chassis
     wheel_radius_scale: float = 1.0  # the controller and the odometry do not know it
+    track_scale: float = 1.0  # times the distance between the wheels, unknown likewise
     latency_s: float = 0.05  # from a command to the wheels' set point
     gain: float = 1.0  # of the wheel set points
     lidar_noise_m: float = 0.01  # standard deviation of a range

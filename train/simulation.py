@@ -98,6 +98,7 @@ class Simulation:
         self.slipped = np.zeros(num_envs, np.bool_)  # on a patch, in the last control period
         self.blown_up = np.zeros(num_envs, np.bool_)
         self.base_friction = np.full(num_envs, FLOOR_FRICTION)
+        self.left_friction = np.ones(num_envs)
         self.latency_s = np.zeros(num_envs)
         self.gain = np.ones(num_envs)
         self.radius_m = np.full(num_envs, WHEEL_RADIUS_M)
@@ -150,6 +151,7 @@ class Simulation:
 
     def apply(self, env: int, perturbation: Perturbation) -> None:
         """Write a perturbation's physics into one environment."""
+        self.left_friction[env] = perturbation.left_friction_scale
         self.set_floor_friction(env, FLOOR_FRICTION * perturbation.friction_scale)
         self.latency_s[env] = perturbation.latency_s
         self.gain[env] = perturbation.gain
@@ -160,7 +162,7 @@ class Simulation:
             scale = 1.0 + perturbation.payload_kg / CHASSIS_KG
             mass[env, body] = self.model.body_mass[body] * scale
             inertia[env, body] = self.model.body_inertia[body] * scale
-        if perturbation.wheel_radius_scale != 1.0 or self._radii:
+        if (perturbation.wheel_radius_scale, perturbation.track_scale) != (1, 1) or self._radii:
             self._radii = True
             radius = WHEEL_RADIUS_M * perturbation.wheel_radius_scale
             self.radius_m[env] = radius
@@ -168,7 +170,9 @@ class Simulation:
             place = self.batch.expand("body_pos")
             for geom in self.handles.wheel_geoms:
                 size[env, geom, 0] = bound[env, geom] = radius
-            for body in self.handles.wheel_bodies:  # so that the casters keep their share of load
+            for body, side in zip(self.handles.wheel_bodies, (1, -1), strict=True):
+                place[env, body, 1] = side * TRACK_M / 2 * perturbation.track_scale
+                # So that the casters keep their share of the load.
                 place[env, body, 2] = radius - WHEEL_RADIUS_M
         if self._masses or self._radii:
             self.batch.set_const(np.array([env]))
@@ -176,8 +180,9 @@ class Simulation:
     def set_floor_friction(self, env: int, friction: float) -> None:
         """The floor's friction coefficient where no patch lies."""
         self.base_friction[env] = friction
-        for geom in self.handles.wheel_geoms:
-            self._friction[env, geom, 0] = friction
+        left, right = self.handles.wheel_geoms
+        self._friction[env, left, 0] = friction * self.left_friction[env]
+        self._friction[env, right, 0] = friction
 
     # -- motion ---------------------------------------------------------------------------------
 
@@ -305,8 +310,9 @@ class Simulation:
         """Friction under the wheels of `ids`; returns (n, 2) which of them stand on a patch."""
         base = self.base_friction[ids]
         friction = friction_at(self._wheel_points(pose), self.patches[ids], base)
-        for side, geom in enumerate(self.handles.wheel_geoms):
-            self._friction[ids, geom, 0] = friction[:, side]
+        left, right = self.handles.wheel_geoms
+        self._friction[ids, left, 0] = friction[:, 0] * self.left_friction[ids]
+        self._friction[ids, right, 0] = friction[:, 1]
         return friction < np.minimum(SLIPPERY_BELOW, base[:, None] - 1e-9)
 
     def _wheel_points(self, pose: F64) -> F64:
