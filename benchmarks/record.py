@@ -1,0 +1,95 @@
+"""Recording: robot-minutes a second of work, what a minute weighs, and whether memory grows.
+
+    python benchmarks/record.py [--quick] [--json] [--check]
+
+`--check` exits 1 where a robot-minute costs more than two seconds of work, or where memory grows
+with the recording's length by more than 64 MiB.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from restock.train.recorder import Plan, record
+
+MOST_S_PER_MINUTE = 2.0
+MOST_GROWTH_MIB = 64
+
+
+def measure(file_format: str, minutes: float) -> dict[str, Any]:
+    """One recording at the default rates, in this process."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / ("log.mcap" if file_format == "mcap" else "log")
+        plan = Plan(format="mcap" if file_format == "mcap" else "rosbag2", minutes=minutes, seed=1)
+        done = record(path, plan).describe()
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return {
+        "format": file_format,
+        "minutes": done["minutes"],
+        "minutes_per_s": done["minutes"] / done["work_s"],
+        "s_per_minute": done["work_s"] / done["minutes"],
+        "messages_per_s": done["messages"] / done["work_s"],
+        "mb_per_minute": done["size_bytes"] / 1e6 / done["minutes"],
+        "peak_mib": peak,
+    }
+
+
+def in_own_process(file_format: str, minutes: float) -> dict[str, Any]:
+    """The same, in a fresh process: peak memory is a process's."""
+    command = [sys.executable, __file__, "--one", file_format, str(minutes)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    result: dict[str, Any] = json.loads(done.stdout)
+    return result
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="1 and 4 minutes, not 5 and 60")
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--check", action="store_true")
+    parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.one:
+        sys.stdout.write(json.dumps(measure(options.one[0], float(options.one[1]))))
+        return 0
+    short, long = (1.0, 4.0) if options.quick else (5.0, 60.0)
+    rows = [
+        in_own_process("mcap", short),
+        in_own_process("rosbag2", short),
+        in_own_process("mcap", long),
+    ]
+    figures = {
+        "recordings": rows,
+        "memory_growth_mib": rows[2]["peak_mib"] - rows[0]["peak_mib"],
+    }
+    if options.json:
+        sys.stdout.write(json.dumps(figures, indent=1) + "\n")
+    else:
+        for row in rows:
+            print(
+                f"{row['format']:8} {row['minutes']:5.1f} robot-minutes: "
+                f"{row['minutes_per_s']:.2f} a second of work ({row['s_per_minute']:.2f} s each), "
+                f"{row['messages_per_s']:,.0f} messages/s, {row['mb_per_minute']:.2f} MB/minute, "
+                f"peak {row['peak_mib']:.0f} MiB"
+            )
+    misses = [
+        f"{row['format']}: {row['s_per_minute']:.2f} s a robot-minute, at most {MOST_S_PER_MINUTE}"
+        for row in rows
+        if row["s_per_minute"] > MOST_S_PER_MINUTE
+    ]
+    if figures["memory_growth_mib"] > MOST_GROWTH_MIB:
+        misses.append(f"memory grew by {figures['memory_growth_mib']:.0f} MiB with the length")
+    for miss in misses:
+        sys.stderr.write(f"missed: {miss}\n")
+    return 1 if options.check and misses else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
