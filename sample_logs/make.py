@@ -90,7 +90,7 @@ def record_all(folder: Path, *, quick: bool) -> dict[str, object]:
     plans = {
         "amr_monday.mcap": Plan(format="mcap", minutes=24.0, seed=20260302, rates=monday),
         "amr_tuesday": Plan(
-            format="rosbag2", minutes=2.4, seed=20260303, rates=tuesday, start_ns=FIRST_NS + DAY_NS
+            format="rosbag2", minutes=2.4, seed=20260397, rates=tuesday, start_ns=FIRST_NS + DAY_NS
         ),
     }
     made: dict[str, object] = {}
