@@ -78,7 +78,7 @@ def test_a_stop_on_slippery_floor_takes_what_coulomb_says(friction: float) -> No
     drive(sim, 1.0, 0.0, 2.0)
     sim.set_floor_friction(0, friction)
     before, speed = sim.pose()[0, 1], sim.qvel[0, 1]
-    sim.set_point[0] = 0.0  # a brake, not the base controller's ramp
+    sim.controller.set_point[0] = 0.0  # a brake, not the base controller's ramp
     drive(sim, 0.0, 0.0, 3.0)
     expected = speed**2 / (2 * friction * GRAVITY * wheel_share())
     assert sim.pose()[0, 1] - before == pytest.approx(expected, rel=0.15)
@@ -181,9 +181,8 @@ def test_latency_delays_the_wheels_by_what_it_says() -> None:
         start(sim, (6.0, 1.0, np.pi / 2), Perturbation(latency_s=latency))
         rows = []
         for _ in range(3):
-            sim.commands[:, 1:] = sim.commands[:, :-1]
-            sim.commands[:, 0] = (1.0, 0.0)
-            rows += [sim._wheel_set_points(block)[0] for block in range(2)]
+            sim.controller.command(np.array([[1.0, 0.0]]))
+            rows += [sim.controller.wheel_speeds(block * BLOCK_S)[0] for block in range(2)]
         assert int((np.concatenate(rows)[:, 0] == 0).sum()) == still
 
 

@@ -1,4 +1,4 @@
-"""A top-down drawing of the warehouse without GL: as pixels, or as SVG for reports."""
+"""A top-down drawing of the warehouse as pixels; needs no GL."""
 
 from __future__ import annotations
 
@@ -49,23 +49,6 @@ def draw_map(env: WarehouseVectorEnv, index: int) -> NDArray[np.uint8]:
     nose = body.length_m / 2 - 0.1
     canvas.disc(x + nose * np.cos(yaw), y + nose * np.sin(yaw), 0.06, (60, 40, 20))
     return canvas.pixels()
-
-
-def map_svg(warehouse: Warehouse, marks: str = "", *, pixels_per_m: float = 40.0) -> str:
-    """The floor and racks as SVG, with `marks` (SVG in map metres, y up) drawn on top."""
-    width, depth = warehouse.width_m, warehouse.depth_m
-    racks = "".join(
-        f'<rect x="{r.x_min:g}" y="{r.y_min:g}" width="{r.x_max - r.x_min:g}"'
-        f' height="{r.y_max - r.y_min:g}" class="rack"/>'
-        for r in warehouse.racks
-    )
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {depth:g}"'
-        f' width="{width * pixels_per_m:g}" height="{depth * pixels_per_m:g}" class="map">'
-        "<style>.floor{fill:#eeeeec}.rack{fill:#5c6c84}</style>"
-        f'<g transform="translate(0 {depth:g}) scale(1 -1)">'
-        f'<rect width="{width:g}" height="{depth:g}" class="floor"/>{racks}{marks}</g></svg>'
-    )
 
 
 class _Canvas:

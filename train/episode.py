@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from restock.errors import ConfigError
 from restock.train.friction import NO_PATCH, PATCHES
-from restock.train.layout import Segment, Warehouse
+from restock.train.layout import Warehouse
 from restock.train.model import PALLET_HALF_M, PALLETS, PARKED_M
 from restock.train.perturbation import Perturbation
 from restock.train.planner import Planner
@@ -187,12 +187,6 @@ def _draw_block(
         y = area.center[1] + side * (width / 2 - gap - half_y)
         pallets[0] = (x, y, rng.normal(0.0, 0.02))
     return pallets
-
-
-def segment_at(warehouse: Warehouse, x_m: float, y_m: float) -> Segment | None:
-    """The aisle segment a point lies in."""
-    index = int(warehouse.segment_of(np.array([x_m]), np.array([y_m]))[0])
-    return warehouse.segments[index] if index >= 0 else None
 
 
 def length_m(plan: F64) -> float:

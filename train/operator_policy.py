@@ -145,7 +145,7 @@ class Operator(SoftPolicy):
         period = env.task.control_period_s
         shape = (env.num_envs, len(table))
         x, y, yaw = (np.broadcast_to(pose[:, axis, None], shape) for axis in range(3))
-        velocity = np.broadcast_to(env.simulation.set_point[:, None], (*shape, 2))
+        velocity = np.broadcast_to(env.simulation.controller.set_point[:, None], (*shape, 2))
         ends = np.empty((*shape, HORIZON, 3))
         speed = np.empty((*shape, HORIZON))
         for step in range(HORIZON):

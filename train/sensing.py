@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 
 from restock.ingest.route import view_route
 from restock.ingest.scan import SectorMap
-from restock.ingest.signals import SIGNALS, localised_velocity, wrap_angle
+from restock.ingest.signals import localised_velocity, wrap_angle
 from restock.ingest.task import Task, clearance_ahead
 from restock.train.model import body_velocity
 from restock.train.perturbation import Perturbation
@@ -103,8 +103,8 @@ class Sensing:
             "sector_clearance_m": clearance,
             "clearance_m": clearance.min(axis=1),
             "bumped": sim.bumped[ids].copy(),
-            "command_speed_mps": sim.commands[ids, 0, 0].copy(),
-            "command_yaw_rate_radps": sim.commands[ids, 0, 1].copy(),
+            "command_speed_mps": sim.controller.commands[ids, 0, 0].copy(),
+            "command_yaw_rate_radps": sim.controller.commands[ids, 0, 1].copy(),
         }
 
 
@@ -127,6 +127,3 @@ def add_route(task: Task, signals: Signals, plans_m: F64, goals_m: F64) -> F64:
         task, signals["sector_clearance_m"], near[:, 0], near[:, 1]
     )
     return view.offset_m
-
-
-SIGNAL_NAMES = tuple(signal.name for signal in SIGNALS)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from restock.errors import ConfigError
 from restock.ingest.task import Task
+from restock.train.controller import BaseController
 from restock.train.episode import Episode
 from restock.train.friction import NO_PATCH, PATCHES, SLIPPERY_BELOW, friction_at
 from restock.train.layout import Warehouse
@@ -32,7 +33,6 @@ from restock.train.model import (
     TRACK_M,
     WHEEL_RADIUS_M,
     build_model,
-    wheel_commands,
     yaw_of,
 )
 from restock.train.perturbation import Perturbation
@@ -42,9 +42,7 @@ F64 = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
 BLOCK_S = 0.1
-ACCEL_LIMIT = np.array([4.0, 10.0])  # of the base controller: m/s2 and rad/s2
 REST_Z_M = 0.09756  # of the chassis frame, standing still
-_HISTORY = 5  # commands kept: enough for the longest latency at the shortest period
 LIDAR_BEAMS = 72
 _CONTROLLED = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_MOCAP_POS)
 
@@ -90,8 +88,7 @@ class Simulation:
         self.traffic = Traffic(num_envs, (task.body.length_m / 2, task.body.width_m / 2))
         self.patches = np.tile(NO_PATCH, (num_envs, PATCHES, 1)).astype(np.float64)
         self.pallets = np.full((num_envs, PALLETS, 3), PARKED_M[0])
-        self.commands = np.zeros((num_envs, _HISTORY, 2))  # newest first
-        self.set_point = np.zeros((num_envs, 2))
+        self.controller = BaseController(num_envs, task.control_period_s, timestep_s, self.substeps)
         self.time_s = np.zeros(num_envs)
         self.bumped = np.zeros(num_envs, np.bool_)  # in the last control period
         self.accel = np.zeros((num_envs, 3))  # mean over the last half block
@@ -99,8 +96,6 @@ class Simulation:
         self.blown_up = np.zeros(num_envs, np.bool_)
         self.base_friction = np.full(num_envs, FLOOR_FRICTION)
         self.left_friction = np.ones(num_envs)
-        self.latency_s = np.zeros(num_envs)
-        self.gain = np.ones(num_envs)
         self.radius_m = np.full(num_envs, WHEEL_RADIUS_M)
 
         bearings = np.arange(LIDAR_BEAMS) * (2 * np.pi / LIDAR_BEAMS) - np.pi
@@ -137,7 +132,8 @@ class Simulation:
         self._show_traffic(ids)
         self._control[env, :, 2:] = self._still(ids)[0]
         self._has_patches[env] = (patches[:, 2] > 0).any()
-        self.commands[env] = self.set_point[env] = self.accel[env] = 0.0
+        self.controller.reset(env)
+        self.accel[env] = 0.0
         self.time_s[env] = 0.0
         self.bumped[env] = self.slipped[env] = self.blown_up[env] = False
 
@@ -153,8 +149,8 @@ class Simulation:
         """Write a perturbation's physics into one environment."""
         self.left_friction[env] = perturbation.left_friction_scale
         self.set_floor_friction(env, FLOOR_FRICTION * perturbation.friction_scale)
-        self.latency_s[env] = perturbation.latency_s
-        self.gain[env] = perturbation.gain
+        self.controller.latency_s[env] = perturbation.latency_s
+        self.controller.gain[env] = perturbation.gain
         if perturbation.payload_kg or self._masses:
             self._masses = True
             body = self.handles.chassis_body
@@ -188,8 +184,7 @@ class Simulation:
 
     def drive(self, command: F64) -> None:
         """Drive one control period under commands (N, 2): forward speed, yaw rate."""
-        self.commands[:, 1:] = self.commands[:, :-1]
-        self.commands[:, 0] = command
+        self.controller.command(command)
         self.bumped[:] = False
         self.slipped[:] = False
         touched = self.bumped.copy()
@@ -198,7 +193,7 @@ class Simulation:
             self._walk(self.traffic.advance(pose, self.qvel[:, :2], touched, BLOCK_S))
             icy = np.flatnonzero(self._has_patches)
             slippery = self._write_friction(icy, pose[icy])
-            touched = self._run(self._wheel_set_points(block))
+            touched = self._run(self.controller.wheel_speeds(block * BLOCK_S))
             self.bumped |= touched
             if slippery.any():
                 self.slipped[icy] |= self._slipping(icy, slippery)
@@ -219,9 +214,8 @@ class Simulation:
         records = []
         for start, stop in parts:
             part = control[:, start:stop]
-            sensed = self.batch.rollout(stop - start, part, _CONTROLLED, ("sensordata",))[
-                "sensordata"
-            ]
+            record = self.batch.rollout(stop - start, part, _CONTROLLED, ("sensordata",))
+            sensed = record["sensordata"]
             pressed = (sensed[:, :, self.handles.bumper] > 0).any(axis=1)
             touched |= pressed
             self.time_s += (stop - start) * self.timestep_s
@@ -272,39 +266,12 @@ class Simulation:
             wheel_speed_radps=self.qvel[:, 6:8].copy(),
             accel_mps2=accel,
             bumped=pressed,
-            set_point=self.set_point.copy(),
+            set_point=self.controller.set_point.copy(),
         )
 
     def pose(self) -> F64:
         """True x, y and heading, (N, 3)."""
         return np.column_stack([self.qpos[:, :2], yaw_of(self.qpos[:, 3:7])])
-
-    def _wheel_set_points(self, block: int) -> F64:
-        """Wheel speeds asked for at each substep of a block, (N, substeps, 2).
-
-        The command in force reaches the base controller `latency_s` late, which ramps toward it.
-        Within a block the command changes at most once, which gives the ramp in closed form.
-        """
-        step = np.arange(self.substeps)
-        since = block * BLOCK_S + step * self.timestep_s - self.latency_s[:, None] + 1e-9
-        age = np.clip(-np.floor(since / self.task.control_period_s), 0, _HISTORY - 1)
-        age = age.astype(np.int64)  # (N, S) how many ticks old the command in force is
-        first, last = age[:, 0], age[:, -1]
-        rows = np.arange(self.num_envs)
-        old, new = self.commands[rows, first][:, None], self.commands[rows, last][:, None]
-        switch = (age == first[:, None]).sum(axis=1)[:, None, None]  # substeps under `old`
-        switch = np.where(first[:, None, None] == last[:, None, None], self.substeps, switch)
-        reach = ACCEL_LIMIT * self.timestep_s
-        begin = self.set_point[:, None]
-        count = (step + 1)[None, :, None]
-        under_old = begin + _limit(old - begin, reach * np.minimum(count, switch))
-        turned = begin + _limit(old - begin, reach * switch)
-        under_new = turned + _limit(new - turned, reach * np.maximum(count - switch, 0))
-        asked = np.where(count <= switch, under_old, under_new)
-        self.set_point = asked[:, -1].copy()
-        left, right = wheel_commands(asked[..., 0], asked[..., 1])
-        control: F64 = np.stack([left, right], axis=-1) * self.gain[:, None, None]
-        return control
 
     def _write_friction(self, ids: Ids, pose: F64) -> NDArray[np.bool_]:
         """Friction under the wheels of `ids`; returns (n, 2) which of them stand on a patch."""
@@ -354,7 +321,8 @@ class Simulation:
 
     # -- state ----------------------------------------------------------------------------------
 
-    _ARRAYS = ("commands", "set_point", "time_s", "bumped", "slipped", "accel", "blown_up")
+    _ARRAYS = ("time_s", "bumped", "slipped", "accel", "blown_up")
+    _CONTROLLER = ("commands", "set_point")
     _TRAFFIC = (
         *("state", "travelled_m", "waited_s", "position_m", "heading_rad"),
         "attentive",
@@ -363,6 +331,7 @@ class Simulation:
     def get_state(self) -> dict[str, NDArray[Any]]:
         """Everything that changes during an episode, as arrays."""
         state = {name: getattr(self, name).copy() for name in self._ARRAYS}
+        state |= {name: getattr(self.controller, name).copy() for name in self._CONTROLLER}
         state |= {f"traffic_{name}": getattr(self.traffic, name).copy() for name in self._TRAFFIC}
         state["walked"] = self._walked.copy()
         return state | {"physics": self.batch.state.copy()}
@@ -371,15 +340,13 @@ class Simulation:
         """Undo to a state of `get_state`; layouts must have been reset to the same episodes."""
         for name in self._ARRAYS:
             setattr(self, name, state[name].copy())
+        for name in self._CONTROLLER:
+            setattr(self.controller, name, state[name].copy())
         for name in self._TRAFFIC:
             setattr(self.traffic, name, state[f"traffic_{name}"].copy())
         self.batch.state[:] = state["physics"]
         self._walked = state["walked"].copy()
         self._control[:, :, 2:] = self._still(np.arange(self.num_envs))
-
-
-def _limit(change: F64, most: F64) -> F64:
-    return np.minimum(np.maximum(change, -most), most)
 
 
 def _quat(yaw_rad: F64) -> F64:
