@@ -124,6 +124,7 @@ def assert_same_run(first: Session, second: Session) -> None:
     for a, b in (
         (first.learner.network, second.learner.network),
         (first.learner.target_network, second.learner.target_network),
+        (first.learner.policy_network, second.learner.policy_network),
     ):
         for name, value in a.state_dict().items():
             assert torch.equal(value, b.state_dict()[name]), name
@@ -355,6 +356,23 @@ def test_a_learner_fits_a_batch_it_sees_again_and_again() -> None:
     td, q, _ = learner.td_error(rows)
     chosen = q.gather(1, rows[:, -3:-2].long()).squeeze(1)
     assert torch.allclose(td, chosen - expected, atol=1e-5)
+
+
+def test_the_policy_that_is_kept_is_an_average_of_the_weights() -> None:
+    rows = logs().rows[:32].clone()
+    for rate in (1.0, 0.25):
+        learner = Learner(config(evaluation={"averaging": rate}), TASK.observation_size, 3)
+        seen = []
+        for _ in range(6):
+            learner.update(rows)
+            seen.append(learner.network.advantage.bias.detach().clone())
+        # The mean of the first four, then a quarter of the way to each further one.
+        expected = seen[-1]
+        if rate == 0.25:
+            expected = torch.stack(seen[:4]).mean(dim=0)
+            for weights in seen[4:]:
+                expected = expected + 0.25 * (weights - expected)
+        assert torch.allclose(learner.policy_network.advantage.bias, expected, atol=1e-6)
 
 
 def test_the_conservative_term_lowers_what_the_logs_never_did(tmp_path: Path) -> None:

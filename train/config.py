@@ -122,10 +122,13 @@ class EvaluationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     every_env_steps: int = 20_000
     episodes: int = 10  # per condition
     seed: int = 90_000  # of the first fixed episode; kept away from training seeds
+    averaging: float = 0.001  # rate of the average of weights that is evaluated; 1: the last ones
 
     def __post_init__(self) -> None:
         if self.every_env_steps < 1 or self.episodes < 1:
             raise ValueError("evaluation.every_env_steps and evaluation.episodes must be above 0")
+        if not 0 < self.averaging <= 1:
+            raise ValueError(f"evaluation.averaging must be in (0, 1], got {self.averaging}")
 
 
 class RecordConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

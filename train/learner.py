@@ -38,6 +38,8 @@ class Learner:
         ).to(self.device)
         self.target_network = clone(self.network)
         self.target = TargetUpdate(config.target, self.network, self.target_network)
+        self.averaging = config.evaluation.averaging
+        self.policy_network = clone(self.network)
         self.optimizer = torch.optim.Adam(
             self.network.parameters(), lr=config.optimizer.learning_rate, fused=True
         )
@@ -77,7 +79,23 @@ class Learner:
             torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.max_grad_norm)
         self.optimizer.step()
         self.gradient_steps += 1
+        self._average()
         return loss
+
+    @torch.no_grad()
+    def _average(self) -> None:
+        """`policy_network`, the one that is evaluated and kept, follows as an average of weights.
+
+        The greedy policy of a single update is noisy: a small change of values turns over many
+        actions at once. The average over the last 1 / averaging updates is not (Polyak and
+        Juditsky 1992). Until there are as many, it is the mean of all of them.
+        """
+        rate = max(self.averaging, 1.0 / self.gradient_steps)
+        torch._foreach_lerp_(
+            list[Tensor](self.policy_network.parameters()),
+            list[Tensor](self.network.parameters()),
+            rate,
+        )
 
     @torch.no_grad()
     def td_error(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -100,6 +118,7 @@ class Learner:
         return {
             "network": dict(self.network.state_dict()),
             "target_network": dict(self.target_network.state_dict()),
+            "policy_network": dict(self.policy_network.state_dict()),
             "optimizer": {str(index): dict(entry) for index, entry in optimizer.items()},
             "gradient_steps": self.gradient_steps,
             "last_sync": self.target.last_sync,
@@ -109,6 +128,7 @@ class Learner:
         """Puts the learner where `state_dict` found it."""
         self.network.load_state_dict(state["network"])
         self.target_network.load_state_dict(state["target_network"])
+        self.policy_network.load_state_dict(state["policy_network"])
         self.optimizer.load_state_dict(
             {
                 "state": {int(index): dict(entry) for index, entry in state["optimizer"].items()},

@@ -224,7 +224,7 @@ def _evaluate(session: Session, notify: Notify) -> None:
     specs = fixed_episodes(names, config.evaluation.episodes, config.evaluation.seed)
     results = run_episodes(
         session.evaluation_env,
-        GreedyPolicy(learner.network),
+        GreedyPolicy(learner.policy_network),
         specs,
         control_period_s=session.task.control_period_s,
         time_limit_steps=session.task.time_limit_steps,

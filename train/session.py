@@ -134,7 +134,7 @@ class Session:
         checkpoint.save(
             self.run.best,
             {
-                "network": dict(self.learner.network.state_dict()),
+                "network": dict(self.learner.policy_network.state_dict()),
                 "observation_size": self.learner.network.observation_size,
                 "actions": self.learner.network.actions,
                 "task_hash": self.task.hash,
