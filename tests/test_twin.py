@@ -19,7 +19,12 @@ from restock.ingest.profile import load_profile
 from restock.ingest.signals import SIGNALS
 from restock.ingest.task import observe, reward, terminated
 from restock.train.episode import KINDS, EpisodeSpec
-from restock.train.perturbation import PERTURBATIONS, Perturbation, load_perturbation
+from restock.train.perturbation import (
+    PERTURBATIONS,
+    Perturbation,
+    load_perturbation,
+    load_schedule,
+)
 from restock.train.policies import PlannerFollower
 from restock.train.vector_env import WarehouseVectorEnv
 
@@ -283,6 +288,29 @@ def test_perturbations_can_differ_between_episodes() -> None:
     made.reset(seed=0)
     mass = made.simulation.batch.expand("body_mass")[:, made.simulation.handles.chassis_body]
     assert mass[1] - mass[0] == pytest.approx(60.0, rel=0.05)
+
+
+def test_a_schedule_draws_a_perturbation_for_every_episode(tmp_path: Path) -> None:
+    path = tmp_path / "fleet.toml"
+    path.write_text('name = "fleet"\n[ranges]\npayload_kg = [0, 50]\nlatency_s = [0.05, 0.2]\n')
+    schedule = load_schedule(path)
+    made = WarehouseVectorEnv(8, perturbation=schedule)
+    _, info = made.reset(seed=4)
+    assert set(info["perturbation"]) == {"fleet"}
+    drawn = [spec.perturbation for spec in made.specs]
+    loads = [item.payload_kg for item in drawn if item is not None]
+    assert len(set(loads)) == 8
+    assert 0 <= min(loads) <= max(loads) <= 50
+    again = WarehouseVectorEnv(8, perturbation=schedule)
+    again.reset(seed=4)
+    assert again.specs == made.specs
+    state = made.get_state()
+    expected = np.array(roll(made, 10, 0))
+    made.set_state(state)
+    np.testing.assert_array_equal(np.array(roll(made, 10, 0)), expected)
+    path.write_text("[ranges]\npayload_kg = [0, 500]\n")
+    with pytest.raises(ConfigError, match=r"payload_kg must rise within \[0.0, 150.0\]"):
+        load_schedule(path)
 
 
 def test_a_perturbation_is_read_from_toml_and_refused_with_its_range(tmp_path: Any) -> None:

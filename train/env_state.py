@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _ENV = (
     *("observation", "previous_action", "steps", "bumps", "episode_number", "episode_seed"),
-    *("episode_condition", "block", "episodes_begun", "_drawn"),
+    *("episode_condition", "block", "perturbation_name", "episodes_begun", "_drawn"),
 )
 
 

@@ -7,11 +7,14 @@ small noise as every robot has.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
+import numpy as np
 
 from restock.errors import ConfigError
+
+T = TypeVar("T")
 
 RANGES: dict[str, tuple[float, float]] = {
     "friction_scale": (0.05, 2.0),
@@ -65,14 +68,51 @@ class Perturbation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 raise ValueError(f"{field} must be in [{low}, {high}], got {value}")
 
 
+class Schedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A perturbation drawn anew for every episode: uniform in `ranges`, the rest from `base`."""
+
+    ranges: dict[str, tuple[float, float]]
+    base: Perturbation = Perturbation()
+    name: str = "schedule"
+
+    def __post_init__(self) -> None:
+        for field, (low, high) in self.ranges.items():
+            if field not in RANGES or field == "timestep_s":
+                known = ", ".join(name for name in RANGES if name != "timestep_s")
+                raise ValueError(f"no such range: {field!r}; the fields are {known}")
+            least, most = RANGES[field]
+            if not least <= low <= high <= most:
+                raise ValueError(
+                    f"the range of {field} must rise within [{least}, {most}], got [{low}, {high}]"
+                )
+
+    def draw(self, rng: np.random.Generator) -> Perturbation:
+        """One perturbation, named like the schedule."""
+        drawn = {field: float(rng.uniform(*self.ranges[field])) for field in sorted(self.ranges)}
+        return msgspec.structs.replace(self.base, name=self.name, **drawn)
+
+
 def load_perturbation(path: Path) -> Perturbation:
     """Read a perturbation from TOML: one `field = number` a line.
 
     Raises:
         ConfigError: no such file, a field that does not exist, or a value out of its range.
     """
+    return _load(path, Perturbation)
+
+
+def load_schedule(path: Path) -> Schedule:
+    """Read a schedule from TOML: `[ranges]` with `field = [low, high]`, and `[base]`.
+
+    Raises:
+        ConfigError: as `load_perturbation`.
+    """
+    return _load(path, Schedule)
+
+
+def _load(path: Path, kind: type[T]) -> T:
     try:
-        return msgspec.toml.decode(path.read_bytes(), type=Perturbation)
+        return msgspec.toml.decode(path.read_bytes(), type=kind)
     except OSError as error:
         raise ConfigError(
             f"cannot be read: {error.strerror}", where=str(path), remedy="check the path"

@@ -13,7 +13,8 @@ termination.
 - `signals`: the stored signals at t + 1, before any autoreset (`env.signals`: after it). Its
   `command_*` columns are the commands of [t, t + 1); `progress_m` along the plan in force at t;
 - `true_condition`: what was physically so over [t, t + 1); `episode_condition`, `block` (none,
-  partial, full), `episode_seed`, `episode_number` (place in `set_episodes`, or -1);
+  partial, full), `episode_seed`, `perturbation` (its name), `episode_number` (place in
+  `set_episodes`, or -1);
 - `success` (at the goal without any bump, at the episode's end), `bumps` (steps with a bump so
   far), `episode_steps`, `true_pose` (N, 3);
 - `invalid`: the physics blew up: the episode is truncated and the step must not enter replay;
@@ -38,7 +39,7 @@ from restock.train.draw import draw_map
 from restock.train.episode import KINDS, Episode, EpisodeSpec, draw_episode
 from restock.train.layout import Warehouse, default_warehouse
 from restock.train.navigation import Navigation
-from restock.train.perturbation import Perturbation
+from restock.train.perturbation import Perturbation, Schedule
 from restock.train.sensing import Sensing, Signals, add_motion, add_route
 from restock.train.simulation import Live, Simulation
 from restock.train.truth import Truth
@@ -66,7 +67,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArr
         num_envs: int = 1,
         *,
         conditions: Mapping[str, float] | None = None,
-        perturbation: Perturbation | None = None,
+        perturbation: Perturbation | Schedule | None = None,
         seed: int = 0,
         nthread: int = 1,
         render_mode: str | None = None,
@@ -75,6 +76,9 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArr
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
     ) -> None:
         """`conditions` are shares of episodes per kind; `nthread` 0 uses every core.
+
+        A `perturbation` holds for every episode whose spec has none of its own; a schedule draws
+        one for each such episode (fixed episodes get its base). `env.specs` tells them.
 
         Raises:
             ConfigError: an unknown condition, shares that are no shares, no environments, or an
@@ -86,7 +90,9 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArr
         self.render_mode = render_mode
         self.task = task or load_profile("warehouse_amr").task
         self.warehouse = warehouse or default_warehouse()
-        self.perturbation = perturbation or Perturbation()
+        self.schedule = perturbation if isinstance(perturbation, Schedule) else None
+        base = perturbation.base if isinstance(perturbation, Schedule) else perturbation
+        self.perturbation = base or Perturbation()
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             raise ConfigError("autoreset is SameStep or Disabled", where="the twin")
@@ -122,6 +128,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArr
         self.episode_seed = np.zeros(num_envs, np.int64)
         self.episode_condition = np.full(num_envs, "nominal", "U16")
         self.block = np.full(num_envs, "none", "U8")
+        self.perturbation_name = np.full(num_envs, "nominal", "U32")
 
     # -- episodes -------------------------------------------------------------------------------
 
@@ -156,7 +163,10 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArr
         draw = np.random.SeedSequence([self._seed, env, int(self._drawn[env])]).generate_state(3)
         self._drawn[env] += 1
         kind = np.searchsorted(self._cumulative, draw[0] / 2**32, side="right")
-        return EpisodeSpec(KINDS[int(kind)], int(draw[1]) << 20 ^ int(draw[2]))
+        seed = int(draw[1]) << 20 ^ int(draw[2])
+        rng = np.random.default_rng([seed, 1])
+        drawn = self.schedule.draw(rng) if self.schedule else None
+        return EpisodeSpec(KINDS[int(kind)], seed, drawn)
 
     def _begin(self, ids: NDArray[np.int64]) -> None:
         """Start the next episode of each environment in `ids`."""
@@ -191,6 +201,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArr
         self.truth.reset(np.array([env]))
         self.episode_condition[env], self.block[env] = spec.condition, episode.block
         self.episode_seed[env] = spec.seed
+        self.perturbation_name[env] = perturbation.name
         self.episodes_begun[env] += 1
 
     # -- gymnasium ------------------------------------------------------------------------------
@@ -272,6 +283,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArr
             "episode_condition": self.episode_condition.copy(),
             "block": self.block.copy(),
             "episode_seed": self.episode_seed.copy(),
+            "perturbation": self.perturbation_name.copy(),
             "episode_number": self.episode_number.copy(),
             "episode_steps": self.steps.copy(),
             "bumps": self.bumps.copy(),
