@@ -65,6 +65,7 @@ def test_a_run_says_what_it_was_made_from(trained: Path, panel: Path) -> None:
     assert set(document["versions"]) >= {"restock", "torch", "mujoco", "python"}
     # The mixture's share of logs is resolved: half of a batch.
     assert document["config"]["replay"]["logs_share"] == 0.5
+    assert document["config"]["epsilon"]["start"] == 0.2  # it has learnt to drive offline
 
 
 def test_offline_then_online_batches_are_half_from_the_panel(trained: Path) -> None:
@@ -81,6 +82,9 @@ def test_finished_episodes_of_the_twin_are_labelled(tmp_path: Path) -> None:
     # Random driving for longer than an episode, so that several end.
     argv = ["train", "--out", str(path), "--env-steps", "2400", *TINY]
     assert main([*argv, "--set", "schedule.warmup_env_steps=2400", "--set", "env.num_envs=8"]) == 0
+    document = json.loads((path / "config.json").read_text())
+    assert document["panel"] is None
+    assert document["config"]["epsilon"]["start"] == 1.0
     episodes = pq.read_table(path / "episodes.parquet").to_pylist()
     assert len(episodes) >= 8
     found = {name for row in episodes for name in row["conditions"]}
