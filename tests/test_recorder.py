@@ -26,7 +26,7 @@ from restock.ingest.store import StoreWriter
 from restock.replay.store import Store
 from restock.train.crew import FleetCrew
 from restock.train.fleet import Driven, Fleet
-from restock.train.missions import BLOCK, FLEET, NATURAL, parse_shares, schedule
+from restock.train.missions import BLOCK, FLEET, NATURAL, Driver, parse_shares, schedule
 from restock.train.perturbation import Perturbation
 from restock.train.publish import LIDAR_LSB_M
 from restock.train.recorder import HARDWARE, NOISELESS, Plan, parse_rates, record
@@ -142,6 +142,28 @@ def test_the_summary_counts_what_is_in_the_file(trip: Trip) -> None:
     )
     assert sum(summary["missions"].values()) == 5
     assert sum(summary["policy_steps"].values()) == len(trip.rows)
+
+
+def test_both_formats_hold_the_same_drive(tmp_path: Path) -> None:
+    tables = []
+    for name, file_format in (("a.mcap", "mcap"), ("a", "rosbag2")):
+        record(tmp_path / name, Plan(format=file_format, missions=1, seed=3))
+        store = tmp_path / f"store_{file_format}"
+        ingest(tmp_path / name, load_profile("warehouse_amr"), store=StoreWriter(store))
+        columns = "observation, action, reward, next_observation, terminated, truncated, stamp_ns"
+        query = (
+            f"SELECT {columns}, condition, behaviour_policy FROM transitions ORDER BY step_index"
+        )
+        tables.append(Store(store).sql(query).to_arrow_table())
+    assert len(tables[0]) > 20
+    assert tables[0].equals(tables[1])
+
+
+@pytest.mark.parametrize("policy", ["planner", "operator"])
+def test_one_driver_alone_can_be_asked_for(tmp_path: Path, policy: Driver) -> None:
+    summary = record(tmp_path / "log.mcap", Plan(missions=1, seed=3, policy=policy))
+    assert set(summary.policies) == {f"{policy} 1"}
+    assert summary.succeeded["nominal"] == summary.missions["nominal"] == 1
 
 
 @pytest.mark.parametrize("name", ["a.mcap", "a"])
