@@ -6,32 +6,29 @@ outcome = ingest(Path("logs/run.mcap"), profile, store=StoreWriter("store"))
 
 from __future__ import annotations
 
-import datetime as dt
 import uuid
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
-import msgspec
 import numpy as np
 import pyarrow as pa
 
 from restock.errors import RecordingError
 from restock.ingest.conditions import NOMINAL
 from restock.ingest.episodes import Split, split
+from restock.ingest.manifest import definitions, manifest_row, software_version
 from restock.ingest.profile import Profile
 from restock.ingest.readers import open_recording
 from restock.ingest.recording import Recording
 from restock.ingest.schema import recording_schema
 from restock.ingest.scores import LabelScore, score
-from restock.ingest.sources import stand_ins, wanted_fields
+from restock.ingest.sources import wanted_fields
 from restock.ingest.steps import Steps, steps_of
 from restock.ingest.store import StoreWriter
-from restock.ingest.transitions import EpisodeRows, Provenance, episode_rows, transitions
+from restock.ingest.transitions import Provenance, episode_rows, transitions
 
 Status = Literal["written", "unchanged", "dry run"]
-UNUSED = "not used by the profile"
 
 
 @dataclass(frozen=True)
@@ -87,28 +84,10 @@ def ingest(
             raise RecordingError(error.what, where=str(path), remedy=error.remedy) from error
 
 
-def software_version() -> str:
-    """Restock's version."""
-    try:
-        return version("restock")
-    except PackageNotFoundError:  # running from a source tree that was never installed
-        return "0.0.0+unknown"
-
-
-def _definitions(profile: Profile) -> dict[str, str]:
-    """What rows depend on beside the recording."""
-    return {
-        "profile_hash": profile.hash,
-        "task_hash": profile.task.hash,
-        "labels_version": profile.labels_version,
-        "restock_version": software_version(),
-    }
-
-
 def _unchanged(store: StoreWriter, recording: Recording, profile: Profile) -> dict[str, Any] | None:
     """The manifest row of the same recording ingested by the same definitions, if it is there."""
-    key = {"recording_id": recording.recording_id, **_definitions(profile)}
-    for row in store.live().to_pylist():
+    key = {"recording_id": recording.recording_id, **definitions(profile)}
+    for row in store.live(recording.recording_id).to_pylist():
         if all(row[name] == value for name, value in key.items()):
             return dict(row)
     return None
@@ -122,8 +101,8 @@ class _Ingest:
         self.ingest_id = uuid.uuid4().hex[:16]
 
     def run(self, store: StoreWriter | None) -> Outcome:
-        columns = self._columns()
-        steps = steps_of(self.profile, columns)
+        profile, columns = self.profile, self._columns()
+        steps = steps_of(profile, columns)
         episodes = split(self.profile.task, steps)
         if not episodes.transitions:
             raise RecordingError(
@@ -141,7 +120,9 @@ class _Ingest:
         scores = score(
             {name: named == name for name in rows.labels}, table["true_condition"].to_pylist()
         )
-        manifest = self._manifest(steps, episodes, rows, columns, scores)
+        manifest = manifest_row(
+            self.recording, profile, provenance, columns, steps, episodes, rows, scores
+        )
         at = (
             store.write(pa.Table.from_pylist([manifest], recording_schema()), table)
             if store
@@ -171,82 +152,6 @@ class _Ingest:
             if source.topic in readable
         }
         return recording.read(wanted_fields(self.profile, readable, stamped))
-
-    def _manifest(
-        self,
-        steps: Steps,
-        episodes: Split,
-        rows: EpisodeRows,
-        columns: dict[str, Any],
-        scores: list[LabelScore],
-    ) -> dict[str, Any]:
-        recording, profile, stamps = self.recording, self.profile, steps.signals["stamp_ns"]
-        span = recording.span_ns or (0, 0)
-        instead = stand_ins(profile, columns)
-        conditions = [
-            {"name": c.name, "timing": c.timing, "priority": c.priority, "sql": c.sql}
-            for c in profile.conditions
-        ]
-        return {
-            "recording_id": recording.recording_id,
-            "ingest_id": self.ingest_id,
-            "ingested_at": dt.datetime.now(dt.UTC),
-            "source_file": self.path,
-            "format": recording.format,
-            "integrity": recording.integrity,
-            "duration_s": (span[1] - span[0]) * 1e-9,
-            "start_stamp_ns": int(stamps.min()),
-            "end_stamp_ns": int(stamps.max()),
-            "clock": steps.clock.alignment,
-            "clock_offset_ns": steps.clock.offset_ns,
-            "clock_jumps": steps.clock.jumps,
-            "profile": profile.name,
-            **_definitions(profile),
-            "ticks": len(steps),
-            "steps": len(np.unique(rows.tick)),
-            "episodes": len(episodes.episodes),
-            "transitions": episodes.transitions,
-            "episode_ends": episodes.ends,
-            "drops": [
-                {"reason": reason, "count": count}
-                for reason, count in sorted(episodes.dropped.items(), key=lambda item: -item[1])
-            ],
-            "topics": self._topics(),
-            "stand_ins": [{"input": name, "instead": how} for name, how in instead.items()],
-            "label_scores": [
-                {
-                    "condition": s.condition,
-                    "precision": s.precision,
-                    "recall": s.recall,
-                    "labelled": s.labelled,
-                    "support": s.support,
-                }
-                for s in scores
-            ],
-            "task_json": msgspec.json.encode(profile.task).decode(),
-            "conditions_json": msgspec.json.encode(conditions).decode(),
-        }
-
-    def _topics(self) -> list[dict[str, Any]]:
-        """Every topic: the messages the container counts, those decoded, and why not the rest."""
-        found = []
-        for name, info in self.recording.topics.items():
-            account = self.recording.accounts.get(name)
-            reason = info.skipped or UNUSED
-            if account is not None:
-                reason = "; ".join(f"{why}: {n}" for why, n in account.reasons.items() if n)
-            decoded = account.decoded if account is not None else 0
-            found.append(
-                {
-                    "topic": name,
-                    "type": info.type,
-                    "expected": info.expected,
-                    "decoded": decoded,
-                    "skipped": max(info.expected - decoded, 0),
-                    "reason": reason,
-                }
-            )
-        return found
 
     def _messages(self) -> dict[str, int]:
         accounts = self.recording.accounts.values()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
@@ -23,7 +24,9 @@ class Sources:
     def __init__(self, profile: Profile, topics: Mapping[str, TopicColumns]) -> None:
         self.topics = topics
         self.inputs = {
-            name: source for name, source in profile.inputs.items() if source.topic in topics
+            name: source
+            for name, source in profile.inputs.items()
+            if source.topic in topics and not (source.optional and not len(topics[source.topic]))
         }
 
     def present(self, name: str) -> Input | None:
@@ -83,43 +86,52 @@ def wanted_fields(
 ) -> dict[str, list[str]]:
     """topic -> the field paths to read for this profile, of the topics that are `available`.
 
-    `available` maps a topic to something with a `type`; `stamped` says which topics' messages
-    carry a header.
+    `available` maps a topic to something with a `type` and an `expected` count; `stamped` says
+    which topics' messages carry a header.
 
     Raises:
         RecordingError: a required topic is missing, or holds another type than the profile says.
     """
     wanted: dict[str, list[str]] = {}
-    missing, wrong = [], []
-    for name, source in profile.inputs.items():
-        if source.topic not in available:
-            if not source.optional:
-                missing.append(f"{source.topic} ({name})")
-            continue
-        found = available[source.topic].type
-        if found != source.type:
-            wrong.append(f"{source.topic} ({name}) holds {found}, not {source.type}")
-            continue
+    problems = input_problems(profile, available)
+    if problems:
+        have = ", ".join(sorted(available)) or "none"
+        raise RecordingError(
+            f"does not fit the profile {profile.name!r}: {'; '.join(problems)}",
+            remedy=f"its topics are {have}; choose another --profile or see `restock info`",
+        )
+    for source in (source for _, source in profile.inputs.items() if source.topic in available):
         paths = wanted.setdefault(source.topic, [])
         for key, path in source.fields.items():
             paths += [f"{path}.{axis}" for axis in "xyzw"] if key == "orientation" else [path]
         if stamped[source.topic]:
             paths.append(STAMP)
-    if missing or wrong:
-        have = ", ".join(sorted(available)) or "none"
-        said = [f"it has no {', '.join(missing)}"] if missing else []
-        raise RecordingError(
-            f"does not fit the profile {profile.name!r}: {'; '.join(said + wrong)}",
-            remedy=f"its topics are {have}; choose another --profile or see `restock info`",
-        )
     return {topic: list(dict.fromkeys(paths)) for topic, paths in wanted.items()}
 
 
-def stand_ins(profile: Profile, topics: Mapping[str, Any]) -> dict[str, str]:
+def input_problems(profile: Profile, available: Mapping[str, Any]) -> list[str]:
+    """Why a recording with these topics does not fit the profile, a line a topic."""
+    needed: dict[str, list[str]] = {}
+    wrong: dict[str, list[str]] = {}
+    for name, source in profile.inputs.items():
+        found = available.get(source.topic)
+        if (found is None or not found.expected) and not source.optional:
+            what = "no message of" if found is not None else "no topic"
+            needed.setdefault(f"{what} {source.topic}", []).append(name)
+        elif found is not None and found.type != source.type:
+            said = f"{source.topic} holds {found.type}, not {source.type}"
+            wrong.setdefault(said, []).append(name)
+    return [
+        f"{what} ({', '.join(names)})"
+        for what, names in itertools.chain(needed.items(), wrong.items())
+    ]
+
+
+def stand_ins(profile: Profile, topics: Mapping[str, TopicColumns]) -> dict[str, str]:
     """Inputs that this recording does not fill -> what stands in for each."""
     absent = {
         name: FALLBACKS[name]
         for name, source in profile.inputs.items()
-        if source.optional and source.topic not in topics
+        if source.optional and not (source.topic in topics and len(topics[source.topic]))
     }
     return profile.fallbacks | absent

@@ -12,7 +12,8 @@ import json
 import os
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
@@ -39,14 +40,23 @@ class StoreWriter:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
 
-    def live(self) -> pa.Table:
-        """The manifest rows whose transitions are in the store."""
+    def live(self, recording_id: str | None = None) -> pa.Table:
+        """The manifest rows whose transitions are in the store (of one recording, or of all)."""
         if not self._exists(RECORDINGS) or not self._exists(TRANSITIONS):
             return recording_schema().empty_table()
-        manifests = _read(self._open(RECORDINGS), self.path / RECORDINGS)
-        ingests = {file.ingest_id for file in _files(self._open(TRANSITIONS))}
-        alive = [ingest in ingests for ingest in manifests["ingest_id"].to_pylist()]
-        return manifests.filter(pa.array(alive, pa.bool_()))
+        shown = {file.ingest_id for file in _files(self._open(TRANSITIONS))}
+        parts = [
+            pq.read_table(self.path / RECORDINGS / file.path, partitioning=None)
+            for file in _files(self._open(RECORDINGS))
+            if file.ingest_id in shown and recording_id in (None, file.recording_id)
+        ]
+        empty = recording_schema().empty_table()
+        return pa.concat_tables([empty, *parts], promote_options="default")
+
+    def rows(self, recording_id: str, ingest_id: str) -> pa.Table:
+        """One recording's transitions, as they were written."""
+        path = self.path / TRANSITIONS / recording_id / f"{ingest_id}.parquet"
+        return pq.read_table(path, partitioning=None)
 
     def write(self, manifest: pa.Table, rows: pa.Table) -> int:
         """Put one recording's manifest row and transitions in the store, replacing its old ones.
@@ -56,17 +66,37 @@ class StoreWriter:
         Raises:
             StoreError: `path` is something else, or other writers were faster too many times.
         """
-        recording_id = manifest["recording_id"][0].as_py()
-        ingest_id = manifest["ingest_id"][0].as_py()
-        self._create(RECORDINGS, recording_schema())
-        self._create(TRANSITIONS, _delta_schema(rows.schema))
-        name = f"{recording_id}/{ingest_id}.parquet"
-        added = {
-            RECORDINGS: _write_parquet(manifest, self.path / RECORDINGS / name),
-            TRANSITIONS: _write_parquet(rows, self.path / TRANSITIONS / name),
-        }
-        self._commit(RECORDINGS, recording_id, name, added[RECORDINGS], len(manifest))
-        return self._commit(TRANSITIONS, recording_id, name, added[TRANSITIONS], len(rows))
+        return self.write_all([(manifest, rows)])
+
+    def write_all(
+        self,
+        recordings: Iterable[tuple[pa.Table, pa.Table]],
+        *,
+        instead_of: Mapping[str, str] | None = None,
+    ) -> int:
+        """Put several recordings, as (manifest row, transitions), in the store in one commit.
+
+        `instead_of` (recording -> ingest) are the ingests that were read to make them: if another
+        writer has replaced one since, nothing is written.
+
+        Raises:
+            StoreError: as `write`, or what was to be replaced has changed.
+        """
+        manifests: list[_Added] = []
+        transitions: list[_Added] = []
+        for manifest, rows in recordings:
+            recording_id = manifest["recording_id"][0].as_py()
+            name = f"{recording_id}/{manifest['ingest_id'][0].as_py()}.parquet"
+            self._create(RECORDINGS, recording_schema())
+            self._create(TRANSITIONS, _delta_schema(rows.schema))
+            for table, what, added in (
+                (manifest, RECORDINGS, manifests),
+                (rows, TRANSITIONS, transitions),
+            ):
+                size = _write_parquet(table, self.path / what / name)
+                added.append(_Added(recording_id, name, size, len(table)))
+        self._commit(RECORDINGS, manifests, instead_of or {})
+        return self._commit(TRANSITIONS, transitions, instead_of or {})
 
     def clean(self, retention_hours: int = RETENTION_HOURS) -> list[str]:
         """Delete files that no version within the retention window needs; returns their paths.
@@ -122,46 +152,76 @@ class StoreWriter:
             from deltalake import Schema
 
             nullable = pa.schema([field.with_nullable(True) for field in extra])
-            table.alter.add_columns(Schema.from_arrow(nullable).fields)
+            fields = Schema.from_arrow(nullable).fields
+            _again_on_conflict(lambda: table.alter.add_columns(fields), self.path)
 
-    def _commit(self, name: str, recording_id: str, file: str, size: int, rows: int) -> int:
-        """Add one file and remove the recording's others, all or nothing."""
-        app = f"restock/{recording_id}"
+    def _commit(self, name: str, added: Sequence[_Added], instead_of: Mapping[str, str]) -> int:
+        """Add files and remove the same recordings' others, all or nothing."""
+        recordings = {file.recording_id for file in added}
 
         def commit() -> int:
             table = self._open(name)
+            self._still(instead_of)
+            now_ms = time.time_ns() // 1_000_000
+            actions: list[AddAction | RemoveAction] = [
+                AddAction(f.path, f.size, {}, now_ms, True, json.dumps({"numRecords": f.rows}))
+                for f in added
+            ]
+            actions += [
+                RemoveAction(path, True, now_ms) for path in self._replaced(name, table, recordings)
+            ]
             # Two first ingests of one recording add without removing, which is no conflict by
             # itself: the transaction id makes it one.
-            turn = Transaction(app, (table.transaction_version(app) or 0) + 1)
-            now_ms = time.time_ns() // 1_000_000
-            add = AddAction(file, size, {}, now_ms, True, json.dumps({"numRecords": rows}))
-            old = [
-                RemoveAction(path, True, now_ms)
-                for path in self._replaced(name, table, recording_id)
+            turns = [
+                Transaction(app, (table.transaction_version(app) or 0) + 1)
+                for app in (f"restock/{recording}" for recording in sorted(recordings))
             ]
             table.create_write_transaction(
-                [add, *old],
+                actions,
                 mode="append",
                 schema=table.schema(),
                 commit_properties=CommitProperties(
-                    custom_metadata={"operation_name": "restock ingest"}, app_transactions=[turn]
+                    custom_metadata={"operation_name": "restock ingest"}, app_transactions=turns
                 ),
             )
             return DeltaTable(str(self.path / name)).version()
 
         return _again_on_conflict(commit, self.path)
 
-    def _replaced(self, name: str, table: DeltaTable, recording_id: str) -> list[str]:
-        """The recording's files that this commit takes out of a table.
+    def _still(self, instead_of: Mapping[str, str]) -> None:
+        """Check that these ingests are the ones in the store."""
+        if not instead_of:
+            return
+        shown = {file.recording_id: file.ingest_id for file in _files(self._open(TRANSITIONS))}
+        for recording, ingest in instead_of.items():
+            if shown.get(recording) != ingest:
+                raise StoreError(
+                    f"recording {recording} was ingested anew meanwhile",
+                    where=str(self.path),
+                    remedy="try again; the store is as that ingest left it",
+                )
 
-        Of the manifests, all but the one whose transitions are in the store until the second
+    def _replaced(self, name: str, table: DeltaTable, recordings: Collection[str]) -> list[str]:
+        """The recordings' files that this commit takes out of a table.
+
+        Of the manifests, all but those whose transitions are in the store until the second
         commit replaces them.
         """
-        files = [file for file in _files(table) if file.recording_id == recording_id]
+        files = [file for file in _files(table) if file.recording_id in recordings]
         if name == RECORDINGS:
             shown = {file.ingest_id for file in _files(self._open(TRANSITIONS))}
             files = [file for file in files if file.ingest_id not in shown]
         return [file.path for file in files]
+
+
+@dataclass(frozen=True)
+class _Added:
+    """A file written, and not yet committed."""
+
+    recording_id: str
+    path: str  # in its table
+    size: int  # bytes
+    rows: int
 
 
 class _File:
@@ -180,13 +240,6 @@ class _File:
 
 def _files(table: DeltaTable) -> list[_File]:
     return [_File(path) for path in table.get_add_actions(flatten=True)["path"].to_pylist()]
-
-
-def _read(table: DeltaTable, folder: Path) -> pa.Table:
-    parts = [pq.read_table(folder / file.path, partitioning=None) for file in _files(table)]
-    if not parts:
-        return recording_schema().empty_table()
-    return pa.concat_tables(parts, promote_options="default")
 
 
 def _write_parquet(rows: pa.Table, path: Path) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +21,9 @@ from restock.ingest.task import observe, reward
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
+
+
+ENDS = b"restock.episode_ends"  # key in the rows' metadata
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,12 @@ class EpisodeRows:
     def starts(self) -> Ints:
         """The rows that begin a transition, (N,); each one's successor is the row after it."""
         return np.flatnonzero(~self.is_end)
+
+    def ends_table(self) -> pa.Table:
+        """The ends of the episodes, as `label_table` has them."""
+        ends = np.flatnonzero(self.is_end)
+        signals = {name: column[ends] for name, column in self.signals.items()}
+        return label_table(signals, self.episode[ends], self.step[ends])
 
 
 def episode_rows(profile: Profile, steps: Steps, episodes: Split) -> EpisodeRows:
@@ -152,7 +162,27 @@ def transitions(
         "restock_version": [provenance.restock_version] * count,
     }
     schema = transition_schema(task.observation_size)
-    return pa.table([_typed(columns[field.name], field.type) for field in schema], schema=schema)
+    table = pa.table([_typed(columns[field.name], field.type) for field in schema], schema=schema)
+    return table.replace_schema_metadata({ENDS: _packed(rows.ends_table())})
+
+
+def episode_ends(table: pa.Table) -> pa.Table | None:
+    """The steps that only end an episode, as conditions see them, of a recording's rows.
+
+    They are no transitions, but conditions that look ahead see them; they lie in the rows'
+    metadata (and so in that of their Parquet file). None where the rows carry none.
+    """
+    packed = (table.schema.metadata or {}).get(ENDS)
+    if packed is None:
+        return None
+    return pa.ipc.open_stream(base64.b64decode(packed)).read_all()
+
+
+def _packed(table: pa.Table) -> bytes:
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, table.schema) as writer:
+        writer.write_table(table)
+    return base64.b64encode(sink.getvalue())
 
 
 def _vectors(rows: NDArray[np.float32]) -> pa.Array:

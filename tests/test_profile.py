@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from importlib.resources import files
 
 import numpy as np
 import pytest
 
+from restock.cli import main
 from restock.errors import ConfigError
 from restock.ingest.profile import load_profile, parse_profile, shipped_profiles
 
@@ -104,3 +106,84 @@ def test_what_stands_in_is_said():
     assert set(load_profile("turtlebot3").fallbacks) == {
         "bumper", "behaviour_policy", "true_condition", "goal", "plan",
     }  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def bag(tmp_path_factory):
+    """A bag of a robot with a navigation stack."""
+    from driven_robot import Drive, write_bag
+
+    return write_bag(Drive(), tmp_path_factory.mktemp("bag") / "drive")
+
+
+def test_a_proposed_profile_reads_the_recording_it_was_proposed_from(bag, tmp_path, capsys):
+    file = tmp_path / "mine.toml"
+    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
+    assert capsys.readouterr().out == ""
+    profile = load_profile(file)
+    assert profile.name == "mine"
+    shipped = load_profile("warehouse_amr")
+    for name, source in profile.inputs.items():
+        wanted = getattr(shipped.inputs, name)
+        assert (source.topic, source.type) == (wanted.topic, wanted.type), name
+        assert source.fields == wanted.fields, name
+    assert profile.task.goal == "route"
+    assert profile.task.control_period_s == 0.2
+    assert profile.clock.steps == "command"
+    assert (0.4, 0.0) in profile.task.actions  # what the robot was told
+    assert main(["profile", "check", str(file), str(bag), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["problems"] == []
+    assert said["outcome"]["transitions"] == 29
+    assert {one["input"] for one in said["inputs"]} >= {"command", "pose", "scan", "plan"}
+
+
+def test_a_proposal_says_what_no_topic_fills(tmp_path, capsys):
+    from driven_robot import Drive, write_bag
+
+    class Blind(Drive):
+        def topics(self):
+            topics = super().topics()
+            del topics["/scan"], topics["/plan"], topics["/imu"]
+            return topics
+
+    bag = write_bag(Blind(), tmp_path / "bag")
+    assert main(["profile", "new", str(bag)]) == 0
+    out, err = capsys.readouterr()
+    assert "MISSING, and required" in out
+    assert 'goal = "none"' in out
+    assert "# [inputs.imu]  # no topic seen; instead: gyro yaw rate taken from the wheels" in out
+    assert "no topic for scan" in err
+    assert main(["profile", "new", str(bag), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["missing"] == ["scan"]
+
+
+def test_checking_a_profile_that_does_not_fit(bag, tmp_path, capsys):
+    file = tmp_path / "p.toml"
+    file.write_text(TEXT.replace('"/scan"', '"/front"').replace('"/odom"', '"/imu"'))
+    assert main(["profile", "check", str(file), str(bag)]) == 2
+    out, err = capsys.readouterr()
+    assert "no topic /front (scan)" in err
+    assert "/imu holds sensor_msgs/msg/Imu, not nav_msgs/msg/Odometry (wheels)" in err
+    assert "/amcl_pose" in out
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["new"], "takes 1 path, got 0"),
+        (["check", "warehouse_amr"], "takes 2 paths, got 1"),
+        (["new", "nowhere.mcap"], "nowhere.mcap"),
+        (["check", "warehouse", "nowhere.mcap"], "did you mean 'warehouse_amr'"),
+    ],
+)
+def test_wrong_usage_of_profile(args, said, capsys):
+    assert main(["profile", *args]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_profile_is_never_overwritten(bag, tmp_path, capsys):
+    file = tmp_path / "mine.toml"
+    file.write_text("mine")
+    assert main(["profile", "new", str(bag), "--out", str(file)]) == 2
+    assert file.read_text() == "mine"

@@ -190,3 +190,19 @@ def test_without_imu_and_goal_the_stand_ins_are_used():
     assert set(steps.policy) == {"unknown"}
     assert (steps.signals["goal_distance_m"] == 0).all()
     assert (steps.routing.goal == -1).all()
+
+
+def test_an_optional_topic_without_messages_is_replaced_like_one_that_is_not_there():
+    import msgspec
+
+    from restock.ingest.sources import stand_ins
+
+    topics = Drive().topics()
+    empty = without(topics["/bumper"], np.zeros(60, np.bool_))
+    bumper = msgspec.structs.replace(PROFILE.inputs.bumper, optional=True)
+    inputs = msgspec.structs.replace(PROFILE.inputs, bumper=bumper)
+    profile = msgspec.structs.replace(PROFILE, inputs=inputs)
+    steps = steps_of(profile, topics | {"/bumper": empty})
+    assert set(steps.problem) == {""}
+    assert "bumper" in stand_ins(profile, topics | {"/bumper": empty})
+    assert "bumper" not in stand_ins(profile, topics)

@@ -18,7 +18,9 @@ from restock.errors import ExitCode, RestockError
 VERBS = {
     "record": "drive the simulated stand-in and write what a real robot would log",
     "info": "what is in these recordings?",
+    "profile": "propose a profile for an unknown robot, or check one against a recording",
     "ingest": "recordings -> labelled Parquet transitions in a store",
+    "label": "changed conditions over a store's signals, without the recordings",
     "sql": "any question to a store (or a run), in SQL",
     "audit": "is the coverage good enough? exit 1 if not",
     "mix": "a pinned replay panel with quotas per stratum",

@@ -135,7 +135,7 @@ def as_json(outcome: Outcome) -> dict[str, Any]:
 def show(outcome: Outcome) -> None:
     """One recording's counts, as tables on stdout."""
     from restock.cli import output
-    from restock.ingest.pipeline import UNUSED
+    from restock.ingest.manifest import UNUSED
 
     row = outcome.manifest
     console = output.stdout()

@@ -1,0 +1,264 @@
+"""A first profile for an unknown robot: from the topics and types of one of its recordings.
+
+What each topic is for is guessed from its type and name; speeds of the actions and maximum ages
+come from the messages. The proposal is TOML with a comment at each guess.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from restock.ingest.profile import FALLBACKS
+from restock.ingest.recording import Recording, TopicInfo
+
+_TWIST = {"speed_mps": "linear.x", "yaw_rate_radps": "angular.z"}
+_POSE = {"x_m": "position.x", "y_m": "position.y", "orientation": "orientation"}
+
+
+def _under(path: str, fields: dict[str, str]) -> dict[str, str]:
+    return {key: f"{path}.{value}" for key, value in fields.items()}
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A message type that may fill an input, and how."""
+
+    type: str
+    fields: dict[str, str]
+    words: tuple[str, ...] = ()  # in the topic's name, they speak for it
+    must: bool = False  # … and without one of them it is not taken
+
+
+# Best first.
+KINDS: dict[str, tuple[Kind, ...]] = {
+    "command": (
+        Kind("geometry_msgs/msg/Twist", _TWIST, ("cmd_vel",)),
+        Kind("geometry_msgs/msg/TwistStamped", _under("twist", _TWIST), ("cmd_vel",)),
+    ),
+    "pose": (
+        Kind(
+            "geometry_msgs/msg/PoseWithCovarianceStamped",
+            _under("pose.pose", _POSE),
+            ("amcl", "pose", "local"),
+        ),
+        Kind(
+            "geometry_msgs/msg/PoseStamped",
+            _under("pose", _POSE),
+            ("robot_pose", "tracked_pose", "slam"),
+            must=True,
+        ),
+        Kind("nav_msgs/msg/Odometry", _under("pose.pose", _POSE), ("filtered", "map", "odom")),
+    ),
+    "wheels": (Kind("nav_msgs/msg/Odometry", _under("twist.twist", _TWIST), ("wheel", "odom")),),
+    "imu": (
+        Kind(
+            "sensor_msgs/msg/Imu",
+            {"yaw_rate_radps": "angular_velocity.z", "accel_x_mps2": "linear_acceleration.x"},
+            ("imu",),
+        ),
+    ),
+    "scan": (
+        Kind(
+            "sensor_msgs/msg/LaserScan",
+            {
+                "ranges_m": "ranges",
+                "angle_min_rad": "angle_min",
+                "angle_increment_rad": "angle_increment",
+            },
+            ("scan",),
+        ),
+    ),
+    "goal": (
+        Kind(
+            "geometry_msgs/msg/PoseStamped",
+            {"x_m": "pose.position.x", "y_m": "pose.position.y"},
+            ("goal",),
+            must=True,
+        ),
+    ),
+    "plan": (
+        Kind(
+            "nav_msgs/msg/Path",
+            {"x_m": "poses[].pose.position.x", "y_m": "poses[].pose.position.y"},
+            ("plan", "path"),
+        ),
+    ),
+    "bumper": (Kind("std_msgs/msg/Bool", {"pressed": "data"}, ("bump", "contact"), must=True),),
+    "behaviour_policy": (
+        Kind("std_msgs/msg/String", {"text": "data"}, ("policy", "mode", "behavi"), must=True),
+    ),
+    "true_condition": (
+        Kind("std_msgs/msg/String", {"text": "data"}, ("ground_truth", "true_cond"), must=True),
+    ),
+}
+REQUIRED = ("command", "pose", "wheels", "scan")
+LATCHED = ("goal", "plan", "behaviour_policy")
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """The TOML of a profile, and what in it needs a person."""
+
+    toml: str
+    missing: list[str] = field(default_factory=list)  # required inputs that no topic fills
+
+
+Roles = dict[str, list[tuple[TopicInfo, Kind]]]  # input -> the topics that may fill it, best first
+
+
+@dataclass(frozen=True)
+class Commands:
+    """What the commands of a recording say about the robot."""
+
+    speed_mps: float = 0.5
+    yaw_rate_radps: float = 1.0
+    backs: bool = False
+    period_s: float | None = None  # between two of them, mostly
+    count: int = 0
+    topic: str = ""
+
+
+def propose(recording: Recording, name: str) -> Proposal:
+    """A profile for recordings like this one."""
+    topics = {n: t for n, t in recording.topics.items() if t.skipped is None and t.expected}
+    roles = {role: _candidates(topics, kinds) for role, kinds in KINDS.items()}
+    if not (roles["goal"] and roles["plan"]):
+        roles["goal"] = roles["plan"] = []
+    commands = _commands(recording, roles)
+    seconds = _driven_s(recording, commands)
+    lines = [
+        f"# Proposed from {recording.path.name}: check what stands in comments, then run",
+        f"# restock profile check THIS_FILE {recording.path.name}",
+        f'name = "{name}"',
+        'conditions = ["recovery", "near_collision", "wheel_slip", "blocked_aisle"]',
+        'behaviour_policy = "unknown"  # who drove, where no topic says',
+        "",
+        *_task_lines(commands, routed=bool(roles["goal"])),
+        *_clock_lines(recording, roles, commands),
+    ]
+    for role, found in roles.items():
+        lines += _input_lines(role, found, seconds)
+    lines += [
+        "# Named rectangles of the map, for coverage by place:",
+        "# [[zone]]",
+        '# name = "aisle_1"',
+        "# box_m = [0.0, 0.0, 10.0, 1.8]  # x0, y0, x1, y1",
+        "",
+    ]
+    return Proposal("\n".join(lines), [role for role in REQUIRED if not roles[role]])
+
+
+def _candidates(
+    topics: dict[str, TopicInfo], kinds: tuple[Kind, ...]
+) -> list[tuple[TopicInfo, Kind]]:
+    """The topics that may fill an input, best first: by kind, by name, by messages."""
+    found = []
+    for rank, kind in enumerate(kinds):
+        for topic in topics.values():
+            named = [place for place, word in enumerate(kind.words) if word in topic.name.lower()]
+            if topic.type == kind.type and (named or not kind.must):
+                order = (rank, min(named, default=len(kind.words)), -topic.expected, topic.name)
+                found.append((order, topic, kind))
+    return [(topic, kind) for _, topic, kind in sorted(found, key=lambda item: item[0])]
+
+
+def _commands(recording: Recording, roles: Roles) -> Commands:
+    """Read the commands: how fast, which way, how often."""
+    if not roles["command"]:
+        return Commands()
+    topic, kind = roles["command"][0]
+    paths = list(kind.fields.values())
+    columns = recording.read({topic.name: paths})[topic.name]
+    speed, turn = (np.asarray(columns.fields[path], np.float64) for path in paths)
+    sane = np.isfinite(speed) & np.isfinite(turn)
+    speed, turn = speed[sane], turn[sane]
+    gaps = np.diff(np.sort(columns.log_time_ns)) * 1e-9
+    # The fastest that is commanded now and then; a single outlier is no action.
+    fast, sharp = (float(np.percentile(np.abs(c), 98)) if len(c) else 0.0 for c in (speed, turn))
+    return Commands(
+        fast or Commands.speed_mps,
+        sharp or Commands.yaw_rate_radps,
+        bool((speed < -0.05 * fast).any()),
+        float(np.median(gaps)) if len(gaps) else None,
+        len(columns),
+        topic.name,
+    )
+
+
+def _driven_s(recording: Recording, commands: Commands) -> float:
+    """How long the robot drove: recordings may pause between drives."""
+    span = recording.span_ns
+    whole = (span[1] - span[0]) * 1e-9 if span else 0.0
+    if commands.period_s is None:
+        return whole
+    driven = commands.period_s * commands.count
+    return min(driven, whole) if driven > whole / 10 else whole
+
+
+def _task_lines(commands: Commands, *, routed: bool) -> list[str]:
+    speed, turn = commands.speed_mps, commands.yaw_rate_radps
+    actions = [(0.0, 0.0), (speed / 2, 0.0), (speed, 0.0)]
+    actions += [(0.8 * speed, 0.6 * turn), (0.8 * speed, -0.6 * turn), (0.0, turn), (0.0, -turn)]
+    actions += [(-speed / 2, 0.0)] if commands.backs else []
+    period = float(np.clip(round(commands.period_s or 0.2, 2), 0.1, 0.5))
+    seen = f"from {commands.count} commands of {commands.topic}" if commands.count else "a guess"
+    return [
+        "[task]",
+        f'goal = "{"route" if routed else "none"}"'
+        + ("" if routed else "  # no goal and plan seen: progress is forward displacement"),
+        f"control_period_s = {period:g}",
+        "range_max_m = 4.0  # lidar ranges beyond it count as free",
+        f"actions = [  # (m/s, rad/s), {seen}; the first must be stop",
+        *(f"  [{v:.3g}, {w:.3g}]," for v, w in actions),
+        "]",
+        "",
+        "[task.body]  # MEASURE THESE: they decide what is near",
+        "length_m = 0.6",
+        "width_m = 0.5",
+        "lidar_x_m = 0.0  # of the lidar, ahead of the middle",
+        "",
+    ]
+
+
+def _clock_lines(recording: Recording, roles: Roles, commands: Commands) -> list[str]:
+    sensors = [found[0][0].name for role, found in roles.items() if found and role in REQUIRED[1:]]
+    stamped = [name for name in sensors if "header.stamp" in recording.leaves(name)]
+    by_stamp = bool(sensors) and len(stamped) == len(sensors)
+    period = commands.period_s
+    steady = period is not None and 0.08 <= period <= 0.5
+    why = f"a command every {period:.2f} s, mostly" if period is not None else "no commands seen"
+    return [
+        "[clock]",
+        f'alignment = "{"header.stamp" if by_stamp else "log_time"}"',
+        f'steps = "{"command" if steady else "rate"}"  # {why}',
+        "max_gap_s = 0.5",
+        "",
+    ]
+
+
+def _input_lines(role: str, found: list[tuple[TopicInfo, Kind]], seconds: float) -> list[str]:
+    if not found:
+        if role in REQUIRED:
+            return ["# MISSING, and required: no topic of a type that fits was seen.",
+                    f"# [inputs.{role}]", ""]  # fmt: skip
+        instead = FALLBACKS.get(role, "progress without a goal")
+        return [f"# [inputs.{role}]  # no topic seen; instead: {instead}", ""]
+    topic, kind = found[0]
+    rate = topic.expected / seconds if seconds > 0 else 0.0
+    others = ", ".join(other.name for other, _ in found[1:4])
+    fields = ", ".join(f'{key} = "{path}"' for key, path in kind.fields.items())
+    lines = [
+        f"[inputs.{role}]  # {rate:.1f} Hz" + (f"; or {others}?" if others else ""),
+        f"topic = {json.dumps(topic.name)}",
+        f'type = "{topic.type}"',
+        f"fields = {{ {fields} }}",
+    ]
+    if role not in LATCHED:
+        age = float(np.clip(round(4 / rate, 2) if rate else 1.0, 0.2, 1.0))
+        lines.append(f"max_age_s = {age:g}")
+    if role in FALLBACKS:
+        lines.append("optional = true")
+    return [*lines, ""]

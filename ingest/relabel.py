@@ -1,0 +1,151 @@
+"""Relabel: run conditions again over the signals that are stored, without the recordings.
+
+Rows, observations and rewards stay as they were ingested; `condition`, `conditions` and
+`labels_version` become new, and so do the manifest's scores. All recordings change in one commit.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import uuid
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from restock.errors import StoreError
+from restock.ingest.conditions import NOMINAL, Condition, label, labels_version, primary
+from restock.ingest.manifest import conditions_json, score_rows
+from restock.ingest.schema import SIGNAL_COLUMNS, recording_schema
+from restock.ingest.scores import LabelScore, score
+from restock.ingest.store import StoreWriter
+from restock.ingest.transitions import episode_ends
+
+
+@dataclass(frozen=True)
+class Relabelled:
+    """What became of one recording's labels."""
+
+    recording_id: str
+    source_file: str
+    before: str  # labels version
+    after: str
+    changed: int = 0  # rows whose one condition is another now
+    named: dict[str, int] = field(default_factory=dict)  # rows per condition, after
+    named_before: dict[str, int] = field(default_factory=dict)
+    scores: list[LabelScore] = field(default_factory=list)
+
+
+def relabel(
+    store: StoreWriter,
+    conditions_of: Callable[[str], Sequence[Condition]],
+    *,
+    dry_run: bool = False,
+) -> tuple[list[Relabelled], int | None]:
+    """Label every recording anew whose labels are not of the conditions it should have.
+
+    `conditions_of` gives the conditions for the profile (by name) that read a recording. Returns
+    what became of each, and the version of `transitions` (None where nothing was written).
+
+    Raises:
+        StoreError: rows were written before their episodes' ends were kept, or changed meanwhile.
+        ConfigError: a condition's SQL does not run.
+    """
+    outcomes: list[Relabelled] = []
+    stale: list[dict[str, Any]] = []
+    for row in store.live().to_pylist():
+        version = labels_version(conditions_of(row["profile"]))
+        if row["labels_version"] == version:
+            outcomes.append(Relabelled(row["recording_id"], row["source_file"], version, version))
+        else:
+            stale.append(row)
+
+    def anew() -> Iterator[tuple[pa.Table, pa.Table]]:
+        for row in stale:
+            manifest, rows, outcome = _one(store, row, conditions_of(row["profile"]))
+            outcomes.append(outcome)
+            yield manifest, rows
+
+    if dry_run or not stale:
+        for _ in anew():
+            pass
+        return outcomes, None
+    replaced = {row["recording_id"]: row["ingest_id"] for row in stale}
+    return outcomes, store.write_all(anew(), instead_of=replaced)
+
+
+def _one(
+    store: StoreWriter, row: dict[str, Any], conditions: Sequence[Condition]
+) -> tuple[pa.Table, pa.Table, Relabelled]:
+    """One recording's manifest and rows with new labels."""
+    rows = store.rows(row["recording_id"], row["ingest_id"])
+    ends = episode_ends(rows)
+    if ends is None:
+        raise StoreError(
+            f"the rows of {row['source_file']} came without the ends of their episodes",
+            where=str(store.path),
+            remedy="ingest the recording again",
+        )
+    seen = ["episode_index", "step_index", *(column.name for column in SIGNAL_COLUMNS)]
+    steps = pa.concat_tables([rows.select(seen), ends.select(seen).cast(rows.select(seen).schema)])
+    labels = {name: holds[: len(rows)] for name, holds in label(steps, conditions).items()}
+    named = primary(labels, conditions) or [NOMINAL] * len(rows)
+    was = rows["condition"].to_pylist()
+    version = labels_version(conditions)
+    ingest_id = uuid.uuid4().hex[:16]
+    new = {
+        "condition": named,
+        "conditions": [[n for n, holds in labels.items() if holds[i]] for i in range(len(rows))],
+        "labels_version": [version] * len(rows),
+        "ingest_id": [ingest_id] * len(rows),
+    }
+    metadata = rows.schema.metadata
+    for name, values in new.items():
+        index = rows.schema.get_field_index(name)
+        kind = rows.schema.field(index)
+        rows = rows.set_column(index, kind, pa.array(values, kind.type))
+    rows = rows.replace_schema_metadata(metadata)
+    names = np.array(named, object)
+    scores = score({name: names == name for name in labels}, rows["true_condition"].to_pylist())
+    manifest = row | {
+        "ingest_id": ingest_id,
+        "ingested_at": dt.datetime.now(dt.UTC),
+        "labels_version": version,
+        "label_scores": score_rows(scores),
+        "conditions_json": conditions_json(conditions),
+    }
+    outcome = Relabelled(
+        row["recording_id"],
+        row["source_file"],
+        row["labels_version"],
+        version,
+        sum(a != b for a, b in zip(was, named, strict=True)),
+        _counts(named),
+        _counts(was),
+        scores,
+    )
+    return pa.Table.from_pylist([manifest], recording_schema()), rows, outcome
+
+
+def _counts(names: Sequence[str]) -> dict[str, int]:
+    found, counts = np.unique(np.array(names, str), return_counts=True)
+    return dict(zip(found.tolist(), counts.tolist(), strict=True))
+
+
+def open_for_relabel(path: Path | str) -> StoreWriter:
+    """The store at `path`, which must be there.
+
+    Raises:
+        StoreError: there is none.
+    """
+    store = StoreWriter(path)
+    if not len(store.live()):
+        raise StoreError(
+            "no store, or an empty one",
+            where=str(path),
+            remedy=f"`restock ingest RECORDINGS --store {path}` makes one",
+        )
+    return store

@@ -1,0 +1,115 @@
+"""`restock label`: new conditions over the signals that are stored."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from restock.errors import ExitCode
+
+if TYPE_CHECKING:
+    from restock.ingest.conditions import Condition
+    from restock.ingest.relabel import Relabelled
+
+
+@dataclass
+class Label:
+    """Label a store's transitions anew where their conditions have changed.
+
+    Conditions run over the signals that are stored: no recording is read, and observations,
+    actions and rewards stay as they are. Recordings whose labels are of the conditions they should
+    have are left alone; the others change in one commit. Each row keeps the version of its labels.
+
+    The conditions of a recording are those of the profile that read it, by name; `--profile` gives
+    others, for the recordings of that profile's name (or, with --all, for every recording).
+    """
+
+    store: Annotated[Path, tyro.conf.Positional]
+    """The store's folder."""
+    profile: str | None = None
+    """A profile that comes with Restock, or a TOML file, whose conditions to use."""
+    all: bool = False
+    """Use that profile's conditions for recordings that another profile read, too."""
+    dry_run: bool = False
+    """Do all but write: say what would change."""
+    json: bool = False
+    """Print one JSON document: {"version", "recordings": [{"recording_id", "changed", …}]}."""
+
+    def run(self) -> int:
+        """Label, and say what changed."""
+        from restock.cli import output
+        from restock.ingest.relabel import open_for_relabel, relabel
+
+        store = open_for_relabel(self.store)
+        outcomes, version = relabel(store, self._conditions_of(), dry_run=self.dry_run)
+        rows = [as_json(outcome) for outcome in outcomes]
+        if self.json:
+            output.print_json({"version": version, "dry_run": self.dry_run, "recordings": rows})
+            return ExitCode.OK
+        output.print_table(
+            [
+                {
+                    "recording": row["source_file"],
+                    "labels": f"{row['before']} -> {row['after']}"
+                    if row["before"] != row["after"]
+                    else f"{row['after']}, unchanged",
+                    "rows changed": row["changed"],
+                }
+                for row in rows
+            ]
+        )
+        names = sorted({name for o in outcomes for name in (*o.named, *o.named_before)})
+        if names:
+            output.print_table(
+                [
+                    {
+                        "condition": name,
+                        "rows before": sum(o.named_before.get(name, 0) for o in outcomes),
+                        "rows after": sum(o.named.get(name, 0) for o in outcomes),
+                    }
+                    for name in names
+                ]
+            )
+        if version is not None:
+            output.stdout().print(f"store version {version}")
+        return ExitCode.OK
+
+    def _conditions_of(self) -> Any:
+        from restock.errors import ConfigError
+        from restock.ingest.profile import load_profile
+
+        given = load_profile(self.profile) if self.profile is not None else None
+
+        def conditions_of(name: str) -> Sequence[Condition]:
+            if given is not None and (self.all or given.name == name):
+                return given.conditions
+            try:
+                return load_profile(name).conditions
+            except ConfigError as error:
+                raise ConfigError(
+                    f"recordings of the profile {name!r} are in the store, and it is not at hand",
+                    where=str(self.store),
+                    remedy="name its file: --profile FILE (with --all for every recording)",
+                ) from error
+
+        return conditions_of
+
+
+def as_json(outcome: Relabelled) -> dict[str, Any]:
+    """An outcome as `--json` prints it."""
+    from restock.ingest.manifest import score_rows
+
+    return {
+        "recording_id": outcome.recording_id,
+        "source_file": outcome.source_file,
+        "before": outcome.before,
+        "after": outcome.after,
+        "changed": outcome.changed,
+        "named": outcome.named,
+        "named_before": outcome.named_before,
+        "label_scores": score_rows(outcome.scores),
+    }
