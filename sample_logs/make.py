@@ -39,6 +39,8 @@ def main() -> int:
     args = parser.parse_args()
     if "NPY_DISABLE_CPU_FEATURES" not in os.environ:
         return run_on_baseline()
+    # Read before anything is replaced: --out may be this very folder.
+    wanted = json.loads((HERE / "manifest.json").read_text())["files"] if args.check else None
     args.out.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix=".making-", dir=args.out) as scratch:
         made = record_all(Path(scratch), quick=args.quick)
