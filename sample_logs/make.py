@@ -53,10 +53,7 @@ def main() -> int:
     (args.out / "manifest.json").write_text(json.dumps(manifest, indent=1) + "\n")
     for name, entry in manifest["files"].items():
         sys.stdout.write(f"{entry['sha256']}  {entry['bytes']:>9,}  {name}\n")
-    if (
-        args.check
-        and digests(args.out) != json.loads((HERE / "manifest.json").read_text())["files"]
-    ):
+    if wanted is not None and manifest["files"] != wanted:
         sys.stderr.write("the bytes differ from those in sample_logs/manifest.json\n")
         return 1
     return 0
