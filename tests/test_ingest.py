@@ -116,6 +116,27 @@ def test_a_bad_recording_is_named_and_the_others_go_on(bag, tmp_path, run):
     assert "bad.mcap" in err
 
 
+def test_two_workers_make_the_same_store_as_one(tmp_path, run):
+    bags = [write_bag(Drive(duration_s=2.0 + n), tmp_path / f"bag{n}") for n in range(3)]
+    bad = tmp_path / "bad.mcap"
+    bad.write_bytes(b"")
+    found = []
+    for workers in (1, 2):
+        store = tmp_path / f"store{workers}"
+        code, said, err = run(bags[0], bad, *bags[1:], "--store", store, "--workers", workers)
+        assert code == 3
+        assert "bad.mcap" in err
+        assert [one["path"] for one in said["recordings"]] == [*map(str, bags), str(bad)]
+        with Store(store) as opened:
+            found.append(
+                opened.sql(
+                    "SELECT * EXCLUDE (ingest_id) FROM transitions ORDER BY transition_id"
+                ).to_arrow_table()
+            )
+    assert len(found[0]) > 20
+    assert found[0].equals(found[1])
+
+
 @pytest.mark.parametrize("content", [b"", b"hello, I am no recording at all", None])
 def test_what_is_no_recording_leaves_the_store_as_it_was(bag, content, tmp_path, run):
     store, bad = tmp_path / "s", tmp_path / "bad.mcap"
@@ -172,6 +193,7 @@ def test_no_usable_step_is_an_error_with_the_reasons(tmp_path, run):
     [
         ([], "no path given"),
         (["x.mcap"], "no store given"),
+        (["x.mcap", "--store", "s", "--workers", "0"], "--workers must be 1 or more, got 0"),
         (["x.mcap", "--store", "s", "--profile", "warehouse"], "did you mean 'warehouse_amr'"),
     ],
 )

@@ -42,13 +42,15 @@ class Ingest:
     """Take what is whole of files that are cut short or damaged (exit code 3)."""
     typestore: str | None = None
     """Distribution whose message definitions serve recordings without their own (humble)."""
+    workers: int = 1
+    """Processes that read recordings at the same time."""
     json: bool = False
     """Print one JSON document: {"recordings": [{"path", "status", "transitions", …}]}."""
 
     def run(self) -> int:
         """Ingest each recording; the exit code for them all."""
         from restock.cli import output
-        from restock.ingest.pipeline import ingest
+        from restock.ingest.batch import Job, ingest_all
         from restock.ingest.profile import load_profile
         from restock.ingest.store import StoreWriter
 
@@ -56,34 +58,27 @@ class Ingest:
             raise RecordingError("no path given", remedy="restock ingest PATH --store STORE")
         if self.store is None and not self.dry_run:
             raise ConfigError("no store given", remedy="say --store STORE, or --dry-run")
+        if self.workers < 1:
+            raise ConfigError(f"--workers must be 1 or more, got {self.workers}")
         profile = load_profile(self.profile)
-        writer = None if self.dry_run or self.store is None else StoreWriter(self.store)
+        store = None if self.dry_run else self.store
+        job = Job(profile, store, self.force, self.salvage, self.typestore)
         paths, failures = self._recordings()
         outcomes: list[dict[str, Any]] = []
         lossy = False
         with output.progress("ingest", len(paths)) as advance:
-            for path in paths:
-                advance(0, path.name)
-                try:
-                    outcome = ingest(
-                        path,
-                        profile,
-                        store=writer,
-                        force=self.force,
-                        salvage=self.salvage,
-                        typestore=self.typestore,
-                    )
-                except RestockError as error:
-                    failures.append({"path": str(path), "status": "failed", "error": str(error)})
-                    sys.stderr.write(f"restock: {error}\n")
-                else:
-                    lossy |= outcome.lossy
-                    outcomes.append(as_json(outcome))
-                    if not self.json:
-                        show(outcome)
-                advance(1)
-        if writer is not None and outcomes:
-            writer.clean()
+            for path, result in ingest_all(paths, job, workers=self.workers):
+                advance(1, path.name)
+                if isinstance(result, RestockError):
+                    failures.append({"path": str(path), "status": "failed", "error": str(result)})
+                    sys.stderr.write(f"restock: {result}\n")
+                    continue
+                lossy |= result.lossy
+                outcomes.append(as_json(result))
+                if not self.json:
+                    show(result)
+        if store is not None and outcomes:
+            StoreWriter(store).clean()
         if self.json:
             output.print_json({"recordings": outcomes + failures})
         if not outcomes:
