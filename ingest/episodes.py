@@ -107,8 +107,10 @@ class _Walk:
             return False
         if self.goal[tick] != self.goal[first]:
             over = bool(self.over_old[tick])
+            bump = self.task.bump_terminates and self.steps.signals["bumped"][tick]
+            ended = "bump" if bump else "goal"
             cut = "new goal" if self.goal[tick] >= 0 else "no route"
-            self._close(tick, "goal or bump" if over else cut, terminated=over, shared=True)
+            self._close(tick, ended if over else cut, terminated=over, shared=True)
             return False
         if self.over[tick]:
             reached = self._at_goal(tick)

@@ -7,6 +7,7 @@ outcome = ingest(Path("logs/run.mcap"), profile, store=StoreWriter("store"))
 from __future__ import annotations
 
 import uuid
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -42,6 +43,7 @@ class Outcome:
     conditions: dict[str, int] = field(default_factory=dict)  # transitions a label holds on
     named: dict[str, int] = field(default_factory=dict)  # … and is the row's one condition
     scores: list[LabelScore] = field(default_factory=list)
+    endings: dict[str, int] = field(default_factory=dict)  # episodes by what ended them
     losses: list[str] = field(default_factory=list)  # messages or bytes that could not be had
     notes: list[str] = field(default_factory=list)
     version: int | None = None  # of the store's transitions, where they were written
@@ -138,6 +140,7 @@ class _Ingest:
             counts,
             first,
             scores,
+            dict(Counter(episode.ended_by for episode in episodes.episodes).most_common()),
             self._losses(),
             self._notes(steps, table),
             at,

@@ -43,7 +43,7 @@ def test_a_goal_reached_on_the_tick_of_the_next_goal_still_terminates():
     """The mission layer sends the next goal at once: judge the tick by the goal before it."""
     found = episodes_of(Drive(goals=[(0.0, 3.0, 1.0), (3.2, 11.0, 1.0)]).topics())
     assert found.episodes == [
-        Episode(0, 16, True, "goal or bump", True),
+        Episode(0, 16, True, "goal", True),
         Episode(16, 29, False, "end of the recording", False),
     ]
 

@@ -51,6 +51,7 @@ def test_a_bag_becomes_transitions(bag, tmp_path, run):
         drop["count"] for drop in one["drops"]
     )
     assert one["conditions"]["nominal"] == 29
+    assert one["endings"] == {"goal": 1, "end of the recording": 1}
     topics = {topic["topic"]: topic for topic in one["topics"]}
     assert topics["/cmd_vel"]["expected"] == topics["/cmd_vel"]["decoded"] == 30
     assert one["messages"]["expected"] == one["messages"]["decoded"]

@@ -121,6 +121,7 @@ def as_json(outcome: Outcome) -> dict[str, Any]:
             for score in outcome.manifest["label_scores"]
             for p, r in [(score["precision"], score["recall"])]
         ],
+        "endings": outcome.endings,
         "losses": outcome.losses,
         "notes": outcome.notes,
         **row,
@@ -175,6 +176,8 @@ def show(outcome: Outcome) -> None:
     )
     if row["drops"]:
         output.print_table([{"dropped": d["reason"], "ticks": d["count"]} for d in row["drops"]])
+    endings = ", ".join(f"{reason} {count}" for reason, count in outcome.endings.items())
+    console.print(f"episodes ended by: {endings}", markup=False)
     for item in row["stand_ins"]:
         console.print(f"no {item['input']}: {item['instead']}", markup=False)
     for note in outcome.notes:
