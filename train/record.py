@@ -8,8 +8,7 @@ update loop) and summed once an interval. The sums go to the run's tables `strat
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -18,49 +17,12 @@ from numpy.typing import NDArray
 from restock.replay.ring import FreshRing
 from restock.train.batches import Batch, Logs
 from restock.train.checkpoint import generator_state, restore_generator
+from restock.train.drawn import Drawn, as_columns, from_state, to_state
 from restock.train.loss import Loss
 from restock.train.run import Run
 
 UNLABELLED = "unlabelled"
 _NS_PER_DAY = 86_400e9
-
-
-@dataclass(frozen=True, slots=True)
-class _Kept:
-    """What a batch was, as it was drawn: L rows of logs and F fresh ones, B = L + F."""
-
-    step: int
-    env_steps: int
-    log_row: NDArray[np.int64]  # (L,)
-    log_stratum: NDArray[np.int64]  # (L,)
-    code: NDArray[np.int16]  # (F,) condition of each fresh row, -1 while unlabelled
-    episode: NDArray[np.int64]  # (F,)
-    episode_step: NDArray[np.int32]  # (F,)
-    policy: NDArray[np.int16]  # (F,)
-    env_step: NDArray[np.int64]  # (F,) when it was collected
-    gradient_step: NDArray[np.int64]  # (F,)
-    td: NDArray[np.float32]  # (B,)
-    q: NDArray[np.float32]  # (B,)
-    weight: NDArray[np.float32] | None  # (B,)
-    tail: NDArray[np.float32]  # (B, 2) reward, discount
-
-
-# The arrays of a batch that a checkpoint keeps, and which of its rows they are about.
-_ARRAYS = {
-    **dict.fromkeys(("log_row", "log_stratum"), "log"),
-    **dict.fromkeys(
-        ("code", "episode", "episode_step", "policy", "env_step", "gradient_step"), "fresh"
-    ),
-    **dict.fromkeys(("td", "q", "tail"), "both"),
-}
-
-
-def _logged(values: NDArray[Any], batch: _Kept) -> NDArray[Any]:
-    return values[: len(batch.log_row)]
-
-
-def _fresh(values: NDArray[Any], batch: _Kept) -> NDArray[Any]:
-    return values[len(batch.log_row) :]
 
 
 class FeedRecord:
@@ -87,7 +49,7 @@ class FeedRecord:
         )
         self._fresh_strata = [*ring.conditions, UNLABELLED]
         self._drawn: dict[str, int] = {}  # "source/stratum" -> rows since the run began
-        self._kept: list[_Kept] = []
+        self._kept: list[Drawn] = []
 
     def batch(self, step: int, env_steps: int, batch: Batch, loss: Loss, last_sync: int) -> None:
         """Keep the batch of gradient step `step` (from 1), and its audit rows if it is chosen.
@@ -96,7 +58,7 @@ class FeedRecord:
         """
         ring, slots = self.ring, batch.slots
         meta = ring.meta
-        kept = _Kept(
+        kept = Drawn(
             step=step,
             env_steps=env_steps,
             log_row=batch.log_rows,
@@ -114,42 +76,7 @@ class FeedRecord:
         )
         self._kept.append(kept)
         if self._rng.random() < self.audit_share:
-            self._audit(step, batch, self._columns([kept]), last_sync)
-
-    def _columns(self, kept: Sequence[_Kept]) -> dict[str, NDArray[Any]]:
-        """Batches as columns over all their rows, logs and fresh apart."""
-
-        def joined(name: str) -> NDArray[Any]:
-            return np.concatenate([getattr(batch, name) for batch in kept])
-
-        fresh = [len(batch.code) for batch in kept]
-        code = joined("code")
-        columns = {
-            "log_row": joined("log_row"),
-            "log_stratum": joined("log_stratum"),
-            "fresh_stratum": np.where(code < 0, len(self.ring.conditions), code),
-            "fresh_key": (joined("episode") << 20) | joined("episode_step"),
-            "fresh_policy": joined("policy"),
-            "age_env_steps": np.repeat([b.env_steps for b in kept], fresh) - joined("env_step"),
-            "age_gradient_steps": np.repeat([b.step for b in kept], fresh)
-            - joined("gradient_step"),
-        }
-        for side, part in (("log", _logged), ("fresh", _fresh)):
-            for name in ("td", "q"):
-                columns[f"{side}_{name}"] = np.concatenate(
-                    [part(getattr(batch, name), batch) for batch in kept]
-                )
-            columns[f"{side}_weight"] = np.concatenate(
-                [
-                    np.ones(len(part(batch.td, batch)), np.float32)
-                    if batch.weight is None
-                    else part(batch.weight, batch)
-                    for batch in kept
-                ]
-            )
-            tail = np.concatenate([part(batch.tail, batch) for batch in kept])
-            columns[f"{side}_reward"], columns[f"{side}_discount"] = tail[:, 0], tail[:, 1]
-        return columns
+            self._audit(step, batch, as_columns([kept], len(ring.conditions)), last_sync)
 
     def flush(self, env_steps: int, gradient_steps: int, phase: str) -> dict[str, float | None]:
         """Write the interval's sums; returns its means, for `progress`."""
@@ -158,7 +85,7 @@ class FeedRecord:
             return dict.fromkeys(
                 ("td_abs_mean", "q_mean", "q_abs_max", "reward_mean", "logs_share")
             )
-        kept, self._kept = self._columns(self._kept), []
+        kept, self._kept = as_columns(self._kept, len(self.ring.conditions)), []
         if self.logs is not None and len(kept["log_row"]):
             self._log_tables(kept, clocks, phase, self.logs)
         if len(kept["fresh_stratum"]):
@@ -363,32 +290,14 @@ class FeedRecord:
 
     def state_dict(self) -> dict[str, Any]:
         """Arrays and JSON values: the totals, the audit's generator and the open interval."""
-        kept = self._kept
-        joined = {}
-        for name in _ARRAYS if kept else ():
-            joined[name] = np.concatenate([getattr(batch, name) for batch in kept])
-        weights = [b.weight if b.weight is not None else np.ones_like(b.td) for b in kept]
         return {
             "rng": generator_state(self._rng),
             "drawn": dict(self._drawn),
-            "clocks": [[b.step, b.env_steps, len(b.log_row), len(b.code)] for b in kept],
-            "weight": np.concatenate(weights) if kept else None,
-            **joined,
+            "kept": to_state(self._kept),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Puts the record where `state_dict` found it."""
         restore_generator(self._rng, state["rng"])
         self._drawn = {name: int(count) for name, count in state["drawn"].items()}
-        self._kept = []
-        logged = fresh = 0
-        for step, env_steps, log_rows, slots in state["clocks"]:
-            places = {
-                "log": slice(logged, logged + log_rows),
-                "fresh": slice(fresh, fresh + slots),
-                "both": slice(logged + fresh, logged + fresh + log_rows + slots),
-            }
-            arrays = {name: state[name][places[side]] for name, side in _ARRAYS.items()}
-            weight = state["weight"][places["both"]]
-            self._kept.append(_Kept(step=step, env_steps=env_steps, weight=weight, **arrays))
-            logged, fresh = logged + log_rows, fresh + slots
+        self._kept = from_state(state["kept"])
