@@ -15,6 +15,8 @@ import pytest
 import torch
 from toy_twin import CELLS, CONDITIONS, TASK, ToyTwin
 
+from restock.errors import ConfigError
+from restock.ingest.conditions import Condition
 from restock.replay.layout import row_width
 from restock.train import checkpoint
 from restock.train.batches import Coded, Logs
@@ -96,7 +98,7 @@ def session(path: Path, settings: TrainConfig, *, resume: bool = False, **parts:
         run,
         settings,
         task=TASK,
-        conditions=CONDITIONS,
+        conditions=parts.get("conditions", CONDITIONS),
         env=ToyTwin(settings.env.num_envs, settings.env.conditions),
         evaluation_env=ToyTwin(3),
         logs=parts.get("logs", logs()),
@@ -399,9 +401,13 @@ def test_the_conservative_term_lowers_what_the_logs_never_did(tmp_path: Path) ->
     assert q.argmax(dim=1).tolist() == [1] * (CELLS - 1)
 
 
-def test_the_config_refuses_unknown_keys_with_their_path() -> None:
-    from restock.errors import ConfigError
+def test_a_condition_that_cannot_run_is_refused_before_the_first_step(tmp_path: Path) -> None:
+    broken = Condition("wet", "pre", "humidity > 3")
+    with pytest.raises(ConfigError, match="condition 'wet'"):
+        session(tmp_path / "a", config(), conditions=[broken])
 
+
+def test_the_config_refuses_unknown_keys_with_their_path() -> None:
     with pytest.raises(ConfigError, match=r"unknown field `taw`.*target"):
         parse_config({"target": {"rule": "polyak", "taw": 1}}, where="x.toml")
     with pytest.raises(ConfigError, match=r"logs_share must be in \[0, 1\], got 2"):

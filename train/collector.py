@@ -75,6 +75,14 @@ class Collector:
         self._future: Future[Any] | None = None
         self._result: Any = None
 
+    def check_conditions(self) -> None:
+        """Raises ConfigError now, not after minutes of driving, if a condition's SQL cannot run."""
+        columns: dict[str, Any] = {
+            name: np.zeros(0, np.int64) for name in ("episode_index", "step_index")
+        }
+        columns |= {name: history[:0, 0] for name, history in self._history.items()}
+        label(pa.table(columns), self.conditions)
+
     def reset(self, seed: int) -> None:
         """Begin: the first observations (N, D)."""
         self.observation, _ = self.env.reset(seed=seed)

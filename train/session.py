@@ -200,6 +200,7 @@ def open_session(
         executor=executor,
         logs=logs,
     )
+    session.collector.check_conditions()
     if resume:
         session.restore()
     else:
