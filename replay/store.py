@@ -9,6 +9,7 @@ import os
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from urllib.parse import unquote
 
 import duckdb
 import msgspec
@@ -194,4 +195,5 @@ def parquet_view(
 
 
 def _local(uri: str) -> str:
-    return uri.removeprefix("file://")
+    """A file's path from its address: deltalake percent-encodes what is no plain letter."""
+    return unquote(uri.removeprefix("file://"))

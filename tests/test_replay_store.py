@@ -270,3 +270,10 @@ def test_the_views_run_over_tables_in_memory_too(transitions: pa.Table) -> None:
 def test_the_page_lists_every_column_as_it_is() -> None:
     page = (Path(__file__).parents[1] / "docs" / "sql.md").read_text(encoding="utf-8")
     assert rewrite(page) == page, "run: python -m restock.replay.column_docs docs/sql.md"
+
+
+def test_a_store_may_lie_in_a_folder_with_spaces_and_umlauts(tmp_path: Path) -> None:
+    path = write_store(tmp_path / "Läger 7 (neu)" / "my store", [recording_transitions(1)])
+    with Store(path) as store:
+        ((rows,),) = store.sql("SELECT count(*) FROM transitions").fetchall()
+    assert rows > 0

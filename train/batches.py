@@ -61,7 +61,7 @@ class Logs:
     weights: F32 | None  # (n,) importance weights, or None where all are 1
     as_of_ns: int  # calendar ages are against it
     transition_id: Ints  # (n,)
-    stamp_ns: Ints  # (n,)
+    stamp_ns: Ints  # (n,), when each was logged: measurement stamps may be a simulator's
     condition: Coded
     behaviour_policy: Coded
     behaviour_version: Coded
@@ -85,9 +85,9 @@ class Logs:
             stratum_rows=panel.stratum_rows(),
             shares=np.array([stratum.share for stratum in panel.strata]),
             weights=None if np.all(weights == 1) else weights,
-            as_of_ns=panel.header.as_of_ns,
+            as_of_ns=panel.header.newest_ns,
             transition_id=np.asarray(meta["transition_id"], np.int64),
-            stamp_ns=np.asarray(meta["stamp_ns"], np.int64),
+            stamp_ns=np.asarray(meta["logged_ns"], np.int64),
             condition=Coded.of(meta["condition"]),
             behaviour_policy=Coded.of(meta["behaviour_policy"]),
             behaviour_version=Coded.of(meta["behaviour_version"]),
