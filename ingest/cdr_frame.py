@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.ingest.columns import I64, FieldColumn, Ragged, offsets_of
+from restock.ingest.columns import I64, FieldColumn, Ragged, gather, offsets_of
 
 Order: TypeAlias = Literal["<", ">"]
 ORDERS: tuple[Order, Order] = ("<", ">")
@@ -97,23 +97,6 @@ def uniform(values: I64) -> Position:
 def spread(value: Position, count: int) -> I64:
     """An array of `count`, whatever it was."""
     return np.full(count, value, np.int64) if isinstance(value, int) else value
-
-
-def gather(buffer: NDArray[np.uint8], at: I64, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """One value of `dtype` (which may be a structure or an array) at each byte position, (N, …).
-
-    Positions must fit. All bytes of a value are moved at once, whatever its fields.
-    """
-    size = dtype.itemsize
-    if not len(at) or not size:
-        return np.zeros(len(at), dtype)
-    raw = np.dtype((np.void, size))
-    everywhere: NDArray[Any] = np.ndarray((len(buffer) - size + 1,), raw, buffer, strides=(1,))
-    found = everywhere[at]
-    if dtype.subdtype:
-        base, shape = dtype.subdtype
-        return found.view(base).reshape(len(at), *shape)
-    return found.view(dtype)
 
 
 def native(values: NDArray[Any]) -> NDArray[Any]:

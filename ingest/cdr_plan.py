@@ -22,14 +22,13 @@ from restock.ingest.cdr_frame import (
     Frame,
     Order,
     Position,
-    gather,
     gather_sequences,
     native,
     spread,
     texts,
     uniform,
 )
-from restock.ingest.columns import FieldColumn, Ragged, join, offsets_of, take
+from restock.ingest.columns import FieldColumn, Ragged, gather, join, offsets_of, take
 from restock.ingest.definitions import DTYPES, TIMES, CannotDecode, FieldType, MessageType
 
 Columns: TypeAlias = dict[str, FieldColumn]  # by field path

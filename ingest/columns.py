@@ -95,6 +95,23 @@ def equal(left: FieldColumn, right: FieldColumn) -> bool:
     return np.array_equal(left, right, equal_nan=left.dtype.kind == "f")
 
 
+def gather(buffer: NDArray[np.uint8], at: I64, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """One value of `dtype` (which may be a structure or an array) at each byte position, (N, …).
+
+    Positions must fit. All bytes of a value are moved at once, whatever its fields.
+    """
+    size = dtype.itemsize
+    if not len(at) or not size:
+        return np.zeros(len(at), dtype)
+    raw = np.dtype((np.void, size))
+    everywhere: NDArray[Any] = np.ndarray((len(buffer) - size + 1,), raw, buffer, strides=(1,))
+    found = everywhere[at]  # numpy moves opaque values as they are: faster than structures
+    if dtype.subdtype:
+        base, shape = dtype.subdtype
+        return found.view(base).reshape(len(at), *shape)
+    return np.ndarray((len(at),), dtype, found)  # `view` first checks every field, slowly
+
+
 @dataclass(frozen=True)
 class TopicColumns:
     """The decoded messages of one topic, in the order of their log time."""

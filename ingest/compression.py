@@ -78,5 +78,6 @@ def decompress_messages(batch: Batch) -> tuple[Batch, int]:
 
 def _any_zstd(batch: Batch) -> bool:
     long = batch.start[batch.stop - batch.start >= len(ZSTD_MAGIC)]
+    long = long[batch.buffer[long] == ZSTD_MAGIC[0]]
     same = [batch.buffer[long + at] == byte for at, byte in enumerate(ZSTD_MAGIC)]
     return bool(np.logical_and.reduce(same).any())

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import struct
 import zlib
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 import lz4.frame
 import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
-from restock.ingest.columns import I64
+from restock.ingest.columns import I64, gather
 from restock.ingest.mcap_records import PREFIX, Malformed, Op, parse, walk
 
 # A chunk's uncompressed size is the file's word: beyond these it is refused, not allocated.
@@ -33,6 +34,9 @@ HEAD_SIZE = _HEAD.itemsize  # 31
 _INDEX = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 
 
+Positions: TypeAlias = dict[int, I64]  # of message records, by channel
+
+
 class BadChunk(Exception):
     """A chunk whose content cannot be had."""
 
@@ -49,11 +53,6 @@ class Chunk:
     compression: str
     span_ns: tuple[int, int]
     index: dict[int, tuple[int, int]] = field(default_factory=dict)  # channel -> entries in file
-
-    @property
-    def indexed(self) -> bool:
-        """Whether message index records follow it."""
-        return bool(self.index)
 
     def counts(self) -> dict[int, int]:
         """Messages per channel, by the message index."""
@@ -174,27 +173,31 @@ def indexed_messages(
     )
 
 
-def gather(buffer: NDArray[np.uint8], at: I64, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """The records of `dtype` at these byte positions of a buffer, (N,). Positions must fit."""
-    room = len(buffer) - dtype.itemsize + 1
-    raw = np.dtype((np.void, dtype.itemsize))
-    view: NDArray[Any] = np.ndarray((room,), raw, buffer, strides=(1,))
-    return view[at].view(dtype)
-
-
-def walked_messages(
-    buffer: Any, start: int, stop: int
-) -> tuple[dict[int, list[int]], Malformed | None]:
-    """Positions of the message records per channel in buffer[start:stop], up to what is cut."""
-    found: dict[int, list[int]] = {}
-    try:
-        for opcode, at, end in walk(buffer, start, stop):
-            if opcode == Op.MESSAGE and end - at >= HEAD_SIZE - PREFIX:
-                channel = buffer[at] | buffer[at + 1] << 8
-                found.setdefault(channel, []).append(at - PREFIX)
-    except Malformed as cut:
-        return found, cut
-    return found, None
+def walked_messages(part: bytes) -> tuple[Positions, str | None]:
+    """Where the message records of an uncompressed chunk start, per channel, and what is cut."""
+    places: list[int] = []
+    channels: list[int] = []
+    unpack = struct.Struct("<BQH").unpack_from
+    position, end = 0, len(part)
+    cut = None
+    while position + PREFIX + 2 <= end:
+        opcode, length, channel = unpack(part, position)
+        after = position + PREFIX + length
+        if after > end:
+            break
+        if opcode == Op.MESSAGE and length >= HEAD_SIZE - PREFIX:
+            places.append(position)
+            channels.append(channel)
+        position = after
+    if (
+        position != end
+        and position + PREFIX + int.from_bytes(part[position + 1 : position + PREFIX], "little")
+        != end
+    ):
+        cut = f"cut within a record, {end - position:,} bytes before its end"
+    found = np.array(places, np.int64)
+    numbers = np.array(channels, np.int64)
+    return {number: found[numbers == number] for number in np.unique(numbers).tolist()}, cut
 
 
 def messages_at(buffer: NDArray[np.uint8], positions: Any) -> Messages:
