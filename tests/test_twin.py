@@ -210,7 +210,7 @@ def test_fixed_episodes_are_numbered_and_then_run_out() -> None:
 def test_a_blow_up_truncates_the_episode_and_is_counted(
     env: WarehouseVectorEnv, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warning to MUJOCO_LOG.TXT where it runs
+    monkeypatch.chdir(tmp_path)
     env.reset(seed=8)
     count = env.blown_up
     env.simulation.qvel[3, 0] = np.nan
@@ -225,6 +225,7 @@ def test_a_blow_up_truncates_the_episode_and_is_counted(
     np.testing.assert_array_equal(info["final_obs"][3], before[3])
     observation, *_, info = env.step(np.full(8, 2))
     assert not info["invalid"].any()
+    assert not list(tmp_path.iterdir())  # and no MUJOCO_LOG.TXT where the user stands
 
 
 def test_conditions_come_in_their_shares() -> None:

@@ -77,6 +77,7 @@ class Simulation:
         self.blocks = round(task.control_period_s / BLOCK_S)
         _check_times(task, timestep_s, self.substeps, self.blocks)
         self.model, self.handles = build_model(warehouse, task.body, timestep_s)
+        _no_log_file()
         self.batch = Batch(self.model, num_envs, nthread)
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._ctrl = self.batch.bind("ctrl")
@@ -369,3 +370,11 @@ def _check_times(task: Task, timestep_s: float, substeps: int, blocks: int) -> N
             where="task",
             remedy="the twin drives in blocks of .1 s",
         )
+
+
+def _no_log_file() -> None:
+    """No MUJOCO_LOG.TXT wherever the user happens to stand: blow-ups are counted and reported."""
+    config = mujoco.MjLogConfig.get()
+    if config.logto_file:
+        config.logto_file = False
+        config.set()
