@@ -185,6 +185,23 @@ def test_drawn_shares_are_over_the_whole_run(run: Path) -> None:
     assert fed["fresh", HOSTILE]["drawn_share"] == pytest.approx(0.1)
 
 
+def test_shares_after_weights_count_intervals_by_what_was_drawn_in_them(tmp_path: Path) -> None:
+    made = Run.create(tmp_path / "run", {"config": {}})
+    made.append("progress", [filled("progress", phase="online")])
+    made.append(
+        "strata",
+        [
+            # A stratum that only the first, small interval held.
+            filled("strata", gradient_steps=1, stratum="a", drawn_rows=50, effective_share=0.5),
+            filled("strata", gradient_steps=1, stratum="b", drawn_rows=50, effective_share=0.5),
+            filled("strata", gradient_steps=2, stratum="a", drawn_rows=900, effective_share=1.0),
+        ],
+    )
+    made.flush()
+    fed = {row["stratum"]: row["effective_share"] for row in gather(made.path).fed}
+    assert fed == pytest.approx({"a": 0.95, "b": 0.05})
+
+
 def test_the_kept_evaluation_is_the_best_and_not_the_last(run: Path) -> None:
     kept = gather(run).kept
     assert kept is not None
