@@ -45,7 +45,7 @@ def test_loss_by_hand() -> None:
     # td = 2 - 1.5 = 0.5 and 3 - 0 = 3; huber 0.125 and 2.5; mean 1.3125
     assert loss.td.tolist() == [0.5, 3.0]
     assert loss.q.tolist() == [2.0, 3.0]
-    assert float(loss.value) == pytest.approx(1.3125)
+    assert loss.value.item() == pytest.approx(1.3125)
     loss.value.backward()
     assert q.grad is not None
     # Half of each error's clipped slope, and only at the actions taken.
