@@ -276,7 +276,6 @@ def _header(source: Source, plan: Plan, observation_size: int, partial: Path) ->
         n_step=plan.mixture.n_step,
         packing_version=PACKING_VERSION,
         restock_version=__version__,
-        as_of_ns=int(plan.rows["stamp_ns"].to_numpy().max()),
         newest_ns=plan.newest_ns,
         logs_share=plan.logs_share,
         conditions=[*(c.name for c in by_priority), NOMINAL],

@@ -70,7 +70,6 @@ class Header(msgspec.Struct, frozen=True):
     n_step: int
     packing_version: int
     restock_version: str
-    as_of_ns: int  # newest stamp of the source
     newest_ns: int  # when its newest row was logged: ages of rows are against it, from logged_ns
     logs_share: float  # of a batch
     conditions: list[str]  # by priority, nominal last

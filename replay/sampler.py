@@ -7,7 +7,7 @@ of 12, and a share of 0.003 of a batch is met over time, because the rounding is
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,19 +16,6 @@ from restock.errors import MixtureError
 from restock.replay.layout import F32, F64, Ints
 
 BLOCK = 64  # batches drawn at a time
-
-
-class Sampler(Protocol):
-    """Draws the rows of a batch."""
-
-    def draw(self) -> tuple[Ints, Ints]:
-        """Row numbers (B,) and the stratum of each (B,)."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """All that decides the draws to come: numpy arrays and plain JSON values."""
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on exactly as the sampler whose `state_dict` this is would have."""
 
 
 class Quotas:

@@ -75,6 +75,19 @@ class EpisodeResult:
     end_y_m: float
     failure: str | None  # stuck | timeout | bump | cut
 
+    @property
+    def row(self) -> dict[str, Any]:
+        """What every table of episodes says of one."""
+        return {
+            "condition": self.condition,
+            "block": self.block,
+            "episode_seed": self.episode_seed,
+            "success": self.success,
+            "bumps": self.bumps,
+            "time_s": self.time_s,
+            "return": self.undiscounted_return,
+        }
+
 
 def fixed_episodes(conditions: Sequence[str], episodes: int, first_seed: int) -> list[EpisodeSpec]:
     """The same episodes always: `episodes` per condition, seeds from `first_seed`."""

@@ -241,13 +241,7 @@ def _evaluate(session: Session, notify: Notify) -> None:
             {
                 "env_steps": clock.env_steps,
                 "gradient_steps": learner.gradient_steps,
-                "condition": result.condition,
-                "block": result.block,
-                "episode_seed": result.episode_seed,
-                "success": result.success,
-                "bumps": result.bumps,
-                "time_s": result.time_s,
-                "return": result.undiscounted_return,
+                **result.row,
                 "best": best,
             }
             for result in results

@@ -58,10 +58,6 @@ class QNetwork(nn.Module):
         value: Tensor = self.value(features)
         return value + advantage - advantage.mean(dim=1, keepdim=True)
 
-    @property
-    def parameter_count(self) -> int:
-        return sum(parameter.numel() for parameter in self.parameters())
-
 
 def clone(network: QNetwork) -> QNetwork:
     """A copy that takes no gradients: the target network."""

@@ -7,7 +7,7 @@ small noise as every robot has.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import msgspec
 import numpy as np
@@ -121,11 +121,6 @@ def _load(path: Path, kind: type[T]) -> T:
         raise ConfigError(
             str(error), where=str(path), remedy=f"the fields are name, {', '.join(RANGES)}"
         ) from error
-
-
-def to_dict(perturbation: Perturbation) -> dict[str, Any]:
-    """As plain names and numbers, for JSON and metadata columns."""
-    return dict(msgspec.structs.asdict(perturbation))
 
 
 # Ready-made ones for evaluation: each changes one thing, by about what a fleet shows.
