@@ -3,7 +3,9 @@
 `recordings` holds one manifest row an ingest, `transitions` the rows; `ingest_id` joins them. The
 manifest is committed first and the transitions second, so an ingest that is cut between the two is
 a manifest that joins nothing, and a reader sees each recording whole or not at all. A recording
-that is ingested again replaces its old rows in the same commit that adds the new ones.
+that is ingested again replaces its old rows in the same commit that adds the new ones; the
+manifests of what was replaced go last, by the writer that replaced it. A manifest that joins
+nothing yet is never removed: another writer may be about to commit its transitions.
 """
 
 from __future__ import annotations
@@ -96,7 +98,9 @@ class StoreWriter:
                 size = _write_parquet(table, self.path / what / name)
                 added.append(_Added(recording_id, name, size, len(table)))
         self._commit(RECORDINGS, manifests, instead_of or {})
-        return self._commit(TRANSITIONS, transitions, instead_of or {})
+        version, replaced = self._commit(TRANSITIONS, transitions, instead_of or {})
+        self._remove(RECORDINGS, replaced)
+        return version
 
     def clean(self, retention_hours: int = RETENTION_HOURS) -> list[str]:
         """Delete files that no version within the retention window needs; returns their paths.
@@ -104,6 +108,7 @@ class StoreWriter:
         They are what killed writers left, and what replaced recordings had.
         """
         deleted = []
+        self._remove(RECORDINGS, self._abandoned(retention_hours))
         for name in (RECORDINGS, TRANSITIONS):
             if not self._exists(name):
                 continue
@@ -119,8 +124,22 @@ class StoreWriter:
                 deleted.append(f"{name}/{file}")
         return deleted
 
+    def _abandoned(self, retention_hours: int) -> list[str]:
+        """Manifests that join nothing, and are too old for a writer to be on its way to commit."""
+        if not self._exists(RECORDINGS) or not self._exists(TRANSITIONS):
+            return []
+        manifests = self._open(RECORDINGS)  # before the transitions that may join them
+        shown = {file.ingest_id for file in _files(self._open(TRANSITIONS))}
+        before_ms = (time.time() - retention_hours * 3600) * 1000
+        return [
+            file.path
+            for file in _files(manifests)
+            if file.ingest_id not in shown and file.added_ms < before_ms
+        ]
+
     def _exists(self, name: str) -> bool:
-        return (self.path / name / "_delta_log").is_dir()
+        # A folder of a log is not yet a table: another writer may be making its first version.
+        return DeltaTable.is_deltatable(str(self.path / name))
 
     def _open(self, name: str) -> DeltaTable:
         try:
@@ -155,38 +174,71 @@ class StoreWriter:
             fields = Schema.from_arrow(nullable).fields
             _again_on_conflict(lambda: table.alter.add_columns(fields), self.path)
 
-    def _commit(self, name: str, added: Sequence[_Added], instead_of: Mapping[str, str]) -> int:
-        """Add files and remove the same recordings' others, all or nothing."""
+    def _commit(
+        self, name: str, added: Sequence[_Added], instead_of: Mapping[str, str]
+    ) -> tuple[int, list[str]]:
+        """Add files and remove the same recordings' other transitions, all or nothing.
+
+        Returns the table's version and the files removed from it.
+        """
         recordings = {file.recording_id for file in added}
 
-        def commit() -> int:
+        def commit() -> tuple[int, list[str]]:
             table = self._open(name)
             self._still(instead_of)
             now_ms = time.time_ns() // 1_000_000
+            replaced = [
+                file.path
+                for file in _files(table)
+                if name == TRANSITIONS and file.recording_id in recordings
+            ]
             actions: list[AddAction | RemoveAction] = [
                 AddAction(f.path, f.size, {}, now_ms, True, json.dumps({"numRecords": f.rows}))
                 for f in added
             ]
-            actions += [
-                RemoveAction(path, True, now_ms) for path in self._replaced(name, table, recordings)
-            ]
+            actions += [RemoveAction(path, True, now_ms) for path in replaced]
             # Two first ingests of one recording add without removing, which is no conflict by
             # itself: the transaction id makes it one.
             turns = [
                 Transaction(app, (table.transaction_version(app) or 0) + 1)
                 for app in (f"restock/{recording}" for recording in sorted(recordings))
             ]
-            table.create_write_transaction(
-                actions,
-                mode="append",
-                schema=table.schema(),
-                commit_properties=CommitProperties(
-                    custom_metadata={"operation_name": "restock ingest"}, app_transactions=turns
-                ),
-            )
-            return DeltaTable(str(self.path / name)).version()
+            self._transact(table, actions, turns)
+            return DeltaTable(str(self.path / name)).version(), replaced
 
         return _again_on_conflict(commit, self.path)
+
+    def _remove(self, name: str, paths: Collection[str]) -> None:
+        """Take files out of a table, those that are still in it."""
+
+        def commit() -> None:
+            table = self._open(name)
+            now_ms = time.time_ns() // 1_000_000
+            actions = [
+                RemoveAction(file.path, True, now_ms)
+                for file in _files(table)
+                if file.path in paths
+            ]
+            if actions:
+                self._transact(table, actions, [])
+
+        if paths:
+            _again_on_conflict(commit, self.path)
+
+    def _transact(
+        self,
+        table: DeltaTable,
+        actions: Sequence[AddAction | RemoveAction],
+        turns: Sequence[Transaction],
+    ) -> None:
+        table.create_write_transaction(
+            list(actions),
+            mode="append",
+            schema=table.schema(),
+            commit_properties=CommitProperties(
+                custom_metadata={"operation_name": "restock ingest"}, app_transactions=list(turns)
+            ),
+        )
 
     def _still(self, instead_of: Mapping[str, str]) -> None:
         """Check that these ingests are the ones in the store."""
@@ -200,18 +252,6 @@ class StoreWriter:
                     where=str(self.path),
                     remedy="try again; the store is as that ingest left it",
                 )
-
-    def _replaced(self, name: str, table: DeltaTable, recordings: Collection[str]) -> list[str]:
-        """The recordings' files that this commit takes out of a table.
-
-        Of the manifests, all but those whose transitions are in the store until the second
-        commit replaces them.
-        """
-        files = [file for file in _files(table) if file.recording_id in recordings]
-        if name == RECORDINGS:
-            shown = {file.ingest_id for file in _files(self._open(TRANSITIONS))}
-            files = [file for file in files if file.ingest_id not in shown]
-        return [file.path for file in files]
 
 
 @dataclass(frozen=True)
@@ -227,19 +267,21 @@ class _Added:
 class _File:
     """An active file of a table, by its path `<recording_id>/<ingest_id>.parquet`."""
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str, added_ms: int) -> None:
         if not _OWN_PATH.fullmatch(path):
             raise StoreError(
                 f"holds a file that `restock ingest` did not write: {path}",
                 remedy="restore the version before it was added (compacting tools rewrite files)",
             )
-        self.path = path
+        self.path, self.added_ms = path, added_ms
         self.recording_id, name = path.split("/")
         self.ingest_id = name.removesuffix(".parquet")
 
 
 def _files(table: DeltaTable) -> list[_File]:
-    return [_File(path) for path in table.get_add_actions(flatten=True)["path"].to_pylist()]
+    actions = table.get_add_actions(flatten=True)
+    paths, added_ms = actions["path"].to_pylist(), actions["modification_time"].to_pylist()
+    return [_File(path, ms) for path, ms in zip(paths, added_ms, strict=True)]
 
 
 def _write_parquet(rows: pa.Table, path: Path) -> int:

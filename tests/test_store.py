@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pyarrow as pa
@@ -18,7 +19,7 @@ from deltalake import DeltaTable
 
 from restock.errors import StoreError
 from restock.ingest.schema import recording_schema
-from restock.ingest.store import StoreWriter
+from restock.ingest.store import RECORDINGS, TRANSITIONS, StoreWriter
 from restock.replay.store import Store
 
 
@@ -92,8 +93,17 @@ def test_a_manifest_without_transitions_shows_nothing_and_is_cleared_away(tmp_pa
     assert list(shown(tmp_path / "s")) == ["0000000000000001-a"]
     writer.write(*one(1, "c"))
     assert list(shown(tmp_path / "s")) == ["0000000000000001-c"]
-    kept = DeltaTable(str(tmp_path / "s" / "recordings")).get_add_actions(flatten=True)["path"]
-    assert not any("-b" in path for path in kept.to_pylist())
+
+    def manifests() -> list[str]:
+        kept = DeltaTable(str(tmp_path / "s" / RECORDINGS)).get_add_actions(flatten=True)["path"]
+        return sorted(Path(path).stem[-1] for path in kept.to_pylist())
+
+    # Another writer may still be about to commit what joins nothing, so only age removes it.
+    writer.clean()
+    assert manifests() == ["b", "c"]
+    writer.clean(retention_hours=0)
+    assert manifests() == ["c"]
+    assert list(shown(tmp_path / "s")) == ["0000000000000001-c"]
 
 
 def test_orphans_are_cleaned_after_the_retention_window_only(tmp_path):
@@ -133,6 +143,27 @@ def test_writers_at_the_same_time_lose_nothing_and_double_nothing(tmp_path):
     for ingest, count in found.items():
         recording, name = ingest.split("-")
         assert count == len(one(int(recording, 16), name)[1])
+
+
+class _Overtaken(StoreWriter):
+    """A writer between whose two commits another one writes."""
+
+    def __init__(self, path: Path, meanwhile: Callable[[], object]) -> None:
+        super().__init__(path)
+        self.meanwhile = meanwhile
+
+    def _commit(self, name, added, instead_of):
+        if name == TRANSITIONS:
+            self.meanwhile()
+        return super()._commit(name, added, instead_of)
+
+
+def test_a_writer_overtaken_by_another_of_the_same_recording_loses_nothing(tmp_path):
+    path = tmp_path / "s"
+    _Overtaken(path, lambda: StoreWriter(path).write(*one(1, "b"))).write(*one(1, "a"))
+    assert shown(path) == {"0000000000000001-a": len(one(1, "a")[1])}
+    manifests = DeltaTable(str(path / RECORDINGS)).file_uris()
+    assert [Path(uri).stem for uri in manifests] == ["0000000000000001-a"]
 
 
 def _write_for_ever(path: Path) -> None:
