@@ -18,6 +18,7 @@ from restock.replay.ring import FreshRing
 from restock.train.batches import Batch, Logs
 from restock.train.checkpoint import generator_state, restore_generator
 from restock.train.drawn import Drawn, as_columns, from_state, to_state
+from restock.train.fed_episodes import episode_columns
 from restock.train.loss import Loss
 from restock.train.run import Run
 
@@ -118,6 +119,7 @@ class FeedRecord:
         )
         if self._age_days is not None:
             self._ages("logs", "days", self._age_days[kept["log_row"]], clocks)
+        self._episodes("logs", logs.episode.codes[kept["log_row"]], kept, logs.strata, clocks)
         policy = logs.behaviour_policy
         counts = np.bincount(policy.codes[kept["log_row"]], minlength=len(policy.names))
         self._policies("logs", policy.names, counts, clocks)
@@ -140,6 +142,7 @@ class FeedRecord:
         )
         for unit in ("env_steps", "gradient_steps"):
             self._ages("fresh", unit, kept[f"age_{unit}"].astype(np.float64), clocks)
+        self._episodes("fresh", kept["fresh_key"] >> 20, kept, names, clocks)
         counts = np.bincount(kept["fresh_policy"], minlength=len(ring.behaviour_policies))
         self._policies("fresh", ring.behaviour_policies, counts, clocks)
 
@@ -212,6 +215,29 @@ class FeedRecord:
                 "p90": p90,
                 "p99": p99,
             },
+        )
+
+    def _episodes(
+        self,
+        source: str,
+        episode: NDArray[Any],
+        kept: dict[str, NDArray[Any]],
+        strata: list[str],
+        clocks: dict[str, int],
+    ) -> None:
+        side = "log" if source == "logs" else "fresh"
+        columns = episode_columns(
+            episode, kept[f"{side}_stratum"], kept[f"{side}_weight"], len(strata)
+        )
+        named = np.array(strata, object)[columns["stratum"]]
+        keys: Any = columns["episode"]
+        if source == "logs" and self.logs is not None:
+            names = np.array(self.logs.episode.names, object)[keys]
+        else:
+            names = keys.astype(str)
+        self.run.append_columns(
+            "fed_episodes",
+            {**clocks, "source": source, **columns, "stratum": named, "episode": names},
         )
 
     def _policies(

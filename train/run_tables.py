@@ -75,6 +75,15 @@ TABLES: dict[str, pa.Schema] = {
         ("p90", _F),
         ("p99", _F),
     ),
+    # One row an interval x source x stratum x episode: draws, as rows of one episode are alike.
+    "fed_episodes": _schema(
+        *_CLOCKS,
+        ("source", _S),
+        ("stratum", _S),
+        ("episode", _S),  # of the logs: episode_id; fresh: the ring's key
+        ("drawn_rows", _I),
+        ("weight", _F),  # the sum of their importance weights
+    ),
     # One row an interval x source x behaviour policy.
     "policies": _schema(*_CLOCKS, ("source", _S), ("behaviour_policy", _S), ("rows", _I)),
     # One row an interval x condition: the critic on a fixed set of rows.
