@@ -1,0 +1,218 @@
+"""Were two runs fed the same? An equivalence test, resampled by episode.
+
+A difference test asks the wrong question: at a million draws it rejects trifles, and it takes rows
+of one episode for independent ones. So two feeds are comparable only when the data show that they
+differ by *at most* a stated limit. What a mixture fixes (the shares of logged strata, in exact
+quotas) is compared as it is; what chance decides (which fresh episodes there were) is resampled by
+whole episodes. Total variation distance alone does not see a rare stratum, hence the ratios.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+Verdict = Literal["comparable", "inconclusive", "incomparable"]
+_CHECKS = 30  # about as many are made of chance
+_ORDER: list[Verdict] = ["comparable", "inconclusive", "incomparable"]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What still counts as the same feed."""
+
+    distance: float = 0.02  # total variation between the mixes of the whole run
+    tenth_distance: float = 0.05  # … of one tenth of it, which has a tenth of the episodes
+    share_ratio: float = 1.25  # of a stratum's shares
+    share_floor: float = 0.0005  # strata below this share in both are not asked for a ratio
+    episode_ratio: float = 1.5  # of the numbers of episodes that a stratum was drawn from
+    confidence: float = 0.95
+    resamples: int = 1000
+
+
+@dataclass(frozen=True)
+class Feed:
+    """What one arm's critics were fed: draws by cell (source/stratum), tenth of training, episode.
+
+    Rows are sums over the draws of one episode in one cell and tenth.
+    """
+
+    cells: list[str]  # "logs/wheel_slip", …
+    cell: NDArray[np.int64]  # (n,)
+    tenth: NDArray[np.int64]  # (n,) 0 to 9
+    episode: NDArray[np.int64]  # (n,) fresh ones are distinct over the arm's runs
+    run: NDArray[np.int64]  # (n,)
+    drawn: F64  # (n,)
+    weight: F64  # (n,) the sum of importance weights
+
+
+@dataclass(frozen=True)
+class Check:
+    """One question of the gate, with its answer."""
+
+    name: str  # "mix", "mix after weights", "share of logs/wheel_slip", …
+    part: str  # "whole run", or "tenth 3"
+    first: float | None  # the arms' own figures, where there are such
+    second: float | None
+    value: float  # distance, or ratio of the larger to the smaller
+    low: float  # of its confidence interval
+    high: float
+    limit: float
+
+    @property
+    def verdict(self) -> Verdict:
+        if self.high <= self.limit:
+            return "comparable"
+        return "incomparable" if self.low > self.limit else "inconclusive"
+
+
+def worst(verdicts: Sequence[Verdict]) -> Verdict:
+    """The verdict of many: one that is incomparable decides."""
+    return max(verdicts, key=_ORDER.index, default="comparable")
+
+
+def check_feeds(first: Feed, second: Feed, limits: Limits, rng: np.random.Generator) -> list[Check]:
+    """All checks of the gate. Both feeds must name the same cells in the same order."""
+    checks = []
+    for after_weights in (False, True):
+        name = "mix after weights" if after_weights else "mix"
+        for tenth in (None, *range(10)):
+            limit = limits.distance if tenth is None else limits.tenth_distance
+            mixes = [
+                _resampled(feed, tenth, after_weights, limits, rng) for feed in (first, second)
+            ]
+            part = "whole run" if tenth is None else f"tenth {tenth + 1}"
+            if any(mix is None for mix in mixes):
+                if any(mix is not None for mix in mixes):  # one arm was not fed at all then
+                    checks.append(Check(name, part, None, None, 1.0, 1.0, 1.0, limit))
+                continue
+            a, b = (mix for mix in mixes if mix is not None)
+            checks.append(_distance(name, part, a, b, limit, limits))
+            if tenth is None:
+                checks += _ratios(first.cells, name, a, b, limits)
+    return checks + _episodes(first, second, limits)
+
+
+def _ratios(cells: Sequence[str], name: str, a: F64, b: F64, limits: Limits) -> list[Check]:
+    after = " after weights" if name.endswith("weights") else ""
+    checks = []
+    for index, cell in enumerate(cells):
+        shares = float(a[0, index]), float(b[0, index])
+        if max(shares) < limits.share_floor:
+            continue
+        checks.append(_ratio(f"share of {cell}{after}", a[:, index], b[:, index], limits))
+    return checks
+
+
+def _episodes(first: Feed, second: Feed, limits: Limits) -> list[Check]:
+    """Episodes that each cell was drawn from: a count, with nothing left to chance in it."""
+    checks = []
+    totals = [np.bincount(f.cell, f.drawn, len(f.cells)) / f.drawn.sum() for f in (first, second)]
+    for index, cell in enumerate(first.cells):
+        if max(total[index] for total in totals) < limits.share_floor:
+            continue
+        one, other = _episodes_a_run(first, index), _episodes_a_run(second, index)
+        value = max(one, other) / min(one, other) if min(one, other) else math.inf
+        checks.append(
+            Check(
+                f"episodes of {cell}",
+                "whole run",
+                *(one, other, value, value, value),
+                limits.episode_ratio,
+            )
+        )
+    return checks
+
+
+def _episodes_a_run(feed: Feed, cell: int) -> float:
+    """Distinct episodes that a cell was drawn from, the mean over the arm's runs."""
+    here = feed.cell == cell
+    pairs = np.stack([feed.run[here], feed.episode[here]])
+    return float(np.unique(pairs, axis=1).shape[1] / (int(feed.run.max()) + 1))
+
+
+def _distance(name: str, part: str, a: F64, b: F64, limit: float, limits: Limits) -> Check:
+    """Total variation distance of mixes (1 + R, C): the figure, then its resamples."""
+    values = np.abs(a - b).sum(1) / 2
+    value = float(values[0])
+    low, high, lowest, highest = _interval(values[1:], limits)
+    # Two resamples are further apart than what they are from, for noise alone; mirrored about the
+    # figure the interval errs to the other side. The wider of the two at each end says neither
+    # "same" nor "different" for noise.
+    low, high = min(lowest, 2 * value - highest), max(high, 2 * value - low)
+    return Check(name, part, None, None, value, max(low, 0.0), high, limit)
+
+
+def _ratio(name: str, a: F64, b: F64, limits: Limits) -> Check:
+    """The larger share over the smaller; a, b (1 + R,): the figure, then its resamples."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logs = np.log(a) - np.log(b)
+    logs[np.isnan(logs)] = 0.0  # none in both
+    low, high, lowest, highest = _interval(logs[1:], limits)
+    nearest = 0.0 if lowest <= 0 <= highest else min(abs(lowest), abs(highest))
+    return Check(
+        name,
+        "whole run",
+        float(a[0]),
+        float(b[0]),
+        float(np.exp(abs(logs[0]))),
+        math.exp(nearest) if nearest < 700 else math.inf,
+        math.exp(max(abs(low), abs(high))) if max(abs(low), abs(high)) < 700 else math.inf,
+        limits.share_ratio,
+    )
+
+
+def _interval(values: F64, limits: Limits) -> tuple[float, float, float, float]:
+    """The interval that shows "the same", and the wider one that must hold for "different".
+
+    All checks must pass for the same, but any one of them makes a difference: its interval is
+    widened for their number (Bonferroni), or noise would make one of thirty now and then.
+    """
+    tail = (1 - limits.confidence) / 2
+    at = [tail, 1 - tail, tail / _CHECKS, 1 - tail / _CHECKS]
+    # By order, not interpolated: between two infinite ratios there is nothing to interpolate.
+    low, high, lowest, highest = np.quantile(values, at, method="nearest")
+    return float(low), float(high), float(lowest), float(highest)
+
+
+def _resampled(
+    feed: Feed, tenth: int | None, after_weights: bool, limits: Limits, rng: np.random.Generator
+) -> F64 | None:
+    """Shares of the cells, (1 + R, C): as they were, then with the fresh episodes resampled.
+
+    None when nothing was drawn in that tenth.
+    """
+    chosen = slice(None) if tenth is None else feed.tenth == tenth
+    amount = (feed.weight if after_weights else feed.drawn)[chosen]
+    cell, episode = feed.cell[chosen], feed.episode[chosen]
+    size = len(feed.cells)
+    total = np.bincount(cell, amount, size)
+    if total.sum() <= 0:
+        return None
+    by_chance = np.array([name.startswith("fresh/") for name in feed.cells])
+    fresh = by_chance[cell]
+    shares = np.repeat(total[None], 1 + limits.resamples, axis=0)
+    if fresh.any():
+        _, place = np.unique(episode[fresh], return_inverse=True)
+        episodes = int(place.max()) + 1
+        matrix = np.bincount(place * size + cell[fresh], amount[fresh], episodes * size)
+        matrix = matrix.reshape(episodes, size)
+        resampled = np.empty((limits.resamples, size))
+        for start in range(0, limits.resamples, 100):
+            stop = min(start + 100, limits.resamples)
+            # Poisson times each: the multinomial's, but for the total, which shares do not have.
+            times = rng.poisson(1.0, (stop - start, episodes)).astype(np.float64)
+            resampled[start:stop] = times @ matrix
+        # The source's share of the batch is a setting, no chance: it is kept.
+        scale = total[by_chance].sum() / np.maximum(resampled[:, by_chance].sum(1), 1e-12)
+        shares[1:, by_chance] = resampled[:, by_chance] * scale[:, None]
+    return np.asarray(shares / shares.sum(1, keepdims=True), np.float64)
+
+
+__all__ = ["Check", "Feed", "Limits", "Verdict", "check_feeds", "worst"]
