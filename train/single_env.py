@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from restock.train.vector_env import WarehouseVectorEnv
 
 
-class WarehouseEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
+class WarehouseEnv(gymnasium.Env[NDArray[np.float32], Any]):
     """The vector environment with N = 1; `info` holds its values without the leading axis.
 
     Takes the vector environment's keyword arguments. The one inside is `self.vector`.
@@ -43,9 +43,7 @@ class WarehouseEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
         observation, info = self.vector.reset(seed=seed)
         return observation[0], _first(info)
 
-    def step(
-        self, action: np.int64
-    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """One control period."""
         observation, reward, terminated, truncated, info = self.vector.step(np.array([action]))
         return (

@@ -4,6 +4,9 @@
     observation, info = env.reset(seed=1)
     observation, reward, terminated, truncated, info = env.step(actions)
 
+Actions index the task's table; with `action="continuous"` they are (N, 2) speeds in m/s and yaw
+rates in rad/s over the same task: see `restock.train.action_face`.
+
 Autoreset is SAME_STEP (in the metadata): where an episode ends, `observation` is already the next
 episode's first, and the last one is in `info["final_obs"]`. Bootstrap on truncation, never on
 termination.
@@ -18,7 +21,8 @@ termination.
 - `success` (at the goal without any bump, at the episode's end), `bumps` (steps with a bump so
   far), `episode_steps`, `true_pose` (N, 3);
 - `invalid`: the physics blew up: the episode is truncated and the step must not enter replay;
-- `final_obs`, with the mask `_final_obs`.
+- `final_obs`, with the mask `_final_obs`;
+- on the continuous face `action`, the nearest of the task's, and `action_residual`.
 """
 
 from __future__ import annotations
@@ -35,6 +39,7 @@ from numpy.typing import NDArray
 from restock.errors import ConfigError
 from restock.ingest.profile import load_profile
 from restock.ingest.task import Task, observe, reached_goal, reward, terminated
+from restock.train.action_face import Face, action_face
 from restock.train.draw import draw_map
 from restock.train.episode import KINDS, Episode, EpisodeSpec, draw_episode
 from restock.train.layout import Warehouse, default_warehouse
@@ -53,7 +58,7 @@ DEFAULT_CONDITIONS: Mapping[str, float] = {
 OBSERVATION_LIMIT = 20.0  # no sensor of this robot gives more; holds the space's bounds
 
 
-class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[Any]]):
+class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]):
     """N warehouses. See the module for what `info` holds."""
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium declares it
@@ -74,6 +79,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArr
         task: Task | None = None,
         warehouse: Warehouse | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        action: Face = "discrete",
     ) -> None:
         """`conditions` are shares of episodes per kind; `nthread` 0 uses every core.
 
@@ -81,8 +87,9 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArr
         one for each such episode (fixed episodes get its base). `env.specs` tells them.
 
         Raises:
-            ConfigError: an unknown condition, shares that are no shares, no environments, or an
-                autoreset mode other than SAME_STEP and DISABLED.
+            ConfigError: an unknown condition, shares that are no shares, no environments, an
+                action space that is not there, or an autoreset mode other than SAME_STEP and
+                DISABLED.
         """
         if num_envs < 1:
             raise ConfigError(f"num_envs must be 1 or more, got {num_envs}", where="the twin")
@@ -101,7 +108,8 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArr
 
         limit = np.full(self.task.observation_size, OBSERVATION_LIMIT, np.float32)
         self.single_observation_space = gymnasium.spaces.Box(-limit, limit, dtype=np.float32)
-        self.single_action_space = gymnasium.spaces.Discrete(len(self.task.actions))
+        self.face = action_face(action, self.task, num_envs)
+        self.single_action_space = self.face.space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
@@ -110,7 +118,6 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArr
         self.sensing = Sensing(self.simulation, self.task)
         self.truth = Truth(self.task, num_envs)
         self.navigation = Navigation(self.warehouse, num_envs, self.task)
-        self._actions = np.asarray(self.task.actions, np.float64)
         self.episodes: list[Episode | None] = [None] * num_envs
         self.specs: list[EpisodeSpec] = [EpisodeSpec("nominal", 0)] * num_envs
         self._fixed: list[EpisodeSpec] = []
@@ -226,7 +233,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArr
         return self.observation.copy(), self._info_now()
 
     def step(
-        self, actions: NDArray[np.int64]
+        self, actions: NDArray[Any]
     ) -> tuple[
         NDArray[np.float32],
         NDArray[np.float32],
@@ -234,12 +241,12 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArr
         NDArray[np.bool_],
         dict[str, Any],
     ]:
-        """One control period everywhere. `actions` (N,) index the task's actions."""
-        action = np.asarray(actions, np.int64).reshape(self.num_envs)
+        """One control period everywhere. `actions` (N,) index the task's actions, or are (N, 2)."""
+        action, command, chosen = self.face.read(actions)
         now, sim, task = self.signals, self.simulation, self.task
         everyone = np.arange(self.num_envs)
         self.truth.look(sim.pose(), self.navigation.plans_m, sim.pallets, everyone)
-        sim.drive(self._actions[action])
+        sim.drive(command)
         self.steps += 1
 
         after = self.sensing.sense(everyone, self.steps)
@@ -258,7 +265,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArr
         over &= ~invalid
         cut = ((self.steps >= task.time_limit_steps) & ~over) | invalid
         observed = _bounded(observe(task, after, now, action))
-        info = self._info_after(after, progress, over, invalid)
+        info = self._info_after(after, progress, over, invalid) | chosen
         if invalid.any():
             self.blown_up += int(invalid.sum())
             earned = np.where(invalid, np.float32(0), earned)
