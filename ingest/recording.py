@@ -8,58 +8,19 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-import numpy as np
-
 from restock.errors import RecordingError
+from restock.ingest.account import Account, Loss, TopicInfo
 from restock.ingest.cdr import ColumnDecoder
-from restock.ingest.columns import I64, Batch, FieldColumn, TopicColumns, join, take
-from restock.ingest.compression import decompress_messages
+from restock.ingest.columns import TopicColumns
 from restock.ingest.definitions import CannotDecode, MessageType, message_type
+from restock.ingest.reading import Reduction, TopicReading, together
 from restock.ingest.storage import Channel, Damage, Integrity, Storage
-
-
-@dataclass(frozen=True)
-class TopicInfo:
-    """What a recording says about a topic before anything is read."""
-
-    name: str
-    type: str  # "nav_msgs/msg/Odometry"; "" where the container names none
-    expected: int  # messages, by the container's own count
-    encoding: str  # "cdr", "json", "protobuf", "ros1", …
-    definition: str  # "embedded", a distribution's name, or "" where it cannot be decoded
-    skipped: str | None  # why it cannot be decoded, or None
-
-
-@dataclass
-class Account:
-    """What became of a topic's messages: expected = decoded + lost, always."""
-
-    topic: str
-    type: str
-    expected: int  # by the container's own count
-    read: int = 0  # payloads that came out of the container
-    decoded: int = 0
-    reasons: dict[str, int] = field(default_factory=dict)  # why the rest were not decoded
-
-    @property
-    def lost(self) -> int:
-        """Messages that the container counts and that gave no row."""
-        return max(self.expected - self.decoded, 0)
-
-
-@dataclass(frozen=True)
-class Loss:
-    """Messages or bytes of a recording that could not be had, and why."""
-
-    topic: str | None  # None: of the file as a whole
-    messages: int | None  # None: unknown
-    reason: str
 
 
 @dataclass(frozen=True)
@@ -185,10 +146,16 @@ class Recording:
         except CannotDecode:
             return []
 
-    def read(self, wanted: Mapping[str, Sequence[str]]) -> dict[str, TopicColumns]:
+    def read(
+        self,
+        wanted: Mapping[str, Sequence[str]],
+        reductions: Mapping[str, Reduction] | None = None,
+    ) -> dict[str, TopicColumns]:
         """Columns of these topics: field paths to arrays (N, …) or Ragged, by log time.
 
-        A topic that cannot be decoded is not in the answer; `accounts` says why.
+        A topic that cannot be decoded is not in the answer; `accounts` says why. `reductions`
+        names, of some of these topics, fields that are made into others as they are read: for
+        fields that are wide, and of which little is needed.
 
         Raises:
             RecordingError: the recording has no such topic, or its messages no such field.
@@ -200,9 +167,12 @@ class Recording:
                 where=str(self.path),
                 remedy=f"it has {', '.join(sorted(self._streams)) or 'none'}",
             )
-        readings = {topic: _Reading(self.topics[topic]) for topic in wanted}
+        readings = {
+            topic: TopicReading(self.topics[topic], paths, (reductions or {}).get(topic))
+            for topic, paths in wanted.items()
+        }
         for storage in self._storages:
-            self._read_storage(storage, wanted, readings)
+            self._read_storage(storage, readings)
         columns = {}
         for topic, reading in readings.items():
             self.accounts[topic] = reading.close(self._lost(topic))
@@ -215,25 +185,24 @@ class Recording:
     def _read_storage(
         self,
         storage: Storage,
-        wanted: Mapping[str, Sequence[str]],
-        readings: Mapping[str, _Reading],
+        readings: Mapping[str, TopicReading],
     ) -> None:
         decoders: dict[int, ColumnDecoder] = {}
         topics: dict[int, str] = {}
-        for topic, paths in wanted.items():
+        for topic, reading in readings.items():
             for stream in self._streams[topic]:
                 if stream.storage is not storage:
                     continue
                 topics[stream.channel.id] = topic
                 try:
-                    decoder = self._decoder(topic, stream.channel, paths)
-                    readings[topic].use(decoder)
+                    decoder = self._decoder(topic, stream.channel, reading.paths)
+                    reading.use(decoder.empty())
                     decoders[stream.channel.id] = decoder
                 except CannotDecode as reason:
                     count = storage.counts.get(stream.channel.id, 0)
-                    readings[topic].skip(str(reason), count)
-        for channel, batch in storage.batches(list(decoders)):
-            readings[topics[channel]].take(decoders[channel], batch)
+                    reading.skip(str(reason), count)
+        for channel, batch in together(storage.batches(list(decoders))):
+            readings[topics[channel]].take(decoders[channel].decode, batch)
 
     def _decoder(self, topic: str, channel: Channel, paths: Sequence[str]) -> ColumnDecoder:
         kind = self._type(channel)
@@ -273,61 +242,3 @@ class Recording:
         trace: TracebackType | None,
     ) -> None:
         self.close()
-
-
-class _Reading:
-    """What has come of one topic so far."""
-
-    def __init__(self, topic: TopicInfo) -> None:
-        self._account = Account(topic.name, topic.type, topic.expected)
-        self._times: list[tuple[I64, I64]] = []  # log and publish time
-        self._fields: dict[str, list[FieldColumn]] = {}
-        self.decodable = False
-
-    def use(self, decoder: ColumnDecoder) -> None:
-        """Make columns for the decoder's fields, even if no message comes."""
-        self.decodable = True
-        for path, column in decoder.empty().items():
-            self._fields.setdefault(path, [column])
-
-    def skip(self, reason: str, count: int) -> None:
-        """Messages that are not read at all."""
-        self._add({reason: count})
-
-    def take(self, decoder: ColumnDecoder, batch: Batch) -> None:
-        """Decode a batch and keep its columns."""
-        self._account.read += len(batch)
-        batch, damaged = decompress_messages(batch)
-        if damaged:
-            self._add({"its zstd data is damaged": damaged})
-        decoded = decoder.decode(batch)
-        self._add(decoded.bad)
-        self._account.decoded += len(decoded.rows)
-        self._times.append((batch.log_time_ns[decoded.rows], batch.publish_time_ns[decoded.rows]))
-        for path, column in decoded.fields.items():
-            self._fields[path].append(column)
-
-    def _add(self, reasons: Mapping[str, int]) -> None:
-        for reason, count in reasons.items():
-            self._account.reasons[reason] = self._account.reasons.get(reason, 0) + count
-
-    def close(self, lost: Mapping[str, int]) -> Account:
-        """The account, reconciled: what the container counts beyond what came is a loss too."""
-        account = self._account
-        self._add(lost)
-        unsaid = account.expected - account.decoded - sum(account.reasons.values())
-        if unsaid > 0:
-            self._add({"counted by the container, but not in it": unsaid})
-        return account
-
-    def columns(self) -> TopicColumns:
-        """All of it, in the order of log time."""
-        none = np.zeros(0, np.int64)
-        log = np.concatenate([log for log, _ in self._times] or [none])
-        publish = np.concatenate([publish for _, publish in self._times] or [none])
-        fields = {path: join(parts) for path, parts in self._fields.items()}
-        if (np.diff(log) < 0).any():
-            order = np.argsort(log, kind="stable")
-            log, publish = log[order], publish[order]
-            fields = {path: take(column, order) for path, column in fields.items()}
-        return TopicColumns(log, publish, fields)
