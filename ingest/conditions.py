@@ -9,12 +9,14 @@ says what it may look at:
 - `post`: about the outcome of step t; may look at t + 1 and later.
 
 The difference matters to replay: boosting a `post` stratum resamples the outcome of an action and
-biases what the critic learns, unless it is corrected for.
+biases what the critic learns, unless it is corrected for. What else a condition may not say is in
+`restock.ingest.condition_sql`.
 """
 
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Sequence
 from importlib.resources import files
 from typing import Literal
@@ -26,6 +28,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from restock.errors import ConfigError
+from restock.ingest.condition_sql import SANDBOX, refusal, select_of
 
 Timing = Literal["pre", "post"]
 NOMINAL = "nominal"
@@ -40,6 +43,12 @@ class Condition(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     priority: int = 50
     doc: str = ""
 
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", self.name) or self.name == NOMINAL:
+            raise ValueError(
+                f"name must be letters, digits and _, and not {NOMINAL!r}: {self.name!r}"
+            )
+
 
 def shipped() -> dict[str, Condition]:
     """The conditions that come with Restock, by name: `ingest/conditions/*.sql`."""
@@ -48,20 +57,23 @@ def shipped() -> dict[str, Condition]:
     for entry in sorted(folder.iterdir(), key=lambda item: item.name):
         if entry.name.endswith(".sql"):
             name = entry.name.removesuffix(".sql")
-            found[name] = _parse(name, entry.read_text(encoding="utf-8"))
+            text = entry.read_text(encoding="utf-8")
+            found[name] = msgspec.convert({"name": name, **settings_of(text)}, Condition)
     return found
 
 
-def _parse(name: str, text: str) -> Condition:
+def settings_of(text: str) -> dict[str, str | int]:
+    """What a .sql file says: `sql`, and of its comments `timing`, `priority` and `doc`."""
     comments = [line[2:].strip() for line in text.splitlines() if line.startswith("--")]
-    settings = dict(
-        line.split(": ", 1) for line in comments if line.startswith(("timing: ", "priority: "))
-    )
-    doc = " ".join(line for line in comments if not line.startswith(("timing: ", "priority: ")))
+    told = ("timing: ", "priority: ")
+    settings: dict[str, str | int] = {}
+    for line in comments:
+        if line.startswith(told):
+            key, value = line.split(": ", 1)
+            settings[key] = int(value) if value.lstrip("-").isdigit() else value
+    doc = " ".join(line for line in comments if not line.startswith(told))
     sql = "\n".join(line for line in text.splitlines() if not line.startswith("--")).strip()
-    return msgspec.convert(
-        {"name": name, "sql": sql, "doc": doc, **settings}, Condition, strict=False
-    )
+    return {"sql": sql, "doc": doc, **settings}
 
 
 def labels_version(conditions: Sequence[Condition]) -> str:
@@ -81,8 +93,12 @@ def label(steps: pa.Table, conditions: Sequence[Condition]) -> dict[str, NDArray
     """
     if not conditions:
         return {}
-    with duckdb.connect(config={"threads": 1}) as connection:
+    for condition in conditions:
+        if reason := refusal(condition.sql, condition.timing):
+            raise ConfigError(reason, where=f"condition {condition.name!r}")
+    with duckdb.connect(config=SANDBOX) as connection:
         connection.register("steps", steps.append_column("row_", pa.array(range(len(steps)))))
+        connection.execute("SET lock_configuration = true").fetchall()
         try:
             rows = _query(connection, conditions)
         except duckdb.Error:
@@ -109,11 +125,7 @@ def label(steps: pa.Table, conditions: Sequence[Condition]) -> dict[str, NDArray
 
 def _query(connection: duckdb.DuckDBPyConnection, conditions: Sequence[Condition]) -> pa.Table:
     columns = ",\n".join(f'({c.sql}\n) AS "{c.name}"' for c in conditions)
-    return connection.sql(
-        f"SELECT {columns} FROM steps"
-        " WINDOW episode AS (PARTITION BY episode_index ORDER BY step_index)"
-        " ORDER BY row_"
-    ).to_arrow_table()
+    return connection.sql(select_of(columns)).to_arrow_table()
 
 
 def primary(labels: dict[str, NDArray[np.bool_]], conditions: Sequence[Condition]) -> list[str]:
@@ -131,4 +143,13 @@ def _first_line(error: Exception) -> str:
     return str(error).splitlines()[0]
 
 
-__all__ = ["NOMINAL", "Condition", "Timing", "label", "labels_version", "primary", "shipped"]
+__all__ = [
+    "NOMINAL",
+    "Condition",
+    "Timing",
+    "label",
+    "labels_version",
+    "primary",
+    "settings_of",
+    "shipped",
+]

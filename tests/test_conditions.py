@@ -189,6 +189,76 @@ def test_a_condition_that_does_not_run_is_named():
     assert "clearance_m" in str(error.value)
 
 
+REFUSED = {
+    "(SELECT count(*) FROM read_text('/etc/passwd')) > 0": "it holds a query",
+    "EXISTS (FROM duckdb_settings())": "it holds a query",
+    "clearance_m > (SELECT avg(clearance_m) FROM steps)": "it holds a query",
+    "read_text('/etc/passwd') IS NULL": "does not run over the steps",
+    "getenv('HOME') = 'x'": "does not run over the steps",
+    "current_setting('home_directory') = 'x'": "looks outside the steps",
+    "user = 'x'": "looks outside the steps",
+    "current_date > '2026-01-01'": "looks outside the steps",
+    "random() < 0.5": "looks outside the steps",
+    "sleep_ms(100000) IS NULL": "looks outside the steps",
+    "pg_get_viewdef('x') = 'x'": "looks outside the steps",
+    "ATTACH 'x.db'": "does not run over the steps",
+    "COPY steps TO 'x.csv'": "syntax error",
+    "true); ATTACH 'x.db'; SELECT (true": "SELECT",
+    "true; COPY steps TO 'x.csv'": "syntax error",
+    "true) AS x, (SELECT 1": "more than one expression",
+    "true), (false": "more than one expression",
+    "true) FROM steps WHERE (true": "syntax error",
+    "true) UNION ALL SELECT (true": "more than one expression",
+    "true /*": "comment",
+    "COLUMNS(*) > 1": "it holds *",
+    "$1": "it holds a parameter",
+    "max(clearance_m) OVER () > 1": "sees other episodes",
+    "lead(bumped) OVER episode": 'say timing = "post"',
+    "max(bumped) OVER (episode ROWS BETWEEN 1 PRECEDING AND 1 FOLLOWING)": "at CURRENT ROW",
+    "lag(bumped, -1) OVER episode": "lag by a plain number",
+    "max(bumped) OVER (PARTITION BY episode_index)": "write OVER episode",
+    "max(bumped) OVER (PARTITION BY episode_index ORDER BY step_index DESC)": "write OVER episode",
+    "percent_rank() OVER episode > 0.5": 'say timing = "post"',
+}
+
+
+@pytest.mark.parametrize("sql", REFUSED)
+def test_what_a_stranger_might_write_in_a_condition(sql, tmp_path, monkeypatch):
+    """No files, no other tables, no settings, no clock, no chance, no look ahead under `pre`."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match="condition 'x'") as error:
+        label(steps(3), [Condition("x", "pre", sql)])
+    assert REFUSED[sql] in str(error.value)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "sql",
+    [
+        "count(*) OVER episode > 2",
+        "lag(clearance_m, 2) OVER episode > 1 AND list_max([clearance_m, 1.5]) > 1",
+        "avg(clearance_m) FILTER (NOT bumped) OVER (episode ROWS 5 PRECEDING) > 1",
+        "rank() OVER episode = 1 OR clearance_m BETWEEN 1 AND 2 OR nullif(clearance_m, 2) IS NULL",
+        "list_filter([clearance_m], lambda x: x > 1)[1] > 1",
+    ],
+)
+def test_what_a_condition_may_say(sql):
+    assert label(steps(3), [Condition("x", "pre", sql)])["x"].any()
+
+
+def test_a_condition_sees_no_variable_of_the_program():
+    secret = pa.table({"z": [1]})
+    assert len(secret) == 1
+    with pytest.raises(ConfigError, match="it holds a query"):
+        label(steps(3), [Condition("x", "pre", "(SELECT z FROM secret) = 1")])
+
+
+@pytest.mark.parametrize("name", ['a" FROM steps; --', "nominal", "", "a b", "1a"])
+def test_a_condition_has_a_plain_name(name):
+    with pytest.raises(ValueError, match="letters, digits and _"):
+        Condition(name, "pre", "true")
+
+
 def test_a_condition_that_is_no_boolean_is_named():
     with pytest.raises(ConfigError, match="not a boolean"):
         label(steps(3), [Condition("number", "pre", "clearance_m")])

@@ -1,0 +1,166 @@
+"""What the SQL of a condition may say: an expression over the steps of its episode, nothing else.
+
+Profiles are passed between strangers, so a condition is read before it is run: no query inside,
+no other table, no function that looks outside the row's data (files, settings, time, chance). It
+stays in its episode, and a `pre` condition looks at no later step. Beside that DuckDB runs it
+without access to files and with its settings locked.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from functools import cache, lru_cache
+from typing import Any, Literal
+
+import duckdb
+
+WINDOW = "WINDOW episode AS (PARTITION BY episode_index ORDER BY step_index)"
+SANDBOX: dict[str, str | bool | int | float | list[str]] = {
+    "threads": 1,
+    "enable_external_access": False,
+    "autoload_known_extensions": False,
+    "autoinstall_known_extensions": False,
+    "allow_community_extensions": False,
+    "memory_limit": "4GB",
+}
+_REFUSED = {
+    "SUBQUERY": "it holds a query: a condition is one expression over the steps",
+    "STAR": "it holds *: name the columns",
+    "PARAMETER": "it holds a parameter",
+    "POSITIONAL_REFERENCE": "it names a column by its place: use its name",
+}
+# Macros of DuckDB's own that compute from their arguments alone; the others look around.
+_MACROS = ("list_", "array_")
+_MORE_MACROS = {
+    *("nullif", "if", "fmod", "fdiv", "split_part", "date_add", "days_in_month"),
+    *("geomean", "geometric_mean", "wavg", "weighted_avg"),
+}
+_BACKWARD = {
+    *("WINDOW_AGGREGATE", "WINDOW_LAG"),
+    *("WINDOW_FIRST_VALUE", "WINDOW_LAST_VALUE", "WINDOW_NTH_VALUE"),
+    *("WINDOW_ROW_NUMBER", "WINDOW_RANK", "WINDOW_RANK_DENSE"),
+}
+
+
+def select_of(columns: str) -> str:
+    """The query that computes such columns over the table `steps`."""
+    return f"SELECT {columns} FROM steps {WINDOW} ORDER BY row_"
+
+
+@lru_cache(maxsize=1024)
+def refusal(sql: str, timing: Literal["pre", "post"]) -> str | None:
+    """Why this SQL may not be a condition's, or None. Whether it binds is DuckDB's to say."""
+    with duckdb.connect(config=SANDBOX) as connection:
+        asked = "SELECT json_serialize_sql(?::VARCHAR)"
+        text = connection.execute(asked, [select_of(f"({sql}\n)")]).fetchall()[0][0]
+    try:
+        return _read(json.loads(text), timing)
+    except RecursionError:
+        return "it nests too deeply"
+
+
+def _read(said: dict[str, Any], timing: str) -> str | None:
+    if said["error"]:
+        return "its SQL cannot be read: " + str(said["error_message"]).splitlines()[0]
+    statements = said["statements"]
+    node = statements[0]["node"]
+    if len(statements) != 1 or node["type"] != "SELECT_NODE" or len(node["select_list"]) != 1:
+        return "it is more than one expression"
+    if not _plain_query(node):
+        return "it closes its own bracket: a condition is one expression over the steps"
+    for part in _walk(node["select_list"][0]):
+        if reason := _refuse(part, timing):
+            return reason
+    return None
+
+
+def _plain_query(node: dict[str, Any]) -> bool:
+    """Whether the query around the expression is still the one that we wrote."""
+    source = node["from_table"]
+    return (
+        source["type"] == "BASE_TABLE"
+        and source["table_name"] == "steps"
+        and not node["cte_map"]["map"]
+        and all(not node[key] for key in ("where_clause", "group_expressions", "having"))
+        and all(not node[key] for key in ("qualify", "sample"))
+        and [item["type"] for item in node["modifiers"]] == ["ORDER_MODIFIER"]
+    )
+
+
+def _walk(part: Any) -> Iterator[dict[str, Any]]:
+    """Every node of an expression."""
+    if isinstance(part, dict):
+        if "class" in part:
+            yield part
+        for inner in part.values():
+            yield from _walk(inner)
+    elif isinstance(part, list):
+        for inner in part:
+            yield from _walk(inner)
+
+
+def _refuse(part: dict[str, Any], timing: str) -> str | None:
+    kind = part["class"]
+    if kind == "STAR" and not part["columns"]:
+        return None  # count(*); anywhere else it does not bind
+    if kind in _REFUSED:
+        return _REFUSED[kind]
+    if kind in ("FUNCTION", "WINDOW") and part["function_name"].lower() in _outside():
+        return f"{part['function_name']}() looks outside the steps: it is not allowed here"
+    if kind == "COLUMN_REF" and part["column_names"][-1].lower() in _outside():
+        return f"{part['column_names'][-1]} looks outside the steps: it is not allowed here"
+    return _refuse_window(part, timing) if kind == "WINDOW" else None
+
+
+def _refuse_window(part: dict[str, Any], timing: str) -> str | None:
+    name = part["function_name"]
+    if not any(_column(item) == "episode_index" for item in part["partitions"]):
+        return f"{name}() sees other episodes: write OVER episode, or OVER (episode ROWS …)"
+    if timing == "post":
+        return None
+    ahead = f'timing is "pre", but {name}() may look at later steps: '
+    if part["type"] not in _BACKWARD:
+        return ahead + 'say timing = "post"'
+    orders = [(item["type"], _column(item["expression"])) for item in part["orders"]]
+    if not orders or orders[0] not in [
+        (kind, column)
+        for kind in ("ORDER_DEFAULT", "ASCENDING")
+        for column in ("step_index", "stamp_ns")
+    ]:
+        return ahead + "write OVER episode"
+    backward = part["end"] in ("CURRENT_ROW_ROWS", "CURRENT_ROW_RANGE") or (
+        part["end"].startswith("EXPR_PRECEDING") and _constant(part["end_expr"])
+    )
+    if not backward:
+        return ahead + "end its frame at CURRENT ROW"
+    offset = part["arguments"][1:2] if part["type"] == "WINDOW_LAG" else []
+    if not all(_constant(item["expression"]) for item in offset):
+        return ahead + "lag by a plain number"
+    return None
+
+
+def _column(part: dict[str, Any]) -> str:
+    return str(part["column_names"][-1]) if part["class"] == "COLUMN_REF" else ""
+
+
+def _constant(part: dict[str, Any] | None) -> bool:
+    """Whether it is a number that is not below zero."""
+    if part is None or part["class"] != "CONSTANT":
+        return False
+    return str(part["literal"]["text"]).isdigit()
+
+
+@cache
+def _outside() -> frozenset[str]:
+    """Names of functions whose result does not follow from their arguments alone."""
+    with duckdb.connect(config=SANDBOX) as connection:
+        rows = connection.sql(
+            "SELECT DISTINCT function_name, function_type, stability FROM duckdb_functions()"
+        ).fetchall()
+    return frozenset(
+        name
+        for name, kind, stability in rows
+        if stability in ("VOLATILE", "CONSISTENT_WITHIN_QUERY")
+        or (kind == "macro" and not name.startswith(_MACROS) and name not in _MORE_MACROS)
+    )
