@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
+import platform
 import shutil
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -12,32 +15,20 @@ from pathlib import Path
 
 import duckdb
 import msgspec
-import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
 from restock import __version__
 from restock.errors import PanelError, StoreError
 from restock.ingest.conditions import NOMINAL, Condition, labels_version, shipped
 from restock.ingest.task import Task
-from restock.replay.layout import PACKING_VERSION, Ints, n_step_return, row_columns, row_width
+from restock.replay.layout import PACKING_VERSION
 from restock.replay.mixture import Mixture
-from restock.replay.panel import (
-    HEADER,
-    HELD_OUT,
-    META,
-    ROWS,
-    FileRecord,
-    Header,
-    Panel,
-    Stratum,
-    checksum,
-)
+from restock.replay.pack import Packer, packing_code
+from restock.replay.panel import HEADER, HELD_OUT, META, ROWS, Header, Panel, Stratum
 from restock.replay.plan import Plan, plan_panel
+from restock.replay.scratch import Steps
+from restock.replay.seal import FileRecord, seal
 from restock.replay.store import Store
-
-BATCH_ROWS = 16_384  # observations held in memory at a time, while packing
 
 
 @dataclass(frozen=True)
@@ -135,146 +126,130 @@ def write_panel(
     Raises PanelError when something is at `out` that may not be replaced.
     """
     out = Path(out)
-    if out.exists() and not (force and (out / HEADER).is_file()):
-        raise PanelError(
-            "already there",
-            where=str(out),
-            remedy="choose another --out"
-            + ("; --force replaces a panel" if (out / HEADER).is_file() else ""),
+    _check_free(out, force)
+    with _building(out) as partial:
+        scratch = partial / "scratch"
+        scratch.mkdir()
+        task_json = source.task_json(plan.task_hash)
+        steps = Steps(
+            scratch,
+            source.connection,
+            len(plan.stratum),
+            chance=_chance(task_json),
+            cut_at_off_policy=plan.mixture.cut_at_off_policy,
         )
-    out.parent.mkdir(parents=True, exist_ok=True)
-    partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir()
-    try:
-        observation_size = _pack(source.connection, plan, partial / ROWS, advance)
-        pq.write_table(_meta(plan), partial / META, compression="zstd")
-        held = plan.rows.filter(pa.array(plan.held_out))
-        pq.write_table(
-            held.select(["transition_id", "recording_id", "episode_id", "step_index", "condition"]),
-            partial / HELD_OUT,
-            compression="zstd",
-        )
-        header = _header(source, plan, observation_size, partial)
-        (partial / HEADER).write_bytes(msgspec.json.format(msgspec.json.encode(header), indent=1))
-        if out.exists():
-            shutil.rmtree(out)
-        partial.rename(out)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
+        packer = Packer(source.connection, plan, steps, scratch)
+        size = packer.write_rows(partial / ROWS, advance)
+        packer.write_meta(partial / META, partial / HELD_OUT)
+        identity = panel_id(source.version, plan, packer.digest())
+        shutil.rmtree(scratch)
+        header = _header(source, plan, identity, task_json, size, partial)
+        (partial / HEADER).write_bytes(seal(header))
+        for name in (HEADER, *header.files):
+            _finish(partial / name)
+        _put(partial, out, force)
     return Panel.open(out)
 
 
-def _pack(
-    connection: duckdb.DuckDBPyConnection, plan: Plan, path: Path, advance: Callable[[int], None]
-) -> int:
-    """Write the packed rows; returns the observation size. Memory: one batch of observations."""
-    chosen = plan.panel_rows
-    ids = plan.rows["transition_id"].to_numpy()
-    wanted = ids[chosen]
-    # The row whose next observation is the one n steps after: last step of each row's return.
-    last = chosen + plan.horizon[chosen] - 1
-    last_ids = ids[last]
-    by_id, by_last = np.argsort(wanted), np.argsort(last_ids, kind="stable")
-    sorted_ids, sorted_last = wanted[by_id], last_ids[by_last]
-    needed = np.union1d(wanted, last_ids)
-    of_task = f"FROM transitions WHERE task_hash = '{plan.task_hash}'"
-    first = connection.sql(f"SELECT len(observation) {of_task} LIMIT 1").fetchall()
-    size = int(first[0][0])
-    query = f"SELECT transition_id, observation, next_observation {of_task}"
-    rows = np.memmap(path, np.dtype("<f4"), "w+", shape=(len(chosen), row_width(size)))
-    part = row_columns(size)
-    for batch in connection.sql(query).to_arrow_reader(BATCH_ROWS):
-        batch_ids = batch.column("transition_id").to_numpy()
-        for name, ordered, places in (
-            ("observation", sorted_ids, by_id),
-            ("next_observation", sorted_last, by_last),
-        ):
-            values = _matrix(batch.column(name), size)
-            source_row, target = _matches(batch_ids, ordered, places)
-            rows[target, part[name]] = values[source_row]
-        advance(len(batch_ids))
-    if not np.isin(needed, ids).all():
-        raise PanelError("the source changed while it was read", where=str(path))
-    reward = plan.rows["reward"].to_numpy()
-    discount = plan.mixture.discount
-    rows[:, part["action"]] = plan.rows["action"].to_numpy()[chosen][:, None]
-    rows[:, part["reward"]] = n_step_return(reward, plan.horizon, discount)[chosen][:, None]
-    going_on = ~plan.rows["terminated"].to_numpy()[last]
-    rows[:, part["discount"]] = (discount ** plan.horizon[chosen] * going_on)[:, None]
-    rows.flush()
-    return size
+def _check_free(out: Path, force: bool) -> None:
+    is_panel = (out / HEADER).is_file()
+    if out.exists() and not (force and is_panel):
+        raise PanelError(
+            "already there",
+            where=str(out),
+            remedy="choose another --out" + ("; --force replaces a panel" if is_panel else ""),
+        )
 
 
-def _matches(ids: Ints, ordered: Ints, places: Ints) -> tuple[Ints, Ints]:
-    """Of a batch's ids: (row of the batch, place in the panel) for every panel row that asks.
+@contextmanager
+def _building(out: Path) -> Iterator[Path]:
+    """A folder beside `out` that no other builder has; what is left of it at the end goes away.
 
-    `ordered` are the ids the panel's rows ask for, sorted (they may repeat); `places` their rows.
+    Those of builders that were killed go away first.
     """
-    order = np.argsort(ids)
-    sorted_ids = ids[order]
-    low = int(np.searchsorted(ordered, sorted_ids[0], "left"))
-    high = int(np.searchsorted(ordered, sorted_ids[-1], "right"))
-    asked = ordered[low:high]
-    at = np.searchsorted(sorted_ids, asked)
-    found = sorted_ids[np.minimum(at, len(sorted_ids) - 1)] == asked
-    return order[at[found]], places[low:high][found]
+    out.parent.mkdir(parents=True, exist_ok=True)
+    mine = f".{out.name}.building~"
+    for left in out.parent.iterdir():
+        if left.name.startswith(mine):
+            host, process, _ = left.name.removeprefix(mine).split("~")
+            if host == platform.node() and not _alive(int(process)):
+                shutil.rmtree(left, ignore_errors=True)
+    partial = Path(tempfile.mkdtemp("", f"{mine}{platform.node()}~{os.getpid()}~", out.parent))
+    try:
+        yield partial
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
 
 
-def _matrix(column: pa.Array, size: int) -> NDArray[np.float32]:
-    """A list column (n lists of `size` floats) as (n, size)."""
-    flat = column.flatten().to_numpy(zero_copy_only=False)
-    if flat.size != len(column) * size:
-        raise PanelError(f"observations are not all of {size} entries; `restock audit` names them")
-    matrix: NDArray[np.float32] = flat.reshape(len(column), size)
-    return matrix
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True
 
 
-def _meta(plan: Plan) -> pa.Table:
-    chosen = plan.panel_rows
-    code = plan.stratum[chosen]
-    names = pa.array([line.stratum for line in plan.strata], pa.string())
-    meta = plan.rows.take(pa.array(chosen))
-    meta = meta.append_column(
-        "stratum", pa.DictionaryArray.from_arrays(pa.array(code.astype(np.int32)), names)
-    )
-    meta = meta.append_column("stratum_code", pa.array(code))
-    meta = meta.append_column("horizon", pa.array(plan.horizon[chosen].astype(np.int16)))
-    return meta.append_column("weight", pa.array(plan.weight))
+def _finish(path: Path) -> None:
+    """Flush a file to the disk, and take the right to write away: a panel never changes."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+    path.chmod(0o444)
 
 
-def panel_id(source_version: int, plan: Plan) -> str:
-    """What names a panel: store version, mixture, task, rows, strata, weights, packing code."""
-    chosen = plan.panel_rows
-    digest = hashlib.blake2b(digest_size=8)
-    digest.update(
-        msgspec.json.encode([PACKING_VERSION, source_version, plan.mixture, plan.task_hash])
-    )
-    for array in (
-        plan.rows["transition_id"].to_numpy()[chosen],
-        plan.stratum[chosen],
-        plan.horizon[chosen],
-        plan.weight,
-    ):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
+def _put(partial: Path, out: Path, force: bool) -> None:
+    """Give the finished panel its name, which takes one step, or two where it replaces another."""
+    partial.chmod(0o755)  # what mkdtemp makes is for its owner alone
+    old = partial.with_name(partial.name + "-old")
+    if force and (out / HEADER).is_file():
+        with contextlib.suppress(FileNotFoundError):  # taken away meanwhile
+            out.rename(old)
+    try:
+        partial.rename(out)
+    except OSError as error:
+        raise PanelError(
+            "another builder was faster", where=str(out), remedy="use the panel that is there"
+        ) from error
+    finally:
+        shutil.rmtree(old, ignore_errors=True)
 
 
-def _header(source: Source, plan: Plan, observation_size: int, partial: Path) -> Header:
+def _chance(task_json: str) -> float:
+    """How probable each action is to one who chooses blindly; 0 where the task is not known."""
+    if not task_json:
+        return 0.0
+    return 1.0 / len(msgspec.json.decode(task_json, type=Task).actions)
+
+
+def panel_id(source_version: int, plan: Plan, digest: str) -> str:
+    """What names a panel: store version, mixture, task, rows (by `digest`), code of the packing."""
+    named = [packing_code(), source_version, plan.mixture, plan.task_hash, digest]
+    return hashlib.blake2b(msgspec.json.encode(named), digest_size=8).hexdigest()
+
+
+def _header(
+    source: Source,
+    plan: Plan,
+    identity: str,
+    task_json: str,
+    observation_size: int,
+    partial: Path,
+) -> Header:
     by_priority = sorted(source.conditions, key=lambda c: (c.priority, c.name))
     return Header(
-        id=panel_id(source.version, plan),
+        id=identity,
         store=source.name,
         store_version=source.version,
         task_hash=plan.task_hash,
-        task_json=source.task_json(plan.task_hash),
+        task_json=task_json,
         labels_version=labels_version(source.conditions),
         observation_size=observation_size,
         rows=len(plan.panel_rows),
         discount=plan.mixture.discount,
         n_step=plan.mixture.n_step,
         packing_version=PACKING_VERSION,
+        packing_code=packing_code(),
         restock_version=__version__,
         newest_ns=plan.newest_ns,
         logs_share=plan.logs_share,
@@ -286,8 +261,5 @@ def _header(source: Source, plan: Plan, observation_size: int, partial: Path) ->
             for line in plan.strata
         ],
         mixture=plan.mixture,
-        files={
-            name: FileRecord((partial / name).stat().st_size, checksum(partial / name))
-            for name in (ROWS, META, HELD_OUT)
-        },
+        files={name: FileRecord.of(partial / name) for name in (ROWS, META, HELD_OUT)},
     )

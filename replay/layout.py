@@ -36,29 +36,3 @@ def row_columns(observation_size: int) -> dict[str, slice]:
     for place, name in enumerate(SCALARS):
         columns[name] = slice(2 * size + place, 2 * size + place + 1)
     return columns
-
-
-def n_step_horizon(continues: Bools, n_step: int) -> Ints:
-    """How many steps each row's return spans, (N,) in 1..n_step.
-
-    `continues[i]` (N,) says that row i + 1 is the step after row i of the same episode (so it is
-    False where the episode ends, where a step is missing, and on the last row).
-    """
-    horizon = np.ones(len(continues), np.int64)
-    unbroken = np.ones(len(continues), np.bool_)
-    for ahead in range(1, min(n_step, len(continues) + 1)):
-        # Row i reaches i + ahead if it reached i + ahead - 1 and that one continues.
-        step = np.zeros(len(continues), np.bool_)
-        step[: len(continues) - ahead + 1] = continues[ahead - 1 :]
-        unbroken &= step
-        horizon += unbroken
-    return horizon
-
-
-def n_step_return(reward: F32, horizon: Ints, discount: float) -> F64:
-    """sum(gamma^k r[i + k]) for k below horizon[i], (N,)."""
-    total = np.asarray(reward, np.float64).copy()
-    for ahead in range(1, int(horizon.max(initial=1))):
-        reach = np.flatnonzero(horizon > ahead)
-        total[reach] += discount**ahead * reward[reach + ahead]
-    return total

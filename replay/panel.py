@@ -10,8 +10,6 @@ A directory that never changes once it is there:
 
 from __future__ import annotations
 
-import hashlib
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +24,7 @@ from restock.ingest.task import Task
 from restock.replay.layout import F32, PACKING_VERSION, Ints, row_columns, row_width
 from restock.replay.mixture import Mixture
 from restock.replay.sampler import QuotaSampler
+from restock.replay.seal import AGAIN, FileRecord, unseal
 
 HEADER, ROWS, META, HELD_OUT = "panel.json", "rows.f32", "meta.parquet", "held_out.parquet"
 
@@ -48,13 +47,6 @@ class Stratum(msgspec.Struct, frozen=True):
     note: str
 
 
-class FileRecord(msgspec.Struct, frozen=True):
-    """Size and checksum of one file of the panel."""
-
-    bytes: int
-    blake2b: str
-
-
 class Header(msgspec.Struct, frozen=True):
     """panel.json."""
 
@@ -69,6 +61,7 @@ class Header(msgspec.Struct, frozen=True):
     discount: float
     n_step: int
     packing_version: int
+    packing_code: str  # a hash of the code that packed it
     restock_version: str
     newest_ns: int  # when its newest row was logged: ages of rows are against it, from logged_ns
     logs_share: float  # of a batch
@@ -106,27 +99,22 @@ class Panel:
                 where=str(path),
                 remedy="`restock mix STORE --mixture coverage --out PANEL` makes one",
             )
-        try:
-            header = msgspec.json.decode((path / HEADER).read_bytes(), type=Header)
-        except (msgspec.DecodeError, ValueError) as error:
-            raise PanelError(
-                f"its header cannot be read: {error}", where=str(path / HEADER), remedy=_AGAIN
-            ) from error
+        header = unseal((path / HEADER).read_bytes(), Header, path / HEADER)
         if header.packing_version != PACKING_VERSION:
             raise PanelError(
                 f"packed by version {header.packing_version} of the packing,"
                 f" this is {PACKING_VERSION}",
                 where=str(path),
-                remedy=_AGAIN,
+                remedy=AGAIN,
             )
         for name, record in header.files.items():
-            _check_file(path / name, record, verify)
+            record.check(path / name, verify=verify)
         shape = (header.rows, row_width(header.observation_size))
         if header.files[ROWS].bytes != 4 * shape[0] * shape[1]:
             raise PanelError(
                 f"{header.files[ROWS].bytes} bytes are not {shape[0]} rows of {shape[1]} float32",
                 where=str(path / ROWS),
-                remedy=_AGAIN,
+                remedy=AGAIN,
             )
         return cls(path, header, np.memmap(path / ROWS, np.dtype("<f4"), "r", shape=shape))
 
@@ -217,35 +205,3 @@ class Panel:
         return torch.from_file(
             str(self.path / ROWS), shared=False, size=self.rows.size, dtype=torch.float32
         ).view(self.rows.shape)
-
-
-_AGAIN = "make it again with `restock mix`"
-
-
-def _check_file(path: Path, record: FileRecord, verify: bool) -> None:
-    if sys.byteorder != "little":
-        raise PanelError("panels need a little-endian machine", where=str(path))
-    if not path.is_file():
-        raise PanelError("this file of the panel is missing", where=str(path), remedy=_AGAIN)
-    size = path.stat().st_size
-    if size != record.bytes:
-        raise PanelError(
-            f"it has {size} bytes, not the {record.bytes} that were written",
-            where=str(path),
-            remedy=_AGAIN,
-        )
-    if verify and (found := checksum(path)) != record.blake2b:
-        raise PanelError(
-            f"its checksum is {found}, not {record.blake2b}: it was changed or damaged",
-            where=str(path),
-            remedy=_AGAIN,
-        )
-
-
-def checksum(path: Path) -> str:
-    """blake2b of a file's content, 32 hex digits."""
-    digest = hashlib.blake2b(digest_size=16)
-    with path.open("rb") as file:
-        while chunk := file.read(1 << 20):
-            digest.update(chunk)
-    return digest.hexdigest()

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from restock.errors import ConfigError, MixtureError, StoreError
 from restock.ingest.conditions import Condition
-from restock.replay.layout import F32, Bools, Ints, n_step_horizon
+from restock.replay.layout import F32, Bools, Ints
 from restock.replay.mixture import HeldOut, Mixture
 from restock.replay.shares import SharePlan, plan_shares
 from restock.replay.strata import (
@@ -45,6 +45,8 @@ META_COLUMNS = (
     ),
     *("terminated", "truncated"),
 )
+BATCH_ROWS = 65_536  # read at a time
+_CODED = pa.dictionary(pa.int32(), pa.string())
 _TEXT = ("recording_id", "episode_id", "condition", "zone", "behaviour_policy", "behaviour_version")
 
 
@@ -75,7 +77,6 @@ class Plan:
     rows: pa.Table  # META_COLUMNS of every row of the store, by recording, episode, step
     task_hash: str
     stratum: NDArray[np.int16]  # (N,) of each row; -1 where it is not in the panel
-    horizon: Ints  # (N,) steps of its return
     weight: F32  # (n,) of the panel's rows
     held_out: Bools  # (N,)
     strata: tuple[StratumPlan, ...]
@@ -173,7 +174,6 @@ def _finish(
         rows=table.select(META_COLUMNS),
         task_hash=task_hash,
         stratum=stratum,
-        horizon=n_step_horizon(continuing(table), mixture.n_step),
         weight=weight,
         held_out=held_out,
         strata=tuple(lines),
@@ -233,7 +233,9 @@ def _read(
         " ORDER BY recording_id, episode_index, step_index"
     )
     try:
-        table = connection.sql(query).to_arrow_table()
+        # Text becomes codes batch by batch: whole columns of it would be most of the memory.
+        reader = connection.sql(query).to_arrow_reader(BATCH_ROWS)
+        table = pa.Table.from_batches([_encoded(batch) for batch in reader], _schema(reader.schema))
     except duckdb.Error as error:
         for name, sql in predicates.items():  # one by one, to say which
             try:
@@ -246,11 +248,23 @@ def _read(
                     else "mixture, `where`",
                 ) from cause
         raise StoreError(f"its transitions cannot be read: {error}") from error
+    return table.unify_dictionaries().combine_chunks()
+
+
+def _schema(schema: pa.Schema) -> pa.Schema:
     for name in _TEXT:
-        place = table.schema.get_field_index(name)
-        encoded = table[name].combine_chunks().dictionary_encode()
-        table = table.set_column(place, name, encoded)
-    return table
+        place = schema.get_field_index(name)
+        schema = schema.set(place, schema.field(place).with_type(_CODED))
+    return schema
+
+
+def _encoded(batch: pa.RecordBatch) -> pa.RecordBatch:
+    schema = _schema(batch.schema)
+    columns = [
+        column.cast(pa.string()).dictionary_encode() if field.name in _TEXT else column
+        for column, field in zip(batch.columns, schema, strict=True)
+    ]
+    return pa.RecordBatch.from_arrays(columns, schema=schema)
 
 
 def _one_task(table: pa.Table) -> str:
@@ -266,19 +280,6 @@ def _one_task(table: pa.Table) -> str:
             + f"""{hashes[0]}'", or ingest into one store per task""",
         )
     return str(hashes[0])
-
-
-def continuing(table: pa.Table) -> Bools:
-    """Whether the next row is the step after this one, by the same policy, (N,)."""
-    step = table["step_index"].to_numpy()
-    ended = _bools(table, "terminated") | _bools(table, "truncated")
-    going_on = np.zeros(len(table), np.bool_)
-    same = np.ones(max(len(table) - 1, 0), np.bool_)
-    for name in ("episode_id", "behaviour_policy", "behaviour_version"):
-        code = _codes(table, name)
-        same &= code[1:] == code[:-1]
-    going_on[:-1] = same & (step[1:] == step[:-1] + 1) & ~ended[:-1]
-    return going_on
 
 
 def hold_out(table: pa.Table, rule: HeldOut, seed: int) -> Bools:

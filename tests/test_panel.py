@@ -17,8 +17,8 @@ from restock.errors import MixtureError, PanelError, StoreError
 from restock.ingest.task import Task
 from restock.replay import build
 from restock.replay.build import build_panel
-from restock.replay.layout import n_step_horizon, n_step_return
 from restock.replay.mixture import Mixture, load_mixture, parse_mixture
+from restock.replay.n_step import n_step_horizon, n_step_return
 from restock.replay.panel import ROWS, Panel
 from restock.replay.store import Store
 
@@ -225,12 +225,18 @@ def test_damage_is_found(transitions: pa.Table, tmp_path: Path) -> None:
     panel = build_panel(transitions, uniform(), tmp_path / "p")
     rows = panel.path / ROWS
     Panel.open(panel.path, verify=True)
+    assert not rows.stat().st_mode & 0o222
+    rows.chmod(0o644)
     content = bytearray(rows.read_bytes())
-    content[1000] ^= 1
+    content[6000] ^= 1  # between two of the blocks that every opening looks at
     rows.write_bytes(content)
     Panel.open(panel.path)
     with pytest.raises(PanelError, match="checksum"):
         Panel.open(panel.path, verify=True)
+    content[-1] ^= 1
+    rows.write_bytes(content)
+    with pytest.raises(PanelError, match="checksum"):
+        Panel.open(panel.path)
     rows.write_bytes(content[:-4])
     with pytest.raises(PanelError, match="bytes, not the"):
         Panel.open(panel.path)
