@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -31,6 +32,7 @@ _HEAD = np.dtype(  # a message record up to its data
     ]
 )
 HEAD_SIZE = _HEAD.itemsize  # 31
+_START = np.dtype([("op", "u1"), ("length", "<u8"), ("channel", "<u2")])
 _INDEX = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 
 
@@ -75,22 +77,59 @@ class Messages:
         return len(self.start)
 
 
+def refuse_implausible(chunk: Chunk) -> None:
+    """Check the size that a chunk claims, before as much is set aside.
+
+    Raises:
+        BadChunk: it is more than so few bytes can hold.
+    """
+    stored = chunk.stop - chunk.start
+    limit = max(PLAUSIBLE_SIZE, PLAUSIBLE_RATIO * stored)
+    if chunk.size > min(limit, LARGEST_CHUNK):
+        raise BadChunk(f"{stored:,} bytes that claim to hold {chunk.size:,}")
+
+
 def inflate(chunk: Chunk, file: Any) -> bytes:
     """The chunk's records, uncompressed and checked against its CRC.
 
     Raises:
         BadChunk: unknown compression, an implausible size, damaged data or a wrong CRC.
     """
-    stored = file[chunk.start : chunk.stop]
-    limit = max(PLAUSIBLE_SIZE, PLAUSIBLE_RATIO * len(stored))
-    if chunk.size > min(limit, LARGEST_CHUNK):
-        raise BadChunk(f"{len(stored):,} bytes that claim to hold {chunk.size:,}")
-    data = _decompress(chunk.compression, stored, chunk.size)
+    refuse_implausible(chunk)
+    data = _decompress(chunk.compression, file[chunk.start : chunk.stop], chunk.size)
     if len(data) != chunk.size:
         raise BadChunk(f"{len(data):,} bytes uncompressed, where it claims {chunk.size:,}")
+    _check(chunk, data)
+    return data
+
+
+def inflate_into(chunk: Chunk, file: Any, room: NDArray[np.uint8]) -> None:
+    """The same into `room`, which has the chunk's size: memory that is used again costs less.
+
+    Raises:
+        BadChunk: as `inflate`.
+    """
+    if chunk.compression == "zstd" and _unpack(file[chunk.start : chunk.stop], room):
+        _check(chunk, room.data)
+    else:  # whatever is wrong with it is found and named there
+        room[:] = np.frombuffer(inflate(chunk, file), np.uint8)
+
+
+def _unpack(stored: bytes, room: NDArray[np.uint8]) -> bool:
+    """Decompress zstd data that fills the room exactly; False where it does not."""
+    try:
+        with zstandard.ZstdDecompressor().stream_reader(stored) as reader:
+            at = 0
+            while at < len(room) and (count := reader.readinto(room.data[at:])):
+                at += count
+            return at == len(room) and not reader.read(1)
+    except zstandard.ZstdError:
+        return False
+
+
+def _check(chunk: Chunk, data: Any) -> None:
     if chunk.crc and zlib.crc32(data) != chunk.crc:
         raise BadChunk("its CRC does not match")
-    return data
 
 
 def inflate_what_is_there(chunk: Chunk, file: Any) -> bytes:
@@ -137,28 +176,42 @@ def _decompress(compression: str, stored: bytes, size: int) -> bytes:
     raise BadChunk(f"compression {compression!r} is not known")
 
 
-def indexed_messages(
-    buffer: NDArray[np.uint8], base: int, size: int, entries: bytes, channel: int
-) -> Messages | None:
-    """A channel's messages by its index entries, in a chunk at buffer[base:base + size].
+@dataclass(frozen=True)
+class Indexed:
+    """A channel's index entries in one chunk, which lies at buffer[base:base + size]."""
 
-    None where the index does not fit what is there: then the chunk is to be walked.
+    base: int
+    size: int
+    entries: bytes
+
+
+def indexed_messages(
+    buffer: NDArray[np.uint8], parts: Sequence[Indexed], channel: int
+) -> Messages | None:
+    """A channel's messages by its index entries in some chunks, which lie in this order.
+
+    None where the index does not fit what is there: then the chunks are to be walked.
     """
-    if len(entries) % _INDEX.itemsize:
+    if any(len(part.entries) % _INDEX.itemsize for part in parts):
         return None
-    offset = np.frombuffer(entries, _INDEX)["offset"]
+    offset = np.frombuffer(b"".join(part.entries for part in parts), _INDEX)["offset"]
     if not len(offset):
         none = np.zeros(0, np.int64)
         return Messages(none, none, none, none)
-    if size < HEAD_SIZE or int(offset.max()) > size - HEAD_SIZE:
+    counts = [len(part.entries) // _INDEX.itemsize for part in parts]
+    base = np.repeat(np.array([part.base for part in parts], np.int64), counts)
+    size = np.repeat(np.array([part.size for part in parts], np.int64), counts)
+    room = np.maximum(size - HEAD_SIZE, 0).astype(np.uint64)
+    if (offset > room).any() or (size < HEAD_SIZE).any():
         return None
-    at = np.sort(offset.astype(np.int64)) + base  # file order: entries are sorted by time
+    # File order: entries are sorted by time. Chunk by chunk, so `base` and `size` stay right.
+    at = np.sort(offset.astype(np.int64) + base)
     head = gather(buffer, at, _HEAD)
     length = head["length"]
     if (
         (head["op"] != Op.MESSAGE).any()
         or (head["channel"] != channel).any()
-        or (length > size).any()
+        or (length > size.astype(np.uint64)).any()
         or (length < HEAD_SIZE - PREFIX).any()
     ):
         return None
@@ -173,22 +226,19 @@ def indexed_messages(
     )
 
 
-def walked_messages(part: bytes) -> tuple[Positions, str | None]:
+def walked_messages(part: Any) -> tuple[Positions, str | None]:
     """Where the message records of an uncompressed chunk start, per channel, and what is cut."""
     places: list[int] = []
-    channels: list[int] = []
-    unpack = struct.Struct("<BQH").unpack_from
+    note = places.append
+    length_at = struct.Struct("<xQ").unpack_from  # after the opcode
     position, end = 0, len(part)
+    last = end - (PREFIX + 2)
+    while position <= last:
+        note(position)
+        position += PREFIX + length_at(part, position)[0]
+    if position > end:  # the last record is not whole
+        position = places.pop()
     cut = None
-    while position + PREFIX + 2 <= end:
-        opcode, length, channel = unpack(part, position)
-        after = position + PREFIX + length
-        if after > end:
-            break
-        if opcode == Op.MESSAGE and length >= HEAD_SIZE - PREFIX:
-            places.append(position)
-            channels.append(channel)
-        position = after
     if (
         position != end
         and position + PREFIX + int.from_bytes(part[position + 1 : position + PREFIX], "little")
@@ -196,7 +246,9 @@ def walked_messages(part: bytes) -> tuple[Positions, str | None]:
     ):
         cut = f"cut within a record, {end - position:,} bytes before its end"
     found = np.array(places, np.int64)
-    numbers = np.array(channels, np.int64)
+    head = gather(np.frombuffer(part, np.uint8), found, _START)
+    found = found[(head["op"] == Op.MESSAGE) & (head["length"] >= HEAD_SIZE - PREFIX)]
+    numbers = gather(np.frombuffer(part, np.uint8), found, _START)["channel"]
     return {number: found[numbers == number] for number in np.unique(numbers).tolist()}, cut
 
 

@@ -11,6 +11,7 @@ import mmap
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from restock.ingest.mapped import FORGET_BYTES, forget
 from restock.ingest.mcap_chunk import HEAD_SIZE, Chunk
 from restock.ingest.mcap_records import MAGIC, PREFIX, Malformed, Op, parse, walk
 
@@ -56,8 +57,12 @@ def survey(file: mmap.mmap) -> Contents:
     contents = Contents()
     end = len(file)
     finished = False
+    walked = 0
     try:
         for opcode, at, stop in walk(file, len(MAGIC), end):
+            if at - walked > FORGET_BYTES:
+                forget(file, walked, at)
+                walked = at
             if opcode == Op.FOOTER:
                 finished = file[stop : stop + len(MAGIC)] == MAGIC
                 break

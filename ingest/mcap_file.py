@@ -7,6 +7,7 @@ import zlib
 from collections.abc import Collection, Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +15,16 @@ from numpy.typing import NDArray
 from restock.errors import RecordingError
 from restock.ingest import mcap_chunk
 from restock.ingest.columns import Batch
-from restock.ingest.mcap_chunk import BadChunk, Chunk, Messages, Positions
+from restock.ingest.mapped import FORGET_BYTES, forget
+from restock.ingest.mcap_chunk import BadChunk, Chunk, Indexed, Messages, Positions
 from restock.ingest.mcap_contents import survey
 from restock.ingest.mcap_records import MAGIC
 from restock.ingest.storage import Channel, Damage, Integrity
 
 GROUP_BYTES = 8 << 20  # of chunks decoded together: enough to amortise numpy's calls
 LATEST_NS = 2**63 - 1
+
+_Part: TypeAlias = tuple[Chunk, int, int]  # a chunk, and where it lies: first byte, bytes
 
 
 class McapFile:
@@ -119,8 +123,8 @@ class McapFile:
         contents = self._contents
         # A chunk without messages says 0 to 0.
         spans = [chunk.span_ns for chunk in contents.chunks if any(chunk.span_ns)]
-        for positions in contents.loose.values():
-            stamps = mcap_chunk.messages_at(self._buffer, positions).log_time_ns
+        for _, messages in self._loose(contents.loose):
+            stamps = messages.log_time_ns
             spans.append((int(stamps.min()), int(stamps.max())))
         if not spans or not any(self.counts.values()):
             return None
@@ -145,7 +149,13 @@ class McapFile:
         position, crc = self._contents.data_end
         if not crc:
             self._unchecked += 1
-        elif zlib.crc32(self._buffer[:position].data) == crc:
+            return
+        found = 0
+        for start in range(0, position, FORGET_BYTES):
+            stop = min(start + FORGET_BYTES, position)
+            found = zlib.crc32(self._buffer[start:stop].data, found)
+            forget(self._file, start, stop)
+        if found == crc:
             self._verified += 1
         else:
             self._damaged("the CRC of its data section does not match", {})
@@ -156,11 +166,17 @@ class McapFile:
         try:
             data = mcap_chunk.inflate(chunk, self._file)
         except BadChunk as bad:
-            self._damaged(f"chunk at byte {chunk.at:,} is lost: {bad}", chunk.counts())
+            self._lost(chunk, bad)
             return b""
+        self._count_checked(chunk)
+        return data
+
+    def _lost(self, chunk: Chunk, why: BadChunk) -> None:
+        self._damaged(f"chunk at byte {chunk.at:,} is lost: {why}", chunk.counts())
+
+    def _count_checked(self, chunk: Chunk) -> None:
         self._verified += bool(chunk.crc)
         self._unchecked += not chunk.crc
-        return data
 
     # -- reading ---------------------------------------------------------------------------
 
@@ -170,14 +186,28 @@ class McapFile:
         A batch is valid until the next one is asked for: its buffer is used again.
         """
         wanted = set(channels)
-        loose = sorted(wanted & self._contents.loose.keys())
+        loose = wanted & self._contents.loose.keys()
         if loose:
             self._check_loose()
-        for channel in loose:
-            found = mcap_chunk.messages_at(self._buffer, self._contents.loose[channel])
+        for channel, found in self._loose(loose):
             yield channel, _batch(self._buffer, [found])
         for group in self._groups(wanted):
             yield from self._read_group(group, wanted)
+            forget(self._file, group[0].at, group[-1].stop)
+
+    def _loose(self, channels: Collection[int]) -> Iterator[tuple[int, Messages]]:
+        """These channels' messages outside chunks, from about 8 MiB of the file at a time."""
+        places = {c: np.asarray(self._contents.loose[c], np.int64) for c in sorted(channels)}
+        if not places:
+            return
+        end = max(int(at[-1]) for at in places.values()) + 1
+        for start in range(min(int(at[0]) for at in places.values()), end, GROUP_BYTES):
+            stop = start + GROUP_BYTES
+            for channel, at in places.items():
+                low, high = np.searchsorted(at, (start, stop)).tolist()
+                if low < high:
+                    yield channel, mcap_chunk.messages_at(self._buffer, at[low:high])
+            forget(self._file, start, stop)
 
     def _groups(self, wanted: set[int]) -> Iterator[list[Chunk]]:
         group: list[Chunk] = []
@@ -195,49 +225,105 @@ class McapFile:
             yield group
 
     def _read_group(self, group: list[Chunk], wanted: set[int]) -> Iterator[tuple[int, Batch]]:
-        parts = [self._inflate(chunk) for chunk in group]
-        buffer = self._together(parts)
+        buffer, parts = self._inflate_group(group)
+        whole = self._by_index(parts, buffer, wanted)
+        if whole is not None:
+            for channel in sorted(whole):
+                yield channel, _batch(buffer, [whole[channel]])
+            return
         found: dict[int, list[Messages]] = {}
-        base = 0
-        for chunk, part in zip(group, parts, strict=True):
-            for channel, messages in self._locate(chunk, part, buffer, base, wanted):
+        for part in parts:
+            for channel, messages in self._locate(part, buffer, wanted):
                 if len(messages):
                     found.setdefault(channel, []).append(messages)
-            base += len(part)
         for channel in sorted(found):
             yield channel, _batch(buffer, found[channel])
 
-    def _together(self, parts: list[bytes]) -> NDArray[np.uint8]:
-        """The parts one after the other, in memory that is used again: fresh pages cost more."""
-        if len(parts) == 1:
-            return np.frombuffer(parts[0], np.uint8)
-        size = sum(map(len, parts))
+    def _by_index(
+        self,
+        parts: list[_Part],
+        buffer: NDArray[np.uint8],
+        wanted: set[int],
+    ) -> dict[int, Messages] | None:
+        """Where the messages of some chunks are, if the index of each says so, and rightly."""
+        entries: dict[int, list[Indexed]] = {}
+        for chunk, base, size in parts:
+            if not chunk.index or chunk.at in self._walked:
+                return None
+            for channel in chunk.index.keys() & wanted:
+                start, stop = chunk.index[channel]
+                one = Indexed(base, size, self._file[start:stop])
+                entries.setdefault(channel, []).append(one)
+        found = {}
+        for channel, indexed in entries.items():
+            messages = mcap_chunk.indexed_messages(buffer, indexed, channel)
+            if messages is None:
+                return None
+            if len(messages):
+                found[channel] = messages
+        return found
+
+    def _inflate_group(self, group: list[Chunk]) -> tuple[NDArray[np.uint8], list[_Part]]:
+        """What these chunks hold, in memory that is used again, and where; without bad ones."""
+        cut = self._contents.cut_chunk
+        torn = b""
+        if cut is not None and cut in group:
+            torn = mcap_chunk.inflate_what_is_there(cut, self._file)
+        rooms = [
+            (chunk, len(torn) if chunk is cut else chunk.size)
+            for chunk in group
+            if chunk is cut or self._plausible(chunk)
+        ]
+        size = sum(size for _, size in rooms)
         if len(self._scratch) < size:
             self._scratch = np.empty(size, np.uint8)
+        parts = []
         at = 0
-        for part in parts:
-            self._scratch[at : at + len(part)] = np.frombuffer(part, np.uint8)
-            at += len(part)
-        return self._scratch[:size]
+        for chunk, size in rooms:
+            room = self._scratch[at : at + size]
+            if chunk is cut:
+                room[:] = np.frombuffer(torn, np.uint8)
+            elif not self._inflate_into(chunk, room):
+                continue
+            if size:
+                parts.append((chunk, at, size))
+                at += size
+        return self._scratch[:at], parts
+
+    def _plausible(self, chunk: Chunk) -> bool:
+        try:
+            mcap_chunk.refuse_implausible(chunk)
+        except BadChunk as bad:
+            self._lost(chunk, bad)
+            return False
+        return True
+
+    def _inflate_into(self, chunk: Chunk, room: NDArray[np.uint8]) -> bool:
+        """Fill the room with the chunk's records, if they can be had."""
+        try:
+            mcap_chunk.inflate_into(chunk, self._file, room)
+        except BadChunk as bad:
+            self._lost(chunk, bad)
+            return False
+        self._count_checked(chunk)
+        return True
 
     def _locate(
-        self, chunk: Chunk, part: bytes, buffer: NDArray[np.uint8], base: int, wanted: set[int]
+        self, part: _Part, buffer: NDArray[np.uint8], wanted: set[int]
     ) -> Iterator[tuple[int, Messages]]:
-        if not part:
-            return
+        chunk, base, size = part
         if chunk.index and chunk.at not in self._walked:
             located = {}
             for channel in chunk.index.keys() & wanted:
                 start, stop = chunk.index[channel]
-                located[channel] = mcap_chunk.indexed_messages(
-                    buffer, base, len(part), self._file[start:stop], channel
-                )
+                one = Indexed(base, size, self._file[start:stop])
+                located[channel] = mcap_chunk.indexed_messages(buffer, [one], channel)
             whole = {channel: at for channel, at in located.items() if at is not None}
             if len(whole) == len(located):
                 yield from whole.items()
                 return
             self.notes.append(f"chunk at byte {chunk.at:,}: its message index is wrong; walked")
-        for channel, positions in self._walk_part(chunk, part).items():
+        for channel, positions in self._walk_part(chunk, buffer[base : base + size].data).items():
             if channel in wanted:
                 yield channel, mcap_chunk.messages_at(buffer, positions + base)
 
@@ -247,7 +333,7 @@ class McapFile:
             self._walked[chunk.at] = self._walk_part(chunk, self._inflate(chunk))
         return self._walked[chunk.at]
 
-    def _walk_part(self, chunk: Chunk, part: bytes) -> Positions:
+    def _walk_part(self, chunk: Chunk, part: bytes | memoryview) -> Positions:
         if chunk.at in self._walked:
             return self._walked[chunk.at]
         positions, cut = mcap_chunk.walked_messages(part)

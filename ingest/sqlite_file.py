@@ -7,8 +7,12 @@ import shutil
 import sqlite3
 import tempfile
 from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
+
+import numpy as np
 
 from restock.errors import RecordingError
 from restock.ingest.columns import Batch
@@ -16,7 +20,7 @@ from restock.ingest.storage import Channel, Damage, Integrity
 
 MAGIC = b"SQLite format 3\x00"
 ROWS_PER_FETCH = 1000
-BYTES_PER_BATCH = 32 << 20
+BYTES_PER_BATCH = 8 << 20
 LONGEST_GAP = 64 << 30  # of a short file, filled with holes in a private copy
 
 
@@ -165,22 +169,22 @@ class SqliteFile:
             f" WHERE topic_id IN ({marks}) AND typeof(timestamp) = 'integer' ORDER BY id",
             wanted,
         )
-        held: dict[int, list[tuple[int, bytes]]] = {}
-        size = 0
-        while rows := self._fetch(cursor):
-            for channel, stamp, data in rows:
-                payload = data if isinstance(data, bytes) else str(data or "").encode()
-                held.setdefault(channel, []).append((stamp, payload))
-                size += len(payload) + 64
+        held: dict[int, _Rows] = {}
+        size = count = 0
+        while rows := self._fetch(cursor, size // count if count else BYTES_PER_BATCH // 16):
             if size >= BYTES_PER_BATCH:
-                yield from _batches(held)
-                held, size = {}, 0
-        yield from _batches(held)
+                yield from ((channel, rows.batch()) for channel, rows in held.items())
+                held, size, count = {}, 0, 0
+            size += _hold(rows, held)
+            count += len(rows)
+        yield from ((channel, rows.batch()) for channel, rows in held.items())
 
-    def _fetch(self, cursor: sqlite3.Cursor) -> list[tuple[int, int, bytes | None]]:
+    def _fetch(self, cursor: sqlite3.Cursor, row_bytes: int) -> list[tuple[int, int, Any]]:
+        """Some rows, fewer of larger ones: how large they are shows in those before."""
         # A failing fetch loses all its rows: where damage is expected, one row at a time.
+        some = min(max(BYTES_PER_BATCH // max(row_bytes, 1), 1), ROWS_PER_FETCH)
         try:
-            return cursor.fetchmany(1 if self.salvage else ROWS_PER_FETCH)
+            return cursor.fetchmany(1 if self.salvage else some)
         except sqlite3.DatabaseError as error:
             self._damaged(f"rows after the damage are lost: {error}")
             return []
@@ -192,7 +196,28 @@ class SqliteFile:
             self._copy.cleanup()
 
 
-def _batches(held: dict[int, list[tuple[int, bytes]]]) -> Iterator[tuple[int, Batch]]:
-    for channel, rows in held.items():
-        stamps = [stamp for stamp, _ in rows]
-        yield channel, Batch.of([data for _, data in rows], stamps, stamps)
+@dataclass
+class _Rows:
+    """Rows of one topic that wait to be a batch."""
+
+    stamps: list[int] = field(default_factory=list)
+    payloads: list[bytes] = field(default_factory=list)
+
+    def batch(self) -> Batch:
+        return Batch.of(self.payloads, self.stamps, self.stamps)
+
+
+def _hold(rows: list[tuple[int, int, Any]], held: dict[int, _Rows]) -> int:
+    """Sort (topic, stamp, data) rows by topic; returns how many bytes they hold."""
+    topics, stamps, payloads = zip(*rows, strict=True)
+    if set(map(type, payloads)) != {bytes}:
+        payloads = tuple(
+            data if isinstance(data, bytes) else str(data or "").encode() for data in payloads
+        )
+    numbers = np.array(topics)
+    for topic in np.unique(numbers).tolist():
+        waiting = held.setdefault(topic, _Rows())
+        mine = np.flatnonzero(numbers == topic).tolist()
+        waiting.stamps += [stamps[row] for row in mine]
+        waiting.payloads += [payloads[row] for row in mine]
+    return sum(map(len, payloads)) + 64 * len(rows)
