@@ -7,65 +7,53 @@ of 12, and a share of 0.003 of a batch is met over time, because the rounding is
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import MixtureError
 from restock.replay.layout import F32, F64, Ints
+from restock.replay.quotas import Quotas
 
 BLOCK = 64  # batches drawn at a time
 
 
-class Quotas:
-    """Shares to whole rows per batch by largest remainder, the rounding carried to the next."""
-
-    def __init__(self, shares: Sequence[float] | F64, batch_size: int) -> None:
-        given = np.asarray(shares, np.float64)
-        if batch_size < 1:
-            raise MixtureError(f"batch_size must be at least 1, got {batch_size}")
-        if given.ndim != 1 or not len(given) or not np.isfinite(given).all() or (given < 0).any():
-            raise MixtureError(f"shares must be finite and not negative, got {shares!r}")
-        if abs(given.sum() - 1.0) > 1e-6:
-            raise MixtureError(f"shares must sum to 1, got {given.sum():.6g}")
-        self.shares: F64 = given / given.sum()
-        self.batch_size = batch_size
-        self._mean: list[float] = (self.shares * batch_size).tolist()
-        self._carry = [0.0] * len(self._mean)
+class Sampler(Protocol):
+    """What draws the rows of batches. `QuotaSampler`, `PrioritySampler` and `ChunkedSampler`."""
 
     @property
-    def carry(self) -> F64:
-        """Rows that each stratum is still owed, (S,)."""
-        return np.array(self._carry)
+    def batch_size(self) -> int: ...
 
-    @carry.setter
-    def carry(self, owed: F64) -> None:
-        self._carry = np.asarray(owed, np.float64).tolist()
+    @property
+    def shares(self) -> F64:
+        """Of each stratum, (S,)."""
 
-    def next(self) -> Ints:
-        """Rows per stratum of the next batch, (S,); they sum to the batch size."""
-        if len(self.shares) == 1:
-            return np.array([self.batch_size], np.int64)
-        # Plain floats: for a handful of strata numpy's calls cost more than the work.
-        owed = [mean + carry for mean, carry in zip(self._mean, self._carry, strict=True)]
-        quota = [int(part) if part > 0 else 0 for part in owed]
-        rest = [part - whole for part, whole in zip(owed, quota, strict=True)]
-        short = self.batch_size - sum(quota)
-        if short > 0:
-            for index in sorted(range(len(rest)), key=rest.__getitem__, reverse=True)[:short]:
-                quota[index] += 1
-                rest[index] -= 1.0
-        for _ in range(-short):  # strata in debt can leave the others owed a row too many
-            index = min((i for i, q in enumerate(quota) if q), key=rest.__getitem__)
-            quota[index] -= 1
-            rest[index] += 1.0
-        self._carry = rest
-        return np.array(quota, np.int64)
+    @property
+    def drawn_weights(self) -> F32 | None:
+        """Importance weights (B,) that the batch last drawn needs; None for ones."""
+
+    def draw(self) -> tuple[Ints, Ints]:
+        """Row numbers (B,) and the stratum of each (B,)."""
+
+    def update(self, rows: Ints, td_abs: NDArray[Any]) -> None:
+        """|TD error| (n,) of rows (n,) that were just learnt from."""
+
+    def set_shares(self, shares: Sequence[float] | F64) -> None:
+        """Other shares from the next batch on."""
+
+    def set_batch_size(self, batch_size: int) -> None:
+        """Batches of another size from the next one on."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that decides the draws to come: arrays and JSON values."""
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Puts the draws to come where `state_dict` found them."""
 
 
 class QuotaSampler:
-    """Exact quotas per batch over strata of rows.
+    """Exact quotas per batch over strata of rows, each stratum's rows alike.
 
     Batches are drawn BLOCK at a time and handed out one by one, which takes the cost of a draw from
     about that of the gather to a tenth of it; what is drawn ahead is part of `state_dict`.
@@ -84,6 +72,8 @@ class QuotaSampler:
         MixtureError: shares that are no distribution, or a share on an empty stratum.
     """
 
+    block = BLOCK
+
     def __init__(
         self,
         stratum_rows: Sequence[NDArray[Any]],
@@ -96,13 +86,9 @@ class QuotaSampler:
     ) -> None:
         if len(stratum_rows) != len(shares):
             raise MixtureError(f"{len(stratum_rows)} strata but {len(shares)} shares")
-        self.quotas = Quotas(shares, batch_size)
         self.sizes: Ints = np.array([len(rows) for rows in stratum_rows], np.int64)
-        for stratum in np.flatnonzero((self.quotas.shares > 0) & (self.sizes == 0)).tolist():
-            raise MixtureError(
-                f"stratum {stratum} has a share of {shares[stratum]:g} and no rows",
-                remedy="give it share 0, or let `restock mix` redistribute it",
-            )
+        self.quotas = Quotas(shares, batch_size)
+        self._check_shares(self.quotas.shares)
         self._members = [np.array(rows, np.int64) for rows in stratum_rows]
         last = max((int(rows.max(initial=-1)) for rows in self._members), default=-1)
         self.weights: F32 = np.ones(last + 1, np.float32) if weights is None else weights
@@ -112,6 +98,8 @@ class QuotaSampler:
         if not replacement:
             for members in self._members:
                 self.rng.shuffle(members)
+        # Rows whose turn came and that were not handed out, because the shares changed: next ones.
+        self._returned = [np.empty(0, np.int64) for _ in self._members]
         self._ahead_rows: Ints = np.zeros((0, batch_size), np.int64)
         self._ahead_strata: Ints = np.zeros((0, batch_size), np.int64)
         self._next = 0  # of those drawn ahead
@@ -124,6 +112,11 @@ class QuotaSampler:
     def shares(self) -> F64:
         return self.quotas.shares
 
+    @property
+    def drawn_weights(self) -> F32 | None:
+        """Importance weights that the batch last drawn needs: none, its rows are drawn alike."""
+        return None
+
     def draw(self) -> tuple[Ints, Ints]:
         """Row numbers (B,) and the stratum of each (B,), strata in order."""
         if self._next == len(self._ahead_rows):
@@ -131,24 +124,64 @@ class QuotaSampler:
         self._next += 1
         return self._ahead_rows[self._next - 1], self._ahead_strata[self._next - 1]
 
+    def update(self, rows: Ints, td_abs: NDArray[Any]) -> None:
+        """|TD error| (n,) of rows (n,) that were just learnt from: changes nothing here."""
+
+    def set_shares(self, shares: Sequence[float] | F64) -> None:
+        """Other shares (S,) from the next batch on; what was drawn ahead goes back.
+
+        Raises:
+            MixtureError: shares that are no distribution, or a share on an empty stratum.
+        """
+        given = Quotas(shares, self.batch_size).shares
+        if np.array_equal(given, self.quotas.shares):
+            return
+        self._check_shares(given)
+        self._hand_back()
+        self.quotas.set_shares(shares)
+
+    def set_batch_size(self, batch_size: int) -> None:
+        """Batches of another size from the next one on; what was drawn ahead goes back."""
+        if batch_size != self.batch_size:
+            self._hand_back()
+            self.quotas.set_batch_size(batch_size)
+            self._ahead_rows = np.zeros((0, batch_size), np.int64)
+            self._ahead_strata = np.zeros((0, batch_size), np.int64)
+
+    def _check_shares(self, shares: F64) -> None:
+        if len(shares) != len(self.sizes):
+            raise MixtureError(f"{len(shares)} shares for {len(self.sizes)} strata")
+        for stratum in np.flatnonzero((shares > 0) & (self.sizes == 0)).tolist():
+            raise MixtureError(
+                f"stratum {stratum} has a share of {shares[stratum]:g} and no rows",
+                remedy="give it share 0, or let `restock mix` redistribute it",
+            )
+
     def _draw_block(self) -> None:
-        quota = np.stack([self.quotas.next() for _ in range(BLOCK)])  # (BLOCK, S)
-        strata = np.tile(np.arange(len(self.sizes)), BLOCK)
-        stratum = np.repeat(strata, quota.ravel())  # (BLOCK * B,) batch by batch
-        drawn = np.empty(len(stratum), np.int64)
+        strata = len(self.sizes)
+        quota = np.stack([self.quotas.next() for _ in range(self.block)])  # (block, S)
+        stratum = np.repeat(np.tile(np.arange(strata), self.block), quota.ravel())
         # All that a stratum gives to the block is taken at once, and dealt out in order.
-        taken = [self._take(s, count) for s, count in enumerate(quota.sum(axis=0).tolist())]
-        drawn[np.argsort(stratum.astype(np.int16), kind="stable")] = np.concatenate(taken)
-        self._ahead_rows = drawn.reshape(BLOCK, -1)
-        self._ahead_strata = stratum.reshape(BLOCK, -1)
+        order = np.argsort(stratum.astype(np.int16), kind="stable")
+        self._take_all(quota.sum(axis=0), order)
+        self._ahead_strata = stratum.reshape(self.block, -1)  # batch by batch
         self._next = 0
+
+    def _take_all(self, counts: Ints, order: Ints) -> None:
+        """Take `counts` (S,) rows of the strata; those are dealt to places `order` of the block."""
+        drawn = np.empty(len(order), np.int64)
+        taken = [self._take(stratum, count) for stratum, count in enumerate(counts.tolist())]
+        drawn[order] = np.concatenate(taken)
+        self._ahead_rows = drawn.reshape(self.block, -1)
 
     def _take(self, stratum: int, count: int) -> Ints:
         """The next `count` rows of a stratum."""
         members, size = self._members[stratum], int(self.sizes[stratum])
         if self.replacement:
             return members[(self.rng.random(count) * size).astype(np.int64)]
-        parts = [np.empty(0, np.int64)]
+        back = self._returned[stratum]
+        parts, self._returned[stratum] = [back[:count]], back[count:]
+        count -= len(parts[0])
         while count:
             at = int(self._cursor[stratum])
             if at == size:  # all have had their turn
@@ -160,31 +193,45 @@ class QuotaSampler:
             count -= some
         return np.concatenate(parts)
 
+    def _hand_back(self) -> None:
+        """Forget what is drawn ahead: quotas are owed again, rows that had their turn are next."""
+        rows, strata = self._ahead_rows[self._next :], self._ahead_strata[self._next :]
+        quota = np.stack([(strata == s).sum(axis=1) for s in range(len(self.sizes))], axis=1)
+        self.quotas.give_back(quota)
+        if not self.replacement:
+            for stratum, back in enumerate(self._returned):
+                self._returned[stratum] = np.concatenate([rows[strata == stratum], back])
+        self._ahead_rows, self._ahead_strata = rows[:0], strata[:0]
+        self._next = 0
+
     def state_dict(self) -> dict[str, Any]:
         """Carried rounding, what is drawn ahead, orders, the generator: arrays and JSON values."""
         state: dict[str, Any] = {
             "carry": self.quotas.carry.copy(),
+            "shares": self.shares.copy(),
             "sizes": self.sizes.copy(),
             "ahead_rows": self._ahead_rows[self._next :].copy(),
             "ahead_strata": self._ahead_strata[self._next :].copy(),
             "rng": self.rng.bit_generator.state,
         }
         if not self.replacement:
-            order = np.concatenate(self._members)
-            state |= {"cursor": self._cursor.copy(), "order": order}
+            state |= {
+                "cursor": self._cursor.copy(),
+                "order": np.concatenate(self._members),
+                "returned": np.concatenate(self._returned),
+                "returned_count": np.array([len(rows) for rows in self._returned], np.int64),
+            }
         return state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Raises MixtureError when the state is of a sampler over other strata."""
-        if (
-            not np.array_equal(state["sizes"], self.sizes)
-            or ("order" in state) == self.replacement
-            or state["ahead_rows"].shape[1:] != (self.batch_size,)
-        ):
+        if not np.array_equal(state["sizes"], self.sizes) or ("order" in state) == self.replacement:
             raise MixtureError(
-                "the saved sampler drew from other strata, or batches of another size",
+                "the saved sampler drew from other strata, or by another rule",
                 remedy="resume with the panel and the settings the run began with",
             )
+        self.quotas.set_batch_size(int(state["ahead_rows"].shape[1]))
+        self.quotas.set_shares(np.asarray(state["shares"]))
         self.quotas.carry = np.array(state["carry"], np.float64)
         self._ahead_rows = np.array(state["ahead_rows"], np.int64)
         self._ahead_strata = np.array(state["ahead_strata"], np.int64)
@@ -192,10 +239,19 @@ class QuotaSampler:
         self.rng.bit_generator.state = state["rng"]
         if not self.replacement:
             self._cursor = np.array(state["cursor"], np.int64)
-            ends = np.cumsum(self.sizes)[:-1]
-            self._members = [part.copy() for part in np.split(np.array(state["order"]), ends)]
+            self._members = _parts(state["order"], self.sizes)
+            self._returned = _parts(state["returned"], state["returned_count"])
+
+
+def _parts(joined: NDArray[Any], counts: Ints) -> list[Ints]:
+    """Arrays of `counts` (S,) entries, one after the other in `joined`."""
+    ends = np.cumsum(counts)[:-1]
+    return [part.copy() for part in np.split(np.array(joined, np.int64), ends)]
 
 
 def uniform_sampler(rows: int, batch_size: int, rng: np.random.Generator) -> QuotaSampler:
     """Every row with the same probability: one stratum of all rows."""
     return QuotaSampler([np.arange(rows)], [1.0], batch_size, rng)
+
+
+__all__ = ["BLOCK", "QuotaSampler", "Quotas", "Sampler", "uniform_sampler"]

@@ -112,6 +112,61 @@ def test_a_restored_sampler_goes_on_exactly(replacement: bool) -> None:
         np.testing.assert_array_equal(strata, strata_again)
 
 
+@settings(max_examples=60, deadline=None)
+@given(
+    steps=st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5), st.integers(1, 40)), max_size=8),
+    replacement=st.booleans(),
+    seed=st.integers(0, 2**32),
+)
+def test_shares_and_batch_size_may_change_between_batches(
+    steps: list[tuple[int, int, int]], replacement: bool, seed: int
+) -> None:
+    rows = [np.arange(0, 30), np.arange(30, 41), np.arange(41, 60)]
+    sampler = QuotaSampler(
+        rows, [0.5, 0.3, 0.2], 16, np.random.default_rng(seed), replacement=replacement
+    )
+    counts, wanted, total = np.zeros(60), np.zeros(3), np.zeros(3)
+    for first, second, batch_size in steps:
+        shares = np.array([first, second, 1.0]) / (first + second + 1)
+        sampler.set_shares(shares)
+        sampler.set_batch_size(batch_size)
+        for _ in range(3):
+            drawn, stratum = sampler.draw()
+            quota = np.bincount(stratum, minlength=3)
+            assert quota.sum() == batch_size
+            assert (quota[shares == 0] == 0).all()
+            np.add.at(counts, drawn, 1)
+            total += quota
+            wanted += shares * batch_size
+            # A stratum whose share goes to 0 forfeits what it is owed: less than a row a change.
+            assert np.abs(total - wanted).max() < 3.0 + len(steps)
+        if not replacement:  # what was drawn ahead and given back is no turn
+            assert all(np.ptp(counts[members]) <= 1 for members in rows)
+
+
+@pytest.mark.parametrize("replacement", [True, False])
+def test_a_sampler_restored_after_a_change_of_shares_goes_on_exactly(replacement: bool) -> None:
+    def fresh(seed: int) -> QuotaSampler:
+        rows = [np.arange(37), np.arange(40, 51)]
+        return QuotaSampler(
+            rows, [0.83, 0.17], 16, np.random.default_rng(seed), replacement=replacement
+        )
+
+    first = fresh(1)
+    first.draw()
+    first.set_shares([1 / 3, 2 / 3])
+    first.set_batch_size(7)
+    second = fresh(2)
+    second.load_state_dict(first.state_dict())
+    assert second.batch_size == 7
+    for index in range(100):
+        if index == 50:
+            for sampler in (first, second):
+                sampler.set_shares([0.9, 0.1])
+        for one, other in zip(first.draw(), second.draw(), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
 def test_a_state_of_other_strata_is_refused() -> None:
     state = uniform_sampler(10, 4, np.random.default_rng(0)).state_dict()
     with pytest.raises(MixtureError, match="other strata"):

@@ -1,0 +1,115 @@
+"""Batches by quota between strata, and by priority within each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.errors import MixtureError
+from restock.replay.layout import F32, F64, Ints
+from restock.replay.priorities import Priorities, Rule
+from restock.replay.sampler import BLOCK, QuotaSampler
+
+FEW_ROWS = 100_000  # below, sums are refreshed more often: it costs little, and the rows come round
+FEW_ROWS_BLOCK = 8
+
+
+class PrioritySampler(QuotaSampler):
+    """Exact quotas per batch over strata, each stratum's rows in proportion to their priority.
+
+    Args:
+        rule: `Per()` or `Lap()`.
+        refresh_every: batches drawn from one state of the priorities; None: 64, or 8 below 100,000
+            rows. 1 draws every batch from the priorities as they are.
+
+    After each draw, `drawn_weights` (B,) are the importance weights of the distribution that the
+    batch was really drawn from, and `update` takes the |TD errors| of what was learnt.
+
+    Raises:
+        MixtureError: as `QuotaSampler`, or a row in two strata.
+    """
+
+    def __init__(
+        self,
+        stratum_rows: Sequence[NDArray[Any]],
+        shares: Sequence[float] | F64,
+        batch_size: int,
+        rng: np.random.Generator,
+        *,
+        rule: Rule,
+        refresh_every: int | None = None,
+        weights: F32 | None = None,
+    ) -> None:
+        super().__init__(stratum_rows, shares, batch_size, rng, weights=weights)
+        if refresh_every is None:
+            refresh_every = BLOCK if self.sizes.sum() >= FEW_ROWS else FEW_ROWS_BLOCK
+        if refresh_every < 1:
+            raise MixtureError(f"refresh_every must be at least 1, got {refresh_every}")
+        self.block = refresh_every
+        self.priorities = Priorities(stratum_rows, rule)
+        self._batches = 0  # handed out
+        self._ahead_weights: F32 | None = None
+
+    @property
+    def rule(self) -> Rule:
+        return self.priorities.rule
+
+    @property
+    def drawn_weights(self) -> F32 | None:
+        """Importance weights (B,) that the batch last drawn needs; None where the rule has none."""
+        return None if self._ahead_weights is None else self._ahead_weights[self._next - 1]
+
+    def draw(self) -> tuple[Ints, Ints]:
+        """Row numbers (B,) and the stratum of each (B,), strata in order."""
+        rows, strata = super().draw()
+        self._batches += 1
+        return rows, strata
+
+    def update(self, rows: Ints, td_abs: NDArray[Any]) -> None:
+        """|TD error| (n,) of rows (n,) just learnt from: their priorities from the next block on.
+
+        Raises:
+            MixtureError: a TD error that is not finite.
+        """
+        self.priorities.update(rows, td_abs)
+
+    def _take_all(self, counts: Ints, order: Ints) -> None:
+        rows, weights = self.priorities.draw(counts, self._batches, self.rng)
+        drawn = np.empty(len(order), np.int64)
+        drawn[order] = rows
+        self._ahead_rows = drawn.reshape(self.block, -1)
+        self._ahead_weights = None
+        if weights is not None:
+            dealt = np.empty(len(order), np.float32)
+            dealt[order] = weights
+            self._ahead_weights = dealt.reshape(self.block, -1)
+
+    def _hand_back(self) -> None:
+        super()._hand_back()
+        self._ahead_weights = None
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that decides the draws to come: arrays and JSON values."""
+        state = super().state_dict() | {
+            "batches": self._batches,
+            "priorities": self.priorities.state_dict(),
+        }
+        if self._ahead_weights is not None:
+            state["ahead_weights"] = self._ahead_weights[self._next :].copy()
+        return state
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Raises MixtureError when the state is of a sampler over other strata."""
+        if "priorities" not in state:
+            raise MixtureError(
+                "the saved sampler did not draw by priority",
+                remedy="resume with the panel and the settings the run began with",
+            )
+        super().load_state_dict(state)
+        self._batches = int(state["batches"])
+        self.priorities.load_state_dict(state["priorities"])
+        weights = state.get("ahead_weights")
+        self._ahead_weights = None if weights is None else np.array(weights, np.float32)
