@@ -29,6 +29,7 @@ from restock.replay.plan import Plan, plan_panel
 from restock.replay.scratch import Steps
 from restock.replay.seal import FileRecord, seal
 from restock.replay.store import Store
+from restock.replay.stores import PinnedStore, all_stores
 
 
 @dataclass(frozen=True)
@@ -40,28 +41,34 @@ class Source:
     version: int
     task_json: Callable[[str], str]  # task hash -> the task as JSON; "" where nothing is known
     conditions: tuple[Condition, ...]
+    others: tuple[PinnedStore, ...] = ()  # whose rows are in the view too
 
 
 @contextmanager
 def open_source(
     transitions: pa.Table | Store,
+    mixture: Mixture,
     *,
     task: Task | None = None,
     conditions: Sequence[Condition] | None = None,
+    folder: Path | None = None,
 ) -> Iterator[Source]:
     """A store, or a table with the columns of `ingest.schema`, as a source of a panel.
 
+    A store comes with the mixture's other stores, whose relative paths are looked up in `folder`.
     Without `conditions` a table's are the shipped ones that its labels name.
     """
     if isinstance(transitions, Store):
         found = transitions.conditions() if conditions is None else tuple(conditions)
-        yield Source(
-            transitions.connection,
-            str(transitions.path),
-            transitions.version,
-            transitions.task_json,
-            found,
-        )
+        with all_stores(transitions, mixture, folder) as stores:
+            yield Source(
+                stores.connection,
+                str(transitions.path),
+                transitions.version,
+                transitions.task_json,
+                found,
+                stores.others,
+            )
         return
     with duckdb.connect() as connection:
         connection.register("given", transitions)
@@ -108,8 +115,8 @@ def build_panel(
         ConfigError, MixtureError, StoreError: see `plan_panel`.
         PanelError: `out` is there already.
     """
-    with open_source(transitions, task=task, conditions=conditions) as source:
-        plan = plan_panel(source.connection, mixture, source.conditions)
+    with open_source(transitions, mixture, task=task, conditions=conditions) as source:
+        plan = plan_panel(source.connection, mixture, source.conditions, source.others)
         return write_panel(source, plan, out, force=force, advance=advance)
 
 
@@ -141,7 +148,7 @@ def write_panel(
         packer = Packer(source.connection, plan, steps, scratch)
         size = packer.write_rows(partial / ROWS, advance)
         packer.write_meta(partial / META, partial / HELD_OUT)
-        identity = panel_id(source.version, plan, packer.digest())
+        identity = panel_id(source, plan, packer.digest())
         shutil.rmtree(scratch)
         header = _header(source, plan, identity, task_json, size, partial)
         (partial / HEADER).write_bytes(seal(header))
@@ -222,9 +229,10 @@ def _chance(task_json: str) -> float:
     return 1.0 / len(msgspec.json.decode(task_json, type=Task).actions)
 
 
-def panel_id(source_version: int, plan: Plan, digest: str) -> str:
-    """What names a panel: store version, mixture, task, rows (by `digest`), code of the packing."""
-    named = [packing_code(), source_version, plan.mixture, plan.task_hash, digest]
+def panel_id(source: Source, plan: Plan, digest: str) -> str:
+    """What names a panel: store versions, mixture, task, rows (by `digest`), packing code."""
+    versions = [source.version, *(store.version for store in source.others)]
+    named = [packing_code(), versions, plan.mixture, plan.task_hash, digest]
     return hashlib.blake2b(msgspec.json.encode(named), digest_size=8).hexdigest()
 
 
@@ -261,5 +269,7 @@ def _header(
             for line in plan.strata
         ],
         mixture=plan.mixture,
+        others=list(plan.others),
+        ratios=list(plan.ratios),
         files={name: FileRecord.of(partial / name) for name in (ROWS, META, HELD_OUT)},
     )

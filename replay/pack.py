@@ -29,6 +29,7 @@ from restock.replay.scratch import BATCH_ROWS, ORDER, STRETCH, Steps
 from restock.replay.strata import NO_STRATUM
 
 ROW_GROUP_ROWS = 65_536
+BATCH_BYTES = 4 << 20  # of observations, in memory at a time
 FINITE = (
     'where = "isfinite(list_sum(observation::FLOAT[]) + list_sum(next_observation::FLOAT[])'
     ' + reward)"'
@@ -116,7 +117,7 @@ class Packer:
         # Rows may come as the threads that read them finish: each knows where it belongs.
         self.connection.execute("SET preserve_insertion_order = false")
         try:
-            for batch in self.connection.sql(query).to_arrow_reader(BATCH_ROWS):
+            for batch in self.connection.sql(query).to_arrow_reader(BATCH_BYTES // (8 * size)):
                 place = places.of(batch.column("transition_id").to_numpy())
                 filled += self._write(rows, size, batch, place)
                 advance(len(batch))
@@ -150,9 +151,7 @@ class Packer:
         first, behind = (np.searchsorted(self.last, place, side) for side in ("left", "right"))
         source = np.repeat(np.arange(len(place)), behind - first)
         ends = np.arange(len(source)) + np.repeat(first - _starts(behind - first), behind - first)
-        rows[ends, part["next_observation"]] = _matrix(batch.column("next_observation"), size)[
-            source
-        ]
+        rows[ends, part["next_observation"]] = following[source]
         going_on = ~np.asarray(batch.column("terminated").to_numpy(zero_copy_only=False), np.bool_)
         spanned = self.last[ends] - self.chosen[ends] + 1
         rows[ends, part["discount"]] = (self.mixture.discount**spanned * going_on[source])[:, None]
@@ -193,7 +192,10 @@ class Packer:
                     "stratum_code": pa.array(code),
                     "horizon": pa.array((self.last[mine] - self.chosen[mine] + 1).astype(np.int16)),
                     "weight": pa.array(self.plan.weight[mine]),
+                    **{name: pa.array(v[mine]) for name, v in self.plan.beside.items()},
                 }
+                for name, column in self.plan.beside.items():
+                    beside[name] = pa.array(column[mine])
                 if to_go is not None:
                     beside["return_to_go"] = pa.array(to_go[0][begin:end][rows])
                     beside["return_to_go_whole"] = pa.array(to_go[1][begin:end][rows])

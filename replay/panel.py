@@ -21,10 +21,12 @@ from numpy.typing import NDArray
 
 from restock.errors import PanelError
 from restock.ingest.task import Task
+from restock.replay.density_ratio import RatioFit
 from restock.replay.layout import F32, PACKING_VERSION, Ints, row_columns, row_width
 from restock.replay.mixture import Mixture
 from restock.replay.sampler import QuotaSampler
 from restock.replay.seal import AGAIN, FileRecord, unseal
+from restock.replay.stores import PinnedStore
 
 HEADER, ROWS, META, HELD_OUT = "panel.json", "rows.f32", "meta.parquet", "held_out.parquet"
 
@@ -33,8 +35,10 @@ class Stratum(msgspec.Struct, frozen=True):
     """A stratum of a panel: what it wanted, what it got, what its rows must bear."""
 
     name: str
+    source: str  # logs, or the name of another store
     timing: str
     correction: str
+    within: str
     rows: int
     episodes: int
     natural_share: float
@@ -42,6 +46,7 @@ class Stratum(msgspec.Struct, frozen=True):
     share: float  # of the logs' part of a batch; shares of a panel sum to 1
     replays_per_row: float  # expected over the mixture's planned updates
     effective_episodes: float
+    effective_rows: float  # rows drawn equally often that its weighted draw is worth
     largest_weight: float
     effective_share: float  # after weights
     note: str
@@ -70,6 +75,8 @@ class Header(msgspec.Struct, frozen=True):
     effective_rows: float  # rows drawn equally often that the weighted draw is worth
     strata: list[Stratum]
     mixture: Mixture
+    others: list[PinnedStore]  # stores besides the first
+    ratios: list[RatioFit]  # how well density ratios were estimated, where a correction uses them
     files: dict[str, FileRecord]
 
 

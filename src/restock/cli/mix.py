@@ -50,8 +50,12 @@ class Mix:
         if self.out is None and not self.dry_run:
             raise MixtureError("no --out given", remedy="say where the panel goes, or --dry-run")
         mixture = load_mixture(self.mixture)
-        with Store(self.store, version=self.version) as store, open_source(store) as source:
-            plan = plan_panel(source.connection, mixture, source.conditions)
+        folder = Path(self.mixture).parent
+        with (
+            Store(self.store, version=self.version) as store,
+            open_source(store, mixture, folder=folder) as source,
+        ):
+            plan = plan_panel(source.connection, mixture, source.conditions, source.others)
             document = describe(plan) | {"store_version": store.version, "mixture": self.mixture}
             if self.out is not None and not self.dry_run:
                 with output.progress("packing", len(plan.rows)) as advance:
