@@ -29,7 +29,7 @@ from restock.replay.plan import Plan, plan_panel
 from restock.replay.scratch import Steps
 from restock.replay.seal import FileRecord, seal
 from restock.replay.store import Store
-from restock.replay.stores import PinnedStore, all_stores
+from restock.replay.stores import AllStores, PinnedStore, all_stores
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Source:
 @contextmanager
 def open_source(
     transitions: pa.Table | Store,
-    mixture: Mixture,
+    mixture: Mixture | None = None,
     *,
     task: Task | None = None,
     conditions: Sequence[Condition] | None = None,
@@ -55,12 +55,15 @@ def open_source(
 ) -> Iterator[Source]:
     """A store, or a table with the columns of `ingest.schema`, as a source of a panel.
 
-    A store comes with the mixture's other stores, whose relative paths are looked up in `folder`.
+    A store comes with the other stores of `mixture`, whose relative paths begin at `folder`.
     Without `conditions` a table's are the shipped ones that its labels name.
     """
     if isinstance(transitions, Store):
         found = transitions.conditions() if conditions is None else tuple(conditions)
-        with all_stores(transitions, mixture, folder) as stores:
+        with contextlib.ExitStack() as opened:
+            stores = AllStores(transitions.connection, ())
+            if mixture is not None:
+                stores = opened.enter_context(all_stores(transitions, mixture, folder))
             yield Source(
                 stores.connection,
                 str(transitions.path),
