@@ -6,6 +6,7 @@ visible in `restock mix --dry-run`. `docs/mixture.md` explains each key.
 
 from __future__ import annotations
 
+import itertools
 from importlib.resources import files
 from pathlib import Path
 from typing import Literal
@@ -13,10 +14,12 @@ from typing import Literal
 import msgspec
 
 from restock.errors import ConfigError
+from restock.replay.schedules import Portion, Schedule, knots, value_at
 
 Timing = Literal["pre", "post"]
-Share = float | Literal["natural", "equal"]
-Correction = Literal["none", "beta", "full", "clipped"]
+Share = float | Literal["natural", "equal"] | Schedule
+Correction = Literal["none", "beta", "full", "clipped", "density_ratio"]
+Within = Literal["uniform", "without_replacement", "per", "lap"]
 
 
 def _check(ok: bool, message: str) -> None:
@@ -24,22 +27,68 @@ def _check(ok: bool, message: str) -> None:
         raise ValueError(message)
 
 
-class Sources(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Shares of a batch by source; they sum to 1."""
+class OtherStore(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One more store that batches are drawn from, with the same strata and shares of its own."""
 
-    logs: float = 0.5
-    fresh: float = 0.5
+    name: str  # its strata are called `name/stratum`
+    path: str  # as it is, or from the folder of the mixture's file
+    share: Portion  # of a batch
+    version: int | None = None  # of the store; the newest, which the panel then pins
 
     def __post_init__(self) -> None:
-        _check(self.logs > 0 and self.fresh >= 0, "sources: logs must be above 0, fresh at least 0")
+        _check(bool(self.name) and "/" not in self.name, f"no name for a store: {self.name!r}")
+        _check(self.name not in ("logs", "fresh"), f"a store cannot be called {self.name!r}: taken")
+        _check_portion(f"the store {self.name!r}", self.share)
+
+
+class Sources(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Shares of an online batch by source, numbers or schedules; what is left is fresh."""
+
+    logs: Portion = 0.5
+    fresh: float | None = None  # default: what logs and stores leave, at every step
+    stores: tuple[OtherStore, ...] = ()
+
+    def __post_init__(self) -> None:
+        portions = [self.logs, *(store.share for store in self.stores)]
+        _check_portion("logs", self.logs)
+        names = [store.name for store in self.stores]
+        _check(len(set(names)) == len(names), f"stores named twice: {sorted(names)}")
+        if self.fresh is not None:
+            fixed = [portion for portion in portions if isinstance(portion, int | float)]
+            _check(
+                len(fixed) == len(portions),
+                "sources: leave `fresh` out beside a schedule: it gets what is left",
+            )
+            total = sum(fixed) + self.fresh
+            _check(
+                self.fresh >= 0 and abs(total - 1) < 1e-6,
+                f"sources must sum to 1, got {total:g}",
+            )
+        bends = sorted({0, *(step for portion in portions for step in knots(portion))})
+        # Between two bends a cosine can lie above the line that joins them.
+        fine = [a + (b - a) * i / 16 for a, b in itertools.pairwise(bends) for i in range(16)]
+        totals = [
+            sum(value_at(portion, step) for portion in portions) for step in [*fine, bends[-1]]
+        ]
+        _check(max(totals) <= 1 + 1e-6, f"sources sum to {max(totals):g} at some step, above 1")
         _check(
-            abs(self.logs + self.fresh - 1) < 1e-6,
-            f"sources must sum to 1, got {self.logs + self.fresh:g}",
+            value_at(self.logs, 0) > 0,
+            "sources.logs must be above 0 at step 0: the offline phase draws from it",
         )
+
+    @property
+    def parts(self) -> dict[str, Portion]:
+        """The share of a batch of each source that is not fresh."""
+        return {"logs": self.logs, **{store.name: store.share for store in self.stores}}
+
+    @property
+    def last_bend(self) -> int:
+        """The environment step at which the last schedule ends, 0 without one."""
+        return max((step for part in self.parts.values() for step in knots(part)), default=0)
 
 
 class PlannedUse(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How much will be drawn: what `max_replays_per_row` is worked out from."""
+    """How much will be drawn, as far as `restock mix` can know; a run puts its own in its place."""
 
     updates: int = 20_000
     batch_size: int = 128
@@ -58,17 +107,57 @@ class HeldOut(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         _check(0 <= self.share < 1, f"held_out.share must be in [0, 1), got {self.share:g}")
 
 
+class Safety(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Rows that nobody is to learn from."""
+
+    unsafe: str  # SQL predicate over `transitions`
+    leave_out: Literal["rows", "episodes"] = "rows"  # those alone, or all of their episode
+
+
 class CorrectionRule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Importance weights against the boost of strata, by what their condition may look at."""
 
     pre: Correction = "none"  # chosen on the state: the fixed point stays where it is
     post: Correction = "full"  # chosen on the outcome: uncorrected, Q is biased
     beta: float = 0.5  # exponent of the weights where the rule is "beta"
-    clip: float = 4.0  # largest weight, and smallest inverse, where the rule is "clipped"
+    clip: float = 4.0  # largest weight of "clipped" (and smallest inverse) and "density_ratio"
 
     def __post_init__(self) -> None:
         _check(0 <= self.beta <= 1, f"correction.beta must be in [0, 1], got {self.beta:g}")
         _check(self.clip >= 1, f"correction.clip must be at least 1, got {self.clip:g}")
+
+
+class Prioritised(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The numbers of `within = "per"` (arXiv:1511.05952) and `"lap"` (arXiv:2007.06049)."""
+
+    per_alpha: float = 0.6  # exponent of |TD|
+    per_beta: float = 0.4  # exponent of the importance weights
+    per_epsilon: float = 1e-3  # added to |TD|
+    lap_alpha: float = 0.4  # exponent of max(|TD|, 1)
+
+    def __post_init__(self) -> None:
+        for name in ("per_alpha", "per_beta", "lap_alpha"):
+            value = getattr(self, name)
+            _check(0 <= value <= 1, f"prioritised.{name} must be in [0, 1], got {value:g}")
+        _check(self.per_epsilon > 0, "prioritised.per_epsilon must be above 0")
+
+
+class Adaptive(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Shares that follow the TD error: group DRO (arXiv:1911.08731) over the strata of the logs."""
+
+    step_size: float = 0.05  # of the exponent, a step; |TD| is taken in units of its mean
+    floor: float = 0.01  # the least share of a stratum that has rows
+    ceiling: float = 0.6  # the largest
+    every_updates: int = 100  # one step
+    after_updates: int = 1_000  # none before: first errors say more of the network than of rows
+
+    def __post_init__(self) -> None:
+        _check(self.step_size > 0, f"adaptive.step_size must be above 0, got {self.step_size:g}")
+        _check(0 <= self.floor < self.ceiling <= 1, "adaptive needs 0 <= floor < ceiling <= 1")
+        _check(
+            self.every_updates >= 1 and self.after_updates >= 0,
+            "adaptive.every_updates must be at least 1, after_updates at least 0",
+        )
 
 
 class StratumRule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -76,14 +165,17 @@ class StratumRule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     name: str  # a condition's name or "nominal", unless `where` says otherwise
     where: str | None = None  # SQL predicate over `transitions`
-    share: Share = "natural"  # of the logs' part of a batch
+    share: Share = "natural"  # of its source's part of a batch
     floor: float = 0.0
     cap: float = 1.0
     priority: int | None = None  # default: the condition's; `where` strata 50; nominal 1000
     timing: Timing | None = None  # default: the condition's; "post" for a `where` stratum
     correction: Correction | None = None  # default: the mixture's rule for its timing
+    within: Within | None = None  # default: the mixture's
     min_rows: int = 1
     min_episodes: int = 1
+    max_rows_per_episode: int | None = None  # default: the mixture's
+    max_rows_per_recording: int | None = None  # default: the mixture's
 
     def __post_init__(self) -> None:
         _check_share(self.name, self.share, self.floor, self.cap)
@@ -92,19 +184,27 @@ class StratumRule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class EachCondition(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A stratum for every condition of the store (and nominal) that `strata` does not name."""
 
-    share: Share = "natural"
+    share: Literal["natural", "equal"] = "natural"
     floor: float = 0.0
     cap: float = 1.0
     correction: Correction | None = None
+    within: Within | None = None
     min_rows: int = 1
     min_episodes: int = 1
+    max_rows_per_episode: int | None = None
+    max_rows_per_recording: int | None = None
 
     def __post_init__(self) -> None:
         _check_share("each_condition", self.share, self.floor, self.cap)
 
 
+def _check_portion(name: str, share: Portion) -> None:
+    if isinstance(share, int | float):
+        _check(0 <= share <= 1, f"share of {name} must be in [0, 1], got {share:g}")
+
+
 def _check_share(name: str, share: Share, floor: float, cap: float) -> None:
-    if not isinstance(share, str):
+    if isinstance(share, int | float):
         _check(0 <= share <= 1, f"share of {name!r} must be in [0, 1], got {share:g}")
     _check(0 <= floor <= cap <= 1, f"{name!r} needs 0 <= floor <= cap <= 1")
 
@@ -114,30 +214,58 @@ class Mixture(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     doc: str = ""
     seed: int = 0
+    # How rows are packed.
     discount: float = 0.97  # gamma of one step
-    n_step: int = 1  # steps of a log row's return, cut at episode ends and handovers
+    n_step: int = 1  # steps of a log row's return, cut at episode ends
+    cut_at_off_policy: bool = True  # and where the behaviour policy or its version changes
+    return_to_go: bool = False  # pack each row's discounted return to the end of its episode
+    sampling: Literal["memory", "chunked"] = "memory"  # chunked: for panels larger than memory
+    held_out: HeldOut = HeldOut()
+    # Which rows may be drawn.
+    where: str | None = None  # SQL predicate: only these transitions
+    safety: Safety | None = None
+    max_age_days: float | None = None  # against the newest transition of the store
+    max_versions_behind: int | None = None  # of its behaviour policy's newest; 0: only that one
+    max_age_env_steps: int | None = None  # of fresh rows
+    max_rows_per_episode: int | None = None  # of one stratum
+    max_rows_per_recording: int | None = None
+    unlabelled: Literal["refuse", "drop", "nominal"] = "refuse"  # rows without a condition
+    unlisted: Literal["refuse", "drop"] = "refuse"  # rows that belong to no stratum
+    # In which shares.
     sources: Sources = Sources()
     planned: PlannedUse = PlannedUse()
-    where: str | None = None  # SQL predicate: only these transitions
-    max_age_days: float | None = None  # against the newest transition of the store
     strata: tuple[StratumRule, ...] = ()
     each_condition: EachCondition | None = None
-    unlisted: Literal["refuse", "drop"] = "refuse"  # rows that belong to no stratum
-    max_replays_per_row: float | None = None  # expected, over the planned updates
+    max_replays_per_row: float | None = None  # a run's learner holds it
     shortfall: Literal["refuse", "redistribute", "shrink"] = "redistribute"
+    adaptive: Adaptive | None = None
+    # And how, within a stratum.
+    within: Within = "without_replacement"
+    prioritised: Prioritised = Prioritised()
     correction: CorrectionRule = CorrectionRule()
-    held_out: HeldOut = HeldOut()
 
     def __post_init__(self) -> None:
         _check(0 <= self.discount <= 1, f"discount must be in [0, 1], got {self.discount:g}")
         _check(self.n_step >= 1, f"n_step must be at least 1, got {self.n_step}")
+        for name in ("max_age_days", "max_versions_behind", "max_age_env_steps"):
+            value = getattr(self, name)
+            _check(value is None or value >= 0, f"{name} must be at least 0, got {value}")
+        for rule in (self, self.each_condition, *self.strata):
+            for name in ("max_rows_per_episode", "max_rows_per_recording"):
+                value = getattr(rule, name, None)
+                _check(value is None or value >= 1, f"{name} must be at least 1, got {value}")
+        _check(
+            self.max_replays_per_row is None or self.max_replays_per_row >= 1,
+            f"max_replays_per_row must be at least 1, got {self.max_replays_per_row}",
+        )
         _check(
             bool(self.strata) or self.each_condition is not None,
             "no strata: list some under [[strata]], or give [each_condition]",
         )
         names = [rule.name for rule in self.strata]
         _check(len(set(names)) == len(names), f"strata named twice: {sorted(names)}")
-        given = sum(rule.share for rule in self.strata if not isinstance(rule.share, str))
+        _check(not any("/" in name for name in names), "a stratum's name cannot hold a /")
+        given = sum(rule.share for rule in self.strata if isinstance(rule.share, int | float))
         _check(given <= 1 + 1e-6, f"shares of strata sum to {given:g}, above 1")
 
 

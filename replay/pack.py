@@ -194,8 +194,6 @@ class Packer:
                     "weight": pa.array(self.plan.weight[mine]),
                     **{name: pa.array(v[mine]) for name, v in self.plan.beside.items()},
                 }
-                for name, column in self.plan.beside.items():
-                    beside[name] = pa.array(column[mine])
                 if to_go is not None:
                     beside["return_to_go"] = pa.array(to_go[0][begin:end][rows])
                     beside["return_to_go_whole"] = pa.array(to_go[1][begin:end][rows])

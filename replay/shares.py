@@ -10,6 +10,7 @@ import numpy as np
 from restock.errors import MixtureError
 from restock.replay.layout import F64, Bools, Ints
 from restock.replay.mixture import Mixture, Share, StratumRule
+from restock.replay.schedules import value_at
 
 
 @dataclass(frozen=True)
@@ -24,15 +25,39 @@ class SharePlan:
 
 
 def plan_shares(
-    mixture: Mixture, rules: Sequence[StratumRule], rows: Ints, episodes: Ints
+    mixture: Mixture,
+    rules: Sequence[StratumRule],
+    rows: Ints,
+    episodes: Ints,
+    *,
+    draws: float,
+    env_steps: float = 0,
 ) -> SharePlan:
     """Shares from the mixture's rules and how many rows (S,) and episodes (S,) there are.
+
+    `draws` is how many rows will be drawn in all, `env_steps` when, for shares with a schedule.
 
     Raises:
         MixtureError: shares that cannot sum to 1, or a shortfall where the mixture refuses one.
     """
-    wanted = wanted_shares(rules, rows)
-    limit = _limits(mixture, rules, rows, episodes)
+    wanted = wanted_shares(rules, rows, env_steps)
+    limit = row_limits(mixture, rules, rows, episodes, draws)
+    return within_limits(mixture, rules, rows, episodes, wanted, limit)
+
+
+def within_limits(
+    mixture: Mixture,
+    rules: Sequence[StratumRule],
+    rows: Ints,
+    episodes: Ints,
+    wanted: F64,
+    limit: F64,
+) -> SharePlan:
+    """What becomes of wanted shares (S,) where rows can bear no more than `limit` (S,).
+
+    Raises:
+        MixtureError: a shortfall where the mixture refuses one, or no rows at all.
+    """
     granted = np.minimum(wanted, limit)
     missing = 1.0 - granted.sum()
     short = wanted > limit + 1e-12
@@ -65,9 +90,15 @@ def plan_shares(
     )
 
 
-def wanted_shares(rules: Sequence[StratumRule], rows: Ints) -> F64:
-    """Given shares as they are; the rest to "equal" and "natural" strata, within floor and cap."""
-    given = np.array([0.0 if isinstance(rule.share, str) else rule.share for rule in rules])
+def wanted_shares(rules: Sequence[StratumRule], rows: Ints, env_steps: float = 0) -> F64:
+    """Given shares as they are; the rest to "equal" and "natural" strata, within floor and cap.
+
+    Raises:
+        MixtureError: shares that cannot sum to 1 within their floors and caps.
+    """
+    given = np.array(
+        [0.0 if isinstance(rule.share, str) else value_at(rule.share, env_steps) for rule in rules]
+    )
     flexible = np.array([isinstance(rule.share, str) for rule in rules], np.bool_)
     rest = 1.0 - float(given.sum())
     if rest < -1e-6 or (rest > 1e-6 and not flexible.any()):
@@ -127,11 +158,16 @@ def scaled_within(base: F64, low: F64, high: F64) -> F64:
     return np.asarray(shares / shares.sum(), np.float64)
 
 
-def _limits(mixture: Mixture, rules: Sequence[StratumRule], rows: Ints, episodes: Ints) -> F64:
-    """The largest share each stratum's rows can bear, (S,)."""
+def row_limits(
+    mixture: Mixture,
+    rules: Sequence[StratumRule],
+    rows: Ints,
+    episodes: Ints,
+    draws: float,
+) -> F64:
+    """The largest share of `draws` each stratum's rows can bear, (S,)."""
     limit = np.where(rows > 0, 1.0, 0.0)
-    if mixture.max_replays_per_row is not None:
-        draws = mixture.planned.updates * mixture.planned.batch_size * mixture.sources.logs
+    if mixture.max_replays_per_row is not None and draws > 0:
         limit = np.minimum(limit, mixture.max_replays_per_row * rows / draws)
     for index, rule in enumerate(rules):
         if rows[index] < rule.min_rows or episodes[index] < rule.min_episodes:

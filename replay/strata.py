@@ -11,8 +11,16 @@ from numpy.typing import NDArray
 
 from restock.errors import ConfigError
 from restock.ingest.conditions import NOMINAL, Condition
+from restock.replay.density_ratio import density_ratio
 from restock.replay.layout import F32, F64, Bools
-from restock.replay.mixture import Correction, CorrectionRule, EachCondition, Mixture, StratumRule
+from restock.replay.mixture import (
+    Correction,
+    CorrectionRule,
+    EachCondition,
+    Mixture,
+    StratumRule,
+    Within,
+)
 
 NO_STRATUM = -1
 NOMINAL_PRIORITY = 1000
@@ -28,6 +36,7 @@ class Stratum:
     priority: int
     timing: Literal["pre", "post"]
     correction: Correction
+    within: Within = "without_replacement"
 
     @property
     def name(self) -> str:
@@ -46,7 +55,14 @@ def resolve_strata(mixture: Mixture, conditions: Sequence[Condition]) -> list[St
         listed = {rule.name for rule in rules}
         names = [NOMINAL, *(c.name for c in sorted(conditions, key=lambda c: (c.priority, c.name)))]
         rules += [_rule_for(name, mixture.each_condition) for name in names if name not in listed]
-    return [_resolve(rule, known, mixture.correction) for rule in rules]
+    return [_resolve(rule, known, mixture) for rule in rules]
+
+
+def rules_of(mixture: Mixture, names: Sequence[str]) -> list[StratumRule]:
+    """The rules of strata by their names, listed ones and those of `each_condition`."""
+    listed = {rule.name: rule for rule in mixture.strata}
+    each = mixture.each_condition or EachCondition()
+    return [listed.get(name) or _rule_for(name, each) for name in names]
 
 
 def _rule_for(name: str, each: EachCondition) -> StratumRule:
@@ -56,12 +72,15 @@ def _rule_for(name: str, each: EachCondition) -> StratumRule:
         floor=each.floor,
         cap=each.cap,
         correction=each.correction,
+        within=each.within,
         min_rows=each.min_rows,
         min_episodes=each.min_episodes,
+        max_rows_per_episode=each.max_rows_per_episode,
+        max_rows_per_recording=each.max_rows_per_recording,
     )
 
 
-def _resolve(rule: StratumRule, known: dict[str, Condition], correct: CorrectionRule) -> Stratum:
+def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -> Stratum:
     timing: Literal["pre", "post"]
     if rule.where is not None:
         predicate, priority, timing = rule.where, WHERE_PRIORITY, "post"
@@ -78,13 +97,14 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], correct: Correction
             remedy=f"the store knows {', '.join([NOMINAL, *sorted(known)])}",
         )
     timing = rule.timing or timing
-    default = correct.pre if timing == "pre" else correct.post
+    default = mixture.correction.pre if timing == "pre" else mixture.correction.post
     return Stratum(
         rule,
         predicate,
         priority if rule.priority is None else rule.priority,
         timing,
         rule.correction or default,
+        rule.within or mixture.within,
     )
 
 
@@ -110,14 +130,19 @@ def importance_weights(
     strata: Sequence[Stratum],
     shares: F64,
     rule: CorrectionRule,
+    outcome: F32 | None = None,
 ) -> F32:
-    """Weights (N,) of the rows of a panel, of mean 1 over what the quotas draw.
+    """Weights (N,) of the rows of one source, of mean 1 over what the quotas draw.
 
-    `code` (N,) is each row's stratum (never -1), `state_code` (N,) the one its state alone gives.
+    `code` (N,) is each row's stratum (never -1), `state_code` (N,) the one its state alone gives,
+    `outcome` (N, S) the probability of each "density_ratio" stratum given a row's state and action
+    (0 for the other strata), see `replay.density_ratio`.
+
     A stratum is drawn f = share * N / rows times as often as it occurs. A row chosen on its
     outcome is weighted back to the density of the rows of the same state whose outcome was
     another, which keeps P(s'|s, a) what it was; a row chosen on its state, where that is asked
-    for, to its natural density.
+    for, to its natural density. With `outcome`, all rows of a state and action are then weighted by
+    how much oftener the quotas draw that state and action than they occur, whatever came of it.
     """
     rows = np.bincount(code, minlength=len(strata))
     boost = np.divide(shares * len(code), rows, out=np.ones(len(strata)), where=rows > 0)
@@ -132,10 +157,13 @@ def importance_weights(
     weight[change] = aim_of_row[change] / boost[code[change]]
     for index, stratum in enumerate(strata):
         mine = code == index
+        by_ratio = stratum.correction == "density_ratio" and stratum.timing == "pre"
         if stratum.correction == "beta":
             weight[mine] **= rule.beta
-        elif stratum.correction == "clipped":
+        elif stratum.correction == "clipped" or by_ratio:
             weight[mine] = np.clip(weight[mine], 1 / rule.clip, rule.clip)
+    if outcome is not None:
+        weight *= density_ratio(outcome, boost, state_aim, rule.clip)
     drawn = boost[code] / len(code)
     return np.asarray(weight / (drawn * weight).sum(), np.float32)
 
