@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 from typing import Literal
 
 import numpy as np
@@ -80,19 +81,21 @@ def worst(verdicts: Sequence[Verdict]) -> Verdict:
 def check_feeds(first: Feed, second: Feed, limits: Limits, rng: np.random.Generator) -> list[Check]:
     """All checks of the gate. Both feeds must name the same cells in the same order."""
     checks = []
-    for after_weights in (False, True):
-        name = "mix after weights" if after_weights else "mix"
+    totals = [_resampled(feed, limits, rng) for feed in (first, second)]
+    # Without importance weights the mix after weights is the mix.
+    weighted = any(not np.array_equal(feed.drawn, feed.weight) for feed in (first, second))
+    for kind, name in enumerate(("mix", "mix after weights")[: 1 + weighted]):
         for tenth in (None, *range(10)):
             limit = limits.distance if tenth is None else limits.tenth_distance
-            mixes = [
-                _resampled(feed, tenth, after_weights, limits, rng) for feed in (first, second)
-            ]
             part = "whole run" if tenth is None else f"tenth {tenth + 1}"
-            if any(mix is None for mix in mixes):
-                if any(mix is not None for mix in mixes):  # one arm was not fed at all then
+            cells = slice(None) if tenth is None else slice(tenth, tenth + 1)
+            a, b = (total[:, kind, cells].sum(1) for total in totals)
+            fed = a[0].sum() > 0, b[0].sum() > 0
+            if not all(fed):
+                if any(fed):  # one arm was not fed at all then
                     checks.append(Check(name, part, None, None, 1.0, 1.0, 1.0, limit))
                 continue
-            a, b = (mix for mix in mixes if mix is not None)
+            a, b = a / a.sum(1, keepdims=True), b / b.sum(1, keepdims=True)
             checks.append(_distance(name, part, a, b, limit, limits))
             if tenth is None:
                 checks += _ratios(first.cells, name, a, b, limits)
@@ -175,44 +178,49 @@ def _interval(values: F64, limits: Limits) -> tuple[float, float, float, float]:
     widened for their number (Bonferroni), or noise would make one of thirty now and then.
     """
     tail = (1 - limits.confidence) / 2
-    at = [tail, 1 - tail, tail / _CHECKS, 1 - tail / _CHECKS]
     # By order, not interpolated: between two infinite ratios there is nothing to interpolate.
-    low, high, lowest, highest = np.quantile(values, at, method="nearest")
-    return float(low), float(high), float(lowest), float(highest)
+    low, high = np.quantile(values, [tail, 1 - tail], method="nearest")
+    if not np.isfinite(values).all():
+        return float(low), float(high), float(values.min()), float(values.max())
+    # So far out there are no resamples to count: the normal's tail.
+    centre, spread = float(values.mean()), float(values.std())
+    reach = NormalDist().inv_cdf(1 - tail / _CHECKS) * spread
+    return float(low), float(high), centre - reach, centre + reach
 
 
-def _resampled(
-    feed: Feed, tenth: int | None, after_weights: bool, limits: Limits, rng: np.random.Generator
-) -> F64 | None:
-    """Shares of the cells, (1 + R, C): as they were, then with the fresh episodes resampled.
+def _resampled(feed: Feed, limits: Limits, rng: np.random.Generator) -> F64:
+    """Draws, then weights, by tenth and cell, (1 + R, 2, 10, C): as they were, then resampled.
 
-    None when nothing was drawn in that tenth.
+    An episode is resampled as a whole: in all tenths and cells that it was drawn in.
     """
-    chosen = slice(None) if tenth is None else feed.tenth == tenth
-    amount = (feed.weight if after_weights else feed.drawn)[chosen]
-    cell, episode = feed.cell[chosen], feed.episode[chosen]
-    size = len(feed.cells)
-    total = np.bincount(cell, amount, size)
-    if total.sum() <= 0:
-        return None
+    from scipy.sparse import csr_array
+
+    cells = len(feed.cells)
+    place = feed.tenth * cells + feed.cell
+    amounts = (feed.drawn, feed.weight)
+    counts = [np.bincount(place, a, 10 * cells).astype(np.float64) for a in amounts]
+    total = np.stack(counts).reshape(2, 10, cells)
+    sums: F64 = np.repeat(total[None], 1 + limits.resamples, axis=0)
     by_chance = np.array([name.startswith("fresh/") for name in feed.cells])
-    fresh = by_chance[cell]
-    shares = np.repeat(total[None], 1 + limits.resamples, axis=0)
-    if fresh.any():
-        _, place = np.unique(episode[fresh], return_inverse=True)
-        episodes = int(place.max()) + 1
-        matrix = np.bincount(place * size + cell[fresh], amount[fresh], episodes * size)
-        matrix = matrix.reshape(episodes, size)
-        resampled = np.empty((limits.resamples, size))
-        for start in range(0, limits.resamples, 100):
-            stop = min(start + 100, limits.resamples)
-            # Poisson times each: the multinomial's, but for the total, which shares do not have.
-            times = rng.poisson(1.0, (stop - start, episodes)).astype(np.float64)
-            resampled[start:stop] = times @ matrix
-        # The source's share of the batch is a setting, no chance: it is kept.
-        scale = total[by_chance].sum() / np.maximum(resampled[:, by_chance].sum(1), 1e-12)
-        shares[1:, by_chance] = resampled[:, by_chance] * scale[:, None]
-    return np.asarray(shares / shares.sum(1, keepdims=True), np.float64)
+    fresh = by_chance[feed.cell]
+    if not fresh.any():
+        return sums
+    _, episode = np.unique(feed.episode[fresh], return_inverse=True)
+    episodes = int(episode.max()) + 1
+    matrices = [
+        csr_array((a[fresh], (episode, place[fresh])), (episodes, 10 * cells)) for a in amounts
+    ]
+    for start in range(0, limits.resamples, 100):
+        stop = min(start + 100, limits.resamples)
+        # Poisson times each: the multinomial's, but for the total, which shares do not have.
+        times = rng.poisson(1.0, (stop - start, episodes)).astype(np.float64)
+        for kind, matrix in enumerate(matrices):
+            drawn = (times @ matrix).reshape(-1, 10, cells)
+            # The source's share of the batch is a setting, no chance: it is kept.
+            was, now = total[kind][:, by_chance].sum(-1), drawn[..., by_chance].sum(-1)
+            drawn *= (was / np.maximum(now, 1e-12))[..., None]
+            sums[1 + start : 1 + stop, kind][..., by_chance] = drawn[..., by_chance]
+    return sums
 
 
 __all__ = ["Check", "Feed", "Limits", "Verdict", "check_feeds", "worst"]

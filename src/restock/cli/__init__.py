@@ -24,8 +24,10 @@ VERBS = {
     "sql": "any question to a store (or a run), in SQL",
     "audit": "is the coverage good enough? exit 1 if not",
     "mix": "a pinned replay panel with quotas per stratum",
+    "export": "transitions as a data set for Minari, d3rlpy, LeRobot, Parquet or NumPy",
     "train": "offline warm-up on the panel, then online in the twin",
     "eval": "success per condition, clean and perturbed",
+    "compare": "refuses if the two were fed differently; else who did better, by how much",
     "report": "one HTML page with all of it",
     "demo": "all of the above, on sample_logs/",
 }

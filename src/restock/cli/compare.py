@@ -1,0 +1,135 @@
+"""`restock compare`: were two runs fed the same, and if so, which one did better?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+if TYPE_CHECKING:
+    from restock.train.compare import Comparison
+
+
+@dataclass
+class Compare:
+    """Compare two methods, unless their critics were fed differently: then it is refused, exit 1.
+
+    Name the treatment: the one thing that may differ. Under `algorithm` (network, loss, optimizer)
+    and `target` (the target rule) the arms must have been fed the same rows in the same mix,
+    which an equivalence test over episodes decides, and been evaluated alike. Under `mixture` the
+    feed is what is compared, and the store, the algorithm, the target rule, the evaluation and
+    the numbers of steps and updates must be the same.
+
+    Several seeds an arm show more: `restock compare runs/a1 runs/a2 --against runs/b1 runs/b2`
+
+    Example: `restock compare runs/uniform runs/quotas --treatment mixture`
+    """
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Two runs; or, with --against, all runs (seeds) of the first method."""
+    against: tuple[Path, ...] = ()
+    """The runs of the second method."""
+    treatment: Literal["algorithm", "target", "mixture"] = "algorithm"
+    """What is compared, and so may differ."""
+    all_checks: bool = False
+    """Show every check of the gate, not only the ones that decided."""
+    json: bool = False
+    """Print the verdict, the differences, the checks and the outcomes as JSON."""
+
+    def run(self) -> int:
+        from restock.cli.output import print_json
+        from restock.errors import ConfigError, ExitCode
+        from restock.train.compare import compare
+
+        first, second = self.runs, self.against
+        if not second:
+            if len(first) != 2:
+                raise ConfigError(
+                    f"needs two runs, got {len(first)}",
+                    where="restock compare",
+                    remedy="several seeds of a method: RUN RUN --against RUN RUN",
+                )
+            first, second = first[:1], first[1:]
+        found = compare(first, second, treatment=self.treatment)
+        if self.json:
+            print_json(found.as_json())
+        else:
+            _show(found, self.all_checks)
+        return int(ExitCode.OK if found.verdict == "comparable" else ExitCode.FAILED)
+
+
+def _show(found: Comparison, all_checks: bool) -> None:
+    from restock.cli.output import print_table, say
+
+    refused = {difference.setting for difference in found.refused}
+    if found.differences:
+        rows = [
+            {
+                "setting": difference.setting,
+                "first": difference.first,
+                "second": difference.second,
+                "": "not allowed" if difference.setting in refused else difference.kind,
+            }
+            for difference in found.differences
+        ]
+        print_table(rows, title=f"what differs (treatment: {found.treatment})")
+    checks = found.totals + found.checks
+    shown = checks if all_checks else [c for c in checks if c.verdict != "comparable"]
+    if shown:
+        judged = "" if found.treatment != "mixture" else " (the treatment: shown, not judged)"
+        print_table([_check(check) for check in shown], title=f"what was fed{judged}")
+    say(_sentence(found))
+    if found.rows:
+        of = "restock eval's episodes" if found.source == "restock eval" else "the last evaluation"
+        print_table(
+            [_outcome(row) for row in found.rows], title=f"success on the same episodes, from {of}"
+        )
+
+
+def _check(check: Any) -> dict[str, Any]:
+    return {
+        "check": check.name,
+        "of": check.part,
+        "first": check.first,
+        "second": check.second,
+        "value": check.value,
+        "interval": f"{check.low:.3g} to {check.high:.3g}",
+        "limit": check.limit,
+        "": check.verdict,
+    }
+
+
+def _outcome(row: dict[str, Any]) -> dict[str, Any]:
+    low, high = row["difference_low"], row["difference_high"]
+    return {
+        "perturbation": row["perturbation"],
+        "condition": row["condition"],
+        "episodes": row["episodes"],
+        "first": f"{row['success'][0]:.2f}",
+        "second": f"{row['success'][1]:.2f}",
+        "difference [95 %]": f"{row['difference']:+.2f} [{low:+.2f}, {high:+.2f}]",
+        "P(second better)": f"{row['improvement']:.2f}",
+    }
+
+
+def _sentence(found: Comparison) -> str:
+    if found.verdict == "comparable":
+        what = "settings, steps" if found.treatment == "mixture" else "settings, steps and feed"
+        return f"COMPARABLE: {what} are the same within the limits, but for the {found.treatment}"
+    if found.refused:
+        names = ", ".join(difference.setting for difference in found.refused)
+        return (
+            f"REFUSED: the runs differ in {names}, which is not what --treatment"
+            f" {found.treatment} compares"
+        )
+    failed = [check for check in found.gate if check.verdict == found.verdict]
+    names = ", ".join(dict.fromkeys(f"{check.name} ({check.part})" for check in failed[:4]))
+    more = f" and {len(failed) - 4} more" if len(failed) > 4 else ""
+    if found.verdict == "inconclusive":
+        return (
+            f"REFUSED, inconclusive: too few episodes to show that {names}{more} are the same;"
+            " add seeds to both sides (RUN RUN --against RUN RUN)"
+        )
+    return f"REFUSED: the critics were fed differently in {names}{more}"

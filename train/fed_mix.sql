@@ -1,0 +1,14 @@
+-- What one run's critic was fed, by episode, cell (source/stratum) and tenth of its training.
+-- $fed is the run's fed_episodes.parquet.
+WITH fed AS (
+    SELECT *, max(gradient_steps) OVER () AS whole FROM read_parquet($fed)
+)
+SELECT source || '/' || stratum AS cell,
+       least((gradient_steps * 10 - 1) // whole, 9)::BIGINT AS tenth,
+       source,
+       episode,
+       sum(drawn_rows)::DOUBLE AS drawn,
+       sum(weight)::DOUBLE AS weight
+FROM fed
+GROUP BY ALL
+ORDER BY ALL
