@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 
 from restock.errors import RecordingError
+from restock.ingest.clearance import scan_reduction
 from restock.ingest.conditions import NOMINAL
 from restock.ingest.episodes import Split, split
 from restock.ingest.manifest import definitions, manifest_row, software_version
@@ -154,7 +155,13 @@ class _Ingest:
             for _, source in self.profile.inputs.items()
             if source.topic in readable
         }
-        return recording.read(wanted_fields(self.profile, readable, stamped))
+        wanted = wanted_fields(self.profile, readable, stamped)
+        scan = self.profile.inputs.scan
+        if scan is None or scan.topic not in wanted:
+            return recording.read(wanted)
+        reduction = scan_reduction(self.profile.task, scan.topic, scan.fields)
+        wanted[scan.topic] = [p for p in wanted[scan.topic] if p not in reduction.fields]
+        return recording.read(wanted, {scan.topic: reduction})
 
     def _messages(self) -> dict[str, int]:
         accounts = self.recording.accounts.values()

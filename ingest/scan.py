@@ -53,12 +53,14 @@ class SectorMap:
         """
         ranges = np.asarray(ranges_m, np.float64)
         valid = (ranges >= range_min_m) & (ranges <= range_max_m)  # False for NaN and inf
-        free = np.where(valid, np.maximum(ranges - self.reach_m, 0.0), range_max_m)
+        near = ranges - self.reach_m
+        np.copyto(near, range_max_m, where=~valid)
         clearance = np.full((len(ranges), self.sectors), float(range_max_m))
         if len(self.filled):
-            clearance[:, self.filled] = np.minimum.reduceat(
-                free[:, self.order], self.starts, axis=1
-            )
+            if (self.order[1:] < self.order[:-1]).any():
+                near = near[:, self.order]
+            nearest = np.minimum.reduceat(near, self.starts, axis=1)
+            clearance[:, self.filled] = np.maximum(nearest, 0.0)
         return clearance
 
 

@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.ingest.align import NS, ClockReport, Held, Samples, Segment, align, ticks_of
-from restock.ingest.columns import Ragged, TopicColumns, take
+from restock.ingest.clearance import BEAMS, SECTORS, scan_reduction
+from restock.ingest.columns import TopicColumns
 from restock.ingest.profile import Profile
+from restock.ingest.reading import Fields
 from restock.ingest.routing import LARGEST, Routing, plan_ends, plan_problems, same_goals
-from restock.ingest.scan import SectorMap
 from restock.ingest.signals import localised_velocity
 from restock.ingest.sources import Sources
 from restock.ingest.task import nearest_action
@@ -26,7 +27,6 @@ from restock.ingest.task import nearest_action
 F64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
-_CHUNK = 4096  # scans at a time: bounds memory whatever the recording's length
 
 # A handover is said on the tick it takes force; its message may arrive a moment later. Used for
 # provenance alone, never for what the robot knew.
@@ -232,36 +232,20 @@ class _Filling:
 
     def _scan(self) -> None:
         held = self._required("scan")
+        source = self.sources.inputs["scan"]
+        fields: Fields = self.sources.topics[source.topic].fields
+        if SECTORS not in fields:  # columns of whole scans, as no recording's reader gives them
+            fields = scan_reduction(self.task, source.topic, source.fields).apply(fields)
         sectors = np.full((len(self.tick_ns), self.task.sectors), float(self.task.range_max_m))
-        used, inverse = np.unique(held.row[held.fresh], return_inverse=True)
-        if len(used):
+        fresh = held.fresh
+        if fresh.any():
+            rows = held.row[fresh]
             beams = np.zeros(len(self.tick_ns), np.int64)
-            beams[held.fresh] = self.sources.beams(used)[inverse]
-            self._blame(held.fresh & (beams == 0), "scan: no beams")
-            sectors[held.fresh] = self._sectors(used)[inverse]
+            beams[fresh] = np.asarray(fields[BEAMS])[rows]
+            self._blame(fresh & (beams == 0), "scan: no beams")
+            sectors[fresh] = np.asarray(fields[SECTORS])[rows]
         self.signals["sector_clearance_m"] = sectors
         self.signals["clearance_m"] = sectors.min(axis=1)
-
-    def _sectors(self, rows: NDArray[np.intp]) -> F64:
-        """Clearance per sector (N, K) of these scans; one sector map a lidar geometry."""
-        task, beams = self.task, self.sources.beams(rows)
-        angles = [self.sources.numbers("scan", f"angle_{n}_rad") for n in ("min", "increment")]
-        geometry = np.stack([angles[0][rows], angles[1][rows], beams], axis=1)
-        clearance = np.full((len(rows), task.sectors), float(task.range_max_m))
-        kinds, kind = np.unique(geometry, axis=0, return_inverse=True)
-        for index, (first, increment, count) in enumerate(kinds):
-            if count == 0 or not np.isfinite(first + increment):
-                continue
-            bearings = first + increment * np.arange(int(count))
-            sector_map = SectorMap.build(bearings, task.sectors, task.body)
-            same = np.flatnonzero(kind == index)
-            for start in range(0, len(same), _CHUNK):
-                part = same[start : start + _CHUNK]
-                ranges = take(self.sources.column("scan", "ranges_m"), rows[part])
-                values = ranges.values if isinstance(ranges, Ragged) else ranges
-                table = np.asarray(values).reshape(len(part), int(count))
-                clearance[part] = sector_map.clearance(table, task.range_min_m, task.range_max_m)
-        return clearance
 
     def _bumper(self) -> None:
         bumped = [np.zeros(len(self.tick_ns), np.bool_)]
