@@ -1,0 +1,311 @@
+"""Batches drawn where the panel lies: row numbers, priorities and generator on one torch device.
+
+On a GPU the host decides the quotas of a block of batches (a few hundred integers) and sends them
+over once; between blocks nothing crosses the bus. The same code runs on the CPU.
+
+panel = torch.from_numpy(np.array(panel.rows)).to(device)
+sampler = DeviceSampler(stratum_rows, shares, 256, seed=0, device=device, rule=Per())
+rows, strata = sampler.draw()                             # (B,) int64 each, on the device
+torch.index_select(panel, 0, rows, out=batch)             # no copy leaves the device
+sampler.update(rows, td.abs())                            # nor does this wait for it
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from restock.errors import MixtureError
+from restock.replay.layout import F64, Ints
+from restock.replay.priorities import Per, Rule
+from restock.replay.quotas import Quotas
+from restock.replay.sampler import BLOCK
+
+_SUM_BITS = 62  # priorities are summed as integers, which add up alike in any order
+
+
+class DeviceSampler:
+    """Exact quotas per batch over strata; within one uniformly, in shuffled turns or by priority.
+
+    Args:
+        stratum_rows: the row numbers of each stratum, S arrays (n_s,).
+        shares: of each stratum, (S,), summing to 1.
+        batch_size: rows per draw.
+        seed: of the generator, which lives on the device.
+        device: where rows are drawn.
+        rule: `Per()` or `Lap()`; None draws a stratum's rows alike.
+        replacement: False, without a rule, goes through each stratum in shuffled order before any
+            row repeats.
+
+    Raises:
+        MixtureError: shares that are no distribution, or a share on an empty stratum.
+    """
+
+    def __init__(
+        self,
+        stratum_rows: Sequence[NDArray[Any]],
+        shares: Sequence[float] | F64,
+        batch_size: int,
+        *,
+        seed: int,
+        device: torch.device | str,
+        rule: Rule | None = None,
+        replacement: bool = True,
+    ) -> None:
+        if len(stratum_rows) != len(shares):
+            raise MixtureError(f"{len(stratum_rows)} strata but {len(shares)} shares")
+        self.device = torch.device(device)
+        self.sizes: Ints = np.array([len(rows) for rows in stratum_rows], np.int64)
+        self.quotas = Quotas(shares, batch_size)
+        self._check_shares(self.quotas.shares)
+        self.rule, self.replacement = rule, replacement or rule is not None
+        self.generator = torch.Generator(self.device).manual_seed(seed)
+        joined = np.concatenate([np.asarray(rows, np.int64) for rows in stratum_rows])
+        self._members = torch.from_numpy(joined).to(self.device)  # (N,) stratum by stratum
+        self._first: Ints = np.concatenate([[0], np.cumsum(self.sizes)])[:-1].astype(np.int64)
+        self._orders = [self._shuffled(stratum) for stratum in range(len(self.sizes))]
+        self._cursor = [0] * len(self.sizes)
+        self._returned = [self._members[:0] for _ in self.sizes]
+        self._quota_ahead: Ints = np.zeros((0, len(self.sizes)), np.int64)
+        self._rows_ahead = self._strata_ahead = self._members.new_zeros((0, batch_size))
+        self._weights_ahead: Tensor | None = None
+        self._next = 0  # of those drawn ahead
+        self._batches = 0  # handed out
+        if rule is not None:
+            self._place = torch.full((int(joined.max()) + 1,), -1, device=self.device)
+            self._place[self._members] = torch.arange(len(joined), device=self.device)
+            if len(np.unique(joined)) != len(joined):
+                raise MixtureError("a row is in two strata")
+            self._largest = self._priority_of(torch.ones(1, device=self.device))
+            self._priority = self._largest.expand(len(joined)).clone()
+            self._new = torch.ones(len(joined), dtype=torch.bool, device=self.device)
+
+    @property
+    def batch_size(self) -> int:
+        return self.quotas.batch_size
+
+    @property
+    def shares(self) -> F64:
+        return self.quotas.shares
+
+    @property
+    def drawn_weights(self) -> Tensor | None:
+        """Importance weights (B,) that the batch last drawn needs, on the device; None for ones."""
+        return None if self._weights_ahead is None else self._weights_ahead[self._next - 1]
+
+    def draw(self) -> tuple[Tensor, Tensor]:
+        """Row numbers (B,) and the stratum of each (B,), int64, on the device."""
+        if self._next == len(self._rows_ahead):
+            self._draw_block()
+        self._next += 1
+        self._batches += 1
+        return self._rows_ahead[self._next - 1], self._strata_ahead[self._next - 1]
+
+    def update(self, rows: Tensor, td_abs: Tensor) -> None:
+        """|TD error| (n,) of rows (n,) just learnt from, on the device; counts from the next block.
+
+        A TD error that is not finite is refused when the next block is drawn: to look at it here
+        would wait for the device.
+        """
+        if self.rule is None:
+            return
+        place = self._place[rows]
+        priority = self._priority_of(td_abs.detach().float())
+        self._priority[place] = priority
+        self._new[place] = False
+        self._largest = torch.maximum(self._largest, priority.max())  # passes NaN on
+
+    def set_shares(self, shares: Sequence[float] | F64) -> None:
+        """Other shares (S,) from the next batch on; what was drawn ahead goes back.
+
+        Raises:
+            MixtureError: shares that are no distribution, or a share on an empty stratum.
+        """
+        given = Quotas(shares, self.batch_size).shares
+        if np.array_equal(given, self.quotas.shares):
+            return
+        self._check_shares(given)
+        self._hand_back()
+        self.quotas.set_shares(shares)
+
+    def set_batch_size(self, batch_size: int) -> None:
+        """Batches of another size from the next one on; what was drawn ahead goes back."""
+        if batch_size != self.batch_size:
+            self._hand_back()
+            self.quotas.set_batch_size(batch_size)
+            self._rows_ahead = self._strata_ahead = self._members.new_zeros((0, batch_size))
+
+    def _check_shares(self, shares: F64) -> None:
+        for stratum in np.flatnonzero((shares > 0) & (self.sizes == 0)).tolist():
+            raise MixtureError(
+                f"stratum {stratum} has a share of {shares[stratum]:g} and no rows",
+                remedy="give it share 0, or let `restock mix` redistribute it",
+            )
+
+    def _priority_of(self, td_abs: Tensor) -> Tensor:
+        if isinstance(self.rule, Per):
+            return (td_abs + self.rule.epsilon) ** self.rule.alpha
+        if self.rule is None:
+            raise RuntimeError("no rule of priority")
+        return td_abs.clamp_min(self.rule.floor) ** self.rule.alpha
+
+    def _draw_block(self) -> None:
+        strata = len(self.sizes)
+        quota = np.stack([self.quotas.next() for _ in range(BLOCK)])  # (BLOCK, S)
+        counts = torch.from_numpy(quota.ravel()).to(self.device)  # the one thing sent over
+        stratum = torch.arange(strata, device=self.device).repeat(BLOCK)
+        stratum = stratum.repeat_interleave(counts, output_size=int(quota.sum()))
+        order = torch.argsort(stratum, stable=True)
+        if self.rule is not None:
+            self._raise_new()
+        taken = [
+            self._take(index, int(count)) for index, count in enumerate(quota.sum(axis=0)) if count
+        ]
+        rows = torch.empty_like(stratum)
+        rows[order] = torch.cat([drawn for drawn, _ in taken])
+        self._rows_ahead, self._strata_ahead = rows.view(BLOCK, -1), stratum.view(BLOCK, -1)
+        self._weights_ahead = None
+        weights = [weight for _, weight in taken if weight is not None]
+        if weights:
+            weight = torch.empty(len(rows), device=self.device)
+            weight[order] = torch.cat(weights)
+            self._weights_ahead = weight.view(BLOCK, -1)
+        self._quota_ahead, self._next = quota, 0
+
+    def _take(self, stratum: int, count: int) -> tuple[Tensor, Tensor | None]:
+        """The next `count` rows of a stratum, and their weights where the rule has them."""
+        first, size = int(self._first[stratum]), int(self.sizes[stratum])
+        if self.rule is not None:
+            return self._take_by_priority(self.rule, first, size, count)
+        if self.replacement:
+            at = (self._random(count) * size).long().clamp_max(size - 1)
+            return self._members[first + at], None
+        back = self._returned[stratum]
+        parts, self._returned[stratum] = [back[:count]], back[count:]
+        count -= len(parts[0])
+        while count:
+            begin = self._cursor[stratum]
+            if begin == size:  # all have had their turn
+                self._orders[stratum] = self._shuffled(stratum)
+                begin = 0
+            some = min(count, size - begin)
+            parts.append(self._orders[stratum][begin : begin + some])
+            self._cursor[stratum] = begin + some
+            count -= some
+        return torch.cat(parts), None
+
+    def _take_by_priority(
+        self, rule: Rule, first: int, size: int, count: int
+    ) -> tuple[Tensor, Tensor | None]:
+        """One draw from each of `count` equal parts of the stratum's range of sums, shuffled."""
+        priority = self._priority[first : first + size].double()
+        scale = 2.0**_SUM_BITS / size / self._largest.double()
+        share = (priority * scale).long().clamp_min(1)
+        ends = share.cumsum(0)
+        total = ends[-1].double()
+        within = torch.arange(count, device=self.device) + self._random(count)
+        at = torch.searchsorted(ends, (within * (total / count)).long(), right=True)
+        turns = torch.randperm(count, generator=self.generator, device=self.device)
+        at = at.clamp_max(size - 1)[turns]
+        beta = rule.beta_after(self._batches)
+        if beta == 0:
+            return self._members[first + at], None
+        mean = (priority ** (1.0 - beta)).sum()  # sums are of one order on one device
+        weight = (priority.sum() / mean * priority[at] ** -beta).float()
+        return self._members[first + at], weight
+
+    def _raise_new(self) -> None:
+        """Rows not drawn yet get the largest priority so far. Waits for the device, once a block.
+
+        Raises:
+            MixtureError: there were TD errors that are not finite.
+        """
+        if not bool(torch.isfinite(self._largest).all()):
+            raise MixtureError(
+                "TD errors are not finite",
+                remedy="training has diverged: lower the learning rate, or slow the target down",
+            )
+        self._priority = torch.where(self._new, self._largest, self._priority)
+
+    def _random(self, count: int) -> Tensor:
+        # float64: the 24 bits of a float32 reach no further than 16 million rows.
+        kind = torch.float64
+        return torch.rand(count, generator=self.generator, device=self.device, dtype=kind)
+
+    def _shuffled(self, stratum: int) -> Tensor:
+        first, size = int(self._first[stratum]), int(self.sizes[stratum])
+        if self.replacement:
+            return self._members[:0]
+        turns = torch.randperm(size, generator=self.generator, device=self.device)
+        return self._members[first + turns]
+
+    def _hand_back(self) -> None:
+        """Forget what is drawn ahead: quotas are owed again, rows that had their turn are next."""
+        rows, strata = self._rows_ahead[self._next :], self._strata_ahead[self._next :]
+        self.quotas.give_back(self._quota_ahead[self._next :])
+        if not self.replacement:
+            for stratum, back in enumerate(self._returned):
+                self._returned[stratum] = torch.cat([rows[strata == stratum], back])
+        self._rows_ahead, self._strata_ahead = rows[:0], strata[:0]
+        self._quota_ahead, self._weights_ahead = self._quota_ahead[:0], None
+        self._next = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that decides the draws to come: tensors, arrays and JSON values."""
+        state: dict[str, Any] = {
+            "carry": self.quotas.carry,
+            "shares": self.shares.copy(),
+            "sizes": self.sizes.copy(),
+            "quota_ahead": self._quota_ahead[self._next :].copy(),
+            "rows_ahead": self._rows_ahead[self._next :].cpu().clone(),
+            "strata_ahead": self._strata_ahead[self._next :].cpu().clone(),
+            "generator": self.generator.get_state().clone(),
+            "batches": self._batches,
+        }
+        if self._weights_ahead is not None:
+            state["weights_ahead"] = self._weights_ahead[self._next :].cpu().clone()
+        if not self.replacement:
+            state["order"] = torch.cat(self._orders).cpu()
+            state["cursor"] = list(self._cursor)
+            state["returned"] = torch.cat(self._returned).cpu()
+            state["returned_count"] = [len(rows) for rows in self._returned]
+        if self.rule is not None:
+            for name in ("priority", "new", "largest"):
+                state[name] = getattr(self, f"_{name}").cpu().clone()
+        return state
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Raises MixtureError when the state is of a sampler over other strata."""
+        if (
+            not np.array_equal(state["sizes"], self.sizes)
+            or ("order" in state) == self.replacement
+            or ("priority" in state) != (self.rule is not None)
+        ):
+            raise MixtureError(
+                "the saved sampler drew from other strata, or by another rule",
+                remedy="resume with the panel and the settings the run began with",
+            )
+        self.quotas.set_batch_size(int(state["rows_ahead"].shape[1]))
+        self.quotas.set_shares(np.asarray(state["shares"]))
+        self.quotas.carry = np.array(state["carry"], np.float64)
+        self._quota_ahead = np.array(state["quota_ahead"], np.int64)
+        self._rows_ahead = state["rows_ahead"].to(self.device)
+        self._strata_ahead = state["strata_ahead"].to(self.device)
+        weights = state.get("weights_ahead")
+        self._weights_ahead = None if weights is None else weights.to(self.device)
+        self._next, self._batches = 0, int(state["batches"])
+        self.generator.set_state(state["generator"].cpu())
+        if not self.replacement:
+            order = state["order"].to(self.device)
+            self._orders = list(order.split(self.sizes.tolist()))
+            self._cursor = [int(at) for at in state["cursor"]]
+            returned = state["returned"].to(self.device)
+            self._returned = list(returned.split([int(n) for n in state["returned_count"]]))
+        if self.rule is not None:
+            for name in ("priority", "new", "largest"):
+                setattr(self, f"_{name}", state[name].to(self.device))
