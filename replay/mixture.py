@@ -131,7 +131,8 @@ class Prioritised(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The numbers of `within = "per"` (arXiv:1511.05952) and `"lap"` (arXiv:2007.06049)."""
 
     per_alpha: float = 0.6  # exponent of |TD|
-    per_beta: float = 0.4  # exponent of the importance weights
+    per_beta: float = 0.4  # exponent of the importance weights, to begin with
+    per_beta_batches: int = 100_000  # after which it is 1
     per_epsilon: float = 1e-3  # added to |TD|
     lap_alpha: float = 0.4  # exponent of max(|TD|, 1)
 
@@ -139,7 +140,10 @@ class Prioritised(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         for name in ("per_alpha", "per_beta", "lap_alpha"):
             value = getattr(self, name)
             _check(0 <= value <= 1, f"prioritised.{name} must be in [0, 1], got {value:g}")
-        _check(self.per_epsilon > 0, "prioritised.per_epsilon must be above 0")
+        _check(
+            self.per_epsilon > 0 and self.per_beta_batches >= 1,
+            "prioritised.per_epsilon and per_beta_batches must be above 0",
+        )
 
 
 class Adaptive(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

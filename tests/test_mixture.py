@@ -18,11 +18,15 @@ from restock.errors import ConfigError, MixtureError
 from restock.ingest.conditions import Condition
 from restock.replay.build import build_panel, open_source
 from restock.replay.mixture import (
+    Adaptive,
     CorrectionRule,
     EachCondition,
     HeldOut,
     Mixture,
+    OtherStore,
     PlannedUse,
+    Prioritised,
+    Safety,
     Sources,
     StratumRule,
     load_mixture,
@@ -30,6 +34,7 @@ from restock.replay.mixture import (
     shipped_mixtures,
 )
 from restock.replay.plan import Plan, plan_panel
+from restock.replay.schedules import Cosine, Linear, Piecewise
 from restock.replay.shares import plan_shares, scaled_within, wanted_shares
 from restock.replay.strata import (
     Stratum,
@@ -65,7 +70,23 @@ def test_the_shipped_mixtures_load_and_fill(name: str, transitions: pa.Table) ->
     ("text", "message"),
     [
         (EVERY + "sahre = 1", "sahre"),
-        (EVERY + "[sources]\nlogs = 0.7", "sum to 1"),
+        (EVERY + "[sources]\nlogs = 0.7\nfresh = 0.4", "sum to 1"),
+        (
+            EVERY + "[sources]\nfresh = 0.5\nlogs = {schedule = 'linear', start = 0.9, end = 0.1,"
+            " to_env_steps = 10}",
+            "leave `fresh` out",
+        ),
+        (
+            EVERY + "[sources]\nlogs = {schedule = 'linear', start = 0.2, end = 0.9,"
+            " to_env_steps = 10}\n[[sources.stores]]\nname = 'b'\npath = 'b'\nshare = 0.5",
+            "sources sum to 1.4",
+        ),
+        (EVERY + "[sources]\nlogs = {schedule = 'step', start = 1}", "sources.logs.schedule"),
+        (EVERY + "[sources]\nlogs = {schedule = 'piecewise', points = [[9, 1], [2, 0]]}", "rising"),
+        (EVERY + "[adaptive]\nfloor = 0.7", "floor < ceiling"),
+        (EVERY + "[safety]\nleave_out = 'rows'", "unsafe"),
+        ("max_rows_per_episode = 0\n" + EVERY, "max_rows_per_episode"),
+        ("within = 'rank'\n" + EVERY, "within"),
         ("discount = 1.5\n" + EVERY, "discount"),
         ("seed = 'x'\n" + EVERY, "seed"),
         ("discount = 0.9", "no strata"),
@@ -153,18 +174,22 @@ def test_replays_per_row_cap_a_small_stratum_and_the_surplus_goes_to_the_others(
     text = "max_replays_per_row = 50\n[planned]\nupdates = 1000\nbatch_size = 100\n" + EVERY
     rules = [StratumRule(name="nominal", share=0.5), StratumRule(name="rare", share=0.5)]
     rows, episodes = np.array([10_000, 100]), np.array([100, 10])
-    plan = plan_shares(parse_mixture(text), rules, rows, episodes)
+    plan = plan_shares(parse_mixture(text), rules, rows, episodes, draws=50_000)
     np.testing.assert_allclose(plan.got, [0.9, 0.1])
     np.testing.assert_allclose(plan.wanted, [0.5, 0.5])
     assert plan.notes == ("took the surplus", "short of rows")
     assert plan.scale == 1.0
-    shrunk = plan_shares(parse_mixture("shortfall = 'shrink'\n" + text), rules, rows, episodes)
+    shrunk = plan_shares(
+        parse_mixture("shortfall = 'shrink'\n" + text), rules, rows, episodes, draws=50_000
+    )
     assert shrunk.scale == pytest.approx(0.6)
     np.testing.assert_allclose(shrunk.got, [0.5 / 0.6, 0.1 / 0.6])
     with pytest.raises(MixtureError, match=r"rare wants 50\.0%, its 100 rows in 10 episodes"):
-        plan_shares(parse_mixture("shortfall = 'refuse'\n" + text), rules, rows, episodes)
+        plan_shares(
+            parse_mixture("shortfall = 'refuse'\n" + text), rules, rows, episodes, draws=50_000
+        )
     # Where nobody can take the surplus, it cannot come from the logs.
-    small = plan_shares(parse_mixture(text), rules, np.array([300, 100]), episodes)
+    small = plan_shares(parse_mixture(text), rules, np.array([300, 100]), episodes, draws=50_000)
     assert small.scale == pytest.approx(0.4)
     np.testing.assert_allclose(small.got, [0.75, 0.25])
 
@@ -344,8 +369,18 @@ def test_the_same_store_and_mixture_give_the_same_bytes(
 
 def test_the_page_explains_every_key() -> None:
     page = (Path(__file__).parents[1] / "docs" / "mixture.md").read_text(encoding="utf-8")
-    structs = (Mixture, StratumRule, EachCondition, PlannedUse, HeldOut, Sources, CorrectionRule)
+    structs = (
+        *(Mixture, StratumRule, EachCondition, PlannedUse, HeldOut, Sources, CorrectionRule),
+        *(OtherStore, Safety, Prioritised, Adaptive, Linear, Cosine, Piecewise),
+    )
     for struct in structs:
         for field in msgspec.structs.fields(struct):
             name = field.encode_name
-            assert any(f"`{form}`" in page for form in (name, f"[{name}]", f"[[{name}]]")), name
+            forms = (
+                f"`{name}`",
+                f"`[{name}]`",
+                f"[[{name}]]`",
+                f"[[sources.{name}]]`",
+                f"{name} = ",
+            )
+            assert any(form in page for form in forms), name
