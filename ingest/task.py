@@ -168,20 +168,33 @@ def reward(
     `progress_m` (N,) is how much shorter the plan in force at t became (with a goal), or how far
     the robot moved forward (without one).
     """
+    parts = reward_parts(task, now, after, progress_m, action, previous_action)
+    return np.asarray(sum(parts.values()), np.float32)
+
+
+def reward_parts(
+    task: Task,
+    now: Columns,
+    after: Columns,
+    progress_m: NDArray[Any],
+    action: Ints,
+    previous_action: Ints,
+) -> dict[str, NDArray[Any]]:
+    """What each event of [t, t + 1) was worth, (N,) each, by the names of `Rewards`."""
     weight = task.rewards
     harsh = np.abs(after["wheel_speed_mps"] - now["wheel_speed_mps"]) / task.control_period_s
     slip = np.abs(after["wheel_speed_mps"] - after["localised_speed_mps"])
-    total = (
-        weight.progress_per_m * np.clip(progress_m, -1.0, 1.0)
-        + weight.step
-        + weight.action_change * (action != previous_action)
-        + weight.tight * (after["clearance_m"] < weight.tight_clearance_m)
-        + weight.harsh * (harsh > weight.harsh_mps2)
-        + weight.slip_per_mps * np.clip(slip - 0.2, 0.0, 2.0)
-        + weight.goal * reached_goal(task, after)
-        + weight.bump * after["bumped"]
-    )
-    return np.asarray(total, np.float32)
+    progress = weight.progress_per_m * np.clip(progress_m, -1.0, 1.0)
+    return {
+        "progress_per_m": progress,
+        "step": np.full_like(progress, weight.step),
+        "action_change": weight.action_change * (action != previous_action),
+        "tight": weight.tight * (after["clearance_m"] < weight.tight_clearance_m),
+        "harsh": weight.harsh * (harsh > weight.harsh_mps2),
+        "slip_per_mps": weight.slip_per_mps * np.clip(slip - 0.2, 0.0, 2.0),
+        "goal": weight.goal * reached_goal(task, after),
+        "bump": weight.bump * after["bumped"],
+    }
 
 
 def clearance_ahead(
