@@ -1,0 +1,69 @@
+"""`restock export`: transitions as a data set of another library."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+
+@dataclass
+class Export:
+    """Transitions as another library's data set: Minari, d3rlpy, LeRobot, Parquet or NumPy.
+
+    Takes a panel, or the rows of a query to a store, and puts them back together into episodes:
+    in order, with how each ended and the observation after its last step. Where a query leaves
+    rows out, an episode becomes several, cut where rows are missing. The data set says where it is
+    from: store version, query or panel, task, counts. See docs/neighbours.md.
+    """
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    """A store or a panel."""
+    to: Literal["minari", "d3rlpy", "lerobot", "parquet", "npz"]
+    """The format: minari and lerobot are directories, d3rlpy (.h5), parquet and npz files."""
+    out: Annotated[Path, tyro.conf.arg(metavar="OUT")]
+    """The file or directory to write, which must not exist yet."""
+    query: Annotated[str | None, tyro.conf.arg(metavar="SQL")] = None
+    """What to take of a store, as whole transitions; everything without one."""
+    panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
+    """A panel whose tables the query may use, as panel.rows and panel.strata."""
+    action: Literal["discrete", "continuous"] = "discrete"
+    """The index of the task's action, or the logged command (m/s, rad/s)."""
+    json: bool = False
+    """Print what was written as one JSON document."""
+
+    def run(self) -> None:
+        """Write the data set and say what is in it."""
+        from restock.cli import output
+        from restock.replay.export_dataset import export_dataset
+
+        with output.progress(f"writing {self.to}", None) as advance:
+            document = export_dataset(
+                self.source,
+                self.to,
+                self.out,
+                query=self.query,
+                panel=self.panel,
+                continuous=self.action == "continuous",
+                advance=lambda steps: advance(steps),
+            )
+        if self.json:
+            output.print_json(document)
+            return
+        for line in _summary(document):
+            output.stdout().print(line)
+
+
+def _summary(document: dict[str, Any]) -> list[str]:
+    left_out = ", ".join(f"{count:,} {reason}" for reason, count in document["left_out"].items())
+    return [
+        f"{document['transitions']:,} transitions of {document['rows']:,} rows -> "
+        f"{document['path']} ({document['format']})"
+        + (f"; left out: {left_out}" if left_out else ""),
+        f"{document['trajectories']:,} trajectories of {document['episodes']:,} episodes:"
+        f" {document['terminated']:,} terminated, {document['truncated']:,} truncated,"
+        f" {document['cut']:,} cut where rows are missing",
+        *document["notes"],
+    ]

@@ -1,0 +1,38 @@
+"""Reads an export with the real lerobot and prints what it finds: `… DIR`.
+
+Run by tests/test_export.py, with a Python that has lerobot.
+"""
+
+import json
+import os
+import sys
+
+os.environ["HF_HUB_OFFLINE"] = "1"
+
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+dataset = LeRobotDataset("restock/logs", root=sys.argv[1])
+frames = [dataset[index] for index in range(len(dataset))]
+few = LeRobotDataset(
+    "restock/logs",
+    root=sys.argv[1],
+    episodes=[1],
+    delta_timestamps={"action": [0.0, 1 / dataset.fps]},
+)
+found = {
+    "episodes": dataset.num_episodes,
+    "fps": dataset.fps,
+    "mean_reward": float(dataset.meta.stats["next.reward"]["mean"][0]),
+    "lengths": [int(length) for length in dataset.meta.episodes["length"]],
+    "episode": [int(frame["episode_index"]) for frame in frames],
+    "action": [frame["action"].tolist() for frame in frames],
+    "reward": [float(frame["next.reward"]) for frame in frames],
+    "first": [float(frame["observation.state"][0]) for frame in frames],
+    "next_first": [float(frame["next.observation.state"][0]) for frame in frames],
+    "terminated": [bool(frame["next.terminated"]) for frame in frames],
+    "truncated": [bool(frame["next.truncated"]) for frame in frames],
+    "transition_id": [int(frame["restock.transition_id"]) for frame in frames],
+    "condition": [frame["restock.condition"] for frame in frames],
+    "chunk": few[0]["action"].tolist(),
+}
+sys.stdout.write("\n" + json.dumps(found) + "\n")
