@@ -31,6 +31,9 @@ class Ended:
     env_steps: int
     gradient_steps: int
     key: int  # of the ring
+    env: int
+    episode_seed: int
+    perturbation: str
     true_condition: str
     block: str
     undiscounted_return: float
@@ -153,6 +156,9 @@ class Collector:
                     env_steps=env_steps + self.env.num_envs,
                     gradient_steps=gradient_steps,
                     key=int(keys[place]),
+                    env=int(place),
+                    episode_seed=int(info["episode_seed"][place]),
+                    perturbation=str(info["perturbation"][place]),
                     true_condition=str(info["episode_condition"][place]),
                     block=str(info["block"][place]),
                     undiscounted_return=float(self._return[place]),
@@ -202,6 +208,9 @@ class Collector:
                     "env_steps": episode.env_steps,
                     "gradient_steps": episode.gradient_steps,
                     "episode": episode.key,
+                    "env": episode.env,
+                    "episode_seed": episode.episode_seed,
+                    "perturbation": episode.perturbation,
                     "true_condition": episode.true_condition,
                     "block": episode.block,
                     "conditions": [name for name, held in labels.items() if held[inside].any()],

@@ -284,8 +284,10 @@ class FeedRecord:
         return {
             "source": "logs",
             "transition_id": int(logs.transition_id[row]),
+            "panel_row": row,
             "ring_slot": None,
             "episode": logs.episode.name(row),
+            "episode_step": None,
             "age_days": float(self._age_days[row]),
             "age_env_steps": None,
             "age_gradient_steps": None,
@@ -303,8 +305,10 @@ class FeedRecord:
         return {
             "source": "fresh",
             "transition_id": None,
+            "panel_row": None,
             "ring_slot": slot,
             "episode": str(int(ring.meta["episode"][slot])),
+            "episode_step": int(ring.meta["episode_step"][slot]),
             "age_days": None,
             "age_env_steps": int(columns["age_env_steps"][at]),
             "age_gradient_steps": int(columns["age_gradient_steps"][at]),

@@ -97,10 +97,23 @@ TABLES: dict[str, pa.Schema] = {
         ("q_lag", _F),  # mean |Q - Q_target| / mean |Q|
         ("probe_hash", _S),
     ),
+    # One row an evaluation x condition: the critic on that evaluation's steps, which no replay has.
+    "held_out": _schema(
+        *_CLOCKS,
+        ("condition", _S),
+        ("rows", _I),
+        ("td_abs_mean", _F),
+        ("td_online_abs_mean", _F),  # as if the online network bootstrapped
+        ("q_abs_mean", _F),
+        ("q_lag", _F),  # mean |Q - Q_target| / mean |Q|
+    ),
     # One row a finished training episode (the agent explores in them).
     "episodes": _schema(
         *_CLOCKS,
         ("episode", _I),  # the ring's key
+        ("env", pa.int32()),  # the environment it ran in
+        ("episode_seed", _I),  # with true_condition and perturbation, what lays it out again
+        ("perturbation", _S),  # its name
         ("true_condition", _S),
         ("block", _S),  # none | partial | full
         ("conditions", pa.list_(_S)),  # labels that held at some step, as the robot can sense
@@ -116,8 +129,10 @@ TABLES: dict[str, pa.Schema] = {
         ("batch_row", pa.int32()),
         ("source", _S),
         ("transition_id", _I),  # logs
+        ("panel_row", _I),  # logs
         ("ring_slot", _I),  # fresh
         ("episode", _S),
+        ("episode_step", _I),  # fresh; of a logged row the store has it
         ("age_days", _F),  # logs
         ("age_env_steps", _I),  # fresh
         ("age_gradient_steps", _I),  # fresh
