@@ -123,6 +123,12 @@ class TopicColumns:
     def __len__(self) -> int:
         return len(self.log_time_ns)
 
+    def times(self, start: int, stop: int) -> TopicColumns:
+        """When messages `start` to `stop` came, without their fields, in memory of their own."""
+        return TopicColumns(
+            self.log_time_ns[start:stop].copy(), self.publish_time_ns[start:stop].copy()
+        )
+
 
 @dataclass(frozen=True)
 class Batch:

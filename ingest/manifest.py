@@ -12,13 +12,14 @@ import numpy as np
 
 from restock.ingest.columns import TopicColumns
 from restock.ingest.conditions import Condition
+from restock.ingest.episode_rows import EpisodeRows
 from restock.ingest.episodes import Split
 from restock.ingest.profile import Profile
 from restock.ingest.recording import Recording
 from restock.ingest.scores import LabelScore
 from restock.ingest.sources import stand_ins
 from restock.ingest.steps import Steps
-from restock.ingest.transitions import EpisodeRows, Provenance
+from restock.ingest.transitions import Provenance
 
 UNUSED = "not used by the profile"
 

@@ -16,19 +16,18 @@ import numpy as np
 import pyarrow as pa
 
 from restock.errors import RecordingError
-from restock.ingest.clearance import scan_reduction
 from restock.ingest.conditions import NOMINAL
 from restock.ingest.episodes import Split, split
 from restock.ingest.manifest import definitions, manifest_row, software_version
+from restock.ingest.needs import reductions, wanted_fields
 from restock.ingest.profile import Profile
 from restock.ingest.readers import open_recording
 from restock.ingest.recording import Recording
 from restock.ingest.schema import recording_schema
 from restock.ingest.scores import LabelScore, score
-from restock.ingest.sources import wanted_fields
 from restock.ingest.steps import Steps, steps_of
 from restock.ingest.store import StoreWriter
-from restock.ingest.transitions import Provenance, episode_rows, transitions
+from restock.ingest.transitions import Provenance, recording_table
 
 Status = Literal["written", "unchanged", "dry run"]
 
@@ -106,18 +105,19 @@ class _Ingest:
     def run(self, store: StoreWriter | None) -> Outcome:
         profile, columns = self.profile, self._columns()
         steps = steps_of(profile, columns)
-        episodes = split(self.profile.task, steps)
+        # What follows needs to know which topics said anything, and not what: let go of it.
+        columns = {name: column.times(0, 1) for name, column in columns.items()}
+        episodes = split(profile.task, steps)
         if not episodes.transitions:
             raise RecordingError(
                 f"gives no transition with the profile {self.profile.name!r}: "
                 f"{_why(steps, episodes)}",
                 remedy="choose another --profile, or mend its maximum ages; see docs/ingest.md",
             )
-        rows = episode_rows(self.profile, steps, episodes)
         provenance = Provenance(
             self.recording.recording_id, self.ingest_id, self.path, software_version()
         )
-        table = transitions(self.profile, steps, episodes, rows, provenance)
+        table, rows = recording_table(profile, steps, episodes, provenance)
         named = np.array(table["condition"].to_pylist(), object)
         first = {name: int((named == name).sum()) for name in (*rows.labels, NOMINAL)}
         scores = score(
@@ -150,18 +150,11 @@ class _Ingest:
     def _columns(self) -> dict[str, Any]:
         recording = self.recording
         readable = {n: info for n, info in recording.topics.items() if info.skipped is None}
-        stamped = {
-            source.topic: "header.stamp" in recording.leaves(source.topic)
-            for _, source in self.profile.inputs.items()
-            if source.topic in readable
+        leaves = {
+            topic: recording.fields(topic) for topic in self.profile.topics if topic in readable
         }
-        wanted = wanted_fields(self.profile, readable, stamped)
-        scan = self.profile.inputs.scan
-        if scan is None or scan.topic not in wanted:
-            return recording.read(wanted)
-        reduction = scan_reduction(self.profile.task, scan.topic, scan.fields)
-        wanted[scan.topic] = [p for p in wanted[scan.topic] if p not in reduction.fields]
-        return recording.read(wanted, {scan.topic: reduction})
+        wanted = wanted_fields(self.profile, readable, leaves)
+        return recording.read(wanted, reductions(self.profile, readable))
 
     def _messages(self) -> dict[str, int]:
         accounts = self.recording.accounts.values()
@@ -181,7 +174,7 @@ class _Ingest:
 
     def _notes(self, steps: Steps, table: pa.Table) -> list[str]:
         clock = steps.clock
-        notes = list(self.recording.notes)
+        notes = [*self.recording.notes, *steps.notes]
         if clock.alignment == "header.stamp":
             notes.append(
                 f"clock: log time is {clock.offset_ns * 1e-9:,.3f} s ahead of header stamps, "

@@ -18,11 +18,11 @@ import pyarrow as pa
 
 from restock.errors import StoreError
 from restock.ingest.conditions import NOMINAL, Condition, label, labels_version, primary
+from restock.ingest.episode_rows import episode_ends
 from restock.ingest.manifest import conditions_json, score_rows
 from restock.ingest.schema import SIGNAL_COLUMNS, recording_schema
 from restock.ingest.scores import LabelScore, score
 from restock.ingest.store import StoreWriter
-from restock.ingest.transitions import episode_ends
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,8 +11,10 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from restock.errors import RecordingError
-from restock.ingest.conditions import label, primary
-from restock.ingest.episodes import Split, changed_route, with_route
+from restock.ingest.columns import offsets_of
+from restock.ingest.conditions import primary
+from restock.ingest.episode_rows import ENDS, EpisodeRows, episode_rows, groups, packed
+from restock.ingest.episodes import Split
 from restock.ingest.profile import Profile
 from restock.ingest.schema import SIGNAL_COLUMNS, STEP_BITS, transition_schema
 from restock.ingest.steps import Steps
@@ -21,9 +22,6 @@ from restock.ingest.task import observe, reward
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
-
-
-ENDS = b"restock.episode_ends"  # key in the rows' metadata
 
 
 @dataclass(frozen=True)
@@ -36,61 +34,26 @@ class Provenance:
     restock_version: str
 
 
-@dataclass(frozen=True)
-class EpisodeRows:
-    """The steps of all episodes, one after the other: R rows, the last of each only an end."""
+def recording_table(
+    profile: Profile, steps: Steps, episodes: Split, provenance: Provenance
+) -> tuple[pa.Table, EpisodeRows]:
+    """All transitions of a recording, and the steps they are made of (without their signals).
 
-    tick: Ints  # (R,)
-    episode: Ints  # (R,) index of the episode
-    step: Ints  # (R,) in its episode, from 0
-    is_end: Bools  # (R,)
-    signals: dict[str, NDArray[Any]]  # leading axis R, as the row's episode sees them
-    labels: dict[str, Bools]  # condition -> (R,)
+    Some whole episodes at a time, which changes no value: an episode's rows and labels depend on
+    its own steps alone, and only those of one group are in memory in full.
 
-    @property
-    def starts(self) -> Ints:
-        """The rows that begin a transition, (N,); each one's successor is the row after it."""
-        return np.flatnonzero(~self.is_end)
-
-    def ends_table(self) -> pa.Table:
-        """The ends of the episodes, as `label_table` has them."""
-        ends = np.flatnonzero(self.is_end)
-        signals = {name: column[ends] for name, column in self.signals.items()}
-        return label_table(signals, self.episode[ends], self.step[ends])
-
-
-def episode_rows(profile: Profile, steps: Steps, episodes: Split) -> EpisodeRows:
-    """Lay the episodes' steps out, with the route that is theirs, and label them."""
-    lengths = np.array([e.last - e.first + 1 for e in episodes.episodes], np.int64)
-    episode = np.repeat(np.arange(len(lengths)), lengths)
-    start = np.concatenate([[0], np.cumsum(lengths)])[:-1]
-    step = np.arange(lengths.sum(), dtype=np.int64) - np.repeat(start, lengths)
-    first = np.array([e.first for e in episodes.episodes], np.int64)
-    tick = first[episode] + step if len(first) else step
-    is_end = step == lengths[episode] - 1 if len(first) else np.zeros(0, np.bool_)
-    signals = {name: column[tick] for name, column in steps.signals.items()}
-    # A tick that ends one episode and begins the next is seen with each one's own route.
-    old = np.flatnonzero(is_end & np.isin(tick, changed_route(steps)))
-    if len(old):
-        before, routing = tick[old] - 1, steps.routing
-        seen = with_route(
-            profile.task, steps, tick[old], routing.goal[before], routing.plan[before]
-        )
-        for name, column in seen.items():
-            signals[name][old] = column
-    table = label_table(signals, episode, step)
-    return EpisodeRows(tick, episode, step, is_end, signals, label(table, profile.conditions))
-
-
-def label_table(signals: Mapping[str, NDArray[Any]], episode: Ints, step: Ints) -> pa.Table:
-    """The steps as conditions see them: the stored signals, in the types they are stored in."""
-    columns = {
-        column.name: pa.array(np.asarray(signals[column.name]), pa.float64()).cast(column.type)
-        if column.type == pa.float32()
-        else pa.array(np.asarray(signals[column.name]), column.type)
-        for column in SIGNAL_COLUMNS
-    }
-    return pa.table({"episode_index": episode, "step_index": step, **columns})
+    Raises:
+        RecordingError: as `transitions`.
+    """
+    tables, ends, parts = [], [], []
+    for group in groups(episodes):
+        rows = episode_rows(profile, steps, episodes, group)
+        tables.append(transitions(profile, steps, episodes, rows, provenance))
+        ends.append(rows.ends_table())
+        parts.append(rows.without_signals())
+    table = pa.concat_tables(tables)
+    metadata = {ENDS: packed(pa.concat_tables(ends).combine_chunks())}
+    return table.replace_schema_metadata(metadata), EpisodeRows.join(parts)
 
 
 def transitions(
@@ -125,7 +88,6 @@ def transitions(
     terminates = np.array([e.terminated for e in episodes.episodes], np.bool_)
     for_good = terminates[rows.episode[begin]] if len(terminates) else last
     named = primary(rows.labels, profile.conditions) or ["nominal"] * len(rows.tick)
-    held = [_names(rows.labels, row) for row in begin]
     number = int(provenance.recording_id, 16) >> (64 - (63 - STEP_BITS))
     count = len(begin)
 
@@ -145,7 +107,7 @@ def transitions(
         "terminated": last & for_good,
         "truncated": last & ~for_good,
         "condition": [named[row] for row in begin],
-        "conditions": held,
+        "conditions": _names(rows.labels, begin),
         "true_condition": each(steps.truth),
         "zone": profile.zone_of(now["pose_x_m"], now["pose_y_m"]),
         "behaviour_policy": each(steps.policy),
@@ -161,28 +123,11 @@ def transitions(
         "labels_version": [profile.labels_version] * count,
         "restock_version": [provenance.restock_version] * count,
     }
-    schema = transition_schema(task.observation_size)
+    own = rows.custom.take(pa.array(begin))
+    columns |= dict(zip(own.column_names, own.columns, strict=True))
+    schema = transition_schema(task.observation_size, list(own.schema))
     table = pa.table([_typed(columns[field.name], field.type) for field in schema], schema=schema)
-    return table.replace_schema_metadata({ENDS: _packed(rows.ends_table())})
-
-
-def episode_ends(table: pa.Table) -> pa.Table | None:
-    """The steps that only end an episode, as conditions see them, of a recording's rows.
-
-    They are no transitions, but conditions that look ahead see them; they lie in the rows'
-    metadata (and so in that of their Parquet file). None where the rows carry none.
-    """
-    packed = (table.schema.metadata or {}).get(ENDS)
-    if packed is None:
-        return None
-    return pa.ipc.open_stream(base64.b64decode(packed)).read_all()
-
-
-def _packed(table: pa.Table) -> bytes:
-    sink = pa.BufferOutputStream()
-    with pa.ipc.new_stream(sink, table.schema) as writer:
-        writer.write_table(table)
-    return base64.b64encode(sink.getvalue())
+    return table.replace_schema_metadata({ENDS: packed(rows.ends_table())})
 
 
 def _vectors(rows: NDArray[np.float32]) -> pa.Array:
@@ -194,12 +139,19 @@ def _vectors(rows: NDArray[np.float32]) -> pa.Array:
 
 
 def _typed(values: Any, kind: pa.DataType) -> pa.Array:
-    if isinstance(values, pa.Array):
-        return values
+    if isinstance(values, pa.Array | pa.ChunkedArray):
+        return values if values.type == kind else values.cast(kind)
     if isinstance(values, np.ndarray):
         return pa.array(values).cast(kind, safe=False) if len(values) else pa.array([], kind)
     return pa.array(values, kind)
 
 
-def _names(labels: Mapping[str, Bools], row: int) -> list[str]:
-    return [name for name, holds in labels.items() if holds[row]]
+def _names(labels: Mapping[str, Bools], rows: Ints) -> pa.Array:
+    """The labels that hold in each of these rows, in their order, as a list array."""
+    table = np.zeros((len(rows), len(labels)), np.bool_)
+    for column, holds in zip(table.T, labels.values(), strict=True):
+        column[:] = holds[rows]
+    which = pa.array(np.nonzero(table)[1].astype(np.int32))
+    names = pa.DictionaryArray.from_arrays(which, pa.array(list(labels), pa.string()))
+    offsets = pa.array(offsets_of(table.sum(axis=1)).astype(np.int32))
+    return pa.ListArray.from_arrays(offsets, names.cast(pa.string()))

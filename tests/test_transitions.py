@@ -9,11 +9,12 @@ import pytest
 from driven_robot import SPEED_MPS, START_NS, Drive, columns, without
 
 from restock.ingest.columns import TopicColumns
+from restock.ingest.episode_rows import episode_rows
 from restock.ingest.episodes import split
 from restock.ingest.profile import Profile, load_profile
 from restock.ingest.schema import STEP_BITS, transition_schema
 from restock.ingest.steps import steps_of
-from restock.ingest.transitions import Provenance, episode_rows, transitions
+from restock.ingest.transitions import Provenance, transitions
 
 PROFILE = load_profile("warehouse_amr")
 TASK = PROFILE.task
