@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from restock.ingest.cdr_frame import TOO_LONG, BadRows, Frame, Order
 from restock.ingest.cdr_plan import Columns, compile_plan
 from restock.ingest.columns import Batch, FieldColumn, join, take
-from restock.ingest.definitions import Leaf, MessageType
+from restock.ingest.definitions import RosType
+from restock.ingest.fields import Leaf
 from restock.ingest.rows import Decoded, RowDecoder
 
 HEADER = 4  # bytes of the encapsulation header
@@ -37,7 +38,7 @@ _ENCAPSULATIONS = {
 class ColumnDecoder:
     """Decodes the wanted fields of one message type, whole batches at a time."""
 
-    def __init__(self, message: MessageType, leaves: Sequence[Leaf], *, ros1: bool = False) -> None:
+    def __init__(self, message: RosType, leaves: Sequence[Leaf], *, ros1: bool = False) -> None:
         self._message, self._leaves, self._ros1 = message, tuple(leaves), ros1
         # `name[]` is asked for and `name` compiled: brackets at the end say nothing more.
         self._paths = {leaf.path: leaf.path.removesuffix("[]") for leaf in leaves}

@@ -29,7 +29,8 @@ from restock.ingest.cdr_frame import (
     uniform,
 )
 from restock.ingest.columns import FieldColumn, Ragged, gather, join, offsets_of, take
-from restock.ingest.definitions import DTYPES, TIMES, CannotDecode, FieldType, MessageType
+from restock.ingest.definitions import TIMES, RosType
+from restock.ingest.fields import DTYPES, CannotDecode, FieldType
 
 Columns: TypeAlias = dict[str, FieldColumn]  # by field path
 
@@ -389,7 +390,7 @@ class _Elements:
 class _Compiler:
     """Walks a definition and collects its operations."""
 
-    def __init__(self, message: MessageType, wanted: Collection[str], ros1: bool) -> None:
+    def __init__(self, message: RosType, wanted: Collection[str], ros1: bool) -> None:
         self.message, self.wanted, self.ros1 = message, wanted, ros1
 
     def plan(self, name: str, prefix: str) -> Plan:
@@ -483,7 +484,7 @@ class _Compiler:
             plan.paths[wanted] = (kind, dims)
 
 
-def compile_plan(message: MessageType, wanted: Iterable[str], *, ros1: bool = False) -> Plan:
+def compile_plan(message: RosType, wanted: Iterable[str], *, ros1: bool = False) -> Plan:
     """The plan that reads these leaf paths of a message type (each as `Leaf.path` gives it).
 
     Raises:

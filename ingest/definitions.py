@@ -1,17 +1,11 @@
-"""Message definitions: from the text in a recording, or a named distribution's, to field paths.
-
-A field path names a value inside a message: `twist.twist.linear.x`, `ranges`, `header.stamp`
-(nanoseconds), `poses[].pose.position.x` (one value per element of a sequence), `name` or `name[]`.
-"""
+"""ROS message definitions: from the text in a recording, or a named distribution's."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import (
     Stores,
@@ -23,141 +17,31 @@ from rosbags.typesys import (
 from rosbags.typesys.msg import normalize_msgtype
 
 from restock.errors import RecordingError
+from restock.ingest.fields import DTYPES, CannotDecode, FieldType, Many, MessageType
 from restock.ingest.storage import Channel
 
 DEFAULT_DISTRO = "humble"
-DEEPEST = 24  # nested messages; real ones reach 6
-MOST_FIELDS = 20_000
 LONGEST_DEFINITION = 4 << 20
 LONGEST_ARRAY = 1 << 20
 
 EMPTY = "structure_needs_at_least_one_member"  # stands in a message without fields
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
-DTYPES: dict[str, np.dtype[Any]] = {
-    "bool": np.dtype(np.bool_),
-    "byte": np.dtype(np.uint8),
-    "octet": np.dtype(np.uint8),
-    "char": np.dtype(np.uint8),
-    "int8": np.dtype(np.int8),
-    "uint8": np.dtype(np.uint8),
-    "int16": np.dtype(np.int16),
-    "uint16": np.dtype(np.uint16),
-    "int32": np.dtype(np.int32),
-    "uint32": np.dtype(np.uint32),
-    "int64": np.dtype(np.int64),
-    "uint64": np.dtype(np.uint64),
-    "float32": np.dtype(np.float32),
-    "float64": np.dtype(np.float64),
-}
-
-
-class CannotDecode(Exception):
-    """A type that cannot be decoded, and why: the topic is skipped, the recording is not."""
 
 
 @dataclass(frozen=True)
-class Many:
-    """A field that repeats: a fixed array of `length`, or a sequence where that is None."""
-
-    length: int | None
-
-
-@dataclass(frozen=True)
-class FieldType:
-    """One field: a primitive (`base`) or a message (`message`), alone or repeated."""
-
-    name: str
-    base: str | None  # key of DTYPES, or "string"
-    message: str | None  # full name
-    many: Many | None
-
-
-@dataclass(frozen=True)
-class Leaf:
-    """A field path, resolved: the fields it goes through and what is at its end."""
-
-    path: str
-    steps: tuple[FieldType, ...]
-    kind: str  # key of DTYPES, "string" or "time"
-
-    @property
-    def dims(self) -> tuple[int | None, ...]:
-        """Per repetition along the path, outermost first: its fixed length, or None."""
-        return tuple(step.many.length for step in self.steps if step.many)
-
-
-@dataclass(frozen=True)
-class MessageType:
-    """A message type with everything it is made of."""
+class RosType(MessageType):
+    """A ROS message type with everything it is made of."""
 
     name: str
     source: str  # "embedded" or the distribution's name
     raw: dict[str, Any]  # rosbags' Typesdict, which the row-wise decoder registers
+    times = TIMES
 
     def fields_of(self, name: str) -> list[FieldType]:
-        """The fields of a message of this type's family.
-
-        Raises:
-            CannotDecode: it is not defined, or uses something that cannot be read.
-        """
         if name not in self.raw:
             raise CannotDecode(f"{name} is not defined in the recording or in {self.source!r}")
         fields = [_field(field, description) for field, description in self.raw[name][1]]
         return [] if [field.name for field in fields] == [EMPTY] else fields
-
-    def leaves(self) -> list[Leaf]:
-        """Every field path of the type, in the order of its serialisation."""
-        return list(self._leaves(self.name, "", (), 0, [0]))
-
-    def _leaves(
-        self, name: str, prefix: str, steps: tuple[FieldType, ...], depth: int, count: list[int]
-    ) -> Iterator[Leaf]:
-        if depth > DEEPEST:
-            raise CannotDecode(f"{self.name} nests deeper than {DEEPEST} messages")
-        for field in self.fields_of(name):
-            count[0] += 1
-            if count[0] > MOST_FIELDS:
-                raise CannotDecode(f"{self.name} has more than {MOST_FIELDS:,} fields")
-            path = prefix + field.name
-            here = (*steps, field)
-            if field.base:
-                yield Leaf(path, here, field.base)
-            elif field.message in TIMES:
-                yield Leaf(path, here, "time")
-            elif field.message:
-                inner = path + ("[]." if field.many else ".")
-                yield from self._leaves(field.message, inner, here, depth + 1, count)
-
-    def leaf(self, path: str) -> Leaf:
-        """One field path.
-
-        Raises:
-            RecordingError: the type has no such field; says which there are.
-        """
-        name, steps = self.name, []
-        parts = path.split(".")
-        for place, part in enumerate(parts):
-            fields = {field.name: field for field in self.fields_of(name)}
-            field = fields.get(part.removesuffix("[]"))
-            last = place == len(parts) - 1
-            if field is None or (part.endswith("[]") and not field.many):
-                raise _no_field(self.name, path, f"{name} has {', '.join(fields) or 'no fields'}")
-            if field.many and not last and not part.endswith("[]"):
-                raise _no_field(self.name, path, f"{part} repeats: write {part}[]")
-            steps.append(field)
-            if last and field.base:
-                return Leaf(path, tuple(steps), field.base)
-            if last and field.message in TIMES:
-                return Leaf(path, tuple(steps), "time")
-            if field.message is None:
-                raise _no_field(self.name, path, f"{part} is a {field.base}, it has no fields")
-            name = field.message
-        inside = ", ".join(field.name for field in self.fields_of(name))
-        raise _no_field(self.name, path, f"it is a message: name one of its fields ({inside})")
-
-
-def _no_field(kind: str, path: str, remedy: str) -> RecordingError:
-    return RecordingError(f"{kind} has no value at {path!r}", remedy=remedy)
 
 
 def _field(name: str, description: Any) -> FieldType:
@@ -197,7 +81,7 @@ def _distro_store(distro: str) -> Any:
     return get_typestore(names[distro])
 
 
-def message_type(channel: Channel, distro: str) -> MessageType:
+def message_type(channel: Channel, distro: str) -> RosType:
     """The type of a channel's messages.
 
     Raises:
@@ -224,14 +108,14 @@ def message_type(channel: Channel, distro: str) -> MessageType:
 
 
 @cache
-def _from_distro(name: str, distro: str) -> MessageType:
-    found = MessageType(name, distro, distro_types(distro))
+def _from_distro(name: str, distro: str) -> RosType:
+    found = RosType(name, distro, distro_types(distro))
     found.leaves()  # refuses what cannot be read
     return found
 
 
 @cache
-def _embedded(name: str, form: str, definition: bytes, distro: str) -> MessageType:
+def _embedded(name: str, form: str, definition: bytes, distro: str) -> RosType:
     try:
         text = definition.decode()
         types: dict[str, Any] = {}
@@ -252,7 +136,7 @@ def _embedded(name: str, form: str, definition: bytes, distro: str) -> MessageTy
     if missing:  # some writers leave out the messages inside; their sizes will tell if they differ
         types = {**distro_types(distro), **types}
         source = f"embedded, and {distro}"
-    found = MessageType(name, source, types)
+    found = RosType(name, source, types)
     found.leaves()  # refuses what cannot be read
     return found
 

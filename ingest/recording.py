@@ -7,7 +7,7 @@ decoded and skipped is kept per topic.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,10 +16,12 @@ from typing import Self
 
 from restock.errors import RecordingError
 from restock.ingest.account import Account, Loss, TopicInfo
-from restock.ingest.cdr import ColumnDecoder
 from restock.ingest.columns import TopicColumns
-from restock.ingest.definitions import CannotDecode, MessageType, message_type
+from restock.ingest.compression import decompress_messages
+from restock.ingest.decoders import decoder_of, type_of
+from restock.ingest.fields import CannotDecode, Leaf, MessageType
 from restock.ingest.reading import Reduction, TopicReading, together
+from restock.ingest.rows import Decoder
 from restock.ingest.storage import Channel, Damage, Integrity, Storage
 
 
@@ -29,6 +31,11 @@ class _Stream:
 
     storage: Storage
     channel: Channel
+
+    def payloads(self) -> Iterator[bytes]:
+        """Its messages as they are in the file, in file order."""
+        for _, batch in self.storage.batches([self.channel.id]):
+            yield from decompress_messages(batch)[0].payloads()
 
 
 class Recording:
@@ -54,6 +61,7 @@ class Recording:
         self._cleanup: list[Callable[[], None]] = []
         self._bag_damage: list[Damage] = []
         self._streams: dict[str, list[_Stream]] = {}
+        self._types: dict[tuple[int, int], MessageType] = {}  # by storage and channel
         for storage in self._storages:
             for channel in storage.channels.values():
                 self._streams.setdefault(channel.topic, []).append(_Stream(storage, channel))
@@ -90,15 +98,16 @@ class Recording:
         first = streams[0].channel
         expected = sum(stream.storage.counts.get(stream.channel.id, 0) for stream in streams)
         try:
-            source, skipped = self._type(first).source, None
+            source, skipped = self._type(streams[0]).source, None
         except CannotDecode as reason:
             source, skipped = "", str(reason)
         return TopicInfo(name, first.type, expected, first.encoding, source, skipped)
 
-    def _type(self, channel: Channel) -> MessageType:
-        if channel.encoding not in ("cdr", "ros1"):
-            raise CannotDecode(f"messages encoded as {channel.encoding!r} are not read")
-        return message_type(channel, self.distro)
+    def _type(self, stream: _Stream) -> MessageType:
+        key = self._storages.index(stream.storage), stream.channel.id
+        if key not in self._types:
+            self._types[key] = type_of(stream.channel, self.distro, stream.payloads)
+        return self._types[key]
 
     @property
     def size_bytes(self) -> int:
@@ -141,8 +150,12 @@ class Recording:
 
     def leaves(self, topic: str) -> list[str]:
         """Every field path of a topic's messages; empty where it cannot be decoded."""
+        return [leaf.path for leaf in self.fields(topic)]
+
+    def fields(self, topic: str) -> list[Leaf]:
+        """Every field of a topic's messages, with its type; empty where it cannot be decoded."""
         try:
-            return [leaf.path for leaf in self._type(self._streams[topic][0].channel).leaves()]
+            return self._type(self._streams[topic][0]).leaves()
         except CannotDecode:
             return []
 
@@ -187,7 +200,7 @@ class Recording:
         storage: Storage,
         readings: Mapping[str, TopicReading],
     ) -> None:
-        decoders: dict[int, ColumnDecoder] = {}
+        decoders: dict[int, Decoder] = {}
         topics: dict[int, str] = {}
         for topic, reading in readings.items():
             for stream in self._streams[topic]:
@@ -195,7 +208,7 @@ class Recording:
                     continue
                 topics[stream.channel.id] = topic
                 try:
-                    decoder = self._decoder(topic, stream.channel, reading.paths)
+                    decoder = self._decoder(topic, stream, reading.paths)
                     reading.use(decoder.empty())
                     decoders[stream.channel.id] = decoder
                 except CannotDecode as reason:
@@ -204,17 +217,21 @@ class Recording:
         for channel, batch in together(storage.batches(list(decoders))):
             readings[topics[channel]].take(decoders[channel].decode, batch)
 
-    def _decoder(self, topic: str, channel: Channel, paths: Sequence[str]) -> ColumnDecoder:
-        kind = self._type(channel)
+    def _decoder(self, topic: str, stream: _Stream, paths: Sequence[str]) -> Decoder:
+        channel, kind = stream.channel, self._type(stream)
         if channel.type != self.topics[topic].type:
             raise CannotDecode(f"it also carries {channel.type}, beside {self.topics[topic].type}")
         try:
             leaves = [kind.leaf(path) for path in paths]
+            first = self._type(self._streams[topic][0])
+            for leaf, before in zip(leaves, map(first.leaf, paths), strict=True):
+                if (leaf.kind, leaf.dims) != (before.kind, before.dims):
+                    raise CannotDecode(f"{leaf.path} is a {leaf.kind} here, a {before.kind} before")
         except RecordingError as error:
             raise RecordingError(
                 error.what, where=f"{self.path}, {topic}", remedy=error.remedy
             ) from None
-        return ColumnDecoder(kind, leaves, ros1=channel.encoding == "ros1")
+        return decoder_of(channel, kind, leaves)
 
     def _lost(self, topic: str) -> dict[str, int]:
         """Messages of a topic that damage is known to have cost, by reason."""

@@ -13,7 +13,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from restock.ingest.cdr import ColumnDecoder
 from restock.ingest.columns import Batch, Ragged, equal
-from restock.ingest.definitions import CannotDecode, Leaf, MessageType, message_type
+from restock.ingest.definitions import RosType, message_type
+from restock.ingest.fields import CannotDecode, Leaf
 from restock.ingest.readers import open_recording
 from restock.ingest.rows import RowDecoder
 from restock.ingest.storage import Channel
@@ -32,7 +33,7 @@ def batch(payloads: list[bytes], lead: int = 3) -> Batch:
     return Batch(whole.buffer, whole.start + lead, whole.stop, whole.log_time_ns, whole.log_time_ns)
 
 
-def agree(message: MessageType, payloads: list[bytes], *, ros1: bool = False) -> None:
+def agree(message: RosType, payloads: list[bytes], *, ros1: bool = False) -> None:
     leaves = message.leaves()
     given_batch = batch(payloads)
     ours = ColumnDecoder(message, leaves, ros1=ros1).decode(given_batch)
@@ -190,12 +191,12 @@ def test_other_peoples_messages_decode_as_rosbags_does(name: str) -> None:
 # -- golden bytes ---------------------------------------------------------------------------
 
 
-def one(kind: str, definition: str = "") -> MessageType:
+def one(kind: str, definition: str = "") -> RosType:
     form = "ros2msg" if definition else ""
     return message_type(Channel(1, "/t", kind, "cdr", form, definition.encode()), "humble")
 
 
-def leaf(message: MessageType, path: str) -> Leaf:
+def leaf(message: RosType, path: str) -> Leaf:
     return message.leaf(path)
 
 
