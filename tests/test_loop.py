@@ -254,12 +254,29 @@ def test_every_drawn_row_is_counted(undisturbed: Session) -> None:
     last = {(row["source"], row["stratum"]): row["total_drawn_rows"] for row in drawn.to_pylist()}
     assert sum(last.values()) == steps * 32
     assert sum(pq.read_table(path / "policies.parquet")["rows"].to_pylist()) == steps * 32
+    fed = pq.read_table(path / "fed_episodes.parquet").to_pylist()
+    assert sum(row["drawn_rows"] for row in fed) == steps * 32
+    assert {row["episode"] for row in fed if row["source"] == "logs"} == {"a/0"}
+    assert len({row["episode"] for row in fed if row["source"] == "fresh"}) > 50
     ages = pq.read_table(path / "ages.parquet").to_pylist()
     by_unit = {
         unit: sum(r["count"] for r in ages if r["unit"] == unit) for unit in ("days", "env_steps")
     }
     assert sum(by_unit.values()) == steps * 32
     assert sum(pq.read_table(path / "progress.parquet")["updates"].to_pylist()) == steps
+
+
+def test_the_critic_is_measured_on_steps_that_no_replay_has(undisturbed: Session) -> None:
+    path = undisturbed.run.path
+    evaluated = set(pq.read_table(path / "evaluations.parquet")["gradient_steps"].to_pylist())
+    measured = pq.read_table(path / "held_out.parquet").to_pylist()
+    assert {row["gradient_steps"] for row in measured} == evaluated
+    assert {row["condition"] for row in measured} >= {"nominal", "wheel_slip"}
+    last = [row for row in measured if row["gradient_steps"] == max(evaluated)]
+    first = [row for row in measured if row["gradient_steps"] == min(evaluated)]
+    assert all(row["rows"] > 0 and row["td_abs_mean"] > 0 for row in measured)
+    mean = [sum(row["td_abs_mean"] for row in rows) / len(rows) for rows in (first, last)]
+    assert mean[1] < mean[0]  # it learnt
 
 
 def test_audit_rows_hold_what_the_row_was(undisturbed: Session) -> None:

@@ -98,13 +98,17 @@ class Learner:
         )
 
     @torch.no_grad()
-    def td_error(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Of rows, without learning: Q(s, a) - y (B,), Q(s) (B, A), Q_target(s) (B, A)."""
+    def td_error(self, rows: Tensor, *, online: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+        """Of rows, without learning: Q(s, a) - y (B,), Q(s) (B, A), Q_target(s) (B, A).
+
+        `online` lets the online network bootstrap y, as if the target's clock did not lag.
+        """
         observation, next_observation, action, reward, discount = unpack(
             rows, self.network.observation_size
         )
+        slow = self.network if online else self.target_network
         next_q = self.network(next_observation) if self.loss.double else None
-        target = td_target(reward, discount, self.target_network(next_observation), next_q)
+        target = td_target(reward, discount, slow(next_observation), next_q)
         q: Tensor = self.network(observation)
         return dqn_loss(q, action, target).td, q, self.target_network(observation)
 

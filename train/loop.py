@@ -220,7 +220,7 @@ def _close_interval(session: Session, phase: str, notify: Notify) -> None:
 def _evaluate(session: Session, notify: Notify) -> None:
     """The fixed episodes, greedily; the policy is kept if it is the best so far."""
     config, clock, learner = session.config, session.clock, session.learner
-    names = [name for name, share in config.env.conditions.items() if share > 0]
+    names = list(config.env.conditions)  # also those with a share of 0: never trained on, yet met
     specs = fixed_episodes(names, config.evaluation.episodes, config.evaluation.seed)
     results = run_episodes(
         session.evaluation_env,
@@ -229,6 +229,9 @@ def _evaluate(session: Session, notify: Notify) -> None:
         control_period_s=session.task.control_period_s,
         time_limit_steps=session.task.time_limit_steps,
     )
+    measured = session.evaluation_env.measure(learner)
+    clocks = {"env_steps": clock.env_steps, "gradient_steps": learner.gradient_steps}
+    session.run.append("held_out", [{**clocks, **row} for row in measured])
     clock.evaluated_at = clock.env_steps
     session.last = score(results)
     best = session.last.beats(session.best)
@@ -237,15 +240,7 @@ def _evaluate(session: Session, notify: Notify) -> None:
         session.save_best(session.last)
     session.run.append(
         "evaluations",
-        [
-            {
-                "env_steps": clock.env_steps,
-                "gradient_steps": learner.gradient_steps,
-                **result.row,
-                "best": best,
-            }
-            for result in results
-        ],
+        [{**clocks, **result.row, "best": best} for result in results],
     )
     session.run.flush(everything=False)
     summary = {**session.last.success, "mean": session.last.success_mean}

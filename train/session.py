@@ -23,6 +23,7 @@ from restock.train.collector import Collector, ring_conditions
 from restock.train.config import TrainConfig
 from restock.train.evaluate import Score, Twin
 from restock.train.events import Events
+from restock.train.held_out import HeldOut
 from restock.train.learner import Learner
 from restock.train.probe import Probe
 from restock.train.record import FeedRecord
@@ -64,7 +65,7 @@ class Session:
     config: TrainConfig
     task: Task
     env: Twin
-    evaluation_env: Twin
+    evaluation_env: HeldOut
     learner: Learner
     ring: FreshRing
     batches: Batches
@@ -188,7 +189,7 @@ def open_session(
         config=config,
         task=task,
         env=env,
-        evaluation_env=evaluation_env,
+        evaluation_env=HeldOut(evaluation_env, task, conditions, ring),
         learner=learner,
         ring=ring,
         batches=batches,
