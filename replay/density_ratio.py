@@ -8,11 +8,11 @@ likes; only what comes of them may not change. So its rows, whatever their outco
 
 times their natural density: the ratio of the density at which the quotas draw the state and action
 to the one at which they occur. P(k | s, a) is estimated by logistic regression, which is how a
-density ratio is estimated by classification (Bickel, Brückner and Scheffer, JMLR 10, 2009; Sugiyama,
-Suzuki and Kanamori, Density Ratio Estimation in Machine Learning, 2012, chapter 4). r is clipped
-from above and weights are normalised over what is drawn (self-normalised importance sampling). As r
-is a function of the state and action alone, a poor fit changes which states are boosted, and not
-the outcomes that the critic sees in each.
+density ratio is estimated by classification (Bickel, Brückner and Scheffer, JMLR 10, 2009;
+Sugiyama, Suzuki and Kanamori, Density Ratio Estimation in Machine Learning, 2012, chapter 4). r is
+clipped from above and weights are normalised over what is drawn (self-normalised importance
+sampling). As r is a function of the state and action alone, a poor fit changes which states are
+boosted, and not the outcomes that the critic sees in each.
 """
 
 from __future__ import annotations

@@ -25,13 +25,8 @@ from restock.replay.mixture import Mixture
 from restock.replay.schedules import mean_over
 from restock.replay.source_plan import SourcePlan, SourceRows, StratumPlan, plan_source
 from restock.replay.stores import PinnedStore
-from restock.replay.strata import (
-    NO_STRATUM,
-    Stratum,
-    assign,
-    effective_count,
-    resolve_strata,
-)
+from restock.replay.strata import NO_STRATUM, Stratum, assign, resolve_strata
+from restock.replay.weights import effective_count
 
 LOGS = "logs"  # the name of the first store's part
 

@@ -14,12 +14,8 @@ from restock.replay.exclusions import scramble
 from restock.replay.layout import F32, Bools, Ints
 from restock.replay.mixture import Mixture
 from restock.replay.shares import SharePlan, plan_shares
-from restock.replay.strata import (
-    Stratum,
-    effective_count,
-    effective_shares,
-    importance_weights,
-)
+from restock.replay.strata import Stratum
+from restock.replay.weights import effective_count, effective_shares, importance_weights
 
 
 @dataclass(frozen=True)

@@ -36,14 +36,8 @@ from restock.replay.mixture import (
 from restock.replay.plan import Plan, plan_panel
 from restock.replay.schedules import Cosine, Linear, Piecewise
 from restock.replay.shares import plan_shares, scaled_within, wanted_shares
-from restock.replay.strata import (
-    Stratum,
-    assign,
-    effective_count,
-    effective_shares,
-    importance_weights,
-    resolve_strata,
-)
+from restock.replay.strata import Stratum, assign, resolve_strata
+from restock.replay.weights import effective_count, effective_shares, importance_weights
 
 EVERY = "[each_condition]\nshare = 'natural'\n"
 
