@@ -17,17 +17,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import RecordingError
 from restock.ingest.columns import TopicColumns
-from restock.ingest.profile import Clock
+
+if TYPE_CHECKING:
+    from restock.ingest.profile import Clock
 
 I64 = NDArray[np.int64]
 STAMP = "header.stamp"
 NS = 1_000_000_000
+AHEAD_NS = 50_000_000  # a transform stamped further ahead counts from when it was received
 
 
 @dataclass(frozen=True)
@@ -81,14 +85,18 @@ class ClockReport:
 
 
 def align(
-    topics: Mapping[str, TopicColumns], clock: Clock, latched: frozenset[str] = frozenset()
+    topics: Mapping[str, TopicColumns],
+    clock: Clock,
+    latched: frozenset[str] = frozenset(),
+    transforms: frozenset[str] = frozenset(),
 ) -> tuple[list[Segment], ClockReport]:
     """Every topic on the alignment clock, cut where that clock jumps.
 
     `topics` are in the order of their log time; stamped ones hold the field `header.stamp`.
     A message whose stamp is more than `clock.jump_s` from where its segment's clock has it is
     left out and counted, but one of a `latched` topic (it may have been published long before
-    the recording began) is put at its log time instead.
+    the recording began) is put at its log time instead. `transforms` may be stamped ahead: they
+    do not say what time it is, and count from when they were received.
 
     Raises:
         RecordingError: the alignment clock is `header.stamp` and no topic has one.
@@ -100,7 +108,7 @@ def align(
     delay = {
         name: columns.log_time_ns - np.asarray(columns.fields[STAMP], np.int64)
         for name, columns in topics.items()
-        if STAMP in columns.fields and name not in latched and len(columns)
+        if STAMP in columns.fields and name not in latched | transforms and len(columns)
     }
     if not delay:
         raise RecordingError(
@@ -112,7 +120,9 @@ def align(
     report.jumps = len(edges)
     segments = []
     for index in range(len(edges) + 1):
-        segments.append(_segment(topics, delay, reference, edges, index, clock, latched, report))
+        segments.append(
+            _segment(topics, delay, reference, edges, index, clock, latched, transforms, report)
+        )
     report.offset_ns = segments[0].offset_ns
     low, high = np.percentile(delay[reference] - _median(delay[reference]), [1, 99])
     report.spread_ns = int(high - low)
@@ -171,6 +181,7 @@ def _segment(
     index: int,
     clock: Clock,
     latched: frozenset[str],
+    transforms: frozenset[str],
     report: ClockReport,
 ) -> Segment:
     inside = {
@@ -190,6 +201,9 @@ def _segment(
             samples[name] = _ordered(log_time - offset, rows)
             continue
         stamp = np.asarray(columns.fields[STAMP], np.int64)[rows]
+        if name in transforms:
+            ahead = stamp - (log_time - offset) > AHEAD_NS
+            stamp = np.where(ahead, log_time - offset, stamp)
         off = np.abs(log_time - stamp - middle) > jump_ns
         if off.any() and name in latched:
             report.restamped[name] = report.restamped.get(name, 0) + int(off.sum())

@@ -111,7 +111,7 @@ def episode_rows(
 def label_table(
     signals: Mapping[str, NDArray[Any]], episode: Ints, step: Ints, custom: pa.Table
 ) -> pa.Table:
-    """The steps as conditions see them: stored signals and custom ones, typed as they are stored."""
+    """The steps as conditions see them: stored signals and custom ones, as they are stored."""
     columns = {
         column.name: pa.array(np.asarray(signals[column.name]), pa.float64()).cast(column.type)
         if column.type == pa.float32()

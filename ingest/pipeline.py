@@ -16,16 +16,15 @@ import numpy as np
 import pyarrow as pa
 
 from restock.errors import RecordingError
-from restock.ingest.clearance import scan_reduction
 from restock.ingest.conditions import NOMINAL
 from restock.ingest.episodes import Split, split
 from restock.ingest.manifest import definitions, manifest_row, software_version
+from restock.ingest.needs import reductions, wanted_fields
 from restock.ingest.profile import Profile
 from restock.ingest.readers import open_recording
 from restock.ingest.recording import Recording
 from restock.ingest.schema import recording_schema
 from restock.ingest.scores import LabelScore, score
-from restock.ingest.sources import wanted_fields
 from restock.ingest.steps import Steps, steps_of
 from restock.ingest.store import StoreWriter
 from restock.ingest.transitions import Provenance, recording_table
@@ -151,18 +150,11 @@ class _Ingest:
     def _columns(self) -> dict[str, Any]:
         recording = self.recording
         readable = {n: info for n, info in recording.topics.items() if info.skipped is None}
-        stamped = {
-            source.topic: "header.stamp" in recording.leaves(source.topic)
-            for _, source in self.profile.inputs.items()
-            if source.topic in readable
+        leaves = {
+            topic: recording.fields(topic) for topic in self.profile.topics if topic in readable
         }
-        wanted = wanted_fields(self.profile, readable, stamped)
-        scan = self.profile.inputs.scan
-        if scan is None or scan.topic not in wanted:
-            return recording.read(wanted)
-        reduction = scan_reduction(self.profile.task, scan.topic, scan.fields)
-        wanted[scan.topic] = [p for p in wanted[scan.topic] if p not in reduction.fields]
-        return recording.read(wanted, {scan.topic: reduction})
+        wanted = wanted_fields(self.profile, readable, leaves)
+        return recording.read(wanted, reductions(self.profile, readable))
 
     def _messages(self) -> dict[str, int]:
         accounts = self.recording.accounts.values()
@@ -182,7 +174,7 @@ class _Ingest:
 
     def _notes(self, steps: Steps, table: pa.Table) -> list[str]:
         clock = steps.clock
-        notes = list(self.recording.notes)
+        notes = [*self.recording.notes, *steps.notes]
         if clock.alignment == "header.stamp":
             notes.append(
                 f"clock: log time is {clock.offset_ns * 1e-9:,.3f} s ahead of header stamps, "

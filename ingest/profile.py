@@ -1,9 +1,10 @@
 """Profiles: how one kind of robot's topics fill the signals, and the task that is learnt on them.
 
 A profile is a TOML file: `name`, the shipped `conditions` it uses and `[[condition]]` of its own,
-`[task]`, `[clock]`, `[episodes]`, `[inputs.*]` (which topic fills what) and `[[zone]]` (named
-rectangles of the map). `load_profile("warehouse_amr")` reads one that comes with Restock,
-`load_profile("my_robot.toml")` one of yours.
+`[task]`, `[clock]`, `[episodes]`, `[inputs.*]` (which topic fills what), `[frames]` (poses from
+transforms), `[signals.*]` (custom columns) and `[[zone]]` (named rectangles of the map).
+`load_profile("warehouse_amr")` reads one that comes with Restock, `load_profile("my_robot.toml")`
+one of yours.
 """
 
 from __future__ import annotations
@@ -11,7 +12,6 @@ from __future__ import annotations
 import hashlib
 import re
 import tomllib
-from collections.abc import Iterator
 from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
@@ -22,65 +22,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import ConfigError
-from restock.ingest.conditions import Condition, labels_version, shipped
+from restock.ingest.condition_files import with_files
+from restock.ingest.conditions import Condition, label, labels_version, shipped
+from restock.ingest.custom import CustomSignal, name_problem
+from restock.ingest.frames import Frames
+from restock.ingest.inputs import (
+    FALLBACKS,
+    INPUT_FIELDS,
+    POSE_FALLBACK,
+    ROUTE_FALLBACK,
+    Input,
+    Inputs,
+    check_input,
+)
+from restock.ingest.schema import steps_schema
 from restock.ingest.task import Task
 
 ELSEWHERE = "elsewhere"
-
-# What each input must and may say of a message: signal-side name -> whether it is required.
-# `orientation` is a quaternion's path and becomes a yaw.
-INPUT_FIELDS: dict[str, dict[str, bool]] = {
-    "command": {"speed_mps": True, "yaw_rate_radps": True},
-    "pose": {"x_m": True, "y_m": True, "orientation": False, "yaw_rad": False},
-    "wheels": {"speed_mps": True, "yaw_rate_radps": True},
-    "imu": {"yaw_rate_radps": True, "accel_x_mps2": True},
-    "scan": {"ranges_m": True, "angle_min_rad": True, "angle_increment_rad": True},
-    "goal": {"x_m": True, "y_m": True},
-    "plan": {"x_m": True, "y_m": True},
-    "bumper": {"pressed": True},
-    "behaviour_policy": {"text": True},
-    "true_condition": {"text": True},
-}
-
-# What stands in for an input that a profile leaves out, or marks optional and a recording lacks.
-FALLBACKS: dict[str, str] = {
-    "imu": "gyro yaw rate taken from the wheels, acceleration 0",
-    "bumper": "never pressed",
-    "behaviour_policy": "the profile's behaviour_policy",
-    "true_condition": "unknown: labels are not scored",
-}
-ROUTE_FALLBACK = "none: the task has no goal, progress is forward displacement"
-
-
-class Input(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One topic, and which of its fields fill what."""
-
-    topic: str
-    type: str
-    fields: dict[str, str]
-    max_age_s: float | None = None  # None: latched, held until the next message
-    optional: bool = False
-
-
-class Inputs(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The `[inputs]` of a profile."""
-
-    command: Input
-    pose: Input
-    wheels: Input
-    scan: Input
-    imu: Input | None = None
-    goal: Input | None = None
-    plan: Input | None = None
-    bumper: Input | None = None
-    behaviour_policy: Input | None = None
-    true_condition: Input | None = None
-
-    def items(self) -> Iterator[tuple[str, Input]]:
-        for name in self.__struct_fields__:
-            source = getattr(self, name)
-            if source is not None:
-                yield name, source
 
 
 class Clock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -125,6 +83,8 @@ class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     clock: Clock = Clock()
     episodes: Episodes = Episodes()
     zones: list[Zone] = msgspec.field(default_factory=list, name="zone")
+    frames: Frames | None = None
+    signals: dict[str, CustomSignal] = msgspec.field(default_factory=dict)
 
     @property
     def conditions(self) -> list[Condition]:
@@ -142,10 +102,24 @@ class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return hashlib.blake2b(msgspec.json.encode(self), digest_size=6).hexdigest()
 
     @property
+    def transform_topics(self) -> tuple[str, ...]:
+        """The topics of the transforms that `[frames]` asks for."""
+        return (self.frames.topic, self.frames.static_topic) if self.frames else ()
+
+    @property
+    def topics(self) -> list[str]:
+        """Every topic that the profile names."""
+        named = [source.topic for _, source in self.inputs.items()]
+        named += [signal.topic for signal in self.signals.values()]
+        return list(dict.fromkeys([*named, *self.transform_topics]))
+
+    @property
     def fallbacks(self) -> dict[str, str]:
         """Inputs the profile leaves out -> what stands in for each."""
         given = dict(self.inputs.items())
         stand_ins = {name: how for name, how in FALLBACKS.items() if name not in given}
+        if self.inputs.pose is None:
+            stand_ins["pose"] = POSE_FALLBACK
         if self.task.goal == "none":
             stand_ins |= dict.fromkeys(("goal", "plan"), ROUTE_FALLBACK)
         return stand_ins
@@ -190,13 +164,15 @@ def load_profile(name_or_path: str | Path) -> Profile:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"cannot be read as UTF-8 text: {error}", where=where) from error
-    return parse_profile(text, where=where)
+    return parse_profile(text, where=where, folder=path.parent)
 
 
-def parse_profile(text: str, *, where: str) -> Profile:
-    """A profile from its TOML text; `where` names it in errors."""
+def parse_profile(text: str, *, where: str, folder: Path | None = None) -> Profile:
+    """A profile from its TOML text; `where` names it in errors, `.sql` files lie in `folder`."""
     try:
-        profile = msgspec.convert(tomllib.loads(text), Profile)
+        said = with_files(tomllib.loads(text), folder, where)
+        _convert_signals(said.get("signals"), where)
+        profile = msgspec.convert(said, Profile)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"is not TOML: {error}", where=where) from error
     except msgspec.ValidationError as error:
@@ -219,7 +195,13 @@ def _check(profile: Profile, where: str) -> None:
     if doubled := sorted({name for name in names if names.count(name) > 1}):
         raise ConfigError(f"`conditions`: {', '.join(doubled)} given twice", where=where)
     for name, source in profile.inputs.items():
-        _check_fields(name, source, where)
+        check_input(name, source, where, framed=profile.frames is not None)
+    if profile.inputs.pose is None and profile.frames is None:
+        raise ConfigError(
+            "`inputs.pose` is missing, and there is no `frames`",
+            where=where,
+            remedy="name the topic of the pose, or take it from /tf: [frames] fixed and base",
+        )
     for name in ("goal", "plan"):
         if profile.task.goal == "route" and getattr(profile.inputs, name) is None:
             raise ConfigError(
@@ -227,35 +209,44 @@ def _check(profile: Profile, where: str) -> None:
                 where=where,
                 remedy=f'name the topic of the {name}, or set task.goal = "none"',
             )
+    _check_signals(profile, where)
+    _check_conditions(profile, where)
 
 
-def _check_fields(name: str, source: Input, where: str) -> None:
-    known = INPUT_FIELDS[name]
-    unknown = sorted(source.fields.keys() - known.keys())
-    missing = sorted(
-        key for key, required in known.items() if required and key not in source.fields
-    )
-    if name == "pose" and not source.fields.keys() & {"orientation", "yaw_rad"}:
-        missing.append("orientation")
-    if unknown or missing:
-        said = [f"unknown {key!r}" for key in unknown] + [f"missing {key!r}" for key in missing]
-        raise ConfigError(
-            f"`inputs.{name}.fields`: {', '.join(said)}",
-            where=where,
-            remedy=f"{name} takes {', '.join(known)}",
-        )
-    if source.optional and name not in FALLBACKS:
-        raise ConfigError(
-            f"`inputs.{name}.optional`: nothing can stand in for {name}",
-            where=where,
-            remedy=f"optional may be {', '.join(FALLBACKS)}",
-        )
+def _convert_signals(said: Any, where: str) -> None:
+    """Each signal by itself first: msgspec's paths leave out the keys of a table of tables."""
+    for name, table in said.items() if isinstance(said, dict) else ():
+        try:
+            msgspec.convert(table, CustomSignal)
+        except msgspec.ValidationError as error:
+            raise ConfigError(_explain(str(error), f"signals.{name}"), where=where) from error
 
 
-def _explain(message: str) -> str:
+def _check_signals(profile: Profile, where: str) -> None:
+    for name in profile.signals:
+        if problem := name_problem(name):
+            raise ConfigError(f"`signals.{name}`: {problem}", where=where)
+
+
+def _check_conditions(profile: Profile, where: str) -> None:
+    """That every condition of the profile's own binds to the steps that there will be."""
+    fields = [signal.field(name) for name, signal in profile.signals.items()]
+    steps = steps_schema(fields).empty_table()
+    for place, condition in enumerate(profile.own_conditions):
+        try:
+            label(steps, [condition])
+        except ConfigError as error:
+            raise ConfigError(
+                f"`condition[{place}].sql` ({condition.name!r}): {error.what}",
+                where=where,
+                remedy=error.remedy,
+            ) from error
+
+
+def _explain(message: str, under: str = "") -> str:
     """msgspec's message with the key as TOML writes it: `task.body.foo`, not `$.task.body`."""
     said, _, path = message.partition(" - at `$")
-    path = path.rstrip("`").lstrip(".")
+    path = ".".join(part for part in (under, path.rstrip("`").lstrip(".")) if part)
     unknown = re.fullmatch(r"Object contains unknown field `(.*)`", said)
     if unknown:
         return f"unknown key `{'.'.join(part for part in (path, unknown[1]) if part)}`"
@@ -267,6 +258,8 @@ def _explain(message: str) -> str:
 
 __all__ = [
     "ELSEWHERE",
+    "FALLBACKS",
+    "INPUT_FIELDS",
     "Clock",
     "Episodes",
     "Input",

@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from restock.ingest.profile import FALLBACKS
-from restock.ingest.recording import Recording, TopicInfo
+from restock.ingest.account import TopicInfo
+from restock.ingest.inputs import FALLBACKS
+from restock.ingest.recording import Recording
 
 _TWIST = {"speed_mps": "linear.x", "yaw_rate_radps": "angular.z"}
 _POSE = {"x_m": "position.x", "y_m": "position.y", "orientation": "orientation"}

@@ -6,6 +6,7 @@ whole under any filter, sort or engine.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import pyarrow as pa
@@ -76,8 +77,18 @@ SIGNAL_COLUMNS: tuple[Column, ...] = tuple(
 COLUMNS: tuple[Column, ...] = IDENTITY + TRANSITION + COVERAGE + SIGNAL_COLUMNS + PROVENANCE
 
 
-def transition_schema(observation_size: int) -> pa.Schema:
-    """The Arrow schema of rows whose observations have `observation_size` entries."""
+def steps_schema(custom: Sequence[pa.Field] = ()) -> pa.Schema:
+    """The steps as conditions see them: the stored signals, and a profile's custom ones."""
+    keys = [("episode_index", pa.int64()), ("step_index", pa.int64())]
+    own = [(column.name, column.type) for column in SIGNAL_COLUMNS]
+    return pa.schema([*(pa.field(*field) for field in keys + own), *custom])
+
+
+def transition_schema(observation_size: int, custom: Sequence[pa.Field] = ()) -> pa.Schema:
+    """The Arrow schema of rows whose observations have `observation_size` entries.
+
+    `custom` are the columns of a profile's own signals; they come last.
+    """
     sized = pa.list_(pa.field("element", pa.float32()), observation_size)
     return pa.schema(
         [
@@ -88,6 +99,7 @@ def transition_schema(observation_size: int) -> pa.Schema:
             )
             for column in COLUMNS
         ]
+        + list(custom)
     )
 
 
@@ -140,6 +152,27 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
             labelled=pa.int64(), support=pa.int64(),
         ),
         "of the labels against the true condition; empty where that is not known",
+    ),
+    Column(
+        "clocks",
+        _rows_of(
+            topic=pa.string(), stamped=pa.bool_(), offset_ns=pa.int64(), spread_ns=pa.int64(),
+            publish_offset_ns=pa.int64(), jumps=pa.int64(), backsteps=pa.int64(),
+            duplicates=pa.int64(), zero_stamps=pa.int64(), off_clock=pa.int64(),
+            restamped=pa.int64(),
+        ),
+        "per topic read: log time against header stamp, and what is odd about the stamps",
+        nullable=True,
+    ),
+    Column(
+        "signals",
+        _rows_of(
+            name=pa.string(), unit=pa.string(), type=pa.string(), topic=pa.string(),
+            path=pa.string(), meaning=pa.string(), messages=pa.int64(), found=pa.int64(),
+            unread=pa.int64(), steps=pa.int64(),
+        ),
+        "custom signals: unit and source, messages, those that have it, steps that know it",
+        nullable=True,
     ),
     Column("task_json", pa.string(), "the task, as JSON"),
     Column("conditions_json", pa.string(), "the conditions: name, timing, priority, sql, as JSON"),

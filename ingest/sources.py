@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import RecordingError
-from restock.ingest.align import STAMP
+from restock.ingest.align import Segment
 from restock.ingest.columns import FieldColumn, Ragged, TopicColumns
-from restock.ingest.profile import FALLBACKS, Input, Profile
+from restock.ingest.custom import yaw_of
+from restock.ingest.frames import FRAME_ID, Edges, Placement, Tree, plain
+from restock.ingest.inputs import FALLBACKS, POSE_FALLBACK, Input
+from restock.ingest.profile import Profile
 
 F64 = NDArray[np.float64]
 
@@ -23,6 +24,7 @@ class Sources:
 
     def __init__(self, profile: Profile, topics: Mapping[str, TopicColumns]) -> None:
         self.topics = topics
+        self.placed: dict[str, Placement] = {}  # of each message of an input in another frame
         self.inputs = {
             name: source
             for name, source in profile.inputs.items()
@@ -55,21 +57,40 @@ class Sources:
         """The text of an input, one a message."""
         return [str(text) for text in np.asarray(self.column(name, "text"), object)]
 
-    def beams(self, rows: NDArray[np.intp]) -> NDArray[np.int64]:
-        """How many ranges each of these scans holds, (N,)."""
-        ranges = self.column("scan", "ranges_m")
-        if isinstance(ranges, Ragged):
-            return ranges.lengths[rows]
-        return np.full(len(rows), ranges.shape[1] if ranges.ndim > 1 else 1, np.int64)
-
     @cached_property
     def plans(self) -> list[F64]:
         """Each plan's points (P, 2); P is 0 where the planner found none."""
         x, y = self.column("plan", "x_m"), self.column("plan", "y_m")
-        return [
+        points = [
             np.stack([np.asarray(x[row], np.float64), np.asarray(y[row], np.float64)], axis=-1)
             for row in range(len(x))
         ]
+        if "plan" not in self.placed:
+            return points
+        at = self.placed["plan"]
+        return [
+            plan @ at.rotation[row, :2, :2].T + at.translation_m[row, :2]
+            for row, plan in enumerate(points)
+        ]
+
+    @cached_property
+    def goals(self) -> F64:
+        """Each goal (G, 2)."""
+        goals = np.stack([self.numbers("goal", axis) for axis in ("x_m", "y_m")], axis=1)
+        if "goal" not in self.placed:
+            return goals
+        at = self.placed["goal"]
+        return np.asarray(
+            np.einsum("nij,nj->ni", at.rotation[:, :2, :2], goals) + at.translation_m[:, :2]
+        )
+
+    def frames_of(self, name: str) -> list[str]:
+        """The frame that each message of an input is in; empty where messages do not say."""
+        source = self.inputs.get(name)
+        column = None if source is None else self.topics[source.topic].fields.get(FRAME_ID)
+        if column is None:
+            return []
+        return [plain(str(frame)) for frame in np.asarray(column, object)]
 
     def _yaw(self, name: str) -> F64:
         """Quaternions (N,) to yaw in (-pi, pi], REP 103: about z, counter-clockwise."""
@@ -77,61 +98,72 @@ class Sources:
         fields = self.topics[source.topic].fields
         path = source.fields["orientation"]
         x, y, z, w = (np.asarray(fields[f"{path}.{axis}"], np.float64) for axis in "xyzw")
-        with np.errstate(over="ignore", invalid="ignore"):  # what is no number stays none
-            return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-
-
-def wanted_fields(
-    profile: Profile, available: Mapping[str, Any], stamped: Mapping[str, bool]
-) -> dict[str, list[str]]:
-    """topic -> the field paths to read for this profile, of the topics that are `available`.
-
-    `available` maps a topic to something with a `type` and an `expected` count; `stamped` says
-    which topics' messages carry a header.
-
-    Raises:
-        RecordingError: a required topic is missing, or holds another type than the profile says.
-    """
-    wanted: dict[str, list[str]] = {}
-    problems = input_problems(profile, available)
-    if problems:
-        have = ", ".join(sorted(available)) or "none"
-        raise RecordingError(
-            f"does not fit the profile {profile.name!r}: {'; '.join(problems)}",
-            remedy=f"its topics are {have}; choose another --profile or see `restock info`",
-        )
-    for source in (source for _, source in profile.inputs.items() if source.topic in available):
-        paths = wanted.setdefault(source.topic, [])
-        for key, path in source.fields.items():
-            paths += [f"{path}.{axis}" for axis in "xyzw"] if key == "orientation" else [path]
-        if stamped[source.topic]:
-            paths.append(STAMP)
-    return {topic: list(dict.fromkeys(paths)) for topic, paths in wanted.items()}
-
-
-def input_problems(profile: Profile, available: Mapping[str, Any]) -> list[str]:
-    """Why a recording with these topics does not fit the profile, a line a topic."""
-    needed: dict[str, list[str]] = {}
-    wrong: dict[str, list[str]] = {}
-    for name, source in profile.inputs.items():
-        found = available.get(source.topic)
-        if (found is None or not found.expected) and not source.optional:
-            what = "no message of" if found is not None else "no topic"
-            needed.setdefault(f"{what} {source.topic}", []).append(name)
-        elif found is not None and found.type != source.type:
-            said = f"{source.topic} holds {found.type}, not {source.type}"
-            wrong.setdefault(said, []).append(name)
-    return [
-        f"{what} ({', '.join(names)})"
-        for what, names in itertools.chain(needed.items(), wrong.items())
-    ]
+        return yaw_of(x, y, z, w)
 
 
 def stand_ins(profile: Profile, topics: Mapping[str, TopicColumns]) -> dict[str, str]:
-    """Inputs that this recording does not fill -> what stands in for each."""
+    """Inputs and signals that this recording does not fill -> what stands in for each."""
     absent = {
-        name: FALLBACKS[name]
+        name: FALLBACKS.get(name, POSE_FALLBACK)
         for name, source in profile.inputs.items()
         if source.optional and not (source.topic in topics and len(topics[source.topic]))
     }
-    return profile.fallbacks | absent
+    silent = {
+        f"signals.{name}": f"null: no message of {signal.topic}"
+        for name, signal in profile.signals.items()
+        if not (signal.topic in topics and len(topics[signal.topic]))
+    }
+    return profile.fallbacks | absent | silent
+
+
+def transforms_of(profile: Profile, sources: Sources) -> Edges:
+    """The transforms that the pose, goals and plans need; none where the profile has no frames.
+
+    Raises:
+        RecordingError: the pose is to come from them, and none of them joins its two frames.
+    """
+    frames = profile.frames
+    if frames is None:
+        return Edges({}, frozenset(), {})
+    edges = Edges.of(frames, sources.topics)
+    if sources.present("pose") is None and (why := edges.missing(frames.base, frames.fixed)):
+        raise RecordingError(
+            why, remedy="mend `frames` in the profile; see `restock profile check`"
+        )
+    said = {frame for name in ("goal", "plan") for frame in sources.frames_of(name)}
+    return edges.only({frames.base, frames.fixed, *said})
+
+
+def place_messages(sources: Sources, tree: Tree, segments: Sequence[Segment]) -> None:
+    """Find where in the fixed frame goals and plans are that were given in another one."""
+    fixed = plain(tree.frames.fixed)
+    for name in ("goal", "plan"):
+        said = np.array([*sources.frames_of(name), None], object)[:-1]
+        others = sorted(set(said.tolist()) - {fixed, ""})
+        if not others:
+            continue
+        at = sources.placed[name] = Placement.nowhere(len(said))
+        topic = sources.inputs[name].topic
+        for frame in others:
+            samples = [segment.topics[topic] for segment in segments]
+            mine = [said[one.row] == frame for one in samples]
+            times = [one.stamp_ns[keep] for one, keep in zip(samples, mine, strict=True)]
+            rows = np.concatenate([one.row[keep] for one, keep in zip(samples, mine, strict=True)])
+            # A latched message stands again at the start of later segments: the first counts.
+            at.fill(rows[::-1], tree.place(frame, times), slice(None, None, -1))
+
+
+def frame_notes(profile: Profile, sources: Sources, edges: Edges) -> list[str]:
+    """What is odd about the frames of a recording."""
+    notes = []
+    if edges.parent_changes:
+        notes.append(f"transforms: a frame was given another parent {edges.parent_changes} times")
+    if profile.frames is None:
+        said = {name: set(sources.frames_of(name)) - {""} for name in ("goal", "plan")}
+        frames = sorted(said["goal"] | said["plan"])
+        if len(frames) > 1:
+            notes.append(
+                f"goals and plans are in the frames {', '.join(frames)}, and are taken as if in"
+                " one: the profile has no [frames]"
+            )
+    return notes

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 from restock.ingest.align import NS, ClockReport, Held, Samples, Segment, align, ticks_of
 from restock.ingest.clearance import BEAMS, SECTORS, scan_reduction
 from restock.ingest.columns import TopicColumns
+from restock.ingest.custom import Custom, custom_signals
+from restock.ingest.frames import Tree
 from restock.ingest.profile import Profile
 from restock.ingest.reading import Fields
 from restock.ingest.routing import LARGEST, Routing, plan_ends, plan_problems, same_goals
 from restock.ingest.signals import localised_velocity
-from restock.ingest.sources import Sources
+from restock.ingest.sources import Sources, frame_notes, place_messages, transforms_of
 from restock.ingest.task import nearest_action
 
 F64 = NDArray[np.float64]
@@ -52,6 +54,8 @@ class Steps:
     truth: list[str | None]  # (T,) true condition, where a simulator said it
     clock: ClockReport
     commands_between: int  # commands that got no tick of their own
+    custom: Custom  # the profile's own signals
+    notes: list[str] = field(default_factory=list)  # what else is worth saying
 
     def __len__(self) -> int:
         return len(self.segment)
@@ -65,9 +69,17 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
             not what its input needs.
     """
     sources = Sources(profile, topics)
-    latched = {s.topic for s in sources.inputs.values() if s.max_age_s is None}
-    latched -= {s.topic for s in sources.inputs.values() if s.max_age_s is not None}
-    segments, report = align(topics, profile.clock, frozenset(latched))
+    edges = transforms_of(profile, sources)
+    ages = [(source.topic, source.max_age_s) for source in sources.inputs.values()]
+    ages += [(signal.topic, signal.max_age_s) for signal in profile.signals.values()]
+    latched = {topic for topic, age in ages if age is None}
+    latched -= {topic for topic, age in ages if age is not None}
+    segments, report = align(
+        {**topics, **edges.topics},
+        profile.clock,
+        edges.static.union(latched),
+        frozenset(edges.topics),
+    )
     ticks, between = [], 0
     for segment in segments:
         end = max((int(s.stamp_ns[-1]) for s in segment.topics.values() if len(s.row)), default=0)
@@ -75,7 +87,10 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
         stamps, extra = ticks_of(command, profile.clock, profile.task.control_period_s, end)
         ticks.append(stamps)
         between += extra
-    filling = _Filling(profile, sources, segments, ticks)
+    tree = Tree(profile.frames, edges, segments) if profile.frames else None
+    if tree is not None:
+        place_messages(sources, tree, segments)
+    filling = _Filling(profile, sources, segments, ticks, tree)
     signals = filling.fill()
     follows, cut = filling.continuity()
     before = np.arange(len(follows)) - follows  # the tick before, or itself
@@ -103,6 +118,8 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
         filling.truth(),
         report,
         between,
+        custom_signals(profile.signals, topics, segments, ticks),
+        frame_notes(profile, sources, edges),
     )
 
 
@@ -115,7 +132,9 @@ class _Filling:
         sources: Sources,
         segments: Sequence[Segment],
         ticks: Sequence[Ints],
+        tree: Tree | None,
     ) -> None:
+        self.tree = tree
         self.profile, self.task, self.sources = profile, profile.task, sources
         self.segments, self.ticks = segments, ticks
         self.tick_ns = np.concatenate(ticks)
@@ -128,8 +147,7 @@ class _Filling:
     def fill(self) -> dict[str, NDArray[Any]]:
         """Every signal but the localised velocity, which needs to know the tick before."""
         self._command()
-        self._numbers("pose", x_m="pose_x_m", y_m="pose_y_m", yaw_rad="pose_yaw_rad")
-        self.signals["pose_stamp_ns"] = self.tick_ns - self._hold("pose").age_ns
+        self._pose()
         self._numbers("wheels", speed_mps="wheel_speed_mps", yaw_rate_radps="wheel_yaw_rate_radps")
         if self.sources.present("imu"):
             self._numbers("imu", yaw_rate_radps="gyro_yaw_rate_radps", accel_x_mps2="accel_x_mps2")
@@ -219,6 +237,22 @@ class _Filling:
             self._blame(~sane, f"{name}: not finite")
             self.signals[signal] = np.where(sane & held.known, column, 0.0)
 
+    def _pose(self) -> None:
+        if self.sources.present("pose"):
+            self._numbers("pose", x_m="pose_x_m", y_m="pose_y_m", yaw_rad="pose_yaw_rad")
+            self.signals["pose_stamp_ns"] = self.tick_ns - self._hold("pose").age_ns
+            return
+        assert self.tree is not None  # the profile is refused otherwise
+        at = self.tree.place(self.tree.frames.base, self.ticks)
+        for reason in sorted(set(at.problem) - {""}):
+            self._blame(at.problem == reason, f"pose: {reason}")
+        x, y, _ = at.translation_m.T
+        for signal, values in (("x_m", x), ("y_m", y), ("yaw_rad", at.yaw_rad)):
+            sane = np.abs(values) <= LARGEST  # False for NaN
+            self._blame(~sane, "pose: not finite")
+            self.signals[f"pose_{signal}"] = np.where(sane & (at.problem == ""), values, 0.0)
+        self.signals["pose_stamp_ns"] = at.stamp_ns
+
     def _command(self) -> None:
         # At a fixed rate a command lands anywhere in the interval: the one in force for most of
         # it is the one in force at its middle. On the command clock it opens the interval.
@@ -231,6 +265,11 @@ class _Filling:
         )
 
     def _scan(self) -> None:
+        if not self.sources.present("scan"):
+            shape = len(self.tick_ns), self.task.sectors
+            self.signals["sector_clearance_m"] = np.full(shape, float(self.task.range_max_m))
+            self.signals["clearance_m"] = np.full(shape[0], float(self.task.range_max_m))
+            return
         held = self._required("scan")
         source = self.sources.inputs["scan"]
         fields: Fields = self.sources.topics[source.topic].fields
@@ -262,8 +301,12 @@ class _Filling:
     def _route(self) -> None:
         held_goal = self._required("goal", route=True)
         held_plan = self._required("plan", route=True)
-        axes = [self.sources.numbers("goal", axis) for axis in ("x_m", "y_m")]
-        goals, plans = np.stack(axes, axis=1), self.sources.plans
+        goals, plans = self.sources.goals, self.sources.plans
+        for name, held in (("goal", held_goal), ("plan", held_plan)):
+            if name in self.sources.placed:
+                problems = np.where(held.known, self.sources.placed[name].problem[held.row], "")
+                for reason in sorted(set(problems) - {""}):
+                    self._blame(problems == reason, f"{name}: {reason}", route=True)
         settings = self.profile.episodes
         goal, plan = (np.where(held.known, held.row, -1) for held in (held_goal, held_plan))
         if len(goals):

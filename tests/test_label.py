@@ -142,7 +142,7 @@ def test_wrong_usage(store, tmp_path, capsys):
     bad = tmp_path / "bad.toml"
     bad.write_text(TEXT + SOON.format("lead(pose_x_mm) OVER episode > 2"))
     assert main(["label", str(store), "--profile", str(bad)]) == 2
-    assert "condition 'soon': its SQL does not run" in capsys.readouterr().err
+    assert "`condition[0].sql` ('soon'): its SQL does not run" in capsys.readouterr().err
 
 
 def test_the_ends_are_kept_with_the_rows(store):

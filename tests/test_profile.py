@@ -69,8 +69,8 @@ def test_an_error_names_the_file_and_the_key(old, new, said):
 
 
 def test_what_nothing_can_stand_in_for_is_not_optional():
-    text = TEXT.replace("[inputs.scan]", "[inputs.scan]\noptional = true")
-    with pytest.raises(ConfigError, match="nothing can stand in for scan"):
+    text = TEXT.replace("[inputs.wheels]", "[inputs.wheels]\noptional = true")
+    with pytest.raises(ConfigError, match="nothing can stand in for wheels"):
         parse_profile(text, where="mine.toml")
 
 

@@ -71,14 +71,15 @@ class Profile:
         from restock.cli import output
         from restock.cli.ingest import as_json, show
         from restock.ingest.pipeline import ingest
+        from restock.ingest.needs import input_problems
         from restock.ingest.profile import load_profile
         from restock.ingest.readers import open_recording
-        from restock.ingest.sources import input_problems
 
         profile = load_profile(self.paths[0])
         with open_recording(self.paths[1], typestore=self.typestore) as recording:
             topics = {n: t for n, t in recording.topics.items() if t.skipped is None}
-            problems = input_problems(profile, topics)
+            leaves = {name: recording.fields(name) for name in profile.topics if name in topics}
+            problems = input_problems(profile, topics, leaves)
             inputs: list[dict[str, Any]] = [
                 {
                     "input": name,
