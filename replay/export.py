@@ -25,7 +25,7 @@ def init_script(store: Store) -> str:
     )
     return "\n".join(
         [
-            f"-- {store.path.absolute()}, version {store.version}",
+            f"-- {store.path}, version {store.version}",
             *(
                 parquet_view(view, [Path(file).absolute() for file in files]) + ";"
                 for view, files in store.files.items()
@@ -50,6 +50,12 @@ def export_views(store: Store, out: str | Path) -> Path:
     if out.exists():
         raise StoreError(
             "already there", where=str(out), remedy="choose another name, or remove it"
+        )
+    if store.path.folder is None:
+        raise StoreError(
+            "views of a store on S3 cannot be had by other DuckDBs",
+            where=str(store.path),
+            remedy="ask it with `restock sql`, or from Python with restock.open()",
         )
     if not all(store.files.values()):
         raise StoreError("it holds no recordings to look at", where=str(store.path))

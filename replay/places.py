@@ -11,6 +11,7 @@ import msgspec
 import pyarrow as pa
 
 from restock.errors import StoreError
+from restock.ingest.location import Location
 from restock.replay.panel import HEADER, HELD_OUT, META, Panel
 from restock.replay.store import Store, is_store, read_parquet
 
@@ -28,7 +29,7 @@ def open_place(
     """A connection with the views of a store, a run or a panel.
 
     Args:
-        path: the place.
+        path: the place: a folder, or `s3://bucket/prefix` for a store.
         beside: more places, each under a schema of its own: `{"run": "runs/a"}` gives
             `run.audit`. Runs and panels only.
         memory_limit: of DuckDB, for a store.
@@ -37,12 +38,13 @@ def open_place(
     Raises:
         StoreError: there is nothing that can be queried.
     """
-    path = Path(path)
-    if only_store or is_store(path):
-        with Store(path, memory_limit=memory_limit) as store:
+    place = Location.of(path)
+    if only_store or place.folder is None or is_store(place):
+        with Store(place, memory_limit=memory_limit) as store:
             _add_all(store.connection, beside)
             yield store.connection
         return
+    path = place.folder
     with duckdb.connect() as connection:
         if not _add(connection, path, "main"):
             raise StoreError(

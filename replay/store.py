@@ -1,6 +1,8 @@
 """A store, open for reading: DuckDB over the Parquet of one version of its Delta tables.
 
-The views of `views.sql` and the macros of `macros.sql` are there; queries are read-only.
+The views of `views.sql` and the macros of `macros.sql` are there; queries are read-only. DuckDB
+reads a folder's files itself; those on S3 it reads through Arrow, which skips the columns and row
+groups that a query does not ask for.
 """
 
 from __future__ import annotations
@@ -14,37 +16,42 @@ from urllib.parse import unquote
 import duckdb
 import msgspec
 import pyarrow as pa
+import pyarrow.dataset
 from deltalake import DeltaTable
-from deltalake.exceptions import DeltaError, TableNotFoundError
 
 from restock.errors import StoreError
 from restock.ingest.conditions import Condition
+from restock.ingest.location import Location
+from restock.ingest.store import OWN_PATH, RECORDINGS, TRANSITIONS
 from restock.ingest.task import Task
 from restock.replay.query import install, query
-
-TRANSITIONS, RECORDINGS = "transitions", "recordings"
 
 
 class Store:
     """A store at one version. Close it, or use it as a context manager.
 
     Args:
-        path: the store's directory.
+        path: the store's directory, or `s3://bucket/prefix`.
         version: of its transitions table; default the newest.
         memory_limit: what DuckDB may hold in memory, e.g. "4GB"; default DuckDB's own (80 %).
 
     `version` is of the transitions table, `files` the Parquet files of each table.
 
     Raises:
-        StoreError: nothing there, not a store, or no such version.
+        StoreError: nothing there, not a store, no such version, or it cannot be reached.
     """
 
     def __init__(
-        self, path: str | Path, *, version: int | None = None, memory_limit: str | None = None
+        self,
+        path: str | Path | Location,
+        *,
+        version: int | None = None,
+        memory_limit: str | None = None,
     ) -> None:
-        self.path = Path(path)
-        transitions = _open(self.path, TRANSITIONS, version)
-        recordings = _open(self.path, RECORDINGS, None)
+        self.path = Location.of(path)
+        _expect(self.path)
+        transitions = self.path.open_table(TRANSITIONS, version)
+        recordings = self.path.open_table(RECORDINGS)
         self.version: int = transitions.version()
         self._spill = tempfile.TemporaryDirectory(prefix="restock-")
         self.connection = duckdb.connect(
@@ -52,9 +59,11 @@ class Store:
         )
         if memory_limit is not None:
             self._set_memory(memory_limit)
+        rows = _paths(transitions)
+        manifests = _manifests(self.path, recordings, rows)
         self.files = {
-            "stored_recordings": _present(self.connection, "stored_recordings", recordings),
-            "stored_transitions": _present(self.connection, "stored_transitions", transitions),
+            "stored_recordings": self._present(RECORDINGS, recordings, manifests, hold=True),
+            "stored_transitions": self._present(TRANSITIONS, transitions, rows),
         }
         self._tasks = self._read_tasks()
         self.observation_type = self._observation_type()
@@ -129,6 +138,33 @@ class Store:
         }
         return f"FLOAT[{sizes.pop()}]" if len(sizes) == 1 else "FLOAT[]"
 
+    def _present(
+        self, name: str, table: DeltaTable, paths: Sequence[str], *, hold: bool = False
+    ) -> list[str]:
+        """A view `stored_…` of a table's files; returns their full paths.
+
+        What lies on S3 is read at each query, or once, to be held in memory.
+        """
+        view, schema = f"stored_{name}", pa.schema(table.schema().to_arrow())
+        files = [f"{self.path.table(name)}/{path}" for path in paths]
+        if not files:
+            self.connection.register(view, schema.empty_table())
+        elif self.path.folder is not None:
+            read_parquet(self.connection, view, files)
+        else:
+            parquet = pa.dataset.ParquetFileFormat(
+                default_fragment_scan_options=pa.dataset.ParquetFragmentScanOptions(pre_buffer=True)
+            )
+            remote = pa.dataset.FileSystemDataset(
+                [parquet.make_fragment(f"{name}/{path}", self.path.files) for path in paths],
+                schema,
+                parquet,
+                self.path.files,
+            )
+            with self.path.explained():
+                self.connection.register(view, remote.to_table() if hold else remote)
+        return files
+
     def _set_memory(self, limit: str) -> None:
         try:
             self.connection.execute(f"SET memory_limit = '{limit}'")
@@ -138,37 +174,38 @@ class Store:
             ) from error
 
 
-def is_store(path: str | Path) -> bool:
-    """Whether there is a store at `path`."""
-    return all((Path(path) / name / "_delta_log").is_dir() for name in (TRANSITIONS, RECORDINGS))
+def is_store(path: str | Path | Location) -> bool:
+    """Whether there is a store at `path`. Raises StoreError where the place cannot be reached."""
+    place = Location.of(path)
+    return all(place.has_table(name) for name in (TRANSITIONS, RECORDINGS))
 
 
-def _open(path: Path, name: str, version: int | None) -> DeltaTable:
-    if not is_store(path):
-        raise StoreError(
-            "not a store" if path.exists() else "no such store",
-            where=str(path),
-            remedy=f"`restock ingest RECORDINGS --store {path}` makes one",
-        )
-    try:
-        return DeltaTable(str(path / name), version=version)
-    except (TableNotFoundError, DeltaError, ValueError) as error:
-        raise StoreError(
-            f"its table `{name}` cannot be opened"
-            + (f" at version {version}" if version is not None else "")
-            + f": {str(error).splitlines()[0]}",
-            where=str(path),
-        ) from error
+def _expect(place: Location) -> None:
+    if is_store(place):
+        return
+    raise StoreError(
+        "not a store" if place.folder is not None and place.folder.exists() else "no such store",
+        where=str(place),
+        remedy=f"`restock ingest RECORDINGS --store {place}` makes one",
+    )
 
 
-def _present(connection: duckdb.DuckDBPyConnection, view: str, table: DeltaTable) -> list[str]:
-    """A view of a Delta table at its version; returns the files it reads."""
-    files = [_local(uri) for uri in table.file_uris()]
-    if files:
-        read_parquet(connection, view, files)
-    else:
-        connection.register(view, pa.schema(table.schema().to_arrow()).empty_table())
-    return files
+def _paths(table: DeltaTable) -> list[str]:
+    """The table's files, by their paths in it."""
+    paths = table.get_add_actions(flatten=True)["path"].to_pylist()
+    return [unquote(str(path)) for path in paths]
+
+
+def _manifests(place: Location, recordings: DeltaTable, rows: Sequence[str]) -> list[str]:
+    """The files of the manifests, those of an older version's rows included.
+
+    A manifest is taken out of `recordings` when its rows are replaced. Who reads the rows as they
+    were before, by version or because the writer was between two commits, finds it by its name.
+    """
+    active = _paths(recordings)
+    gone = sorted(set(filter(OWN_PATH.fullmatch, rows)) - set(active))
+    found = place.files.get_file_info([f"{RECORDINGS}/{path}" for path in gone])
+    return active + [path for path, info in zip(gone, found, strict=True) if info.is_file]
 
 
 def read_parquet(
@@ -192,8 +229,3 @@ def parquet_view(
         f"CREATE OR REPLACE VIEW {name} AS"
         f" SELECT * FROM read_parquet([{quoted}], union_by_name = true)"
     )
-
-
-def _local(uri: str) -> str:
-    """A file's path from its address: deltalake percent-encodes what is no plain letter."""
-    return unquote(uri.removeprefix("file://"))

@@ -16,8 +16,10 @@ import pytest
 from conftest import manifest as small_manifest
 from conftest import recording_transitions
 from deltalake import DeltaTable
+from deltalake.exceptions import CommitFailedError
 
 from restock.errors import StoreError
+from restock.ingest.location import Location
 from restock.ingest.schema import recording_schema
 from restock.ingest.store import RECORDINGS, TRANSITIONS, StoreWriter
 from restock.replay.store import Store
@@ -73,6 +75,34 @@ def test_the_old_rows_can_still_be_read_at_the_old_version(tmp_path):
     writer.write(*one(1, "b"))
     files = DeltaTable(str(tmp_path / "s" / "transitions"), version=version).file_uris()
     assert pq.read_table(files[0].removeprefix("file://")).equals(one(1, "a")[1])
+
+
+def test_an_old_version_keeps_its_manifests(tmp_path):
+    """They are taken out of `recordings` when the rows are replaced, and found by their names."""
+    writer = StoreWriter(tmp_path / "s")
+    version = writer.write(*one(1, "a"))
+    writer.write(*one(1, "b"))
+    with Store(tmp_path / "s", version=version) as store:
+        assert store.sql("SELECT DISTINCT ingest_id FROM transitions").fetchall() == [
+            ("0000000000000001-a",)
+        ]
+        assert store.sql("SELECT ingest_id FROM recordings").fetchall() == [("0000000000000001-a",)]
+
+
+def test_a_reader_between_a_replacing_writers_commits_sees_the_recording(tmp_path, monkeypatch):
+    """It opens the rows as they were, and their manifest is gone when it looks."""
+    path = tmp_path / "s"
+    StoreWriter(path).write(*one(1, "a"))
+    open_table = Location.open_table
+
+    def overtaken(self, name, *rest):
+        if name == RECORDINGS:
+            monkeypatch.undo()
+            StoreWriter(path).write(*one(1, "b"))
+        return open_table(self, name, *rest)
+
+    monkeypatch.setattr(Location, "open_table", overtaken)
+    assert shown(path) == {"0000000000000001-a": len(one(1, "a")[1])}
 
 
 def test_a_manifest_without_transitions_shows_nothing_and_is_cleared_away(tmp_path, monkeypatch):
@@ -145,6 +175,53 @@ def test_writers_at_the_same_time_lose_nothing_and_double_nothing(tmp_path):
         assert count == len(one(int(recording, 16), name)[1])
 
 
+def test_columns_that_two_writers_add_at_once_are_added_once(tmp_path, monkeypatch):
+    path, (manifest, rows) = tmp_path / "s", one(1)
+    StoreWriter(path).write(manifest, rows.drop_columns(["zone"]))
+    open_table = Location.open_table
+
+    def overtaken(self, name, *rest):
+        table = open_table(self, name, *rest)
+        if name == TRANSITIONS:
+            monkeypatch.undo()
+            StoreWriter(path).write(*one(2))
+        return table
+
+    monkeypatch.setattr(Location, "open_table", overtaken)
+    StoreWriter(path).write(*one(3))
+    assert len(shown(path)) == 3
+
+
+def test_a_commit_whose_answer_was_lost_is_not_done_twice(tmp_path, monkeypatch):
+    transact = StoreWriter._transact
+
+    def lost(self, *args):
+        transact(self, *args)
+        monkeypatch.setattr(StoreWriter, "_transact", transact)
+        raise CommitFailedError("the answer was lost")
+
+    writer = StoreWriter(tmp_path / "s")
+    writer.write(*one(1, "a"))
+    monkeypatch.setattr(StoreWriter, "_transact", lost)
+    writer.write(*one(1, "b"))
+    assert shown(tmp_path / "s") == {"0000000000000001-b": len(one(1, "b")[1])}
+    assert DeltaTable(str(tmp_path / "s" / RECORDINGS)).count() == 1
+
+
+def test_an_interrupt_before_the_first_commit_leaves_no_file(tmp_path):
+    writer = StoreWriter(tmp_path / "s")
+    writer.write(*one(1))
+    before = sorted((tmp_path / "s").rglob("*.parquet"))
+
+    def interrupted():
+        yield one(2)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        writer.write_all(interrupted())
+    assert sorted((tmp_path / "s").rglob("*.parquet")) == before
+
+
 class _Overtaken(StoreWriter):
     """A writer between whose two commits another one writes."""
 
@@ -206,6 +283,22 @@ def test_a_file_in_the_way_is_said_so(tmp_path):
     (tmp_path / "s").write_text("hello")
     with pytest.raises(StoreError, match="is a file, not a store"):
         StoreWriter(tmp_path / "s").write(*one(1))
+
+
+@pytest.mark.parametrize(
+    ("place", "said"),
+    [
+        ("gs://bucket/store", "cannot lie on gs:"),
+        ("some%20where/store", "percent sign"),
+    ],
+)
+def test_places_that_cannot_hold_a_store_are_refused(place, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(StoreError, match=said):
+        StoreWriter(place)
+    with pytest.raises(StoreError, match=said):
+        Store(place)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_files_of_other_tools_are_refused_by_name(tmp_path):

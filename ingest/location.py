@@ -1,0 +1,229 @@
+"""Where a store lies: a folder of this machine, or `s3://bucket/prefix`.
+
+What S3 needs comes from the environment, by the names that AWS's own tools use: `AWS_REGION`,
+`AWS_ACCESS_KEY_ID`, `AWS_SECRET_ACCESS_KEY`, `AWS_SESSION_TOKEN`, and `AWS_ENDPOINT_URL` for a
+server that is not Amazon's. Tables are opened and committed by Delta's library, with conditional
+puts against other writers; Parquet is read and written by Arrow's S3 client, which is faster.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.fs
+import pyarrow.parquet as pq
+from deltalake import DeltaTable
+from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
+from deltalake.fs import DeltaStorageHandler
+
+from restock.errors import StoreError
+
+# An endpoint that is down or silent is given up after a minute at most.
+CONNECT_S, REQUEST_S, RETRIES, RETRY_S = 5, 30, 4, 30
+DEFAULT_REGION = "us-east-1"  # servers that are not Amazon's have none, and are signed for anyway
+# pathlib folds the two slashes of an address into one.
+_S3 = re.compile(r"s3a?:/{1,2}(?P<bucket>[^/]+)/?(?P<prefix>.*)")
+_SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/")
+_ENCODED = re.compile(r"%[0-9A-Fa-f]{2}")
+# What a server or a client says -> what it means, and what to do.
+_MEANINGS = (
+    ("NoSuchBucket|Bucket .* not found", "there is no such bucket",
+     "make it first, or mend the address"),
+    ("InvalidAccessKeyId|InvalidClientTokenId", "the server does not know the access key",
+     "check AWS_ACCESS_KEY_ID (and AWS_ENDPOINT_URL)"),
+    ("SignatureDoesNotMatch", "the server refused the signature",
+     "check AWS_SECRET_ACCESS_KEY and AWS_REGION"),
+    ("ExpiredToken", "the credentials have expired", "get new ones"),
+    ("169.254.169|CredentialsNotLoaded|ECS_CONTAINER|no providers in chain",
+     "no credentials were found",
+     "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE"),
+    ("AccessDenied|403 Forbidden|ACCESS_DENIED", "access is denied",
+     "the credentials must be allowed to list, read, write and delete there"),
+    ("Connection refused|dns error|failed to lookup|NETWORK_CONNECTION|Connect\\)|tcp connect",
+     "the server cannot be reached", "check AWS_ENDPOINT_URL"),
+    ("timed out|TIMEOUT|timeout was reached", "the server does not answer",
+     "check AWS_ENDPOINT_URL and the network"),
+    ("PermanentRedirect|301 Moved", "the bucket is in another region", "set AWS_REGION"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Location:
+    """A store's place. `str()` gives it as a user writes it."""
+
+    text: str
+    folder: Path | None  # None on S3
+
+    @classmethod
+    def of(cls, place: str | Path | Location) -> Location:
+        """The place that a path or an address names.
+
+        Raises:
+            StoreError: an address of another kind, or a path where Delta cannot have a table.
+        """
+        if isinstance(place, Location):
+            return place
+        text = str(place)
+        if found := _S3.fullmatch(text):
+            prefix = found["prefix"].strip("/")
+            return cls(f"s3://{found['bucket']}" + (f"/{prefix}" if prefix else ""), None)
+        if scheme := _SCHEME.match(text):
+            raise StoreError(
+                f"a store cannot lie on {scheme[1]}:",
+                where=text,
+                remedy="name a folder, or s3://bucket/prefix",
+            )
+        if _ENCODED.search(str(Path(text).absolute())):
+            # Delta's library takes it for an encoded character, and reads somewhere else.
+            raise StoreError(
+                "a store cannot lie below a folder with a percent sign and two hex digits in it",
+                where=text,
+                remedy="choose another folder, or rename it",
+            )
+        return cls(text, Path(text))
+
+    def __str__(self) -> str:
+        return self.text
+
+    @property
+    def options(self) -> dict[str, str] | None:
+        """What Delta's library is told, beside what it takes from the environment."""
+        if self.folder is not None:
+            return None
+        return {
+            "connect_timeout": f"{CONNECT_S}s",
+            "timeout": f"{REQUEST_S}s",
+            "max_retries": f"{RETRIES}",
+            "retry_timeout": f"{RETRY_S}s",
+            "aws_conditional_put": "etag",  # only one writer makes a version of the log
+            **({"aws_region": region} if (region := _region()) else {}),
+            **({"aws_endpoint_url": endpoint} if (endpoint := _endpoint(self.text)) else {}),
+            "allow_http": str(endpoint.startswith("http://")).lower(),
+        }
+
+    def table(self, name: str) -> str:
+        """The address of one of its tables."""
+        return str(self.folder / name) if self.folder is not None else f"{self.text}/{name}"
+
+    def has_table(self, name: str) -> bool:
+        """Whether there is such a table. Raises StoreError where the place cannot be reached.
+
+        A folder of a log is not yet one: another writer may be making its first version.
+        """
+        with self.explained():
+            return bool(DeltaTable.is_deltatable(self.table(name), self.options))
+
+    def open_table(self, name: str, version: int | None = None) -> DeltaTable:
+        """One of its tables, at a version or at its newest.
+
+        Raises:
+            StoreError: no such table or version, or the place cannot be reached.
+        """
+        try:
+            with self.explained():
+                return DeltaTable(self.table(name), version=version, storage_options=self.options)
+        except (TableNotFoundError, DeltaError, ValueError) as error:
+            raise StoreError(
+                f"its table `{name}` cannot be opened"
+                + (f" at version {version}" if version is not None else "")
+                + f": {first_line(error)}",
+                where=self.text,
+            ) from error
+
+    @cached_property
+    def files(self) -> pa.fs.FileSystem:
+        """A file system whose root is the store."""
+        if self.folder is not None:
+            return pa.fs.SubTreeFileSystem(str(self.folder.absolute()), pa.fs.LocalFileSystem())
+        s3 = pa.fs.S3FileSystem(
+            region=_region(),
+            endpoint_override=_endpoint(self.text) or None,
+            connect_timeout=CONNECT_S,
+            request_timeout=REQUEST_S,
+            retry_strategy=pa.fs.AwsStandardS3RetryStrategy(max_attempts=RETRIES),
+        )
+        return pa.fs.SubTreeFileSystem(self.text.removeprefix("s3://"), s3)
+
+    def write(self, rows: pa.Table, path: str, **options: Any) -> int:
+        """Write a Parquet file, whole and on disks flushed; returns its size in bytes."""
+        if self.folder is None:
+            with self.explained(), self.files.open_output_stream(path) as out:
+                pq.write_table(rows, out, **options)
+                return int(out.tell())
+        file = self.folder / path
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with file.open("wb") as out:
+            pq.write_table(rows, out, **options)
+            out.flush()
+            os.fsync(out.fileno())
+            return out.tell()
+
+    def read(self, path: str) -> pa.Table:
+        """A Parquet file's rows, as they were written.
+
+        Raises:
+            FileNotFoundError: it is not there.
+            StoreError: the place cannot be reached.
+        """
+        with self.explained(), self.files.open_input_file(path) as file:
+            return pq.read_table(file, partitioning=None)
+
+    def delete(self, path: str) -> None:
+        """Delete a file; one that is not there is as good."""
+        if self.folder is not None:
+            (self.folder / path).unlink(missing_ok=True)
+            return
+        # Not by Arrow's client: it puts an empty object where a folder's last file was.
+        with self.explained():
+            DeltaStorageHandler(self.text, self.options).delete_file(path)
+
+    @contextmanager
+    def explained(self) -> Iterator[None]:
+        """Turn what goes wrong on the way to S3 into a StoreError that says what to do.
+
+        What Delta says of its tables passes, and so do conflicts of writers and missing files.
+        """
+        try:
+            yield
+        except (CommitFailedError, TableNotFoundError):
+            raise
+        except (OSError, DeltaError) as error:
+            text = str(error)
+            if self.folder is not None or not re.search("S3|AWS", text):
+                raise
+            for pattern, meaning, remedy in _MEANINGS:
+                if re.search(pattern, text):
+                    raise StoreError(meaning, where=self.text, remedy=remedy) from error
+            if isinstance(error, FileNotFoundError):
+                raise
+            raise StoreError(first_line(error), where=self.text) from error
+
+
+def first_line(error: Exception) -> str:
+    """What an error says first; Delta's library says the rest below it, drawn as a tree."""
+    return next(iter(str(error).splitlines()), type(error).__name__)
+
+
+def _region() -> str | None:
+    """None where a profile says it."""
+    named = os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION")
+    return named or (None if os.environ.get("AWS_PROFILE") else DEFAULT_REGION)
+
+
+def _endpoint(where: str) -> str:
+    endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
+    if endpoint and not re.match(r"https?://[^/]", endpoint):
+        raise StoreError(
+            f"AWS_ENDPOINT_URL is {endpoint!r}, which is no address of a server",
+            where=where,
+            remedy="write it like http://127.0.0.1:9000",
+        )
+    return endpoint
