@@ -66,7 +66,7 @@ def open_source(
                 stores = opened.enter_context(all_stores(transitions, mixture, folder))
             yield Source(
                 stores.connection,
-                str(transitions.path),
+                str(transitions.path.resolve()),  # a trace looks there, from anywhere
                 transitions.version,
                 transitions.task_json,
                 found,

@@ -56,7 +56,7 @@ class Header(msgspec.Struct, frozen=True):
     """panel.json."""
 
     id: str
-    store: str  # as it was given
+    store: str  # its absolute path
     store_version: int  # of the store's Delta table; -1 for a table in memory
     task_hash: str
     task_json: str  # "" where the source did not say
@@ -177,15 +177,35 @@ class Panel:
             self._meta = pq.read_table(self.path / META)
         return self._meta
 
+    def meta_column(self, name: str) -> NDArray[Any]:
+        """One column of `meta` (n,), without reading the others."""
+        if self._meta is not None:
+            return np.asarray(self._meta[name].to_numpy())
+        return np.asarray(pq.read_table(self.path / META, columns=[name])[name].to_numpy())
+
     @property
     def stratum_code(self) -> NDArray[np.int16]:
         """The place of each row's stratum in `strata`, (n,)."""
-        return np.asarray(self.meta["stratum_code"].to_numpy(), np.int16)
+        return np.asarray(self.meta_column("stratum_code"), np.int16)
 
     @property
     def weights(self) -> F32:
         """Importance weight of each row, (n,), of mean 1 over what the quotas draw."""
-        return np.asarray(self.meta["weight"].to_numpy(), np.float32)
+        return np.asarray(self.meta_column("weight"), np.float32)
+
+    @property
+    def return_to_go(self) -> F32:
+        """Discounted rewards to the end of each row's episode, (n,).
+
+        Raises PanelError where the mixture did not ask for it.
+        """
+        if not self.header.mixture.return_to_go:
+            raise PanelError(
+                "it carries no return-to-go",
+                where=str(self.path),
+                remedy="say `return_to_go = true` in the mixture and mix again",
+            )
+        return np.asarray(self.meta_column("return_to_go"), np.float32)
 
     def stratum_rows(self) -> list[Ints]:
         """The row numbers of each stratum, in order of `strata`."""

@@ -28,6 +28,7 @@ VERBS = {
     "train": "offline warm-up on the panel, then online in the twin",
     "eval": "success per condition, clean and perturbed",
     "compare": "refuses if the two were fed differently; else who did better, by how much",
+    "trace": "where did a sampled row come from? down to the messages",
     "report": "one HTML page with all of it",
     "demo": "all of the above, on sample_logs/",
 }

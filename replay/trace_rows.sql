@@ -1,0 +1,18 @@
+-- Audited rows of a run, those with the largest TD errors first: `row` is the name for `trace`.
+SELECT
+    gradient_step || '/' || batch_row AS row,
+    source,
+    stratum,
+    condition,
+    behaviour_policy,
+    transition_id,
+    episode,
+    age_days,
+    age_env_steps,
+    action,
+    reward,
+    q,
+    td
+FROM read_parquet($file)
+ORDER BY abs(td) DESC, gradient_step, batch_row
+LIMIT $limit
