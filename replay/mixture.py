@@ -19,6 +19,7 @@ from restock.replay.schedules import Portion, Schedule, knots, value_at
 Timing = Literal["pre", "post"]
 Share = float | Literal["natural", "equal"] | Schedule
 Correction = Literal["none", "beta", "full", "clipped", "density_ratio"]
+Shortfall = Literal["refuse", "redistribute", "shrink"]
 Within = Literal["uniform", "without_replacement", "per", "lap"]
 
 
@@ -241,7 +242,7 @@ class Mixture(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     strata: tuple[StratumRule, ...] = ()
     each_condition: EachCondition | None = None
     max_replays_per_row: float | None = None  # a run's learner holds it
-    shortfall: Literal["refuse", "redistribute", "shrink"] = "redistribute"
+    shortfall: Shortfall = "redistribute"
     adaptive: Adaptive | None = None
     # And how, within a stratum.
     within: Within = "without_replacement"

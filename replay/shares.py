@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from restock.errors import MixtureError
 from restock.replay.layout import F64, Bools, Ints
-from restock.replay.mixture import Mixture, Share, StratumRule
+from restock.replay.mixture import Mixture, Share, Shortfall, StratumRule
 from restock.replay.schedules import value_at
 
 
@@ -42,30 +42,37 @@ def plan_shares(
     """
     wanted = wanted_shares(rules, rows, env_steps)
     limit = row_limits(mixture, rules, rows, episodes, draws)
-    return within_limits(mixture, rules, rows, episodes, wanted, limit)
+    caps = np.array([rule.cap for rule in rules])
+
+    def complaints() -> str:
+        return "; ".join(
+            f"{rule.name} wants {wanted[i]:.1%}, its {rows[i]} rows in {episodes[i]} episodes can"
+            f" bear {limit[i]:.1%}"
+            for i, rule in enumerate(rules)
+            if wanted[i] > limit[i] + 1e-12
+        )
+
+    return within_limits(wanted, limit, caps, mixture.shortfall, complaints)
 
 
 def within_limits(
-    mixture: Mixture,
-    rules: Sequence[StratumRule],
-    rows: Ints,
-    episodes: Ints,
-    wanted: F64,
-    limit: F64,
+    wanted: F64, limit: F64, caps: F64, shortfall: Shortfall, complaints: Callable[[], str]
 ) -> SharePlan:
     """What becomes of wanted shares (S,) where rows can bear no more than `limit` (S,).
 
+    `caps` (S,) bound what a stratum takes of the others' surplus; `complaints` says who is short.
+
     Raises:
-        MixtureError: a shortfall where the mixture refuses one, or no rows at all.
+        MixtureError: a shortfall where it is to be refused, or no rows at all.
     """
     granted = np.minimum(wanted, limit)
     missing = 1.0 - granted.sum()
     short = wanted > limit + 1e-12
     if missing <= 1e-9:
-        return SharePlan(wanted, wanted, limit, 1.0, ("",) * len(rules))
-    if mixture.shortfall == "refuse":
+        return SharePlan(wanted, wanted, limit, 1.0, ("",) * len(wanted))
+    if shortfall == "refuse":
         raise MixtureError(
-            "not enough rows: " + "; ".join(_complaints(rules, wanted, limit, rows, episodes)),
+            f"not enough rows: {complaints()}",
             remedy='lower the shares, raise max_replays_per_row, or set shortfall = "redistribute"',
         )
     if granted.sum() <= 0:
@@ -74,15 +81,14 @@ def within_limits(
             remedy="`restock audit` shows what the store holds; lower min_rows or the conditions",
         )
     notes = np.where(short, "short of rows", "")
-    if mixture.shortfall == "shrink":
+    if shortfall == "shrink":
         return SharePlan(
             wanted, granted / granted.sum(), limit, float(granted.sum()), tuple(notes.tolist())
         )
-    caps = np.array([rule.cap for rule in rules])
     roof = np.maximum(granted, np.minimum(limit, caps))
     scale = min(float(roof.sum()), 1.0)
     if scale < 1.0 - 1e-9:  # every stratum is at its limit: what is left cannot come from the logs
-        return SharePlan(wanted, roof / scale, limit, scale, ("short of rows",) * len(rules))
+        return SharePlan(wanted, roof / scale, limit, scale, ("short of rows",) * len(wanted))
     got = scaled_within(granted, granted, roof)
     more = (got > granted + 1e-9) & ~short
     return SharePlan(
@@ -173,14 +179,3 @@ def row_limits(
         if rows[index] < rule.min_rows or episodes[index] < rule.min_episodes:
             limit[index] = 0.0
     return limit
-
-
-def _complaints(
-    rules: Sequence[StratumRule], wanted: F64, limit: F64, rows: Ints, episodes: Ints
-) -> list[str]:
-    return [
-        f"{rule.name} wants {wanted[index]:.1%}, its {rows[index]} rows in {episodes[index]}"
-        f" episodes can bear {limit[index]:.1%}"
-        for index, rule in enumerate(rules)
-        if wanted[index] > limit[index] + 1e-12
-    ]
