@@ -21,6 +21,7 @@ from restock.ingest.fields import DTYPES, CannotDecode, FieldType, Many, Message
 from restock.ingest.storage import Channel
 
 DEFAULT_DISTRO = "humble"
+_STORES = {store.value.removeprefix("ros2_"): store for store in Stores}
 LONGEST_DEFINITION = 4 << 20
 LONGEST_ARRAY = 1 << 20
 
@@ -70,15 +71,23 @@ def distro_types(distro: str) -> dict[str, Any]:
     return dict(_distro_store(distro).fielddefs)
 
 
-@cache
-def _distro_store(distro: str) -> Any:
-    names = {store.value.removeprefix("ros2_"): store for store in Stores}
-    if distro not in names:
+def refuse_unknown(distro: str) -> None:
+    """Check a distribution's name, without loading its definitions.
+
+    Raises:
+        RecordingError: no distribution of that name.
+    """
+    if distro not in _STORES:
         raise RecordingError(
             f"no type store named {distro!r}",
-            remedy=f"there are {', '.join(sorted(names.keys() - {'empty', 'latest'}))}",
+            remedy=f"there are {', '.join(sorted(_STORES.keys() - {'empty', 'latest'}))}",
         )
-    return get_typestore(names[distro])
+
+
+@cache
+def _distro_store(distro: str) -> Any:
+    refuse_unknown(distro)
+    return get_typestore(_STORES[distro])
 
 
 def message_type(channel: Channel, distro: str) -> RosType:
@@ -92,9 +101,10 @@ def message_type(channel: Channel, distro: str) -> RosType:
     for part, word in (("/srv/", "service"), ("/action/", "action")):
         if part in name:
             raise CannotDecode(f"{word} events are not read")
-    types = distro_types(distro)
     # An empty definition is that of a message without fields, or was left out by the writer.
     embedded = channel.definition_format in ("ros2msg", "ros2idl", "ros1msg")
+    # Loading a distribution takes a quarter of a second: not where a recording says it all.
+    types = {} if embedded and channel.definition else distro_types(distro)
     if embedded and (channel.definition or name not in types):
         if len(channel.definition) > LONGEST_DEFINITION:
             raise CannotDecode(f"its definition has {len(channel.definition):,} bytes")

@@ -14,12 +14,13 @@ from typing import Any
 
 from restock.errors import RecordingError
 from restock.ingest import discover
+from restock.ingest.account import Account, Loss, TopicInfo
 from restock.ingest.columns import Ragged, TopicColumns
 from restock.ingest.compression import decompress_file
-from restock.ingest.definitions import DEFAULT_DISTRO, distro_types
+from restock.ingest.definitions import DEFAULT_DISTRO, refuse_unknown
 from restock.ingest.discover import METADATA, recordings_in
 from restock.ingest.mcap_file import McapFile
-from restock.ingest.recording import Account, Loss, Recording, TopicInfo
+from restock.ingest.recording import Recording
 from restock.ingest.sqlite_file import SqliteFile
 from restock.ingest.storage import Damage, Storage
 
@@ -42,7 +43,7 @@ def open_recording(
     """
     path = Path(path)
     distro = typestore or DEFAULT_DISTRO
-    distro_types(distro)  # an unknown name is refused before anything is opened
+    refuse_unknown(distro)  # before anything is opened
     return _Opening(path, distro, salvage).open()
 
 
