@@ -23,13 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import RecordingError
+from restock.ingest.clocks import STAMP, jumps, median
 from restock.ingest.columns import TopicColumns
 
 if TYPE_CHECKING:
     from restock.ingest.profile import Clock
 
 I64 = NDArray[np.int64]
-STAMP = "header.stamp"
 NS = 1_000_000_000
 AHEAD_NS = 50_000_000  # a transform stamped further ahead counts from when it was received
 
@@ -116,7 +116,7 @@ def align(
             remedy='set [clock] alignment = "log_time" in the profile',
         )
     reference = max(delay, key=lambda name: (len(delay[name]), name))
-    edges = _jumps(topics[reference].log_time_ns, delay[reference], round(clock.jump_s * NS))
+    edges = jumps(topics[reference].log_time_ns, delay[reference], round(clock.jump_s * NS))
     report.jumps = len(edges)
     segments = []
     for index in range(len(edges) + 1):
@@ -124,7 +124,7 @@ def align(
             _segment(topics, delay, reference, edges, index, clock, latched, transforms, report)
         )
     report.offset_ns = segments[0].offset_ns
-    low, high = np.percentile(delay[reference] - _median(delay[reference]), [1, 99])
+    low, high = np.percentile(delay[reference] - median(delay[reference]), [1, 99])
     report.spread_ns = int(high - low)
     _carry_latched(segments, latched)
     return segments, report
@@ -155,24 +155,6 @@ def _ordered(stamp_ns: I64, row: NDArray[np.intp]) -> Samples:
     return Samples(np.asarray(stamp_ns, np.int64)[order], row[order])
 
 
-def _median(delay_ns: I64) -> int:
-    """The (upper) median; in integers, for float64 holds a time of day to 256 ns only."""
-    return int(np.sort(delay_ns)[len(delay_ns) // 2])
-
-
-def _jumps(log_time_ns: I64, delay_ns: I64, jump_ns: int) -> I64:
-    """The log times at which a topic's clock jumps.
-
-    A running median of five first: a single bad stamp is no jump.
-    """
-    if len(delay_ns) >= 5:
-        padded = np.pad(delay_ns, 2, mode="edge")
-        windows = np.lib.stride_tricks.sliding_window_view(padded, 5)
-        delay_ns = np.sort(windows, axis=1)[:, 2]
-    at = np.flatnonzero(np.abs(np.diff(delay_ns)) > jump_ns) + 1
-    return log_time_ns[at]
-
-
 def _segment(
     topics: Mapping[str, TopicColumns],
     delay: Mapping[str, I64],
@@ -189,8 +171,8 @@ def _segment(
         for name, columns in topics.items()
     }
     jump_ns = round(clock.jump_s * NS)
-    middle = _median(delay[reference][inside[reference]])
-    medians = [_median(delay[name][inside[name]]) for name in delay if len(inside[name])]
+    middle = median(delay[reference][inside[reference]])
+    medians = [median(delay[name][inside[name]]) for name in delay if len(inside[name])]
     # Latency only ever adds to the clocks' offset, so the least delayed topic shows it best.
     offset = min(median for median in medians if abs(median - middle) <= jump_ns)
     samples = {}

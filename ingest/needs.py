@@ -10,7 +10,8 @@ from restock.errors import RecordingError
 from restock.ingest.align import STAMP
 from restock.ingest.clearance import scan_reduction
 from restock.ingest.columns import FieldColumn
-from restock.ingest.custom import CustomSignal, custom_reduction
+from restock.ingest.custom import CustomSignal
+from restock.ingest.custom_columns import custom_reduction
 from restock.ingest.frames import FIELDS, FRAME_ID
 from restock.ingest.inputs import Input
 from restock.ingest.profile import Profile

@@ -90,3 +90,11 @@ def localised_velocity(
 def wrap_angle(angle_rad: NDArray[Any]) -> NDArray[Any]:
     """The same angle in [-pi, pi)."""
     return (angle_rad + np.pi) % (2 * np.pi) - np.pi
+
+
+def yaw_of(
+    x: NDArray[Any], y: NDArray[Any], z: NDArray[Any], w: NDArray[Any]
+) -> NDArray[np.float64]:
+    """Quaternions (N,) to yaw in (-pi, pi], REP 103: about z, counter-clockwise."""
+    with np.errstate(over="ignore", invalid="ignore"):  # what is no number stays none
+        return np.asarray(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)), np.float64)

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from restock.errors import RecordingError
 from restock.ingest.align import Segment
 from restock.ingest.columns import FieldColumn, Ragged, TopicColumns
-from restock.ingest.custom import yaw_of
 from restock.ingest.frames import FRAME_ID, Edges, Placement, Tree, plain
 from restock.ingest.inputs import FALLBACKS, POSE_FALLBACK, Input
 from restock.ingest.profile import Profile
+from restock.ingest.signals import yaw_of
 
 F64 = NDArray[np.float64]
 

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from restock.ingest.align import NS, ClockReport, Held, Samples, Segment, align, ticks_of
 from restock.ingest.clearance import BEAMS, SECTORS, scan_reduction
+from restock.ingest.clocks import TopicClock, topic_clocks
 from restock.ingest.columns import TopicColumns
-from restock.ingest.custom import Custom, custom_signals
+from restock.ingest.custom_columns import Custom, custom_signals
 from restock.ingest.frames import Tree
 from restock.ingest.profile import Profile
 from restock.ingest.reading import Fields
@@ -55,6 +56,7 @@ class Steps:
     clock: ClockReport
     commands_between: int  # commands that got no tick of their own
     custom: Custom  # the profile's own signals
+    clocks: list[TopicClock] = field(default_factory=list)  # of each topic that was read
     notes: list[str] = field(default_factory=list)  # what else is worth saying
 
     def __len__(self) -> int:
@@ -102,6 +104,7 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
         profile.task, signals["command_speed_mps"], signals["command_yaw_rate_radps"]
     )
     policy, version, probability = filling.behaviour()
+    custom = custom_signals(profile.signals, topics, segments, ticks)
     return Steps(
         signals,
         filling.segment,
@@ -118,8 +121,9 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
         filling.truth(),
         report,
         between,
-        custom_signals(profile.signals, topics, segments, ticks),
-        frame_notes(profile, sources, edges),
+        custom,
+        topic_clocks(topics, profile.clock.jump_s),
+        frame_notes(profile, sources, edges) + custom.notes,
     )
 
 
