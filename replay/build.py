@@ -66,7 +66,7 @@ def open_source(
                 stores = opened.enter_context(all_stores(transitions, mixture, folder))
             yield Source(
                 stores.connection,
-                str(transitions.path.resolve()),  # a trace looks there, from anywhere
+                _address(transitions),
                 transitions.version,
                 transitions.task_json,
                 found,
@@ -159,6 +159,12 @@ def write_panel(
             _finish(partial / name)
         _put(partial, out, force)
     return Panel.open(out)
+
+
+def _address(store: Store) -> str:
+    """Where a trace finds the store, whatever folder it begins in."""
+    folder = store.path.folder
+    return str(store.path if folder is None else folder.resolve())
 
 
 def _check_free(out: Path, force: bool) -> None:

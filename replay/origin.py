@@ -30,7 +30,7 @@ _LEFT_OUT = ("task_json", "conditions_json", "topics", "label_scores")  # of a m
 class Source:
     """A store to look in, at a version (None: the newest)."""
 
-    path: Path
+    path: str
     version: int | None = None
 
 
@@ -71,7 +71,7 @@ def find_origin(
         if not is_store(source.path):
             raise StoreError(
                 "the store is not there (any more)",
-                where=str(source.path),
+                where=source.path,
                 remedy="say with --store where it is now",
             )
         origin = _look_up(source, transition)
@@ -80,7 +80,7 @@ def find_origin(
             return origin
     raise StoreError(
         f"no transition {transition} in it",
-        where=", ".join(str(source.path) for source in sources),
+        where=", ".join(source.path for source in sources),
         remedy="its recording was taken out, or ingested anew with other steps: `restock sql STORE"
         ' "FROM recordings"` lists what is there; `--store` names another store',
     )
@@ -124,7 +124,7 @@ def _read(source: Source, transition: int) -> Origin | None:
     manifest = manifests[0] if manifests else None
     origin = Origin(
         transition=row,
-        store={"path": str(source.path), "version": version},
+        store={"path": source.path, "version": version},
         moment=_moment(row, manifest),
         recording=manifest,
     )

@@ -37,7 +37,7 @@ class Trace:
 class Where:
     """Places that are not where they were, and what a trace may use."""
 
-    store: Path | None = None
+    store: str | None = None
     panel: Path | None = None
     recording: Path | None = None
     profile: str | None = None
@@ -63,9 +63,9 @@ def trace(place: str | Path, row: str, where: Where | None = None) -> Trace:
         _of_run(found, path, row, where)
     elif (path / HEADER).is_file():
         _of_panel(found, Panel.open(path), _number(row, path, "row number of the panel"), where)
-    elif is_store(path):
+    elif is_store(str(place)):
         number = _number(row, path, "transition id")
-        found.origin = _origin([Source(path)], number, where)
+        found.origin = _origin([Source(str(place))], number, where)
     else:
         raise StoreError(
             "neither a run, a panel nor a store" if path.exists() else "nothing is there",
@@ -129,8 +129,8 @@ def _of_panel(found: Trace, panel: Panel, number: int, where: Where) -> None:
             "the panel was made from a table in memory: there is no store to look in"
         )
         return
-    sources = [Source(where.store or Path(header.store), header.store_version)]
-    sources += [Source(Path(other.path), other.version) for other in header.others]
+    sources = [Source(where.store or header.store, header.store_version)]
+    sources += [Source(other.path, other.version) for other in header.others]
     found.origin = _origin(sources, int(meta["transition_id"]), where)
     stored = np.float32(found.origin.transition["observation"])
     same = np.array_equal(packed[panel.columns["observation"]], stored)

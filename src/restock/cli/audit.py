@@ -23,7 +23,7 @@ class Audit:
     The thresholds are in replay/audits.toml; docs/audit.md lists all audits.
     """
 
-    store: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
+    store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
     """The store to audit."""
     panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
     """A panel made from it, to be audited too."""

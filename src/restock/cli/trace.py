@@ -26,7 +26,7 @@ class Trace:
     that tick. A fresh row leads to its episode in the twin, and to what lays that out again.
     """
 
-    place: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|PANEL|STORE")]
+    place: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|PANEL|STORE")]
     """Where the row is."""
     row: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[ROW]")] = None
     """STEP/ROW of a run (1200/17), a row number of a panel, a transition id of a store."""
@@ -34,7 +34,7 @@ class Trace:
     """The recording it is from: shows the messages it was made of."""
     profile: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
     """The profile that read the recording, where it is one of your own."""
-    store: Annotated[Path | None, tyro.conf.arg(metavar="STORE")] = None
+    store: Annotated[str | None, tyro.conf.arg(metavar="STORE")] = None
     """Where the store is now, if it was moved."""
     panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
     """Where the panel is now, if it was moved."""
