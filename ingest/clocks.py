@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,17 +33,6 @@ class TopicClock:
     backsteps: int | None = None  # stamps before that of the message received just before
     duplicates: int | None = None  # messages whose stamp another one has, too
     zero_stamps: int | None = None
-
-    @property
-    def odd(self) -> str:
-        """What is worth a look, in words; "" for nothing."""
-        counts = {
-            "jumps": self.jumps,
-            "backsteps": self.backsteps,
-            "stamps twice": self.duplicates,
-            "zero stamps": self.zero_stamps,
-        }
-        return ", ".join(f"{count:,} {name}" for name, count in counts.items() if count)
 
     def as_row(self) -> dict[str, str | int | bool | None]:
         """Plain values, as `recordings.clocks` holds them (less what aligning found)."""
@@ -74,6 +64,19 @@ def topic_clock(topic: str, columns: TopicColumns, jump_s: float) -> TopicClock:
         int((repeats[(repeats > 1) & (found != 0)] - 1).sum()),
         int((~told).sum()),
     )
+
+
+def odd(row: Mapping[str, Any]) -> str:
+    """What of a topic's clocks is worth a look, in words; "" for nothing."""
+    words = {
+        "jumps": "jumps",
+        "backsteps": "backsteps",
+        "duplicates": "repeated stamps",
+        "zero_stamps": "zero stamps",
+        "off_clock": "left out",
+        "restamped": "put at log time",
+    }
+    return ", ".join(f"{row[key]:,} {word}" for key, word in words.items() if row.get(key))
 
 
 def topic_clocks(topics: Mapping[str, TopicColumns], jump_s: float) -> list[TopicClock]:

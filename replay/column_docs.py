@@ -63,7 +63,10 @@ def unit(column: str) -> str:
 
 def install_columns(connection: duckdb.DuckDBPyConnection) -> None:
     """Create the view `columns` over the views that are there."""
-    docs = column_docs()
+    docs, own_units = column_docs(), {}
+    for name, own_unit, meaning, topic, path in _custom(connection):
+        docs["transitions", name] = meaning or f"{path} of {topic}"
+        own_units["transitions", name] = own_unit
     there = connection.sql(
         "SELECT table_name, column_name, data_type FROM duckdb_columns()"
         " WHERE NOT internal AND table_name NOT LIKE 'stored_%' ORDER BY table_name, column_index"
@@ -76,7 +79,7 @@ def install_columns(connection: duckdb.DuckDBPyConnection) -> None:
             "view": view,
             "column": column,
             "type": kind,
-            "unit": unit(column),
+            "unit": own_units.get((view, column)) or unit(column),
             "meaning": docs.get((view, column)) or docs.get(("shared", column)),
         }
         for view, column, kind in sorted(there, key=lambda row: order.index(row[0])) + own
@@ -84,6 +87,19 @@ def install_columns(connection: duckdb.DuckDBPyConnection) -> None:
     names = ("view", "column", "type", "unit", "meaning")
     schema = pa.schema([pa.field(name, pa.string()) for name in names])
     connection.register("columns", pa.Table.from_pylist(rows, schema=schema))
+
+
+def _custom(connection: duckdb.DuckDBPyConnection) -> list[tuple[str, ...]]:
+    """Custom signals of the store's profiles: name, unit, meaning, topic and path."""
+    has = connection.sql(
+        "SELECT 1 FROM duckdb_columns() WHERE table_name = 'recordings' AND column_name = 'signals'"
+    ).fetchall()
+    if not has:
+        return []
+    return connection.sql(
+        "SELECT DISTINCT ON (s.name) s.name, s.unit, s.meaning, s.topic, s.path"
+        " FROM (SELECT ingested_at, unnest(signals) AS s FROM recordings) ORDER BY ingested_at DESC"
+    ).fetchall()
 
 
 def markdown() -> str:

@@ -148,11 +148,28 @@ def show(outcome: Outcome) -> None:
     into = f"{outcome.status}: {episodes}, profile {row['profile']} {row['profile_hash']}"
     console.print(into + (f", store version {outcome.version}" if outcome.version else ""))
     told = [topic for topic in row["topics"] if topic["reason"] != UNUSED]
-    output.print_table(told, ["topic", "type", "expected", "decoded", "skipped", "reason"])
+    clocks = {clock["topic"]: clock for clock in row["clocks"] or []}
+    told = [{**topic, **_clock_cells(clocks.get(topic["topic"]))} for topic in told]
+    columns = ["topic", "type", "expected", "decoded", "skipped", "log-stamp s", "clock", "reason"]
+    output.print_table(told, columns)
     if len(told) < len(row["topics"]):
         rest = [topic["expected"] for topic in row["topics"] if topic["reason"] == UNUSED]
         topics = _count(len(rest), "further topic")
         console.print(f"{topics} ({sum(rest):,} messages): not used by the profile")
+    if row["signals"]:
+        output.print_table(
+            [
+                {
+                    "signal": signal["name"],
+                    "unit": signal["unit"],
+                    "from": f"{signal['topic']} {signal['path']}",
+                    "messages": signal["messages"],
+                    "with a value": signal["found"],
+                    "ticks that know it": signal["steps"],
+                }
+                for signal in row["signals"]
+            ]
+        )
     scores = {score.condition: score for score in outcome.scores}
     output.print_table(
         [
@@ -185,6 +202,17 @@ def show(outcome: Outcome) -> None:
     for loss in outcome.losses:
         console.print(f"lost: {loss}", markup=False, soft_wrap=True)
     console.print()
+
+
+def _clock_cells(clock: dict[str, Any] | None) -> dict[str, Any]:
+    """A topic's clocks for a table: how far behind the stamps are, and what is odd about them."""
+    from restock.ingest.clocks import odd
+
+    if clock is None:
+        return {"log-stamp s": "", "clock": ""}
+    offset = clock["offset_ns"]
+    said = "" if offset is None else f"{offset * 1e-9:,.3f}"
+    return {"log-stamp s": said, "clock": odd(clock)}
 
 
 def _count(number: int, noun: str) -> str:
