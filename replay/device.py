@@ -22,10 +22,11 @@ from torch import Tensor
 
 from restock.errors import MixtureError
 from restock.replay.layout import F64, Ints
-from restock.replay.priorities import Per, Rule
+from restock.replay.priorities import Exponents, Lap, Per, Rule
 from restock.replay.quotas import Quotas
 from restock.replay.sampler import BLOCK
 
+_PRIORITY_STATE = ("priority", "new", "largest", "finite")
 _SUM_BITS = 62  # priorities are summed as integers, which add up alike in any order
 
 
@@ -38,9 +39,9 @@ class DeviceSampler:
         batch_size: rows per draw.
         seed: of the generator, which lives on the device.
         device: where rows are drawn.
-        rule: `Per()` or `Lap()`; None draws a stratum's rows alike.
-        replacement: False, without a rule, goes through each stratum in shuffled order before any
-            row repeats.
+        rule: `Per()` or `Lap()`, of all strata or of each, (S,); None draws a stratum's rows alike.
+        replacement: False, where there is no rule, goes through a stratum in shuffled order before
+            any row repeats; for all strata or for each, (S,).
 
     Raises:
         MixtureError: shares that are no distribution, or a share on an empty stratum.
@@ -54,8 +55,8 @@ class DeviceSampler:
         *,
         seed: int,
         device: torch.device | str,
-        rule: Rule | None = None,
-        replacement: bool = True,
+        rule: Rule | Sequence[Rule | None] | None = None,
+        replacement: bool | Sequence[bool] = True,
     ) -> None:
         if len(stratum_rows) != len(shares):
             raise MixtureError(f"{len(stratum_rows)} strata but {len(shares)} shares")
@@ -63,27 +64,43 @@ class DeviceSampler:
         self.sizes: Ints = np.array([len(rows) for rows in stratum_rows], np.int64)
         self.quotas = Quotas(shares, batch_size)
         self._check_shares(self.quotas.shares)
-        self.rule, self.replacement = rule, replacement or rule is not None
+        strata = len(self.sizes)
+        whole = rule is None or isinstance(rule, Per | Lap)
+        self.rules: list[Rule | None] = [rule] * strata if whole else list(rule)  # type: ignore
+        again = [replacement] * strata if isinstance(replacement, bool) else list(replacement)
+        if len(self.rules) != strata or len(again) != strata:
+            raise MixtureError(f"{len(self.rules)} rules for {strata} strata")
+        self._turns = [s for s in range(strata) if not again[s] and self.rules[s] is None]
         self.generator = torch.Generator(self.device).manual_seed(seed)
         joined = np.concatenate([np.asarray(rows, np.int64) for rows in stratum_rows])
         self._members = torch.from_numpy(joined).to(self.device)  # (N,) stratum by stratum
         self._first: Ints = np.concatenate([[0], np.cumsum(self.sizes)])[:-1].astype(np.int64)
-        self._orders = [self._shuffled(stratum) for stratum in range(len(self.sizes))]
-        self._cursor = [0] * len(self.sizes)
-        self._returned = [self._members[:0] for _ in self.sizes]
+        self._orders = {stratum: self._shuffled(stratum) for stratum in self._turns}
+        self._returned = dict.fromkeys(self._turns, self._members[:0])
+        self._cursor = dict.fromkeys(self._turns, 0)
         self._quota_ahead: Ints = np.zeros((0, len(self.sizes)), np.int64)
         self._rows_ahead = self._strata_ahead = self._members.new_zeros((0, batch_size))
         self._weights_ahead: Tensor | None = None
         self._next = 0  # of those drawn ahead
         self._batches = 0  # handed out
-        if rule is not None:
+        self._ruled = any(own is not None for own in self.rules)
+        if self._ruled:
             self._place = torch.full((int(joined.max()) + 1,), -1, device=self.device)
             self._place[self._members] = torch.arange(len(joined), device=self.device)
             if len(np.unique(joined)) != len(joined):
                 raise MixtureError("a row is in two strata")
-            self._largest = self._priority_of(torch.ones(1, device=self.device))
-            self._priority = self._largest.expand(len(joined)).clone()
+            codes = np.repeat(np.arange(strata), self.sizes)
+            self._stratum = torch.from_numpy(codes).to(self.device)  # of each place, (N,)
+            exponents = Exponents(self.rules)
+            self._epsilon, self._floor, self._alpha = (
+                torch.from_numpy(values).to(self.device)
+                for values in (exponents.epsilon, exponents.floor, exponents.alpha)
+            )
+            every = torch.arange(strata, device=self.device)
+            self._largest = self._priority_of(torch.ones(strata, device=self.device), every)
+            self._priority = self._largest[self._stratum]  # (N,)
             self._new = torch.ones(len(joined), dtype=torch.bool, device=self.device)
+            self._finite = torch.ones((), dtype=torch.bool, device=self.device)
 
     @property
     def batch_size(self) -> int:
@@ -112,13 +129,15 @@ class DeviceSampler:
         A TD error that is not finite is refused when the next block is drawn: to look at it here
         would wait for the device.
         """
-        if self.rule is None:
+        if not self._ruled:
             return
-        place = self._place[rows]
-        priority = self._priority_of(td_abs.detach().float())
+        place, errors = self._place[rows], td_abs.detach().float()
+        stratum = self._stratum[place]
+        priority = self._priority_of(errors, stratum)
         self._priority[place] = priority
         self._new[place] = False
-        self._largest = torch.maximum(self._largest, priority.max())  # passes NaN on
+        self._largest.scatter_reduce_(0, stratum, priority, "amax")
+        self._finite &= torch.isfinite(errors).all()
 
     def set_shares(self, shares: Sequence[float] | F64) -> None:
         """Other shares (S,) from the next batch on; what was drawn ahead goes back.
@@ -147,21 +166,17 @@ class DeviceSampler:
                 remedy="give it share 0, or let `restock mix` redistribute it",
             )
 
-    def _priority_of(self, td_abs: Tensor) -> Tensor:
-        if isinstance(self.rule, Per):
-            return (td_abs + self.rule.epsilon) ** self.rule.alpha
-        if self.rule is None:
-            raise RuntimeError("no rule of priority")
-        return td_abs.clamp_min(self.rule.floor) ** self.rule.alpha
+    def _priority_of(self, td_abs: Tensor, stratum: Tensor) -> Tensor:
+        raised = torch.maximum(td_abs + self._epsilon[stratum], self._floor[stratum])
+        return raised ** self._alpha[stratum]
 
     def _draw_block(self) -> None:
-        strata = len(self.sizes)
         quota = np.stack([self.quotas.next() for _ in range(BLOCK)])  # (BLOCK, S)
         counts = torch.from_numpy(quota.ravel()).to(self.device)  # the one thing sent over
-        stratum = torch.arange(strata, device=self.device).repeat(BLOCK)
+        stratum = torch.arange(len(self.sizes), device=self.device).repeat(BLOCK)
         stratum = stratum.repeat_interleave(counts, output_size=int(quota.sum()))
         order = torch.argsort(stratum, stable=True)
-        if self.rule is not None:
+        if self._ruled:
             self._raise_new()
         taken = [
             self._take(index, int(count)) for index, count in enumerate(quota.sum(axis=0)) if count
@@ -170,19 +185,20 @@ class DeviceSampler:
         rows[order] = torch.cat([drawn for drawn, _ in taken])
         self._rows_ahead, self._strata_ahead = rows.view(BLOCK, -1), stratum.view(BLOCK, -1)
         self._weights_ahead = None
-        weights = [weight for _, weight in taken if weight is not None]
-        if weights:
+        if any(weight is not None for _, weight in taken):
             weight = torch.empty(len(rows), device=self.device)
-            weight[order] = torch.cat(weights)
+            weight[order] = torch.cat(
+                [torch.ones(len(d), device=self.device) if w is None else w for d, w in taken]
+            )
             self._weights_ahead = weight.view(BLOCK, -1)
         self._quota_ahead, self._next = quota, 0
 
     def _take(self, stratum: int, count: int) -> tuple[Tensor, Tensor | None]:
         """The next `count` rows of a stratum, and their weights where the rule has them."""
         first, size = int(self._first[stratum]), int(self.sizes[stratum])
-        if self.rule is not None:
-            return self._take_by_priority(self.rule, first, size, count)
-        if self.replacement:
+        if (rule := self.rules[stratum]) is not None:
+            return self._take_by_priority(rule, stratum, count)
+        if stratum not in self._orders:
             at = (self._random(count) * size).long().clamp_max(size - 1)
             return self._members[first + at], None
         back = self._returned[stratum]
@@ -200,11 +216,12 @@ class DeviceSampler:
         return torch.cat(parts), None
 
     def _take_by_priority(
-        self, rule: Rule, first: int, size: int, count: int
+        self, rule: Rule, stratum: int, count: int
     ) -> tuple[Tensor, Tensor | None]:
         """One draw from each of `count` equal parts of the stratum's range of sums, shuffled."""
+        first, size = int(self._first[stratum]), int(self.sizes[stratum])
         priority = self._priority[first : first + size].double()
-        scale = 2.0**_SUM_BITS / size / self._largest.double()
+        scale = 2.0**_SUM_BITS / size / self._largest[stratum].double()
         share = (priority * scale).long().clamp_min(1)
         ends = share.cumsum(0)
         total = ends[-1].double()
@@ -225,12 +242,12 @@ class DeviceSampler:
         Raises:
             MixtureError: there were TD errors that are not finite.
         """
-        if not bool(torch.isfinite(self._largest).all()):
+        if not bool(self._finite):
             raise MixtureError(
                 "TD errors are not finite",
                 remedy="training has diverged: lower the learning rate, or slow the target down",
             )
-        self._priority = torch.where(self._new, self._largest, self._priority)
+        self._priority = torch.where(self._new, self._largest[self._stratum], self._priority)
 
     def _random(self, count: int) -> Tensor:
         # float64: the 24 bits of a float32 reach no further than 16 million rows.
@@ -239,8 +256,6 @@ class DeviceSampler:
 
     def _shuffled(self, stratum: int) -> Tensor:
         first, size = int(self._first[stratum]), int(self.sizes[stratum])
-        if self.replacement:
-            return self._members[:0]
         turns = torch.randperm(size, generator=self.generator, device=self.device)
         return self._members[first + turns]
 
@@ -248,9 +263,8 @@ class DeviceSampler:
         """Forget what is drawn ahead: quotas are owed again, rows that had their turn are next."""
         rows, strata = self._rows_ahead[self._next :], self._strata_ahead[self._next :]
         self.quotas.give_back(self._quota_ahead[self._next :])
-        if not self.replacement:
-            for stratum, back in enumerate(self._returned):
-                self._returned[stratum] = torch.cat([rows[strata == stratum], back])
+        for stratum, back in self._returned.items():
+            self._returned[stratum] = torch.cat([rows[strata == stratum], back])
         self._rows_ahead, self._strata_ahead = rows[:0], strata[:0]
         self._quota_ahead, self._weights_ahead = self._quota_ahead[:0], None
         self._next = 0
@@ -269,13 +283,14 @@ class DeviceSampler:
         }
         if self._weights_ahead is not None:
             state["weights_ahead"] = self._weights_ahead[self._next :].cpu().clone()
-        if not self.replacement:
-            state["order"] = torch.cat(self._orders).cpu()
-            state["cursor"] = list(self._cursor)
-            state["returned"] = torch.cat(self._returned).cpu()
-            state["returned_count"] = [len(rows) for rows in self._returned]
-        if self.rule is not None:
-            for name in ("priority", "new", "largest"):
+        if self._turns:
+            state["turns"] = list(self._turns)
+            state["order"] = torch.cat(list(self._orders.values())).cpu()
+            state["cursor"] = list(self._cursor.values())
+            state["returned"] = torch.cat(list(self._returned.values())).cpu()
+            state["returned_count"] = [len(rows) for rows in self._returned.values()]
+        if self._ruled:
+            for name in _PRIORITY_STATE:
                 state[name] = getattr(self, f"_{name}").cpu().clone()
         return state
 
@@ -283,8 +298,8 @@ class DeviceSampler:
         """Raises MixtureError when the state is of a sampler over other strata."""
         if (
             not np.array_equal(state["sizes"], self.sizes)
-            or ("order" in state) == self.replacement
-            or ("priority" in state) != (self.rule is not None)
+            or list(state.get("turns", [])) != self._turns
+            or ("priority" in state) != self._ruled
         ):
             raise MixtureError(
                 "the saved sampler drew from other strata, or by another rule",
@@ -300,12 +315,13 @@ class DeviceSampler:
         self._weights_ahead = None if weights is None else weights.to(self.device)
         self._next, self._batches = 0, int(state["batches"])
         self.generator.set_state(state["generator"].cpu())
-        if not self.replacement:
-            order = state["order"].to(self.device)
-            self._orders = list(order.split(self.sizes.tolist()))
-            self._cursor = [int(at) for at in state["cursor"]]
-            returned = state["returned"].to(self.device)
-            self._returned = list(returned.split([int(n) for n in state["returned_count"]]))
-        if self.rule is not None:
-            for name in ("priority", "new", "largest"):
+        if self._turns:
+            orders = state["order"].to(self.device).split(self.sizes[self._turns].tolist())
+            counts = [int(count) for count in state["returned_count"]]
+            returned = state["returned"].to(self.device).split(counts)
+            self._orders = dict(zip(self._turns, orders, strict=True))
+            self._returned = dict(zip(self._turns, returned, strict=True))
+            self._cursor = dict(zip(self._turns, map(int, state["cursor"]), strict=True))
+        if self._ruled:
+            for name in _PRIORITY_STATE:
                 setattr(self, f"_{name}", state[name].to(self.device))

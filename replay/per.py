@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import MixtureError
-from restock.replay.layout import F32, F64, Ints
-from restock.replay.priorities import Priorities, Rule
+from restock.replay.layout import F32, F64, Bools, Ints
+from restock.replay.priorities import Lap, Per, Priorities, Rule
 from restock.replay.sampler import BLOCK, QuotaSampler
 
 FEW_ROWS = 100_000  # below, sums are refreshed more often: it costs little, and the rows come round
@@ -21,7 +21,8 @@ class PrioritySampler(QuotaSampler):
     """Exact quotas per batch over strata, each stratum's rows in proportion to their priority.
 
     Args:
-        rule: `Per()` or `Lap()`.
+        rule: `Per()` or `Lap()`, of all strata or of each, (S,). A stratum that has None is drawn
+            from as `replacement` says.
         refresh_every: batches drawn from one state of the priorities; None: 64, or 8 below 100,000
             rows. 1 draws every batch from the priorities as they are.
 
@@ -39,23 +40,27 @@ class PrioritySampler(QuotaSampler):
         batch_size: int,
         rng: np.random.Generator,
         *,
-        rule: Rule,
+        rule: Rule | Sequence[Rule | None],
         refresh_every: int | None = None,
         weights: F32 | None = None,
+        replacement: bool | Sequence[bool] = True,
     ) -> None:
-        super().__init__(stratum_rows, shares, batch_size, rng, weights=weights)
+        rules = [rule] * len(stratum_rows) if isinstance(rule, Per | Lap) else list(rule)
+        if len(rules) != len(stratum_rows):
+            raise MixtureError(f"{len(rules)} rules for {len(stratum_rows)} strata")
+        given = [replacement] * len(rules) if isinstance(replacement, bool) else list(replacement)
+        # By priority is with replacement.
+        again = [own or rule is not None for own, rule in zip(given, rules, strict=True)]
+        super().__init__(stratum_rows, shares, batch_size, rng, weights=weights, replacement=again)
         if refresh_every is None:
             refresh_every = BLOCK if self.sizes.sum() >= FEW_ROWS else FEW_ROWS_BLOCK
         if refresh_every < 1:
             raise MixtureError(f"refresh_every must be at least 1, got {refresh_every}")
         self.block = refresh_every
-        self.priorities = Priorities(stratum_rows, rule)
+        self.priorities = Priorities(stratum_rows, rules)
+        self._ruled: Bools = np.array([rule is not None for rule in rules], np.bool_)
         self._batches = 0  # handed out
         self._ahead_weights: F32 | None = None
-
-    @property
-    def rule(self) -> Rule:
-        return self.priorities.rule
 
     @property
     def drawn_weights(self) -> F32 | None:
@@ -77,7 +82,10 @@ class PrioritySampler(QuotaSampler):
         self.priorities.update(rows, td_abs)
 
     def _take_all(self, counts: Ints, order: Ints) -> None:
-        rows, weights = self.priorities.draw(counts, self._batches, self.rng)
+        ruled = self._ruled
+        rows, weights = self.priorities.draw(np.where(ruled, counts, 0), self._batches, self.rng)
+        if not ruled.all():
+            rows, weights = self._with_others(rows, weights, counts)
         drawn = np.empty(len(order), np.int64)
         drawn[order] = rows
         self._ahead_rows = drawn.reshape(self.block, -1)
@@ -86,6 +94,24 @@ class PrioritySampler(QuotaSampler):
             dealt = np.empty(len(order), np.float32)
             dealt[order] = weights
             self._ahead_weights = dealt.reshape(self.block, -1)
+
+    def _with_others(
+        self, rows: Ints, weights: F32 | None, counts: Ints
+    ) -> tuple[Ints, F32 | None]:
+        """Rows by priority and those of strata without a rule, stratum by stratum."""
+        by_priority = np.repeat(self._ruled, counts)
+        every = np.empty(len(by_priority), np.int64)
+        every[by_priority] = rows
+        others = [
+            self._take(stratum, int(counts[stratum]))
+            for stratum in np.flatnonzero(~self._ruled).tolist()
+        ]
+        every[~by_priority] = np.concatenate(others)
+        if weights is None:
+            return every, None
+        all_weights = np.ones(len(every), np.float32)
+        all_weights[by_priority] = weights
+        return every, all_weights
 
     def _hand_back(self) -> None:
         super()._hand_back()

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,7 @@ class Per:
     beta: float = 0.4
     beta_batches: int = 100_000
     epsilon: float = 1e-3
+    floor: ClassVar[float] = 0.0
 
     def __post_init__(self) -> None:
         _check_alpha(self.alpha)
@@ -50,11 +51,6 @@ class Per:
             )
         if not self.epsilon > 0:
             raise MixtureError(f"PER: epsilon must be above 0, got {self.epsilon:g}")
-
-    def priority(self, td_abs: F32) -> F32:
-        """(n,), above 0."""
-        raised: F32 = (td_abs + np.float32(self.epsilon)) ** np.float32(self.alpha)
-        return raised
 
     def beta_after(self, batches: int) -> float:
         """The exponent of the weights once so many batches are drawn."""
@@ -67,16 +63,12 @@ class Lap:
 
     alpha: float = 0.4
     floor: float = 1.0
+    epsilon: ClassVar[float] = 0.0
 
     def __post_init__(self) -> None:
         _check_alpha(self.alpha)
         if not self.floor > 0:
             raise MixtureError(f"LAP: floor must be above 0, got {self.floor:g}")
-
-    def priority(self, td_abs: F32) -> F32:
-        """(n,), at least floor ** alpha."""
-        raised: F32 = np.maximum(td_abs, np.float32(self.floor)) ** np.float32(self.alpha)
-        return raised
 
     def beta_after(self, batches: int) -> float:
         """No weights, whenever."""
@@ -84,6 +76,22 @@ class Lap:
 
 
 Rule = Per | Lap
+
+
+class Exponents:
+    """The numbers of S rules side by side: priority = max(|TD| + epsilon, floor) ** alpha."""
+
+    def __init__(self, rules: Sequence[Rule | None]) -> None:
+        def each(name: str) -> F32:
+            return np.array([getattr(rule, name, 0.0) for rule in rules], np.float32)
+
+        self.epsilon, self.floor, self.alpha = each("epsilon"), each("floor"), each("alpha")
+
+    def priority(self, td_abs: F32, stratum: NDArray[Any]) -> F32:
+        """(n,), above 0, of |TD| (n,) of rows of these strata (n,)."""
+        raised: F32 = np.maximum(td_abs + self.epsilon[stratum], self.floor[stratum])
+        raised **= self.alpha[stratum]
+        return raised
 
 
 def _check_alpha(alpha: float) -> None:
@@ -95,62 +103,76 @@ class Priorities:
     """The priorities of the rows of S strata, and draws in proportion.
 
     Rows lie stratum by stratum, each stratum's filled up to a multiple of CHUNK with rows of
-    priority 0 that are never drawn. A row that was not drawn yet has the largest priority so far,
-    so that every row is seen.
+    priority 0 that are never drawn. A row that was not drawn yet has the largest priority that its
+    stratum has had, so that every row is seen.
+
+    Args:
+        rules: of each stratum, (S,); the rows of one that has None have no priority.
 
     Raises:
         MixtureError: a row in two strata.
     """
 
-    def __init__(self, stratum_rows: Sequence[NDArray[Any]], rule: Rule) -> None:
-        self.rule = rule
-        self.sizes: Ints = np.array([len(rows) for rows in stratum_rows], np.int64)
-        room = -(-self.sizes // CHUNK) * CHUNK
-        self._first: Ints = np.concatenate([[0], np.cumsum(room)])[:-1].astype(np.int64)
-        filled: Bools = np.zeros(int(room.sum()), np.bool_)
-        for first, size in zip(self._first.tolist(), self.sizes.tolist(), strict=True):
-            filled[first : first + size] = True
-        self._filled = np.flatnonzero(filled)
-        rows = np.concatenate([np.asarray(rows, np.int64) for rows in stratum_rows])
-        self._rows: Ints = np.full(len(filled), -1, np.int64)
-        self._rows[self._filled] = rows
-        self._place: Ints = np.full(int(rows.max(initial=-1)) + 1, -1, np.int64)
-        self._place[rows] = self._filled
-        if (self._rows[self._place[rows]] != rows).any() or len(np.unique(rows)) != len(rows):
+    def __init__(self, stratum_rows: Sequence[NDArray[Any]], rules: Sequence[Rule | None]) -> None:
+        self.rules = tuple(rules)
+        self.exponents = Exponents(rules)
+        joined = np.concatenate([np.asarray(rows, np.int64) for rows in stratum_rows])
+        if len(np.unique(joined)) != len(joined):
             raise MixtureError(
                 "a row is in two strata", remedy="strata drawn by priority must be disjoint"
             )
-        self._largest = float(rule.priority(np.ones(1, np.float32))[0])
-        self._priority: F32 = np.zeros(len(filled), np.float32)
-        self._priority[self._filled] = self._largest
-        self._new: Bools = filled  # not drawn yet
-        self._stale_new = False  # the largest priority grew since rows not drawn yet were given it
+        ruled = [rule is not None for rule in rules]
+        self.sizes: Ints = np.array(
+            [len(rows) if own else 0 for rows, own in zip(stratum_rows, ruled, strict=True)]
+        )
+        room = -(-self.sizes // CHUNK) * CHUNK
+        self._first: Ints = np.concatenate([[0], np.cumsum(room)])[:-1].astype(np.int64)
+        self._stratum = np.repeat(np.arange(len(room), dtype=np.int16), room)  # of each place
+        self._rows: Ints = np.full(int(room.sum()), -1, np.int64)
+        self._place: Ints = np.full(int(joined.max(initial=-1)) + 1, -1, np.int64)
+        for stratum in np.flatnonzero(self.sizes).tolist():
+            first, rows = int(self._first[stratum]), np.asarray(stratum_rows[stratum], np.int64)
+            self._rows[first : first + len(rows)] = rows
+            self._place[rows] = first + np.arange(len(rows))
+        self._filled = np.flatnonzero(self._rows >= 0)
+        self._largest: F32 = self.exponents.priority(
+            np.ones(len(room), np.float32), np.arange(len(room))
+        )
+        self._priority: F32 = np.zeros(len(self._rows), np.float32)
+        self._priority[self._filled] = self._largest[self._stratum[self._filled]]
+        self._new: Bools = self._rows >= 0  # not drawn yet
+        self._stale_new = False  # a largest priority grew since rows not drawn yet were given it
 
     def of(self, rows: Ints) -> F32:
-        """The priorities of rows (n,), as they are now."""
+        """The priorities of rows (n,) of strata that have a rule, as they are now."""
         return self._priority[self._place[rows]]
 
     def update(self, rows: Ints, td_abs: NDArray[Any]) -> None:
-        """New |TD error| (n,) of rows (n,).
+        """New |TD error| (n,) of rows (n,); those of strata without a rule are left alone.
 
         Raises:
             MixtureError: a TD error that is not finite.
         """
-        priority = self.rule.priority(np.asarray(td_abs, np.float32))
-        largest = float(priority.max(initial=0.0))
-        if not np.isfinite(largest):  # max passes NaN on
+        place, errors = self._place[rows], np.asarray(td_abs, np.float32)
+        if not np.isfinite(errors).all():
             raise MixtureError(
-                f"{int((~np.isfinite(priority)).sum())} TD errors are not finite",
+                f"{int((~np.isfinite(errors)).sum())} TD errors are not finite",
                 remedy="training has diverged: lower the learning rate, or slow the target down",
             )
-        place = self._place[rows]
+        if None in self.rules:
+            place, errors = place[place >= 0], errors[place >= 0]
+        stratum = self._stratum[place]
+        priority = self.exponents.priority(errors, stratum)
         self._priority[place] = priority
         self._new[place] = False
-        if largest > self._largest:
-            self._largest, self._stale_new = largest, True
+        if (priority > self._largest[stratum]).any():
+            np.maximum.at(self._largest, stratum, priority)
+            self._stale_new = True
 
     def draw(self, counts: Ints, batches: int, rng: np.random.Generator) -> tuple[Ints, F32 | None]:
         """`counts` (S,) rows of each stratum, in proportion to the priorities as they are now.
+
+        Those of strata without a rule must be 0.
 
         Each stratum's range of sums is cut into `counts` equal parts with one draw in each (Schaul
         et al., appendix B.2.1), dealt in random order: a row's expected draws are exactly in
@@ -159,12 +181,12 @@ class Priorities:
         Returns row numbers (counts.sum(),), stratum by stratum, and their weights, None for ones.
         """
         if self._stale_new:
-            self._priority[self._new] = self._largest
+            self._priority[self._new] = self._largest[self._stratum[self._new]]
             self._stale_new = False
         # einsum adds in one order on every machine and number of threads; BLAS does not.
         sums: F32 = np.einsum("ij->i", self._priority.reshape(-1, CHUNK))
-        beta = self.rule.beta_after(batches)
         drawn, weights = [np.empty(0, np.int64)], [np.empty(0, np.float32)]
+        weighted = False
         for stratum in np.flatnonzero(counts).tolist():
             count, size = int(counts[stratum]), int(self.sizes[stratum])
             first = int(self._first[stratum])
@@ -172,10 +194,16 @@ class Priorities:
             place = first + self._search(chunks, first, size, rng.random(count))
             place = place[rng.permutation(count)]
             drawn.append(self._rows[place])
+            rule = self.rules[stratum]
+            beta = 0.0 if rule is None else rule.beta_after(batches)
             if beta > 0:
                 own = self._priority[first : first + size]
-                weights.append(_weights(self._priority[place], own, float(chunks.sum()), beta))
-        return np.concatenate(drawn), np.concatenate(weights) if beta > 0 else None
+                total = float(chunks.sum(dtype=np.float64))
+                weights.append(_weights(self._priority[place], own, total, beta))
+                weighted = True
+            else:
+                weights.append(np.ones(count, np.float32))
+        return np.concatenate(drawn), np.concatenate(weights) if weighted else None
 
     def _search(self, chunks: F32, first: int, size: int, within: F64) -> Ints:
         """Which member of the stratum at `first` each of `within` (n,), in [0, 1), falls on."""
@@ -195,7 +223,7 @@ class Priorities:
         return {
             "priority": self._priority[self._filled],
             "new": self._new[self._filled],
-            "largest": self._largest,
+            "largest": self._largest.copy(),
             "stale_new": self._stale_new,
         }
 
@@ -203,7 +231,8 @@ class Priorities:
         """Puts the priorities where `state_dict` found them."""
         self._priority[self._filled] = state["priority"]
         self._new[self._filled] = state["new"]
-        self._largest, self._stale_new = float(state["largest"]), bool(state["stale_new"])
+        self._largest = np.array(state["largest"], np.float32)
+        self._stale_new = bool(state["stale_new"])
 
 
 _UPTO: F32 = np.tril(np.ones((CHUNK, CHUNK), np.float32))

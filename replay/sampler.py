@@ -65,8 +65,8 @@ class QuotaSampler:
         batch_size: rows per draw.
         rng: the generator of the draws; its state is part of `state_dict`.
         weights: importance weight of each row number, or None for ones.
-        replacement: False goes through each stratum in shuffled order before any row repeats
-            (within a stratum, rows differ by at most one draw).
+        replacement: False goes through a stratum in shuffled order before any row repeats
+            (within it, rows differ by at most one draw); for all strata or for each, (S,).
 
     Raises:
         MixtureError: shares that are no distribution, or a share on an empty stratum.
@@ -82,7 +82,7 @@ class QuotaSampler:
         rng: np.random.Generator,
         *,
         weights: F32 | None = None,
-        replacement: bool = True,
+        replacement: bool | Sequence[bool] = True,
     ) -> None:
         if len(stratum_rows) != len(shares):
             raise MixtureError(f"{len(stratum_rows)} strata but {len(shares)} shares")
@@ -93,11 +93,14 @@ class QuotaSampler:
         last = max((int(rows.max(initial=-1)) for rows in self._members), default=-1)
         self.weights: F32 = np.ones(last + 1, np.float32) if weights is None else weights
         self.rng = rng
-        self.replacement = replacement
+        again = replacement
+        self._again = [again] * len(shares) if isinstance(again, bool) else list(again)
+        if len(self._again) != len(shares):
+            raise MixtureError(f"{len(self._again)} rules for {len(shares)} strata")
+        self._turns = [stratum for stratum, own in enumerate(self._again) if not own]
         self._cursor: Ints = np.zeros(len(self.sizes), np.int64)
-        if not replacement:
-            for members in self._members:
-                self.rng.shuffle(members)
+        for stratum in self._turns:
+            self.rng.shuffle(self._members[stratum])
         # Rows whose turn came and that were not handed out, because the shares changed: next ones.
         self._returned = [np.empty(0, np.int64) for _ in self._members]
         self._ahead_rows: Ints = np.zeros((0, batch_size), np.int64)
@@ -177,7 +180,7 @@ class QuotaSampler:
     def _take(self, stratum: int, count: int) -> Ints:
         """The next `count` rows of a stratum."""
         members, size = self._members[stratum], int(self.sizes[stratum])
-        if self.replacement:
+        if self._again[stratum]:
             return members[(self.rng.random(count) * size).astype(np.int64)]
         back = self._returned[stratum]
         parts, self._returned[stratum] = [back[:count]], back[count:]
@@ -198,9 +201,9 @@ class QuotaSampler:
         rows, strata = self._ahead_rows[self._next :], self._ahead_strata[self._next :]
         quota = np.stack([(strata == s).sum(axis=1) for s in range(len(self.sizes))], axis=1)
         self.quotas.give_back(quota)
-        if not self.replacement:
-            for stratum, back in enumerate(self._returned):
-                self._returned[stratum] = np.concatenate([rows[strata == stratum], back])
+        for stratum in self._turns:
+            back = self._returned[stratum]
+            self._returned[stratum] = np.concatenate([rows[strata == stratum], back])
         self._ahead_rows, self._ahead_strata = rows[:0], strata[:0]
         self._next = 0
 
@@ -214,18 +217,23 @@ class QuotaSampler:
             "ahead_strata": self._ahead_strata[self._next :].copy(),
             "rng": self.rng.bit_generator.state,
         }
-        if not self.replacement:
+        if self._turns:
+            returned = [self._returned[stratum] for stratum in self._turns]
             state |= {
+                "turns": list(self._turns),
                 "cursor": self._cursor.copy(),
-                "order": np.concatenate(self._members),
-                "returned": np.concatenate(self._returned),
-                "returned_count": np.array([len(rows) for rows in self._returned], np.int64),
+                "order": np.concatenate([self._members[stratum] for stratum in self._turns]),
+                "returned": np.concatenate(returned),
+                "returned_count": np.array([len(rows) for rows in returned], np.int64),
             }
         return state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Raises MixtureError when the state is of a sampler over other strata."""
-        if not np.array_equal(state["sizes"], self.sizes) or ("order" in state) == self.replacement:
+        if (
+            not np.array_equal(state["sizes"], self.sizes)
+            or list(state.get("turns", [])) != self._turns
+        ):
             raise MixtureError(
                 "the saved sampler drew from other strata, or by another rule",
                 remedy="resume with the panel and the settings the run began with",
@@ -237,10 +245,12 @@ class QuotaSampler:
         self._ahead_strata = np.array(state["ahead_strata"], np.int64)
         self._next = 0
         self.rng.bit_generator.state = state["rng"]
-        if not self.replacement:
+        if self._turns:
             self._cursor = np.array(state["cursor"], np.int64)
-            self._members = _parts(state["order"], self.sizes)
-            self._returned = _parts(state["returned"], state["returned_count"])
+            orders = _parts(state["order"], self.sizes[self._turns])
+            returned = _parts(state["returned"], state["returned_count"])
+            for stratum, order, back in zip(self._turns, orders, returned, strict=True):
+                self._members[stratum], self._returned[stratum] = order, back
 
 
 def _parts(joined: NDArray[Any], counts: Ints) -> list[Ints]:

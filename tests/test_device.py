@@ -12,7 +12,7 @@ from scipy import stats
 
 from restock.errors import MixtureError
 from restock.replay.device import DeviceSampler
-from restock.replay.priorities import Lap, Per
+from restock.replay.priorities import Lap, Per, Rule
 from restock.train import checkpoint
 
 STRATA = [np.arange(0, 400, 2), np.arange(1, 101, 2)]  # 200 and 50 rows
@@ -22,6 +22,7 @@ WAYS: dict[str, dict[str, Any]] = {
     "in turns": {"replacement": False},
     "PER": {"rule": Per(alpha=0.7)},
     "LAP": {"rule": Lap()},
+    "in turns beside PER": {"rule": [None, Per(alpha=0.7)], "replacement": False},
 }
 
 
@@ -36,6 +37,13 @@ def sampler(device: torch.device, *, seed: int = 0, **way: Any) -> DeviceSampler
     return DeviceSampler(STRATA, SHARES, 50, seed=seed, device=device, **way)
 
 
+def priority(rule: Rule | None, td_abs: np.ndarray) -> np.ndarray:
+    """As the papers have it."""
+    if isinstance(rule, Per):
+        return (td_abs + rule.epsilon) ** rule.alpha
+    return np.maximum(td_abs, rule.floor) ** rule.alpha if rule else np.ones_like(td_abs)
+
+
 def errors() -> np.ndarray:
     """|TD| of each row (400,), over three orders of magnitude."""
     return 10 ** np.random.default_rng(5).uniform(-2, 1, 400)
@@ -44,7 +52,8 @@ def errors() -> np.ndarray:
 @pytest.mark.parametrize("way", WAYS)
 def test_quotas_are_exact_and_rows_drawn_as_the_rule_says(device: torch.device, way: str) -> None:
     drawing, td = sampler(device, **WAYS[way]), errors()
-    rule = WAYS[way].get("rule")
+    given = WAYS[way].get("rule")
+    rules = given if isinstance(given, list) else [given, given]
     for rows in STRATA:
         drawing.update(torch.from_numpy(rows).to(device), torch.from_numpy(td[rows]).to(device))
     counts = np.zeros(400)
@@ -53,13 +62,12 @@ def test_quotas_are_exact_and_rows_drawn_as_the_rule_says(device: torch.device, 
         assert drawn.device.type == device.type
         assert torch.bincount(stratum).tolist() == [35, 15]
         np.add.at(counts, drawn.cpu().numpy(), 1)
-    for rows, total in zip(STRATA, (70_000, 30_000), strict=True):
+    for rows, total, rule in zip(STRATA, (70_000, 30_000), rules, strict=True):
         assert counts[rows].sum() == total
-        if way == "in turns":
+        if rule is None and not WAYS[way].get("replacement", True):
             assert np.ptp(counts[rows]) <= 1
             continue
-        share = np.ones(len(rows)) if rule is None else rule.priority(td[rows].astype(np.float32))
-        share = share.astype(np.float64)
+        share = priority(rule, td[rows])
         assert stats.chisquare(counts[rows], share / share.sum() * total).pvalue > 1e-4
 
 
@@ -75,8 +83,7 @@ def test_weights_are_those_of_the_distribution_drawn_from(
     assert drawing.drawn_weights is not None
     weights = drawing.drawn_weights.cpu().numpy()
     for code, rows in enumerate(STRATA):
-        priority = rule.priority(td.astype(np.float32)).astype(np.float64)
-        p = priority / priority[rows].sum()
+        p = priority(rule, td) / priority(rule, td[rows]).sum()
         mean = (p[rows] * (len(rows) * p[rows]) ** -beta).sum()
         mine = (stratum == code).cpu().numpy()
         np.testing.assert_allclose(

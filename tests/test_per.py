@@ -37,6 +37,13 @@ def errors(seed: int = 5) -> np.ndarray:
     return 10 ** np.random.default_rng(seed).uniform(-2, 1, 400)
 
 
+def priority(rule: Rule | None, td_abs: np.ndarray) -> np.ndarray:
+    """As the papers have it."""
+    if isinstance(rule, Per):
+        return (td_abs + rule.epsilon) ** rule.alpha
+    return np.maximum(td_abs, rule.floor) ** rule.alpha if rule else np.ones_like(td_abs)
+
+
 def expected(priority: np.ndarray) -> np.ndarray:
     return priority / priority.sum()
 
@@ -52,15 +59,56 @@ def test_draws_are_in_proportion_to_priorities_within_each_stratum(rule: Rule) -
         assert np.bincount(stratum).tolist() == [35, 15]  # quotas stay exact
         np.add.at(counts, drawn, 1)
     for rows, total in zip(STRATA, (140_000, 60_000), strict=True):
-        priority = rule.priority(td[rows].astype(np.float32)).astype(np.float64)
         assert counts[rows].sum() == total
-        assert stats.chisquare(counts[rows], expected(priority) * total).pvalue > 1e-4
+        wanted = expected(priority(rule, td[rows])) * total
+        assert stats.chisquare(counts[rows], wanted).pvalue > 1e-4
 
 
 def test_priorities_are_those_of_the_papers() -> None:
-    td = np.array([0.0, 0.5, 4.0], np.float32)
-    np.testing.assert_allclose(Per(alpha=0.5, epsilon=0.25).priority(td), (td + 0.25) ** 0.5)
-    np.testing.assert_allclose(Lap(alpha=0.5).priority(td), [1.0, 1.0, 2.0])
+    td, rows = np.array([0.0, 0.5, 4.0], np.float32), np.arange(3)
+    strata = [rows, rows + 3]
+    priorities = Priorities(strata, [Per(alpha=0.5, epsilon=0.25), Lap(alpha=0.5)])
+    for members in strata:
+        priorities.update(members, td)
+    np.testing.assert_allclose(priorities.of(rows), (td + 0.25) ** 0.5)
+    np.testing.assert_allclose(priorities.of(rows + 3), [1.0, 1.0, 2.0])
+
+
+def test_each_stratum_may_have_its_own_rule() -> None:
+    strata = [np.arange(0, 60), np.arange(60, 90), np.arange(90, 130), np.arange(130, 150)]
+    rules = [Per(alpha=1.0, beta=1.0), None, Lap(alpha=1.0), None]
+
+    def fresh(seed: int) -> PrioritySampler:
+        return PrioritySampler(
+            strata,
+            [0.25] * 4,
+            40,
+            np.random.default_rng(seed),
+            rule=rules,
+            replacement=[True, False, True, True],
+        )
+
+    drawing, td = fresh(0), 10 ** np.random.default_rng(1).uniform(-1, 1, 150)
+    drawing.update(np.arange(150), td)
+    counts = np.zeros(150)
+    for _ in range(3000):
+        drawn, stratum = drawing.draw()
+        assert np.bincount(stratum).tolist() == [10] * 4
+        weights = drawing.drawn_weights
+        assert weights is not None
+        assert (weights[stratum > 0] == 1).all()
+        assert (weights[stratum == 0] != 1).all()
+        np.add.at(counts, drawn, 1)
+    assert np.ptp(counts[strata[1]]) <= 1
+    for stratum_index in (0, 2, 3):
+        rows = strata[stratum_index]
+        wanted = expected(priority(rules[stratum_index], td[rows])) * 30_000
+        assert stats.chisquare(counts[rows], wanted).pvalue > 1e-4
+    again = fresh(7)
+    again.load_state_dict(drawing.state_dict())
+    for _ in range(30):
+        for one, other in zip(drawing.draw(), again.draw(), strict=True):
+            np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize("beta", [0.4, 0.8, 1.0])
@@ -127,10 +175,11 @@ def test_beta_grows_to_one_and_lap_has_no_weights() -> None:
 
 
 def test_rows_not_drawn_yet_have_the_largest_priority_so_far() -> None:
-    priorities = Priorities(STRATA, Per(alpha=1.0, epsilon=1e-3))
+    priorities = Priorities(STRATA, [Per(alpha=1.0, epsilon=1e-3)] * 2)
     priorities.update(np.array([0, 1]), np.array([7.0, 0.1]))
     priorities.draw(np.array([1, 1]), 0, np.random.default_rng(0))
-    np.testing.assert_allclose(priorities.of(np.array([0, 1, 2, 3])), [7.001, 0.101, 7.001, 7.001])
+    # Of its own stratum: the second has had no error above the one it began with.
+    np.testing.assert_allclose(priorities.of(np.array([0, 1, 2, 3])), [7.001, 0.101, 7.001, 1.001])
 
 
 @settings(max_examples=60, deadline=None)
@@ -207,7 +256,7 @@ def test_what_cannot_be_a_priority_is_refused() -> None:
     with pytest.raises(MixtureError, match="not finite"):
         sampler(Per()).update(np.array([0, 2]), np.array([1.0, np.nan]))
     with pytest.raises(MixtureError, match="two strata"):
-        Priorities([np.arange(3), np.arange(2, 5)], Lap())
+        Priorities([np.arange(3), np.arange(2, 5)], [Lap()] * 2)
     with pytest.raises(MixtureError, match="alpha"):
         Per(alpha=2.0)
     with pytest.raises(MixtureError, match="did not draw by priority"):
