@@ -44,8 +44,10 @@ class WarehouseEnv(gymnasium.Env[NDArray[np.float32], Any]):
         return observation[0], _first(info)
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """One control period."""
+        """One control period. `info["signals_before"]` are the signals that `action` answered."""
+        before = self.vector.signals
         observation, reward, terminated, truncated, info = self.vector.step(np.array([action]))
+        info["signals_before"] = before
         return (
             *(observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0])),
             _first(info),

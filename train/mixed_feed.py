@@ -1,0 +1,294 @@
+"""What another library's replay buffer draws, labels and writes down: logs by quota, and fresh.
+
+The library owns the training loop. Its buffer is a subclass (`restock.train.sb3_buffer`,
+`restock.train.tianshou_buffer`) that asks this class for rows of the panel, tells it every step and
+every batch, and so leaves a run directory with the same tables as `restock train` does: `strata`,
+`ages`, `policies`, `fed_episodes`, `episodes`, `audit` and `progress`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from restock.errors import ConfigError, PanelError
+from restock.ingest.profile import load_profile
+from restock.replay.panel import Panel
+from restock.train.batches import Batch, Logs
+from restock.train.fresh_meta import FreshMeta
+from restock.train.info_labels import InfoLabels
+from restock.train.loss import Loss
+from restock.train.record import FeedRecord
+from restock.train.run import Run, now_ns, software_versions
+from restock.train.run_tables import TABLES
+
+Ints = NDArray[np.int64]
+_TOLD = (
+    *("episode_seed", "perturbation", "block", "success", "bumps"),
+)  # of an episode that ended, by the infos of its last step
+
+
+class _Sink:
+    """A run whose NaNs are nulls: what a library keeps to itself is not known here."""
+
+    def __init__(self, run: Run) -> None:
+        self.run = run
+
+    def append(self, table: str, rows: Sequence[Mapping[str, Any]]) -> None:
+        self.run.append(table, [{k: _known(v) for k, v in row.items()} for row in rows])
+
+    def append_columns(self, table: str, columns: Mapping[str, Any]) -> None:
+        self.run.append_columns(table, columns)
+
+
+def _known(value: Any) -> Any:
+    return None if isinstance(value, float) and value != value else value
+
+
+class MixedFeed:
+    """The part that does not depend on the library.
+
+    Args:
+        library: the distribution whose loop this is, e.g. "stable-baselines3".
+        num_envs: N.
+        observation_size: D, of the library's environment.
+        panel: a panel or its directory; None for fresh rows alone.
+        run: the run directory to make; None keeps no record.
+        logs_share: of a batch; default the panel's own.
+        profile: whose task and conditions the environment has.
+        seed: of the draws and of which batches are audited.
+        audit_share: of all batches, each row of which is written down.
+        log_every: batches summed into one row of each table.
+
+    Raises:
+        ConfigError: a share outside [0, 1].
+        PanelError: a panel of another task than the environment's.
+        RunError: something is at `run` already.
+    """
+
+    def __init__(
+        self,
+        library: str,
+        num_envs: int,
+        observation_size: int,
+        *,
+        panel: Panel | str | Path | None,
+        run: str | Path | None,
+        logs_share: float | None,
+        profile: str,
+        seed: int,
+        audit_share: float,
+        log_every: int,
+    ) -> None:
+        known = load_profile(profile)
+        self.panel = Panel.open(panel) if isinstance(panel, str | Path) else panel
+        if logs_share is None:
+            logs_share = self.panel.header.logs_share if self.panel is not None else 0.0
+        if not 0 <= logs_share <= 1:
+            raise ConfigError(f"logs_share must be in [0, 1], got {logs_share:g}")
+        self.logs_share = logs_share if self.panel is not None else 0.0
+        if self.panel is not None:
+            _check(self.panel, known.task.hash, profile, observation_size)
+        self.logs = Logs.of_panel(self.panel) if self.panel is not None else None
+        self.seed, self.log_every, self.audit_share = seed, log_every, audit_share
+        self.rng = np.random.default_rng([seed, 1])
+        self.labels = InfoLabels(known.conditions, num_envs)
+        self.num_envs, self.library = num_envs, library
+        self.env_steps = self.batches = self.invalid_steps = 0
+        self._samplers: dict[int, Any] = {}
+        self._phase = "offline"
+        self._open = 0  # batches since the last rows were written
+        self._episodes: dict[int, dict[str, Any]] = {}
+        self._begun = time.monotonic()
+        self.run: Run | None = None
+        if run is not None:
+            self.run = Run.create(
+                Path(run),
+                {
+                    "created_ns": now_ns(),
+                    "library": {"name": library, "version": version(library)},
+                    "config": {
+                        "logs_share": self.logs_share,
+                        "seed": seed,
+                        "audit_share": audit_share,
+                        "num_envs": num_envs,
+                    },
+                    "panel": _fed(self.panel),
+                    "task_hash": known.task.hash,
+                    "labels_version": known.labels_version,
+                    "profile": {"name": known.name, "hash": known.hash},
+                    "seeds": {"run": seed},
+                    "versions": software_versions() | {library: version(library)},
+                },
+            )
+        self.record: FeedRecord | None = None
+        self.fresh: Any = None
+
+    def keep_record(self, fresh: Any) -> None:
+        """Say what the fresh rows are: a `FreshRing`, or a `FreshMeta`."""
+        self.fresh = fresh
+        if self.run is not None:
+            sink: Any = _Sink(self.run)
+            self.record = FeedRecord(
+                sink, self.logs, fresh, audit_share=self.audit_share, seed=self.seed
+            )
+
+    # -- steps ----------------------------------------------------------------------------------
+
+    def take(self, envs: Ints, keys: Ints, ended: NDArray[Any], infos: Sequence[Any]) -> None:
+        """One step of `envs` (n,), of the episodes `keys` (n,): labels those that ended."""
+        self.env_steps += len(envs)
+        for env, key, over, info in zip(
+            envs.tolist(), keys.tolist(), np.asarray(ended).tolist(), infos, strict=True
+        ):
+            self.labels.step(env, info, ended=bool(over), key=key)
+            if over and self.run is not None:
+                self._episodes[key] = _told(env, key, info) | {
+                    "env_steps": self.env_steps,
+                    "gradient_steps": self.batches,
+                }
+        self.label()
+
+    def label(self, *, all_of_them: bool = False) -> None:
+        """Label what ended."""
+        for labelled in self.labels.label(all_of_them=all_of_them):
+            self.fresh.set_labels(labelled.key, labelled.codes)
+            if labelled.key in self._episodes:
+                self._episodes[labelled.key]["conditions"] = labelled.conditions
+
+    # -- batches --------------------------------------------------------------------------------
+
+    def draw_logs(self, batch_size: int) -> tuple[Ints, Ints]:
+        """Rows of the panel (L,) and their strata (L,), by its quotas; all where nothing is fresh.
+
+        L is the share of logs in a batch of that size.
+        """
+        count = round(batch_size * self.logs_share) if len(self.fresh) else batch_size
+        if self.panel is None or not count:
+            return np.empty(0, np.int64), np.empty(0, np.int64)
+        if count not in self._samplers:
+            rng = np.random.default_rng([self.seed, 3, count])
+            self._samplers[count] = self.panel.sampler(count, rng)
+        rows, strata = self._samplers[count].draw()
+        return rows, strata
+
+    def drawn(
+        self,
+        packed: NDArray[np.float32],
+        log_rows: Ints,
+        log_stratum: Ints,
+        slots: Ints,
+        *,
+        weight: NDArray[np.float32] | None = None,
+        td: NDArray[np.float32] | None = None,
+        q: NDArray[np.float32] | None = None,
+    ) -> None:
+        """The batch of one update, logs first: packed rows (B, W), and what is known of them.
+
+        `weight`, `td` (Q - target) and `q` (B,); unknown ones are null in the tables.
+        """
+        phase = "online" if len(slots) else "offline"
+        if phase != self._phase:
+            self.flush()  # an interval is of one phase
+            self._phase = phase
+        self.batches += 1
+        if self.record is None:
+            return
+        unknown = np.full(len(packed), np.nan, np.float32)
+        batch = Batch(
+            rows=torch.from_numpy(packed),
+            weight=None if weight is None else torch.from_numpy(weight),
+            log_rows=log_rows,
+            log_stratum=log_stratum,
+            slots=slots,
+        )
+        loss = Loss(
+            value=torch.zeros(()),
+            td=torch.from_numpy(unknown if td is None else td),
+            q=torch.from_numpy(unknown if q is None else q),
+        )
+        self.record.batch(self.batches, self.env_steps, batch, loss, 0)
+        self._open += 1
+        if self._open >= self.log_every:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write the rows of the open interval; the run's files are whole after it."""
+        if self.record is None or self.run is None:
+            return
+        self.label(all_of_them=True)
+        means = self.record.flush(self.env_steps, self.batches, self._phase)
+        if self._open:
+            known = {
+                "env_steps": self.env_steps,
+                "gradient_steps": self.batches,
+                "wall_s": time.monotonic() - self._begun,
+                "phase": self._phase,
+                "updates": self._open,
+                "ring_rows": len(self.fresh),
+                "episodes": len(self._episodes),
+                **{name: _known(value) for name, value in means.items()},
+            }
+            blank = dict.fromkeys(TABLES["progress"].names)
+            self.run.append("progress", [blank | known])
+        if self._episodes:
+            blank = dict.fromkeys(TABLES["episodes"].names)
+            rows = [blank | row for row in self._episodes.values()]
+            self.run.append("episodes", rows)
+        self._open, self._episodes = 0, {}
+        self.run.flush()
+
+    def fresh_meta(self, capacity: int) -> FreshMeta:
+        """Metadata beside a buffer that the library keeps."""
+        name = self.library
+        return FreshMeta(
+            capacity, self.num_envs, conditions=self.labels.names, behaviour_policy=name
+        )
+
+
+def _check(panel: Panel, task_hash: str, profile: str, observation_size: int) -> None:
+    if panel.task_hash != task_hash or panel.observation_size != observation_size:
+        raise PanelError(
+            f"its rows are of task {panel.task_hash} ({panel.observation_size} entries an"
+            f" observation), the environment's ({profile}) is {task_hash} ({observation_size})",
+            where=str(panel.path),
+            remedy=f"ingest the logs with `--profile {profile}` and mix anew",
+        )
+
+
+def _fed(panel: Panel | None) -> dict[str, Any] | None:
+    if panel is None:
+        return None
+    return {
+        "path": str(panel.path.resolve()),
+        "id": panel.id,
+        "store_version": panel.store_version,
+        "rows": len(panel),
+        "n_step": panel.n_step,
+        "discount": panel.discount,
+        "labels_version": panel.header.labels_version,
+        "strata": {stratum.name: stratum.share for stratum in panel.strata},
+    }
+
+
+def _told(env: int, key: int, info: Mapping[str, Any]) -> dict[str, Any]:
+    """A row of `episodes`, as far as the last step's info tells."""
+    columns = set(TABLES["episodes"].names)
+    told = {"env": env, "episode": key, "conditions": []}
+    told |= {name: _plain(info[name]) for name in _TOLD if name in info}
+    if "episode_condition" in info:
+        told["true_condition"] = _plain(info["episode_condition"])
+    if "episode_steps" in info:
+        told["steps"] = _plain(info["episode_steps"])
+    return {name: value for name, value in told.items() if name in columns}
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if hasattr(value, "item") else value
