@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -176,14 +176,25 @@ class Location:
         with self.explained(), self.files.open_input_file(path) as file:
             return pq.read_table(file, partitioning=None)
 
-    def delete(self, path: str) -> None:
-        """Delete a file; one that is not there is as good."""
+    def listing(self, folder: str) -> set[str]:
+        """The files below a folder of the store, by their paths in that folder."""
+        with self.explained():
+            found = self.files.get_file_info(
+                pa.fs.FileSelector(folder, recursive=True, allow_not_found=True)
+            )
+        return {info.path.removeprefix(f"{folder}/") for info in found if info.is_file}
+
+    def delete(self, paths: Iterable[str]) -> None:
+        """Delete files; one that is not there is as good."""
         if self.folder is not None:
-            (self.folder / path).unlink(missing_ok=True)
+            for path in paths:
+                (self.folder / path).unlink(missing_ok=True)
             return
         # Not by Arrow's client: it puts an empty object where a folder's last file was.
         with self.explained():
-            DeltaStorageHandler(self.text, self.options).delete_file(path)
+            s3 = DeltaStorageHandler(self.text, self.options)
+            for path in paths:
+                s3.delete_file(path)
 
     @contextmanager
     def explained(self) -> Iterator[None]:

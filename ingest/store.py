@@ -28,6 +28,7 @@ from deltalake.exceptions import CommitFailedError, DeltaError
 from deltalake.transaction import AddAction, RemoveAction
 
 from restock.errors import StoreError
+from restock.ingest.custom import refuse_other_signals
 from restock.ingest.location import Location, first_line
 from restock.ingest.schema import recording_schema
 
@@ -104,10 +105,9 @@ class StoreWriter:
                     added.append(_Added(recording_id, name, len(table)))
                     added[-1].size = self._write(table, f"{what}/{name}")
         except BaseException:  # no commit has begun, so nobody needs them
-            for what, added in ((RECORDINGS, manifests), (TRANSITIONS, transitions)):
-                for file in added:
-                    with suppress(OSError, StoreError):
-                        self.path.delete(f"{what}/{file.path}")
+            with suppress(OSError, StoreError):
+                self.path.delete(f"{RECORDINGS}/{file.path}" for file in manifests)
+                self.path.delete(f"{TRANSITIONS}/{file.path}" for file in transitions)
             raise
         self._commit(RECORDINGS, manifests, instead_of or {})
         version, replaced = self._commit(TRANSITIONS, transitions, instead_of or {})
@@ -132,10 +132,11 @@ class StoreWriter:
                     enforce_retention_duration=False,
                     full=True,
                 )
-            for file in unneeded:
-                # Without a commit of its own: cleaning changes no version of the table.
-                self.path.delete(f"{name}/{file}")
-                deleted.append(f"{name}/{file}")
+            # It names removed files for as long as the log does, there or not.
+            there = sorted(set(unneeded) & self.path.listing(name))
+            deleted += [f"{name}/{file}" for file in there]
+        # Without commits of its own: cleaning changes no version of a table.
+        self.path.delete(deleted)
         return deleted
 
     def _abandoned(self, retention_hours: int) -> list[str]:
@@ -185,7 +186,8 @@ class StoreWriter:
                     configuration={"delta.checkpointInterval": str(CHECKPOINT_COMMITS)},
                 )
             table = self.path.open_table(name)
-            have = {field.name for field in table.schema().fields}
+            have = {field.name: field for field in table.schema().fields}
+            refuse_other_signals(have, schema, str(self.path))
             extra = [field.with_nullable(True) for field in schema if field.name not in have]
             if extra:
                 table.alter.add_columns(Schema.from_arrow(pa.schema(extra)).fields)

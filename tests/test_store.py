@@ -131,8 +131,9 @@ def test_a_manifest_without_transitions_shows_nothing_and_is_cleared_away(tmp_pa
     # Another writer may still be about to commit what joins nothing, so only age removes it.
     writer.clean()
     assert manifests() == ["b", "c"]
-    writer.clean(retention_hours=0)
+    assert writer.clean(retention_hours=0) != []
     assert manifests() == ["c"]
+    assert writer.clean(retention_hours=0) == []
     assert list(shown(tmp_path / "s")) == ["0000000000000001-c"]
 
 
@@ -148,6 +149,7 @@ def test_orphans_are_cleaned_after_the_retention_window_only(tmp_path):
     os.utime(orphan, (old, old))
     version = DeltaTable(str(tmp_path / "s" / "transitions")).version()
     assert writer.clean() == ["transitions/00000000000000ff/x.parquet"]
+    assert writer.clean() == []
     assert not orphan.exists()
     assert len(shown(tmp_path / "s")) == 1
     assert DeltaTable(str(tmp_path / "s" / "transitions")).version() == version
