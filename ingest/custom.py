@@ -9,13 +9,14 @@ not.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal
 
 import duckdb
 import msgspec
 import pyarrow as pa
 
+from restock.errors import StoreError
 from restock.ingest.schema import COLUMNS
 from restock.ingest.signal_paths import PathProblem, SignalPath
 
@@ -110,6 +111,31 @@ def name_problem(name: str) -> str | None:
     if name in _reserved():
         return "SQL has a word of that name: choose another"
     return None
+
+
+def refuse_other_signals(have: Mapping[str, Any], schema: pa.Schema, where: str) -> None:
+    """See that a store's columns of custom signals mean what rows of this schema mean by them.
+
+    `have` are the fields of the store's table, as deltalake gives them.
+
+    Raises:
+        StoreError: one of the same name has another type or unit.
+    """
+    for field in schema:
+        unit = (field.metadata or {}).get(b"unit")
+        known = have.get(field.name)
+        if unit is None or known is None:
+            continue
+        mine = "list" if field.type == LIST else "number"
+        theirs = "list" if "Array" in type(known.type).__name__ else "number"
+        unit_there = known.metadata.get("unit", "")
+        if (mine, unit.decode()) != (theirs, unit_there):
+            raise StoreError(
+                f"its column `{field.name}` is a {theirs} in {unit_there or '1'},"
+                f" and `signals.{field.name}` of the profile a {mine} in {unit.decode()}",
+                where=where,
+                remedy="rename the signal in the profile, or use another store",
+            )
 
 
 def _reserved() -> set[str]:
