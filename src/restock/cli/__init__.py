@@ -29,6 +29,7 @@ VERBS = {
     "eval": "success per condition, clean and perturbed",
     "compare": "refuses if the two were fed differently; else who did better, by how much",
     "trace": "where did a sampled row come from? down to the messages",
+    "diagnose": "buffer failure or target failure?",
     "report": "one HTML page with all of it",
     "demo": "all of the above, on sample_logs/",
 }

@@ -1,0 +1,156 @@
+"""Faults planted in training, and what `restock diagnose` makes of them: a confusion table.
+
+    python benchmarks/planted_faults.py --out /tmp/faults --seeds 3
+
+Three faults of the buffer, all in the blocked aisles, which the twin's training episodes then lack:
+their logged rows are removed; stale (next observations and rewards of other rows of the stratum);
+or mislabelled (the label stands on nominal rows). Four of the target and the optimizer: frozen, too
+slow, no target at all (tau 1), learning rate a hundred times too high. Runs are kept in --out and
+taken up where they are, so that a table can be made again without training again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from restock.cli import main as restock
+from restock.ingest.store import StoreWriter
+from restock.train.diagnose import diagnose
+from restock.train.run import Run
+
+STRATUM = "blocked_aisle"
+BUFFER, TARGET, DIVERGENCE = {"BUFFER", "BOTH"}, {"TARGET", "BOTH", "DIVERGENCE"}, {"DIVERGENCE"}
+# fault -> what may be said of it, and the settings that plant it
+FAULTS: dict[str, tuple[set[str], list[str]]] = {
+    "healthy": ({"HEALTHY"}, []),
+    "stratum removed": (BUFFER, [f"env.conditions.{STRATUM}=0"]),
+    "stratum stale": (BUFFER, [f"env.conditions.{STRATUM}=0"]),
+    "stratum mislabelled": (BUFFER, [f"env.conditions.{STRATUM}=0"]),
+    "target frozen": (TARGET, ["target={rule='hard', every=1000000}"]),
+    "target too slow": (TARGET, ["target={rule='polyak', tau=0.00003}"]),
+    "target too fast": (TARGET, ["target={rule='polyak', tau=1.0}"]),
+    "learning rate too high": (TARGET, ["optimizer.learning_rate=0.03"]),
+}
+SETTINGS = {
+    "schedule.env_steps": 32_000,
+    "schedule.offline_updates": 1_000,
+    "schedule.warmup_env_steps": 1_000,
+    "schedule.updates_per_env_step": 0.25,
+    "evaluation.every_env_steps": 5_000,
+    "evaluation.episodes": 6,
+    "epsilon.steps": 8_000,
+    "optimizer.learning_rate": 0.0003,
+    "record.every_updates": 250,
+    "record.tensorboard": "false",
+}
+
+
+def plant(clean: Path, faulty: Path, fault: str) -> None:
+    """A store with the fault in its rows."""
+    rng = np.random.default_rng(0)
+    source, writer = StoreWriter(clean), StoreWriter(faulty)
+    for row in source.live().to_pylist():
+        rows = source.rows(row["recording_id"], row["ingest_id"])
+        labels = rows["conditions"].to_pylist()
+        names = np.array(rows["condition"].to_pylist(), object)
+        mine = np.array([STRATUM in held for held in labels]) | (names == STRATUM)
+        if fault == "stratum removed":
+            rows = rows.filter(pa.array(~mine))
+        elif fault == "stratum stale":
+            order = np.arange(len(rows))
+            order[mine] = rng.permutation(order[mine])
+            for column in ("next_observation", "reward", "terminated"):
+                at = rows.schema.get_field_index(column)
+                rows = rows.set_column(at, rows.schema.field(at), rows[column].take(order))
+        elif fault == "stratum mislabelled":
+            nominal = np.flatnonzero(names == "nominal")
+            chosen = rng.choice(nominal, min(int(mine.sum()), len(nominal)), replace=False)
+            names[mine], names[chosen] = "nominal", STRATUM
+            labels = [[n for n in held if n != STRATUM] for held in labels]
+            for index in chosen:
+                labels[index] = [STRATUM]
+            for column, values in (("condition", names.tolist()), ("conditions", labels)):
+                at = rows.schema.get_field_index(column)
+                field = rows.schema.field(at)
+                rows = rows.set_column(at, field, pa.array(values, field.type))
+        manifest = source.live(row["recording_id"])
+        writer.write(manifest, rows)
+
+
+def panel_for(fault: str, out: Path) -> Path:
+    """The panel that a fault trains on, made once."""
+    clean, panel = out / "clean", out / "panels" / fault.replace(" ", "_")
+    if not (clean / "transitions").exists():
+        logs = Path(__file__).parents[1] / "sample_logs"
+        _must(["ingest", str(logs), "--store", str(clean)])
+    if not panel.exists():
+        store = clean
+        if fault.startswith("stratum"):
+            store = out / "stores" / fault.replace(" ", "_")
+            if not store.exists():
+                plant(clean, store, fault)
+        panel.parent.mkdir(exist_ok=True)
+        _must(["mix", str(store), "--mixture", "coverage", "--out", str(panel)])
+    return panel
+
+
+def run_for(fault: str, seed: int, out: Path) -> Run:
+    """One run with the fault, trained if it is not there."""
+    path = out / "runs" / f"{fault.replace(' ', '_')}-{seed}"
+    if not (path / "done").exists():
+        panel = panel_for(fault if fault.startswith("stratum") else "healthy", out)
+        sets = [f"{key}={value}" for key, value in SETTINGS.items()] + FAULTS[fault][1]
+        flags = [word for setting in [*sets, f"seed={seed}"] for word in ("--set", setting)]
+        _must(["train", "--panel", str(panel), "--out", str(path), *flags])
+        (path / "done").touch()
+    return Run.open(path)
+
+
+def _must(arguments: list[str]) -> None:
+    if restock(arguments) not in (0, 3):
+        raise SystemExit(f"restock {' '.join(arguments)} failed")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, required=True, help="where stores, panels and runs go")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--faults", default=",".join(FAULTS), help="comma-separated")
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument(
+        "--check", action="store_true", help="exit 1 below 90 %, or if ever opposite"
+    )
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    table: dict[str, dict[str, int]] = {}
+    right = opposite = total = 0
+    for fault in given.faults.split(","):
+        expected = FAULTS[fault][0]
+        said = [diagnose([run_for(fault, seed, given.out)]).cause for seed in range(given.seeds)]
+        table[fault] = dict(Counter(said))
+        total += len(said)
+        right += sum(cause in expected or cause == "UNDETERMINED" for cause in said)
+        wrong = TARGET - BUFFER if expected == BUFFER else BUFFER - TARGET
+        opposite += sum(cause in wrong for cause in said)
+    if given.json:
+        print(json.dumps({"table": table, "right": right, "opposite": opposite, "runs": total}))
+    else:
+        causes = ["HEALTHY", "BUFFER", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED"]
+        print("| planted | " + " | ".join(causes) + " |\n|" + " --- |" * (len(causes) + 1))
+        for fault, counts in table.items():
+            print(f"| {fault} | " + " | ".join(str(counts.get(c, "")) for c in causes) + " |")
+        print(f"\n{right} of {total} named right or UNDETERMINED; {opposite} named the opposite")
+    if given.check and (right < 0.9 * total or opposite):
+        raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,102 @@
+"""`restock diagnose`: is it what the critic was fed, or the target it follows?"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+if TYPE_CHECKING:
+    from restock.train.diagnose import Diagnosis
+
+
+@dataclass
+class Diagnose:
+    """Tell a failure of the buffer from a failure of the target.
+
+    Compares the critic's TD error on the periodic evaluations' own steps, which no replay has,
+    with that in replay, condition by condition, and the online network with the target network.
+    Says HEALTHY, BUFFER, TARGET, BOTH, DIVERGENCE or UNDETERMINED, on what evidence, and which
+    experiment would confirm it. Three evaluations in a row must agree, and most of the runs.
+
+    Example: `restock diagnose runs/a runs/a-seed1 runs/a-seed2`
+    """
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Runs of one method (seeds)."""
+    confirm: Path | None = None
+    """Run the experiment that would confirm it, into this new run directory."""
+    json: bool = False
+    """Print the verdict, the evidence and every window as JSON."""
+
+    def run(self) -> int:
+        from restock.cli.output import print_json
+        from restock.errors import ConfigError
+        from restock.train.confirm import confirm
+        from restock.train.diagnose import diagnose
+        from restock.train.run import Run
+
+        if not self.runs:
+            raise ConfigError("needs a run", where="restock diagnose")
+        runs = [Run.open(path) for path in self.runs]
+        found = diagnose(runs)
+        if not self.json:
+            _show(found, self.runs)
+        confirmed = confirm(runs[0], found, self.confirm) if self.confirm is not None else None
+        if self.json:
+            print_json(_document(found, self.runs) | {"confirmation": confirmed})
+        elif confirmed is not None:
+            _show_confirmation(confirmed)
+        return 0
+
+
+def _show(found: Diagnosis, paths: tuple[Path, ...]) -> None:
+    from restock.cli.output import print_table, stdout
+
+    print_table(
+        [
+            {
+                "run": str(path),
+                "verdict": cause,
+                "updates": windows[-1].gradient_steps,
+                "condition": symptom.condition,
+                "share of replay": symptom.replay_share,
+                "G": symptom.gap,
+                "G / median": windows[-1].relative(symptom),
+                "median G": windows[-1].gap_median,
+                "L": windows[-1].lag,
+                "S": windows[-1].clock,
+            }
+            for path, cause, windows in zip(paths, found.runs, found.windows, strict=True)
+            for symptom in windows[-1].symptoms
+        ],
+        title="G: |TD| held out / in replay; L: lag of the target; S: |TD| by the online network"
+        " / by the target",
+    )
+    out = stdout()
+    out.print(f"{found.cause}")
+    for line in found.evidence:
+        out.print(f"  {line}")
+    out.print(f"to confirm: {found.experiment}")
+
+
+def _show_confirmation(confirmed: dict[str, Any]) -> None:
+    from restock.cli.output import stdout
+
+    answer = {True: "CONFIRMED", False: "REFUTED", None: "NOT DECIDED"}[confirmed["confirmed"]]
+    changed = ", ".join(confirmed["changed"])
+    stdout().print(f"{answer}: with {changed} it is {confirmed['cause']} ({confirmed['run']})")
+
+
+def _document(found: Diagnosis, paths: tuple[Path, ...]) -> dict[str, Any]:
+    return {
+        "cause": found.cause,
+        "evidence": found.evidence,
+        "experiment": found.experiment,
+        "runs": [
+            {"run": str(path), "cause": cause, "windows": [asdict(window) for window in windows]}
+            for path, cause, windows in zip(paths, found.runs, found.windows, strict=True)
+        ],
+    }

@@ -1,0 +1,247 @@
+"""Buffer failure or target failure: what a critic gets wrong, and where.
+
+A critic fails in two ways that a falling loss cannot tell apart. Its *replay* may lack, outnumber
+or misstate a condition: then it is wrong on fresh steps of that condition and right elsewhere. Or
+its *target* may follow too slowly, not at all, or too fast: then it is wrong everywhere, or its two
+networks disagree. The evaluations' own steps (`held_out`), which no replay has, tell which:
+
+    G_k  |TD| held out / |TD| in replay, in condition k
+    O_k  |TD| held out in k / the median condition's
+    L    mean |Q - Q_target| / mean |Q|
+    S    |TD| with the online network bootstrapping / |TD| with the target network
+
+The limits were set on faults planted in the twin; docs/diagnose.md has the confusion table.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from statistics import median
+from typing import Any, Literal
+
+import numpy as np
+
+from restock.errors import RunError
+from restock.train.run import Run
+
+Cause = Literal["HEALTHY", "BUFFER", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED"]
+WINDOWS = 3  # in a row must agree
+_LEAST_ROWS = 20  # held out, for a condition to be judged
+
+
+@dataclass(frozen=True)
+class Limits:
+    """From where on a figure is a symptom."""
+
+    gap: float = 2.0  # G_k of a condition; O_k where replay has none of it
+    relative: float = 2.0  # and G_k over the median G
+    gap_median: float = 1.5  # below which the median G must be, for a buffer failure
+    gap_everywhere: float = 2.0  # the median G: everything is worse held out
+    lag: float = 0.25  # L
+    clock: float = 2.0  # S
+    absent_share: float = 0.001  # of replay: less of a condition is none
+    quota_met: float = 0.5
+
+
+@dataclass(frozen=True)
+class Symptom:
+    """One condition in one window."""
+
+    condition: str
+    gap: float | None  # G_k
+    outlier: float  # O_k
+    replay_share: float
+    quota_met: float | None
+
+
+@dataclass(frozen=True)
+class Window:
+    """What one evaluation shows."""
+
+    gradient_steps: int
+    symptoms: list[Symptom]
+    gap_median: float
+    lag: float  # L
+    clock: float  # S
+    q_abs_max: float
+    q_bound: float  # the largest value that rewards seen could add up to
+
+    def relative(self, symptom: Symptom) -> float | None:
+        """G_k over the median G: how much worse held out this condition is than the others."""
+        return symptom.gap / max(self.gap_median, 1e-12) if symptom.gap is not None else None
+
+    def bad(self, limits: Limits) -> dict[str, list[str]]:
+        """The conditions whose replay is in doubt, with what is wrong, for people."""
+        found = {}
+        for symptom in self.symptoms:
+            said = []
+            relative = self.relative(symptom)
+            if symptom.replay_share < limits.absent_share:
+                said.append(f"is {symptom.replay_share:.2%} of replay")
+            if relative is not None and symptom.gap is not None:
+                if symptom.gap >= limits.gap and relative >= limits.relative:
+                    said.append(
+                        f"held-out |TD| is {symptom.gap:.1f} times that in replay,"
+                        f" {relative:.1f} times the median condition's gap"
+                    )
+            elif symptom.outlier >= limits.gap:
+                said.append(
+                    f"held-out |TD| is {symptom.outlier:.1f} times the median condition's, and"
+                    " replay has none of it"
+                )
+            if symptom.quota_met is not None and symptom.quota_met < limits.quota_met:
+                said.append(f"got {symptom.quota_met:.0%} of its quota")
+            if said:
+                found[symptom.condition] = said
+        return found
+
+    def cause(self, limits: Limits) -> Cause:
+        """The rule, on one window."""
+        if not np.isfinite(self.q_abs_max) or self.q_abs_max > self.q_bound:
+            return "DIVERGENCE"
+        bad = self.bad(limits)
+        clocks = self.lag >= limits.lag or self.clock >= limits.clock
+        target = clocks or self.gap_median >= limits.gap_everywhere
+        buffer = 0 < len(bad) <= len(self.symptoms) / 2 and self.gap_median < limits.gap_median
+        if target and buffer:
+            return "BOTH"
+        if target:
+            return "TARGET"
+        if buffer:
+            return "BUFFER"
+        return "UNDETERMINED" if bad else "HEALTHY"
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The verdict on one or more runs (seeds of one method), with the evidence."""
+
+    cause: Cause
+    runs: list[Cause]  # each run's own
+    windows: list[list[Window]]  # each run's, in time
+    evidence: list[str]
+    experiment: str  # what would confirm it
+
+
+def diagnose(runs: Sequence[Run], limits: Limits = Limits()) -> Diagnosis:
+    """Diagnose runs of one method, which differ in their seed.
+
+    Raises:
+        RunError: a run has no evaluation after its updates.
+    """
+    windows = [windows_of(run) for run in runs]
+    causes = [_of_run(found, limits) for found in windows]
+    ((cause, votes), *_) = Counter(causes).most_common()
+    if votes <= len(causes) / 2:
+        cause = "UNDETERMINED"
+    last = [found[-1] for found, own in zip(windows, causes, strict=True) if own == cause]
+    last = last or [found[-1] for found in windows]
+    return Diagnosis(
+        cause, causes, windows, _evidence(last, limits), _experiment(cause, last, limits)
+    )
+
+
+def _of_run(windows: Sequence[Window], limits: Limits) -> Cause:
+    """What the last windows agree on."""
+    causes = {window.cause(limits) for window in windows[-WINDOWS:]}
+    if windows[-1].cause(limits) == "DIVERGENCE":
+        return "DIVERGENCE"
+    if len(windows) < WINDOWS or len(causes) > 1:
+        return "UNDETERMINED"
+    return causes.pop()
+
+
+def windows_of(run: Run) -> list[Window]:
+    """The windows of a run, one an evaluation that had updates before it."""
+    import duckdb
+
+    query = files("restock.train").joinpath("diagnose.sql").read_text(encoding="utf-8")
+    tables = {
+        name: str(run.path / f"{name}.parquet") for name in ("held_out", "strata", "progress")
+    }
+    with duckdb.connect() as connection:
+        rows = connection.sql(query, params=tables).to_arrow_table().to_pylist()
+    if not rows:
+        raise RunError(
+            "has no evaluation to diagnose",
+            where=str(run.path),
+            remedy="let it run past an evaluation (evaluation.every_env_steps)",
+        )
+    bound = _value_bound(run)
+    steps = sorted({row["gradient_steps"] for row in rows})
+    return [_window([row for row in rows if row["gradient_steps"] == at], bound) for at in steps]
+
+
+def _window(rows: list[dict[str, Any]], bound: float) -> Window:
+    judged = [row for row in rows if row["held_out_rows"] >= _LEAST_ROWS] or rows
+    middle = median(row["held_out_td"] for row in judged)
+    symptoms = [
+        Symptom(
+            row["condition"],
+            row["held_out_td"] / row["replay_td"] if row["replay_td"] else None,
+            row["held_out_td"] / max(middle, 1e-12),
+            row["replay_share"] or 0.0,
+            row["quota_met"],
+        )
+        for row in judged
+    ]
+    gaps = [symptom.gap for symptom in symptoms if symptom.gap is not None]
+    weight = sum(row["held_out_rows"] for row in judged)
+
+    def mean(name: str) -> float:
+        return float(sum(row[name] * row["held_out_rows"] for row in judged) / weight)
+
+    return Window(
+        gradient_steps=rows[0]["gradient_steps"],
+        symptoms=symptoms,
+        gap_median=median(gaps) if gaps else 1.0,
+        lag=max(rows[0]["lag"] or 0.0, mean("held_out_lag")),
+        clock=mean("held_out_td_online") / max(mean("held_out_td"), 1e-12),
+        q_abs_max=rows[0]["q_abs_max"],
+        q_bound=bound,
+    )
+
+
+def _value_bound(run: Run) -> float:
+    """r_max / (1 - gamma), with the largest reward in the audited batches."""
+    rewards = run.table("audit")["reward"].to_numpy()
+    largest = float(np.abs(rewards).max(initial=0.0)) if len(rewards) else 0.0
+    discount = run.document["config"]["loss"]["discount"]
+    return largest / (1 - discount) if largest > 0 else float("inf")
+
+
+def _evidence(windows: Sequence[Window], limits: Limits) -> list[str]:
+    """What the last windows show, for people."""
+    said = []
+    for window in windows[:1]:
+        said.append(
+            f"after {window.gradient_steps:,} updates: median G {window.gap_median:.2f},"
+            f" L {window.lag:.3f}, S {window.clock:.2f},"
+            f" max |Q| {window.q_abs_max:.3g} of at most {window.q_bound:.3g}"
+        )
+        for condition, found in window.bad(limits).items():
+            said += [f"{condition}: {what}" for what in found]
+    return said
+
+
+def _experiment(cause: Cause, windows: Sequence[Window], limits: Limits) -> str:
+    named = dict.fromkeys(name for window in windows for name in window.bad(limits))
+    which = ", ".join(named) or "the condition with the largest gap"
+    return {
+        "HEALTHY": "none needed: no figure is past its limit",
+        "BUFFER": f"train again with more or corrected rows of {which} and the same target rule:"
+        " the gap must close there and nothing change elsewhere",
+        "TARGET": "train again with another target rule (target.tau 0.005) on the same panel:"
+        " L and S must fall, or the median G",
+        "BOTH": f"first change the target rule alone, then the rows of {which} alone: one clock"
+        " at a time",
+        "DIVERGENCE": "train again with a lower optimizer.learning_rate, then with a slower"
+        " target: values above what rewards can add up to are nobody's data",
+        "UNDETERMINED": "run longer, or more seeds: the last windows or the runs do not agree",
+    }[cause]
+
+
+__all__ = ["Diagnosis", "Limits", "Symptom", "Window", "diagnose", "windows_of"]
