@@ -108,14 +108,17 @@ def _read(source: Source, transition: int) -> Origin | None:
     """A row with what stands around it; None where that version, or its files, are gone."""
     try:
         with Store(source.path, version=source.version) as store:
-            rows = _rows(store, sql_file("trace.sql"), {"id": transition})
+            rows = rows_of(store.connection, sql_file("trace.sql"), {"id": transition})
             if not rows:
                 return None
             row = rows[0]
             named = {"ingest": row["ingest_id"], "recording": row["recording_id"]}
-            manifests = _rows(store, sql_file("trace_manifest.sql"), named)
+            manifests = rows_of(store.connection, sql_file("trace_manifest.sql"), named)
             around = {"episode": row["episode_id"], "step": row["step_index"]}
-            near = {r["step_index"]: r for r in _rows(store, sql_file("trace_around.sql"), around)}
+            near = {
+                r["step_index"]: r
+                for r in rows_of(store.connection, sql_file("trace_around.sql"), around)
+            }
             version = store.version
     except (duckdb.IOException, StoreError):
         if source.version is None:
@@ -137,8 +140,11 @@ def _read(source: Source, transition: int) -> Origin | None:
     return origin
 
 
-def _rows(store: Store, sql: str, parameters: Mapping[str, Any]) -> list[dict[str, Any]]:
-    relation = store.connection.sql(sql, params=dict(parameters))
+def rows_of(
+    connection: duckdb.DuckDBPyConnection, sql: str, parameters: Mapping[str, Any]
+) -> list[dict[str, Any]]:
+    """The rows that a query gives, by column."""
+    relation = connection.sql(sql, params=dict(parameters))
     return [dict(zip(relation.columns, row, strict=True)) for row in relation.fetchall()]
 
 

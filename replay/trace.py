@@ -16,7 +16,7 @@ import duckdb
 import numpy as np
 
 from restock.errors import PanelError, RunError, StoreError
-from restock.replay.origin import Origin, Source, find_origin, sql_file
+from restock.replay.origin import Origin, Source, find_origin, rows_of, sql_file
 from restock.replay.panel import HEADER, Panel
 from restock.replay.places import RUN_CONFIG
 from restock.replay.store import is_store
@@ -78,10 +78,7 @@ def audited_rows(run: str | Path, limit: int = 20) -> list[dict[str, Any]]:
     """The audited rows of a run with the largest TD errors, each with its name for `trace`."""
     table = _audit_table(Path(run))
     with duckdb.connect() as connection:
-        relation = connection.sql(
-            sql_file("trace_rows.sql"), params={"file": table, "limit": limit}
-        )
-        return [dict(zip(relation.columns, row, strict=True)) for row in relation.fetchall()]
+        return rows_of(connection, sql_file("trace_rows.sql"), {"file": table, "limit": limit})
 
 
 def _of_run(found: Trace, run: Path, row: str, where: Where) -> None:
@@ -147,20 +144,17 @@ def _of_twin(
     found: Trace, run: Path, document: Mapping[str, Any], audit: Mapping[str, Any]
 ) -> None:
     """A fresh row: its episode of the twin, and how that is laid out again."""
-    table = run / "episodes.parquet"
+    query = "FROM read_parquet($file) WHERE episode = $episode"
+    asked = {"file": str(run / "episodes.parquet"), "episode": int(audit["episode"])}
     with duckdb.connect() as connection:
-        relation = connection.sql(
-            "FROM read_parquet($file) WHERE episode = $episode",
-            params={"file": str(table), "episode": int(audit["episode"])},
-        )
-        rows = relation.fetchall()
+        rows = rows_of(connection, query, asked)
     found.episode = {"run_seed": document.get("seeds", {}).get("run")}
     if not rows:
         found.notes.append(
             "its episode had not ended when the run stopped, or its tables end before"
         )
         return
-    found.episode |= dict(zip(relation.columns, rows[0], strict=True))
+    found.episode |= rows[0]
     if found.episode.get("episode_seed") is not None:
         found.episode["spec"] = {
             "condition": found.episode["true_condition"],
@@ -182,19 +176,17 @@ def _audit_row(run: Path, row: str) -> dict[str, Any]:
             remedy="write STEP/ROW, a gradient step and a row of its batch, e.g. 1200/17;"
             f" `restock trace {run}` lists some",
         )
+    query = "FROM read_parquet($file) WHERE gradient_step = $step AND batch_row = $place"
+    asked = {"file": table, "step": int(step), "place": int(place)}
     with duckdb.connect() as connection:
-        relation = connection.sql(
-            "FROM read_parquet($file) WHERE gradient_step = $step AND batch_row = $place",
-            params={"file": table, "step": int(step), "place": int(place)},
-        )
-        rows = relation.fetchall()
+        rows = rows_of(connection, query, asked)
     if not rows:
         raise RunError(
             f"the batch of gradient step {step} was not audited, or has no row {place}",
             where=str(run),
             remedy=f"`restock trace {run}` lists audited rows; record.audit_share says how many",
         )
-    return dict(zip(relation.columns, rows[0], strict=True))
+    return rows[0]
 
 
 def _audit_table(run: Path) -> str:
