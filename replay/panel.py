@@ -23,7 +23,7 @@ from restock.errors import PanelError
 from restock.ingest.task import Task
 from restock.replay.density_ratio import RatioFit
 from restock.replay.layout import F32, PACKING_VERSION, Ints, row_columns, row_width
-from restock.replay.mixture import Mixture
+from restock.replay.mixture import Mixture, Within
 from restock.replay.sampler import QuotaSampler
 from restock.replay.seal import AGAIN, FileRecord, unseal
 from restock.replay.stores import PinnedStore
@@ -38,7 +38,7 @@ class Stratum(msgspec.Struct, frozen=True):
     source: str  # logs, or the name of another store
     timing: str
     correction: str
-    within: str
+    within: Within
     rows: int
     episodes: int
     natural_share: float

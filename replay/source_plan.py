@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from restock.replay.density_ratio import RatioFit, RatioRows, estimate_outcomes
 from restock.replay.exclusions import scramble
 from restock.replay.layout import F32, Bools, Ints
-from restock.replay.mixture import Mixture
+from restock.replay.mixture import Mixture, Within
 from restock.replay.shares import SharePlan, plan_shares
 from restock.replay.strata import Stratum
 from restock.replay.weights import effective_count, effective_shares, importance_weights
@@ -26,7 +26,7 @@ class StratumPlan:
     source: str  # logs, or the name of another store
     timing: str
     correction: str
-    within: str
+    within: Within
     rows: int
     episodes: int
     natural_share: float  # of its source's rows

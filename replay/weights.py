@@ -11,7 +11,7 @@ the one its state would put it in. A density ratio adds a factor of the state an
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,16 @@ from numpy.typing import NDArray
 from restock.replay.density_ratio import density_ratio
 from restock.replay.layout import F32, F64
 from restock.replay.mixture import CorrectionRule
-from restock.replay.strata import Stratum
+
+
+class Corrected(Protocol):
+    """What weights must know of a stratum."""
+
+    @property
+    def timing(self) -> str: ...
+
+    @property
+    def correction(self) -> str: ...
 
 
 class RowWeights:
@@ -37,7 +46,7 @@ class RowWeights:
         self,
         code: NDArray[np.int16],
         state_code: NDArray[np.int16],
-        strata: Sequence[Stratum],
+        strata: Sequence[Corrected],
         rule: CorrectionRule,
         outcome: F32 | None = None,
     ) -> None:
@@ -93,7 +102,7 @@ class RowWeights:
 def importance_weights(
     code: NDArray[np.int16],
     state_code: NDArray[np.int16],
-    strata: Sequence[Stratum],
+    strata: Sequence[Corrected],
     shares: F64,
     rule: CorrectionRule,
     outcome: F32 | None = None,
@@ -113,3 +122,48 @@ def effective_count(sizes: NDArray[Any]) -> float:
     """(sum n)^2 / sum n^2: how many equal groups these would be worth."""
     total = float((np.asarray(sizes, np.float64) ** 2).sum())
     return float(np.asarray(sizes).sum()) ** 2 / total if total > 0 else 0.0
+
+
+class WeightsInForce:
+    """The weights of a panel's rows while its shares move: `of(rows)` under the last `set_shares`.
+
+    Args:
+        code: (n,) the stratum of each row, over all sources: those of source k are k * S and on.
+        state_code: (n,) the stratum its state gives, within its source.
+        strata: (K * S,) timing and correction of each.
+        sources: K, stores that the panel is from.
+        outcome: (n, S) as `RowWeights` has it, or None.
+    """
+
+    def __init__(
+        self,
+        code: NDArray[np.int16],
+        state_code: NDArray[np.int16],
+        strata: Sequence[Corrected],
+        sources: int,
+        rule: CorrectionRule,
+        outcome: F32 | None,
+    ) -> None:
+        self._size = len(strata) // sources
+        self._parts = []
+        for number in range(sources):
+            at = np.flatnonzero(code // self._size == number)
+            mine = slice(number * self._size, (number + 1) * self._size)
+            own = code[at] - number * self._size
+            chances = None if outcome is None else outcome[at]
+            self._parts.append(
+                (at, mine, RowWeights(own, state_code[at], strata[mine], rule, chances))
+            )
+        self._weight: F32 = np.ones(len(code), np.float32)
+
+    def set_shares(self, shares: F64) -> None:
+        """Weights under these shares (K * S,) from now on, of mean 1 in each source."""
+        for at, mine, weights in self._parts:
+            total = shares[mine].sum()
+            if len(at) and total > 0:
+                self._weight[at] = weights.under(shares[mine] / total)
+
+    def of(self, rows: NDArray[Any]) -> F32:
+        """The weights (n,) of rows (n,)."""
+        weight: F32 = self._weight[rows]
+        return weight

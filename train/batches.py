@@ -1,7 +1,8 @@
 """What a batch is made of: rows of logs by quota, and fresh rows from the twin.
 
 The half-and-half batch of online learning with logs (RLPD, arXiv:2302.02948) is put together here,
-from two sources that share one packed row layout, by one gather each.
+from two sources that share one packed row layout, by one gather each. How large the half is, and
+what each stratum has of it, is the diet's to say (`restock.replay.diet`).
 """
 
 from __future__ import annotations
@@ -17,15 +18,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from restock.replay.layout import F32, Ints
+from restock.errors import MixtureError
+from restock.replay.diet import Diet, PlannedDraws
+from restock.replay.layout import F32, F64, Ints
 from restock.replay.ring import FreshRing
-from restock.replay.sampler import QuotaSampler
 from restock.train.checkpoint import generator_state, restore_generator
+from restock.train.log_draws import Drawing, LogDraws
 
 if TYPE_CHECKING:
     from restock.replay.panel import Panel
 
 _NO_ROWS: Ints = np.empty(0, np.int64)
+_UNPLANNED = PlannedDraws()
+_NOTHING = Drawing(_NO_ROWS, _NO_ROWS, None, np.empty(0))
 _IN_MEMORY_BYTES = 4 << 30  # larger panels stay memory-mapped
 
 
@@ -67,11 +72,20 @@ class Logs:
     behaviour_version: Coded
     episode: Coded
 
+    panel: Panel | None = None  # where they are from
+    planned: PlannedDraws = _UNPLANNED  # what the run will draw
+    huber_delta: float = 1.0  # of the run's loss: the floor of LAP's priorities
+
     @classmethod
-    def of_panel(cls, panel: Panel) -> Logs:
+    def of_panel(
+        cls,
+        panel: Panel,
+        planned: PlannedDraws = _UNPLANNED,
+        huber_delta: float = 1.0,
+    ) -> Logs:
         """A panel's rows in memory (memory-mapped where it is larger than 4 GiB)."""
         rows = np.asarray(panel.rows)
-        if rows.nbytes <= _IN_MEMORY_BYTES:
+        if rows.nbytes <= _IN_MEMORY_BYTES and panel.header.mixture.sampling == "memory":
             rows = np.array(rows)
         with warnings.catch_warnings():  # a read-only map is fine: nothing writes to it
             warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
@@ -92,6 +106,9 @@ class Logs:
             behaviour_policy=Coded.of(meta["behaviour_policy"]),
             behaviour_version=Coded.of(meta["behaviour_version"]),
             episode=Coded.of(meta["episode_id"]),
+            panel=panel,
+            planned=planned,
+            huber_delta=huber_delta,
         )
 
     def __len__(self) -> int:
@@ -107,6 +124,7 @@ class Batch:
     log_rows: Ints  # (L,) rows of the panel
     log_stratum: Ints = field(default_factory=lambda: _NO_ROWS)  # (L,)
     slots: Ints = field(default_factory=lambda: _NO_ROWS)  # (B - L,) slots of the ring
+    quota: F64 = field(default_factory=lambda: np.empty(0))  # (S,) shares in force, of the logs
 
     @property
     def logged(self) -> int:
@@ -117,6 +135,12 @@ class Batches:
     """Draws batches: all from logs while offline, `logs_share` of them from logs online.
 
     Without logs every batch is fresh. Each source has its own generator, seeded from `seed`.
+
+    Args:
+        logs_share: of an online batch; None leaves it to the mixture of the logs' panel.
+
+    Raises:
+        MixtureError: the panel's rows cannot bear what the run will draw, where that is refused.
     """
 
     def __init__(
@@ -125,68 +149,105 @@ class Batches:
         ring: FreshRing,
         *,
         batch_size: int,
-        logs_share: float,
+        logs_share: float | None,
         seed: int,
         device: torch.device,
     ) -> None:
         self.logs, self.ring, self.device = logs, ring, device
         self.batch_size = batch_size
-        self.logged = round(batch_size * logs_share) if logs is not None else 0
         self._rng = np.random.default_rng([seed, 1])
         self._fresh = torch.from_numpy(ring.rows)  # shares memory with the ring
         self._buffer = torch.empty((batch_size, ring.rows.shape[1]))
-        self._logs_on_device = logs.rows.to(device) if logs is not None else None
-        self._offline: QuotaSampler | None = None
-        self._online: QuotaSampler | None = None
+        self._draws: LogDraws | None = None
+        self._logs_on_device: Tensor | None = None
+        self._max_age: int | None = None  # of fresh rows, in environment steps
         if logs is not None:
-            self._offline = self._sampler(logs, batch_size, [seed, 2])
-            if self.logged:
-                self._online = self._sampler(logs, self.logged, [seed, 3])
+            self._draws = LogDraws(logs, logs_share, batch_size, seed)
+            if not self._draws.gathers:
+                self._logs_on_device = logs.rows.to(device)
+            if logs.panel is not None:
+                self._max_age = logs.panel.header.mixture.max_age_env_steps
 
-    @staticmethod
-    def _sampler(logs: Logs, batch_size: int, seed: list[int]) -> QuotaSampler:
-        rng = np.random.default_rng(seed)
-        return QuotaSampler(logs.stratum_rows, logs.shares, batch_size, rng, replacement=False)
+    @property
+    def diet(self) -> Diet | None:
+        """The shares in force, and what was drawn; None without logs."""
+        return self._draws.diet if self._draws is not None else None
+
+    def describe(self) -> list[dict[str, Any]]:
+        """Rows for the run's table `shares`; none without logs."""
+        return self._draws.describe() if self._draws is not None else []
 
     def draw_offline(self) -> Batch:
-        """A batch from logs alone."""
-        if self._offline is None:
+        """A batch from logs alone.
+
+        Raises:
+            MixtureError: every row was drawn as often as it may be.
+        """
+        if self._draws is None:
             raise RuntimeError("there are no logs to draw from")
-        rows, stratum = self._offline.draw()
-        return self._gather(rows, stratum, _NO_ROWS)
+        drawn = self._draws.draw(self.batch_size)
+        if len(drawn.rows) < self.batch_size:
+            raise MixtureError(
+                f"every row of the panel was drawn {self._draws.diet.max_replays} times",
+                remedy="train on with fewer offline updates, or mix with more draws a row",
+            )
+        return self._gather(drawn, _NO_ROWS)
 
-    def draw_online(self) -> Batch:
-        """A batch from logs and the fresh ring."""
-        rows, stratum = self._online.draw() if self._online else (_NO_ROWS, _NO_ROWS)
+    def draw_online(self, env_steps: int = 0) -> Batch:
+        """A batch from logs and the fresh ring, after `env_steps` environment steps."""
+        drawn = _NOTHING
+        if self._draws is not None:
+            self._draws.move_to(env_steps)
+            if logged := round(self.batch_size * self._draws.diet.logs_share):
+                drawn = self._draws.draw(logged)
         slots = _NO_ROWS
-        if self.logged < self.batch_size:
-            slots = self.ring.sample(self.batch_size - self.logged, self._rng)
-        return self._gather(rows, stratum, slots)
+        if len(drawn.rows) < self.batch_size:
+            slots = self._sample_fresh(self.batch_size - len(drawn.rows), env_steps)
+        return self._gather(drawn, slots)
 
-    def _gather(self, log_rows: Ints, log_stratum: Ints, slots: Ints) -> Batch:
-        logged = len(log_rows)
-        weight = None
-        if self.device.type == "cpu":
-            packed = self._buffer
-            if logged:
-                index = torch.from_numpy(log_rows)
-                torch.index_select(self._logs_tensor, 0, index, out=packed[:logged])
-            if len(slots):
-                torch.index_select(self._fresh, 0, torch.from_numpy(slots), out=packed[logged:])
-        else:
-            parts = []
-            if logged:
-                index = torch.from_numpy(log_rows).to(self.device)
-                parts.append(self._logs_tensor.index_select(0, index))
-            if len(slots):
-                fresh = self._fresh.index_select(0, torch.from_numpy(slots))
-                parts.append(fresh.to(self.device))
+    def learnt(self, batch: Batch, td: Tensor) -> None:
+        """The TD errors (B,) of a batch, once it was learnt from: priorities and shares follow."""
+        if self._draws is not None and self._draws.listens and batch.logged:
+            td_abs = td[: batch.logged].detach().abs().cpu().numpy()
+            self._draws.update(batch.log_rows, batch.log_stratum, td_abs)
+
+    def _sample_fresh(self, count: int, env_steps: int) -> Ints:
+        if self._max_age is None:
+            return self.ring.sample(count, self._rng)
+        collected = self.ring.meta["env_step"][: len(self.ring)]
+        young = np.flatnonzero(collected >= env_steps - self._max_age)
+        if not len(young):
+            raise MixtureError(
+                f"no fresh row is younger than max_age_env_steps = {self._max_age}",
+                remedy="mix with a larger one",
+            )
+        return young[self._rng.integers(len(young), size=count)]
+
+    def _gather(self, drawn: Drawing, slots: Ints) -> Batch:
+        logged, size = len(drawn.rows), len(drawn.rows) + len(slots)
+        packed = self._buffer[:size]
+        on_cpu = self.device.type == "cpu"
+        if logged and self._draws is not None and self._draws.gathers:
+            self._draws.gather(drawn.rows, packed[:logged].numpy())
+        elif logged and on_cpu:
+            index = torch.from_numpy(drawn.rows)
+            torch.index_select(self._logs_tensor, 0, index, out=packed[:logged])
+        if len(slots):
+            torch.index_select(self._fresh, 0, torch.from_numpy(slots), out=packed[logged:])
+        if not on_cpu:
+            parts = [packed[logged:].to(self.device)]
+            if logged and self._logs_on_device is None:
+                parts.insert(0, packed[:logged].to(self.device))
+            elif logged:
+                index = torch.from_numpy(drawn.rows).to(self.device)
+                parts.insert(0, self._logs_tensor.index_select(0, index))
             packed = torch.cat(parts)
-        if logged and self.logs is not None and self.logs.weights is not None:
-            weight = torch.ones(logged + len(slots))
-            weight[:logged] = torch.from_numpy(self.logs.weights[log_rows])
+        weight = None
+        if drawn.weight is not None:
+            weight = torch.ones(size)
+            weight[:logged] = torch.from_numpy(drawn.weight)
             weight = weight.to(self.device)
-        return Batch(packed, weight, log_rows, log_stratum, slots)
+        return Batch(packed, weight, drawn.rows, drawn.strata, slots, drawn.quota)
 
     @property
     def _logs_tensor(self) -> Tensor:
@@ -198,13 +259,11 @@ class Batches:
         """Arrays and JSON values."""
         return {
             "fresh": generator_state(self._rng),
-            "offline": self._offline.state_dict() if self._offline else None,
-            "online": self._online.state_dict() if self._online else None,
+            "logs": self._draws.state_dict() if self._draws is not None else None,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Puts the draws to come where `state_dict` found them."""
         restore_generator(self._rng, state["fresh"])
-        for sampler, name in ((self._offline, "offline"), (self._online, "online")):
-            if sampler is not None:
-                sampler.load_state_dict(state[name])
+        if self._draws is not None:
+            self._draws.load_state_dict(state["logs"])

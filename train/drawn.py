@@ -22,6 +22,7 @@ class Drawn:
     env_steps: int
     log_row: NDArray[np.int64]  # (L,)
     log_stratum: NDArray[np.int64]  # (L,)
+    quota: NDArray[np.float64]  # (S,) shares of the logs in force; none where no row is logged
     code: NDArray[np.int16]  # (F,) condition of each fresh row, -1 while unlabelled
     episode: NDArray[np.int64]  # (F,)
     episode_step: NDArray[np.int32]  # (F,)
@@ -63,7 +64,9 @@ def as_columns(kept: Sequence[Drawn], unlabelled: int) -> dict[str, NDArray[Any]
 
     fresh = [len(batch.code) for batch in kept]
     code = joined("code")
+    quotas = [batch.quota for batch in kept if len(batch.log_row)]
     columns = {
+        "log_quota": np.mean(quotas, axis=0) if quotas else np.empty(0),
         "log_row": joined("log_row"),
         "log_stratum": joined("log_stratum"),
         "fresh_stratum": np.where(code < 0, unlabelled, code),
@@ -98,6 +101,8 @@ def to_state(kept: Sequence[Drawn]) -> dict[str, Any]:
     return {
         "clocks": [[b.step, b.env_steps, len(b.log_row), len(b.code)] for b in kept],
         "weight": np.concatenate(weights),
+        "quota_sizes": [len(b.quota) for b in kept],
+        "quota": np.concatenate([b.quota for b in kept]),
         **{name: np.concatenate([getattr(b, name) for b in kept]) for name in _ARRAYS},
     }
 
@@ -105,8 +110,9 @@ def to_state(kept: Sequence[Drawn]) -> dict[str, Any]:
 def from_state(state: Mapping[str, Any]) -> list[Drawn]:
     """The batches that `to_state` was given."""
     kept = []
-    logged = fresh = 0
-    for step, env_steps, log_rows, slots in state["clocks"]:
+    logged = fresh = quotas = 0
+    sizes = state.get("quota_sizes", ())
+    for (step, env_steps, log_rows, slots), size in zip(state["clocks"], sizes, strict=True):
         places = {
             "log": slice(logged, logged + log_rows),
             "fresh": slice(fresh, fresh + slots),
@@ -114,6 +120,7 @@ def from_state(state: Mapping[str, Any]) -> list[Drawn]:
         }
         arrays = {name: state[name][places[side]] for name, side in _ARRAYS.items()}
         weight = state["weight"][places["both"]]
-        kept.append(Drawn(step=step, env_steps=env_steps, weight=weight, **arrays))
-        logged, fresh = logged + log_rows, fresh + slots
+        quota = state["quota"][quotas : quotas + size]
+        kept.append(Drawn(step=step, env_steps=env_steps, weight=weight, quota=quota, **arrays))
+        logged, fresh, quotas = logged + log_rows, fresh + slots, quotas + size
     return kept

@@ -92,7 +92,7 @@ def train(
 
         # 4. … while the learner learns from what the ring held before this step.
         for _ in range(_updates_due(session)):
-            _update(session, session.batches.draw_online(), "online", notify)
+            _update(session, session.batches.draw_online(clock.env_steps), "online", notify)
             clock.online_updates += 1
 
         # 5. The step's transitions go into the ring; ended episodes get their labels.
@@ -147,6 +147,7 @@ def _update(session: Session, batch: Batch, phase: str, notify: Notify) -> None:
     )
     step = learner.gradient_steps
     session.feed.batch(step, session.clock.env_steps, batch, loss, learner.target.last_sync)
+    session.batches.learnt(batch, loss.td)
     interval.updates += 1
     interval.loss += float(loss.value.detach())
     every = session.config.record.every_updates
@@ -211,6 +212,7 @@ def _close_interval(session: Session, phase: str, notify: Notify) -> None:
         "updates_per_s": interval.updates / elapsed_s,
     }
     session.run.append("progress", [row])
+    session.run.append("shares", [{**clocks, **row} for row in session.batches.describe()])
     session.run.flush(everything=False)
     session.events.scalars(clock.env_steps, "train", row)
     session.interval = Interval(env_steps_before=clock.env_steps, wall_s_before=wall_s)

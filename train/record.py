@@ -64,6 +64,7 @@ class FeedRecord:
             env_steps=env_steps,
             log_row=batch.log_rows,
             log_stratum=batch.log_stratum,
+            quota=batch.quota,
             code=ring.condition(slots),
             episode=meta["episode"][slots],
             episode_step=meta["episode_step"][slots],
@@ -115,7 +116,7 @@ class FeedRecord:
             available,
             {**clocks, "phase": phase},
             timing=logs.timings,
-            quota=list(logs.shares),
+            quota=kept["log_quota"].tolist(),
         )
         if self._age_days is not None:
             self._ages("logs", "days", self._age_days[kept["log_row"]], clocks)

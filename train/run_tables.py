@@ -64,6 +64,22 @@ TABLES: dict[str, pa.Schema] = {
         ("reward_mean", _F),
         ("terminal_share", _F),
     ),
+    # One row an interval x stratum of the logs: the shares in force at its end, and what rows had.
+    "shares": _schema(
+        *_CLOCKS,
+        ("source", _S),  # logs, or the name of another store of the mixture
+        ("stratum", _S),
+        ("share", _F),  # of the logged rows of a batch
+        ("planned_share", _F),  # as the run began
+        ("logs_share", _F),  # of an online batch, all logged rows together
+        ("rows", _I),  # in the panel
+        ("drawn_rows", _I),  # since the run began
+        ("replays_per_row", _F),  # drawn_rows / rows
+        ("replays_max", _I),  # of one row; null where nothing limits it
+        ("max_replays_per_row", _I),  # the limit
+        ("replaced_rows", _I),  # draws that would have gone beyond it, given to other rows
+        ("exhausted", _B),  # every row had all its draws: others have its share
+    ),
     # One row an interval x source x unit x log2 bucket: how old the drawn rows were.
     "ages": _schema(
         *_CLOCKS,

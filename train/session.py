@@ -179,7 +179,7 @@ def open_session(
         logs,
         ring,
         batch_size=config.replay.batch_size,
-        logs_share=config.replay.logs_share or 0.0,
+        logs_share=config.replay.logs_share,
         seed=seed,
         device=learner.device,
     )
