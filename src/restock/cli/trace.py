@@ -81,12 +81,11 @@ def document(found: tracing.Trace) -> dict[str, Any]:
 def _print(found: tracing.Trace, with_messages: bool) -> None:
     from restock.cli import output
 
-    for title, values in (
-        ("as it was sampled", found.audit),
-        ("its episode of the twin", found.episode),
-        ("its row of the panel", found.panel),
-    ):
-        _section(title, values)
+    _section("as it was sampled", found.audit)
+    _section("its episode of the twin", found.episode)
+    stored = found.origin.transition if found.origin is not None else {}
+    packed = {k: v for k, v in (found.panel or {}).items() if k == "path" or k not in stored}
+    _section("its row of the panel", packed)
     if found.origin is not None:
         _print_origin(found.origin, with_messages)
     for note in found.notes + (found.origin.notes if found.origin else []):
