@@ -4,6 +4,10 @@ Steps of N parallel environments go in; n-step rows come out when they are compl
 of an episode (a truncated one bootstraps with the shortened n). Labels arrive only when an episode
 has ended, because some conditions look ahead: until then its rows can be drawn uniformly, and
 belong to no stratum.
+
+A condition that is seldom met would be washed out by those that are met all the time. Rows may be
+reserved for it: then the next row overwrites the oldest of those conditions that hold more than
+what is reserved for them.
 """
 
 from __future__ import annotations
@@ -15,8 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import MixtureError
-from restock.replay.layout import F32, F64, Bools, Ints, row_columns, row_width
-from restock.replay.sampler import Quotas
+from restock.replay.layout import F32, Bools, Ints, row_columns, row_width
+from restock.replay.pending import PendingSteps
+from restock.replay.quotas import Quotas
+from restock.replay.reserve import Reserve
 from restock.replay.slots import NONE, StratumSlots
 
 UNLABELLED = NONE
@@ -45,6 +51,9 @@ class FreshRing:
         n_step: steps of a return.
         conditions: names that labels index, e.g. `["nominal", "wheel_slip"]`.
         behaviour_policies: names that behaviour codes index.
+        reserved: rows of a condition that others' rows do not overwrite, by its name; together at
+            most `capacity`. Without, the oldest row is overwritten whatever its condition. With
+            them `sample` draws reserved rows as often as others, so more often than they occur.
 
     `rows` (capacity, W) float32 is packed as `replay.layout` says; `meta` holds the arrays of META;
     the first `len(ring)` slots are filled.
@@ -60,6 +69,7 @@ class FreshRing:
         n_step: int = 1,
         conditions: Sequence[str] = (),
         behaviour_policies: Sequence[str] = ("dqn",),
+        reserved: Mapping[str, int] | None = None,
     ) -> None:
         if capacity < num_envs * n_step:
             raise MixtureError(
@@ -78,20 +88,27 @@ class FreshRing:
         self.meta: dict[str, NDArray[Any]] = {
             name: np.zeros(capacity, dtype) for name, dtype in META.items()
         }
-        self.appended = 0  # rows ever appended; the next slot is appended % capacity
         self.strata = StratumSlots(capacity, len(self.conditions))
-        # Steps that wait for their n-step row, per environment: position 0 is the oldest.
-        self._pending_observation: F32 = np.zeros((num_envs, n_step, observation_size), np.float32)
-        self._pending_reward: F64 = np.zeros((num_envs, n_step))
-        self._pending_action: NDArray[np.int16] = np.zeros((num_envs, n_step), np.int16)
-        self._pending_meta = {
-            name: np.zeros((num_envs, n_step), dtype) for name, dtype in META.items()
-        }
-        self._waiting: Ints = np.zeros(num_envs, np.int64)  # steps pending, 0..n_step - 1
+        self._reserve = Reserve(capacity, self.strata, self.conditions, reserved or {})
+        self._pending = PendingSteps(
+            num_envs, observation_size, discount=discount, n_step=n_step, meta=META
+        )
         self.episode_key: Ints = np.arange(num_envs, dtype=np.int64)  # of the episode under way
         self._episode_step: Ints = np.zeros(num_envs, np.int64)
         self._next_key = num_envs
-        self._awaiting_labels: dict[int, list[int]] = {}  # episode key -> its slots
+        # The slot of each step of the episodes under way, (N, longest so far), and of ended ones.
+        self._env_slots: Ints = np.full((num_envs, 256), NONE, np.int64)
+        self._awaiting_labels: dict[int, Ints] = {}  # episode key -> slots of its steps
+
+    @property
+    def appended(self) -> int:
+        """Rows ever appended. Where none are reserved, the next slot is appended % capacity."""
+        return self._reserve.appended
+
+    @appended.setter
+    def appended(self, rows: int) -> None:
+        """For who filled `rows` themselves."""
+        self._reserve.appended = rows
 
     def __len__(self) -> int:
         return min(self.appended, self.capacity)
@@ -119,11 +136,6 @@ class FreshRing:
 
         Returns the key of the episode each of these steps belongs to, (N,), for `set_labels`.
         """
-        envs = np.arange(self.num_envs)
-        place = self._waiting
-        self._pending_observation[envs, place] = observation
-        self._pending_action[envs, place] = action
-        self._pending_reward[envs, place] = reward
         now: dict[str, Any] = {
             "env_step": env_step,
             "gradient_step": gradient_step,
@@ -132,17 +144,18 @@ class FreshRing:
             "action_probability": action_probability,
             "episode": self.episode_key,
             "episode_step": self._episode_step,
-            "horizon": 0,
         }
-        for name, value in now.items():
-            self._pending_meta[name][envs, place] = value
-        self._waiting = self._waiting + 1
+        self._pending.add(observation, action, reward, now)
+        envs = np.arange(self.num_envs)
         ended = np.asarray(terminated, np.bool_) | np.asarray(truncated, np.bool_)
-        full = self._waiting == self.n_step
+        full = self._pending.waiting == self.n_step
         self._emit(envs[full], next_observation, terminated)
-        while len(left := envs[ended & (self._waiting > 0)]):
+        while len(left := envs[ended & (self._pending.waiting > 0)]):
             self._emit(left, next_observation, terminated)
         keys = self.episode_key.copy()
+        for env in np.flatnonzero(ended).tolist() if self.conditions else ():
+            steps = int(self._episode_step[env]) + 1
+            self._awaiting_labels[int(keys[env])] = self._env_slots[env, :steps].copy()
         self._episode_step = np.where(ended, 0, self._episode_step + 1)
         count = int(ended.sum())
         self.episode_key[ended] = self._next_key + np.arange(count)
@@ -150,39 +163,19 @@ class FreshRing:
         return keys
 
     def _emit(self, envs: Ints, next_observation: NDArray[Any], terminated: NDArray[Any]) -> None:
-        """Pack the oldest pending step of each of these environments, and forget it."""
+        """Pack the oldest pending step of each of these environments into slots of its own."""
         if not len(envs):
             return
-        horizon = self._waiting[envs]  # (n,)
-        powers = self.discount ** np.arange(self.n_step)
-        inside = np.arange(self.n_step)[None, :] < horizon[:, None]
-        returns = (self._pending_reward[envs] * powers * inside).sum(axis=1)
-        slots = (self.appended + np.arange(len(envs))) % self.capacity
-        self._release(slots)
-        part = self.columns
-        self.rows[slots, part["observation"]] = self._pending_observation[envs, 0]
-        self.rows[slots, part["next_observation"]] = np.asarray(next_observation)[envs]
-        self.rows[slots, part["action"]] = self._pending_action[envs, :1]
-        self.rows[slots, part["reward"]] = returns[:, None]
-        going_on = ~np.asarray(terminated, np.bool_)[envs]
-        self.rows[slots, part["discount"]] = (self.discount**horizon * going_on)[:, None]
-        for name, pending in self._pending_meta.items():
-            self.meta[name][slots] = pending[envs, 0]
-            pending[envs, :-1] = pending[envs, 1:]
-        self.meta["horizon"][slots] = horizon
-        self._pending_observation[envs, :-1] = self._pending_observation[envs, 1:]
-        self._pending_action[envs, :-1] = self._pending_action[envs, 1:]
-        self._pending_reward[envs, :-1] = self._pending_reward[envs, 1:]
-        self._waiting[envs] -= 1
-        self.appended += len(envs)
+        rows, meta = self._pending.pack(envs, next_observation, terminated)
+        slots = self._reserve.take(len(envs))
+        self.rows[slots] = rows
+        for name, values in meta.items():
+            self.meta[name][slots] = values
         if self.conditions:
-            for slot, key in zip(slots.tolist(), self.meta["episode"][slots].tolist(), strict=True):
-                self._awaiting_labels.setdefault(key, []).append(slot)
-
-    def _release(self, slots: Ints) -> None:
-        """Slots about to be overwritten leave their strata."""
-        if self.appended + len(slots) > self.capacity and self.conditions:
-            self.strata.move(slots, NONE)
+            steps = meta["episode_step"]
+            if steps.max() >= self._env_slots.shape[1]:
+                self._env_slots = np.concatenate([self._env_slots, self._env_slots], axis=1)
+            self._env_slots[envs, steps] = slots
 
     def set_labels(self, episode_key: int, conditions: NDArray[Any]) -> int:
         """Label the rows of an ended episode: `conditions[t]` (T,) codes its step t.
@@ -196,9 +189,13 @@ class FreshRing:
                 f"labels {sorted(set(codes.tolist()))} name no condition of {self.conditions}",
                 where=f"episode {episode_key} of the fresh ring",
             )
-        slots = np.array(self._awaiting_labels.pop(int(episode_key), []), np.int64)
-        slots = slots[self.meta["episode"][slots] == episode_key]  # the others were overwritten
-        steps = self.meta["episode_step"][slots]
+        slots = self._awaiting_labels.pop(int(episode_key), np.empty(0, np.int64))
+        steps = np.arange(len(slots))
+        # The others were overwritten, by other episodes' rows or later ones of the same.
+        there = slots >= 0
+        there &= self.meta["episode"][slots] == episode_key
+        there &= self.meta["episode_step"][slots] == steps
+        slots, steps = slots[there], steps[there]
         if steps.max(initial=-1) >= len(codes):
             raise MixtureError(
                 f"{len(codes)} labels for an episode of at least {int(steps.max()) + 1} steps",
@@ -255,19 +252,15 @@ class FreshRing:
             "discount": self.discount,
             "conditions": list(self.conditions),
             "behaviour_policies": list(self.behaviour_policies),
-            "appended": self.appended,
             "next_key": self._next_key,
             "rows": self.rows[:filled].copy(),
             "stratum": self.strata.stratum[:filled].copy(),
-            "waiting": self._waiting.copy(),
             "episode_key": self.episode_key.copy(),
             "episode_step": self._episode_step.copy(),
-            "pending.observation": self._pending_observation.copy(),
-            "pending.reward": self._pending_reward.copy(),
-            "pending.action": self._pending_action.copy(),
+            **self._reserve.state_dict(),
+            **self._pending.state_dict(),
         }
         state |= {f"meta.{name}": value[:filled].copy() for name, value in self.meta.items()}
-        state |= {f"pending.{name}": value.copy() for name, value in self._pending_meta.items()}
         # Draws within a stratum depend on the order of its members, so the order is kept.
         state |= {
             f"members.{code}": self.strata.members(code).copy()
@@ -286,23 +279,33 @@ class FreshRing:
                 remedy="resume with the settings the run began with",
             )
         filled = len(state["rows"])
-        self.appended, self._next_key = int(state["appended"]), int(state["next_key"])
+        self._next_key = int(state["next_key"])
         self.rows[:filled] = state["rows"]
         for name, values in self.meta.items():
             values[:filled] = state[f"meta.{name}"]
-            self._pending_meta[name][...] = state[f"pending.{name}"]
-        self._waiting = np.array(state["waiting"], np.int64)
+        self._pending.load_state_dict(state)
         self.episode_key = np.array(state["episode_key"], np.int64)
         self._episode_step = np.array(state["episode_step"], np.int64)
-        self._pending_observation[...] = state["pending.observation"]
-        self._pending_reward[...] = state["pending.reward"]
-        self._pending_action[...] = state["pending.action"]
         self.strata = StratumSlots(self.capacity, len(self.conditions))
         for code in range(len(self.conditions)):
             self.strata.move(np.asarray(state[f"members.{code}"], np.int64), code)
+        self._reserve.load_state_dict(state, self.strata)
         self._awaiting_labels = {}
         if self.conditions:
-            oldest_first = (np.arange(filled) + self.appended) % max(filled, 1)
-            for slot in oldest_first[self.strata.stratum[oldest_first] == UNLABELLED].tolist():
-                key = int(self.meta["episode"][slot])
-                self._awaiting_labels.setdefault(key, []).append(slot)
+            self._find_slots()
+
+    def _find_slots(self) -> None:
+        """Where the steps of episodes without labels are, from the rows themselves."""
+        slots = np.flatnonzero(self.strata.stratum[: len(self)] == UNLABELLED)
+        keys, steps = self.meta["episode"][slots], self.meta["episode_step"][slots]
+        longest = max(256, 2 * int(steps.max(initial=0)), 2 * int(self._episode_step.max()))
+        self._env_slots = np.full((self.num_envs, longest), NONE, np.int64)
+        env_of = {key: env for env, key in enumerate(self.episode_key.tolist())}
+        for key in np.unique(keys).tolist():
+            mine = keys == key
+            if key in env_of:
+                self._env_slots[env_of[key], steps[mine]] = slots[mine]
+            else:
+                found = np.full(int(steps[mine].max()) + 1, NONE, np.int64)
+                found[steps[mine]] = slots[mine]
+                self._awaiting_labels[key] = found

@@ -23,7 +23,10 @@ class StratumSlots:
         self.counts: Ints = np.zeros(strata, np.int64)
 
     def move(self, slots: Ints, stratum: int) -> None:
-        """Put slots (n,) into a stratum, or into none (-1)."""
+        """Put distinct slots (n,) into a stratum, or into none (-1)."""
+        if stratum != NONE and (self.stratum[slots] == NONE).all():
+            self._add_all(slots, stratum)  # as when an episode's labels come
+            return
         for slot in slots.tolist():
             old = int(self.stratum[slot])
             if old == stratum:
@@ -37,6 +40,16 @@ class StratumSlots:
     def members(self, stratum: int) -> Ints:
         """The slots of a stratum, (counts[stratum],), in no meaningful order."""
         return self._members[stratum][: self.counts[stratum]]
+
+    def _add_all(self, slots: Ints, stratum: int) -> None:
+        count, size = int(self.counts[stratum]), len(slots)
+        while count + size > len(self._members[stratum]):
+            members = self._members[stratum]
+            self._members[stratum] = np.concatenate([members, np.empty_like(members)])
+        self._members[stratum][count : count + size] = slots
+        self._place[slots] = count + np.arange(size)
+        self.counts[stratum] = count + size
+        self.stratum[slots] = stratum
 
     def _add(self, slot: int, stratum: int) -> None:
         count = int(self.counts[stratum])

@@ -251,3 +251,95 @@ def test_wrong_labels_are_refused() -> None:
 def test_a_ring_too_small_for_its_environments_is_refused() -> None:
     with pytest.raises(MixtureError, match="at least 48 rows"):
         FreshRing(47, 16, SIZE, discount=0.9, n_step=3)
+
+
+def reserving(
+    capacity: int = 60, seed: int = 0, num_envs: int = 2, **reserved: int
+) -> tuple[FreshRing, Drive]:
+    ring = FreshRing(
+        capacity,
+        num_envs,
+        SIZE,
+        discount=0.9,
+        n_step=3,
+        conditions=CONDITIONS,
+        reserved=reserved,
+    )
+    return ring, Drive(num_envs, seed)
+
+
+def label_rarely(ring: FreshRing, drive: Drive, steps: int) -> None:
+    """One episode in ten is of wheel slip, all others are nominal."""
+    for _ in range(steps):
+        step = drive.step()
+        keys = ring.append(**step, env_step=len(drive.steps), gradient_step=0)
+        for key in keys[step["terminated"] | step["truncated"]].tolist():
+            ring.set_labels(key, np.full(500, 0 if key % 10 == 0 else 2))
+
+
+def test_rare_rows_are_not_washed_out_where_they_are_reserved() -> None:
+    plain, drive = reserving(seed=3)
+    label_rarely(plain, drive, 1500)
+    kept, drive = reserving(seed=3, wheel_slip=25, blocked_aisle=10)
+    label_rarely(kept, drive, 1500)
+    assert plain.strata.counts[0] < 15
+    assert 25 <= kept.strata.counts[0] <= 60
+    # What is not used of a reserve is anybody's; nominal rows stay the newest there are.
+    assert kept.strata.counts[2] >= 20
+    newest = np.sort(kept.meta["env_step"][kept.strata.members(2)])[-10:]
+    assert newest.min() > len(drive.steps) - 40
+    # Of the rare ones, too, the oldest went first.
+    slips = kept.meta["env_step"][kept.strata.members(0)]
+    assert slips.min() > 100
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    capacity=st.integers(12, 80),
+    steps=st.integers(1, 120),
+    parts=st.tuples(st.integers(0, 4), st.integers(0, 4), st.integers(0, 4)),
+    seed=st.integers(0, 2**32),
+)
+def test_a_ring_with_reserves_stays_whole(
+    capacity: int, steps: int, parts: tuple[int, int, int], seed: int
+) -> None:
+    reserved = {
+        name: part * capacity // max(sum(parts), 1)
+        for name, part in zip(CONDITIONS, parts, strict=True)
+    }
+    ring, drive = reserving(capacity, seed=seed, **reserved)
+    advance(ring, drive, steps)
+    filled = len(ring)
+    assert filled == min(ring.appended, capacity)
+    codes = ring.condition(np.arange(filled))
+    for code in range(3):
+        assert sorted(ring.strata.members(code)) == np.flatnonzero(codes == code).tolist()
+    # Every row is a step of its own, and as it was when it was appended.
+    key = (ring.meta["episode"][:filled] << 20) + ring.meta["episode_step"][:filled]
+    assert len(np.unique(key)) == filled
+    expected = oracle(drive.steps, 0.9, 3)
+    at = {tuple(np.float32(row)): place for place, row in expected.items()}
+    for slot in range(filled):
+        _, first = at[tuple(ring.rows[slot])]
+        assert ring.meta["env_step"][slot] == first + 1
+
+
+def test_a_restored_ring_with_reserves_goes_on_exactly() -> None:
+    ring, drive = reserving(seed=5, wheel_slip=20)
+    label_rarely(ring, drive, 150)
+    other, _ = reserving(seed=5, wheel_slip=20)
+    other.load_state_dict(ring.state_dict())
+    for one in (ring, other):
+        label_rarely(one, Drive(2, 11), 200)
+    for name, value in ring.state_dict().items():
+        np.testing.assert_array_equal(value, other.state_dict()[name], err_msg=name)
+
+
+def test_what_cannot_be_reserved_is_refused() -> None:
+    with pytest.raises(MixtureError, match="cannot be reserved"):
+        reserving(60, wheel_slip=40, nominal=30)
+    with pytest.raises(MixtureError, match="cannot be reserved"):
+        reserving(60, unheard_of=1)
+    ring, _ = reserving(60, wheel_slip=40)
+    with pytest.raises(MixtureError, match="reserved"):
+        reserving(60, wheel_slip=20)[0].load_state_dict(ring.state_dict())
