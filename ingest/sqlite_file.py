@@ -16,6 +16,7 @@ import numpy as np
 
 from restock.errors import RecordingError
 from restock.ingest.columns import Batch
+from restock.ingest.sqlite_guard import guard, refuse_programs
 from restock.ingest.storage import Channel, Damage, Integrity
 
 MAGIC = b"SQLite format 3\x00"
@@ -40,9 +41,11 @@ class SqliteFile:
         self._full_size = self._refuse_short()
         self._connection = self._connect()
         try:
+            refuse_programs(self._connection, ("topics", "messages", "message_definitions"))
             self.channels = self._read_channels()
+            self._connection.execute("SELECT id, topic_id, timestamp, data FROM messages LIMIT 0")
             self.counts, self.span_ns = self._count()
-        except sqlite3.DatabaseError as error:
+        except (sqlite3.Error, UnicodeError) as error:  # its messages, too, quote what they read
             self.close()
             raise RecordingError(
                 f"not a rosbag2 recording: {error}",
@@ -89,9 +92,11 @@ class SqliteFile:
         mode = "ro" if immutable else "rw"
         uri = f"file:{quote(str(path.absolute()))}?mode={mode}{immutable}"
         try:
-            return sqlite3.connect(uri, uri=True, check_same_thread=False)
+            connection = sqlite3.connect(uri, uri=True, check_same_thread=False)
+            guard(connection, path.stat().st_size + sum(item.stat().st_size for item in sidecars))
         except sqlite3.DatabaseError as error:
             raise RecordingError(str(error), where=str(self.path)) from error
+        return connection
 
     def _read_channels(self) -> dict[int, Channel]:
         definitions: dict[str, tuple[str, bytes]] = {}
@@ -105,7 +110,9 @@ class SqliteFile:
                 str(name): (str(form), text if isinstance(text, bytes) else str(text).encode())
                 for name, form, text in rows
             }
-        rows = self._connection.execute("SELECT id, name, type, serialization_format FROM topics")
+        rows = self._connection.execute(
+            "SELECT id, name, type, serialization_format FROM topics WHERE typeof(id) = 'integer'"
+        )
         return {
             number: Channel(
                 number,
@@ -123,15 +130,17 @@ class SqliteFile:
         high: list[int] = []
         try:
             for number, count, first, last in self._connection.execute(
-                "SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages GROUP BY 1"
+                "SELECT topic_id, count(*), min(stamp), max(stamp) FROM (SELECT topic_id, CASE"
+                " typeof(timestamp) WHEN 'integer' THEN timestamp END AS stamp FROM messages)"
+                " GROUP BY 1"
             ):
                 if number not in self.channels:
                     what = f"{count} messages of topic id {number}, which no topic has"
                     self.damage.append(Damage(what, {number: count}))
                     continue
                 counts[number] = count
-                low.append(first)
-                high.append(last)
+                low += [first] if first is not None else []
+                high += [last] if last is not None else []
         except sqlite3.DatabaseError:
             if not self.salvage:
                 raise
@@ -139,8 +148,8 @@ class SqliteFile:
             for number, stamp in self._whole_rows("topic_id, timestamp"):
                 if number in counts:
                     counts[number] += 1
-                    low.append(stamp)
-                    high.append(stamp)
+                    low += [stamp] if isinstance(stamp, int) else []
+                    high += [stamp] if isinstance(stamp, int) else []
         return counts, ((min(low), max(high)) if low else None)
 
     def _whole_rows(self, columns: str) -> Iterator[tuple[int, int]]:
@@ -164,11 +173,15 @@ class SqliteFile:
         """One pass in rowid order, which is the order of arrival."""
         wanted = [channel for channel in channels if channel in self.channels]
         marks = ",".join("?" * len(wanted))
-        cursor = self._connection.execute(
+        query = (
             "SELECT topic_id, timestamp, data FROM messages NOT INDEXED"
-            f" WHERE topic_id IN ({marks}) AND typeof(timestamp) = 'integer' ORDER BY id",
-            wanted,
+            f" WHERE topic_id IN ({marks}) AND typeof(timestamp) = 'integer' ORDER BY id"
         )
+        try:
+            cursor = self._connection.execute(query, wanted)
+        except sqlite3.DatabaseError as error:
+            self._damaged(f"its rows are lost: {error}")
+            return
         held: dict[int, _Rows] = {}
         size = count = 0
         while rows := self._fetch(cursor, size // count if count else BYTES_PER_BATCH // 16):
