@@ -203,7 +203,7 @@ def custom_signals(
     for name, signal in signals.items():
         array = pa.nulls(count, signal.field(name).type)
         if signal.topic in topics:
-            column = found[name] = _column_of(name, signal, topics[signal.topic])
+            column = found[name] = column_of(name, signal, topics[signal.topic])
             parts = [
                 _at(column, segment.topics[signal.topic], stamps)
                 for segment, stamps in zip(segments, ticks, strict=True)
@@ -213,7 +213,8 @@ def custom_signals(
     return Custom(table.drop_columns("tick"), found)
 
 
-def _column_of(name: str, signal: CustomSignal, topic: TopicColumns) -> CustomColumn:
+def column_of(name: str, signal: CustomSignal, topic: TopicColumns) -> CustomColumn:
+    """A signal's values in its topic's columns."""
     fields: Fields = topic.fields
     if _key(name) not in fields:  # columns of whole messages, as no recording's reader gives them
         fields = custom_reduction({name: signal}).apply(fields)

@@ -94,7 +94,7 @@ class Edges:
 
     def missing(self, base: str, fixed: str) -> str | None:
         """Why no transform of the recording can lead from one frame to the other, or None."""
-        ways = [_upward(plain(frame), self.parents) for frame in (base, fixed)]
+        ways = [upward(plain(frame), self.parents) for frame in (base, fixed)]
         if ways[0] & ways[1]:
             return None
         tops = [sorted(way - self.parents.keys()) or sorted(way) for way in ways]
@@ -314,7 +314,8 @@ def _by_child(topic: TopicColumns) -> dict[str, TopicColumns]:
     return found
 
 
-def _upward(frame: str, parents: Mapping[str, Sequence[str]]) -> set[str]:
+def upward(frame: str, parents: Mapping[str, Sequence[str]]) -> set[str]:
+    """A frame and all that are ever above it."""
     reached, open_ = set[str](), {frame}
     while open_:
         here = open_.pop()

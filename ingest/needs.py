@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
 from restock.errors import RecordingError
@@ -110,7 +111,9 @@ def input_problems(
         found = available.get(source.topic)
         if (found is None or not found.expected) and not source.optional:
             what = "no message of" if found is not None else "no topic"
-            needed.setdefault(f"{what} {source.topic}", []).append(name)
+            hint = near(source.topic, available)
+            said = f"{what} {source.topic}" + (f", {hint}" if hint else "")
+            needed.setdefault(said, []).append(name)
         elif found is not None and found.type != source.type:
             said = f"{source.topic} holds {found.type}, not {source.type}"
             wrong.setdefault(said, []).append(name)
@@ -129,6 +132,12 @@ def input_problems(
         for what, names in itertools.chain(needed.items(), wrong.items())
     ]
     return lacking + fields + _transform_problems(profile, available)
+
+
+def near(topic: str, available: Mapping[str, Any]) -> str:
+    """A question about a topic that is nearly the one that is missing, or ""."""
+    found = [] if topic in available else get_close_matches(topic, available, n=1)
+    return f"did you mean {found[0]}?" if found else ""
 
 
 def _field_problems(name: str, source: Input, leaves: Sequence[Leaf]) -> list[str]:

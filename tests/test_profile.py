@@ -144,7 +144,7 @@ def test_a_proposal_says_what_no_topic_fills(tmp_path, capsys):
     class Blind(Drive):
         def topics(self):
             topics = super().topics()
-            del topics["/scan"], topics["/plan"], topics["/imu"]
+            del topics["/odom"], topics["/plan"], topics["/imu"]
             return topics
 
     bag = write_bag(Blind(), tmp_path / "bag")
@@ -153,9 +153,10 @@ def test_a_proposal_says_what_no_topic_fills(tmp_path, capsys):
     assert "MISSING, and required" in out
     assert 'goal = "none"' in out
     assert "# [inputs.imu]  # no topic seen; instead: gyro yaw rate taken from the wheels" in out
-    assert "no topic for scan" in err
+    assert "no topic of nav_msgs/msg/Odometry." in out
+    assert "no topic for wheels" in err
     assert main(["profile", "new", str(bag), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["missing"] == ["scan"]
+    assert json.loads(capsys.readouterr().out)["missing"] == ["wheels"]
 
 
 def test_checking_a_profile_that_does_not_fit(bag, tmp_path, capsys):

@@ -18,11 +18,13 @@ class Profile:
     """Propose a profile for an unknown robot, or check one against a recording.
 
     `restock profile new RECORDING` proposes one from what is in the file: topics by type and name,
-    rates, the speeds that were commanded; with a comment at each guess. It is printed, or written
-    to --out.
+    rates, clocks, frames, the speeds that were commanded, with a comment at each guess; and, to be
+    taken in by removing a #, every field that might become a column of its own. It is printed, or
+    written to --out.
 
-    `restock profile check PROFILE RECORDING` says what would be used, what is missing, how many
-    transitions there would be and what each condition would label. Nothing is written.
+    `restock profile check PROFILE RECORDING` says what would be used, what is missing (and what
+    the recording has instead), how many transitions there would be and what each condition would
+    label. Nothing is written. Exit code 2 where the profile does not fit.
     """
 
     action: Annotated[Literal["new", "check"], tyro.conf.Positional]
@@ -34,7 +36,8 @@ class Profile:
     typestore: str | None = None
     """Distribution whose message definitions serve recordings without their own (humble)."""
     json: bool = False
-    """Print one JSON document: `new`: {"toml", "missing"}; `check`: {"inputs", "problems", …}."""
+    """Print one JSON document: `new`: {"toml", "missing", "signals"}; `check`: {"inputs",
+    "problems", "outcome", …}."""
 
     def run(self) -> int:
         """Do one of the two."""
@@ -60,7 +63,9 @@ class Profile:
         if self.out is not None:
             self.out.write_text(proposal.toml, encoding="utf-8")
         if self.json:
-            output.print_json({"toml": proposal.toml, "missing": proposal.missing})
+            output.print_json(
+                {"toml": proposal.toml, "missing": proposal.missing, "signals": proposal.signals}
+            )
         elif self.out is None:
             sys.stdout.write(proposal.toml)
         for name in proposal.missing:
@@ -70,8 +75,8 @@ class Profile:
     def _check(self) -> int:
         from restock.cli import output
         from restock.cli.ingest import as_json, show
-        from restock.ingest.pipeline import ingest
         from restock.ingest.needs import input_problems
+        from restock.ingest.pipeline import ingest
         from restock.ingest.profile import load_profile
         from restock.ingest.readers import open_recording
 
@@ -80,17 +85,7 @@ class Profile:
             topics = {n: t for n, t in recording.topics.items() if t.skipped is None}
             leaves = {name: recording.fields(name) for name in profile.topics if name in topics}
             problems = input_problems(profile, topics, leaves)
-            inputs: list[dict[str, Any]] = [
-                {
-                    "input": name,
-                    "topic": source.topic,
-                    "type": source.type,
-                    "messages": topics[source.topic].expected if source.topic in topics else 0,
-                    "at most s old": source.max_age_s,
-                    "optional": source.optional,
-                }
-                for name, source in profile.inputs.items()
-            ]
+            inputs = _inputs(profile, topics)
         said: dict[str, Any] = {"profile": profile.name, "hash": profile.hash, "inputs": inputs}
         if not self.json:
             output.print_table(inputs)
@@ -110,3 +105,32 @@ class Profile:
         for problem in problems:
             sys.stderr.write(f"restock: {self.paths[1]}: {problem}\n")
         return code
+
+
+def _inputs(profile: Any, topics: Any) -> list[dict[str, Any]]:
+    """What the profile takes from where, and how many messages of it there are."""
+
+    from restock.ingest.needs import near
+
+    def row(name: str, topic: str, kind: str, age: float | None, optional: bool) -> dict[str, Any]:
+        return {
+            "input": name,
+            "topic": topic,
+            "type": kind,
+            "messages": topics[topic].expected if topic in topics else 0,
+            "at most s old": age,
+            "optional": optional,
+            "": near(topic, topics),
+        }
+
+    found = [
+        row(name, source.topic, source.type, source.max_age_s, source.optional)
+        for name, source in profile.inputs.items()
+    ]
+    for topic in profile.transform_topics:
+        moving = topic == profile.frames.topic
+        kind = topics[topic].type if topic in topics else ""
+        found.append(row("frames", topic, kind, profile.frames.max_age_s if moving else None, True))
+    for name, signal in profile.signals.items():
+        found.append(row(f"signals.{name}", signal.topic, signal.type, signal.max_age_s, True))
+    return found
