@@ -63,8 +63,9 @@ def test_a_run_says_what_it_was_made_from(trained: Path, panel: Path) -> None:
     assert document["target"] == {"rule": "polyak", "tau": 0.005, "effective_lag_updates": 200.0}
     assert document["seeds"]["run"] == 0
     assert set(document["versions"]) >= {"restock", "torch", "mujoco", "python"}
-    # The mixture's share of logs is resolved: half of a batch.
-    assert document["config"]["replay"]["logs_share"] == 0.5
+    # The mixture is worked out for this run's own draws: half of a batch is from logs.
+    assert document["panel"]["logs_share"] == 0.5
+    assert sum(document["panel"]["strata"].values()) == pytest.approx(1)
     assert document["config"]["epsilon"]["start"] == 0.2  # it has learnt to drive offline
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.replay.chunked import ChunkedSampler
-from restock.replay.diet import Diet, FedStratum
+from restock.replay.diet import Diet, FedStratum, PlannedDraws
 from restock.replay.layout import F32, F64, Ints
 from restock.replay.mixed import panel_sampler
 from restock.replay.mixture import Prioritised, Within
@@ -49,7 +49,12 @@ class LogDraws:
     def __init__(self, logs: Logs, logs_share: float | None, batch_size: int, seed: int) -> None:
         self.logs = logs
         panel = logs.panel
-        self.diet = diet_of(logs, logs_share)
+        sizes = [len(rows) for rows in logs.stratum_rows]
+        self.diet = (
+            Diet.fixed(logs.strata, sizes, logs.shares, logs_share or 0.0)
+            if panel is None
+            else diet_of(panel, logs.planned, logs_share)
+        )
         rng = np.random.default_rng([seed, 2])
         shares = self.diet.shares
         self.sampler: Sampler
@@ -220,19 +225,19 @@ class LogDraws:
         self._follow()
 
 
-def diet_of(logs: Logs, logs_share: float | None) -> Diet:
-    """The diet of a run that is fed these logs."""
-    panel = logs.panel
-    sizes = [len(rows) for rows in logs.stratum_rows]
-    if panel is None:
-        return Diet.fixed(logs.strata, sizes, logs.shares, logs_share or 0.0)
-    mixture = panel.header.mixture
+def diet_of(panel: Panel, planned: PlannedDraws, logs_share: float | None) -> Diet:
+    """The diet of a run that draws so much from a panel.
+
+    Raises:
+        MixtureError: see `Diet`.
+    """
+    mixture, sizes = panel.header.mixture, [len(rows) for rows in panel.stratum_rows()]
     names = [stratum.name.removeprefix(f"{stratum.source}/") for stratum in panel.strata]
     fed = [
         FedStratum(stratum.name, stratum.source, rule, size, stratum.episodes)
         for stratum, rule, size in zip(panel.strata, rules_of(mixture, names), sizes, strict=True)
     ]
-    return Diet(mixture, fed, logs.planned, logs_share=logs_share)
+    return Diet(mixture, fed, planned, logs_share=logs_share)
 
 
 def _weights(panel: Panel) -> WeightsInForce | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import msgspec
 
 from restock.errors import PanelError, RunError
 from restock.ingest.profile import Profile, load_profile
+from restock.replay.diet import PlannedDraws
 from restock.replay.panel import Panel
 from restock.train.batches import Logs
 from restock.train.config import TrainConfig, apply_overrides, load_config, parse_config
@@ -18,6 +19,7 @@ from restock.train.episode import KINDS
 from restock.train.evaluate import Twin
 from restock.train.explore import AFTER_LOGS
 from restock.train.learner import open_device
+from restock.train.log_draws import diet_of
 from restock.train.run import Run, check_free, now_ns, software_versions
 from restock.train.session import Session, open_session
 from restock.train.target import describe
@@ -51,7 +53,7 @@ class Prepared:
                 min(_EVALUATION_ENVS, self.config.evaluation.episodes * len(KINDS)),
                 nthread=0,
             ),
-            logs=Logs.of_panel(self.panel) if self.panel is not None else None,
+            logs=_logs(self.panel, self.config) if self.panel is not None else None,
             resume=self.resumed is not None,
         )
 
@@ -60,7 +62,7 @@ class Prepared:
         config, schedule = self.config, self.config.schedule
         fed = "no panel: online only"
         if self.panel is not None:
-            share = config.replay.logs_share or 0.0
+            share = self.document["panel"].get("logs_share", 0.0)
             fed = f"panel {self.panel.id} ({len(self.panel):,} rows), {share:.0%} of each batch"
         return (
             f"run {self.path}: {fed}; target {config.target}; up to"
@@ -158,19 +160,34 @@ def make_twin(config: TrainConfig, profile: Profile, num_envs: int, nthread: int
 
 
 def _resolve(config: TrainConfig, panel: Panel | None) -> TrainConfig:
-    """What the config leaves to the panel: its mixture's share of logs, and how to begin online."""
-    replay, epsilon = config.replay, config.epsilon
-    if replay.logs_share is None and panel is not None:
-        replay = msgspec.structs.replace(replay, logs_share=panel.header.logs_share)
+    """What the config leaves to whether there is a panel: how to begin online."""
+    epsilon = config.epsilon
     if epsilon.start is None:
         learns_first = panel is not None and config.schedule.offline_updates > 0
         epsilon = msgspec.structs.replace(epsilon, start=AFTER_LOGS if learns_first else 1.0)
-    return msgspec.structs.replace(config, replay=replay, epsilon=epsilon)
+    return msgspec.structs.replace(config, epsilon=epsilon)
+
+
+def planned_draws(config: TrainConfig) -> PlannedDraws:
+    """The rows that a run of this config will draw, if nothing ends it before its budget."""
+    schedule, batch_size = config.schedule, config.replay.batch_size
+    online = max(schedule.env_steps - schedule.warmup_env_steps, 0)
+    return PlannedDraws(
+        offline=schedule.offline_updates * batch_size,
+        online=online * schedule.updates_per_env_step * batch_size,
+        begin_env_steps=min(schedule.warmup_env_steps, schedule.env_steps),
+        end_env_steps=schedule.env_steps,
+    )
+
+
+def _logs(panel: Panel, config: TrainConfig) -> Logs:
+    return Logs.of_panel(panel, planned_draws(config), config.loss.huber_delta)
 
 
 def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dict[str, Any]:
     fed = None
     if panel is not None:
+        diet = diet_of(panel, planned_draws(config), config.replay.logs_share)
         fed = {
             "path": str(panel.path.resolve()),
             "id": panel.id,
@@ -179,7 +196,13 @@ def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dic
             "n_step": panel.n_step,
             "discount": panel.discount,
             "labels_version": panel.header.labels_version,
-            "strata": {stratum.name: stratum.share for stratum in panel.strata},
+            "others": [msgspec.structs.asdict(store) for store in panel.header.others],
+            # The mixture worked out for this run's own draws: shares as it begins.
+            "strata": {
+                s.name: share for s, share in zip(panel.strata, diet.shares.tolist(), strict=True)
+            },
+            "logs_share": diet.logs_share,
+            "planned_draws": asdict(planned_draws(config)),
         }
     return {
         "created_ns": now_ns(),

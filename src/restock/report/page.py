@@ -88,7 +88,7 @@ def _cards(facts: Facts) -> list[dict[str, str]]:
 
 
 def _sampling(facts: Facts) -> str:
-    share = facts.config.get("config", {}).get("replay", {}).get("logs_share")
+    share = (facts.config.get("panel") or {}).get("logs_share")
     if facts.panel is None:
         return "0 %"
     return "?" if share is None else f"{share:.0%}"
