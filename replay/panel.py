@@ -174,7 +174,7 @@ class Panel:
         action_probability, action, reward (of one step), terminated, truncated, stratum,
         stratum_code (its place in `strata`), horizon, weight."""
         if self._meta is None:
-            self._meta = pq.read_table(self.path / META)
+            self._meta = pq.read_table(self.path / META).unify_dictionaries()
         return self._meta
 
     def meta_column(self, name: str) -> NDArray[Any]:

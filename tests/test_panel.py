@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +18,7 @@ from hypothesis import strategies as st
 
 from restock.errors import MixtureError, PanelError, StoreError
 from restock.ingest.task import Task
-from restock.replay import build
+from restock.replay import build, pack, scratch
 from restock.replay.build import build_panel
 from restock.replay.mixture import Mixture, load_mixture, parse_mixture
 from restock.replay.n_step import n_step_horizon, n_step_return
@@ -47,7 +50,8 @@ def test_packed_rows_are_those_of_a_naive_reading_of_the_table(
     shuffled = transitions.take(pa.array(order)).filter(
         pa.array(transitions["transition_id"].to_numpy()[order] != (2 << 25) + 40)
     )
-    panel = build_panel(shuffled, uniform(n_step=n_step, discount=0.9), tmp_path / "p", task=TASK)
+    mixture = uniform(n_step=n_step, discount=0.9, return_to_go=True)
+    panel = build_panel(shuffled, mixture, tmp_path / "p", task=TASK)
     assert len(panel) == len(transitions) - 1
     episodes = by_episode(shuffled)
     part = panel.columns
@@ -71,6 +75,14 @@ def test_packed_rows_are_those_of_a_naive_reading_of_the_table(
         np.testing.assert_allclose(
             packed[part["discount"]], 0.9 ** len(span) * (not span[-1]["terminated"]), rtol=1e-6
         )
+        to_go = [episode[at]]
+        while to_go[-1] is not episode[-1] and (
+            episode[at + len(to_go)]["step_index"] == span[0]["step_index"] + len(to_go)
+        ):
+            to_go.append(episode[at + len(to_go)])
+        expected = sum(0.9**k * row["reward"] for k, row in enumerate(to_go))
+        assert meta["return_to_go"] == pytest.approx(expected, abs=1e-4)
+        assert meta["return_to_go_whole"] == to_go[-1]["terminated"]
 
 
 def test_returns_stop_at_a_handover(tmp_path: Path) -> None:
@@ -80,6 +92,91 @@ def test_returns_stop_at_a_handover(tmp_path: Path) -> None:
     table = table.set_column(place, table.schema.field(place), pa.array(policy))
     panel = build_panel(table, uniform(n_step=4), tmp_path / "p")
     assert panel.meta["horizon"].to_pylist()[:6] == [4, 4, 3, 2, 1, 4]
+    across = build_panel(table, uniform(n_step=4, cut_at_off_policy=False), tmp_path / "q")
+    assert across.meta["horizon"].to_pylist()[:6] == [4] * 6
+
+
+def test_returns_stop_before_an_action_less_likely_than_chance(tmp_path: Path) -> None:
+    table = recording_transitions(1, episodes=1)
+    # Five actions: chance is 0.2. The step that explored is the first of its own return.
+    probability = np.where(np.arange(len(table)) == 5, 0.1, 0.9).astype(np.float32)
+    probability[7] = 0.2
+    place = table.schema.get_field_index("action_probability")
+    table = table.set_column(place, table.schema.field(place), pa.array(probability))
+    panel = build_panel(table, uniform(n_step=4), tmp_path / "p", task=TASK)
+    assert panel.meta["horizon"].to_pylist()[:8] == [4, 4, 3, 2, 1, 4, 4, 4]
+    # Without the task nobody knows what chance is.
+    blind = build_panel(table, uniform(n_step=4), tmp_path / "q")
+    assert blind.meta["horizon"].to_pylist()[:8] == [4] * 8
+
+
+def test_a_return_to_go_that_was_cut_is_not_whole(tmp_path: Path) -> None:
+    table = recording_transitions(1, episodes=1)
+    last = len(table) - 1
+    for name, value in (("terminated", True), ("truncated", False)):
+        place = table.schema.get_field_index(name)
+        ended = pa.array(np.where(np.arange(len(table)) == last, value, False))
+        table = table.set_column(place, table.schema.field(place), ended)
+    policy = np.where(np.arange(len(table)) < 5, "planner", "operator")
+    place = table.schema.get_field_index("behaviour_policy")
+    table = table.set_column(place, table.schema.field(place), pa.array(policy))
+    panel = build_panel(table, uniform(return_to_go=True, discount=1.0), tmp_path / "p")
+    reward = table["reward"].to_numpy()
+    assert panel.return_to_go[0] == pytest.approx(float(reward[:5].sum()), abs=1e-4)
+    assert panel.return_to_go[5] == pytest.approx(float(reward[5:].sum()), abs=1e-4)
+    assert panel.meta["return_to_go_whole"].to_pylist() == [False] * 5 + [True] * (last - 4)
+    without = build_panel(table, uniform(), tmp_path / "q")
+    with pytest.raises(PanelError, match="no return-to-go"):
+        _ = without.return_to_go
+
+
+@pytest.mark.parametrize("whole_file", [True, False])
+def test_small_stretches_and_batches_pack_the_same_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole_file: bool
+) -> None:
+    tables = [recording_transitions(index, episodes=90) for index in (3, 1, 2)]
+    table = pa.concat_tables(tables)  # some 9,000 rows, more than DuckDB gives at a time
+    if not whole_file:
+        table = table.take(pa.array(np.random.default_rng(0).permutation(len(table))))
+    mixture = uniform(n_step=5, return_to_go=True, by="episode")
+    at_once = build_panel(table, mixture, tmp_path / "a", task=TASK)
+    for module, name, value in (
+        (scratch, "STRETCH", 64),
+        (pack, "STRETCH", 64),
+        (scratch, "BATCH_ROWS", 2048),
+        (pack, "BATCH_ROWS", 2048),
+        (pack, "BATCH_BYTES", 2048 * 8 * TASK.observation_size),
+        (pack, "ROW_GROUP_ROWS", 1000),
+    ):
+        monkeypatch.setattr(module, name, value)
+    by_parts = build_panel(table, mixture, tmp_path / "b", task=TASK)
+    np.testing.assert_array_equal(at_once.rows, by_parts.rows)
+    assert at_once.meta.to_pylist() == by_parts.meta.to_pylist()
+    assert at_once.id == by_parts.id
+    held = [pq.read_table(panel.path / "held_out.parquet") for panel in (at_once, by_parts)]
+    assert held[0].to_pylist() == held[1].to_pylist()
+
+
+def test_ids_that_no_ingest_gave_find_their_rows_too(transitions: pa.Table, tmp_path: Path) -> None:
+    # Ids of three recordings mixed: the runs of rising ids overlap.
+    place = transitions.schema.get_field_index("transition_id")
+    ids = np.random.default_rng(1).permutation(len(transitions)).astype(np.int64)
+    table = transitions.set_column(place, transitions.schema.field(place), pa.array(ids))
+    panel = build_panel(table, uniform(n_step=3), tmp_path / "p")
+    plain = build_panel(transitions, uniform(n_step=3), tmp_path / "q")
+    np.testing.assert_array_equal(panel.rows, plain.rows)
+
+
+def test_a_row_that_is_no_number_is_refused(transitions: pa.Table, tmp_path: Path) -> None:
+    rows = transitions["next_observation"].to_pylist()
+    rows[7] = [float("nan"), *rows[7][1:]]
+    place = transitions.schema.get_field_index("next_observation")
+    field = transitions.schema.field(place)
+    table = transitions.set_column(place, field, pa.array(rows, field.type))
+    with pytest.raises(PanelError, match="isfinite") as caught:
+        build_panel(table, uniform(), tmp_path / "p")
+    where = str(caught.value).split('where = "')[1].split('"')[0]
+    assert len(build_panel(table, uniform(where=where), tmp_path / "p")) == len(table) - 1
 
 
 @settings(max_examples=100, deadline=None)
@@ -219,6 +316,59 @@ def test_an_interruption_leaves_nothing(
     with pytest.raises(KeyboardInterrupt):
         build_panel(transitions, uniform(), tmp_path / "p")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_another_builder_of_the_same_panel_does_not_collide(
+    transitions: pa.Table, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_meta = pack.Packer.write_meta
+
+    def meanwhile(*args: Path) -> None:
+        monkeypatch.undo()
+        build_panel(transitions, uniform(), tmp_path / "p")
+        write_meta(*args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(pack.Packer, "write_meta", meanwhile)
+    with pytest.raises(PanelError, match="another builder was faster"):
+        build_panel(transitions, uniform(), tmp_path / "p")
+    assert [path.name for path in tmp_path.iterdir()] == ["p"]
+    Panel.open(tmp_path / "p", verify=True)
+
+
+def test_a_killed_build_leaves_nothing_in_the_way(transitions: pa.Table, tmp_path: Path) -> None:
+    table = tmp_path / "rows.parquet"
+    pq.write_table(transitions, table)
+    code = (
+        "import os, signal, sys, pyarrow.parquet as pq\n"
+        "from restock.replay import build, pack\n"
+        "from restock.replay.mixture import load_mixture\n"
+        "pack.Packer.write_meta = lambda *_: os.kill(os.getpid(), signal.SIGKILL)\n"
+        "build.build_panel(pq.read_table(sys.argv[1]), load_mixture('uniform'), sys.argv[2])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(table), str(tmp_path / "p")])
+    assert done.returncode == -signal.SIGKILL
+    assert not (tmp_path / "p").exists()
+    assert len(list(tmp_path.iterdir())) == 2  # the table, and what the build had begun
+    build_panel(transitions, uniform(), tmp_path / "p")
+    assert {path.name for path in tmp_path.iterdir()} == {"rows.parquet", "p"}
+
+
+def test_an_edited_header_is_refused(transitions: pa.Table, tmp_path: Path) -> None:
+    panel = build_panel(transitions, uniform(), tmp_path / "p")
+    header = panel.path / "panel.json"
+    header.chmod(0o644)
+    header.write_text(header.read_text().replace('"n_step": 1', '"n_step": 2'))
+    with pytest.raises(PanelError, match="changed after it was written"):
+        Panel.open(panel.path)
+
+
+def test_the_id_names_the_code_that_packed(
+    transitions: pa.Table, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = build_panel(transitions, uniform(), tmp_path / "a")
+    assert first.header.packing_code == pack.packing_code()
+    monkeypatch.setattr(build, "packing_code", lambda: "0" * 12)
+    assert build_panel(transitions, uniform(), tmp_path / "b").id != first.id
 
 
 def test_damage_is_found(transitions: pa.Table, tmp_path: Path) -> None:
