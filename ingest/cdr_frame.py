@@ -32,10 +32,35 @@ class BadRows(Exception):
         self.rows, self.reason = rows, reason
 
 
+class Around:
+    """A buffer that holds little but these messages, as one text, made when it is first needed.
+
+    To cut a text from it takes a third of the time that it takes to make and decode bytes.
+    """
+
+    def __init__(self, buffer: NDArray[np.uint8]) -> None:
+        base: Any = buffer.base
+        self._whole: bytes | None = base if isinstance(base, bytes) else None
+        self._text: str | None = None
+
+    def texts(self, at: I64, stop: I64) -> list[str] | None:
+        """The texts at these places; None where they are not all ASCII, or not to be had so."""
+        if self._whole is None:
+            return None
+        if self._text is None:
+            self._text = self._whole.decode("latin-1")  # which never fails
+        whole = self._text
+        pieces = [whole[a:b] for a, b in zip(at.tolist(), stop.tolist(), strict=True)]
+        if not "".join(pieces).isascii():
+            return None
+        known: dict[str, str] = {}
+        return [known.setdefault(piece, piece) for piece in pieces]  # one object for equal texts
+
+
 class Frame:
     """N messages, or N elements of a sequence in them, being read at the same time."""
 
-    __slots__ = ("buffer", "end", "order", "origin", "position", "rows")
+    __slots__ = ("around", "buffer", "end", "order", "origin", "position", "rows")
 
     def __init__(
         self,
@@ -45,8 +70,10 @@ class Frame:
         end: I64,
         rows: NDArray[np.intp],
         position: Position,
+        around: Around | None = None,
     ) -> None:
         self.buffer = buffer
+        self.around = around or Around(buffer)
         self.order = order  # "<" or ">"
         self.origin = origin  # (N,) of the message's first byte in the buffer: alignment is from it
         self.end = end  # (N,) of the message, from its origin
@@ -65,6 +92,7 @@ class Frame:
             self.end[rows],
             self.rows[rows],
             position,
+            self.around,
         )
 
     def need(self, stop: Position) -> None:
@@ -146,12 +174,13 @@ def texts(frame: Frame, at: I64, lengths: Position) -> FieldColumn:
         ):
             out[:] = _decode(raw[:1].tolist(), frame, {})[0]
             return out
-        pieces = raw.tolist()
-    else:
+    stop = at + lengths
+    found = frame.around.texts(at, stop)
+    if found is None:
         view = frame.buffer.data
-        stops = (at + lengths).tolist()
-        pieces = [bytes(view[a:b]) for a, b in zip(at.tolist(), stops, strict=True)]
-    out[:] = _decode(pieces, frame, {})
+        bounds = zip(at.tolist(), stop.tolist(), strict=True)
+        found = _decode([bytes(view[a:b]) for a, b in bounds], frame, {})
+    out[:] = found
     return out
 
 
