@@ -111,9 +111,7 @@ def input_problems(
         found = available.get(source.topic)
         if (found is None or not found.expected) and not source.optional:
             what = "no message of" if found is not None else "no topic"
-            hint = near(source.topic, available)
-            said = f"{what} {source.topic}" + (f", {hint}" if hint else "")
-            needed.setdefault(said, []).append(name)
+            needed.setdefault(f"{what} {source.topic}", []).append(name)
         elif found is not None and found.type != source.type:
             said = f"{source.topic} holds {found.type}, not {source.type}"
             wrong.setdefault(said, []).append(name)
@@ -127,8 +125,9 @@ def input_problems(
         elif found is not None and leaves is not None:
             problem = signal.problem(leaves[signal.topic])
             fields += [f"`signals.{name}.path`: {signal.topic}: {problem}"] if problem else []
+    hints = {what: near(what.split()[-1], available) for what in needed}
     lacking = [
-        f"{what} ({', '.join(names)})"
+        f"{what} ({', '.join(names)})" + (f": {hints[what]}" if hints.get(what) else "")
         for what, names in itertools.chain(needed.items(), wrong.items())
     ]
     return lacking + fields + _transform_problems(profile, available)
