@@ -22,6 +22,7 @@ from restock.train import checkpoint
 from restock.train.batches import Coded, Logs
 from restock.train.config import TrainConfig, parse_config
 from restock.train.learner import Learner
+from restock.train.log_terms import LogTerms
 from restock.train.loop import TrainingInterrupted, train
 from restock.train.run import Run
 from restock.train.run_tables import TABLES
@@ -416,6 +417,58 @@ def test_the_conservative_term_lowers_what_the_logs_never_did(tmp_path: Path) ->
         gaps.append(float((q[:, 1] - q[:, [0, 2]].amax(dim=1)).min()))
     assert gaps[1] > max(gaps[0], 0) + 0.2
     assert q.argmax(dim=1).tolist() == [1] * (CELLS - 1)
+
+
+def test_the_margin_is_for_rows_of_the_named_policy_and_strata() -> None:
+    shelf = logs()
+    operator = shelf.behaviour_policy.codes == shelf.behaviour_policy.names.index("operator")
+    slips = np.isin(np.arange(len(shelf)), shelf.stratum_rows[1])
+    terms = {
+        strata: LogTerms.of(
+            config(loss={"margin": 1.0, "margin_strata": list(strata)}).loss,
+            shelf,
+            torch.device("cpu"),
+        )
+        for strata in ((), ("wheel_slip",))
+    }
+    for strata, chosen in (((), operator), (("wheel_slip",), operator & slips)):
+        expert, to_go = terms[strata].rows(np.arange(len(shelf)))
+        assert expert is not None
+        assert to_go is None
+        np.testing.assert_array_equal(expert.numpy(), chosen)
+
+
+@pytest.mark.parametrize(
+    ("loss", "message"),
+    [
+        ({"margin": 1.0, "margin_policies": ["nobody"]}, "have no 'nobody'"),
+        ({"margin": 1.0, "margin_strata": ["ice"]}, "have no 'ice'"),
+        ({"calibrated": True}, "needs logs from a panel"),
+    ],
+)
+def test_terms_that_the_logs_cannot_serve_are_refused(
+    tmp_path: Path, loss: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        session(tmp_path / "r", config(loss=loss))
+
+
+def test_a_run_with_every_term_resumes_bit_exactly(tmp_path: Path) -> None:
+    settings = config(
+        loss={"margin": 0.5, "conservative": 0.1},
+        network={"hidden": [16], "quantiles": 4, "ensemble": 2},
+        schedule={**SMALL["schedule"], "env_steps": 800},
+    )
+    whole = run_to_end(tmp_path / "whole", settings)
+    first = session(tmp_path / "cut", settings)
+    steps = iter(range(10_000))
+    with pytest.raises(TrainingInterrupted):
+        train(first, stop=lambda: next(steps) > 150)
+    first.close()
+    second = session(tmp_path / "cut", settings, resume=True)
+    train(second)
+    second.close()
+    assert_same_run(whole, second)
 
 
 def test_a_condition_that_cannot_run_is_refused_before_the_first_step(tmp_path: Path) -> None:

@@ -31,10 +31,16 @@ class NetworkConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     hidden: tuple[int, ...] = (256, 256)
     layer_norm: bool = True
     dueling: bool = False
+    quantiles: int = 0  # of each action's return (QR-DQN); 0 learns the mean alone
+    ensemble: int = 1  # networks: their mean acts, their least is the target's value
 
     def __post_init__(self) -> None:
         if not self.hidden or min(self.hidden) < 1:
             raise ValueError(f"network.hidden must be positive widths, got {list(self.hidden)}")
+        if self.quantiles < 0 or self.quantiles == 1:
+            raise ValueError(f"network.quantiles must be 0 or above 1, got {self.quantiles}")
+        if self.ensemble < 1:
+            raise ValueError(f"network.ensemble must be at least 1, got {self.ensemble}")
 
 
 class LossConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -45,8 +51,24 @@ class LossConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     conservative: float = 0.1  # weight of the CQL term on rows from logs, while offline
     conservative_online: float = 0.0  # … and the weight it goes to, linearly, once online
     conservative_steps: int = 20_000  # environment steps that this takes
+    calibrated: bool = False  # Cal-QL: that term stops at the logs' return-to-go
+    munchausen: float = 0.0  # weight of the log-policy in the reward (0.9 in the paper); 0: off
+    munchausen_temperature: float = 0.03
+    munchausen_floor: float = -1.0  # of the log-policy times the temperature
+    margin: float = 0.0  # weight of DQfD's large margin on logged rows of `margin_policies`
+    margin_size: float = 0.8  # by which their action must be better
+    margin_policies: tuple[str, ...] = ("operator",)  # behaviour policies
+    margin_strata: tuple[str, ...] = ()  # only in these strata of the logs; none: in all
 
     def __post_init__(self) -> None:
+        if not 0 <= self.munchausen <= 1:
+            raise ValueError(f"loss.munchausen must be in [0, 1], got {self.munchausen}")
+        if self.munchausen_temperature <= 0 or self.munchausen_floor > 0:
+            raise ValueError(
+                "loss.munchausen_temperature must be above 0 and munchausen_floor at most 0"
+            )
+        if min(self.margin, self.margin_size) < 0:
+            raise ValueError("loss.margin and loss.margin_size must be at least 0")
         if not 0 <= self.discount < 1:
             raise ValueError(f"loss.discount must be in [0, 1), got {self.discount}")
         if self.n_step < 1:
@@ -164,6 +186,10 @@ class TrainConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     env: EnvConfig = msgspec.field(default_factory=EnvConfig)
     evaluation: EvaluationConfig = EvaluationConfig()
     record: RecordConfig = RecordConfig()
+
+    def __post_init__(self) -> None:
+        if self.loss.munchausen and self.network.quantiles:
+            raise ValueError("loss.munchausen and network.quantiles do not go together: choose one")
 
 
 def load_config(path: Path | None, overrides: Sequence[str] = ()) -> TrainConfig:

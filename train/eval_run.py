@@ -21,7 +21,7 @@ from restock.train import checkpoint
 from restock.train.config import TrainConfig, parse_config
 from restock.train.episode import KINDS, EpisodeSpec
 from restock.train.evaluate import EpisodeResult, GreedyPolicy, Policy, run_episodes
-from restock.train.network import QNetwork
+from restock.train.network import make_network
 from restock.train.perturbation import PERTURBATIONS, Perturbation
 from restock.train.run import Run, write_table
 from restock.train.run_tables import EVAL_EPISODES
@@ -159,13 +159,7 @@ def load_agent(run: Run) -> GreedyPolicy:
             where=str(run.best),
             remedy="train again: observations or actions have changed their meaning",
         )
-    network = QNetwork(
-        state["observation_size"],
-        state["actions"],
-        hidden=config.network.hidden,
-        layer_norm=config.network.layer_norm,
-        dueling=config.network.dueling,
-    )
+    network = make_network(config.network, state["observation_size"], state["actions"])
     network.load_state_dict(state["network"])
     return GreedyPolicy(network.eval(), version=f"{run.path.name}@{state['gradient_steps']}")
 

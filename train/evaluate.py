@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from restock.train.episode import EpisodeSpec
 from restock.train.learner import greedy_actions
-from restock.train.network import QNetwork
+from restock.train.network import Network
 from restock.train.stats import wilson
 
 STUCK_WINDOW_S, STUCK_RADIUS_M = 10.0, 0.5
@@ -51,7 +51,7 @@ class GreedyPolicy:
 
     name = "agent"
 
-    def __init__(self, network: QNetwork, version: str = "") -> None:
+    def __init__(self, network: Network, version: str = "") -> None:
         self.network, self.version = network, version
 
     def act(

@@ -12,8 +12,18 @@ from torch import Tensor
 
 from restock.errors import ConfigError
 from restock.train.config import LossConfig, TrainConfig
-from restock.train.loss import Loss, conservative_penalty, dqn_loss, td_target
-from restock.train.network import QNetwork, clone
+from restock.train.loss import (
+    Loss,
+    conservative_penalty,
+    dqn_loss,
+    margin_penalty,
+    mean_loss,
+    munchausen_target,
+    quantile_loss,
+    quantile_target,
+    td_target,
+)
+from restock.train.network import Network, clone, make_network
 from restock.train.target import TargetUpdate
 
 
@@ -28,12 +38,10 @@ class Learner:
         self.device = open_device(config.device)
         self.loss: LossConfig = config.loss
         self.max_grad_norm = config.optimizer.max_grad_norm
-        self.network = QNetwork(
+        self.network: Network = make_network(
+            config.network,
             observation_size,
             actions,
-            hidden=config.network.hidden,
-            layer_norm=config.network.layer_norm,
-            dueling=config.network.dueling,
             generator=torch.Generator().manual_seed(config.seed),
         ).to(self.device)
         self.target_network = clone(self.network)
@@ -52,6 +60,8 @@ class Learner:
         weight: Tensor | None = None,
         logged: int = 0,
         conservative: float = 0.0,
+        return_to_go: Tensor | None = None,
+        expert: Tensor | None = None,
     ) -> Loss:
         """One gradient step on `rows`; the target's clock is ticked by `self.target` afterwards.
 
@@ -60,19 +70,36 @@ class Learner:
             weight: (B,) importance weights, or None for ones.
             logged: how many of the first rows are from logs; the conservative term sees only those.
             conservative: the weight of that term.
+            return_to_go: (logged,) what the logs got from each of them on, for Cal-QL.
+            expert: (logged,) bool, whether the margin term applies, or None: to none.
         """
         observation, next_observation, action, reward, discount = unpack(
             rows, self.network.observation_size
         )
-        with torch.no_grad():
-            next_q = self.network(next_observation) if self.loss.double else None
-            target = td_target(reward, discount, self.target_network(next_observation), next_q)
-        q = self.network(observation)
-        loss = dqn_loss(q, action, target, weight=weight, huber_delta=self.loss.huber_delta)
+        target = self._target(observation, next_observation, action, reward, discount)
+        losses, penalties = [], []
+        for member in self.network.members:
+            if member.quantiles:
+                spread = member.distribution(observation)
+                q = spread.mean(dim=2)
+                loss = quantile_loss(
+                    spread, action, target, weight=weight, huber_delta=self.loss.huber_delta
+                )
+            else:
+                q = member(observation)
+                loss = dqn_loss(q, action, target, weight=weight, huber_delta=self.loss.huber_delta)
+            losses.append(loss)
+            share = logged / len(rows)
+            if conservative > 0 and logged:
+                term = conservative_penalty(q[:logged], action[:logged], return_to_go)
+                penalties.append(conservative * term * share)
+            if expert is not None:
+                term = margin_penalty(q[:logged], action[:logged], expert, self.loss.margin_size)
+                penalties.append(self.loss.margin * term * share)
+        loss = mean_loss(losses)
         value = loss.value
-        if conservative > 0 and logged:
-            penalty = conservative_penalty(q[:logged], action[:logged])
-            value = value + conservative * penalty * (logged / len(rows))
+        if penalties:
+            value = value + torch.stack(penalties).sum() / len(losses)
         self.optimizer.zero_grad(set_to_none=True)
         value.backward()  # type: ignore[no-untyped-call]
         if self.max_grad_norm is not None:
@@ -81,6 +108,43 @@ class Learner:
         self.gradient_steps += 1
         self._average()
         return loss
+
+    @torch.no_grad()
+    def _target(
+        self,
+        observation: Tensor,
+        next_observation: Tensor,
+        action: Tensor,
+        reward: Tensor,
+        discount: Tensor,
+        *,
+        slow: Network | None = None,
+    ) -> Tensor:
+        """What Q(s, a) should be: (B,), or its quantiles (B, N)."""
+        slow = slow or self.target_network
+        if self.loss.munchausen:
+            return munchausen_target(
+                reward,
+                discount,
+                action,
+                slow(observation),
+                slow(next_observation),
+                scale=self.loss.munchausen,
+                temperature=self.loss.munchausen_temperature,
+                floor=self.loss.munchausen_floor,
+            )
+        next_q = self.network(next_observation) if self.loss.double else None
+        if self.network.quantiles:
+            return quantile_target(
+                reward,
+                discount,
+                [member.distribution(next_observation) for member in slow.members],
+                next_q,
+            )
+        targets = [
+            td_target(reward, discount, member(next_observation), next_q) for member in slow.members
+        ]
+        return targets[0] if len(targets) == 1 else torch.stack(targets).amin(dim=0)
 
     @torch.no_grad()
     def _average(self) -> None:
@@ -106,11 +170,17 @@ class Learner:
         observation, next_observation, action, reward, discount = unpack(
             rows, self.network.observation_size
         )
-        slow = self.network if online else self.target_network
-        next_q = self.network(next_observation) if self.loss.double else None
-        target = td_target(reward, discount, slow(next_observation), next_q)
+        target = self._target(
+            observation,
+            next_observation,
+            action,
+            reward,
+            discount,
+            slow=self.network if online else None,
+        )
         q: Tensor = self.network(observation)
-        return dqn_loss(q, action, target).td, q, self.target_network(observation)
+        value = target.mean(dim=1) if target.ndim == 2 else target
+        return dqn_loss(q, action, value).td, q, self.target_network(observation)
 
     def greedy(self, observation: NDArray[np.float32]) -> NDArray[np.int64]:
         """The best action (N,) of each observation (N, D)."""
@@ -156,7 +226,7 @@ def unpack(rows: Tensor, observation_size: int) -> tuple[Tensor, Tensor, Tensor,
 
 
 @torch.inference_mode()
-def greedy_actions(network: QNetwork, observation: NDArray[np.float32]) -> NDArray[np.int64]:
+def greedy_actions(network: Network, observation: NDArray[np.float32]) -> NDArray[np.int64]:
     """The best action (N,) of each observation (N, D), on the network's device."""
     device = next(network.parameters()).device
     values = network(torch.from_numpy(np.ascontiguousarray(observation)).to(device))

@@ -139,11 +139,14 @@ def _updates_due(session: Session) -> int:
 def _update(session: Session, batch: Batch, phase: str, notify: Notify) -> None:
     """One gradient step, its record, and the target's clock."""
     learner, interval = session.learner, session.interval
+    expert, return_to_go = session.log_terms.rows(batch.log_rows)
     loss = learner.update(
         batch.rows,
         weight=batch.weight,
         logged=batch.logged,
         conservative=_conservative_weight(session, phase),
+        return_to_go=return_to_go,
+        expert=expert,
     )
     step = learner.gradient_steps
     session.feed.batch(step, session.clock.env_steps, batch, loss, learner.target.last_sync)

@@ -25,6 +25,7 @@ from restock.train.evaluate import Score, Twin
 from restock.train.events import Events
 from restock.train.held_out import HeldOut
 from restock.train.learner import Learner
+from restock.train.log_terms import LogTerms
 from restock.train.probe import Probe
 from restock.train.record import FeedRecord
 from restock.train.run import Run
@@ -76,6 +77,7 @@ class Session:
     exploration: np.random.Generator
     executor: ThreadPoolExecutor | None
     logs: Logs | None
+    log_terms: LogTerms
     clock: Clock = field(default_factory=Clock)
     interval: Interval = field(default_factory=Interval)
     best: Score | None = None
@@ -200,6 +202,7 @@ def open_session(
         exploration=np.random.default_rng([seed, 5]),
         executor=executor,
         logs=logs,
+        log_terms=LogTerms.of(config.loss, logs, learner.device),
     )
     session.collector.check_conditions()
     if resume:
