@@ -45,6 +45,12 @@ def describe(
                 }
                 for topic in recording.topics.values()
             },
+            "attachments": [
+                {"name": extra.name, "media_type": extra.media_type, "size_bytes": extra.size_bytes}
+                for extra in recording.extras
+                if extra.kind == "attachment"
+            ],
+            "metadata": [extra.name for extra in recording.extras if extra.kind == "metadata"],
             "notes": list(recording.notes),
             "damage": [item.what for item in recording.damage],
         }

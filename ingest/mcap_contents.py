@@ -14,6 +14,13 @@ from typing import Any
 from restock.ingest.mapped import FORGET_BYTES, forget
 from restock.ingest.mcap_chunk import HEAD_SIZE, Chunk
 from restock.ingest.mcap_records import MAGIC, PREFIX, Malformed, Op, parse, walk
+from restock.ingest.storage import Extra
+
+
+# What the survey keeps is bounded, whatever a file is made of.
+MOST_CHUNKS = 1_000_000
+MOST_NAMED = 10_000  # attachments and metadata records; the others are counted
+MOST_DAMAGED = 100
 
 
 @dataclass
@@ -29,7 +36,10 @@ class Contents:
     data_end: tuple[int, int] = (0, 0)  # position, and CRC of the data section (0: unchecked)
     cut: Malformed | None = None  # where and why the walk could not go on
     cut_chunk: Chunk | None = None  # the chunk it could not pass, with what there is of it
+    resumed: bool = False  # beyond the cut, up to a whole summary
     damaged: list[str] = field(default_factory=list)  # records that could not be parsed
+    extras: list[Extra] = field(default_factory=list)  # attachments and metadata records
+    unnamed: int = 0  # more of them
 
     def indexed_counts(self) -> dict[int, int]:
         """Messages per channel as far as they are known without looking into chunks."""
@@ -41,7 +51,7 @@ class Contents:
 
     def claimed_counts(self) -> dict[int, int] | None:
         """Messages per channel by the statistics; None where they are missing or incomplete."""
-        if self.statistics is None or self.cut is not None:
+        if self.statistics is None or (self.cut is not None and not self.resumed):
             return None
         claimed: dict[int, int] = self.statistics["channel_message_counts"]
         # Counts per channel are optional; the total is not.
@@ -67,9 +77,10 @@ def survey(file: mmap.mmap) -> Contents:
                 finished = file[stop : stop + len(MAGIC)] == MAGIC
                 break
             try:
-                _take(contents, file, opcode, at, stop)
+                take_record(contents, file, opcode, at, stop)
             except Malformed as bad:
-                contents.damaged.append(f"record at byte {at - PREFIX:,}: {bad.what}")
+                if len(contents.damaged) < MOST_DAMAGED:
+                    contents.damaged.append(f"record at byte {at - PREFIX:,}: {bad.what}")
     except Malformed as cut:
         contents.cut = cut
     if not finished and contents.cut is None:
@@ -77,15 +88,22 @@ def survey(file: mmap.mmap) -> Contents:
     if contents.cut is not None:
         if contents.chunks:  # the index records after the last whole chunk may be cut off
             contents.chunks[-1] = replace(contents.chunks[-1], index={})
-        contents.cut_chunk = _cut_chunk(file, contents.cut.at, end)
+        contents.cut_chunk = cut_chunk_at(file, contents.cut.at, end)
     return contents
 
 
-def _take(contents: Contents, file: mmap.mmap, opcode: int, at: int, stop: int) -> None:
+def take_record(contents: Contents, file: mmap.mmap, opcode: int, at: int, stop: int) -> None:
+    """Add a top-level record, whose content is file[at:stop].
+
+    Raises:
+        Malformed: its fields reach beyond it.
+    """
     if opcode == Op.MESSAGE and stop - at >= HEAD_SIZE - PREFIX:
         channel = int.from_bytes(file[at : at + 2], "little")
         contents.loose.setdefault(channel, []).append(at - PREFIX)
     elif opcode == Op.CHUNK:
+        if len(contents.chunks) >= MOST_CHUNKS:
+            raise Malformed(f"more than {MOST_CHUNKS:,} chunks: not read", at)
         contents.chunks.append(_chunk(file, at, stop))
     elif opcode == Op.MESSAGE_INDEX and contents.chunks:
         index = parse(Op.MESSAGE_INDEX, file, at, stop)
@@ -101,8 +119,22 @@ def _take(contents: Contents, file: mmap.mmap, opcode: int, at: int, stop: int) 
         contents.statistics = parse(Op.STATISTICS, file, at, stop)
     elif opcode == Op.DATA_END:
         contents.data_end = at - PREFIX, parse(Op.DATA_END, file, at, stop)["data_section_crc"]
+    elif opcode == Op.ATTACHMENT:
+        attached = parse(Op.ATTACHMENT, file, at, stop)
+        low, high = attached["data"]
+        _name(contents, Extra("attachment", attached["name"], attached["media_type"], high - low))
+    elif opcode == Op.METADATA:
+        named = parse(Op.METADATA, file, at, stop)
+        _name(contents, Extra("metadata", named["name"], "", stop - at))
     elif opcode == Op.HEADER and not contents.profile:
         contents.profile = parse(Op.HEADER, file, at, stop)["profile"]
+
+
+def _name(contents: Contents, extra: Extra) -> None:
+    if len(contents.extras) < MOST_NAMED:
+        contents.extras.append(extra)
+    else:
+        contents.unnamed += 1
 
 
 def _chunk(file: mmap.mmap, at: int, stop: int) -> Chunk:
@@ -118,9 +150,10 @@ def _chunk(file: mmap.mmap, at: int, stop: int) -> Chunk:
     )
 
 
-def _cut_chunk(file: mmap.mmap, at: int, end: int) -> Chunk | None:
-    """The chunk in which the file ends: its fields, and what there is of its records."""
-    if at + PREFIX + 40 > end or file[at] != Op.CHUNK:
+def cut_chunk_at(file: mmap.mmap, at: int, end: int) -> Chunk | None:
+    """The chunk at a place, whatever its record's length says: its fields, and what there is of
+    its records before `end`. None where that is nothing."""
+    if at < 0 or at + PREFIX + 40 > end or file[at] != Op.CHUNK:
         return None
     head = at + PREFIX
     start_ns, end_ns, size = (
@@ -132,4 +165,6 @@ def _cut_chunk(file: mmap.mmap, at: int, end: int) -> Chunk | None:
     if records >= end:
         return None
     compression = file[head + 32 : head + 32 + length].decode("utf-8", "backslashreplace")
-    return Chunk(at, records, end, size, crc, compression, (start_ns, end_ns))
+    stored = int.from_bytes(file[records - 8 : records], "little")
+    stop = min(records + stored, end)
+    return Chunk(at, records, stop, size, crc, compression, (start_ns, end_ns))

@@ -19,6 +19,7 @@ from restock.ingest.mapped import FORGET_BYTES, forget
 from restock.ingest.mcap_chunk import BadChunk, Chunk, Indexed, Messages, Positions
 from restock.ingest.mcap_contents import survey
 from restock.ingest.mcap_records import MAGIC
+from restock.ingest.mcap_salvage import resume
 from restock.ingest.storage import Channel, Damage, Integrity
 
 GROUP_BYTES = 8 << 20  # of chunks decoded together: enough to amortise numpy's calls
@@ -50,6 +51,9 @@ class McapFile:
         for what in self._contents.damaged:
             self._damaged(what, {})
         self._refuse_cut(salvage)
+        self.extras = self._contents.extras
+        if self._contents.unnamed:
+            self.notes.append(f"{self._contents.unnamed:,} more attachments and metadata records")
         self._walked: dict[int, Positions] = {}  # chunk.at -> its messages, where there is no index
         self.counts = self._count()
         self.channels = self._channels()
@@ -62,9 +66,11 @@ class McapFile:
         what = f"cut short or damaged at byte {cut.at:,} of {len(self._file):,}: {cut.what}"
         if not salvage:
             raise RecordingError(
-                what, where=str(self.path), remedy="`--salvage` reads up to the last whole record"
+                what, where=str(self.path), remedy="`--salvage` reads what can still be read of it"
             )
         self._damaged(what, {})
+        for lost in resume(self._file, self._contents):
+            self._damaged(lost, {})
         if self._contents.cut_chunk:
             self._contents.chunks.append(self._contents.cut_chunk)
 

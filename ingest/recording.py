@@ -22,7 +22,7 @@ from restock.ingest.decoders import decoder_of, type_of
 from restock.ingest.fields import CannotDecode, Leaf, MessageType
 from restock.ingest.reading import Reduction, TopicReading, together
 from restock.ingest.rows import Decoder
-from restock.ingest.storage import Channel, Damage, Integrity, Storage
+from restock.ingest.storage import Channel, Damage, Extra, Integrity, Storage
 
 
 @dataclass(frozen=True)
@@ -139,6 +139,11 @@ class Recording:
     def damage(self) -> list[Damage]:
         """What of its files could not be read."""
         return self._bag_damage + [item for storage in self._storages for item in storage.damage]
+
+    @property
+    def extras(self) -> list[Extra]:
+        """What its files hold beside messages: attachments and metadata records, by name."""
+        return [extra for storage in self._storages for extra in storage.extras]
 
     @property
     def losses(self) -> list[Loss]:

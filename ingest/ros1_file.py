@@ -16,7 +16,7 @@ from rosbags.rosbag1.reader import Chunk, Header, IndexData, RecordType
 
 from restock.errors import RecordingError
 from restock.ingest.columns import Batch
-from restock.ingest.storage import Channel, Damage, Integrity
+from restock.ingest.storage import Channel, Damage, Extra, Integrity
 
 # A chunk's size is the file's word: what decompresses to more than both is refused.
 PLAUSIBLE_SIZE = 64 << 20
@@ -40,6 +40,7 @@ class Ros1File:
         self.integrity: Integrity = "unverified"
         self.damage: list[Damage] = []
         self.notes: list[str] = []
+        self.extras: list[Extra] = []
         self._reader = _Bag(path)
         try:
             self._reader.open()

@@ -17,7 +17,7 @@ import numpy as np
 from restock.errors import RecordingError
 from restock.ingest.columns import Batch
 from restock.ingest.sqlite_guard import guard, refuse_programs
-from restock.ingest.storage import Channel, Damage, Integrity
+from restock.ingest.storage import Channel, Damage, Extra, Integrity
 
 MAGIC = b"SQLite format 3\x00"
 ROWS_PER_FETCH = 1000
@@ -37,6 +37,7 @@ class SqliteFile:
         self.integrity: Integrity = "unverified"
         self.damage: list[Damage] = []
         self.notes: list[str] = []
+        self.extras: list[Extra] = []
         self._copy: tempfile.TemporaryDirectory[str] | None = None
         self._full_size = self._refuse_short()
         self._connection = self._connect()

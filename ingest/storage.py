@@ -31,12 +31,22 @@ class Damage:
     messages: dict[int, int] = field(default_factory=dict)  # by channel id
 
 
+@dataclass(frozen=True)
+class Extra:
+    """What a file holds beside messages."""
+
+    kind: Literal["attachment", "metadata"]
+    name: str
+    media_type: str
+    size_bytes: int
+
+
 class Storage(Protocol):
     """One open file of messages.
 
     `counts` is what the container itself says it holds, per channel id; `span_ns` the first and
     last log time, or None when it holds no message. `damage` is final once everything asked for
-    has been read. `notes` are worth saying and lose nothing.
+    has been read. `notes` are worth saying and lose nothing. `extras` are not read, but named.
     """
 
     channels: dict[int, Channel]
@@ -44,6 +54,7 @@ class Storage(Protocol):
     span_ns: tuple[int, int] | None
     damage: list[Damage]
     notes: list[str]
+    extras: list[Extra]
 
     @property
     def integrity(self) -> Integrity:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import sqlite3
 from pathlib import Path
@@ -444,31 +443,3 @@ def test_counts_per_topic_of_a_turtlebot() -> None:
         offset_s = (columns["/odom"].log_time_ns - columns["/odom"].fields["header.stamp"]) * 1e-9
         assert np.allclose(offset_s, 1_701_217_691.8, atol=0.5)
         assert np.isinf(columns["/scan"].fields["ranges"].values).any()
-
-
-@needs_shared
-def test_every_conformance_file_gives_the_messages_of_its_json() -> None:
-    files = sorted((SHARED / "mcap-conformance").rglob("*.mcap"))
-    assert len(files) == 416
-    for file in files:
-        wanted = json.loads(file.with_suffix(".json").read_text())["records"]
-        expected = [dict(record["fields"]) for record in wanted if record["type"] == "Message"]
-        with open_recording(file) as recording:
-            assert recording.messages == len(expected), file.name
-            for storage in recording._storages:
-                got = [
-                    (channel, int(log), int(publish), payload)
-                    for channel, batch in storage.batches(list(storage.channels))
-                    for log, publish, payload in zip(
-                        batch.log_time_ns, batch.publish_time_ns, batch.payloads(), strict=True
-                    )
-                ]
-                assert got == [
-                    (
-                        int(fields["channel_id"]),
-                        int(fields["log_time"]),
-                        int(fields["publish_time"]),
-                        bytes(map(int, fields["data"])),
-                    )
-                    for fields in expected
-                ], file.name

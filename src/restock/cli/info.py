@@ -10,6 +10,8 @@ import tyro
 
 from restock.errors import ExitCode, RecordingError
 
+NAMED = 10  # attachments and metadata records that are listed
+
 
 @dataclass
 class Info:
@@ -86,6 +88,14 @@ def _print(entry: dict[str, Any]) -> None:
     )
     sys.stdout.write("  ".join(part for part in about if part) + "\n")
     output.print_table(rows, ["topic", "type", "messages", "rate Hz", ""])
+    for what, names in (
+        ("attachments", [item["name"] for item in entry["attachments"]]),
+        ("metadata records", entry["metadata"]),
+    ):
+        if names:
+            more = f" and {len(names) - NAMED:,} more" if len(names) > NAMED else ""
+            listed = ", ".join(name or "(unnamed)" for name in names[:NAMED])
+            sys.stdout.write(f"{what}, {len(names):,}: {listed}{more}\n")
     sys.stdout.flush()
     for line in entry["damage"]:
         sys.stderr.write(f"{entry['path']}: damaged: {line}\n")
