@@ -18,18 +18,21 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from restock.errors import ConfigError, PanelError
+from restock.errors import ConfigError, MixtureError, PanelError
 from restock.ingest.profile import load_profile
 from restock.replay.panel import Panel
 from restock.train.batches import Batch, Logs
 from restock.train.fresh_meta import FreshMeta
 from restock.train.info_labels import InfoLabels
+from restock.train.log_draws import Drawing, LogDraws
 from restock.train.loss import Loss
 from restock.train.record import FeedRecord
 from restock.train.run import Run, now_ns, software_versions
 from restock.train.run_tables import TABLES
 
 Ints = NDArray[np.int64]
+_NO_ROWS: Ints = np.empty(0, np.int64)
+NO_LOGS = Drawing(_NO_ROWS, _NO_ROWS, None, np.empty(0))
 _TOLD = (
     *("episode_seed", "perturbation", "block", "success", "bumps"),
 )  # of an episode that ended, by the infos of its last step
@@ -89,11 +92,9 @@ class MixedFeed:
     ) -> None:
         known = load_profile(profile)
         self.panel = Panel.open(panel) if isinstance(panel, str | Path) else panel
-        if logs_share is None:
-            logs_share = self.panel.header.logs_share if self.panel is not None else 0.0
-        if not 0 <= logs_share <= 1:
+        if logs_share is not None and not 0 <= logs_share <= 1:
             raise ConfigError(f"logs_share must be in [0, 1], got {logs_share:g}")
-        self.logs_share = logs_share if self.panel is not None else 0.0
+        self.logs_share = logs_share
         if self.panel is not None:
             _check(self.panel, known.task.hash, profile, observation_size)
         self.logs = Logs.of_panel(self.panel) if self.panel is not None else None
@@ -102,7 +103,7 @@ class MixedFeed:
         self.labels = InfoLabels(known.conditions, num_envs)
         self.num_envs, self.library = num_envs, library
         self.env_steps = self.batches = self.invalid_steps = 0
-        self._samplers: dict[int, Any] = {}
+        self._draws: LogDraws | None = None
         self._phase = "offline"
         self._open = 0  # batches since the last rows were written
         self._episodes: dict[int, dict[str, Any]] = {}
@@ -165,25 +166,50 @@ class MixedFeed:
 
     # -- batches --------------------------------------------------------------------------------
 
-    def draw_logs(self, batch_size: int) -> tuple[Ints, Ints]:
-        """Rows of the panel (L,) and their strata (L,), by its quotas; all where nothing is fresh.
+    def draw_logs(self, batch_size: int) -> Drawing:
+        """The logged rows (L,) of a batch, by the mixture; all of it where nothing is fresh.
 
-        L is the share of logs in a batch of that size.
+        Raises:
+            MixtureError: nothing is fresh, and the panel's rows were drawn as often as they may be.
         """
-        count = round(batch_size * self.logs_share) if len(self.fresh) else batch_size
-        if self.panel is None or not count:
-            return np.empty(0, np.int64), np.empty(0, np.int64)
-        if count not in self._samplers:
-            rng = np.random.default_rng([self.seed, 3, count])
-            self._samplers[count] = self.panel.sampler(count, rng)
-        rows, strata = self._samplers[count].draw()
-        return rows, strata
+        if self.logs is None:
+            return NO_LOGS
+        if self._draws is None:
+            self._draws = LogDraws(self.logs, self.logs_share, batch_size, self.seed)
+        count = batch_size
+        if len(self.fresh):
+            self._draws.move_to(self.env_steps)
+            count = round(batch_size * self._draws.diet.logs_share)
+        drawing = self._draws.draw(count) if count else NO_LOGS
+        if not len(self.fresh) and len(drawing.rows) < batch_size:
+            raise MixtureError(
+                f"every row of the panel was drawn {self._draws.diet.max_replays} times",
+                remedy="collect steps, or mix with more draws a row",
+            )
+        return drawing
+
+    def sample_fresh(self, slots: Ints, count: int) -> Ints:
+        """`count` of the filled `slots` (n,), alike; only those that the mixture deems young.
+
+        Raises:
+            MixtureError: there is none.
+        """
+        if not count:
+            return _NO_ROWS
+        most = self.panel.header.mixture.max_age_env_steps if self.panel is not None else None
+        if most is not None:
+            slots = slots[self.fresh.meta["env_step"][slots] >= self.env_steps - most]
+        if not len(slots):
+            raise MixtureError(
+                "there is no fresh row to draw" + (f" younger than {most} steps" if most else ""),
+                remedy="collect steps before learning",
+            )
+        return slots[self.rng.integers(len(slots), size=count)]
 
     def drawn(
         self,
         packed: NDArray[np.float32],
-        log_rows: Ints,
-        log_stratum: Ints,
+        drawing: Drawing,
         slots: Ints,
         *,
         weight: NDArray[np.float32] | None = None,
@@ -192,8 +218,12 @@ class MixedFeed:
     ) -> None:
         """The batch of one update, logs first: packed rows (B, W), and what is known of them.
 
-        `weight`, `td` (Q - target) and `q` (B,); unknown ones are null in the tables.
+        `weight` as applied, `td` (Q - target) and `q` (B,); unknown ones are null in the tables.
+        Priorities and adaptive shares follow `td` where it is known.
         """
+        if td is not None and self._draws is not None and self._draws.listens:
+            count = len(drawing.rows)
+            self._draws.update(drawing.rows, drawing.strata, np.abs(td[:count]))
         phase = "online" if len(slots) else "offline"
         if phase != self._phase:
             self.flush()  # an interval is of one phase
@@ -205,9 +235,10 @@ class MixedFeed:
         batch = Batch(
             rows=torch.from_numpy(packed),
             weight=None if weight is None else torch.from_numpy(weight),
-            log_rows=log_rows,
-            log_stratum=log_stratum,
+            log_rows=drawing.rows,
+            log_stratum=drawing.strata,
             slots=slots,
+            quota=drawing.quota,
         )
         loss = Loss(
             value=torch.zeros(()),

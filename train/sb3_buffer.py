@@ -32,7 +32,7 @@ from restock.errors import MixtureError
 from restock.replay.panel import Panel
 from restock.replay.ring import FreshRing
 from restock.replay.store import Store
-from restock.train.mixed_feed import Ints, MixedFeed
+from restock.train.mixed_feed import MixedFeed
 
 Critic = Callable[[ReplayBufferSamples], tuple[torch.Tensor, torch.Tensor]]
 SB3 = "stable-baselines3"
@@ -91,13 +91,12 @@ class MixtureReplayBuffer(ReplayBuffer):
         self.buffer_size = max(buffer_size, n_envs * n_step)
         size = int(np.prod(self.obs_shape))
         panel = Panel.open(panel) if isinstance(panel, str | Path) else panel
-        if panel is not None and not ignore_weights and not np.all(panel.weights == 1):
+        if panel is not None and not ignore_weights and weighted(panel):
             raise MixtureError(
-                f"its rows have importance weights up to {panel.weights.max():.3g}, and"
-                " Stable-Baselines3's losses take none",
+                "its rows have importance weights, and Stable-Baselines3's losses take none",
                 where=str(panel.path),
-                remedy='mix with `correction = {pre = "none", post = "none"}`, or say'
-                " ignore_weights=True",
+                remedy='mix with `correction = {pre = "none", post = "none"}` and without'
+                ' `within = "per"`, or say ignore_weights=True',
             )
         if discount is None:
             discount = panel.discount if panel is not None else 0.99
@@ -217,20 +216,19 @@ class MixtureReplayBuffer(ReplayBuffer):
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """A batch: logs first, then fresh rows."""
         feed, ring = self.feed, self.ring
-        log_rows, log_stratum = feed.draw_logs(batch_size)
-        fresh = batch_size - len(log_rows)
-        slots: Ints = ring.sample(fresh, feed.rng) if fresh else np.empty(0, np.int64)
+        drawing = feed.draw_logs(batch_size)
+        slots = feed.sample_fresh(np.arange(len(ring)), batch_size - len(drawing.rows))
         parts, actions = [ring.rows[slots]], [self._fresh_actions[slots]]
         if feed.panel is not None and self._log_actions is not None:
-            parts.insert(0, feed.panel.rows[log_rows])
-            actions.insert(0, self._log_actions[log_rows])
+            parts.insert(0, feed.panel.rows[drawing.rows])
+            actions.insert(0, self._log_actions[drawing.rows])
         packed, action = np.concatenate(parts), np.concatenate(actions)
         samples = self._samples(packed, action, env)
         td = q = None
         if self.critic is not None:
             with torch.no_grad():
                 q, td = (part.float().cpu().numpy().ravel() for part in self.critic(samples))
-        feed.drawn(packed, log_rows, log_stratum, slots, td=td, q=q)
+        feed.drawn(packed, drawing, slots, td=td, q=q)
         return samples
 
     def _samples(
@@ -256,6 +254,12 @@ class MixtureReplayBuffer(ReplayBuffer):
     def close(self) -> None:
         """Write what the record still holds; the run is whole after it."""
         self.feed.flush()
+
+
+def weighted(panel: Panel) -> bool:
+    """Whether batches of a panel are to be weighted: by corrections, or by PER within a stratum."""
+    by_rule = any(stratum.within == "per" for stratum in panel.strata)
+    return by_rule or any(stratum.correction != "none" for stratum in panel.strata)
 
 
 def dqn_critic(model: Any) -> Critic:

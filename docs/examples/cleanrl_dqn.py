@@ -1,0 +1,128 @@
+"""DQN in one file, in the style of CleanRL's `dqn.py`, on the native vector environment.
+
+    python docs/examples/cleanrl_dqn.py --steps 100000
+
+Reference: V. Mnih et al., Human-level control through deep reinforcement learning (2015).
+"""
+
+import argparse
+import json
+
+import gymnasium as gym
+import numpy as np
+import torch
+from torch import nn, optim
+from torch.nn import functional as F
+
+import restock  # noqa: F401 - registers restock/Warehouse-v0
+
+
+class QNetwork(nn.Module):
+    def __init__(self, observation_size: int, actions: int) -> None:
+        super().__init__()
+        self.network = nn.Sequential(
+            nn.Linear(observation_size, 120),
+            nn.ReLU(),
+            nn.Linear(120, 84),
+            nn.ReLU(),
+            nn.Linear(84, actions),
+        )
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.network(x)
+
+
+def linear_schedule(start: float, end: float, duration: float, t: int) -> float:
+    return max((end - start) / duration * t + start, end)
+
+
+def main(
+    steps: int = 100_000,
+    num_envs: int = 16,
+    buffer_size: int = 100_000,
+    gamma: float = 0.97,
+    target_network_frequency: int = 500,
+    batch_size: int = 128,
+    learning_starts: int = 1000,
+    train_frequency: int = 4,
+    seed: int = 0,
+) -> dict:
+    rng = np.random.default_rng(seed)
+    torch.manual_seed(seed)
+    learning_starts = min(learning_starts, steps // 4)
+
+    envs = gym.make_vec(
+        "restock/Warehouse-v0", num_envs=num_envs, vectorization_mode="vector_entry_point"
+    )
+    size = envs.single_observation_space.shape[0]
+    q_network = QNetwork(size, envs.single_action_space.n)
+    target_network = QNetwork(size, envs.single_action_space.n)
+    target_network.load_state_dict(q_network.state_dict())
+    optimizer = optim.Adam(q_network.parameters(), lr=2.5e-4)
+
+    buffer = {
+        "obs": np.zeros((buffer_size, size), np.float32),
+        "next_obs": np.zeros((buffer_size, size), np.float32),
+        "action": np.zeros(buffer_size, np.int64),
+        "reward": np.zeros(buffer_size, np.float32),
+        "terminated": np.zeros(buffer_size, np.float32),
+    }
+    filled = updates = 0
+    returns, running = [], np.zeros(num_envs)
+
+    obs, _ = envs.reset(seed=seed)
+    for step in range(0, steps, num_envs):
+        # ALGO LOGIC: epsilon-greedy actions
+        epsilon = linear_schedule(1.0, 0.05, 0.5 * steps, step)
+        with torch.no_grad():
+            actions = q_network(torch.as_tensor(obs)).argmax(dim=1).numpy()
+        explore = rng.random(num_envs) < epsilon
+        actions[explore] = rng.integers(envs.single_action_space.n, size=explore.sum())
+
+        # TRY NOT TO MODIFY: execute the game and log data
+        next_obs, reward, terminated, truncated, info = envs.step(actions)
+        running += reward
+        done = terminated | truncated
+        returns += running[done].tolist()
+        running[done] = 0.0
+
+        # The environments reset in the same step: the last observation is in `final_obs`.
+        last_obs = next_obs.copy()
+        if done.any():
+            last_obs[done] = info["final_obs"][done]
+        for place in np.flatnonzero(~info["invalid"]):  # a blown-up step is no experience
+            row = filled % buffer_size
+            buffer["obs"][row], buffer["next_obs"][row] = obs[place], last_obs[place]
+            buffer["action"][row], buffer["reward"][row] = actions[place], reward[place]
+            buffer["terminated"][row] = terminated[place]  # truncated ones bootstrap
+            filled += 1
+        obs = next_obs
+
+        # ALGO LOGIC: training
+        if step >= learning_starts:
+            for _ in range(max(1, num_envs // train_frequency)):
+                rows = rng.integers(min(filled, buffer_size), size=batch_size)
+                data = {name: torch.as_tensor(array[rows]) for name, array in buffer.items()}
+                with torch.no_grad():
+                    target_max = target_network(data["next_obs"]).amax(dim=1)
+                    td_target = data["reward"] + gamma * target_max * (1 - data["terminated"])
+                old_value = q_network(data["obs"]).gather(1, data["action"][:, None])[:, 0]
+                loss = F.mse_loss(td_target, old_value)
+                optimizer.zero_grad()
+                loss.backward()
+                optimizer.step()
+                updates += 1
+                if updates % target_network_frequency == 0:
+                    target_network.load_state_dict(q_network.state_dict())
+    return {
+        "env_steps": step + num_envs,
+        "updates": updates,
+        "episodes": len(returns),
+        "loss": loss.item(),
+    }
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--steps", type=int, default=100_000)
+    print(json.dumps(main(parser.parse_args().steps)))  # noqa: T201
