@@ -98,6 +98,7 @@ def make_run(
         ({"gap": {"blocked_aisle": 6.0}}, "BUFFER"),
         ({"shares": {n: s for n, s in SHARES.items() if n != "blocked_aisle"}}, "BUFFER"),
         ({"lag": 0.9}, "TARGET"),
+        ({"lag": 0.0}, "TARGET"),  # no target network at all
         ({"clock": 8.0}, "TARGET"),
         ({"gap": 7.0}, "TARGET"),
         ({"lag": 0.9, "gap": {"blocked_aisle": 6.0}}, "BOTH"),

@@ -38,12 +38,13 @@ class Limits:
 
     gap: float = 2.0  # G_k of a condition; O_k where replay has none of it
     relative: float = 2.0  # and G_k over the median G
-    gap_median: float = 1.5  # below which the median G must be, for a buffer failure
-    gap_everywhere: float = 2.0  # the median G: everything is worse held out
-    lag: float = 0.25  # L
+    gap_median: float = 3.0  # below which the median G must be, for a buffer failure
+    gap_everywhere: float = 6.0  # the median G: everything is worse held out
+    lag: float = 0.25  # L: the target is far behind
+    no_lag: float = 0.002  # L below this: there is no target network to speak of
     clock: float = 2.0  # S
     absent_share: float = 0.001  # of replay: less of a condition is none
-    quota_met: float = 0.5
+    quota_met: float = 0.5  # a smaller part of a quota is worth saying beside a gap
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ class Window:
                     f"held-out |TD| is {symptom.outlier:.1f} times the median condition's, and"
                     " replay has none of it"
                 )
-            if symptom.quota_met is not None and symptom.quota_met < limits.quota_met:
+            if said and symptom.quota_met is not None and symptom.quota_met < limits.quota_met:
                 said.append(f"got {symptom.quota_met:.0%} of its quota")
             if said:
                 found[symptom.condition] = said
@@ -103,7 +104,7 @@ class Window:
         if not np.isfinite(self.q_abs_max) or self.q_abs_max > self.q_bound:
             return "DIVERGENCE"
         bad = self.bad(limits)
-        clocks = self.lag >= limits.lag or self.clock >= limits.clock
+        clocks = not limits.no_lag <= self.lag < limits.lag or self.clock >= limits.clock
         target = clocks or self.gap_median >= limits.gap_everywhere
         buffer = 0 < len(bad) <= len(self.symptoms) / 2 and self.gap_median < limits.gap_median
         if target and buffer:
