@@ -50,6 +50,10 @@ class StoreWriter:
     def __init__(self, path: str | Path | Location) -> None:
         self.path = Location.of(path)
 
+    def reach(self) -> None:
+        """See that the place can be reached. Raises StoreError where it cannot."""
+        self.path.has_table(TRANSITIONS)
+
     def live(self, recording_id: str | None = None) -> pa.Table:
         """The manifest rows whose transitions are in the store (of one recording, or of all)."""
         empty = recording_schema().empty_table()

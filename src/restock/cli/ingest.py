@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -30,8 +30,9 @@ class Ingest:
 
     paths: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     """Recordings, folders of recordings, or globs."""
-    store: Path | None = None
-    """The store's folder; made where there is none. Needed unless --dry-run."""
+    store: Annotated[str | None, tyro.conf.arg(metavar="STORE")] = None
+    """The store's folder, or s3://bucket/prefix; made where there is none. Needed unless
+    --dry-run."""
     profile: str = "warehouse_amr"
     """How topics become signals: a profile that comes with Restock, or a TOML file."""
     dry_run: bool = False
@@ -44,6 +45,9 @@ class Ingest:
     """Distribution whose message definitions serve recordings without their own (humble)."""
     workers: int = 1
     """Processes that read recordings at the same time."""
+    engine: Literal["processes", "ray"] = "processes"
+    """Where they run: on this machine, or recording by recording on the cluster of RAY_ADDRESS
+    (without one, a Ray that is started here). Ray is an extra: pip install 'restock[ray]'."""
     json: bool = False
     """Print one JSON document: {"recordings": [{"path", "status", "transitions", …}]}."""
 
@@ -62,12 +66,14 @@ class Ingest:
             raise ConfigError(f"--workers must be 1 or more, got {self.workers}")
         profile = load_profile(self.profile)
         store = None if self.dry_run else self.store
+        if store is not None:
+            StoreWriter(store).reach()  # or say now why not, and not once a recording
         job = Job(profile, store, self.force, self.salvage, self.typestore)
         paths, failures = self._recordings()
         outcomes: list[dict[str, Any]] = []
         lossy = False
         with output.progress("ingest", len(paths)) as advance:
-            for path, result in ingest_all(paths, job, workers=self.workers):
+            for path, result in ingest_all(paths, job, workers=self.workers, engine=self.engine):
                 advance(1, path.name)
                 if isinstance(result, RestockError):
                     failures.append({"path": str(path), "status": "failed", "error": str(result)})

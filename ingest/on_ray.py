@@ -1,0 +1,98 @@
+"""Recordings on a Ray cluster, one task each. Needs the extra: `pip install 'restock[ray]'`.
+
+The cluster is that of RAY_ADDRESS, or one that is started on this machine and stopped again. Its
+machines must have Restock installed, and see recordings and store by the same paths: a shared file
+system, or a store on S3.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from restock.errors import ConfigError, RecordingError
+from restock.ingest.batch import AGAIN, Result, out_of_memory
+
+if TYPE_CHECKING:
+    from restock.ingest.batch import Job
+
+ENVIRONMENT = "AWS_"  # what the tasks are given of this process's environment
+
+
+def run_on_ray(job: Job, paths: Sequence[Path], *, workers: int = 1) -> Iterator[Result]:
+    """Each recording's outcome or error, in the order of `paths`.
+
+    Raises:
+        ConfigError: Ray is not installed, or the cluster does not answer.
+    """
+    with _cluster(workers) as ray:
+        # A task that died may have committed: it is not tried again unasked.
+        task = ray.remote(_task).options(num_cpus=1, max_retries=0)
+        aws = {name: value for name, value in os.environ.items() if name.startswith(ENVIRONMENT)}
+        results = [task.remote(job, path, str(Path.cwd()), aws) for path in paths]
+        for path, result in zip(paths, results, strict=True):
+            try:
+                yield ray.get(result)
+            except ray.exceptions.OutOfMemoryError:
+                yield path, out_of_memory(path)
+            except ray.exceptions.RayError as error:
+                yield (
+                    path,
+                    RecordingError(
+                        f"the process that read it died ({type(error).__name__})",
+                        where=str(path),
+                        remedy=AGAIN,
+                    ),
+                )
+
+
+@contextmanager
+def _cluster(workers: int) -> Iterator[Any]:
+    """Ray, with a cluster to give tasks to."""
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # or Ray warns of it
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # reports to nobody unasked
+    try:
+        import ray
+    except ImportError as error:
+        raise ConfigError(
+            "--engine ray needs Ray, which is not installed",
+            remedy="pip install 'restock[ray]'",
+        ) from error
+    if ray.is_initialized():  # by whoever calls from Python
+        yield ray
+        return
+    address = os.environ.get("RAY_ADDRESS")
+    quiet: dict[str, Any] = {"logging_level": "error", "log_to_driver": False}
+    try:
+        if address:
+            ray.init(address=address, **quiet)
+        else:
+            ray.init(address="local", num_cpus=max(workers, 1), include_dashboard=False, **quiet)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        raise ConfigError(
+            f"no Ray cluster at {address}: {str(error).splitlines()[0]}"
+            if address
+            else f"Ray does not start: {str(error).splitlines()[0]}",
+            remedy="check RAY_ADDRESS, or unset it to start one here" if address else None,
+        ) from error
+    try:
+        yield ray
+    finally:
+        ray.shutdown()
+
+
+def _task(job: Job, path: Path, folder: str, environment: dict[str, str]) -> Result:
+    """One recording, on whatever machine."""
+    os.environ.update(environment)
+    try:
+        os.chdir(folder)
+    except OSError:
+        return path, RecordingError(
+            f"the machine that was to read it has no folder {folder}",
+            where=str(path),
+            remedy="put the recordings where every machine of the cluster sees them",
+        )
+    return job.run(path)
