@@ -43,7 +43,8 @@ class Plan:
     beside: dict[str, NDArray[Any]]  # (n,) each: what new shares need for new weights
     held_out: Bools  # (N,)
     strata: tuple[StratumPlan, ...]
-    logs_share: float  # of a batch, at environment step 0: all stores together
+    logs_share: float  # of a batch, all stores together; the mean over a schedule
+    logs_share_wanted: float  # the same, had all strata rows enough
     left_out: dict[str, int]  # rows not in the panel, by reason
     effective_rows: float  # rows drawn equally often that the weighted draw is worth
     newest_ns: int  # when the newest row was logged
@@ -190,6 +191,7 @@ def _joined(
         held_out=held_out,
         strata=tuple(lines),
         logs_share=float(filled.sum()),
+        logs_share_wanted=sum(source.part for source in given),
         left_out=left_out,
         effective_rows=effective_count(drawn * weight[chosen]),
         newest_ns=int(table["logged_ns"].to_numpy().max()),

@@ -88,7 +88,8 @@ def within_limits(
     roof = np.maximum(granted, np.minimum(limit, caps))
     scale = min(float(roof.sum()), 1.0)
     if scale < 1.0 - 1e-9:  # every stratum is at its limit: what is left cannot come from the logs
-        return SharePlan(wanted, roof / scale, limit, scale, ("short of rows",) * len(wanted))
+        notes = np.where(short, "short of rows", np.where(roof > 0, "gives all it can", ""))
+        return SharePlan(wanted, roof / scale, limit, scale, tuple(notes.tolist()))
     got = scaled_within(granted, granted, roof)
     more = (got > granted + 1e-9) & ~short
     return SharePlan(

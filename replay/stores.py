@@ -61,9 +61,11 @@ def all_stores(first: Store, mixture: Mixture, folder: Path | None = None) -> It
 
 
 def _open(wanted: OtherStore, folder: Path | None) -> Store:
-    path = Path(wanted.path).expanduser()
-    if not path.is_absolute() and folder is not None:
-        path = folder / path
+    path: str | Path = wanted.path
+    if "://" not in wanted.path:
+        path = Path(wanted.path).expanduser()
+        if not path.is_absolute() and folder is not None:
+            path = folder / path
     try:
         return Store(path, version=wanted.version)
     except StoreError as error:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import msgspec
 import tyro
 
 from restock.errors import MixtureError
 
 if TYPE_CHECKING:
     from restock.replay.plan import Plan
+
+_WIDE = 110  # columns of a terminal from which on the table says more
 
 
 @dataclass
@@ -24,7 +28,7 @@ class Mix:
     panel never changes; its id names the store version, the mixture, the task and the rows.
     """
 
-    store: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
+    store: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")] = None
     """The store to take transitions from."""
     mixture: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "coverage"
     """A TOML file, or a shipped mixture: coverage or uniform. See docs/mixture.md."""
@@ -36,6 +40,8 @@ class Mix:
     """Replace a panel that is already there."""
     version: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Version of the store to take (the newest)."""
+    schema: bool = False
+    """Print the JSON Schema of mixture files, for editors, and nothing else."""
     json: bool = False
     """Print the plan as one JSON document."""
 
@@ -44,9 +50,15 @@ class Mix:
         from restock.cli import output
         from restock.replay.build import open_source, write_panel
         from restock.replay.mixture import load_mixture
+        from restock.replay.mixture_schema import shipped_schema
         from restock.replay.plan import plan_panel
         from restock.replay.store import Store
 
+        if self.schema:
+            sys.stdout.write(shipped_schema())
+            return
+        if self.store is None:
+            raise MixtureError("no STORE given", remedy="name the store to take transitions from")
         if self.out is None and not self.dry_run:
             raise MixtureError("no --out given", remedy="say where the panel goes, or --dry-run")
         mixture = load_mixture(self.mixture)
@@ -66,9 +78,13 @@ class Mix:
         if self.json:
             output.print_json(document)
             return
-        output.print_table(document["strata"], title=f"{self.mixture}: the logs' part of a batch")
+        wide = output.stdout().width >= _WIDE
+        output.print_table(
+            _table(document["strata"], wide=wide),
+            title=f"{self.mixture}: the logs' part of a batch",
+        )
         for line in _summary(document):
-            output.stdout().print(line)
+            output.stdout().print(line, markup=False, soft_wrap=not sys.stdout.isatty())
 
 
 def describe(plan: Plan) -> dict[str, Any]:
@@ -78,21 +94,97 @@ def describe(plan: Plan) -> dict[str, Any]:
         "rows": len(plan.panel_rows),
         "left_out": plan.left_out,
         "logs_share": plan.logs_share,
+        "logs_share_wanted": plan.logs_share_wanted,
         "effective_rows": plan.effective_rows,
+        "largest_weight": float(plan.weight.max(initial=0.0)),
+        "density_ratios": [asdict(fit) for fit in plan.ratios],
+        "other_stores": [msgspec.structs.asdict(store) for store in plan.others],
+        "planned_draws": plan.mixture.planned.updates * plan.mixture.planned.batch_size,
+        "max_replays_per_row": plan.mixture.max_replays_per_row,
+        "schedules": {
+            name: msgspec.to_builtins(part)
+            for name, part in plan.mixture.sources.parts.items()
+            if not isinstance(part, int | float)
+        },
+        "adaptive": None
+        if plan.mixture.adaptive is None
+        else msgspec.structs.asdict(plan.mixture.adaptive),
         "task_hash": plan.task_hash,
         "n_step": plan.mixture.n_step,
         "discount": plan.mixture.discount,
     }
 
 
+def _table(strata: list[dict[str, Any]], *, wide: bool) -> list[dict[str, Any]]:
+    """What fits beside each other: shares in percent; more of it where there is room."""
+    rows = []
+    for line in strata:
+        row = {"stratum": line["stratum"], "rows\nthere": line["rows"]}
+        if wide:
+            row |= {"episodes": line["episodes"], "% of\nrows": _percent(line["natural_share"])}
+        row |= {
+            "%\nwanted": _percent(line["wanted_share"]),
+            "%\ngot": _percent(line["share"]),
+            "replays\na row": line["replays_per_row"],
+            "effective\nrows": round(line["effective_rows"]),
+        }
+        if wide:
+            row |= {
+                "largest\nweight": line["largest_weight"],
+                "weights": f"{line['correction']} ({line['timing']})",
+            }
+        rows.append(row | {"% after\nweights": _percent(line["effective_share"])})
+    return rows
+
+
+def _percent(share: float) -> float:
+    return round(100 * share, 2)
+
+
 def _summary(document: dict[str, Any]) -> list[str]:
-    left_out = ", ".join(f"{count:,} {reason}" for reason, count in document["left_out"].items())
     lines = [
-        f"{document['rows']:,} rows of store version {document['store_version']}; not in the panel:"
-        f" {left_out or 'none'}",
-        f"{document['logs_share']:.1%} of a batch from the logs, which after shares and weights are"
-        f" worth {document['effective_rows']:,.0f} rows drawn equally often",
+        f"{line['stratum']}: {line['note']} ({line['wanted_share']:.1%} wanted,"
+        f" {line['share']:.1%} got)"
+        for line in document["strata"]
+        if line["note"]
     ]
+    if document["logs_share"] < document["logs_share_wanted"] - 1e-9:
+        lines.append(
+            f"logs get {document['logs_share']:.1%} of a batch, not"
+            f" {document['logs_share_wanted']:.1%}: their rows can bear no more"
+        )
+    for fit in document["density_ratios"]:
+        lines.append(
+            f"density ratio of {', '.join(fit['strata'])} ({fit['source']}): fitted on"
+            f" {fit['rows']:,} rows, log loss {fit['log_loss']:.3f} against"
+            f" {fit['base_log_loss']:.3f} of knowing nothing"
+        )
+    others = "".join(
+        f", and of {store['name']} ({store['path']}) version {store['version']}"
+        for store in document["other_stores"]
+    )
+    left_out = ", ".join(f"{count:,} {reason}" for reason, count in document["left_out"].items())
+    draws = f"replays a row are over the {document['planned_draws']:,} draws of [planned]"
+    if document["max_replays_per_row"] is not None:
+        draws += f" (limit {document['max_replays_per_row']:g}); a run reckons with its own"
+    moving = " on average" if document["schedules"] else ""
+    lines += [
+        draws,
+        f"{document['rows']:,} rows of store version {document['store_version']}{others};"
+        f" not in the panel: {left_out or 'none'}",
+        f"{document['logs_share']:.1%} of a batch{moving} from the logs, worth"
+        f" {document['effective_rows']:,.0f} rows drawn equally often; largest weight"
+        f" {document['largest_weight']:.3g}",
+    ]
+    rules = dict.fromkeys(line["within"] for line in document["strata"])
+    of_rule = {
+        rule: [line["stratum"] for line in document["strata"] if line["within"] == rule]
+        for rule in rules
+    }
+    drawn = [rule if len(rules) == 1 else f"{rule} ({', '.join(of_rule[rule])})" for rule in rules]
+    lines.append(f"within a stratum: {'; '.join(drawn)}")
+    if document["adaptive"] is not None:
+        lines.append("shares follow the TD error while training: [adaptive]")
     if "id" in document:
         lines.append(f"panel {document['id']} -> {document['panel']}")
     else:
