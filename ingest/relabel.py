@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from restock.errors import StoreError
+from restock.errors import ConfigError, StoreError
 from restock.ingest.conditions import NOMINAL, Condition, label, labels_version, primary
 from restock.ingest.episode_rows import episode_ends
 from restock.ingest.manifest import conditions_json, score_rows
-from restock.ingest.schema import SIGNAL_COLUMNS, recording_schema
+from restock.ingest.schema import recording_schema
 from restock.ingest.scores import LabelScore, score
 from restock.ingest.store import StoreWriter
 
@@ -52,7 +52,7 @@ def relabel(
 
     Raises:
         StoreError: rows were written before their episodes' ends were kept, or changed meanwhile.
-        ConfigError: a condition's SQL does not run.
+        ConfigError: a condition's SQL does not run over the signals that are stored.
     """
     outcomes: list[Relabelled] = []
     stale: list[dict[str, Any]] = []
@@ -89,9 +89,17 @@ def _one(
             where=str(store.path),
             remedy="ingest the recording again",
         )
-    seen = ["episode_index", "step_index", *(column.name for column in SIGNAL_COLUMNS)]
-    steps = pa.concat_tables([rows.select(seen), ends.select(seen).cast(rows.select(seen).schema)])
-    labels = {name: holds[: len(rows)] for name, holds in label(steps, conditions).items()}
+    seen = rows.select(ends.column_names)  # the signals, and the profile's own
+    try:
+        found = label(pa.concat_tables([seen, ends.cast(seen.schema)]), conditions)
+    except ConfigError as error:
+        raise ConfigError(
+            f"{error.where}: {error.what}",
+            where=f"the rows of {row['source_file']}",
+            remedy=f"they hold {', '.join(ends.column_names)}; for signals that are new in the"
+            " profile ingest the recordings again",
+        ) from error
+    labels = {name: holds[: len(rows)] for name, holds in found.items()}
     named = primary(labels, conditions) or [NOMINAL] * len(rows)
     was = rows["condition"].to_pylist()
     version = labels_version(conditions)
