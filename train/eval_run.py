@@ -73,12 +73,13 @@ def plan_evaluation(
         ("--policies", policies, list(POLICIES)),
         ("--perturbations", perturbations, known),
     ):
-        unknown = [name for name in asked if name not in there]
+        unknown = [name for name in asked if name not in there and not _is_path(flag, name)]
         if unknown or not asked:
             raise ConfigError(
                 f"there is no {', '.join(map(repr, unknown))}" if unknown else "names nothing",
                 where=flag,
-                remedy=f"choose from {', '.join(there)}",
+                remedy=f"choose from {', '.join(there)}"
+                + (", onnx:FILE, run:DIRECTORY" if flag == "--policies" else ""),
             )
     if episodes < 1:
         raise ConfigError(f"must be at least 1, got {episodes}", where="--episodes")
@@ -88,7 +89,7 @@ def plan_evaluation(
             where=str(path),
             remedy=f"go on with `restock train --resume {path}`",
         )
-    return Plan(
+    plan = Plan(
         run,
         config,
         tuple(dict.fromkeys(policies)),
@@ -96,6 +97,14 @@ def plan_evaluation(
         episodes,
         first_seed,
     )
+    for name in plan.policies:
+        if _is_path("--policies", name):
+            make_policy(name, plan)  # what is wrong with it is said before anything is driven
+    return plan
+
+
+def _is_path(flag: str, name: str) -> bool:
+    return flag == "--policies" and name.startswith(("onnx:", "run:"))
 
 
 def evaluate(plan: Plan, progress: Callable[[int], None] | None = None) -> Results:
@@ -136,8 +145,15 @@ def make_policy(name: str, plan: Plan) -> Policy:
     """The run's kept policy, or a scripted one."""
     from restock.train.policies import PlannerFollower, RandomPolicy
 
+    kind, _, path = name.partition(":")
     if name == "agent":
         return load_agent(plan.run)
+    if kind == "run":
+        return load_agent(Run.open(Path(path)))
+    if kind == "onnx":
+        from restock.train.onnx_policy import OnnxPolicy
+
+        return OnnxPolicy(Path(path), load_profile(plan.config.profile).task)
     if name == "planner":
         return PlannerFollower(epsilon=0.0, seed=plan.first_seed)
     return RandomPolicy(seed=plan.first_seed)

@@ -27,7 +27,7 @@ class Eval:
     perturbations: str = "none,friction,latency"
     """Comma-separated: none, friction, latency, payload, wheels, sensors."""
     policies: str = "agent,planner,random"
-    """Comma-separated: agent (the run's best), planner, random."""
+    """Comma-separated: agent (the run's best), planner, random, onnx:FILE, run:DIRECTORY."""
     seed: int = 10_000
     """Seed of the first episode; the same seeds for every policy."""
     dry_run: bool = False

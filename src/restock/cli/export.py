@@ -11,18 +11,19 @@ import tyro
 
 @dataclass
 class Export:
-    """Transitions as another library's data set: Minari, d3rlpy, LeRobot, Parquet or NumPy.
+    """Transitions as another library's data set, or a run's policy as an ONNX file.
 
     Takes a panel, or the rows of a query to a store, and puts them back together into episodes:
     in order, with how each ended and the observation after its last step. Where a query leaves
     rows out, an episode becomes several, cut where rows are missing. The data set says where it is
-    from: store version, query or panel, task, counts. See docs/neighbours.md.
+    from: store version, query or panel, task, counts. See docs/neighbours.md. The policy is the one
+    that a run kept as its best, with the task in the file's metadata. See docs/deploy.md.
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
-    """A store or a panel."""
-    to: Literal["minari", "d3rlpy", "lerobot", "parquet", "npz"]
-    """The format: minari and lerobot are directories, d3rlpy (.h5), parquet and npz files."""
+    """A store or a panel; for onnx a run."""
+    to: Literal["minari", "d3rlpy", "lerobot", "parquet", "npz", "onnx"]
+    """The format: minari and lerobot are directories, d3rlpy (.h5), the others files."""
     out: Annotated[Path, tyro.conf.arg(metavar="OUT")]
     """The file or directory to write, which must not exist yet."""
     query: Annotated[str | None, tyro.conf.arg(metavar="SQL")] = None
@@ -37,6 +38,19 @@ class Export:
     def run(self) -> None:
         """Write the data set and say what is in it."""
         from restock.cli import output
+
+        if self.to == "onnx":
+            from restock.train.onnx_policy import export_onnx
+
+            made = export_onnx(self.source, self.out)
+            if self.json:
+                output.print_json(made)
+            else:
+                output.stdout().print(
+                    f"policy {made['version']} of task {made['task_hash']} -> {made['path']}"
+                    f" ({made['bytes']:,} bytes)"
+                )
+            return
         from restock.replay.export_dataset import export_dataset
 
         with output.progress(f"writing {self.to}", None) as advance:
