@@ -137,7 +137,7 @@ def write_panel(
     """
     out = Path(out)
     _check_free(out, force)
-    with _building(out) as partial:
+    with _building(out) as partial, _enough_memory():
         scratch = partial / "scratch"
         scratch.mkdir()
         task_json = source.task_json(plan.task_hash)
@@ -159,6 +159,20 @@ def write_panel(
             _finish(partial / name)
         _put(partial, out, force)
     return Panel.open(out)
+
+
+@contextmanager
+def _enough_memory() -> Iterator[None]:
+    """What DuckDB, or Arrow for it, says when it has too little. Raises PanelError."""
+    try:
+        yield
+    except (duckdb.OutOfMemoryException, OSError) as error:
+        if isinstance(error, OSError) and "Out of Memory" not in str(error):
+            raise
+        raise PanelError(
+            f"DuckDB may hold too little in memory: {str(error).splitlines()[0]}",
+            remedy="give it more with `restock mix --memory-limit`, or Store(memory_limit=…)",
+        ) from error
 
 
 def _address(store: Store) -> str:

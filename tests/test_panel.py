@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -12,11 +13,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from conftest import TASK, recording_transitions, write_store
+from conftest import TASK, manifest, recording_transitions, write_store
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from restock import cli
 from restock.errors import MixtureError, PanelError, StoreError
+from restock.ingest.store import StoreWriter
 from restock.ingest.task import Task
 from restock.replay import build, pack, scratch
 from restock.replay.build import build_panel
@@ -353,6 +356,21 @@ def test_a_killed_build_leaves_nothing_in_the_way(transitions: pa.Table, tmp_pat
     assert {path.name for path in tmp_path.iterdir()} == {"rows.parquet", "p"}
 
 
+def test_the_verb_checks_every_byte(
+    transitions: pa.Table, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    panel = build_panel(transitions, uniform(), tmp_path / "p")
+    assert cli.main(["mix", "--verify", str(panel.path)]) == 0
+    assert panel.id in capsys.readouterr().out
+    rows = panel.path / ROWS
+    rows.chmod(0o644)
+    content = bytearray(rows.read_bytes())
+    content[6000] ^= 1
+    rows.write_bytes(content)
+    assert cli.main(["mix", "--verify", str(panel.path)]) == 2
+    assert "changed or damaged" in capsys.readouterr().err
+
+
 def test_an_edited_header_is_refused(transitions: pa.Table, tmp_path: Path) -> None:
     panel = build_panel(transitions, uniform(), tmp_path / "p")
     header = panel.path / "panel.json"
@@ -410,3 +428,55 @@ def test_the_tensor_is_the_rows(transitions: pa.Table, tmp_path: Path) -> None:
     np.testing.assert_array_equal(panel.tensor().numpy(), panel.rows)
     with pytest.raises(ValueError, match="read-only"):
         panel.rows[0, 0] = 1.0
+
+
+MEASURED = """
+import resource, sys
+from pathlib import Path
+from restock.replay.build import build_panel
+from restock.replay.mixture import parse_mixture
+from restock.replay.store import Store
+
+mixture = parse_mixture("n_step = 3\\nreturn_to_go = true\\n[each_condition]\\nshare = 'natural'")
+with Store(sys.argv[1], memory_limit="110MB") as store:
+    store.sql("SET threads = 1")
+    status = Path("/proc/self/status").read_text().split("VmData:")[1].split()[0]
+    limit = int(status) * 1024 + int(sys.argv[3])
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
+    build_panel(store, mixture, sys.argv[2])
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="limits memory as Linux does")
+def test_a_store_several_times_the_memory_is_packed(tmp_path: Path) -> None:
+    task = Task(body=TASK.body, actions=TASK.actions, sectors=76)
+    limit = 272 << 20  # bytes more than the process has once its store is open
+    first = recording_transitions(1, episodes=1500, task=task)
+    recordings = []
+    for number in range(1, 17):
+        table = first.set_column(
+            0, first.schema.field(0), pa.array((np.int64(number) << 25) + np.arange(len(first)))
+        )
+        for name, values in (
+            ("recording_id", [f"{number:016x}"] * len(first)),
+            ("episode_id", [f"{number:016x}/{e}" for e in first["episode_index"].to_pylist()]),
+            ("ingest_id", [f"{number:016x}-a"] * len(first)),
+        ):
+            place = first.schema.get_field_index(name)
+            table = table.set_column(place, first.schema.field(place), pa.array(values))
+        recordings.append(table)
+    store = tmp_path / "store"
+    StoreWriter(store).write_all((manifest(table, task=task), table) for table in recordings)
+    command = [sys.executable, "-c", MEASURED, str(store), str(tmp_path / "p"), str(limit)]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr[-2000:]
+    panel = Panel.open(tmp_path / "p", verify=True)
+    assert panel.rows.nbytes > 3 * limit
+    order = np.random.default_rng(0).integers(len(panel), size=50)
+    ids = panel.meta_column("transition_id")
+    observation = first["observation"].combine_chunks()
+    for row in order:
+        expected = observation[int(ids[row]) & ((1 << 25) - 1)].as_py()
+        np.testing.assert_array_equal(panel.rows[row, panel.columns["observation"]], expected)

@@ -28,7 +28,7 @@ class Mix:
     panel never changes; its id names the store version, the mixture, the task and the rows.
     """
 
-    store: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")] = None
+    store: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")] = None
     """The store to take transitions from."""
     mixture: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "coverage"
     """A TOML file, or a shipped mixture: coverage or uniform. See docs/mixture.md."""
@@ -40,6 +40,11 @@ class Mix:
     """Replace a panel that is already there."""
     version: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Version of the store to take (the newest)."""
+    memory_limit: Annotated[str | None, tyro.conf.arg(metavar="SIZE")] = None
+    """What DuckDB may hold in memory, e.g. 1GB; panels are packed in little more, whatever their
+    size."""
+    verify: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
+    """Check every byte of a panel that is there, and do nothing else."""
     schema: bool = False
     """Print the JSON Schema of mixture files, for editors, and nothing else."""
     json: bool = False
@@ -57,6 +62,9 @@ class Mix:
         if self.schema:
             sys.stdout.write(shipped_schema())
             return
+        if self.verify is not None:
+            self._verify(self.verify)
+            return
         if self.store is None:
             raise MixtureError("no STORE given", remedy="name the store to take transitions from")
         if self.out is None and not self.dry_run:
@@ -64,7 +72,7 @@ class Mix:
         mixture = load_mixture(self.mixture)
         folder = Path(self.mixture).parent
         with (
-            Store(self.store, version=self.version) as store,
+            Store(self.store, version=self.version, memory_limit=self.memory_limit) as store,
             open_source(store, mixture, folder=folder) as source,
         ):
             plan = plan_panel(source.connection, mixture, source.conditions, source.others)
@@ -85,6 +93,20 @@ class Mix:
         )
         for line in _summary(document):
             output.stdout().print(line, markup=False, soft_wrap=not sys.stdout.isatty())
+
+    def _verify(self, path: Path) -> None:
+        from restock.cli import output
+        from restock.replay.panel import Panel
+
+        panel = Panel.open(path, verify=True)
+        size = sum(record.bytes for record in panel.header.files.values())
+        if self.json:
+            found = {"panel": str(path), "id": panel.id, "rows": len(panel), "bytes": size}
+            output.print_json(found | {"unchanged": True})
+            return
+        output.stdout().print(
+            f"panel {panel.id}: {len(panel):,} rows, all {size:,} bytes as they were written"
+        )
 
 
 def describe(plan: Plan) -> dict[str, Any]:
