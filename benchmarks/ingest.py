@@ -1,17 +1,21 @@
-"""Recordings to columns: Restock beside its peers, as CPU time over mere decompression.
+"""Recordings to columns and to a store: Restock beside its peers, as CPU time over decompression.
 
     python benchmarks/ingest.py [--quick] [--json] [--check]
 
-All contestants read the same generated log in one process, one after the other in every round.
-`--check` exits 1 where a target is missed. Values are compared with rosbags' along the way.
+All contestants read the same generated log (20 minutes of it, 2 with `--quick`) in one process,
+one after the other in every round; their values are compared along the way. Then the whole of
+`restock ingest`, one worker against two, and peak memory on recordings of 2 GB (256 MB with
+`--quick`). `--check` exits 1 where a target of the design is missed.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import resource
 import statistics
+import subprocess
 import sys
 import tempfile
 import time
@@ -20,112 +24,183 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import recording_readers as readers
 import robot_log
-import zstandard
-from mcap.reader import make_reader
-from mcap.records import Chunk
-from mcap.stream_reader import StreamReader
-from mcap_ros2.decoder import DecoderFactory
-from rosbags.highlevel import AnyReader
+from ingest_memory import LIMIT_MB, LONG, LONGER, PLAIN, memory
 
-from restock.ingest.columns import equal
-from restock.ingest.definitions import message_type
-from restock.ingest.readers import open_recording
-from restock.ingest.rows import RowDecoder
+from restock.ingest.pipeline import ingest
+from restock.ingest.profile import load_profile
+from restock.ingest.store import StoreWriter
 
 FLOOR = "decompress only"
-OURS = "restock, all topics to columns"
+OURS = "restock, all topics"
 OURS_PROFILE = "restock, a profile's fields"
 OURS_WALKED = "restock, no message index"
-OURS_BAG = "restock, sqlite3 bag"
-ROSBAGS = "rosbags, decode"
+OURS_BARE = "restock, no index, no summary"
+DIAGNOSTICS = "restock, nested diagnostics"
+INGEST = "restock ingest, the work"
+INGEST_BAG = "restock ingest, the work, sqlite3"
+COMMAND = "restock ingest, a new process"
+RERUN = "rerun-sdk, all topics"
+RERUN_DIAGNOSTICS = "rerun-sdk, nested diagnostics"
+MCAP_ALONE = "mcap, not decoded"
+ROSBAGS = "rosbags, decoded"
 ROSBAGS_COLUMNS = "rosbags, to columns"
-MCAP_ROS2 = "mcap + mcap-ros2-support, decode"
-DIAGNOSTICS = "restock, diagnostics alone"
+MCAP_ROS2 = "mcap + mcap-ros2-support, decoded"
+BAG_FLOOR = "sqlite3, rows fetched only"
+OURS_BAG = "restock, sqlite3 bag, all topics"
+ROSBAGS_BAG = "rosbags, sqlite3 bag, decoded"
 
-PROFILE = {
-    "/odom": ["header.stamp", "twist.twist.linear.x", "twist.twist.angular.z"],
-    "/imu": ["header.stamp", "angular_velocity.z", "linear_acceleration.x"],
-    "/scan": ["header.stamp", "ranges", "angle_min", "angle_increment"],
-    "/cmd_vel": ["linear.x", "angular.z"],
-}
-
-
-def floor(path: Path) -> None:
-    decoder = zstandard.ZstdDecompressor()
-    with path.open("rb") as file:
-        for record in StreamReader(file, emit_chunks=True).records:
-            if isinstance(record, Chunk):
-                decoder.decompress(record.data, max_output_size=record.uncompressed_size)
-
-
-def ours(path: Path) -> int:
-    with open_recording(path) as recording:
-        wanted = {topic: recording.leaves(topic) for topic in recording.topics}
-        columns = recording.read(wanted)
-        assert not recording.losses
-        return sum(len(topic) for topic in columns.values())
-
-
-def ours_profile(path: Path) -> None:
-    with open_recording(path) as recording:
-        recording.read(PROFILE)
-
-
-def ours_diagnostics(path: Path) -> None:
-    with open_recording(path) as recording:
-        recording.read({"/diagnostics": recording.leaves("/diagnostics")})
-
-
-def rosbags_decode(bag: Path) -> None:
-    with AnyReader([bag]) as reader:
-        for connection, _, data in reader.messages():
-            reader.deserialize(data, connection.msgtype)
-
-
-def rosbags_columns(path: Path) -> dict[str, dict[str, Any]]:
-    """rosbags' decoder, message by message, and its values laid out in the same columns."""
-    with open_recording(path) as recording:
-        found: dict[str, dict[str, Any]] = {}
-        for topic in recording.topics:
-            (stream,) = recording._streams[topic]
-            kind = message_type(stream.channel, "humble")
-            decoder = RowDecoder(kind, kind.leaves())
-            from restock.ingest.columns import join
-
-            parts = [
-                decoder.decode(batch).fields
-                for _, batch in stream.storage.batches([stream.channel.id])
-            ]
-            found[topic] = {leaf: join([part[leaf] for part in parts]) for leaf in parts[0]}
-        return found
-
-
-def mcap_ros2(path: Path) -> None:
-    with path.open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        for _ in reader.iter_decoded_messages(log_time_order=False):
-            pass
-
-
-def check_values(path: Path) -> int:
-    """How many columns were compared with rosbags'; fails where one differs."""
-    theirs = rosbags_columns(path)
-    compared = 0
-    with open_recording(path) as recording:
-        mine = recording.read({topic: recording.leaves(topic) for topic in recording.topics})
-    for topic, columns in theirs.items():
-        for leaf, column in columns.items():
-            if not equal(mine[topic].fields[leaf], column):
-                raise SystemExit(f"{topic} {leaf}: not what rosbags reads")
-            compared += 1
-    return compared
+ROBOT = "turtlebot3"  # the shipped profile that fits the generated log
+MEMORY_MB = 400  # what "a few hundred MB" is taken for
+IMAGES_MB = 50  # by how much images may raise it
 
 
 def cpu_s(work: Callable[[], Any]) -> float:
-    start = time.process_time()
+    """CPU time of this process and of those it starts, system time included."""
+    before = _used_s()
     work()
-    return time.process_time() - start
+    return _used_s() - before
+
+
+def _used_s() -> float:
+    kinds = map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(used.ru_utime + used.ru_stime for used in kinds)
+
+
+class Stores:
+    """A new store for every ingest."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.count = folder, 0
+
+    def new(self) -> Path:
+        self.count += 1
+        return self.folder / str(self.count)
+
+
+def command(paths: list[Path], store: Path, workers: int = 1) -> None:
+    """`restock ingest` as a process of its own, start-up included."""
+    options = ["--store", str(store), "--profile", ROBOT, "--workers", str(workers)]
+    subprocess.run(
+        [sys.executable, "-m", "restock", "ingest", *map(str, paths), *options],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        check=True,
+    )
+
+
+def contestants(
+    folder: Path, seconds: float, stores: Stores
+) -> tuple[dict[str, Callable[[], Any]], dict[str, Callable[[], Any]], dict[str, int]]:
+    """Quick ones, slow ones (fewer rounds), and how many columns were found equal."""
+    path = robot_log.write_mcap(folder / "log.mcap", seconds)
+    walked = robot_log.write_mcap(folder / "no_index.mcap", seconds, index=False)
+    bare = robot_log.write_mcap(folder / "bare.mcap", seconds, index=False, summary=False)
+    bag = robot_log.write_bag(folder / "bag", seconds)
+    profile = load_profile(ROBOT)
+    quick: dict[str, Callable[[], Any]] = {
+        FLOOR: readers.decompress_only(path),
+        OURS: lambda: readers.restock_columns(path),
+        RERUN: lambda: readers.rerun_columns(path),
+        OURS_PROFILE: lambda: readers.restock_columns(path, readers.PROFILE),
+        DIAGNOSTICS: lambda: readers.restock_diagnostics(path),
+        RERUN_DIAGNOSTICS: lambda: readers.rerun_columns(path, "/diagnostics"),
+        OURS_WALKED: lambda: readers.restock_columns(walked),
+        OURS_BARE: lambda: readers.restock_columns(bare),
+        INGEST: lambda: ingest(path, profile, store=StoreWriter(stores.new())),
+        COMMAND: lambda: command([path], stores.new()),
+        BAG_FLOOR: lambda: readers.fetch_only(bag),
+        OURS_BAG: lambda: readers.restock_columns(bag),
+        INGEST_BAG: lambda: ingest(bag, profile, store=StoreWriter(stores.new())),
+    }
+    slow: dict[str, Callable[[], Any]] = {
+        MCAP_ALONE: lambda: readers.mcap_alone(path),
+        ROSBAGS: lambda: readers.rosbags_decode(path),
+        ROSBAGS_COLUMNS: lambda: readers.rosbags_columns(path),
+        MCAP_ROS2: lambda: readers.mcap_ros2(path),
+        ROSBAGS_BAG: lambda: readers.rosbags_decode(bag),
+    }
+    return quick, slow, readers.check_values(path, bag)
+
+
+def measure(
+    quick: dict[str, Callable[[], Any]],
+    slow: dict[str, Callable[[], Any]],
+    rounds: int,
+    slow_rounds: int,
+) -> dict[str, list[float]]:
+    """CPU times of each, interleaved; a first round of the quick ones is not counted."""
+    times: dict[str, list[float]] = {name: [] for name in (*quick, *slow)}
+    for number in range(rounds + 1):
+        for name, work in quick.items():
+            spent = cpu_s(work)
+            if number:
+                times[name].append(spent)
+        if 0 < number <= slow_rounds:
+            for name, work in slow.items():
+                times[name].append(cpu_s(work))
+        sys.stderr.write(f"round {number} of {rounds}\n")
+    return times
+
+
+def two_workers(folder: Path, seconds: float, stores: Stores, rounds: int) -> dict[str, float]:
+    """Wall time of six recordings by one worker and by two, start-up included."""
+    log = robot_log.write_mcap(folder / "several.mcap", seconds).read_bytes()
+    paths = [folder / f"several_{number}.mcap" for number in range(6)]
+    for number, path in enumerate(paths):  # of the same length; each with an id of its own
+        path.write_bytes(log.replace(robot_log.LIBRARY, robot_log.LIBRARY[:-1] + b"%d" % number))
+    took: dict[int, list[float]] = {1: [], 2: []}
+    for _ in range(rounds):
+        for workers, walls in took.items():
+            start = time.perf_counter()
+            command(paths, stores.new(), workers)
+            walls.append(time.perf_counter() - start)
+    one, two = statistics.median(took[1]), statistics.median(took[2])
+    return {"one_s": one, "two_s": two, "faster": one / two, "load": os.getloadavg()[0]}
+
+
+def targets(
+    ratio: dict[str, float], workers: dict[str, float], used: dict[str, dict[str, float]]
+) -> dict[str, bool]:
+    """The targets of the design: what they say, and whether they are met."""
+    plain = used[PLAIN]["peak_mb"]
+    heavy = max(found["peak_mb"] for name, found in used.items() if found["images"])
+    return {
+        "all topics to columns at most 3.5x the floor": ratio[OURS] <= 3.5,
+        "a profile's own fields faster still": ratio[OURS_PROFILE] < ratio[OURS],
+        "at least 1.7x faster than rerun-sdk": ratio[RERUN] >= 1.7 * ratio[OURS],
+        "nested diagnostics no slower than rerun-sdk": (
+            ratio[DIAGNOSTICS] <= ratio[RERUN_DIAGNOSTICS]
+        ),
+        "at least 20x rosbags to columns": ratio[ROSBAGS_COLUMNS] >= 20 * ratio[OURS],
+        "no index at most 1.3x indexed": ratio[OURS_WALKED] <= 1.3 * ratio[OURS],
+        "a whole ingest at most 6x the floor": ratio[INGEST] <= 6,
+        "two workers at least 1.7x one": workers["faster"] >= 1.7,
+        f"peak memory at most {MEMORY_MB} MB": (
+            max(found["peak_mb"] for found in used.values()) <= MEMORY_MB
+        ),
+        f"images raise peak memory by at most {IMAGES_MB} MB": heavy - plain <= IMAGES_MB,
+    }
+
+
+def show(answer: dict[str, Any]) -> None:
+    print(f"{answer['messages']:,} messages, {answer['log_s']:.0f} s, {answer['mcap_mb']:.0f} MB")
+    equal = ", ".join(f"{who} {count}" for who, count in answer["equal_columns"].items())
+    print(f"columns equal: {equal}\n")
+    print("| reader | CPU s | over decompression |\n| --- | ---: | ---: |")
+    for name, value in sorted(answer["over_floor"].items(), key=lambda item: item[1]):
+        print(f"| {name} | {answer['cpu_s'][name]:.3f} | {value:.2f} |")
+    print(f"\n| recording ({LIMIT_MB} MB of private memory at most) | MB | peak MB | CPU s |")
+    print("| --- | ---: | ---: | ---: |")
+    for name, used in answer["memory"].items():
+        print(f"| {name} | {used['size_mb']:.0f} | {used['peak_mb']:.0f} | {used['cpu_s']:.2f} |")
+    print(f"\nan hour more of log: {answer['mb_an_hour']:.0f} MB more at the peak")
+    workers = answer["workers"]
+    print(f"\nsix recordings: {workers['one_s']:.2f} s by one worker, {workers['two_s']:.2f} s by"
+          f" two: {workers['faster']:.2f}x (load average {workers['load']:.1f})\n")  # fmt: skip
+    for name, met in answer["targets"].items():
+        print(f"{'met   ' if met else 'MISSED'} {name}")
 
 
 def main() -> int:
@@ -135,63 +210,37 @@ def main() -> int:
     parser.add_argument("--check", action="store_true", help="exit 1 where a target is missed")
     options = parser.parse_args()
     seconds, rounds, slow_rounds = (120.0, 5, 1) if options.quick else (1200.0, 5, 2)
-    with tempfile.TemporaryDirectory() as folder:
-        path = robot_log.write_mcap(Path(folder) / "log.mcap", seconds)
-        walked = robot_log.write_mcap(Path(folder) / "no_index.mcap", seconds, index=False)
-        bag = robot_log.write_bag(Path(folder) / "bag", seconds)
-        mcap_bag = path
-        fast: dict[str, Callable[[], Any]] = {
-            FLOOR: lambda: floor(path),
-            OURS: lambda: ours(path),
-            OURS_PROFILE: lambda: ours_profile(path),
-            DIAGNOSTICS: lambda: ours_diagnostics(path),
-            OURS_WALKED: lambda: ours(walked),
-            OURS_BAG: lambda: ours(bag),
-        }
-        slow: dict[str, Callable[[], Any]] = {
-            ROSBAGS: lambda: rosbags_decode(mcap_bag),
-            ROSBAGS_COLUMNS: lambda: rosbags_columns(path),
-            MCAP_ROS2: lambda: mcap_ros2(path),
-        }
-        columns = check_values(path)
-        peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        times: dict[str, list[float]] = {name: [] for name in (*fast, *slow)}
-        for number in range(rounds):
-            for name, work in fast.items():
-                times[name].append(cpu_s(work))
-            if number < slow_rounds:
-                for name, work in slow.items():
-                    times[name].append(cpu_s(work))
-        messages = ours(path)
-        size_mb = path.stat().st_size / 1e6
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        stores = Stores(folder / "stores")
+        stores.folder.mkdir()
+        quick, slow, equal = contestants(folder, seconds, stores)
+        times = measure(quick, slow, rounds, slow_rounds)
+        workers = two_workers(folder, seconds * 2, stores, 3)
+        used = memory(folder, seconds, 256 if options.quick else 2200)
+        columns = readers.restock_columns(folder / "log.mcap")
+        size_mb = (folder / "log.mcap").stat().st_size / 1e6
     median = {name: statistics.median(values) for name, values in times.items()}
     ratio = {name: value / median[FLOOR] for name, value in median.items()}
-    targets = {
-        "all topics to columns at most 3.5x the floor": ratio[OURS] <= 3.5,
-        "a profile's own fields faster still": ratio[OURS_PROFILE] < ratio[OURS],
-        "at least 20x rosbags to columns": ratio[ROSBAGS_COLUMNS] >= 20 * ratio[OURS],
-        "no index at most 1.3x indexed": ratio[OURS_WALKED] <= 1.3 * ratio[OURS],
-    }
+    met = targets(ratio, workers, used)
     answer = {
-        "messages": messages,
+        "messages": sum(len(topic) for topic in columns.values()),
         "log_s": seconds,
         "mcap_mb": size_mb,
-        "columns_equal_to_rosbags": columns,
+        "equal_columns": equal,
         "cpu_s": median,
         "over_floor": ratio,
-        "peak_mb_with_rosbags": peak_mb,
-        "targets": targets,
+        "workers": workers,
+        "memory": used,
+        "mb_an_hour": (used[LONG]["peak_mb"] - used[PLAIN]["peak_mb"])
+        / ((LONGER - 1) * seconds / 3600),
+        "targets": met,
     }
     if options.json:
         print(json.dumps(answer, indent=1))
     else:
-        print(f"{messages:,} messages, {seconds:.0f} s of log, {size_mb:.0f} MB of MCAP (zstd)")
-        print(f"{columns} columns equal to rosbags'")
-        for name, value in sorted(ratio.items(), key=lambda item: item[1]):
-            print(f"{name:<36} {median[name]:8.3f} s CPU {value:8.2f} x the floor")
-        for name, met in targets.items():
-            print(f"{'met   ' if met else 'MISSED'} {name}")
-    return 0 if all(targets.values()) or not options.check else 1
+        show(answer)
+    return 0 if all(met.values()) or not options.check else 1
 
 
 if __name__ == "__main__":

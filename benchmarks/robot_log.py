@@ -22,6 +22,9 @@ STORE = get_typestore(Stores.ROS2_HUMBLE)
 START_NS = 1_700_000_000_000_000_000
 MARK = 1234.5  # stands in the template where noise goes
 BEAMS = 360
+CAMERA = "/camera"
+LIBRARY = b"restock benchmark 0"
+IMAGE_BYTES = 640 * 480 * 3
 
 TYPES = {
     "/odom": ("nav_msgs/msg/Odometry", 50.0),
@@ -139,36 +142,70 @@ def messages(seconds: float, seed: int = 1) -> Iterator[tuple[str, int, bytes]]:
         yield topics[row], int(every[row]), payloads[row]
 
 
+def with_images(
+    lines: Iterator[tuple[str, int, bytes]], seconds: float, images: int
+) -> Iterator[tuple[str, int, bytes]]:
+    """The same messages with camera images evenly among them: noise, which no one compresses."""
+    if not images:
+        yield from lines
+        return
+    noise = np.random.default_rng(2).bytes(IMAGE_BYTES * 8)
+    every_ns = int(seconds * 1e9 / images)
+    sent = 0
+    for topic, log, payload in lines:
+        while sent < images and log >= START_NS + sent * every_ns:
+            at = sent * 104_729 % (len(noise) - IMAGE_BYTES)
+            yield CAMERA, log, noise[at : at + IMAGE_BYTES]
+            sent += 1
+        yield topic, log, payload
+
+
 def write_mcap(
-    path: Path, seconds: float, *, index: bool = True, chunk_size: int = 1 << 20
+    path: Path,
+    seconds: float,
+    *,
+    seed: int = 1,
+    images: int = 0,
+    chunked: bool = True,
+    index: bool = True,
+    summary: bool = True,
 ) -> Path:
-    """The log as MCAP, zstd."""
+    """The log as MCAP, zstd. Without `summary`, the file's end says nothing of what is in it."""
     with path.open("wb") as file:
         writer = Writer(
             file,
             compression=CompressionType.ZSTD,
-            chunk_size=chunk_size,
+            chunk_size=1 << 20,
+            use_chunking=chunked,
             index_types=IndexType.ALL if index else IndexType.NONE,
+            use_statistics=summary,
+            repeat_channels=summary,
+            repeat_schemas=summary,
         )
-        writer.start(profile="ros2", library="restock benchmark")
+        writer.start(profile="ros2", library=LIBRARY.decode())
         channels = {}
-        for topic, (kind, _) in TYPES.items():
+        for topic, kind in _kinds(images).items():
             text, _ = STORE.generate_msgdef(kind, ros_version=2)
             schema = writer.register_schema(kind, "ros2msg", text.encode())
             channels[topic] = writer.register_channel(topic, "cdr", schema)
-        for topic, log, payload in messages(seconds):
+        for topic, log, payload in with_images(messages(seconds, seed), seconds, images):
             writer.add_message(channels[topic], log, payload, publish_time=log)
         writer.finish()
     return path
 
 
-def write_bag(folder: Path, seconds: float) -> Path:
+def _kinds(images: int) -> dict[str, str]:
+    camera = {CAMERA: "sensor_msgs/msg/Image"} if images else {}
+    return {topic: kind for topic, (kind, _) in TYPES.items()} | camera
+
+
+def write_bag(folder: Path, seconds: float, *, images: int = 0) -> Path:
     """The log as a rosbag2 sqlite3 bag."""
     with BagWriter(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as bag:
         connections = {
             topic: bag.add_connection(topic, kind, typestore=STORE)
-            for topic, (kind, _) in TYPES.items()
+            for topic, kind in _kinds(images).items()
         }
-        for topic, log, payload in messages(seconds):
+        for topic, log, payload in with_images(messages(seconds), seconds, images):
             bag.write(connections[topic], log, payload)
     return folder
