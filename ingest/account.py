@@ -27,6 +27,7 @@ class Account:
     read: int = 0  # payloads that came out of the container
     decoded: int = 0
     reasons: dict[str, int] = field(default_factory=dict)  # why the rest were not decoded
+    log_backsteps: int = 0  # messages logged before the one that lies before them in the file
 
     @property
     def lost(self) -> int:

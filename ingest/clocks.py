@@ -18,6 +18,7 @@ from restock.ingest.columns import TopicColumns
 
 I64 = NDArray[np.int64]
 STAMP = "header.stamp"
+WIDE_NS = 100_000_000  # a spread of (log time - stamp) that is worth a look
 
 
 @dataclass(frozen=True)
@@ -70,13 +71,17 @@ def odd(row: Mapping[str, Any]) -> str:
     """What of a topic's clocks is worth a look, in words; "" for nothing."""
     words = {
         "jumps": "jumps",
+        "log_backsteps": "log time backsteps",
         "backsteps": "backsteps",
         "duplicates": "repeated stamps",
         "zero_stamps": "zero stamps",
         "off_clock": "left out",
         "restamped": "put at log time",
     }
-    return ", ".join(f"{row[key]:,} {word}" for key, word in words.items() if row.get(key))
+    said = [f"{row[key]:,} {word}" for key, word in words.items() if row.get(key)]
+    if (row["spread_ns"] or 0) > WIDE_NS:
+        said.append(f"spread over {row['spread_ns'] * 1e-9:.1f} s")
+    return ", ".join(said)
 
 
 def topic_clocks(topics: Mapping[str, TopicColumns], jump_s: float) -> list[TopicClock]:

@@ -6,17 +6,25 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from restock.ingest.clocks import STAMP, topic_clock
 from restock.ingest.readers import open_recording
+from restock.ingest.recording import Recording
 
 NANOSECONDS = 1_000_000_000
+JUMP_S = 1.0  # a change of (log time - stamp) that means a clock was set, as in profiles
 
 
 def describe(
-    path: Path | str, *, typestore: str | None = None, salvage: bool = False
+    path: Path | str,
+    *,
+    typestore: str | None = None,
+    salvage: bool = False,
+    clocks: bool = False,
 ) -> dict[str, Any]:
-    """Format, size, time span and topics of one recording; nothing is decoded.
+    """Format, size, time span and topics of one recording; nothing is decoded but for `clocks`.
 
-    Times are log times. `rate_hz` is the messages of a topic over the recording's duration.
+    Times are log times. `rate_hz` is the messages of a topic over the recording's duration. With
+    `clocks` the whole recording is read for its header stamps, and every topic has its `clock`.
 
     Raises:
         RecordingError: it cannot be opened; see `open_recording`.
@@ -24,6 +32,7 @@ def describe(
     with open_recording(path, typestore=typestore, salvage=salvage) as recording:
         span = recording.span_ns
         duration_s = (span[1] - span[0]) / NANOSECONDS if span else None
+        compared = _clocks(recording) if clocks else {}
         return {
             "path": str(path),
             "format": recording.format,
@@ -42,6 +51,7 @@ def describe(
                     "encoding": topic.encoding,
                     "definition": topic.definition,
                     "skipped": topic.skipped,
+                    **({"clock": compared.get(topic.name)} if clocks else {}),
                 }
                 for topic in recording.topics.values()
             },
@@ -54,6 +64,20 @@ def describe(
             "notes": list(recording.notes),
             "damage": [item.what for item in recording.damage],
         }
+
+
+def _clocks(recording: Recording) -> dict[str, dict[str, Any]]:
+    """The clocks of every topic that can be decoded."""
+    wanted = {
+        name: [STAMP] if STAMP in recording.leaves(name) else []
+        for name, topic in recording.topics.items()
+        if topic.skipped is None
+    }
+    return {
+        name: topic_clock(name, columns, JUMP_S).as_row()
+        | {"log_backsteps": recording.accounts[name].log_backsteps}
+        for name, columns in recording.read(wanted).items()
+    }
 
 
 def _date(stamp_ns: int) -> str:

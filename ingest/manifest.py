@@ -80,7 +80,7 @@ def manifest_row(
         "topics": topic_rows(recording),
         "stand_ins": [{"input": name, "instead": how} for name, how in instead.items()],
         "label_scores": score_rows(scores),
-        "clocks": clock_rows(steps),
+        "clocks": clock_rows(recording, steps),
         "signals": steps.custom.rows(),
         "task_json": msgspec.json.encode(profile.task).decode(),
         "conditions_json": conditions_json(profile.conditions),
@@ -109,12 +109,13 @@ def topic_rows(recording: Recording) -> list[dict[str, Any]]:
     return found
 
 
-def clock_rows(steps: Steps) -> list[dict[str, Any]]:
+def clock_rows(recording: Recording, steps: Steps) -> list[dict[str, Any]]:
     """Every topic's clocks, and what aligning did about its messages."""
     report = steps.clock
     return [
         {
             **one.as_row(),
+            "log_backsteps": recording.accounts[one.topic].log_backsteps,
             "off_clock": report.off_clock.get(one.topic, 0),
             "restamped": report.restamped.get(one.topic, 0),
         }

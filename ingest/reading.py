@@ -107,7 +107,8 @@ class TopicReading:
         log, publish = self._log.array(), self._publish.array()
         fields: dict[str, FieldColumn] = {}
         order = None
-        if (log[1:] < log[:-1]).any():
+        self._account.log_backsteps = int((log[1:] < log[:-1]).sum())
+        if self._account.log_backsteps:
             order = np.argsort(log, kind="stable")
             log, publish = log[order], publish[order]
         for path in list(self._fields):  # one by one: each lets go of its unordered self

@@ -158,8 +158,8 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
         _rows_of(
             topic=pa.string(), messages=pa.int64(), stamped=pa.bool_(), offset_ns=pa.int64(),
             spread_ns=pa.int64(), publish_offset_ns=pa.int64(), jumps=pa.int64(),
-            backsteps=pa.int64(), duplicates=pa.int64(), zero_stamps=pa.int64(),
-            off_clock=pa.int64(), restamped=pa.int64(),
+            log_backsteps=pa.int64(), backsteps=pa.int64(), duplicates=pa.int64(),
+            zero_stamps=pa.int64(), off_clock=pa.int64(), restamped=pa.int64(),
         ),
         "per topic read: log time against header stamp, and what is odd about the stamps",
         nullable=True,

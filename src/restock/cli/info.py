@@ -18,8 +18,9 @@ class Info:
     """What is in these recordings: format, duration, topics, types, counts and rates.
 
     PATH is an MCAP file, a rosbag2 folder or one of its files, a ROS 1 bag, a folder of many
-    recordings, or a quoted glob. Nothing is decoded and nothing is written. A recording that
-    cannot be read is said so on stderr and makes the exit code 2; the others are still shown.
+    recordings, or a quoted glob. Nothing is decoded (but for --clocks) and nothing is written. A
+    recording that cannot be read is said so on stderr and makes the exit code 2; the others are
+    still shown.
     """
 
     paths: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
@@ -28,6 +29,9 @@ class Info:
     """Distribution whose message definitions serve recordings without their own (humble)."""
     salvage: bool = False
     """Look into files that are cut short, too (exit code 3)."""
+    clocks: bool = False
+    """Read the header stamps, too, and compare the clocks: how far log time is ahead of them, how
+    often they jump, go back, repeat or are zero."""
     json: bool = False
     """Print one JSON document: {"recordings": [{"path", "format", "messages", "topics", …}]}."""
 
@@ -50,7 +54,9 @@ class Info:
                 continue
             for path in paths:
                 try:
-                    entry = describe(path, typestore=self.typestore, salvage=self.salvage)
+                    entry = describe(
+                        path, typestore=self.typestore, salvage=self.salvage, clocks=self.clocks
+                    )
                 except RecordingError as error:
                     sys.stderr.write(f"restock: {error}\n")
                     code = ExitCode.USAGE
@@ -68,8 +74,10 @@ class Info:
 def _print(entry: dict[str, Any]) -> None:
     from restock.cli import output
 
+    clocked = any("clock" in topic for topic in entry["topics"].values())
     rows = [
         {
+            **(output.clock_cells(topic.get("clock")) if clocked else {}),
             "topic": name,
             "type": topic["type"],
             "messages": topic["messages"],
@@ -87,7 +95,8 @@ def _print(entry: dict[str, Any]) -> None:
         f"{entry['size_bytes'] / 1e6:.1f} MB",
     )
     sys.stdout.write("  ".join(part for part in about if part) + "\n")
-    output.print_table(rows, ["topic", "type", "messages", "rate Hz", ""])
+    clock = output.CLOCK_COLUMNS if clocked else []
+    output.print_table(rows, ["topic", "type", "messages", "rate Hz", *clock, ""])
     for what, names in (
         ("attachments", [item["name"] for item in entry["attachments"]]),
         ("metadata records", entry["metadata"]),

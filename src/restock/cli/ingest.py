@@ -155,8 +155,8 @@ def show(outcome: Outcome) -> None:
     console.print(into + (f", store version {outcome.version}" if outcome.version else ""))
     told = [topic for topic in row["topics"] if topic["reason"] != UNUSED]
     clocks = {clock["topic"]: clock for clock in row["clocks"] or []}
-    told = [{**topic, **_clock_cells(clocks.get(topic["topic"]))} for topic in told]
-    columns = ["topic", "type", "expected", "decoded", "skipped", "log-stamp s", "clock", "reason"]
+    told = [{**topic, **output.clock_cells(clocks.get(topic["topic"]))} for topic in told]
+    columns = ["topic", "type", "expected", "decoded", "skipped", *output.CLOCK_COLUMNS, "reason"]
     output.print_table(told, columns)
     if len(told) < len(row["topics"]):
         rest = [topic["expected"] for topic in row["topics"] if topic["reason"] == UNUSED]
@@ -208,17 +208,6 @@ def show(outcome: Outcome) -> None:
     for loss in outcome.losses:
         console.print(f"lost: {loss}", markup=False, soft_wrap=True)
     console.print()
-
-
-def _clock_cells(clock: dict[str, Any] | None) -> dict[str, Any]:
-    """A topic's clocks for a table: how far behind the stamps are, and what is odd about them."""
-    from restock.ingest.clocks import odd
-
-    if clock is None:
-        return {"log-stamp s": "", "clock": ""}
-    offset = clock["offset_ns"]
-    said = "" if offset is None else f"{offset * 1e-9:,.3f}"
-    return {"log-stamp s": said, "clock": odd(clock)}
 
 
 def _count(number: int, noun: str) -> str:
