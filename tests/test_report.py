@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from html.parser import HTMLParser
+from itertools import pairwise
 from pathlib import Path
 
 import pyarrow as pa
@@ -113,6 +114,34 @@ def run(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     table = pa.Table.from_pylist(episodes, schema=EVAL_EPISODES)
     pq.write_table(table, made.path / "eval" / "episodes.parquet")
     return made.path
+
+
+def test_the_replay_card_answers_every_question(run: Path, capsys) -> None:
+    assert cli.main(["report", str(run), "--card", "--json"]) == 0
+    card = json.loads(capsys.readouterr().out)
+    assert card["capacity"]["ring_rows"] == 4096
+    assert card["capacity"]["panel_rows"] > 0
+    assert card["target"] == {"rule": "hard", "every": 500}
+    assert card["sampling"]["logs"].startswith("quotas by stratum")
+    assert card["ages"][0]["p50"] == "below 2"
+    assert {row["stratum"] for row in card["strata"]} == {"nominal", HOSTILE}
+    assert card["behaviour_policies"][0]["behaviour_policy"] == "planner"
+    assert "flatters most" in card["imbalance"]
+    assert json.loads((run / "replay_card.json").read_text()) == card
+
+
+def test_the_replay_card_is_one_page_of_markdown_that_trusts_no_name(run: Path, capsys) -> None:
+    assert cli.main(["report", str(run), "--card"]) == 0
+    page = capsys.readouterr().out
+    assert (run / "replay_card.md").read_text() == page
+    assert len(page.splitlines()) < 60
+    assert "<script" not in page
+    for words in ("Capacity", "Sampling rule", "Target rule", "Corrections", "Age of the sampled"):
+        assert words in page
+    lines = page.splitlines()
+    for before, line in pairwise(lines):  # every table has one width
+        if before.startswith("|") and line.startswith("|"):
+            assert before.replace("\\|", "").count("|") == line.replace("\\|", "").count("|")
 
 
 class Outline(HTMLParser):

@@ -21,6 +21,9 @@ class Report:
     intervals against planner and random (run `restock eval RUN` first), a map of where the logs
     have been and where the agent failed, and where all of it comes from.
 
+    With --card instead the replay card: what the critic was fed on one page of Markdown, on
+    stdout, and as RUN/replay_card.md and RUN/replay_card.json.
+
     Example: `restock report runs/a`
     """
 
@@ -28,12 +31,26 @@ class Report:
     """The directory that `restock train --out` wrote."""
     out: Path | None = None
     """Where to write the page; default RUN/report.html. Replaces what is there."""
+    card: bool = False
+    """The replay card instead of the page."""
     json: bool = False
-    """Print {"report": PATH, "bytes": N} instead of the path."""
+    """Print {"report": PATH, "bytes": N} instead of the path; with --card, the card as JSON."""
 
     def run(self) -> int | None:
-        from restock.report import build_report
+        from restock.errors import ConfigError
+        from restock.report import build_report, write_card
 
+        if self.card:
+            if self.out is not None:
+                raise ConfigError(
+                    "is of the page: a card is written beside the run's metrics", where="--out"
+                )
+            card, markdown = write_card(self.run_directory)
+            if self.json:
+                print_json(card)
+            else:
+                sys.stdout.write(markdown)
+            return None
         path = build_report(self.run_directory, self.out)
         if self.json:
             print_json({"report": str(path), "bytes": path.stat().st_size})

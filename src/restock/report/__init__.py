@@ -1,15 +1,19 @@
 """One self-contained page about a run: what it was fed, what it learnt, where it fails.
 
-`build_report(run)` writes `run/report.html`, which opens without a network.
+`build_report(run)` writes `run/report.html`, which opens without a network; `write_card(run)` the
+replay card, its one-page answer to what the critic was fed.
 """
 
 from __future__ import annotations
 
+import json
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import jinja2
 
+from restock.report.card import as_markdown, replay_card
 from restock.report.facts import gather
 from restock.report.page import page
 from restock.train.run import write_text
@@ -32,4 +36,17 @@ def build_report(run: Path, out: Path | None = None) -> Path:
     return out
 
 
-__all__ = ["build_report"]
+def write_card(run: Path) -> tuple[dict[str, Any], str]:
+    """Write the replay card into a run directory; returns it as JSON values and as Markdown.
+
+    Raises:
+        RunError: as `build_report`.
+    """
+    card = replay_card(gather(run))
+    markdown = as_markdown(card)
+    write_text(run / "replay_card.json", json.dumps(card, indent=1, default=str) + "\n")
+    write_text(run / "replay_card.md", markdown)
+    return card, markdown
+
+
+__all__ = ["build_report", "write_card"]

@@ -1,0 +1,227 @@
+"""The replay card: one page, for people and as JSON, that says what a run's critic was fed.
+
+A metric without its replay is half a result. The card answers, in the order a reviewer would ask:
+capacity, sampling rule, age of the sampled rows, target rule, conditions in the batches, whose
+behaviour, which corrections, the mix after them, and the one imbalance most likely to make the
+evaluation look better than deployment.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from restock.report.facts import Facts, Rows
+from restock.report.feed import flattery
+
+FORMAT = "restock-replay-card/1"
+_UNKNOWN = "not known: run `restock eval` on a run whose panel and store are at hand"
+
+
+def replay_card(facts: Facts) -> dict[str, Any]:
+    """The card as JSON values; null where the run does not say."""
+    settings = facts.config.get("config", {})
+    replay = settings.get("replay", {})
+    panel = facts.panel
+    mixture = msgspec.to_builtins(panel.header.mixture) if panel is not None else None
+    logs = [row for row in facts.fed if row["source"] == "logs"]
+    return {
+        "format": FORMAT,
+        "run": str(facts.run),
+        "capacity": {
+            "ring_rows": replay.get("ring_capacity"),
+            "panel_rows": len(panel) if panel is not None else None,
+            "panel": (facts.config.get("panel") or {}).get("id"),
+            "store_version": panel.header.store_version if panel is not None else None,
+        },
+        "sampling": {
+            "batch_size": replay.get("batch_size"),
+            "logs_share": _drawn_share(facts, "logs"),
+            "logs": _rule(mixture),
+            "fresh": "uniform over the ring" if _drawn_share(facts, "fresh") else None,
+            "n_step": {
+                "logs": panel.n_step if panel is not None else None,
+                "fresh": settings.get("loss", {}).get("n_step"),
+            },
+        },
+        "ages": [_ages(facts.ages, *key) for key in _keys(facts.ages, "source", "unit")],
+        "target": facts.config.get("target") or settings.get("target"),
+        "strata": [
+            {
+                name: row[name]
+                for name in (
+                    *("source", "stratum", "timing", "available_rows", "quota_share"),
+                    *("drawn_rows", "drawn_share", "effective_share", "terminal_share"),
+                )
+            }
+            for row in facts.fed
+        ],
+        "behaviour_policies": [
+            {name: row[name] for name in ("source", "behaviour_policy", "rows", "share")}
+            for row in facts.policies
+        ],
+        "corrections": {
+            "rules": mixture.get("correction") if mixture is not None else None,
+            "post_strata": [row["stratum"] for row in logs if row["timing"] == "post"],
+            "moved_by_weights": sum(
+                abs((row["effective_share"] or 0.0) - (row["drawn_share"] or 0.0)) for row in logs
+            )
+            / 2,
+        },
+        "left_out": dict(panel.header.left_out) if panel is not None else None,
+        "imbalance": flattery(facts) or None,
+        "missing": list(facts.missing),
+    }
+
+
+def as_markdown(card: dict[str, Any]) -> str:
+    """The card as a page of Markdown."""
+    capacity, sampling = card["capacity"], card["sampling"]
+    lines = [f"# Replay card of {_cell(card['run'])}", ""]
+    lines += [f"**The imbalance that flatters most.** {_cell(card['imbalance'] or _UNKNOWN)}", ""]
+    facts = {
+        "Capacity": f"{_count(capacity['ring_rows'])} fresh rows; {_panel(capacity)}",
+        "Sampling rule": f"batches of {_or_none(sampling['batch_size'])},"
+        f" {_percent(sampling['logs_share'])} of all rows from logs, the offline phase among them:"
+        f" {sampling['logs'] or 'rule not known'}; fresh: {sampling['fresh'] or 'none'}",
+        "Returns": f"{_or_none(sampling['n_step']['logs'])}-step in the logs,"
+        f" {_or_none(sampling['n_step']['fresh'])}-step fresh",
+        "Target rule": _words(card["target"]),
+        "Corrections": f"{_words(card['corrections']['rules'])}; outcome strata:"
+        f" {', '.join(card['corrections']['post_strata']) or 'none'}; weights moved"
+        f" {_percent(card['corrections']['moved_by_weights'])} of the logs' mix",
+        "Left out of the panel": _words(card["left_out"]),
+    }
+    lines += ["| | |", "| --- | --- |"]
+    lines += [f"| {name} | {_cell(value)} |" for name, value in facts.items()]
+    lines += ["", "## Conditions in the sampled batches", ""]
+    lines += _table(
+        card["strata"],
+        {
+            "source": "source",
+            "stratum": "stratum",
+            "timing": "timing",
+            "available_rows": "available",
+            "quota_share": "intended",
+            "drawn_share": "drawn",
+            "effective_share": "after weights",
+            "terminal_share": "terminal",
+        },
+    )
+    lines += ["", "## Age of the sampled rows", ""]
+    lines += _table(
+        card["ages"],
+        {
+            "source": "source",
+            "unit": "unit",
+            "rows": "rows",
+            "p50": "p50",
+            "p90": "p90",
+            "p99": "p99",
+        },
+    )
+    lines += ["", "## Whose behaviour it was", ""]
+    lines += _table(
+        card["behaviour_policies"],
+        {"source": "source", "behaviour_policy": "policy", "rows": "rows", "share": "share"},
+    )
+    if card["missing"]:
+        lines += ["", "## Not known", "", *(f"- {_cell(line)}" for line in card["missing"])]
+    return "\n".join(lines) + "\n"
+
+
+def _panel(capacity: dict[str, Any]) -> str:
+    if capacity["panel"] is None:
+        return "no panel"
+    if capacity["panel_rows"] is None:
+        return f"panel {capacity['panel']}, which is not at hand"
+    return (
+        f"panel {capacity['panel']} of {_count(capacity['panel_rows'])} rows"
+        f" (store version {capacity['store_version']})"
+    )
+
+
+def _rule(mixture: dict[str, Any] | None) -> str | None:
+    """How the logged part of a batch is drawn."""
+    if mixture is None:
+        return None
+    within = str(mixture.get("within", "uniform")).replace("_", " ")
+    cap = mixture.get("max_replays_per_row")
+    most = f", a row at most {cap:g} times" if cap else ""
+    return f"quotas by stratum, within one {within}{most}"
+
+
+def _drawn_share(facts: Facts, source: str) -> float | None:
+    rows = sum(row["drawn_rows"] for row in facts.fed)
+    return sum(r["drawn_rows"] for r in facts.fed if r["source"] == source) / rows if rows else None
+
+
+def _keys(rows: Rows, *names: str) -> list[tuple[Any, ...]]:
+    return list(dict.fromkeys(tuple(row[name] for name in names) for row in rows))
+
+
+def _ages(rows: Rows, source: str, unit: str) -> dict[str, Any]:
+    """Quantiles of a log2 histogram: the upper end of the bucket that each falls into."""
+    mine = sorted(
+        (row["bucket"], row["rows"])
+        for row in rows
+        if (row["source"], row["unit"]) == (source, unit)
+    )
+    total = sum(count for _, count in mine)
+    found: dict[str, Any] = {"source": source, "unit": unit, "rows": int(total)}
+    for name, part in (("p50", 0.5), ("p90", 0.9), ("p99", 0.99)):
+        below = 0.0
+        for bucket, count in mine:
+            below += float(count)
+            if below >= part * float(total):
+                found[name] = f"below {2 ** (bucket + 1):,}"
+                break
+    return found
+
+
+def _table(rows: list[dict[str, Any]], columns: dict[str, str]) -> list[str]:
+    if not rows:
+        return ["nothing"]
+    numbers = {"available_rows", "rows"}
+    lines = [f"| {' | '.join(columns.values())} |", f"|{' --- |' * len(columns)}"]
+    for row in rows:
+        cells = []
+        for name in columns:
+            value = row[name]
+            if name in numbers:
+                cells.append(_count(value))
+            elif name.endswith("share"):
+                cells.append(_percent(value))
+            else:
+                cells.append(_cell(value))
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines
+
+
+def _percent(value: float | None) -> str:
+    return "" if value is None else f"{value:.1%}"
+
+
+def _count(value: int | None) -> str:
+    return "" if value is None else f"{int(value):,}"
+
+
+def _or_none(value: Any) -> str:
+    return "none" if value is None else str(value)
+
+
+def _words(value: Any) -> str:
+    """A small document for people."""
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_words(item)}" for key, item in value.items()) or "none"
+    return _or_none(value)
+
+
+def _cell(value: Any) -> str:
+    """Text that cannot leave its cell, nor be markup: names come from recordings."""
+    text = "" if value is None else str(value)
+    return text.replace("&", "&amp;").replace("<", "&lt;").replace("|", "\\|").replace("\n", " ")
+
+
+__all__ = ["as_markdown", "replay_card"]
