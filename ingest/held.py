@@ -15,10 +15,10 @@ import numpy as np
 from restock.errors import RecordingError
 from restock.ingest.align import NS, STAMP, Segment, align, ticks_of
 from restock.ingest.columns import FieldColumn, Ragged, TopicColumns
+from restock.ingest.filling import PROVENANCE_LEAD_S
 from restock.ingest.profile import Profile
 from restock.ingest.readers import open_recording
 from restock.ingest.recording import Recording
-from restock.ingest.steps import PROVENANCE_LEAD_S
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from driven_robot import FREE_M, PERIOD_S, SPEED_MPS, START_NS, Drive, columns, scans, without
 
+from restock.ingest.filling import parse_policy
 from restock.ingest.profile import Clock, load_profile
-from restock.ingest.steps import parse_policy, steps_of
+from restock.ingest.steps import steps_of
 
 PROFILE = load_profile("warehouse_amr")
 
