@@ -188,3 +188,70 @@ def test_a_profile_is_never_overwritten(bag, tmp_path, capsys):
     file.write_text("mine")
     assert main(["profile", "new", str(bag), "--out", str(file)]) == 2
     assert file.read_text() == "mine"
+
+
+OWN = '\n[[condition]]\nfile = "{}"\n'
+TIGHT = "-- There is little room.\n-- timing: pre\n-- priority: 44\nclearance_m < 0.3\n"
+
+
+def test_a_condition_may_lie_in_a_file_beside_the_profile(tmp_path):
+    (tmp_path / "tight.sql").write_text(TIGHT)
+    file = tmp_path / "p.toml"
+    file.write_text(TEXT + OWN.format("tight.sql"))
+    found = load_profile(file).own_conditions[0]
+    assert (found.name, found.timing, found.priority) == ("tight", "pre", 44)
+    assert (found.sql, found.doc) == ("clearance_m < 0.3", "There is little room.")
+    before = load_profile(file)
+    (tmp_path / "tight.sql").write_text(TIGHT.replace("0.3", "0.4"))
+    assert load_profile(file).hash != before.hash
+    assert load_profile(file).labels_version != before.labels_version
+    file.write_text(TEXT + OWN.format("tight.sql") + 'name = "narrow"\npriority = 3\n')
+    found = load_profile(file).own_conditions[0]
+    assert (found.name, found.priority) == ("narrow", 3)
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ('file = "../tight.sql"', "`condition[0].file` leads out of the profile's folder"),
+        ('file = "/etc/passwd.sql"', "`condition[0].file` leads out of the profile's folder"),
+        ('file = "link.sql"', "`condition[0].file` leads out of the profile's folder"),
+        ('file = "none.sql"', "`condition[0].file` cannot be read: none.sql"),
+        ('file = "p.toml"', "`condition[0].file` must name a .sql file"),
+        ('file = "big.sql"', "`condition[0].file` is larger than 100,000 bytes"),
+        ('file = "tight.sql"\nsql = "true"', "`condition[0].file` stands beside `sql`"),
+        ('file = "bare.sql"', "missing key `condition[0].timing`"),
+    ],
+)
+def test_a_file_of_a_condition_stays_beside_the_profile(entry, said, tmp_path):
+    folder = tmp_path / "profiles"
+    folder.mkdir()
+    (tmp_path / "tight.sql").write_text(TIGHT)
+    (folder / "link.sql").symlink_to(tmp_path / "tight.sql")
+    (folder / "tight.sql").write_text(TIGHT)
+    (folder / "bare.sql").write_text("true")
+    (folder / "big.sql").write_text("-- " + "x" * 100_000)
+    file = folder / "p.toml"
+    file.write_text(TEXT + f"\n[[condition]]\n{entry}\n")
+    with pytest.raises(ConfigError) as error:
+        load_profile(file)
+    assert said in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("sql", "said"),
+    [
+        ("clearance_mm < 1", 'Referenced column "clearance_mm" not found'),
+        ("clearance_m", "its SQL gives float, not a boolean"),
+        ("clearance_m <", "its SQL cannot be read: syntax error"),
+        ("lead(bumped) OVER episode", 'timing is "pre", but lead() may look at later steps'),
+        ("(SELECT content FROM read_text('/etc/passwd')) = ''", "it holds a query"),
+        ("getenv('HOME') = ''", "does not exist"),
+    ],
+)
+def test_a_condition_that_does_not_bind_is_refused_with_its_key(sql, said):
+    own = f'\n[[condition]]\nname = "x"\ntiming = "pre"\nsql = """{sql}"""\n'
+    with pytest.raises(ConfigError) as error:
+        parse_profile(TEXT + own, where="mine.toml")
+    assert str(error.value).startswith("mine.toml: `condition[0].sql` ('x'): ")
+    assert said in str(error.value)
