@@ -15,6 +15,7 @@ from restock.ingest.discover import ZSTD_MAGIC
 PLAUSIBLE_SIZE = 256 << 20
 PLAUSIBLE_RATIO = 1000
 LARGEST_MESSAGE = 1 << 30
+BLOCK = 1 << 12  # bytes given to zstd at a time: at its most that makes 128 MiB of them
 
 
 def decompress_file(path: Path, target: Path, *, salvage: bool) -> str | None:
@@ -28,7 +29,7 @@ def decompress_file(path: Path, target: Path, *, salvage: bool) -> str | None:
     problem = None
     with path.open("rb") as source, target.open("wb") as sink:
         decoder = zstandard.ZstdDecompressor().decompressobj()
-        while block := source.read(1 << 16):
+        while block := source.read(BLOCK):
             try:
                 part = decoder.decompress(block)
             except zstandard.ZstdError as error:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from restock.errors import RecordingError
+from restock.errors import RecordingError, visible
 from restock.ingest import mcap_records, sqlite_file
 
 Kind = Literal["mcap", "sqlite3", "ros1"]
@@ -18,7 +18,12 @@ ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 ROS1_MAGIC = b"#ROSBAG V"
 LFS_MAGIC = b"version https://git-lfs"
 METADATA = "metadata.yaml"
-LARGEST_METADATA = 16 << 20
+LARGEST_METADATA = 2 << 20  # real ones have some kB, and the parser is slow
+# What the YAML library raises of a document that is none, or of one that it does not expect.
+_NO_YAML = (
+    *(YAMLError, KeyError, IndexError, TypeError, ValueError, AttributeError, AssertionError),
+    *(RecursionError, OverflowError, NotImplementedError),
+)
 ENDINGS = (".mcap", ".db3", ".bag", ".mcap.zstd", ".db3.zstd", ".mcap.zst", ".db3.zst")
 
 
@@ -88,7 +93,8 @@ def bag_files(folder: Path, metadata: dict[str, Any]) -> tuple[list[Path], list[
     The metadata's paths are not trusted: only files in the folder itself are read.
     """
     listed = metadata.get("relative_file_paths")
-    names = [Path(str(name)).name for name in listed] if isinstance(listed, list) else []
+    listed = listed if isinstance(listed, list) else []
+    names = [Path(name).name for name in listed if isinstance(name, str)]
     present = {item.name: item for item in folder.iterdir() if item.is_file()}
     there = {name: item for name, item in present.items() if is_storage_name(item)}
     order = []
@@ -121,8 +127,9 @@ def read_metadata(folder: Path) -> tuple[dict[str, Any], str | None]:
             return {}, f"{METADATA} has {file.stat().st_size:,} bytes: not read"
         document = YAML(typ="safe", pure=True).load(file.read_text(encoding="utf-8"))
         found = document["rosbag2_bagfile_information"]
-    except (YAMLError, KeyError, TypeError, ValueError, RecursionError) as error:
-        return {}, f"{METADATA} cannot be used: {str(error).splitlines()[0]}"
+    except _NO_YAML as error:
+        why = (str(error).splitlines() or [type(error).__name__])[0]
+        return {}, f"{METADATA} cannot be used: {visible(why[:200])}"
     if not isinstance(found, dict):
         return {}, f"{METADATA} cannot be used: not a mapping"
     return found, None

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from restock.errors import RecordingError
+from restock.errors import RecordingError, visible
 
 DEEPEST = 24  # nested messages; real ones reach 6
 MOST_FIELDS = 20_000
@@ -38,6 +38,9 @@ DTYPES: dict[str, np.dtype[Any]] = {
 
 class CannotDecode(Exception):
     """A type that cannot be decoded, and why: the topic is skipped, the recording is not."""
+
+    def __init__(self, why: str) -> None:
+        super().__init__(visible(why))
 
 
 @dataclass(frozen=True)

@@ -208,7 +208,7 @@ class _Fields:
             if self._count > MOST_FIELDS:
                 raise CannotDecode(f"its messages have more than {MOST_FIELDS:,} fields")
             # A path could not tell such a name from its own dots and brackets.
-            if member and "." not in member and "[]" not in member:
+            if member and member.isprintable() and "." not in member and "[]" not in member:
                 made = self._field(f"{name}.{member}", member, inner, None)
                 fields += [made] if made else []
         self._found[name] = fields

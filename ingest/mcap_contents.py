@@ -16,7 +16,6 @@ from restock.ingest.mcap_chunk import HEAD_SIZE, Chunk
 from restock.ingest.mcap_records import MAGIC, PREFIX, Malformed, Op, parse, walk
 from restock.ingest.storage import Extra
 
-
 # What the survey keeps is bounded, whatever a file is made of.
 MOST_CHUNKS = 1_000_000
 MOST_NAMED = 10_000  # attachments and metadata records; the others are counted

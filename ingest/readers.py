@@ -12,11 +12,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from restock.errors import RecordingError
+from restock.errors import RecordingError, visible
 from restock.ingest import discover
 from restock.ingest.account import Account, Loss, TopicInfo
 from restock.ingest.columns import Ragged, TopicColumns
 from restock.ingest.compression import decompress_file
+from restock.ingest.decoders import READABLE
 from restock.ingest.definitions import DEFAULT_DISTRO, refuse_unknown
 from restock.ingest.discover import METADATA, recordings_in
 from restock.ingest.mcap_file import McapFile
@@ -159,9 +160,10 @@ class _Opening:
             or (isinstance(storage, McapFile) and storage.profile == "ros2")
         ]
         found = {channel.encoding for storage in ros2 for channel in storage.channels.values()}
-        claimed = {topic.get("serialization_format") for topic, _ in _claims(metadata)}
-        for formats in (found, claimed - {None, ""}):
-            if formats and "cdr" not in formats:
+        said = [topic.get("serialization_format") for topic, _ in _claims(metadata)]
+        claimed = {name for name in said if isinstance(name, str)}
+        for formats in (found, claimed - {""}):
+            if formats and not formats & set(READABLE):
                 names = ", ".join(sorted(map(repr, formats)))
                 raise RecordingError(
                     f"its messages are serialised as {names}, and only CDR is read",
@@ -175,6 +177,7 @@ class _Opening:
             name = topic.get("name")
             if not isinstance(name, str) or not isinstance(count, int):
                 continue
+            name = visible(name)  # as the files' own names are
             info = recording.topics.get(name)
             there = info.expected if info else 0
             if there != count:

@@ -1,4 +1,8 @@
-"""What every container of messages offers: the seam between file formats and decoding."""
+"""What every container of messages offers: the seam between file formats and decoding.
+
+Names come out of files, and go to terminals, tables and reports: control characters in them are
+written out (`visible`) where they come in.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
+from restock.errors import visible
 from restock.ingest.columns import Batch
 
 Integrity = Literal["verified", "unverified", "damaged"]
@@ -22,6 +27,10 @@ class Channel:
     definition_format: str = ""  # "ros2msg", "ros2idl", "ros1msg", "jsonschema", "protobuf" or ""
     definition: bytes = b""
 
+    def __post_init__(self) -> None:
+        for name in ("topic", "type", "encoding", "definition_format"):
+            object.__setattr__(self, name, visible(getattr(self, name)))
+
 
 @dataclass
 class Damage:
@@ -29,6 +38,9 @@ class Damage:
 
     what: str
     messages: dict[int, int] = field(default_factory=dict)  # by channel id
+
+    def __post_init__(self) -> None:
+        self.what = visible(self.what)
 
 
 @dataclass(frozen=True)
@@ -39,6 +51,10 @@ class Extra:
     name: str
     media_type: str
     size_bytes: int
+
+    def __post_init__(self) -> None:
+        for name in ("name", "media_type"):
+            object.__setattr__(self, name, visible(getattr(self, name)))
 
 
 class Storage(Protocol):

@@ -9,6 +9,22 @@ from __future__ import annotations
 from enum import IntEnum
 
 
+def visible(text: str, keep: str = "") -> str:
+    """The text with control characters (but those in `keep`) written out, as in `\\x1b[2J`.
+
+    A terminal obeys them: a topic's name could clear the screen, or pass for another line. So
+    are those that reorder text.
+    """
+    if text.isprintable():
+        return text
+    return "".join(
+        letter
+        if letter.isprintable() or letter in keep
+        else letter.encode("unicode_escape").decode("ascii")
+        for letter in text
+    )
+
+
 class ExitCode(IntEnum):
     """Exit codes of every verb."""
 
@@ -25,6 +41,9 @@ class RestockError(Exception):
     exit_code = ExitCode.USAGE
 
     def __init__(self, what: str, *, where: str | None = None, remedy: str | None = None) -> None:
+        # They quote what files say, and end up on a terminal.
+        what, remedy = visible(what, keep="\n"), remedy and visible(remedy, keep="\n")
+        where = where and visible(where)
         self.what, self.where, self.remedy = what, where, remedy
         parts = [f"{where}: {what}" if where else what]
         if remedy:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from restock.errors import ExitCode, RecordingError
+from restock.errors import ExitCode, RecordingError, visible
 
 NAMED = 10  # attachments and metadata records that are listed
 
@@ -87,7 +87,7 @@ def _print(entry: dict[str, Any]) -> None:
         for name, topic in entry["topics"].items()
     ]
     about = (
-        entry["path"],
+        visible(entry["path"]),
         entry["format"],
         f"{entry['messages']:,} messages",
         f"{entry['duration_s']:.1f} s" if entry["duration_s"] is not None else "",
@@ -107,6 +107,6 @@ def _print(entry: dict[str, Any]) -> None:
             sys.stdout.write(f"{what}, {len(names):,}: {listed}{more}\n")
     sys.stdout.flush()
     for line in entry["damage"]:
-        sys.stderr.write(f"{entry['path']}: damaged: {line}\n")
+        sys.stderr.write(visible(f"{entry['path']}: damaged: {line}") + "\n")
     for line in entry["notes"]:
-        sys.stderr.write(f"{entry['path']}: {line}\n")
+        sys.stderr.write(visible(f"{entry['path']}: {line}") + "\n")

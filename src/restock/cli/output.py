@@ -22,6 +22,8 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from restock.errors import visible
+
 Row = Mapping[str, Any]
 
 
@@ -114,7 +116,7 @@ def cell(value: Any) -> str:
         return f"{value:,}" if abs(value) < 1_000_000_000 else str(value)
     if isinstance(value, list | tuple):
         return ", ".join(cell(item) for item in value)
-    return str(value).replace("[", r"\[")
+    return visible(str(value), keep="\n\t").replace("[", r"\[")
 
 
 def _is_number(value: Any) -> bool:
