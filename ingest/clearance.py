@@ -18,7 +18,7 @@ from restock.ingest.task import Task
 SECTORS = "clearance of each sector"  # (N, sectors) float64, m
 BEAMS = "number of beams"  # (N,) int64
 
-_SCANS = 512  # reduced at a time: what is in between stays in the processor's cache
+_VALUES = 1 << 18  # ranges reduced at a time: what is in between stays in the processor's cache
 _MAPS = 64  # geometries that are remembered; a lidar has one
 
 
@@ -68,8 +68,9 @@ class _ScanReducer:
             return
         sectors, task = self._map(first, increment, beams), self.task
         count = len(clearance) if rows is None else len(rows)
-        for start in range(0, count, _SCANS):
-            stop = min(start + _SCANS, count)
+        some = max(_VALUES // beams, 1)
+        for start in range(0, count, some):
+            stop = min(start + some, count)
             if rows is None:
                 here: Any = slice(start, stop)
                 part = cut(ranges, start, stop)
