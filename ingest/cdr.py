@@ -93,13 +93,7 @@ class ColumnDecoder:
 
     def _one_by_one(self, batch: Batch, rows: NDArray[np.intp], bad: dict[str, int]) -> Decoded:
         """What is wrong differs from row to row: let every row fail for itself."""
-        part = Batch(
-            batch.buffer,
-            batch.start[rows],
-            batch.stop[rows],
-            batch.log_time_ns[rows],
-            batch.publish_time_ns[rows],
-        )
+        part = batch.select(rows)
         slow = RowDecoder(self._message, self._leaves, ros1=self._ros1).decode(part)
         for reason, count in slow.bad.items():
             bad[reason] = bad.get(reason, 0) + count

@@ -143,6 +143,16 @@ class Batch:
     def __len__(self) -> int:
         return len(self.start)
 
+    def select(self, rows: NDArray[np.intp]) -> Batch:
+        """These rows, in the same buffer."""
+        return Batch(
+            self.buffer,
+            self.start[rows],
+            self.stop[rows],
+            self.log_time_ns[rows],
+            self.publish_time_ns[rows],
+        )
+
     def payloads(self) -> list[bytes]:
         """Each message's bytes."""
         view = self.buffer.data

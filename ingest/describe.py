@@ -8,6 +8,7 @@ from typing import Any
 
 from restock.ingest.clocks import STAMP, topic_clock
 from restock.ingest.readers import open_recording
+from restock.ingest.reading import LATEST_NS
 from restock.ingest.recording import Recording
 
 NANOSECONDS = 1_000_000_000
@@ -32,6 +33,9 @@ def describe(
     with open_recording(path, typestore=typestore, salvage=salvage) as recording:
         span = recording.span_ns
         duration_s = (span[1] - span[0]) / NANOSECONDS if span else None
+        notes = list(recording.notes)
+        if span and (span[0] < 0 or span[1] == LATEST_NS):
+            notes.append("its log times reach before 1970 or beyond 2262: absurd stamps")
         compared = _clocks(recording) if clocks else {}
         return {
             "path": str(path),
@@ -61,7 +65,7 @@ def describe(
                 if extra.kind == "attachment"
             ],
             "metadata": [extra.name for extra in recording.extras if extra.kind == "metadata"],
-            "notes": list(recording.notes),
+            "notes": notes,
             "damage": [item.what for item in recording.damage],
         }
 

@@ -20,6 +20,7 @@ from restock.ingest.mcap_records import PREFIX, Malformed, Op, parse, walk
 LARGEST_CHUNK = 4 << 30
 PLAUSIBLE_SIZE = 64 << 20
 PLAUSIBLE_RATIO = 1000
+LATEST_NS = 2**63 - 1
 
 _HEAD = np.dtype(  # a message record up to its data
     [
@@ -221,9 +222,15 @@ def indexed_messages(
     return Messages(
         at + HEAD_SIZE,
         stop,
-        head["log_time"].astype(np.int64),
-        head["publish_time"].astype(np.int64),
+        _stamps(head["log_time"]),
+        _stamps(head["publish_time"]),
     )
+
+
+def _stamps(values: NDArray[Any]) -> I64:
+    """Times of 64 bits without a sign: what int64 cannot hold (2262) stays the last that it can."""
+    stamps: I64 = np.minimum(values, np.uint64(LATEST_NS)).astype(np.int64)
+    return stamps
 
 
 def walked_messages(part: Any) -> tuple[Positions, str | None]:
@@ -259,8 +266,8 @@ def messages_at(buffer: NDArray[np.uint8], positions: Any) -> Messages:
     return Messages(
         at + HEAD_SIZE,
         at + PREFIX + head["length"].astype(np.int64),
-        head["log_time"].astype(np.int64),
-        head["publish_time"].astype(np.int64),
+        _stamps(head["log_time"]),
+        _stamps(head["publish_time"]),
     )
 
 

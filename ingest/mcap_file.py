@@ -16,14 +16,13 @@ from restock.errors import RecordingError
 from restock.ingest import mcap_chunk
 from restock.ingest.columns import Batch
 from restock.ingest.mapped import FORGET_BYTES, forget
-from restock.ingest.mcap_chunk import BadChunk, Chunk, Indexed, Messages, Positions
+from restock.ingest.mcap_chunk import LATEST_NS, BadChunk, Chunk, Indexed, Messages, Positions
 from restock.ingest.mcap_contents import survey
 from restock.ingest.mcap_records import MAGIC
 from restock.ingest.mcap_salvage import resume
 from restock.ingest.storage import Channel, Damage, Integrity
 
 GROUP_BYTES = 8 << 20  # of chunks decoded together: enough to amortise numpy's calls
-LATEST_NS = 2**63 - 1
 
 _Part: TypeAlias = tuple[Chunk, int, int]  # a chunk, and where it lies: first byte, bytes
 

@@ -20,6 +20,8 @@ from restock.ingest.rows import Decoded
 SMALL_ROWS = 1024  # batches of fewer messages are put together, up to
 TOGETHER_ROWS = 4096
 TOGETHER_BYTES = 4 << 20
+LATEST_NS = 2**63 - 1
+ABSURD = "logged at an absurd time, before 1970 or after 2262"
 
 Fields = Mapping[str, FieldColumn]
 
@@ -75,6 +77,10 @@ class TopicReading:
         batch, damaged = decompress_messages(batch)
         if damaged:
             self._add({"its zstd data is damaged": damaged})
+        sane = (batch.log_time_ns >= 0) & (batch.log_time_ns < LATEST_NS)
+        if not sane.all():
+            self._add({ABSURD: int((~sane).sum())})
+            batch = batch.select(np.flatnonzero(sane))
         decoded = decode(batch)
         self._add(decoded.bad)
         account.decoded += len(decoded.rows)

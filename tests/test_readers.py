@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import zstandard
 from bag_samples import SHARED, START_NS, TOPICS, messages, write_bag, write_mcap
-from mcap.writer import CompressionType, IndexType
+from mcap.writer import CompressionType, IndexType, Writer
 
 from restock.errors import RecordingError
 from restock.ingest.columns import Ragged, equal
+from restock.ingest.describe import describe
 from restock.ingest.readers import Recording, TopicColumns, open_recording, recordings_in
 
 
@@ -359,6 +360,44 @@ def test_an_unknown_type_skips_its_topic_by_name(tmp_path: Path) -> None:
         assert list(found) == ["/bumper"]
         assert recording.accounts["/odom"].expected == recording.accounts["/odom"].lost == 20
         assert [loss.topic for loss in recording.losses] == ["/odom"]
+
+
+def test_absurd_log_times_are_counted_by_name(tmp_path: Path) -> None:
+    for name, stamps in (
+        ("run.mcap", {3: 2**64 - 1, 5: 2**63, 7: 2**63 - 1}),
+        ("run.db3", {3: -1, 5: -(2**63), 7: 2**63 - 1}),
+    ):
+        file = tmp_path / name
+        if name.endswith("mcap"):
+            with file.open("wb") as out:
+                writer = Writer(out)
+                writer.start()
+                schema = writer.register_schema("std_msgs/msg/Bool", "ros2msg", b"bool data")
+                channel = writer.register_channel("/t", "cdr", schema)
+                for row in range(10):
+                    stamp = stamps.get(row, START_NS)
+                    writer.add_message(channel, stamp, b"\0\1\0\0\1", 2**64 - 1)
+                writer.finish()
+        else:
+            with sqlite3.connect(file) as base:
+                base.executescript(
+                    "CREATE TABLE topics"
+                    " (id INTEGER PRIMARY KEY, name, type, serialization_format);"
+                    "CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id, timestamp, data);"
+                    "INSERT INTO topics VALUES (1, '/t', 'std_msgs/msg/Bool', 'cdr')"
+                )
+                base.executemany(
+                    "INSERT INTO messages (topic_id, timestamp, data) VALUES (1, ?, x'0001000001')",
+                    [(stamps.get(row, START_NS),) for row in range(10)],
+                )
+            base.close()
+        with open_recording(file) as recording:
+            columns = recording.read({"/t": ["data"]})["/t"]
+            assert columns.log_time_ns.tolist() == [START_NS] * 7
+            assert (columns.publish_time_ns > 0).all()
+            reasons = recording.accounts["/t"].reasons
+            assert reasons == {"logged at an absurd time, before 1970 or after 2262": 3}
+        assert any("absurd stamps" in note for note in describe(file)["notes"])
 
 
 # -- recordings that other people made ------------------------------------------------------
