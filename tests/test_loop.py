@@ -419,6 +419,55 @@ def test_the_conservative_term_lowers_what_the_logs_never_did(tmp_path: Path) ->
     assert q.argmax(dim=1).tolist() == [1] * (CELLS - 1)
 
 
+def spoilt(live: Session, at: int) -> Any:
+    """A `stop` that makes the policy useless once, at an environment step: it stands still."""
+
+    def stop() -> bool:
+        if live.clock.env_steps >= at and not getattr(stop, "done", False):
+            stop.done = True  # type: ignore[attr-defined]
+            for network in (live.learner.network, live.learner.policy_network):
+                with torch.no_grad():
+                    network.advantage.weight.zero_()
+                    network.advantage.bias.copy_(torch.tensor([50.0, -50.0, -50.0]))
+        return False
+
+    return stop
+
+
+@pytest.mark.parametrize("action", ["stop", "rollback"])
+def test_the_guard_does_not_let_a_condition_be_unlearnt(tmp_path: Path, action: str) -> None:
+    settings = config(
+        guard={"margin": 0.5, "action": action, "conditions": ["nominal"]},
+        schedule={**SMALL["schedule"], "env_steps": 4000},
+    )
+    live = session(tmp_path / "r", settings)
+    said: list[dict[str, Any]] = []
+    outcome = train(
+        live,
+        stop=spoilt(live, at=2340),
+        notify=lambda event, values: said.append(values) if event == "guard" else None,
+    )
+    live.close()
+    assert said
+    assert said[0]["action"] == action
+    rows = pq.read_table(live.run.path / "guard.parquet").to_pylist()
+    assert {row["condition"] for row in rows} == {"nominal"}
+    assert all(row["best"] - row["now"] >= 0.5 for row in rows)
+    assert outcome.best is not None
+    if action == "stop":
+        assert outcome.stopped
+        assert outcome.env_steps < settings.schedule.env_steps
+    else:
+        assert outcome.rollbacks >= 1
+        assert outcome.env_steps == settings.schedule.env_steps
+        assert outcome.last is not None
+        assert outcome.last.success["nominal"] > 0.5  # it recovered
+
+
+def test_without_a_margin_the_guard_is_off(undisturbed: Session) -> None:
+    assert pq.read_table(undisturbed.run.path / "guard.parquet").num_rows == 0
+
+
 def test_the_margin_is_for_rows_of_the_named_policy_and_strata() -> None:
     shelf = logs()
     operator = shelf.behaviour_policy.codes == shelf.behaviour_policy.names.index("operator")

@@ -153,6 +153,19 @@ class EvaluationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"evaluation.averaging must be in (0, 1], got {self.averaging}")
 
 
+class GuardConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    margin: float | None = None  # of success in a condition, below the kept policy's; None: off
+    action: Literal["stop", "rollback"] = "stop"
+    conditions: tuple[str, ...] = ()  # that are watched; none: all that are evaluated
+    rollbacks: int = 3  # after so many the run stops
+
+    def __post_init__(self) -> None:
+        if self.margin is not None and not 0 < self.margin <= 1:
+            raise ValueError(f"guard.margin must be in (0, 1], got {self.margin}")
+        if self.rollbacks < 0:
+            raise ValueError(f"guard.rollbacks must be at least 0, got {self.rollbacks}")
+
+
 class RecordConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     every_updates: int = 500  # one logging interval
     audit_share: float = 0.01  # of all batches, every row of which is recorded
@@ -185,11 +198,17 @@ class TrainConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     epsilon: LinearEpsilon = LinearEpsilon()
     env: EnvConfig = msgspec.field(default_factory=EnvConfig)
     evaluation: EvaluationConfig = EvaluationConfig()
+    guard: GuardConfig = GuardConfig()
     record: RecordConfig = RecordConfig()
 
     def __post_init__(self) -> None:
         if self.loss.munchausen and self.network.quantiles:
             raise ValueError("loss.munchausen and network.quantiles do not go together: choose one")
+        unknown = set(self.guard.conditions) - set(self.env.conditions)
+        if unknown:
+            raise ValueError(
+                f"guard.conditions: {', '.join(sorted(unknown))} is not among env.conditions"
+            )
 
 
 def load_config(path: Path | None, overrides: Sequence[str] = ()) -> TrainConfig:

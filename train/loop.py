@@ -8,7 +8,7 @@ arXiv:2412.07762). Read `train` from top to bottom: it is the whole of it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from restock.errors import ExitCode, RestockError
@@ -21,6 +21,7 @@ from restock.train.evaluate import (
     score,
 )
 from restock.train.explore import epsilon_greedy
+from restock.train.guard import Fall, falls, roll_back
 from restock.train.probe import Probe
 from restock.train.session import Interval, Session
 from restock.train.target import Hard
@@ -43,6 +44,8 @@ class Outcome:
     wall_s: float
     best: Score | None
     last: Score | None
+    stopped: bool  # by the guard
+    rollbacks: int
 
 
 def train(
@@ -73,7 +76,7 @@ def train(
             _close_interval(session, "offline", notify)
         _evaluate(session, notify)
 
-    while clock.env_steps < schedule.env_steps and _time_left(session):
+    while clock.env_steps < schedule.env_steps and _time_left(session) and not clock.stopped:
         _interrupt(session, stop)
         # 2. Warm-up: the offline policy drives, and nothing is learnt from its rows yet.
         warm = clock.env_steps >= schedule.warmup_env_steps
@@ -124,7 +127,13 @@ def train(
         _evaluate(session, notify)
     session.save()
     return Outcome(
-        clock.env_steps, learner.gradient_steps, session.wall_s, session.best, session.last
+        clock.env_steps,
+        learner.gradient_steps,
+        session.wall_s,
+        session.best,
+        session.last,
+        clock.stopped,
+        clock.rollbacks,
     )
 
 
@@ -251,6 +260,24 @@ def _evaluate(session: Session, notify: Notify) -> None:
     summary = {**session.last.success, "mean": session.last.success_mean}
     session.events.scalars(clock.env_steps, "evaluation", summary)
     notify("evaluation", {"env_steps": clock.env_steps, "best": best, **summary})
+    if fallen := falls(session.last, session.best, config.guard):
+        _guard(session, fallen, notify)
+
+
+def _guard(session: Session, fallen: list[Fall], notify: Notify) -> None:
+    """A condition was unlearnt: go back to the kept policy, or stop."""
+    guard, clock, learner = session.config.guard, session.clock, session.learner
+    again = guard.action == "rollback" and clock.rollbacks < guard.rollbacks
+    action = "rollback" if again else "stop"
+    clocks = {"env_steps": clock.env_steps, "gradient_steps": learner.gradient_steps}
+    session.run.append("guard", [{**clocks, **asdict(fall), "action": action} for fall in fallen])
+    if again:
+        roll_back(learner, session.run)
+        clock.rollbacks += 1
+    else:
+        clock.stopped = True
+    session.run.flush(everything=False)
+    notify("guard", {"action": action, "falls": fallen})
 
 
 def _time_left(session: Session) -> bool:

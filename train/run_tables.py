@@ -123,6 +123,14 @@ TABLES: dict[str, pa.Schema] = {
         ("q_abs_mean", _F),
         ("q_lag", _F),  # mean |Q - Q_target| / mean |Q|
     ),
+    # One row an evaluation x condition in which the guard saw a fall.
+    "guard": _schema(
+        *_CLOCKS,
+        ("condition", _S),
+        ("best", _F),  # success of the kept policy
+        ("now", _F),
+        ("action", _S),  # stop | rollback
+    ),
     # One row a finished training episode (the agent explores in them).
     "episodes": _schema(
         *_CLOCKS,

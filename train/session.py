@@ -41,6 +41,8 @@ class Clock:
     evaluated_at: int = -1  # environment steps of the last evaluation
     checkpointed_at: int = 0
     wall_s: float = 0.0  # of training, before this process
+    rollbacks: int = 0
+    stopped: bool = False  # by the guard
 
 
 @dataclass

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 if TYPE_CHECKING:
+    from restock.train.fresh_rows import Flushed
     from restock.train.loop import Outcome
     from restock.train.prepare import Prepared
 
@@ -46,6 +47,9 @@ class Train:
     """Seed of networks, exploration, batches and episodes."""
     device: Literal["cpu", "cuda"] | None = None
     """Where the network lives."""
+    flush_fresh: Path | None = None
+    """Put the twin's labelled episodes in this store at the end, as a recording of format `twin`.
+    They are kept in the run's directory from the moment this is given."""
     dry_run: bool = False
     """Check everything and print the resolved config; write nothing."""
     json: bool = False
@@ -81,13 +85,16 @@ class Train:
         if self.dry_run:
             print_json(prepared.document)
             return 0
-        outcome = _train(prepared)
-        _print(prepared, outcome, as_json=self.json)
+        outcome, flushed = _train(prepared, self.flush_fresh)
+        _print(prepared, outcome, flushed, as_json=self.json)
         return 0
 
 
-def _train(prepared: Prepared) -> Outcome:
+def _train(prepared: Prepared, store: Path | None) -> tuple[Outcome, Flushed | None]:
+    """Train to the end; then flush what the twin gave, where a store is given."""
     from restock.cli.output import progress, stderr
+    from restock.ingest.store import StoreWriter
+    from restock.train.fresh_rows import flush
     from restock.train.loop import train
 
     config = prepared.config
@@ -95,6 +102,8 @@ def _train(prepared: Prepared) -> Outcome:
     # Soft: a line a reader greps for must not be wrapped.
     say = partial(stderr().print, soft_wrap=True, highlight=False)
     say(prepared.describe())
+    if store is not None or (session.run.path / "fresh").is_dir():
+        session.collector.keep(session.run.path / "fresh")
     try:
         with (
             progress("training", config.schedule.env_steps) as advance,
@@ -107,11 +116,18 @@ def _train(prepared: Prepared) -> Outcome:
                 nonlocal seen
                 if event == "evaluation":
                     say(_evaluation_line(values, session.wall_s))
+                elif event == "guard":
+                    say(_guard_line(values))
                 elif event == "progress":
                     advance(values["env_steps"] - seen, _progress_note(values))
                     seen = values["env_steps"]
 
-            return train(session, stop=stop, notify=notify)
+            outcome = train(session, stop=stop, notify=notify)
+        if store is None or (log := session.collector.log) is None:
+            return outcome, None
+        return outcome, flush(
+            session.run.path, StoreWriter(store), prepared.profile, log.dropped_steps
+        )
     finally:
         session.close()
 
@@ -142,6 +158,14 @@ def _progress_note(values: dict[str, Any]) -> str:
     )
 
 
+def _guard_line(values: dict[str, Any]) -> str:
+    fallen = ", ".join(
+        f"{fall.condition} fell from {fall.best:.2f} to {fall.now:.2f}" for fall in values["falls"]
+    )
+    done = {"stop": "stopped here", "rollback": "back to the best policy so far"}
+    return f"guard: {fallen}; {done[values['action']]}"
+
+
 def _evaluation_line(values: dict[str, Any], wall_s: float) -> str:
     skip = ("env_steps", "best", "mean")
     cells = "  ".join(f"{name} {value:.2f}" for name, value in values.items() if name not in skip)
@@ -149,20 +173,26 @@ def _evaluation_line(values: dict[str, Any], wall_s: float) -> str:
     return f"{wall_s:6.0f} s {values['env_steps']:>9,} steps  success: {cells}{mark}"
 
 
-def _print(prepared: Prepared, outcome: Outcome, *, as_json: bool) -> None:
+def _print(prepared: Prepared, outcome: Outcome, flushed: Flushed | None, *, as_json: bool) -> None:
     from dataclasses import asdict
 
     from restock.cli.output import print_json, print_table, say
 
     path = str(prepared.path)
     if as_json:
-        print_json({"run": path, "panel": prepared.document["panel"], **asdict(outcome)})
+        fresh = {"flushed": asdict(flushed)} if flushed is not None else {}
+        print_json({"run": path, "panel": prepared.document["panel"], **asdict(outcome), **fresh})
         return
     rows = []
     for name, result in (("best (kept)", outcome.best), ("last", outcome.last)):
         if result is not None:
             rows.append({"policy": name, **result.success, "mean": result.success_mean})
     print_table(rows, title="success on the fixed episodes, greedy")
+    if flushed is not None:
+        say(
+            f"recording {flushed.recording_id}, {flushed.episodes:,} episodes of the twin with"
+            f" {flushed.transitions:,} transitions: {flushed.status}"
+        )
     say(
         f"{outcome.env_steps:,} environment steps and {outcome.gradient_steps:,} updates in"
         f" {outcome.wall_s:.0f} s\nnext: restock eval {path}"
