@@ -5,7 +5,7 @@ The header of an audit's file says what it is:
     -- severity: error | warning | info
     -- advice: what to do about the rows it returns
     -- doc: what the rows are
-    -- needs: run | panel          (only where it looks at one)
+    -- needs: run | panel          (only where it looks at one; run.TABLE: that must have TABLE)
 
 `$name` in the query is a threshold, from `audits.toml` or a file of the user's.
 
@@ -48,8 +48,13 @@ class Audit:
     severity: Severity
     advice: str
     doc: str
-    needs: str | None  # "run" or "panel"
+    needs: str | None  # "run", "panel" or a table of one: "run.fed_episodes"
     sql: str
+
+    @property
+    def place(self) -> str | None:
+        """What it looks at beside the store: "run", "panel" or None."""
+        return self.needs.split(".")[0] if self.needs else None
 
     @property
     def parameters(self) -> set[str]:
@@ -119,8 +124,8 @@ def run_audits(
 ) -> list[Finding]:
     """Run audits over a connection with a store's views, worst findings first.
 
-    `beside` names the schemas that are there: "run", "panel". Audits that need another are
-    skipped.
+    `beside` names the schemas that are there: "run", "panel". Audits that need another, or a table
+    that an older run does not have, are skipped.
 
     Raises:
         ConfigError: an audit does not run, a threshold is missing, or one is given that no audit
@@ -128,6 +133,7 @@ def run_audits(
     """
     _check_thresholds(audits, thresholds)
     there = set(beside)
+    there |= {f"{schema}.{table}" for schema, table in _tables(connection) if schema in there}
     findings = [
         _run(connection, audit, thresholds.get(audit.name, {}))
         if audit.needs is None or audit.needs in there
@@ -138,20 +144,28 @@ def run_audits(
     return sorted(findings, key=lambda finding: (order.index(finding.status), finding.audit.name))
 
 
+def _tables(connection: duckdb.DuckDBPyConnection) -> list[tuple[str, str]]:
+    """Schema and name of every table and view."""
+    query = "SELECT table_schema, table_name FROM information_schema.tables"
+    found: list[tuple[str, str]] = connection.sql(query).fetchall()
+    return found
+
+
 def junit_xml(findings: Sequence[Finding], suite: str) -> str:
     """The findings as JUnit XML: failed audits fail, skipped ones are skipped."""
+    suite = _printable(suite)
     root = ElementTree.Element(
         "testsuite",
         name=suite,
         tests=str(len(findings)),
         failures=str(sum(finding.status == "fail" for finding in findings)),
+        errors="0",
         skipped=str(sum(finding.status == "skipped" for finding in findings)),
     )
     for finding in findings:
         case = ElementTree.SubElement(root, "testcase", classname=suite, name=finding.audit.name)
-        text = f"{finding.rows} rows. {finding.audit.advice}\n" + "\n".join(
-            str(row) for row in finding.sample
-        )
+        lines = [f"{finding.rows} rows. {finding.audit.advice}", *map(str, finding.sample)]
+        text = _printable("\n".join(lines))
         if finding.status == "fail":
             ElementTree.SubElement(case, "failure", message=finding.audit.doc).text = text
         elif finding.status == "skipped":
@@ -160,6 +174,11 @@ def junit_xml(findings: Sequence[Finding], suite: str) -> str:
             ElementTree.SubElement(case, "system-out").text = text
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _printable(text: str) -> str:
+    """Text without the characters that XML 1.0 cannot hold, not even escaped."""
+    return re.sub("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", text)
 
 
 def _run(
@@ -236,7 +255,7 @@ def rewrite(text: str) -> str:
     for audit in shipped_audits():
         table = thresholds.get(audit.name, {})
         given = ", ".join(f"{name} = {value}" for name, value in table.items())
-        doc = audit.doc + (f" Needs `--{audit.needs}`." if audit.needs else "")
+        doc = audit.doc + (f" Needs `--{audit.place}`." if audit.needs else "")
         lines.append(
             f"| {audit.name} | {audit.severity} | {doc} | {given} |".replace("|  |", "| |")
         )

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 # Raised when the meaning of a packed row changes; part of a panel's id.
-PACKING_VERSION = 1
+PACKING_VERSION = 2
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

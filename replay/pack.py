@@ -182,7 +182,9 @@ class Packer:
                 if not np.array_equal(ids, self.steps.ids[begin:end]):
                     raise PanelError("the source changed while it was read", where=str(meta.parent))
                 table = _encoded(pa.Table.from_batches([batch]))
-                left.write(table.select(_HELD_OUT).filter(pa.array(self.plan.held_out[begin:end])))
+                held = table.select(_HELD_OUT).filter(pa.array(self.plan.held_out[begin:end]))
+                split_by = pa.repeat(self.mixture.held_out.by, len(held))  # for the audit `leakage`
+                left.write(held.append_column("split_by", split_by))
                 code = self.plan.stratum[begin:end]
                 rows = np.flatnonzero(code != NO_STRATUM)
                 table, code = table.take(pa.array(rows)), code[rows]

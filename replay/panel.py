@@ -25,7 +25,7 @@ from restock.replay.density_ratio import RatioFit
 from restock.replay.layout import F32, PACKING_VERSION, Ints, row_columns, row_width
 from restock.replay.mixture import Mixture, Within
 from restock.replay.sampler import QuotaSampler
-from restock.replay.seal import AGAIN, FileRecord, unseal
+from restock.replay.seal import AGAIN, FileRecord, packed_by, unseal
 from restock.replay.stores import PinnedStore
 
 HEADER, ROWS, META, HELD_OUT = "panel.json", "rows.f32", "meta.parquet", "held_out.parquet"
@@ -106,14 +106,14 @@ class Panel:
                 where=str(path),
                 remedy="`restock mix STORE --mixture coverage --out PANEL` makes one",
             )
-        header = unseal((path / HEADER).read_bytes(), Header, path / HEADER)
-        if header.packing_version != PACKING_VERSION:
+        content = (path / HEADER).read_bytes()
+        if (version := packed_by(content)) not in (PACKING_VERSION, None):
             raise PanelError(
-                f"packed by version {header.packing_version} of the packing,"
-                f" this is {PACKING_VERSION}",
+                f"packed by version {version} of the packing, this is {PACKING_VERSION}",
                 where=str(path),
                 remedy=AGAIN,
             )
+        header = unseal(content, Header, path / HEADER)
         for name, record in header.files.items():
             record.check(path / name, verify=verify)
         shape = (header.rows, row_width(header.observation_size))

@@ -83,6 +83,18 @@ def seal(header: msgspec.Struct) -> bytes:
     return msgspec.json.format(msgspec.json.encode(values | {"seal": _seal_of(values)}), indent=1)
 
 
+class _Version(msgspec.Struct):
+    packing_version: int | None = None
+
+
+def packed_by(content: bytes) -> int | None:
+    """The version of the packing that a header names; None where it names none, or is none."""
+    try:
+        return msgspec.json.decode(content, type=_Version).packing_version
+    except (msgspec.DecodeError, ValueError):
+        return None
+
+
 def unseal(content: bytes, kind: type[T], where: Path) -> T:
     """What `seal` was given. Raises PanelError for what is no such header, or was edited."""
     try:

@@ -117,6 +117,14 @@ def twice(table: pa.Table, recordings: pa.Table) -> Tables:
     return pa.concat_tables([table, table.slice(3, 2)]), recordings
 
 
+def bag_and_a_part_of_it(table: pa.Table, recordings: pa.Table) -> Tables:
+    part = table.filter(pa.array(rows_where(table, "recording_id", f"{1:016x}"))).slice(20, 60)
+    part = replaced(part, "recording_id", [f"{9:016x}"] * len(part))
+    part = replaced(part, "source_file", ["logs/part.mcap"] * len(part))
+    part = replaced(part, "transition_id", (np.int64(9) << 25) + np.arange(len(part)))
+    return pa.concat_tables([table, part.cast(table.schema)]), recordings
+
+
 def two_tasks(table: pa.Table, recordings: pa.Table) -> Tables:
     hashes = np.where(rows_where(table, "episode_index", 0), "0" * 12, TASK.hash)
     return replaced(table, "task_hash", hashes), recordings
@@ -214,6 +222,7 @@ PLANTS: list[tuple[str, Plant, int, dict[str, object]]] = [
     ("unsafe_data", bumping_operator, 1, {"behaviour_policy": "operator"}),
     ("dropped_ticks", many_drops, 1, {"dropped": 2000}),
     ("far_actions", far_operator, 1, {"behaviour_policy": "operator", "far_share": 1.0}),
+    ("repeated_steps", bag_and_a_part_of_it, 1, {"same_as_file": "logs/part.mcap", "rows": 60}),
     ("observation_drift", drifting_clearance, 2, {"signal": "clearance_m"}),
     ("flattering_policy", picky_operator, 1, {"behaviour_policy": "operator"}),
     ("flattering_policy", mostly_easy_operator, 1, {"behaviour_policy": "operator"}),
@@ -283,23 +292,104 @@ def test_an_evaluation_full_of_easy_episodes_flatters(tmp_path: Path) -> None:
         assert run_audits(connection, [AUDITS[name]], thresholds, beside=["run"])[0].rows == 0
 
 
-def test_audits_of_a_panel(store_path: Path, tmp_path: Path) -> None:
-    mixture = parse_mixture("[planned]\nupdates = 50\n[each_condition]\nshare = 'equal'")
+@pytest.fixture(scope="module")
+def panels(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A panel of the store for each way of holding out."""
+    folder, made = tmp_path_factory.mktemp("panels"), {}
     with Store(store_path) as store:
-        build_panel(store, mixture, tmp_path / "p")
-    audits = [AUDITS["leakage"], AUDITS["flattering_panel"]]
-    thresholds = {"flattering_panel": {"max_ratio": 1.5}}
-    with open_place(store_path, beside={"panel": tmp_path / "p"}) as connection:
-        found_now = run_audits(connection, audits, thresholds, beside=["panel"])
-        findings = {finding.audit.name: finding for finding in found_now}
-        assert findings["leakage"].status == "pass"
-        boosted = {row["stratum"] for row in findings["flattering_panel"].sample}
-        assert boosted == {"wheel_slip", "blocked_aisle", "near_collision", "recovery"}
-        connection.execute(
-            "CREATE OR REPLACE VIEW panel.held_out AS SELECT * FROM panel.rows LIMIT 1"
-        )
-        (leak,) = run_audits(connection, audits[:1], {}, beside=["panel"])
-        assert leak.status == "fail"
+        for by in ("episode", "recording", "time"):
+            text = f"held_out = {{by = '{by}'}}\nplanned = {{updates = 50}}"
+            mixture = parse_mixture(f"{text}\n[each_condition]\nshare = 'equal'")
+            made[by] = build_panel(store, mixture, folder / by).path
+    return made
+
+
+def beside_panel(store: Path, panel: Path, name: str, spoil: str = "SELECT 1") -> Finding:
+    """What an audit finds of a panel whose held-out list was spoilt."""
+    chosen = {name: load_thresholds()[name]} if AUDITS[name].parameters else {}
+    with open_place(store, beside={"panel": panel}) as connection:
+        connection.execute(spoil).fetchall()
+        return run_audits(connection, [AUDITS[name]], chosen, beside=["panel"])[0]
+
+
+def test_strata_that_the_panel_flatters_are_named(
+    store_path: Path, panels: dict[str, Path]
+) -> None:
+    finding = beside_panel(store_path, panels["episode"], "flattering_panel")
+    boosted = {row["stratum"] for row in finding.sample}
+    assert boosted == {"wheel_slip", "blocked_aisle", "near_collision", "recovery"}
+
+
+LEAKS = {
+    "episode": ("episode", "the same episode", "SELECT * FROM panel.rows LIMIT 1"),
+    "recording": (
+        "recording",
+        "a recording that is held out",
+        "SELECT * REPLACE ('elsewhere' AS episode_id) FROM panel.rows LIMIT 1",
+    ),
+    "time": (
+        "time",
+        "later than what is held out",
+        "SELECT * REPLACE ('elsewhere' AS episode_id) FROM panel.rows ORDER BY logged_ns LIMIT 1",
+    ),
+}
+
+
+@pytest.mark.parametrize(("by", "leak", "spoilt"), LEAKS.values(), ids=LEAKS)
+def test_what_leaks_from_held_out_data_is_found(
+    store_path: Path, panels: dict[str, Path], by: str, leak: str, spoilt: str
+) -> None:
+    assert beside_panel(store_path, panels[by], "leakage").status == "pass"
+    spoil = f"CREATE OR REPLACE VIEW panel.held_out AS SELECT *, '{by}' AS split_by FROM ({spoilt})"
+    finding = beside_panel(store_path, panels[by], "leakage", spoil)
+    assert finding.status == "fail"
+    assert leak in {row["leak"] for row in finding.sample}
+
+
+def test_a_copy_of_a_held_out_step_is_a_leak(tmp_path: Path) -> None:
+    one = recording_transitions(1)
+    copy = replaced(one, "recording_id", [f"{7:016x}"] * len(one))
+    episodes = [f"{7:016x}/{index}" for index in one["episode_index"].to_pylist()]
+    copy = replaced(copy, "episode_id", episodes)
+    copy = replaced(copy, "transition_id", (np.int64(7) << 25) + np.arange(len(one)))
+    copy = replaced(copy, "ingest_id", ["copy"] * len(one))
+    path = write_store(tmp_path / "store", [one, copy])
+    mixture = parse_mixture("[each_condition]\n[held_out]\nby = 'recording'\nshare = 0.4")
+    with Store(path) as store:
+        panel = build_panel(store, mixture, tmp_path / "p")
+    finding = beside_panel(path, panel.path, "leakage")
+    assert {row["leak"] for row in finding.sample} == {"the same step under another id"}
+    assert finding.rows == len(one["episode_id"].unique())
+
+
+def test_strata_of_few_episodes_are_found_in_a_panel_and_in_a_run(
+    store_path: Path, panels: dict[str, Path], tmp_path: Path
+) -> None:
+    assert beside_panel(store_path, panels["episode"], "few_panel_episodes").status == "pass"
+    spoil = "UPDATE panel.strata SET effective_episodes = 2.5 WHERE name = 'wheel_slip'"
+    finding = beside_panel(store_path, panels["episode"], "few_panel_episodes", spoil)
+    assert [row["stratum"] for row in finding.sample] == ["wheel_slip"]
+
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "config.json").write_text("{}")
+    pq.write_table(pa.table({"condition": ["nominal"]}), run / "evaluations.parquet")
+    name = "few_drawn_episodes"
+    chosen = {name: load_thresholds()[name]}
+    with open_place(store_path, beside={"run": run}) as connection:  # from before there was one
+        (older,) = run_audits(connection, [AUDITS[name]], chosen, beside=["run"])
+    assert older.status == "skipped"
+    drawn = [("nominal", f"a/{index}", 10) for index in range(20)]
+    drawn += [("wheel_slip", "a/0", 500), ("wheel_slip", "a/1", 3), ("wheel_slip", "a/2", 3)]
+    rows = [
+        {"source": "logs", "stratum": stratum, "episode": episode, "drawn_rows": count}
+        for stratum, episode, count in drawn
+    ]
+    pq.write_table(pa.Table.from_pylist(rows), run / "fed_episodes.parquet")
+    with open_place(store_path, beside={"run": run}) as connection:
+        (finding,) = run_audits(connection, [AUDITS[name]], chosen, beside=["run"])
+    assert [(row["stratum"], row["episodes"]) for row in finding.sample] == [("wheel_slip", 3)]
+    assert finding.sample[0]["effective_episodes"] == pytest.approx(1.02, abs=0.01)
 
 
 def test_ones_own_audits_and_thresholds(tmp_path: Path, clean: Tables) -> None:
@@ -394,11 +484,29 @@ def test_the_verb_refuses_what_is_no_store(
     assert "not a store" in capsys.readouterr().err
 
 
-def test_junit_counts_skipped_audits() -> None:
-    findings = [Finding(AUDITS["leakage"], "skipped", 0, [], [], {})]
-    root = ElementTree.fromstring(junit_xml(findings, "s"))
-    assert root.get("skipped") == "1"
-    assert root[0].find("skipped") is not None
+def test_junit_is_as_its_readers_expect() -> None:
+    """The rules of junit-10.xsd that concern us: names of elements, attributes, and the counts."""
+    rows = [{"source_file": "a\x00b\x1b[31m\ud800<&>", "rows": 3}]
+    findings = [
+        Finding(AUDITS["rare_condition"], "fail", 3, ["rows"], rows, {}),
+        Finding(AUDITS["stale_data"], "warn", 1, ["rows"], rows, {}),
+        Finding(AUDITS["several_tasks"], "pass", 0, [], [], {}),
+        Finding(AUDITS["leakage"], "skipped", 0, [], [], {}),
+    ]
+    text = junit_xml(findings, "audit \x07 store")
+    root = ElementTree.fromstring(text.encode("utf-8"))  # what XML cannot hold is not in it
+    assert root.tag == "testsuite"
+    assert root.keys() == ["name", "tests", "failures", "errors", "skipped"]
+    assert [root.get(name) for name in ("tests", "failures", "errors", "skipped")] == list("4101")
+    for case in root:
+        assert case.tag == "testcase"
+        assert {"name", "classname"} == set(case.keys())
+        assert {child.tag for child in case} <= {"failure", "skipped", "system-out"}
+    failure = root[0].find("failure")
+    assert failure is not None
+    assert "<&>" in str(failure.text)
+    assert root[1].find("failure") is None
+    assert root[3].find("skipped") is not None
 
 
 def test_the_page_lists_every_audit_as_it_is() -> None:

@@ -1,8 +1,38 @@
 -- severity: error
 -- needs: panel
--- advice: Make the panel again; episodes must be wholly in or wholly held out.
--- doc: Episodes that are in the panel and held out at once.
-SELECT episode_id, count(*) AS rows
+-- advice: Make the panel again, after `duplicate_transitions` and `repeated_steps` pass; what is held out must share nothing with what is trained on.
+-- doc: What is in the panel and held out at once: an episode; a recording, where whole ones are held out; an episode that ends after the first that is held out, where the latest are; or the same step under another id.
+WITH fed AS (
+    SELECT transitions.transition_id, stamp_ns, action, hash(observation) AS seen, episode_id
+    FROM transitions
+    SEMI JOIN panel.rows USING (transition_id)
+), held AS (
+    SELECT transitions.transition_id, stamp_ns, action, hash(observation) AS seen, episode_id
+    FROM transitions
+    SEMI JOIN panel.held_out USING (transition_id)
+), ends AS (
+    SELECT min(ended_ns) AS first_ns
+    FROM (SELECT max(logged_ns) AS ended_ns FROM panel.held_out GROUP BY episode_id)
+)
+SELECT 'the same episode' AS leak, episode_id, count(*) AS rows
 FROM panel.rows
-WHERE episode_id IN (SELECT episode_id FROM panel.held_out)
+SEMI JOIN panel.held_out USING (episode_id)
 GROUP BY episode_id
+UNION ALL
+SELECT 'a recording that is held out', episode_id, count(*)
+FROM panel.rows
+SEMI JOIN (FROM panel.held_out WHERE split_by = 'recording') USING (recording_id)
+GROUP BY episode_id
+UNION ALL
+SELECT 'later than what is held out', episode_id, count(*)
+FROM panel.rows
+WHERE 'time' IN (SELECT split_by FROM panel.held_out)
+GROUP BY episode_id
+HAVING max(logged_ns) > (SELECT first_ns FROM ends)
+UNION ALL
+SELECT 'the same step under another id', fed.episode_id, count(*)
+FROM fed
+JOIN held USING (stamp_ns, action, seen)
+WHERE fed.transition_id <> held.transition_id
+GROUP BY fed.episode_id
+ORDER BY leak, episode_id

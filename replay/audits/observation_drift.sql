@@ -6,8 +6,10 @@ WITH long AS (
         SELECT
             recording_id,
             wheel_speed_mps::DOUBLE AS wheel_speed_mps,
+            wheel_yaw_rate_radps::DOUBLE AS wheel_yaw_rate_radps,
             gyro_yaw_rate_radps::DOUBLE AS gyro_yaw_rate_radps,
             localised_speed_mps::DOUBLE AS localised_speed_mps,
+            localised_lateral_mps::DOUBLE AS localised_lateral_mps,
             clearance_m::DOUBLE AS clearance_m,
             clearance_ahead_m::DOUBLE AS clearance_ahead_m,
             accel_x_mps2::DOUBLE AS accel_x_mps2

@@ -122,7 +122,24 @@ def _print(findings: list[Finding], shown: int) -> None:
     for finding in findings:
         if not finding.rows:
             continue
+        output.stdout().print()
         more = finding.rows - min(shown, len(finding.sample))
         title = f"{finding.status}: {finding.audit.name}" + (f" ({more} more)" if more else "")
         output.print_table(finding.sample[:shown], finding.columns, title=title)
-        output.stdout().print(f"  {finding.audit.advice}\n", markup=False)
+        output.stdout().print(f"  {finding.audit.advice}", markup=False)
+    output.stdout().print(f"\n{_summary(findings)}")
+
+
+def _summary(findings: list[Finding]) -> str:
+    """How many of each, and what would have let the skipped ones run."""
+    said = {"fail": "failed", "warn": "warned", "info": "informed", "pass": "passed"}
+    counts = [
+        f"{count} {word}"
+        for status, word in said.items()
+        if (count := sum(finding.status == status for finding in findings))
+    ]
+    skipped = [finding.audit.place for finding in findings if finding.status == "skipped"]
+    if skipped:
+        flags = " and ".join(f"--{place}" for place in sorted({place or "" for place in skipped}))
+        counts.append(f"{len(skipped)} skipped ({flags} would let them run)")
+    return ", ".join(counts)

@@ -1,0 +1,19 @@
+-- severity: warning
+-- needs: run.fed_episodes
+-- advice: What the critic knows of this stratum is what these few episodes show: add episodes, or read its results as theirs.
+-- doc: Strata of which a run drew so unevenly that its draws are worth few episodes.
+SELECT
+    source,
+    stratum,
+    sum(drawn) AS drawn_rows,
+    count(*) AS episodes,
+    sum(drawn) ^ 2 / sum(drawn ^ 2) AS effective_episodes
+FROM (
+    SELECT source, stratum, episode, sum(drawn_rows)::DOUBLE AS drawn
+    FROM run.fed_episodes
+    GROUP BY source, stratum, episode
+)
+WHERE stratum <> 'unlabelled'  -- of fresh rows: no stratum, but episodes that have not ended
+GROUP BY source, stratum
+HAVING sum(drawn) ^ 2 / sum(drawn ^ 2) < $min_effective_episodes
+ORDER BY effective_episodes, source, stratum
