@@ -171,7 +171,7 @@ class DeviceSampler:
         return raised ** self._alpha[stratum]
 
     def _draw_block(self) -> None:
-        quota = np.stack([self.quotas.next() for _ in range(BLOCK)])  # (BLOCK, S)
+        quota = self.quotas.take(BLOCK)  # (BLOCK, S)
         counts = torch.from_numpy(quota.ravel()).to(self.device)  # the one thing sent over
         stratum = torch.arange(len(self.sizes), device=self.device).repeat(BLOCK)
         stratum = stratum.repeat_interleave(counts, output_size=int(quota.sum()))

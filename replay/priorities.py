@@ -86,11 +86,13 @@ class Exponents:
             return np.array([getattr(rule, name, 0.0) for rule in rules], np.float32)
 
         self.epsilon, self.floor, self.alpha = each("epsilon"), each("floor"), each("alpha")
+        self._alike = len(set(rules)) == 1
 
     def priority(self, td_abs: F32, stratum: NDArray[Any]) -> F32:
         """(n,), above 0, of |TD| (n,) of rows of these strata (n,)."""
-        raised: F32 = np.maximum(td_abs + self.epsilon[stratum], self.floor[stratum])
-        raised **= self.alpha[stratum]
+        of: Any = 0 if self._alike else stratum
+        raised: F32 = np.maximum(td_abs + self.epsilon[of], self.floor[of])
+        raised **= self.alpha[of]
         return raised
 
 
@@ -129,7 +131,7 @@ class Priorities:
         self._first: Ints = np.concatenate([[0], np.cumsum(room)])[:-1].astype(np.int64)
         self._stratum = np.repeat(np.arange(len(room), dtype=np.int16), room)  # of each place
         self._rows: Ints = np.full(int(room.sum()), -1, np.int64)
-        self._place: Ints = np.full(int(joined.max(initial=-1)) + 1, -1, np.int64)
+        self._place = np.full(int(joined.max(initial=-1)) + 1, -1, np.int32)
         for stratum in np.flatnonzero(self.sizes).tolist():
             first, rows = int(self._first[stratum]), np.asarray(stratum_rows[stratum], np.int64)
             self._rows[first : first + len(rows)] = rows
@@ -141,6 +143,7 @@ class Priorities:
         self._priority: F32 = np.zeros(len(self._rows), np.float32)
         self._priority[self._filled] = self._largest[self._stratum[self._filled]]
         self._new: Bools = self._rows >= 0  # not drawn yet
+        self._any_new = True
         self._stale_new = False  # a largest priority grew since rows not drawn yet were given it
 
     def of(self, rows: Ints) -> F32:
@@ -154,18 +157,20 @@ class Priorities:
             MixtureError: a TD error that is not finite.
         """
         place, errors = self._place[rows], np.asarray(td_abs, np.float32)
-        if not np.isfinite(errors).all():
-            raise MixtureError(
-                f"{int((~np.isfinite(errors)).sum())} TD errors are not finite",
-                remedy="training has diverged: lower the learning rate, or slow the target down",
-            )
         if None in self.rules:
             place, errors = place[place >= 0], errors[place >= 0]
         stratum = self._stratum[place]
         priority = self.exponents.priority(errors, stratum)
+        largest = priority.max(initial=0.0)
+        if not np.isfinite(largest):  # max passes NaN on
+            raise MixtureError(
+                f"{int((~np.isfinite(errors)).sum())} TD errors are not finite",
+                remedy="training has diverged: lower the learning rate, or slow the target down",
+            )
         self._priority[place] = priority
-        self._new[place] = False
-        if (priority > self._largest[stratum]).any():
+        if self._any_new:
+            self._new[place] = False
+        if largest > self._largest.min() and (priority > self._largest[stratum]).any():
             np.maximum.at(self._largest, stratum, priority)
             self._stale_new = True
 
@@ -180,9 +185,10 @@ class Priorities:
 
         Returns row numbers (counts.sum(),), stratum by stratum, and their weights, None for ones.
         """
-        if self._stale_new:
+        self._any_new = self._any_new and bool(self._new.any())
+        if self._stale_new and self._any_new:
             self._priority[self._new] = self._largest[self._stratum[self._new]]
-            self._stale_new = False
+        self._stale_new = False
         # einsum adds in one order on every machine and number of threads; BLAS does not.
         sums: F32 = np.einsum("ij->i", self._priority.reshape(-1, CHUNK))
         drawn, weights = [np.empty(0, np.int64)], [np.empty(0, np.float32)]
@@ -232,7 +238,7 @@ class Priorities:
         self._priority[self._filled] = state["priority"]
         self._new[self._filled] = state["new"]
         self._largest = np.array(state["largest"], np.float32)
-        self._stale_new = bool(state["stale_new"])
+        self._any_new, self._stale_new = True, bool(state["stale_new"])
 
 
 _UPTO: F32 = np.tril(np.ones((CHUNK, CHUNK), np.float32))

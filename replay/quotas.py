@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 
 import numpy as np
@@ -62,23 +63,34 @@ class Quotas:
 
     def next(self) -> Ints:
         """Rows per stratum of the next batch, (S,); they sum to the batch size."""
+        first: Ints = self.take(1)[0]
+        return first
+
+    def take(self, batches: int) -> Ints:
+        """Rows per stratum of the next batches, (n, S); each sums to the batch size."""
         if len(self.shares) == 1:
-            return np.array([self.batch_size], np.int64)
-        # Plain floats: for a handful of strata numpy's calls cost more than the work.
-        owed = [mean + carry for mean, carry in zip(self._mean, self._carry, strict=True)]
-        quota = [int(part) if part > 0 else 0 for part in owed]
-        rest = [part - whole for part, whole in zip(owed, quota, strict=True)]
-        short = self.batch_size - sum(quota)
-        if short > 0:
-            for index in sorted(range(len(rest)), key=rest.__getitem__, reverse=True)[:short]:
-                quota[index] += 1
-                rest[index] -= 1.0
-        for _ in range(-short):  # strata in debt can leave the others owed a row too many
-            index = min((i for i, q in enumerate(quota) if q), key=rest.__getitem__)
-            quota[index] -= 1
-            rest[index] += 1.0
-        self._carry = rest
-        return np.array(quota, np.int64)
+            return np.full((batches, 1), self.batch_size, np.int64)
+        # Plain lists: for a handful of strata numpy's calls cost more than the work.
+        mean, size, carry = self._mean, self.batch_size, self._carry
+        strata = range(len(mean))
+        quotas = []
+        for _ in range(batches):
+            owed = list(map(operator.add, mean, carry))
+            quota = [int(part) if part > 0 else 0 for part in owed]
+            rest = list(map(operator.sub, owed, quota))
+            short = size - sum(quota)
+            if short > 0:
+                for index in sorted(strata, key=rest.__getitem__, reverse=True)[:short]:
+                    quota[index] += 1
+                    rest[index] -= 1.0
+            for _ in range(-short):  # strata in debt can leave the others owed a row too many
+                index = min((i for i, q in enumerate(quota) if q), key=rest.__getitem__)
+                quota[index] -= 1
+                rest[index] += 1.0
+            quotas.append(quota)
+            carry = rest
+        self._carry = carry
+        return np.array(quotas, np.int64)
 
     def give_back(self, quotas: Ints) -> None:
         """Batches that were not handed out after all, (n, S): their strata are owed them again."""

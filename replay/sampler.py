@@ -162,11 +162,10 @@ class QuotaSampler:
 
     def _draw_block(self) -> None:
         strata = len(self.sizes)
-        quota = np.stack([self.quotas.next() for _ in range(self.block)])  # (block, S)
+        quota = self.quotas.take(self.block)  # (block, S)
         stratum = np.repeat(np.tile(np.arange(strata), self.block), quota.ravel())
         # All that a stratum gives to the block is taken at once, and dealt out in order.
-        order = np.argsort(stratum.astype(np.int16), kind="stable")
-        self._take_all(quota.sum(axis=0), order)
+        self._take_all(quota.sum(axis=0), _by_stratum(quota))
         self._ahead_strata = stratum.reshape(self.block, -1)  # batch by batch
         self._next = 0
 
@@ -251,6 +250,15 @@ class QuotaSampler:
             returned = _parts(state["returned"], state["returned_count"])
             for stratum, order, back in zip(self._turns, orders, returned, strict=True):
                 self._members[stratum], self._returned[stratum] = order, back
+
+
+def _by_stratum(quota: Ints) -> Ints:
+    """The places of a block's rows, which lie batch by batch, stratum by stratum: (rows,)."""
+    begins = np.cumsum(quota).reshape(quota.shape) - quota  # of a batch's rows of a stratum
+    counts = quota.T.ravel()
+    return np.repeat(begins.T.ravel() - np.cumsum(counts) + counts, counts) + np.arange(
+        counts.sum()
+    )
 
 
 def _parts(joined: NDArray[Any], counts: Ints) -> list[Ints]:
