@@ -36,8 +36,8 @@ def read_candidates(
     """Every row of the connection's `transitions`, by recording, episode and step.
 
     META_COLUMNS, `task_hash`, `labelled`, and one boolean for each predicate of the mixture:
-    `admitted`, `unsafe`, `stratum_0` …; text columns come as dictionaries; `store` (int) says
-    which store a row is from.
+    `admitted`, `unsafe`, `stratum_0`, `state_0` (of the row's state alone) …; text columns come
+    as dictionaries; `store` (int) says which store a row is from.
 
     Raises:
         ConfigError: a predicate that does not run; names it.
@@ -48,6 +48,8 @@ def read_candidates(
     predicates["unsafe"] = ("safety.unsafe", unsafe)
     for index, stratum in enumerate(strata):
         predicates[f"stratum_{index}"] = (f"stratum {stratum.name!r}", stratum.predicate)
+        state = stratum.state_predicate or stratum.predicate
+        predicates[f"state_{index}"] = (f"stratum {stratum.name!r}", state)
     tests = ", ".join(
         f"coalesce(({sql}\n)::BOOLEAN, false) AS {name}" for name, (_, sql) in predicates.items()
     )

@@ -89,12 +89,16 @@ def plan_panel(
             f"{len(ids) - len(np.unique(ids))} transition ids occur twice",
             remedy="`restock audit` names them; ingest those recordings again",
         )
-    member = np.stack([bools(table, f"stratum_{i}") for i in range(len(strata))], axis=1)
+    member, state = (
+        np.stack([bools(table, f"{kind}_{i}") for i in range(len(strata))], axis=1)
+        for kind in ("stratum", "state")
+    )
     if mixture.unlabelled == "nominal":
         for index, named in enumerate(strata):
             if named.name == NOMINAL and named.rule.where is None:
                 member[:, index] |= ~bools(table, "labelled")
-    stratum, state_code = assign(member, strata), assign(member, strata, only_pre=True)
+                state[:, index] |= ~bools(table, "labelled")
+    stratum, state_code = assign(member, strata), assign(state, strata, only_pre=True)
     held_out = hold_out(table, mixture.held_out, mixture.seed)
     out = leave_out(table, mixture, held_out)
     for other in others:

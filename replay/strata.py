@@ -31,6 +31,8 @@ class Stratum:
 
     rule: StratumRule
     predicate: str  # SQL over `transitions`
+    # The same of the state alone; None where that is the predicate, or the outcome decides.
+    state_predicate: str | None
     priority: int
     timing: Literal["pre", "post"]
     correction: Correction
@@ -80,10 +82,14 @@ def _rule_for(name: str, each: EachCondition) -> StratumRule:
 
 def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -> Stratum:
     timing: Literal["pre", "post"]
+    state_predicate = None
     if rule.where is not None:
         predicate, priority, timing = rule.where, WHERE_PRIORITY, "post"
     elif rule.name == NOMINAL:
         predicate, priority, timing = "len(conditions) = 0", NOMINAL_PRIORITY, "pre"
+        # A slip that nothing announced happened in a nominal state.
+        before = ", ".join(f"'{c.name}'" for c in known.values() if c.timing == "pre")
+        state_predicate = f"NOT list_has_any(conditions, [{before}]::VARCHAR[])"
     elif rule.name in known:
         condition = known[rule.name]
         predicate = f"list_contains(conditions, '{rule.name}')"
@@ -99,6 +105,7 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
     return Stratum(
         rule,
         predicate,
+        state_predicate,
         priority if rule.priority is None else rule.priority,
         timing,
         rule.correction or default,
@@ -111,7 +118,8 @@ def assign(
 ) -> NDArray[np.int16]:
     """The stratum of each row (N,), from membership (N, S); -1 where it belongs to none.
 
-    `only_pre` leaves out strata chosen on the outcome: where the row's state alone would put it.
+    `only_pre` leaves out strata chosen on the outcome: where the row's state alone would put it,
+    if `member` is of the state alone.
     """
     order = sorted(range(len(strata)), key=lambda index: (strata[index].priority, index))
     if only_pre:

@@ -28,8 +28,8 @@ def slippery(seed: int = 0) -> tuple[NDArray[np.float64], NDArray[np.float64], N
 
 def strata(correction: str) -> list[Stratum]:
     return [
-        Stratum(StratumRule(name="slip"), "true", 1, "post", correction),  # type: ignore[arg-type]
-        Stratum(StratumRule(name="nominal"), "true", 9, "pre", "none"),
+        Stratum(StratumRule(name="slip"), "true", None, 1, "post", correction),  # type: ignore[arg-type]
+        Stratum(StratumRule(name="nominal"), "true", None, 9, "pre", "none"),
     ]
 
 

@@ -238,6 +238,7 @@ def strata_of(*timings: str, correction: str = "full") -> list[Stratum]:
         Stratum(
             StratumRule(name=f"s{i}"),
             "true",
+            None,
             i,
             timing,  # type: ignore[arg-type]
             "none" if timing == "pre" else correction,  # type: ignore[arg-type]
@@ -293,6 +294,28 @@ def test_full_correction_keeps_the_outcomes_of_a_state_as_they_were() -> None:
         code, state, strata_of("post", "pre", "pre", correction="none"), given, rule
     )
     np.testing.assert_allclose(raw, 1.0, rtol=1e-5)
+
+
+def test_the_state_of_a_slip_is_nominal_where_nothing_was_known_before(
+    transitions: pa.Table,
+) -> None:
+    """Its row is weighted to the density of nominal rows, boosted or not: P(s'|s, a) stays."""
+    plan = planned(transitions, "[[strata]]\nname = 'nominal'\nshare = 0.2\n" + EVERY)
+    names = [line.stratum for line in plan.strata]
+    slip, nominal = names.index("wheel_slip"), names.index("nominal")
+    chosen = plan.panel_rows
+    code, state = plan.stratum[chosen], plan.beside["state_code"]
+    labels = transitions.sort_by(
+        [("recording_id", "ascending"), ("episode_index", "ascending"), ("step_index", "ascending")]
+    )["conditions"].to_pylist()
+    only_slip = np.array([labels[row] == ["wheel_slip"] for row in chosen])
+    assert only_slip.any()
+    assert (state[only_slip] == nominal).all()
+    share = np.array([line.share for line in plan.strata])
+    density = (share / np.array([line.rows for line in plan.strata]))[code] * plan.weight
+    np.testing.assert_allclose(
+        density[only_slip & (code == slip)], density[code == nominal][0], rtol=1e-5
+    )
 
 
 def test_beta_and_clip_stand_between_none_and_full() -> None:

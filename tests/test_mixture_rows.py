@@ -182,9 +182,7 @@ def test_another_store_is_drawn_from_at_its_pinned_version(
     truth = recording_transitions(7).select(["transition_id", "observation"]).to_pydict()
     rows = panel.rows[from_twin][:, panel.columns["observation"]]
     ids = panel.meta["transition_id"].to_numpy()[from_twin]
-    by_id = dict(
-        zip(truth["transition_id"].to_pylist(), truth["observation"].to_pylist(), strict=True)
-    )
+    by_id = dict(zip(truth["transition_id"], truth["observation"], strict=True))
     np.testing.assert_allclose(rows[:20], [by_id[i] for i in ids[:20].tolist()], rtol=1e-6)
 
 
