@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from restock.ingest.signals import STORED_SIGNALS
 from restock.ingest.task import Task
 from restock.replay.ring import FreshRing
 from restock.train.evaluate import Twin
+from restock.train.fresh_log import FreshLog
 
 _EPISODES_PER_QUERY = 8
 
@@ -77,6 +79,16 @@ class Collector:
         self._sent: tuple[NDArray[np.int64], NDArray[np.float32]] | None = None
         self._future: Future[Any] | None = None
         self._result: Any = None
+        self.log: FreshLog | None = None
+        self._saved_log: Mapping[str, Any] | None = None
+
+    def keep(self, folder: Path) -> FreshLog:
+        """Keep labelled episodes whole in `folder` from here on, or go on as a checkpoint did."""
+        longest = self.task.time_limit_steps
+        self.log = FreshLog(folder, self.ring.observation_size, longest, self._steps)
+        if self._saved_log is not None:
+            self.log.load_state_dict(self._saved_log)
+        return self.log
 
     def check_conditions(self) -> None:
         """Raises ConfigError now, not after minutes of driving, if a condition's SQL cannot run."""
@@ -139,6 +151,16 @@ class Collector:
         )
         if info["invalid"].any():
             self._drop(keys, info["invalid"])
+        if self.log is not None:
+            self.log.began(self._steps, self.observation, acting_step)
+            self.log.took(
+                self._steps,
+                action=action,
+                probability=probability,
+                reward=reward,
+                progress_m=info["progress_m"],
+                truth=info["true_condition"],
+            )
         self.observation = np.array(observation, copy=True)
         after = info["signals"]
         bumped = np.asarray(after["bumped"], np.bool_)
@@ -171,6 +193,14 @@ class Collector:
                     },
                 )
             )
+            if self.log is not None:
+                self.log.ended(
+                    int(place),
+                    finished[-1],
+                    following[place],
+                    terminated=bool(terminated[place]),
+                    broken=bool(info["invalid"][place]),
+                )
         self._steps[ended], self._return[ended], self._bumps[ended] = 0, 0.0, 0
         self._touching[ended] = False
         self._unlabelled.extend(finished)
@@ -193,6 +223,8 @@ class Collector:
             return []
         self._unlabelled = []
         labels = label(steps_table(waiting), self.conditions)
+        if self.log is not None:
+            self.log.labelled(waiting, labels)
         names = primary(labels, self.conditions)
         codes = np.array([self._codes[name] for name in names] or [], np.int64)
         rows, begin = [], 0
@@ -235,6 +267,7 @@ class Collector:
             "touching": self._touching,
             "invalid_steps": self.invalid_steps,
             "history": self._history,
+            "log": self.log.state_dict() if self.log is not None else None,
             "unlabelled": [
                 {name: getattr(episode, name) for name in Ended.__dataclass_fields__}
                 for episode in self._unlabelled
@@ -251,6 +284,7 @@ class Collector:
         self.invalid_steps = int(state["invalid_steps"])
         self._history = {name: np.array(values) for name, values in state["history"].items()}
         self._unlabelled = [Ended(**episode) for episode in state["unlabelled"]]
+        self._saved_log = state.get("log")
 
 
 def ring_conditions(conditions: Sequence[Condition]) -> list[str]:
