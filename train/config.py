@@ -7,6 +7,7 @@ later. Every field has its meaning in a comment; `docs/train.md` explains the ch
 from __future__ import annotations
 
 import copy
+import json
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -98,6 +99,7 @@ class ReplayConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     batch_size: int = 128
     logs_share: float | None = None  # of each online batch; None: what the panel's mixture says
     ring_capacity: int = 100_000  # fresh rows kept
+    ring_reserved: float = 0.0  # share of them reserved for the conditions, in equal parts
 
     def __post_init__(self) -> None:
         if self.batch_size < 1:
@@ -106,6 +108,8 @@ class ReplayConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"replay.logs_share must be in [0, 1], got {self.logs_share}")
         if self.ring_capacity < self.batch_size:
             raise ValueError("replay.ring_capacity must hold at least a batch")
+        if not 0 <= self.ring_reserved <= 1:
+            raise ValueError(f"replay.ring_reserved must be in [0, 1], got {self.ring_reserved}")
 
 
 class ScheduleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -241,6 +245,24 @@ def apply_overrides(document: Mapping[str, Any], overrides: Sequence[str]) -> di
     return changed
 
 
+def as_overrides(document: Mapping[str, Any], prefix: str = "") -> list[str]:
+    """Nested settings as `key.path=value`, which `apply_overrides` takes."""
+    found = []
+    for key, value in document.items():
+        # A target rule is one value: half of one and half of another would be none.
+        if isinstance(value, Mapping) and prefix + key != "target":
+            found += as_overrides(value, f"{prefix}{key}.")
+        elif value is not None:
+            found.append(f"{prefix}{key}={_toml(value)}")
+    return found
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + "}"
+    return json.dumps(value)  # numbers, booleans, strings and lists are the same in TOML
+
+
 def parse_config(document: dict[str, Any], *, where: str) -> TrainConfig:
     """A typed config from plain values; errors name the key."""
     try:
@@ -273,4 +295,11 @@ def _apply(document: dict[str, Any], override: str) -> None:
     document[last] = value
 
 
-__all__ = ["DEFAULT_CONDITIONS", "TrainConfig", "apply_overrides", "load_config", "parse_config"]
+__all__ = [
+    "DEFAULT_CONDITIONS",
+    "TrainConfig",
+    "apply_overrides",
+    "as_overrides",
+    "load_config",
+    "parse_config",
+]

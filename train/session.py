@@ -171,13 +171,16 @@ def open_session(
     torch.set_num_threads(config.threads)
     seed = config.seed
     learner = Learner(config, task.observation_size, len(task.actions))
+    names = ring_conditions(conditions)
+    reserved = int(config.replay.ring_capacity * config.replay.ring_reserved / len(names))
     ring = FreshRing(
         config.replay.ring_capacity,
         env.num_envs,
         task.observation_size,
         discount=config.loss.discount,
         n_step=config.loss.n_step,
-        conditions=ring_conditions(conditions),
+        conditions=names,
+        reserved=dict.fromkeys(names, reserved),
     )
     batches = Batches(
         logs,
