@@ -98,8 +98,10 @@ class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def hash(self) -> str:
-        """Names all that the profile says: 12 hex digits."""
-        return hashlib.blake2b(msgspec.json.encode(self), digest_size=6).hexdigest()
+        """Names all that the profile says but its conditions, 12 hex digits: rows depend on the
+        rest, and labels, which can be changed without the recordings, on `labels_version`."""
+        rest = msgspec.structs.replace(self, shipped_conditions=[], own_conditions=[])
+        return hashlib.blake2b(msgspec.json.encode(rest), digest_size=6).hexdigest()
 
     @property
     def transform_topics(self) -> tuple[str, ...]:

@@ -156,3 +156,30 @@ def test_the_ends_are_kept_with_the_rows(store):
         last = ends["pose_x_m"][0].as_py()
         assert last == pytest.approx(2.6 if row["transitions"] == 16 else 3.9, abs=0.01)
         assert not label(ends, [Condition("x", "pre", "bumped")])["x"].any()
+
+
+def stale(store: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """The recordings whose labels or profile the audit calls stale."""
+    capsys.readouterr()
+    main(["audit", str(store), "--json"])
+    audits = json.loads(capsys.readouterr().out)["audits"]
+    (one,) = [audit for audit in audits if audit["audit"] == "stale_labels"]
+    return [Path(row["source_file"]).name for row in one["sample"]]
+
+
+def test_the_audit_names_stale_labels_until_they_are_run_anew(store, tmp_path, capsys):
+    """End to end: a changed condition, one recording ingested by it, the other one labelled."""
+    profile = tmp_path / "amr.toml"
+    assert stale(store, capsys) == []
+    profile.write_text(TEXT + SOON.format("lead(pose_x_m) OVER episode > 1.95"))
+    bag = str(tmp_path / "b")
+    assert main(["ingest", bag, "--store", str(store), "--profile", str(profile)]) == 0
+    assert stale(store, capsys) == ["a"]
+    assert main(["label", str(store), "--profile", str(profile)]) == 0
+    assert stale(store, capsys) == []
+    bags = [str(tmp_path / name) for name in "ab"]
+    command = ["ingest", *bags, "--store", str(store), "--profile", str(profile), "--json"]
+    capsys.readouterr()
+    assert main(command) == 0
+    said = json.loads(capsys.readouterr().out)["recordings"]
+    assert [one["status"] for one in said] == ["unchanged", "unchanged"]

@@ -1,5 +1,5 @@
 -- severity: warning
--- advice: Ingest these recordings again, so that one condition means the same in all of them.
+-- advice: Where only conditions changed, `restock label STORE --profile PROFILE`; else ingest these recordings again.
 -- doc: Recordings that were labelled, or read, by another version of the conditions or the profile than the newest ingest.
 WITH newest AS (FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1)
 SELECT recordings.recording_id, recordings.source_file, recordings.labels_version, recordings.profile_hash
