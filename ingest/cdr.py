@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.ingest.cdr_frame import TOO_LONG, BadRows, Frame, Order
-from restock.ingest.cdr_plan import Columns, compile_plan
+from restock.ingest.cdr_compile import compile_plan
+from restock.ingest.cdr_frame import TOO_LONG, BadRows, Columns, Frame, Order
 from restock.ingest.columns import Batch, FieldColumn, join, take
 from restock.ingest.definitions import RosType
 from restock.ingest.fields import Leaf

@@ -16,6 +16,7 @@ from restock.ingest.columns import I64, FieldColumn, Ragged, gather, offsets_of
 Order: TypeAlias = Literal["<", ">"]
 ORDERS: tuple[Order, Order] = ("<", ">")
 Position: TypeAlias = "int | I64"
+Columns: TypeAlias = dict[str, FieldColumn]  # by field path
 
 TOO_SHORT = "mis-sized: it ends before its last field"
 TOO_LONG = "mis-sized: bytes are left after its last field"

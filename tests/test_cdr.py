@@ -52,22 +52,25 @@ def agree(message: RosType, payloads: list[bytes], *, ros1: bool = False) -> Non
 
 
 @st.composite
-def definitions(draw: st.DrawFn) -> str:
+def definitions(draw: st.DrawFn, *, ros1: bool = False) -> str:
     """A message definition with the messages it is made of, as a recording carries it."""
+    bounds = "[]" if ros1 else "[<=5]"  # ROS 1 knows none
+    repeats = [bounds if repeat == "[<=5]" else repeat for repeat in REPEATS]
+    others = ["time", "duration"] if ros1 else ["string<=8", "builtin_interfaces/Time"]
     count = draw(st.integers(1, 4))
     texts = []
     for number in range(count):
         inner = [f"pkg/T{other}" for other in range(number + 1, count)]
-        kinds = [*PRIMITIVES, "string", "string<=8", "builtin_interfaces/Time", *inner * 3]
+        kinds = [*PRIMITIVES, "string", *others, *inner * 3]
         fields = draw(
-            st.lists(st.tuples(st.sampled_from(kinds), st.sampled_from(REPEATS)), max_size=6)
+            st.lists(st.tuples(st.sampled_from(kinds), st.sampled_from(repeats)), max_size=6)
         )
         lines = [f"{kind}{repeat} f{place}" for place, (kind, repeat) in enumerate(fields)]
         texts.append("\n".join(lines) or "# nothing in it")
     rule = "\n" + "=" * 80 + "\nMSG: "
     time = "int32 sec\nuint32 nanosec"
     family = [f"pkg/T{number}\n{text}" for number, text in enumerate(texts)][1:]
-    return rule.join([texts[0], *family, f"builtin_interfaces/Time\n{time}"])
+    return rule.join([texts[0], *family, *([] if ros1 else [f"builtin_interfaces/Time\n{time}"])])
 
 
 class Maker:
@@ -131,6 +134,26 @@ def test_any_definition_decodes_as_rosbags_does(
         bytes(store.serialize_cdr(one, "pkg/msg/T0", little_endian=little)) for one in made
     ] * (rows if alike else 1)
     agree(message, payloads)
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
+@given(
+    text=definitions(ros1=True),
+    seed=st.integers(0, 2**32),
+    rows=st.integers(1, 12),
+    longest=st.sampled_from([0, 1, 3, 9]),
+    alike=st.booleans(),
+)
+def test_any_ros1_definition_decodes_as_rosbags_does(
+    text: str, seed: int, rows: int, longest: int, alike: bool
+) -> None:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg(text, "pkg/msg/T0"))
+    channel = Channel(1, "/t", "pkg/T0", "ros1", "ros1msg", text.encode())
+    maker = Maker(store, np.random.default_rng(seed), longest)
+    made = [maker.message("pkg/msg/T0") for _ in range(1 if alike else rows)]
+    payloads = [bytes(store.serialize_ros1(one, "pkg/msg/T0")) for one in made]
+    agree(message_type(channel, "humble"), payloads * (rows if alike else 1), ros1=True)
 
 
 def test_both_byte_orders_in_one_batch() -> None:
