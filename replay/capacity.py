@@ -22,7 +22,13 @@ class Capacity:
     cells: int  # condition x zone x action cells that were ever seen
     recommended: int  # rows: the least that keep `cells_share` of those cells
     cells_share: float
+    half_share: float  # of the cells, what the newest half of the rows keeps
     curve: list[dict[str, Any]]  # capacity, cells, cells_share, conditions, episodes, …
+
+    @property
+    def saturated(self) -> bool:
+        """Whether the second half of the rows showed hardly anything new."""
+        return self.half_share >= self.cells_share
 
 
 def recommend_capacity(
@@ -55,5 +61,6 @@ def recommend_capacity(
         cells=len(firsts),
         recommended=firsts[needed - 1][0],
         cells_share=cells_share,
+        half_share=curve[-2]["cells_share"] if len(curve) > 1 else 1.0,
         curve=curve,
     )

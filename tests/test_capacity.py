@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pyarrow as pa
 import pytest
+from conftest import recording_transitions, write_store
 
 from restock import cli
 from restock.replay.capacity import recommend_capacity
@@ -39,6 +40,25 @@ def test_the_curve_and_the_recommendation_are_those_of_a_naive_count(
         assert 1 <= point["effective_episodes"] <= point["episodes"]
     assert cells(rows[: found.recommended]) >= 0.9 * found.cells
     assert cells(rows[: found.recommended - 1]) < 0.9 * found.cells
+
+
+def test_whether_coverage_is_saturated_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    growing = write_store(tmp_path / "growing", [recording_transitions(1)])
+    with Store(growing) as store:
+        found = recommend_capacity(store.connection)
+    assert found.half_share == found.curve[-2]["cells_share"] < 0.95
+    assert not found.saturated
+    assert cli.main(["audit", str(growing), "--capacity"]) == 0
+    assert "more recordings will show more" in capsys.readouterr().out
+    rows = recording_transitions(1)
+    for name, value in (("condition", "nominal"), ("zone", "cross"), ("action", 1)):
+        place = rows.schema.get_field_index(name)
+        same = pa.array([value] * len(rows), rows.schema.field(place).type)
+        rows = rows.set_column(place, rows.schema.field(place), same)
+    with Store(write_store(tmp_path / "flat", [rows])) as store:
+        assert recommend_capacity(store.connection).saturated
 
 
 def test_the_verb_recommends(store_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -89,6 +89,11 @@ class Audit:
             f" {found.cells} condition x zone x action cells ever seen: with less, a buffer forgets"
             " some that no sampling brings back"
         )
+        if not found.saturated:
+            output.stdout().print(
+                f"the newest half keeps {found.half_share:.0%}: the logs still show new cells, and"
+                " more recordings will show more"
+            )
         return int(ExitCode.OK)
 
 
