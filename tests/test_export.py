@@ -1,8 +1,8 @@
 """Exports: trajectories put back together, each format read back, by the real library where it is.
 
 Not every library can live in one environment (d3rlpy pins an old Gymnasium, lerobot a torch with
-CUDA), so those two are run by the Python that RESTOCK_D3RLPY_PYTHON and RESTOCK_LEROBOT_PYTHON
-name, this one by default.
+CUDA), so those two are read with the Python that RESTOCK_NEIGHBOURS_PYTHON names, else with that of
+`.venv-neighbours` where there is one, else with this one.
 """
 
 from __future__ import annotations
@@ -270,7 +270,10 @@ def test_minari_makes_the_twin_again_for_logs_of_its_task(tmp_path: Path) -> Non
 
 def read_with(library: str, path: Path) -> Any:
     """What the real library finds, in a Python that has it; the test is skipped where none has."""
-    python = os.environ.get(f"RESTOCK_{library.upper()}_PYTHON", sys.executable)
+    apart = TESTS.parent / ".venv-neighbours" / "bin" / "python"
+    python = os.environ.get("RESTOCK_NEIGHBOURS_PYTHON") or str(
+        apart if apart.exists() else sys.executable
+    )
     probe = f"import importlib.util as u; raise SystemExit(u.find_spec('{library}') is None)"
     if subprocess.run([python, "-c", probe], check=False).returncode:
         pytest.skip(f"{python} has no {library}")

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from restock.ingest.conditions import NOMINAL, Condition, label, primary
 from restock.ingest.signals import STORED_SIGNALS
 
-EPISODES_PER_QUERY = 8
+EPISODES_PER_QUERY = 8  # at most: as many as there are environments
 _COMMANDS = ("command_speed_mps", "command_yaw_rate_radps")
 _NAMES = tuple(signal.name for signal in STORED_SIGNALS)
 
@@ -41,6 +41,7 @@ class InfoLabels:
         self.conditions = sorted(conditions, key=lambda c: (c.priority, c.name))
         self.names = (*(condition.name for condition in self.conditions), NOMINAL)
         self._codes = {name: code for code, name in enumerate(self.names)}
+        self._worth_a_query = min(EPISODES_PER_QUERY, num_envs)
         self._running: list[list[dict[str, Any]]] = [[] for _ in range(num_envs)]
         self._ended: list[tuple[int, list[dict[str, Any]]]] = []
         self.unlabelled_episodes = 0
@@ -64,7 +65,7 @@ class InfoLabels:
     def label(self, *, all_of_them: bool = False) -> list[Labelled]:
         """Label the ended episodes, once enough wait to be worth a query."""
         waiting = self._ended
-        if not waiting or (len(waiting) < EPISODES_PER_QUERY and not all_of_them):
+        if not waiting or (len(waiting) < self._worth_a_query and not all_of_them):
             return []
         self._ended = []
         rows = [row for _, steps in waiting for row in steps]
