@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import zstandard
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin
@@ -123,9 +124,10 @@ def write_mcap(
     *,
     compression: CompressionType = CompressionType.ZSTD,
     chunk_size: int = 4096,
+    packed: bool = False,
     **options: Any,
 ) -> Path:
-    """An MCAP file of the same messages, in several chunks."""
+    """An MCAP file of the same messages, in several chunks; `packed`: each message zstd."""
     with path.open("wb") as file:
         writer = McapWriter(file, compression=compression, chunk_size=chunk_size, **options)
         writer.start(profile="ros2", library="test")
@@ -136,6 +138,7 @@ def write_mcap(
             channels[topic] = writer.register_channel(topic, "cdr", schema)
         for topic, log, message in messages(count):
             data = bytes(STORE.serialize_cdr(message, TOPICS[topic]))
+            data = zstandard.ZstdCompressor().compress(data) if packed else data
             writer.add_message(channels[topic], log, data, publish_time=log)
         writer.finish()
     return path

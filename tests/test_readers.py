@@ -11,6 +11,7 @@ import pytest
 import zstandard
 from bag_samples import SHARED, START_NS, TOPICS, messages, write_bag, write_mcap
 from mcap.writer import CompressionType, IndexType, Writer
+from ruamel.yaml import YAML
 
 from restock.errors import RecordingError
 from restock.ingest.columns import Ragged, equal
@@ -60,7 +61,15 @@ CONTAINERS = {
     "sqlite3 bag, zstd file": lambda d: compress_files(write_bag(d / "run")),
     "mcap bag, zstd file": lambda d: compress_files(write_bag(d / "run", storage="mcap")),
     "sqlite3 bag, zstd messages": lambda d: compress_messages(write_bag(d / "run")),
+    "mcap bag, zstd messages": lambda d: write_mcap(d / "r.mcap", packed=True),
     "sqlite3 bag without metadata": lambda d: without_metadata(write_bag(d / "run")),
+    "sqlite3 bag in three files": lambda d: split_sqlite(write_bag(d / "run")),
+    **{
+        f"metadata version {version}": lambda d, version=version: with_metadata(
+            write_bag(d / "run"), version
+        )
+        for version in range(1, 10)
+    },
 }
 
 
@@ -90,6 +99,54 @@ def without_metadata(bag: Path) -> Path:
     return bag
 
 
+def split_sqlite(bag: Path) -> Path:
+    """The bag's messages in three files; the second holds the earliest."""
+    file = next(bag.glob("*.db3"))
+    for part in range(3):
+        copy = shutil.copy(file, bag / f"run_{part}.db3")
+        with sqlite3.connect(copy) as base:
+            base.execute("DELETE FROM messages WHERE (id + 1) % 3 != ?", (part,))
+        base.close()
+    file.unlink()
+    (bag / "metadata.yaml").unlink()
+    return bag
+
+
+def with_metadata(bag: Path, version: int) -> Path:
+    """The bag with a metadata.yaml as rosbag2 wrote it at that version."""
+    file = next(bag.glob("*.db3")).name
+    qos: object = "- history: 1\n  depth: 10\n"
+    about = {
+        "version": version,
+        "storage_identifier": "sqlite3",
+        # The first versions wrote the path from where the recorder was started.
+        "relative_file_paths": [f"run/{file}" if version < 3 else file],
+        "duration": {"nanoseconds": 950_000_006},
+        "starting_time": {"nanoseconds_since_epoch": START_NS + 3_000_000},
+        "message_count": 140,
+        "topics_with_message_count": [
+            {
+                "topic_metadata": {
+                    "name": topic,
+                    "type": kind,
+                    "serialization_format": "cdr",
+                    **({"offered_qos_profiles": qos if version < 9 else []} if version > 3 else {}),
+                    **({"type_description_hash": "RIHS01_0"} if version > 6 else {}),
+                },
+                "message_count": 20,
+            }
+            for topic, kind in TOPICS.items()
+        ],
+        **({"compression_format": "", "compression_mode": ""} if version > 2 else {}),
+        **({"files": [{"path": file, "message_count": 140}]} if version > 4 else {}),
+        **({"custom_data": None} if version > 5 else {}),
+        **({"ros_distro": "rosbags"} if version > 7 else {}),
+    }
+    with (bag / "metadata.yaml").open("w") as out:
+        YAML(typ="safe").dump({"rosbag2_bagfile_information": about}, out)
+    return bag
+
+
 @pytest.mark.parametrize("container", CONTAINERS)
 def test_every_container_gives_the_same_columns(container: str, mcap: Path, tmp_path: Path) -> None:
     with (
@@ -98,6 +155,7 @@ def test_every_container_gives_the_same_columns(container: str, mcap: Path, tmp_
     ):
         expected, found = everything(reference), everything(other)
         assert not other.losses
+        assert not [note for note in other.notes if "no metadata" not in note]
         assert {name: topic.type for name, topic in other.topics.items()} == TOPICS
         same(expected, found)
         for topic, account in other.accounts.items():
