@@ -21,7 +21,9 @@ from restock.ingest.schema import STEP_BITS
 from restock.ingest.task import Task, reward_parts
 from restock.replay.store import Store, is_store
 
-WINDOW_S = 1.0  # before a tick: where the messages lie that it was made of
+# Where in log time the messages of a tick lie: it takes a while until the next ones come, and
+# some take longer than others to be received.
+WINDOW_S = (-1.0, 0.1)
 _RELABELLED = ("condition", "conditions", "labels_version", "profile_hash", "ingest_id", "reward")
 _LEFT_OUT = ("task_json", "conditions_json", "topics", "label_scores")  # of a manifest: long
 
@@ -193,7 +195,7 @@ def _moment(row: Mapping[str, Any], manifest: Mapping[str, Any] | None) -> dict[
         "tick": int(row["transition_id"]) & ((1 << STEP_BITS) - 1),
         "log_time_ns": logged,
         "log_time": _utc(logged),
-        "window_ns": [logged - round(WINDOW_S * 1e9), logged],
+        "window_ns": [logged + round(edge * 1e9) for edge in WINDOW_S],
         "clock_jumps": (manifest or {}).get("clock_jumps"),
     }
 

@@ -76,6 +76,12 @@ def trace(place: str | Path, row: str, where: Where | None = None) -> Trace:
 
 def audited_rows(run: str | Path, limit: int = 20) -> list[dict[str, Any]]:
     """The audited rows of a run with the largest TD errors, each with its name for `trace`."""
+    if not (Path(run) / RUN_CONFIG).is_file():
+        raise RunError(
+            "is no run: only of a run can rows be listed",
+            where=str(run),
+            remedy="name the ROW: a row number of a panel, a transition id of a store",
+        )
     table = _audit_table(Path(run))
     with duckdb.connect() as connection:
         return rows_of(connection, sql_file("trace_rows.sql"), {"file": table, "limit": limit})

@@ -174,6 +174,11 @@ def test_audited_rows_are_listed_by_their_error(places: Places) -> None:
     assert [row["row"] for row in audited_rows(places.run, 3)] == ["7/2", "7/1", "7/3"]
 
 
+def test_rows_are_listed_of_runs_alone(places: Places, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["trace", str(places.panel)]) == 2
+    assert "name the ROW" in capsys.readouterr().err
+
+
 def test_a_row_of_the_panel_can_be_followed_too(places: Places) -> None:
     found = trace(places.panel, "5")
     assert found.panel is not None

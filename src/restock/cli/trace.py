@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from restock.replay.origin import Origin
 
 _LONG = 6  # entries of a list that are printed
+_TABLES = ("clocks", "signals", "stand_ins")  # of a manifest: for `--json` and `restock sql`
 
 
 @dataclass
@@ -97,7 +98,8 @@ def _print_origin(origin: Origin, with_messages: bool) -> None:
 
     _section("its row of the store", {**origin.store, **origin.transition})
     _section("what its reward is made of", origin.reward_parts)
-    _section("its recording", origin.recording)
+    manifest = origin.recording or {}
+    _section("its recording", {k: v for k, v in manifest.items() if k not in _TABLES})
     _section("when it was", origin.moment)
     if origin.messages:
         output.print_table(
