@@ -267,6 +267,12 @@ class Mixture(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             bool(self.strata) or self.each_condition is not None,
             "no strata: list some under [[strata]], or give [each_condition]",
         )
+        rules = [self, *([self.each_condition] if self.each_condition else []), *self.strata]
+        _check(
+            self.sampling == "memory"
+            or all(rule.within in (None, "without_replacement") for rule in rules),
+            'sampling = "chunked" reads rows in shuffled order: within = "without_replacement" only',
+        )
         names = [rule.name for rule in self.strata]
         _check(len(set(names)) == len(names), f"strata named twice: {sorted(names)}")
         _check(not any("/" in name for name in names), "a stratum's name cannot hold a /")

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from conftest import CONDITIONS, TASK, recording_transitions
+import torch
+from conftest import CONDITIONS, recording_transitions
 from test_loop import assert_same_run, config, run_to_end, session
 from toy_twin import TASK as TOY_TASK
 
@@ -20,8 +20,9 @@ from restock.replay.diet import Diet, FedStratum, PlannedDraws
 from restock.replay.mixed import MixedSampler
 from restock.replay.mixture import Prioritised, parse_mixture
 from restock.replay.panel import Panel
+from restock.replay.ring import FreshRing
 from restock.replay.strata import rules_of
-from restock.train.batches import Logs
+from restock.train.batches import Batches, Logs
 from restock.train.log_draws import LogDraws
 from restock.train.loop import TrainingInterrupted, train
 
@@ -122,6 +123,28 @@ def test_no_row_is_drawn_more_often_than_it_may_be(
     if within != "without_replacement":
         assert sum(row["replaced_rows"] for row in rows) > 0
     assert draws.draw(64).rows.size == 0
+
+
+def test_a_panel_read_in_chunks_gives_the_rows_it_names(table: pa.Table, tmp_path: Path) -> None:
+    text = "max_replays_per_row = 9\nsampling = 'chunked'\n[each_condition]\nshare = 'equal'\n"
+    built = panel(table, tmp_path / "p", text)
+    ring = FreshRing(64, 4, TOY_TASK.observation_size, discount=0.9)
+    logs = Logs.of_panel(built, PlannedDraws(offline=4_000))
+    parts = {"batch_size": 64, "logs_share": None, "seed": 0, "device": torch.device("cpu")}
+    batches = Batches(logs, ring, **parts)  # type: ignore[arg-type]
+    again = Batches(logs, ring, **parts)  # type: ignore[arg-type]
+    counted = np.zeros(len(built), np.int64)
+    for number in range(9 * len(built) // 64):
+        batch = batches.draw_offline()
+        np.testing.assert_array_equal(batch.rows.numpy(), built.rows[batch.log_rows])
+        np.add.at(counted, batch.log_rows, 1)
+        if number == 20:
+            again.load_state_dict(batches.state_dict())
+        elif number == 21:
+            np.testing.assert_array_equal(again.draw_offline().log_rows, batch.log_rows)
+    assert counted.max() <= 9
+    with pytest.raises(MixtureError, match="every row of the panel was drawn 9 times"):
+        batches.draw_offline()
 
 
 def test_the_surplus_of_a_stratum_that_is_used_up_goes_to_the_others(
@@ -289,9 +312,3 @@ def test_the_run_records_the_shares_in_force(table: pa.Table, tmp_path: Path) ->
             assert row["drawn_share"] == pytest.approx(row["quota_share"], abs=0.03)
     ages = pq.read_table(tmp_path / "a" / "ages.parquet").to_pylist()
     assert max(row["bucket"] for row in ages if row["unit"] == "env_steps") <= 9  # 2 ** 9 <= 900
-
-
-def test_task_of_the_fixture_is_the_toys(table: pa.Table) -> None:
-    assert TOY_TASK.hash != TASK.hash
-    assert set(table["task_hash"].to_pylist()) == {TOY_TASK.hash}
-    assert msgspec.json.encode(TOY_TASK)

@@ -81,6 +81,7 @@ def test_the_shipped_mixtures_load_and_fill(name: str, transitions: pa.Table) ->
         (EVERY + "[safety]\nleave_out = 'rows'", "unsafe"),
         ("max_rows_per_episode = 0\n" + EVERY, "max_rows_per_episode"),
         ("within = 'rank'\n" + EVERY, "within"),
+        ("sampling = 'chunked'\nwithin = 'per'\n" + EVERY, "without_replacement"),
         ("discount = 1.5\n" + EVERY, "discount"),
         ("seed = 'x'\n" + EVERY, "seed"),
         ("discount = 0.9", "no strata"),

@@ -86,6 +86,7 @@ class LogDraws:
         self.replays: NDArray[np.int32] | None = None
         if cap is not None:
             self.replays = np.zeros(len(logs), np.int32)
+        self._budget: Ints = (cap or 0) * np.array([len(rows) for rows in logs.stratum_rows])
         self._swapped = False  # rows of the last batch, for the cap
         self.replaced: Ints = np.zeros(len(shares), np.int64)  # rows of each stratum, for the cap
         self._rng = np.random.default_rng([seed, 3])
@@ -191,9 +192,8 @@ class LogDraws:
 
     def _used_up(self) -> bool:
         """Whether a stratum that has a share has no row left that may be drawn."""
-        sizes = np.array([len(rows) for rows in self.logs.stratum_rows])
-        full = self.diet.drawn >= (self.diet.max_replays or 0) * sizes
-        return bool((full & (self.diet.shares > 0)).any()) and self.diet.logs_share > 0
+        full = self.diet.drawn >= self._budget
+        return bool(full.any()) and bool(self.diet.shares[full].any()) and self.diet.logs_share > 0
 
     def describe(self) -> list[dict[str, Any]]:
         """A row a stratum, for the run's table `shares`."""
