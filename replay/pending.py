@@ -12,7 +12,7 @@ from restock.replay.layout import F32, F64, Ints, row_columns, row_width
 
 
 class PendingSteps:
-    """Up to n steps of each environment; position 0 is the oldest.
+    """Up to n steps of each environment, the oldest at its `_first`, round and round.
 
     Args:
         num_envs: N.
@@ -41,9 +41,10 @@ class PendingSteps:
             name: np.zeros((num_envs, n_step), dtype) for name, dtype in meta.items()
         }
         self.waiting: Ints = np.zeros(num_envs, np.int64)  # steps pending, 0..n_step - 1
+        self._first: Ints = np.zeros(num_envs, np.int64)  # position of the oldest step
         self._envs = np.arange(num_envs)
-        arrays: list[NDArray[Any]] = [self._observation, self._action, self._reward]
-        self._arrays = arrays + list(self._meta.values())
+        self._ahead = np.arange(n_step)
+        self._powers = discount**self._ahead
 
     def add(
         self,
@@ -53,7 +54,7 @@ class PendingSteps:
         meta: Mapping[str, Any],
     ) -> None:
         """One step of every environment: `observation` (N, D), `action` and `reward` (N,)."""
-        at = self._envs, self.waiting
+        at = self._envs, (self._first + self.waiting) % self.n_step
         self._observation[at] = observation
         self._action[at] = action
         self._reward[at] = reward
@@ -69,23 +70,21 @@ class PendingSteps:
         `next_observation` (N, D) and `terminated` (N,) are of the step added last. Returns rows
         (n, W) and their metadata (n,) each.
         """
-        horizon = self.waiting[envs]  # (n,)
-        powers = self.discount ** np.arange(self.n_step)
-        inside = np.arange(self.n_step)[None, :] < horizon[:, None]
+        horizon, first = self.waiting[envs], self._first[envs]  # (n,)
+        inside = self._ahead < horizon[:, None]
+        ahead = (first[:, None] + self._ahead) % self.n_step
         part = self._columns
         rows: F32 = np.empty((len(envs), self._width), np.float32)
-        rows[:, part["observation"]] = self._observation[envs, 0]
+        rows[:, part["observation"]] = self._observation[envs, first]
         rows[:, part["next_observation"]] = np.asarray(next_observation)[envs]
-        rows[:, part["action"]] = self._action[envs, :1]
-        returns = (self._reward[envs] * powers * inside).sum(axis=1)
+        rows[:, part["action"]] = self._action[envs, first][:, None]
+        returns = (self._reward[envs[:, None], ahead] * self._powers * inside).sum(axis=1)
         rows[:, part["reward"]] = returns[:, None]
         going_on = ~np.asarray(terminated, np.bool_)[envs]
         rows[:, part["discount"]] = (self.discount**horizon * going_on)[:, None]
-        meta = {name: values[envs, 0] for name, values in self._meta.items()}
+        meta = {name: values[envs, first] for name, values in self._meta.items()}
         meta["horizon"] = horizon
-        if self.n_step > 1:
-            for values in self._arrays:
-                values[envs, :-1] = values[envs, 1:]
+        self._first[envs] = (first + 1) % self.n_step
         self.waiting[envs] -= 1
         return rows, meta
 
@@ -93,6 +92,7 @@ class PendingSteps:
         """Arrays."""
         return {
             "waiting": self.waiting.copy(),
+            "pending.first": self._first.copy(),
             "pending.observation": self._observation.copy(),
             "pending.reward": self._reward.copy(),
             "pending.action": self._action.copy(),
@@ -102,6 +102,7 @@ class PendingSteps:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Puts the steps where `state_dict` found them."""
         self.waiting = np.array(state["waiting"], np.int64)
+        self._first = np.array(state["pending.first"], np.int64)
         self._observation[...] = state["pending.observation"]
         self._reward[...] = state["pending.reward"]
         self._action[...] = state["pending.action"]
