@@ -64,18 +64,26 @@ class Node:
 
 @dataclass(eq=False)
 class JsonType(MessageType):
-    """The type of one channel's JSON messages."""
+    """The type of one channel's JSON messages.
+
+    Raises:
+        CannotDecode: its schema is none.
+    """
 
     name: str
     source: str  # "embedded", or "inferred" where there is no schema
     schema: bytes
     sample: Sample  # the channel's first messages
+    _root: Node = field(init=False)
     _fields: dict[str, list[FieldType]] | None = None
     times = tuple(f"{{{first}, {second}}}" for first, second in TIMES)
 
+    def __post_init__(self) -> None:
+        self._root = _Schema(self.schema).root() if self.schema else Node()
+
     def fields_of(self, name: str) -> Sequence[FieldType]:
         if self._fields is None:
-            root = _Schema(self.schema).root() if self.schema else Node()
+            root = self._root
             if not _complete(root):
                 for payload in self.sample():
                     try:

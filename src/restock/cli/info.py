@@ -82,6 +82,7 @@ def _print(entry: dict[str, Any]) -> None:
             "type": topic["type"],
             "messages": topic["messages"],
             "rate Hz": topic["rate_hz"],
+            "encoding": topic["encoding"],
             "": f"skipped: {topic['skipped']}" if topic["skipped"] else "",
         }
         for name, topic in entry["topics"].items()
@@ -96,7 +97,9 @@ def _print(entry: dict[str, Any]) -> None:
     )
     sys.stdout.write("  ".join(part for part in about if part) + "\n")
     clock = output.CLOCK_COLUMNS if clocked else []
-    output.print_table(rows, ["topic", "type", "messages", "rate Hz", *clock, ""])
+    mixed = {topic["encoding"] for topic in entry["topics"].values()} - {"cdr"}
+    coded = ["encoding"] if mixed and entry["format"] != "ros1" else []
+    output.print_table(rows, ["topic", "type", *coded, "messages", "rate Hz", *clock, ""])
     for what, names in (
         ("attachments", [item["name"] for item in entry["attachments"]]),
         ("metadata records", entry["metadata"]),
