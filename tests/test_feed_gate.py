@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -105,6 +107,14 @@ def test_a_shift_within_the_run_that_the_whole_hides_is_found() -> None:
     )
     parts = {check.part for check in failing(first, shifted) if check.name == "mix"}
     assert parts == {"tenth 1", "tenth 10"}
+
+
+def test_rows_that_nobody_could_label_show_nothing() -> None:
+    first, second = feed(1, runs=5), feed(2, runs=5)
+    names = [name.replace("fresh/nominal", "fresh/unlabelled") for name in CELLS]
+    unknown = [dataclasses.replace(one, cells=names) for one in (first, second)]
+    assert verdict(first, second) == "comparable"
+    assert verdict(*unknown) == "inconclusive"
 
 
 def test_a_cell_that_only_one_was_fed_is_an_infinite_ratio() -> None:

@@ -6,11 +6,11 @@ target rule on another feed does. What is left unchanged says as much as what ch
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from restock.errors import RunError
+from restock.train.config import as_overrides
 from restock.train.diagnose import Cause, Diagnosis, diagnose
 from restock.train.loop import train
 from restock.train.prepare import prepare_new
@@ -36,7 +36,7 @@ def confirm(run: Run, diagnosis: Diagnosis, out: Path) -> dict[str, Any]:
         )
     changed = swapped(run, diagnosis.cause)
     panel = run.document["panel"]
-    settings = _settings(run.document["config"]) + changed
+    settings = as_overrides(run.document["config"]) + changed
     prepared = prepare_new(out, Path(panel["path"]) if panel else None, None, settings)
     session = prepared.open()
     try:
@@ -65,23 +65,6 @@ def swapped(run: Run, cause: Cause) -> list[str]:
     share = 1 / len(config["env"]["conditions"])
     names = list(config["env"]["conditions"])
     return ["replay.logs_share=0.0", *(f"env.conditions.{name}={share:.6g}" for name in names)]
-
-
-def _settings(config: dict[str, Any], prefix: str = "") -> list[str]:
-    """A resolved config as `key=value` settings."""
-    found = []
-    for key, value in config.items():
-        if isinstance(value, dict) and prefix + key != "target":
-            found += _settings(value, f"{prefix}{key}.")
-        elif value is not None:
-            found.append(f"{prefix}{key}={_toml(value)}")
-    return found
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}={_toml(item)}" for key, item in value.items()) + "}"
-    return json.dumps(value)  # numbers, booleans, strings and lists are the same in TOML
 
 
 __all__ = ["confirm", "swapped"]

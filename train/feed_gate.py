@@ -32,6 +32,7 @@ class Limits:
     tenth_distance: float = 0.05  # … of one tenth of it, which has a tenth of the episodes
     share_ratio: float = 1.25  # of a stratum's shares
     share_floor: float = 0.0005  # strata below this share in both are not asked for a ratio
+    unlabelled: float = 0.5  # share of the fresh rows drawn before their episode had labels
     episode_ratio: float = 1.5  # of the numbers of episodes that a stratum was drawn from
     confidence: float = 0.95
     resamples: int = 1000
@@ -99,7 +100,7 @@ def check_feeds(first: Feed, second: Feed, limits: Limits, rng: np.random.Genera
             checks.append(_distance(name, part, a, b, limit, limits))
             if tenth is None:
                 checks += _ratios(first.cells, name, a, b, limits)
-    return checks + _episodes(first, second, limits)
+    return checks + _unlabelled(first, second, limits) + _episodes(first, second, limits)
 
 
 def _ratios(cells: Sequence[str], name: str, a: F64, b: F64, limits: Limits) -> list[Check]:
@@ -111,6 +112,21 @@ def _ratios(cells: Sequence[str], name: str, a: F64, b: F64, limits: Limits) -> 
             continue
         checks.append(_ratio(f"share of {cell}{after}", a[:, index], b[:, index], limits))
     return checks
+
+
+def _unlabelled(first: Feed, second: Feed, limits: Limits) -> list[Check]:
+    """Rows that nobody could label when they were drawn may be anything: many show nothing."""
+    fresh = [name.startswith("fresh/") for name in first.cells]
+    shares = []
+    for feed in (first, second):
+        drawn = np.bincount(feed.cell, feed.drawn, len(feed.cells))
+        unknown = [name == "fresh/unlabelled" for name in feed.cells]
+        shares.append(float(drawn[unknown].sum() / max(drawn[fresh].sum(), 1e-12)))
+    most = max(shares)
+    if most <= limits.unlabelled:
+        return []
+    name = "unlabelled share of fresh rows"
+    return [Check(name, "whole run", *shares, most, 0.0, most, limits.unlabelled)]
 
 
 def _episodes(first: Feed, second: Feed, limits: Limits) -> list[Check]:

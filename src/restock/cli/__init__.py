@@ -27,6 +27,7 @@ VERBS = {
     "export": "transitions as a data set for Minari, d3rlpy, LeRobot, Parquet or NumPy",
     "train": "offline warm-up on the panel, then online in the twin",
     "eval": "success per condition, clean and perturbed",
+    "study": "methods x mixtures x seeds, ending in one comparison",
     "compare": "refuses if the two were fed differently; else who did better, by how much",
     "trace": "where did a sampled row come from? down to the messages",
     "diagnose": "buffer failure or target failure?",

@@ -1,0 +1,73 @@
+"""`restock study`: methods x seeds, ending in one comparison."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+@dataclass
+class Study:
+    """Train and evaluate every arm of a study with every seed, then compare them through the gate.
+
+    The study is a TOML file: a store, arms (a mixture or a panel, and settings), seeds, what is
+    compared. Each run is a directory under OUT/runs. What is there already is not done again, so
+    an interrupted study goes on where it was: run the same command. Ends with OUT/study.md and
+    OUT/study.json. See docs/study.md.
+
+    Example: `restock study mixtures.toml --out studies/mixtures --workers 2`
+    """
+
+    study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")]
+    """The study."""
+    out: Path
+    """Where its panels, runs and logs go."""
+    workers: int = 1
+    """Runs at a time, each a process."""
+    dry_run: bool = False
+    """Check the study and print what would be run; write nothing."""
+    json: bool = False
+    """Print what was found as JSON."""
+
+    def run(self) -> int:
+        from json import dumps
+
+        from restock.cli.output import plain, print_json, print_table, say
+        from restock.errors import ConfigError, ExitCode
+        from restock.train.run import write_text
+        from restock.train.study import Plan, load_study, run_study
+        from restock.train.study_page import as_markdown, findings
+
+        if self.workers < 1:
+            raise ConfigError(f"must be at least 1, got {self.workers}", where="--workers")
+        plan = Plan(load_study(self.study), self.study.parent, self.out)
+        if self.dry_run:
+            rows = [
+                {
+                    "run": str(job.path),
+                    "panel": str(plan.panel(job.arm) or "none"),
+                    "settings": " ".join(plan.settings(job.arm, job.seed)),
+                    "done": job.done.exists(),
+                }
+                for job in plan.jobs
+            ]
+            if self.json:
+                print_json(rows)
+            else:
+                print_table(rows, title="what would be run")
+            return 0
+        comparisons = run_study(plan, workers=self.workers, say=say)
+        found = findings(plan, comparisons)
+        page = as_markdown(found)
+        write_text(self.out / "study.md", page)
+        write_text(self.out / "study.json", dumps(plain(found), indent=1) + "\n")
+        if self.json:
+            print_json(found)
+        else:
+            sys.stdout.write(page)
+        refused = any(comparison.verdict != "comparable" for comparison in comparisons)
+        return int(ExitCode.FAILED if refused else ExitCode.OK)
