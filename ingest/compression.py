@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,9 @@ from restock.ingest.discover import ZSTD_MAGIC
 # What decompresses to more than both is taken for an attack (or for an accident).
 PLAUSIBLE_SIZE = 256 << 20
 PLAUSIBLE_RATIO = 1000
+PLAUSIBLE_MESSAGE = 64 << 20
 LARGEST_MESSAGE = 1 << 30
+PIECE = 32 << 20  # of messages decompressed at a time
 BLOCK = 1 << 12  # bytes given to zstd at a time: at its most that makes 128 MiB of them
 
 
@@ -52,29 +55,55 @@ def decompress_file(path: Path, target: Path, *, salvage: bool) -> str | None:
     return problem
 
 
-def decompress_messages(batch: Batch) -> tuple[Batch, int]:
-    """The batch with zstd payloads decompressed, and how many could not be.
+def decompressed(batch: Batch) -> Iterator[tuple[Batch, int]]:
+    """The batch with zstd payloads decompressed, and how many could not be: in pieces of about
+    PIECE bytes, for they may hold many times more than the batch.
 
     Whether a payload is compressed shows in its first four bytes: CDR starts with two zeros, or
     a zero and another small number.
     """
     if not _any_zstd(batch):
-        return batch, 0
-    payloads, good = [], []
-    decoder = zstandard.ZstdDecompressor()
-    for row, payload in enumerate(batch.payloads()):
-        if payload.startswith(ZSTD_MAGIC):
-            try:
-                if zstandard.frame_content_size(payload) > LARGEST_MESSAGE:
-                    continue
-                payload = decoder.decompress(payload, max_output_size=LARGEST_MESSAGE)
-            except zstandard.ZstdError:
-                continue
-        payloads.append(payload)
-        good.append(row)
+        yield batch, 0
+        return
+    payloads, good, size, bad = list[bytes](), list[int](), 0, 0
+    for row in range(len(batch)):
+        payload = batch.buffer[batch.start[row] : batch.stop[row]].tobytes()
+        try:
+            payloads.append(_plain(payload))
+            good.append(row)
+            size += len(payloads[-1])
+        except zstandard.ZstdError:
+            bad += 1
+        if size >= PIECE:
+            yield _piece(batch, payloads, good), bad
+            payloads, good, size, bad = [], [], 0, 0
+    yield _piece(batch, payloads, good), bad
+
+
+def _piece(batch: Batch, payloads: list[bytes], good: list[int]) -> Batch:
     rows = np.asarray(good, np.intp)
-    plain = Batch.of(payloads, batch.log_time_ns[rows], batch.publish_time_ns[rows])
-    return plain, len(batch) - len(plain)
+    return Batch.of(payloads, batch.log_time_ns[rows], batch.publish_time_ns[rows])
+
+
+def _plain(payload: bytes) -> bytes:
+    if not payload.startswith(ZSTD_MAGIC):
+        return payload
+    limit = min(max(PLAUSIBLE_MESSAGE, PLAUSIBLE_RATIO * len(payload)), LARGEST_MESSAGE)
+    size = zstandard.frame_content_size(payload)
+    if 0 <= size <= limit:
+        return bytes(zstandard.ZstdDecompressor().decompress(payload, max_output_size=limit))
+    if size >= 0:
+        raise zstandard.ZstdError("implausibly large")
+    # It does not say its size: nothing is set aside for it.
+    decoder, parts, total = zstandard.ZstdDecompressor().decompressobj(), list[bytes](), 0
+    for at in range(0, len(payload), BLOCK):
+        parts.append(decoder.decompress(payload[at : at + BLOCK]))
+        total += len(parts[-1])
+        if total > limit:
+            raise zstandard.ZstdError("implausibly large")
+        if decoder.eof:
+            return b"".join(parts)
+    raise zstandard.ZstdError("cut short")
 
 
 def _any_zstd(batch: Batch) -> bool:

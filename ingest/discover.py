@@ -56,7 +56,7 @@ def recordings_in(path: Path | str) -> list[Path]:
 def _matched(match: Path) -> list[Path]:
     if match.is_dir():
         return _in_folder(match)
-    return [match] if is_storage_name(match) else []
+    return [match] if match.is_file() and is_storage_name(match) else []
 
 
 def _in_folder(folder: Path) -> list[Path]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from restock.ingest.account import Account, TopicInfo
 from restock.ingest.columns import I64, Batch, FieldColumn, TopicColumns, take
-from restock.ingest.compression import decompress_messages
+from restock.ingest.compression import decompressed
 from restock.ingest.growing import GrowingArray, GrowingColumn
 from restock.ingest.rows import Decoded
 
@@ -72,11 +72,14 @@ class TopicReading:
 
     def take(self, decode: Callable[[Batch], Decoded], batch: Batch) -> None:
         """Decode a batch and keep its columns."""
+        self._account.read += len(batch)
+        for plain, damaged in decompressed(batch):
+            if damaged:
+                self._add({"its zstd data is damaged": damaged})
+            self._take(decode, plain)
+
+    def _take(self, decode: Callable[[Batch], Decoded], batch: Batch) -> None:
         account = self._account
-        account.read += len(batch)
-        batch, damaged = decompress_messages(batch)
-        if damaged:
-            self._add({"its zstd data is damaged": damaged})
         sane = (batch.log_time_ns >= 0) & (batch.log_time_ns < LATEST_NS)
         if not sane.all():
             self._add({ABSURD: int((~sane).sum())})

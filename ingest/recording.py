@@ -17,7 +17,7 @@ from typing import Self
 from restock.errors import RecordingError
 from restock.ingest.account import Account, Loss, TopicInfo
 from restock.ingest.columns import TopicColumns
-from restock.ingest.compression import decompress_messages
+from restock.ingest.compression import decompressed
 from restock.ingest.decoders import decoder_of, type_of
 from restock.ingest.fields import CannotDecode, Leaf, MessageType
 from restock.ingest.reading import Reduction, TopicReading, together
@@ -35,7 +35,8 @@ class _Stream:
     def payloads(self) -> Iterator[bytes]:
         """Its messages as they are in the file, in file order."""
         for _, batch in self.storage.batches([self.channel.id]):
-            yield from decompress_messages(batch)[0].payloads()
+            for plain, _ in decompressed(batch):
+                yield from plain.payloads()
 
 
 class Recording:

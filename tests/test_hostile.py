@@ -217,6 +217,14 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
         lambda: mcap_of(struct.pack("<BQ", 6, 1 << 63)),
         "more than there are",
     ),
+    "zstd messages that are bombs": (
+        lambda: one_topic("pkg/msg/T", b"uint8[] a", bomb()[: 1 << 16]),
+        "",
+    ),
+    "a zstd message that claims 2^62": (
+        lambda: one_topic("pkg/msg/T", b"uint8[] a", b"\x28\xb5\x2f\xfd\xe0" + b"\x3f" * 99),
+        "",
+    ),
     "a definition 500 messages deep": (
         lambda: one_topic("pkg/msg/T", DEEP, bytes(9)),
         "nests deeper than",
@@ -372,3 +380,21 @@ def test_no_control_character_of_a_file_reaches_the_terminal(
 def test_visible_text_stays_as_it_is() -> None:
     assert visible("/odom läuft 🤖") == "/odom läuft 🤖"
     assert visible("a\nb\tc", keep="\n") == "a\nb\\tc"
+
+
+def test_zstd_messages_are_inflated_a_few_at_a_time(tmp_path: Path) -> None:
+    """Ninety messages of 8 MiB in a few kB, in a process that could not hold them all."""
+    packed = zstandard.ZstdCompressor().compress(
+        b"\0\1\0\0" + (8 << 20).to_bytes(4, "little") + bytes(8 << 20)
+    )
+    with (tmp_path / "run.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("pkg/msg/T", "ros2msg", b"uint8[] a")
+        channel = writer.register_channel("/t", "cdr", schema)
+        for row in range(90):
+            writer.add_message(channel, row, packed, row)
+        writer.finish()
+    code = READ.replace("recording.leaves(topic)", "[]")
+    done = limited("-c", code, str(tmp_path / "run.mcap"))
+    assert (done.returncode, done.stdout) == (0, "90\n"), done.stderr
