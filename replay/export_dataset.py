@@ -75,6 +75,13 @@ def export_dataset(
         found = _advancing(_trajectories(selection, counts), advance)
         if (first := next(found, None)) is None:
             raise StoreError("no whole transition is left of the rows", where=selection.where)
+        if first.observations.shape[1] != selection.observation_size:
+            raise StoreError(
+                f"observations have {first.observations.shape[1]} entries, those of its task"
+                f" {selection.observation_size}",
+                where=selection.where,
+                remedy="export the observations as they are stored",
+            )
         out.parent.mkdir(parents=True, exist_ok=True)
         partial = out.with_name(f".{out.stem}.{os.getpid()}.partial{ending}")
         _remove(partial)

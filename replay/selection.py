@@ -18,6 +18,7 @@ from restock.errors import PanelError, QueryError, StoreError
 from restock.ingest.task import Task
 from restock.replay.panel import HEADER, Panel
 from restock.replay.places import open_place
+from restock.replay.query import fetch, interruptible
 from restock.replay.query import query as run_query
 from restock.replay.store import Store
 from restock.replay.trajectory import (
@@ -92,7 +93,8 @@ def _of_query(
     continuous: bool,
 ) -> Selection:
     where = str(store.path)
-    columns = run_query(connection, text, where=where).columns
+    asked = run_query(connection, text, where=where)
+    columns = asked.columns
     if missing := missing_columns(columns, continuous=continuous):
         raise QueryError(
             f"the query gives no {', '.join(missing)}",
@@ -100,11 +102,15 @@ def _of_query(
             remedy="select whole transitions, as `FROM transitions WHERE …` does; an export needs "
             + ", ".join((*REQUIRED, *COMMAND) if continuous else REQUIRED),
         )
+    for name, kind in zip(columns, asked.types, strict=True):
+        if name in ("observation", "next_observation") and not str(kind).endswith("]"):
+            raise QueryError(f"its {name} is a {kind}, not a list of numbers", where=where)
     by_command = ", ".join(f"min({name}), max({name})" for name in COMMAND) if continuous else "0"
     hashes = "list(DISTINCT task_hash)" if "task_hash" in columns else "NULL"
-    facts = run_query(
+    _, rows = fetch(
         connection, f"SELECT count(*), {hashes}, {by_command} FROM ({text})", where=where
-    ).fetchall()[0]
+    )
+    facts = rows[0]
     if not facts[0]:
         raise StoreError("the query gives no rows", where=where, remedy="nothing was written")
     if facts[1] is not None and len(facts[1]) > 1:
@@ -128,7 +134,7 @@ def _of_query(
     seen = ((facts[2], facts[4]), (facts[3], facts[5])) if continuous else None
     return Selection(
         where=where,
-        batches=relation.to_arrow_reader(BATCH_ROWS),
+        batches=_batches(connection, relation, where),
         task=task,
         continuous=continuous,
         command_range=_range(task, seen),
@@ -140,6 +146,21 @@ def _of_query(
             **_of_task(task, continuous),
         },
     )
+
+
+def _batches(
+    connection: duckdb.DuckDBPyConnection, relation: duckdb.DuckDBPyRelation, where: str
+) -> Iterator[pa.RecordBatch]:
+    """A query's rows as they come; Ctrl-C stops it.
+
+    Raises QueryError for what goes wrong while it runs.
+    """
+    try:
+        reader = interruptible(connection, lambda: relation.to_arrow_reader(BATCH_ROWS))
+        while (batch := interruptible(connection, lambda: next(reader, None))) is not None:
+            yield batch
+    except (duckdb.Error, pa.ArrowException, OSError) as error:
+        raise QueryError(str(error).splitlines()[0], where=where) from error
 
 
 def _of_panel(panel: Panel, continuous: bool) -> Selection:

@@ -115,20 +115,29 @@ class _Rows:
 
     def __init__(self, table: pa.Table, continuous: bool, where: str) -> None:
         self.where = where
-        self.episode: NDArray[Any] = _plain(table, "episode_id")
-        self.step: Ints = np.asarray(_plain(table, "step_index"), np.int64)
+        self.episode: NDArray[Any] = _whole(table, "episode_id", where)
+        self.step: Ints = np.asarray(_whole(table, "step_index", where), np.int64)
         self.observation = observation_matrix(table["observation"], where)
         self.next_observation = observation_matrix(table["next_observation"], where)
-        self.terminated: Bools = np.asarray(_plain(table, "terminated"), np.bool_)
-        self.truncated: Bools = np.asarray(_plain(table, "truncated"), np.bool_)
-        self.reward: F32 = np.asarray(_plain(table, "reward"), np.float32)
+        if self.observation.shape != self.next_observation.shape:
+            raise StoreError(
+                f"observations have {self.observation.shape[1]} entries, next observations"
+                f" {self.next_observation.shape[1]}",
+                where=where,
+                remedy="export the observations as they are stored",
+            )
+        self.terminated: Bools = np.asarray(_whole(table, "terminated", where), np.bool_)
+        self.truncated: Bools = np.asarray(_whole(table, "truncated", where), np.bool_)
+        self.reward: F32 = np.asarray(_whole(table, "reward", where), np.float32)
         self.action: NDArray[Any] = (
-            np.stack([np.asarray(_plain(table, name), np.float32) for name in COMMAND], axis=1)
+            np.stack(
+                [np.asarray(_whole(table, name, where), np.float32) for name in COMMAND], axis=1
+            )
             if continuous
-            else np.asarray(_plain(table, "action"), np.int64)
+            else np.asarray(_whole(table, "action", where), np.int64)
         )
         self.known: Bools = (
-            np.asarray(_plain(table, NEXT_IS_NEXT), np.bool_)
+            np.asarray(_whole(table, NEXT_IS_NEXT, where), np.bool_)
             if NEXT_IS_NEXT in table.column_names
             else np.ones(len(table), np.bool_)
         )
@@ -208,6 +217,15 @@ def observation_matrix(column: pa.ChunkedArray, where: str) -> F32:
     size = lengths.pop() if lengths else 0
     flat = np.asarray(array.flatten().to_numpy(zero_copy_only=False), np.float32)
     return flat.reshape(len(array), size)
+
+
+def _whole(table: pa.Table, name: str, where: str) -> NDArray[Any]:
+    """A column that must not have nulls."""
+    if count := table[name].null_count:
+        raise StoreError(
+            f"{count} rows have no {name}", where=where, remedy=f"add WHERE {name} IS NOT NULL"
+        )
+    return _plain(table, name)
 
 
 def _plain(table: pa.Table, name: str) -> NDArray[Any]:

@@ -395,6 +395,34 @@ def test_a_query_that_lacks_columns_is_refused_by_their_names(
         ({"query": "FROM transitions UNION ALL FROM transitions"}, StoreError, "comes twice"),
         ({"query": "COPY transitions TO 'a.csv'"}, QueryError, "read-only"),
         ({"query": "FROM nowhere"}, QueryError, "nowhere"),
+        (
+            {"query": "SELECT * REPLACE (1.5 AS observation) FROM transitions"},
+            QueryError,
+            "its observation is a DECIMAL",
+        ),
+        (
+            {"query": "SELECT * REPLACE (observation[1:3] AS observation) FROM transitions"},
+            StoreError,
+            "observations have 3 entries, next observations 25",
+        ),
+        (
+            {
+                "query": "SELECT * REPLACE (observation[1:3] AS observation,"
+                " next_observation[1:3] AS next_observation) FROM transitions"
+            },
+            StoreError,
+            "observations have 3 entries, those of its task 25",
+        ),
+        (
+            {"query": "SELECT * REPLACE (NULL::FLOAT AS reward) FROM transitions"},
+            StoreError,
+            "rows have no reward",
+        ),
+        (
+            {"query": "SELECT * REPLACE (error('boom')::FLOAT AS reward) FROM transitions"},
+            QueryError,
+            "boom",
+        ),
     ],
 )
 def test_what_cannot_be_exported_is_refused(

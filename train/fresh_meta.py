@@ -75,7 +75,8 @@ class FreshMeta:
 
     def set_labels(self, episode_key: int, codes: Ints) -> int:
         """Label an ended episode's rows, as a ring does; returns how many were still there."""
-        slots = np.array(self._slots.pop(episode_key, []), np.int64)
+        # Once each: an episode longer than the buffer overwrites its own.
+        slots = np.unique(np.array(self._slots.pop(episode_key, []), np.int64))
         slots = slots[self.meta["episode"][slots] == episode_key]  # the others were overwritten
         steps = self.meta["episode_step"][slots]
         for code in np.unique(codes[steps]):
