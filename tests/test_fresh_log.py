@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 import restock
+from restock.cli import main
 from restock.errors import RunError
 from restock.ingest.episode_rows import episode_ends
 from restock.ingest.profile import Profile, load_profile
@@ -210,3 +212,24 @@ def test_episodes_under_way_when_keeping_begins_are_left_out(tmp_path: Path) -> 
         flush(made.folder, StoreWriter(tmp_path / "store"), made.profile)
     made.drive(LONGEST)
     assert flush(made.folder, StoreWriter(tmp_path / "store"), made.profile).episodes == ENVS
+
+
+@pytest.mark.slow
+def test_train_flushes_to_a_store_and_flushing_again_changes_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = ["env.num_envs=4", "evaluation.episodes=1", "network.hidden=[16]"]
+    keys = [word for key in (*small, "record.tensorboard=false") for word in ("--set", key)]
+    run, store = str(tmp_path / "a"), str(tmp_path / "store")
+    new = ["train", "--out", run, "--env-steps", "1000", *keys]
+    assert main([*new, "--flush-fresh", store, "--json"]) == 0
+    flushed = json.loads(capsys.readouterr().out)["flushed"]
+    assert (flushed["status"], flushed["version"]) == ("written", 1)
+    assert flushed["episodes"] >= 4
+    assert main(["train", "--resume", run, "--flush-fresh", store, "--json"]) == 0
+    again = json.loads(capsys.readouterr().out)["flushed"]
+    assert again == flushed | {"status": "unchanged", "version": None}
+    query = "SELECT format, count(*) AS rows FROM transitions JOIN recordings USING (recording_id)"
+    assert main(["sql", store, f"{query} GROUP BY ALL", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found == [{"format": "twin", "rows": flushed["transitions"]}]
