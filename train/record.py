@@ -7,7 +7,6 @@ update loop) and summed once an interval. The sums go to the run's tables `strat
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.replay.ring import FreshRing
+from restock.train.audit_rows import fresh_rows, logged_rows, row_hashes
 from restock.train.batches import Batch, Logs
 from restock.train.checkpoint import generator_state, restore_generator
 from restock.train.drawn import Drawn, as_columns, from_state, to_state
@@ -255,69 +255,26 @@ class FeedRecord:
         self, step: int, batch: Batch, columns: Mapping[str, NDArray[Any]], last_sync: int
     ) -> None:
         packed = batch.rows.cpu().numpy()
-        action = packed[:, -3].astype(np.int16)
-        hashes = [hashlib.blake2b(row.tobytes(), digest_size=8).hexdigest() for row in packed]
-        rows: list[dict[str, Any]] = []
-        for place in range(len(packed)):
-            logged = place < batch.logged
-            side, at = ("log", place) if logged else ("fresh", place - batch.logged)
-            own = self._log_row(columns, at) if logged else self._fresh_row(batch, columns, at)
-            rows.append(
+        hashes, action = row_hashes(packed), packed[:, -3].astype(np.int16)
+        parts: list[tuple[slice, dict[str, Any]]] = []
+        if batch.logged and self.logs is not None and self._age_days is not None:
+            logged = logged_rows(columns, self.logs, self._age_days)
+            parts.append((slice(0, batch.logged), logged))
+        if len(batch.slots):
+            fresh = fresh_rows(columns, batch, self.ring, self._fresh_strata)
+            parts.append((slice(batch.logged, len(packed)), fresh))
+        for place, own in parts:
+            self.run.append_columns(
+                "audit",
                 {
                     "gradient_step": step,
-                    "batch_row": place,
+                    "batch_row": np.arange(place.start, place.stop),
                     **own,
-                    "action": int(action[place]),
-                    **{
-                        name: float(columns[f"{side}_{name}"][at])
-                        for name in ("reward", "discount", "weight", "q", "td")
-                    },
+                    "action": action[place],
                     "last_target_sync": last_sync,
                     "row_hash": hashes[place],
-                }
+                },
             )
-        self.run.append("audit", rows)
-
-    def _log_row(self, columns: Mapping[str, NDArray[Any]], at: int) -> dict[str, Any]:
-        logs, row = self.logs, int(columns["log_row"][at])
-        if logs is None or self._age_days is None:
-            raise RuntimeError("a batch of logs without logs")
-        return {
-            "source": "logs",
-            "transition_id": int(logs.transition_id[row]),
-            "panel_row": row,
-            "ring_slot": None,
-            "episode": logs.episode.name(row),
-            "episode_step": None,
-            "age_days": float(self._age_days[row]),
-            "age_env_steps": None,
-            "age_gradient_steps": None,
-            "stratum": logs.strata[columns["log_stratum"][at]],
-            "condition": logs.condition.name(row),
-            "behaviour_policy": logs.behaviour_policy.name(row),
-            "behaviour_version": logs.behaviour_version.name(row),
-        }
-
-    def _fresh_row(
-        self, batch: Batch, columns: Mapping[str, NDArray[Any]], at: int
-    ) -> dict[str, Any]:
-        ring, slot = self.ring, int(batch.slots[at])
-        stratum = self._fresh_strata[columns["fresh_stratum"][at]]
-        return {
-            "source": "fresh",
-            "transition_id": None,
-            "panel_row": None,
-            "ring_slot": slot,
-            "episode": str(int(ring.meta["episode"][slot])),
-            "episode_step": int(ring.meta["episode_step"][slot]),
-            "age_days": None,
-            "age_env_steps": int(columns["age_env_steps"][at]),
-            "age_gradient_steps": int(columns["age_gradient_steps"][at]),
-            "stratum": stratum,
-            "condition": None if stratum == UNLABELLED else stratum,
-            "behaviour_policy": ring.behaviour_policies[columns["fresh_policy"][at]],
-            "behaviour_version": str(int(ring.meta["policy_version"][slot])),
-        }
 
     def state_dict(self) -> dict[str, Any]:
         """Arrays and JSON values: the totals, the audit's generator and the open interval."""
