@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from restock.errors import MixtureError
 from restock.replay.adaptive import GroupDro
 from restock.replay.layout import F64, Ints
-from restock.replay.mixture import Mixture, Shortfall, Sources, StratumRule
+from restock.replay.mixture import Mixture, Shortfall, StratumRule
 from restock.replay.schedules import knots, mean_over, value_at
 from restock.replay.shares import wanted_shares, within_limits
+from restock.replay.sources import Sources
 
 REFRESH_BATCHES = 64  # shares with a schedule are worked out anew after so many
 
@@ -57,6 +58,7 @@ class _Source:
     caps: F64
     offline: float  # planned draws
     online: float
+    got: F64  # shares of its strata now
     dro: GroupDro | None = None
 
 
@@ -101,9 +103,8 @@ class Diet:
         if mixture.adaptive is not None:
             for source in self.sources:
                 floors = np.array([rule.floor for rule in source.rules])
-                mine = self.shares[source.strata]
-                if mine.sum() > 0:
-                    source.dro = GroupDro(mixture.adaptive, mine / mine.sum(), floors, source.caps)
+                if source.got.sum() > 0:
+                    source.dro = GroupDro(mixture.adaptive, source.got, floors, source.caps)
             self._work_out("redistribute")
 
     @classmethod
@@ -135,6 +136,7 @@ class Diet:
             np.array([self._cap_of(stratum.rule) for stratum in strata]),
             planned.offline * parts[name] / max(sum(parts.values()), 1e-12),
             planned.online * mean[name],
+            np.zeros(len(strata)),
         )
 
     def _cap_of(self, rule: StratumRule) -> float:
@@ -198,9 +200,9 @@ class Diet:
             shortfall = "shrink"
         parts, shares, logs_share = self.parts_at(self.env_steps), np.zeros(len(self.strata)), 0.0
         for source in self.sources:
-            got, filled, online_filled = self._plan(source, shortfall)
+            source.got, filled, online_filled = self._plan(source, shortfall)
             part = value_at(self.mixture.sources.parts[source.name], self.env_steps)
-            shares[source.strata] = got * part * filled
+            shares[source.strata] = source.got * part * filled
             logs_share += parts[source.name] * online_filled
         total = shares.sum()
         shares = shares / total if total > 0 else self.shares

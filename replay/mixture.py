@@ -6,7 +6,6 @@ visible in `restock mix --dry-run`. `docs/mixture.md` explains each key.
 
 from __future__ import annotations
 
-import itertools
 from importlib.resources import files
 from pathlib import Path
 from typing import Literal
@@ -14,78 +13,14 @@ from typing import Literal
 import msgspec
 
 from restock.errors import ConfigError
-from restock.replay.schedules import Portion, Schedule, knots, value_at
+from restock.replay.schedules import Schedule
+from restock.replay.sources import Sources, check
 
 Timing = Literal["pre", "post"]
 Share = float | Literal["natural", "equal"] | Schedule
 Correction = Literal["none", "beta", "full", "clipped", "density_ratio"]
 Shortfall = Literal["refuse", "redistribute", "shrink"]
 Within = Literal["uniform", "without_replacement", "per", "lap"]
-
-
-def _check(ok: bool, message: str) -> None:
-    if not ok:
-        raise ValueError(message)
-
-
-class OtherStore(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One more store that batches are drawn from, with the same strata and shares of its own."""
-
-    name: str  # its strata are called `name/stratum`
-    path: str  # as it is, or from the folder of the mixture's file
-    share: Portion  # of a batch
-    version: int | None = None  # of the store; the newest, which the panel then pins
-
-    def __post_init__(self) -> None:
-        _check(bool(self.name) and "/" not in self.name, f"no name for a store: {self.name!r}")
-        _check(self.name not in ("logs", "fresh"), f"a store cannot be called {self.name!r}: taken")
-        _check_portion(f"the store {self.name!r}", self.share)
-
-
-class Sources(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Shares of an online batch by source, numbers or schedules; what is left is fresh."""
-
-    logs: Portion = 0.5
-    fresh: float | None = None  # default: what logs and stores leave, at every step
-    stores: tuple[OtherStore, ...] = ()
-
-    def __post_init__(self) -> None:
-        portions = [self.logs, *(store.share for store in self.stores)]
-        _check_portion("logs", self.logs)
-        names = [store.name for store in self.stores]
-        _check(len(set(names)) == len(names), f"stores named twice: {sorted(names)}")
-        if self.fresh is not None:
-            fixed = [portion for portion in portions if isinstance(portion, int | float)]
-            _check(
-                len(fixed) == len(portions),
-                "sources: leave `fresh` out beside a schedule: it gets what is left",
-            )
-            total = sum(fixed) + self.fresh
-            _check(
-                self.fresh >= 0 and abs(total - 1) < 1e-6,
-                f"sources must sum to 1, got {total:g}",
-            )
-        bends = sorted({0, *(step for portion in portions for step in knots(portion))})
-        # Between two bends a cosine can lie above the line that joins them.
-        fine = [a + (b - a) * i / 16 for a, b in itertools.pairwise(bends) for i in range(16)]
-        totals = [
-            sum(value_at(portion, step) for portion in portions) for step in [*fine, bends[-1]]
-        ]
-        _check(max(totals) <= 1 + 1e-6, f"sources sum to {max(totals):g} at some step, above 1")
-        _check(
-            value_at(self.logs, 0) > 0,
-            "sources.logs must be above 0 at step 0: the offline phase draws from it",
-        )
-
-    @property
-    def parts(self) -> dict[str, Portion]:
-        """The share of a batch of each source that is not fresh."""
-        return {"logs": self.logs, **{store.name: store.share for store in self.stores}}
-
-    @property
-    def last_bend(self) -> int:
-        """The environment step at which the last schedule ends, 0 without one."""
-        return max((step for part in self.parts.values() for step in knots(part)), default=0)
 
 
 class PlannedUse(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -95,7 +30,7 @@ class PlannedUse(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     batch_size: int = 128
 
     def __post_init__(self) -> None:
-        _check(self.updates > 0 and self.batch_size > 0, "planned: both must be above 0")
+        check(self.updates > 0 and self.batch_size > 0, "planned: both must be above 0")
 
 
 class HeldOut(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -105,7 +40,7 @@ class HeldOut(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     share: float = 0.1
 
     def __post_init__(self) -> None:
-        _check(0 <= self.share < 1, f"held_out.share must be in [0, 1), got {self.share:g}")
+        check(0 <= self.share < 1, f"held_out.share must be in [0, 1), got {self.share:g}")
 
 
 class Safety(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -124,8 +59,8 @@ class CorrectionRule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     clip: float = 4.0  # largest weight of "clipped" (and smallest inverse) and "density_ratio"
 
     def __post_init__(self) -> None:
-        _check(0 <= self.beta <= 1, f"correction.beta must be in [0, 1], got {self.beta:g}")
-        _check(self.clip >= 1, f"correction.clip must be at least 1, got {self.clip:g}")
+        check(0 <= self.beta <= 1, f"correction.beta must be in [0, 1], got {self.beta:g}")
+        check(self.clip >= 1, f"correction.clip must be at least 1, got {self.clip:g}")
 
 
 class Prioritised(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -140,8 +75,8 @@ class Prioritised(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         for name in ("per_alpha", "per_beta", "lap_alpha"):
             value = getattr(self, name)
-            _check(0 <= value <= 1, f"prioritised.{name} must be in [0, 1], got {value:g}")
-        _check(
+            check(0 <= value <= 1, f"prioritised.{name} must be in [0, 1], got {value:g}")
+        check(
             self.per_epsilon > 0 and self.per_beta_batches >= 1,
             "prioritised.per_epsilon and per_beta_batches must be above 0",
         )
@@ -157,9 +92,9 @@ class Adaptive(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     after_updates: int = 1_000  # none before: first errors say more of the network than of rows
 
     def __post_init__(self) -> None:
-        _check(self.step_size > 0, f"adaptive.step_size must be above 0, got {self.step_size:g}")
-        _check(0 <= self.floor < self.ceiling <= 1, "adaptive needs 0 <= floor < ceiling <= 1")
-        _check(
+        check(self.step_size > 0, f"adaptive.step_size must be above 0, got {self.step_size:g}")
+        check(0 <= self.floor < self.ceiling <= 1, "adaptive needs 0 <= floor < ceiling <= 1")
+        check(
             self.every_updates >= 1 and self.after_updates >= 0,
             "adaptive.every_updates must be at least 1, after_updates at least 0",
         )
@@ -203,15 +138,10 @@ class EachCondition(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         _check_share("each_condition", self.share, self.floor, self.cap)
 
 
-def _check_portion(name: str, share: Portion) -> None:
-    if isinstance(share, int | float):
-        _check(0 <= share <= 1, f"share of {name} must be in [0, 1], got {share:g}")
-
-
 def _check_share(name: str, share: Share, floor: float, cap: float) -> None:
     if isinstance(share, int | float):
-        _check(0 <= share <= 1, f"share of {name!r} must be in [0, 1], got {share:g}")
-    _check(0 <= floor <= cap <= 1, f"{name!r} needs 0 <= floor <= cap <= 1")
+        check(0 <= share <= 1, f"share of {name!r} must be in [0, 1], got {share:g}")
+    check(0 <= floor <= cap <= 1, f"{name!r} needs 0 <= floor <= cap <= 1")
 
 
 class Mixture(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -250,34 +180,41 @@ class Mixture(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     correction: CorrectionRule = CorrectionRule()
 
     def __post_init__(self) -> None:
-        _check(0 <= self.discount <= 1, f"discount must be in [0, 1], got {self.discount:g}")
-        _check(self.n_step >= 1, f"n_step must be at least 1, got {self.n_step}")
+        check(0 <= self.discount <= 1, f"discount must be in [0, 1], got {self.discount:g}")
+        check(self.n_step >= 1, f"n_step must be at least 1, got {self.n_step}")
         for name in ("max_age_days", "max_versions_behind", "max_age_env_steps"):
             value = getattr(self, name)
-            _check(value is None or value >= 0, f"{name} must be at least 0, got {value}")
+            check(value is None or value >= 0, f"{name} must be at least 0, got {value}")
         for rule in (self, self.each_condition, *self.strata):
             for name in ("max_rows_per_episode", "max_rows_per_recording"):
                 value = getattr(rule, name, None)
-                _check(value is None or value >= 1, f"{name} must be at least 1, got {value}")
-        _check(
+                check(value is None or value >= 1, f"{name} must be at least 1, got {value}")
+        check(
             self.max_replays_per_row is None or self.max_replays_per_row >= 1,
             f"max_replays_per_row must be at least 1, got {self.max_replays_per_row}",
         )
-        _check(
+        check(
             bool(self.strata) or self.each_condition is not None,
             "no strata: list some under [[strata]], or give [each_condition]",
         )
-        rules = [self, *([self.each_condition] if self.each_condition else []), *self.strata]
-        _check(
+        rules: list[Mixture | EachCondition | StratumRule] = [self, *self.strata]
+        if self.each_condition is not None:
+            rules.append(self.each_condition)
+        check(
             self.sampling == "memory"
             or all(rule.within in (None, "without_replacement") for rule in rules),
-            'sampling = "chunked" reads rows in shuffled order: within = "without_replacement" only',
+            'sampling = "chunked" shuffles by itself: within must be "without_replacement"',
+        )
+        check(
+            self.adaptive is None
+            or all(isinstance(rule.share, int | float | str) for rule in self.strata),
+            "a stratum's share cannot follow both a schedule and [adaptive]",
         )
         names = [rule.name for rule in self.strata]
-        _check(len(set(names)) == len(names), f"strata named twice: {sorted(names)}")
-        _check(not any("/" in name for name in names), "a stratum's name cannot hold a /")
+        check(len(set(names)) == len(names), f"strata named twice: {sorted(names)}")
+        check(not any("/" in name for name in names), "a stratum's name cannot hold a /")
         given = sum(rule.share for rule in self.strata if isinstance(rule.share, int | float))
-        _check(given <= 1 + 1e-6, f"shares of strata sum to {given:g}, above 1")
+        check(given <= 1 + 1e-6, f"shares of strata sum to {given:g}, above 1")
 
 
 def shipped_mixtures() -> list[str]:

@@ -16,7 +16,7 @@ from typing import Any
 
 import msgspec
 
-from restock.replay import mixture, schedules
+from restock.replay import mixture, schedules, sources
 
 FILE = "mixture.schema.json"
 _FIELD = re.compile(r"^    (\w+): .*?  # (.+)$", re.MULTILINE)
@@ -34,7 +34,8 @@ def mixture_schema() -> str:
         definition["properties"] = {
             key: _plain(value) for key, value in definition["properties"].items()
         }
-        struct = getattr(mixture, name, None) or getattr(schedules, name)
+        homes = (mixture, sources, schedules)
+        struct = next(getattr(home, name) for home in homes if hasattr(home, name))
         for key, comment in _FIELD.findall(inspect.getsource(struct)):
             if key in definition["properties"]:
                 definition["properties"][key]["description"] = comment

@@ -12,7 +12,8 @@ import msgspec
 
 from restock.errors import StoreError
 from restock.replay.candidates import STORE_COLUMN
-from restock.replay.mixture import Mixture, OtherStore
+from restock.replay.mixture import Mixture
+from restock.replay.sources import OtherStore
 from restock.replay.store import Store, parquet_view
 
 

@@ -23,11 +23,9 @@ from restock.replay.mixture import (
     EachCondition,
     HeldOut,
     Mixture,
-    OtherStore,
     PlannedUse,
     Prioritised,
     Safety,
-    Sources,
     StratumRule,
     load_mixture,
     parse_mixture,
@@ -36,6 +34,7 @@ from restock.replay.mixture import (
 from restock.replay.plan import Plan, plan_panel
 from restock.replay.schedules import Cosine, Linear, Piecewise
 from restock.replay.shares import plan_shares, scaled_within, wanted_shares
+from restock.replay.sources import OtherStore, Sources
 from restock.replay.strata import Stratum, assign, resolve_strata
 from restock.replay.weights import effective_count, effective_shares, importance_weights
 
@@ -78,6 +77,11 @@ def test_the_shipped_mixtures_load_and_fill(name: str, transitions: pa.Table) ->
         (EVERY + "[sources]\nlogs = {schedule = 'step', start = 1}", "sources.logs.schedule"),
         (EVERY + "[sources]\nlogs = {schedule = 'piecewise', points = [[9, 1], [2, 0]]}", "rising"),
         (EVERY + "[adaptive]\nfloor = 0.7", "floor < ceiling"),
+        (
+            "[adaptive]\n[[strata]]\nname = 'a'\n"
+            "share = {schedule = 'linear', start = 0.1, end = 0.2, to_env_steps = 9}",
+            "both a schedule",
+        ),
         (EVERY + "[safety]\nleave_out = 'rows'", "unsafe"),
         ("max_rows_per_episode = 0\n" + EVERY, "max_rows_per_episode"),
         ("within = 'rank'\n" + EVERY, "within"),

@@ -17,11 +17,13 @@ from conftest import CONDITIONS, TASK, recording_transitions, write_store
 from restock import cli
 from restock.errors import MixtureError, StoreError
 from restock.replay.build import build_panel, open_source
+from restock.replay.diet import PlannedDraws
 from restock.replay.mixture import load_mixture, parse_mixture, shipped_mixtures
 from restock.replay.mixture_schema import FILE, mixture_schema, shipped_schema
 from restock.replay.panel import Panel
 from restock.replay.plan import Plan, plan_panel
 from restock.replay.store import Store
+from restock.train.log_draws import diet_of
 
 EVERY = "[each_condition]\nshare = 'natural'\n"
 NO_HOLD = "[held_out]\nby = 'none'\n"
@@ -184,6 +186,32 @@ def test_another_store_is_drawn_from_at_its_pinned_version(
     ids = panel.meta["transition_id"].to_numpy()[from_twin]
     by_id = dict(zip(truth["transition_id"], truth["observation"], strict=True))
     np.testing.assert_allclose(rows[:20], [by_id[i] for i in ids[:20].tolist()], rtol=1e-6)
+
+
+def test_a_run_draws_from_both_stores_by_their_schedules(
+    two_stores: Path, store_path: Path
+) -> None:
+    share = "{schedule = 'linear', start = 0.0, end = 0.4, to_env_steps = 1000}"
+    text = OTHERS.replace("share = 0.2", f"share = {share}").replace(
+        '"other"', f'"{two_stores}/other"'
+    )
+    every = "[adaptive]\nafter_updates = 0\nevery_updates = 1\nstep_size = 0.5\n" + EVERY
+    with Store(store_path) as store:
+        panel = build_panel(store, parse_mixture(text + every), two_stores / "p")
+    diet = diet_of(panel, PlannedDraws(640, 6400, 0, 1000), None)
+    twin = np.array([stratum.source == "twin" for stratum in panel.strata])
+    assert diet.shares[twin].sum() == 0
+    assert diet.logs_share == pytest.approx(0.4)
+    diet.at(500)
+    assert diet.logs_share == pytest.approx(0.6)
+    assert diet.shares[twin].sum() == pytest.approx(1 / 3)
+    # A stratum of the twin that errs takes from the twin's other strata, not from the logs.
+    worst = [stratum.name for stratum in panel.strata].index("twin/wheel_slip")
+    before = diet.shares.copy()
+    everyone = np.flatnonzero(before > 0)
+    diet.observe(everyone, np.where(everyone == worst, 5.0, 1.0))
+    assert diet.shares[worst] > before[worst]
+    assert diet.shares[twin].sum() == pytest.approx(1 / 3)
 
 
 def test_a_missing_other_store_is_named(store_path: Path, tmp_path: Path) -> None:
