@@ -189,7 +189,7 @@ class Priorities:
         if self._stale_new and self._any_new:
             self._priority[self._new] = self._largest[self._stratum[self._new]]
         self._stale_new = False
-        # einsum adds in one order on every machine and number of threads; BLAS does not.
+        # einsum adds in the same order whatever the number of threads; BLAS may not.
         sums: F32 = np.einsum("ij->i", self._priority.reshape(-1, CHUNK))
         drawn, weights = [np.empty(0, np.int64)], [np.empty(0, np.float32)]
         weighted = False
