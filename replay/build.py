@@ -133,7 +133,8 @@ def write_panel(
 ) -> Panel:
     """Pack a plan's rows into `out`; an interruption leaves nothing there.
 
-    Raises PanelError when something is at `out` that may not be replaced.
+    Raises PanelError when something is at `out` that may not be replaced, or a row cannot be
+    packed.
     """
     out = Path(out)
     _check_free(out, force)
@@ -200,10 +201,10 @@ def _building(out: Path) -> Iterator[Path]:
     out.parent.mkdir(parents=True, exist_ok=True)
     mine = f".{out.name}.building~"
     for left in out.parent.iterdir():
-        if left.name.startswith(mine):
-            host, process, _ = left.name.removeprefix(mine).split("~")
-            if host == platform.node() and not _alive(int(process)):
-                shutil.rmtree(left, ignore_errors=True)
+        host, _, process = left.name.removeprefix(mine).rpartition("~")[0].rpartition("~")
+        ours = left.name.startswith(mine) and host == platform.node() and process.isdigit()
+        if ours and not _alive(int(process)):
+            shutil.rmtree(left, ignore_errors=True)
     partial = Path(tempfile.mkdtemp("", f"{mine}{platform.node()}~{os.getpid()}~", out.parent))
     try:
         yield partial
@@ -238,6 +239,10 @@ def _put(partial: Path, out: Path, force: bool) -> None:
     try:
         partial.rename(out)
     except OSError as error:
+        if not out.exists():
+            if old.exists():
+                old.rename(out)
+            raise
         raise PanelError(
             "another builder was faster", where=str(out), remedy="use the panel that is there"
         ) from error

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -44,14 +43,6 @@ def packing_code() -> str:
     for name in ("layout.py", "n_step.py", "pack.py", "scratch.py"):
         digest.update((files("restock.replay") / name).read_bytes())
     return digest.hexdigest()
-
-
-@dataclass(frozen=True)
-class Packed:
-    """What was written."""
-
-    observation_size: int
-    digest: str  # of ids, strata, horizons and weights of the rows, 16 hex digits
 
 
 class Packer:
@@ -105,9 +96,9 @@ class Packer:
         Raises PanelError where an observation or reward is not finite, or of another size.
         """
         of_task = f"FROM transitions WHERE task_hash = '{self.plan.task_hash}'"
-        size = int(
-            self.connection.sql(f"SELECT len(observation) {of_task} LIMIT 1").fetchall()[0][0]
-        )
+        first = self.connection.sql(f"SELECT len(observation) {of_task} LIMIT 1").fetchall()
+        size = int(first[0][0])
+        at_a_time = max(BATCH_BYTES // (8 * size), 1)
         names = "transition_id, recording_id, action, terminated, observation, next_observation"
         query = f"SELECT {names} {of_task}"
         shape = (len(self.chosen), row_width(size))
@@ -117,7 +108,7 @@ class Packer:
         # Rows may come as the threads that read them finish: each knows where it belongs.
         self.connection.execute("SET preserve_insertion_order = false")
         try:
-            for batch in self.connection.sql(query).to_arrow_reader(BATCH_BYTES // (8 * size)):
+            for batch in self.connection.sql(query).to_arrow_reader(at_a_time):
                 place = places.of(batch.column("transition_id").to_numpy())
                 filled += self._write(rows, size, batch, place)
                 advance(len(batch))
@@ -263,6 +254,3 @@ def _at(values: Ints, place: Ints) -> Ints:
 def _starts(counts: Ints) -> Ints:
     """Where each of consecutive groups of these sizes begins."""
     return np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
-
-
-__all__: list[str] = ["Packed", "Packer", "packing_code"]
