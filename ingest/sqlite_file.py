@@ -94,7 +94,7 @@ class SqliteFile:
         uri = f"file:{quote(str(path.absolute()))}?mode={mode}{immutable}"
         try:
             connection = sqlite3.connect(uri, uri=True, check_same_thread=False)
-            guard(connection, self.path.stat().st_size + sum(item.stat().st_size for item in sidecars))
+            guard(connection, sum(item.stat().st_size for item in (self.path, *sidecars)))
         except sqlite3.DatabaseError as error:
             raise RecordingError(str(error), where=str(self.path)) from error
         return connection
