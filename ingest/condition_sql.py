@@ -1,8 +1,8 @@
 """What the SQL of a condition may say: an expression over the steps of its episode, nothing else.
 
 Profiles are passed between strangers, so a condition is read before it is run: no query inside,
-no other table, no function that looks outside the row's data (files, settings, time, chance). It
-stays in its episode, and a `pre` condition looks at no later step. Beside that DuckDB runs it
+no other table, no function that looks outside the row's data (files, settings, time, chance) or that
+grows without bound. It stays in its episode, and a `pre` condition looks at no later step. Beside that DuckDB runs it
 without access to files and with its settings locked.
 """
 
@@ -35,6 +35,11 @@ _MACROS = ("list_", "array_")
 _MORE_MACROS = {
     *("nullif", "if", "fmod", "fdiv", "split_part", "date_add", "days_in_month"),
     *("geomean", "geometric_mean", "wavg", "weighted_avg"),
+}
+# These make values of any size out of two numbers: a few words could keep a machine busy.
+_GROWING = {
+    *("repeat", "list_repeat", "array_repeat", "range", "generate_series", "generate_subscripts"),
+    *("lpad", "rpad", "bar", "list_resize", "array_resize", "printf", "format", "factorial"),
 }
 _BACKWARD = {
     *("WINDOW_AGGREGATE", "WINDOW_LAG"),
@@ -106,6 +111,8 @@ def _refuse(part: dict[str, Any], timing: str) -> str | None:
         return None  # count(*); anywhere else it does not bind
     if kind in _REFUSED:
         return _REFUSED[kind]
+    if kind == "FUNCTION" and part["function_name"].lower() in _GROWING:
+        return f"{part['function_name']}() may grow without bound: it is not allowed here"
     if kind in ("FUNCTION", "WINDOW") and part["function_name"].lower() in _outside():
         return f"{part['function_name']}() looks outside the steps: it is not allowed here"
     if kind == "COLUMN_REF" and part["column_names"][-1].lower() in _outside():
