@@ -12,7 +12,7 @@ import robot_log
 import zstandard
 
 PLAIN, LONG, LONGER = "MCAP, no images", "MCAP, no images, 4x as long", 4
-LIMIT_MB = 512  # of private memory: with more the process ends with MemoryError
+LIMIT_MB = 768  # of private memory set aside, used or not: beyond it is a MemoryError
 
 # One process' peak: code and pages of mapped files included.
 MEASURE = """

@@ -154,7 +154,7 @@ def with_images(
     sent = 0
     for topic, log, payload in lines:
         while sent < images and log >= START_NS + sent * every_ns:
-            at = sent * 104_729 % (len(noise) - IMAGE_BYTES)
+            at = sent * 3_104_729 % (len(noise) - IMAGE_BYTES)
             yield CAMERA, log, noise[at : at + IMAGE_BYTES]
             sent += 1
         yield topic, log, payload
