@@ -19,93 +19,7 @@ from restock.ingest.clocks import topic_clock
 from restock.ingest.frame_guess import transform_frames
 from restock.ingest.inputs import FALLBACKS
 from restock.ingest.recording import Recording
-
-_TWIST = {"speed_mps": "linear.x", "yaw_rate_radps": "angular.z"}
-_POSE = {"x_m": "position.x", "y_m": "position.y", "orientation": "orientation"}
-
-
-def _under(path: str, fields: dict[str, str]) -> dict[str, str]:
-    return {key: f"{path}.{value}" for key, value in fields.items()}
-
-
-@dataclass(frozen=True)
-class Kind:
-    """A message type that may fill an input, and how."""
-
-    type: str
-    fields: dict[str, str]
-    words: tuple[str, ...] = ()  # in the topic's name, they speak for it
-    must: bool = False  # … and without one of them it is not taken
-
-
-# Best first.
-KINDS: dict[str, tuple[Kind, ...]] = {
-    "command": (
-        Kind("geometry_msgs/msg/Twist", _TWIST, ("cmd_vel",)),
-        Kind("geometry_msgs/msg/TwistStamped", _under("twist", _TWIST), ("cmd_vel",)),
-        # Nobody's command was recorded: what the robot did stands for what it was told.
-        Kind("nav_msgs/msg/Odometry", _under("twist.twist", _TWIST), ("wheel", "odom")),
-    ),
-    "pose": (
-        Kind(
-            "geometry_msgs/msg/PoseWithCovarianceStamped",
-            _under("pose.pose", _POSE),
-            ("amcl", "pose", "local"),
-        ),
-        Kind(
-            "geometry_msgs/msg/PoseStamped",
-            _under("pose", _POSE),
-            ("robot_pose", "tracked_pose", "slam"),
-            must=True,
-        ),
-        Kind("nav_msgs/msg/Odometry", _under("pose.pose", _POSE), ("filtered", "map", "odom")),
-    ),
-    "wheels": (Kind("nav_msgs/msg/Odometry", _under("twist.twist", _TWIST), ("wheel", "odom")),),
-    "imu": (
-        Kind(
-            "sensor_msgs/msg/Imu",
-            {"yaw_rate_radps": "angular_velocity.z", "accel_x_mps2": "linear_acceleration.x"},
-            ("imu",),
-        ),
-    ),
-    "scan": (
-        Kind(
-            "sensor_msgs/msg/LaserScan",
-            {
-                "ranges_m": "ranges",
-                "angle_min_rad": "angle_min",
-                "angle_increment_rad": "angle_increment",
-            },
-            ("scan",),
-        ),
-    ),
-    "goal": (
-        Kind(
-            "geometry_msgs/msg/PoseStamped",
-            {"x_m": "pose.position.x", "y_m": "pose.position.y"},
-            ("goal",),
-            must=True,
-        ),
-    ),
-    "plan": (
-        Kind(
-            "nav_msgs/msg/Path",
-            {"x_m": "poses[].pose.position.x", "y_m": "poses[].pose.position.y"},
-            ("plan", "path"),
-        ),
-    ),
-    "bumper": (Kind("std_msgs/msg/Bool", {"pressed": "data"}, ("bump", "contact"), must=True),),
-    "behaviour_policy": (
-        Kind("std_msgs/msg/String", {"text": "data"}, ("policy", "mode", "behavi"), must=True),
-    ),
-    "true_condition": (
-        Kind("std_msgs/msg/String", {"text": "data"}, ("ground_truth", "true_cond"), must=True),
-    ),
-}
-REQUIRED = ("command", "wheels", "pose")
-MOTION = "nav_msgs/msg/Odometry"
-SPENT = ("goal", "plan", "behaviour_policy", "true_condition")  # nothing else is in them
-LATCHED = ("goal", "plan", "behaviour_policy")
+from restock.ingest.roles import KINDS, LATCHED, MOTION, REQUIRED, SPENT, Kind, Roles, topics_for
 
 
 @dataclass(frozen=True)
@@ -115,9 +29,6 @@ class Proposal:
     toml: str
     missing: list[str] = field(default_factory=list)  # required inputs that nothing fills
     signals: int = 0  # custom signals that stand in it, commented out
-
-
-Roles = dict[str, list[tuple[TopicInfo, Kind]]]  # input -> the topics that may fill it, best first
 
 
 @dataclass(frozen=True)
@@ -135,7 +46,7 @@ class Commands:
 def propose(recording: Recording, name: str) -> Proposal:
     """A profile for recordings like this one."""
     topics = {n: t for n, t in recording.topics.items() if t.skipped is None and t.expected}
-    roles = {role: _candidates(topics, kinds) for role, kinds in KINDS.items()}
+    roles = {role: topics_for(topics, kinds) for role, kinds in KINDS.items()}
     if not (roles["goal"] and roles["plan"]):
         roles["goal"] = roles["plan"] = []
     frames = transform_frames(recording)
@@ -207,20 +118,6 @@ def _topic_lines(recording: Recording, roles: Roles, seconds: float) -> list[str
         why = f"skipped: {topic.skipped}" if topic.skipped else ", ".join(taken.get(name, []))
         lines.append(f"# {name:<{width}}  {topic.type:<{kinds}}  {rate}  {why}".rstrip())
     return [*lines, ""]
-
-
-def _candidates(
-    topics: dict[str, TopicInfo], kinds: tuple[Kind, ...]
-) -> list[tuple[TopicInfo, Kind]]:
-    """The topics that may fill an input, best first: by kind, by name, by messages."""
-    found = []
-    for rank, kind in enumerate(kinds):
-        for topic in topics.values():
-            named = [place for place, word in enumerate(kind.words) if word in topic.name.lower()]
-            if topic.type == kind.type and (named or not kind.must):
-                order = (rank, min(named, default=len(kind.words)), -topic.expected, topic.name)
-                found.append((order, topic, kind))
-    return [(topic, kind) for _, topic, kind in sorted(found, key=lambda item: item[0])]
 
 
 def _commands(recording: Recording, roles: Roles) -> Commands:
