@@ -20,6 +20,7 @@ import pyarrow as pa
 from restock import __version__
 from restock.errors import PanelError, StoreError
 from restock.ingest.conditions import NOMINAL, Condition, labels_version, shipped
+from restock.ingest.location import Location
 from restock.ingest.task import Task
 from restock.replay.layout import PACKING_VERSION
 from restock.replay.mixture import Mixture
@@ -66,7 +67,7 @@ def open_source(
                 stores = opened.enter_context(all_stores(transitions, mixture, folder))
             yield Source(
                 stores.connection,
-                _address(transitions),
+                _address(str(transitions.path)),
                 transitions.version,
                 transitions.task_json,
                 found,
@@ -176,10 +177,10 @@ def _enough_memory() -> Iterator[None]:
         ) from error
 
 
-def _address(store: Store) -> str:
-    """Where a trace finds the store, whatever folder it begins in."""
-    folder = store.path.folder
-    return str(store.path if folder is None else folder.resolve())
+def _address(store: str) -> str:
+    """Where a trace finds a store, whatever folder it begins in."""
+    place = Location.of(store)
+    return str(place if place.folder is None else place.folder.resolve())
 
 
 def _check_free(out: Path, force: bool) -> None:
@@ -297,7 +298,7 @@ def _header(
             for line in plan.strata
         ],
         mixture=plan.mixture,
-        others=list(plan.others),
+        others=[msgspec.structs.replace(o, path=_address(o.path)) for o in plan.others],
         ratios=list(plan.ratios),
         files={name: FileRecord.of(partial / name) for name in (ROWS, META, HELD_OUT)},
     )
