@@ -48,7 +48,13 @@ class _Sink:
         self.run.append(table, [{k: _known(v) for k, v in row.items()} for row in rows])
 
     def append_columns(self, table: str, columns: Mapping[str, Any]) -> None:
-        self.run.append_columns(table, columns)
+        self.run.append_columns(table, {k: _known_column(v) for k, v in columns.items()})
+
+
+def _known_column(values: Any) -> Any:
+    if isinstance(values, np.ndarray) and values.dtype.kind == "f" and np.isnan(values).any():
+        return [_known(value) for value in values.tolist()]
+    return _known(values)
 
 
 def _known(value: Any) -> Any:
