@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from restock.ingest.frames import FIELDS, Edges, Frames, upward
 from restock.ingest.recording import Recording
+from restock.ingest.transforms import FIELDS, Edges, Frames, upward
 
 FIXED = ("map", "odom", "world")  # best first
 BASES = ("base_link", "base_footprint", "base")

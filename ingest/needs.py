@@ -13,11 +13,11 @@ from restock.ingest.clearance import scan_reduction
 from restock.ingest.columns import FieldColumn
 from restock.ingest.custom import CustomSignal
 from restock.ingest.custom_columns import custom_reduction
-from restock.ingest.frames import FIELDS, FRAME_ID
 from restock.ingest.inputs import Input
 from restock.ingest.profile import Profile
 from restock.ingest.reading import Fields, Reduction
 from restock.ingest.signal_paths import offer
+from restock.ingest.transforms import FIELDS, FRAME_ID
 
 if TYPE_CHECKING:
     from restock.ingest.fields import Leaf

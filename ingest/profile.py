@@ -25,7 +25,6 @@ from restock.errors import ConfigError
 from restock.ingest.condition_files import with_files
 from restock.ingest.conditions import Condition, label, labels_version, shipped
 from restock.ingest.custom import CustomSignal, name_problem
-from restock.ingest.frames import Frames
 from restock.ingest.inputs import (
     FALLBACKS,
     INPUT_FIELDS,
@@ -37,6 +36,7 @@ from restock.ingest.inputs import (
 )
 from restock.ingest.schema import steps_schema
 from restock.ingest.task import Task
+from restock.ingest.transforms import Frames
 
 ELSEWHERE = "elsewhere"
 

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from restock.errors import RecordingError
 from restock.ingest.align import Segment
 from restock.ingest.columns import FieldColumn, Ragged, TopicColumns
-from restock.ingest.frames import FRAME_ID, Edges, Placement, Tree, plain
+from restock.ingest.frames import Placement, Tree
 from restock.ingest.inputs import FALLBACKS, POSE_FALLBACK, Input
 from restock.ingest.profile import Profile
 from restock.ingest.signals import yaw_of
+from restock.ingest.transforms import FRAME_ID, Edges, plain
 
 F64 = NDArray[np.float64]
 

@@ -14,9 +14,10 @@ from restock.cli import main
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.align import NS, align
 from restock.ingest.columns import Ragged, TopicColumns, offsets_of
-from restock.ingest.frames import FIELDS, Edges, Frames, Tree, rotations
+from restock.ingest.frames import Tree, rotations
 from restock.ingest.profile import Clock, load_profile, parse_profile
 from restock.ingest.steps import steps_of
+from restock.ingest.transforms import FIELDS, Edges, Frames
 
 TEXT = (Path(__file__).parents[1] / "ingest" / "profiles" / "warehouse_amr.toml").read_text()
 SAMPLE = Path(__file__).parents[1] / "sample_logs" / "amr_monday.mcap"
@@ -121,6 +122,27 @@ def test_static_transforms_never_age():
     found = tree.place("laser", at(0.0, 10.0))
     assert found.problem.tolist() == ["", ""]
     assert found.translation_m.tolist() == [[1, 2, 3], [1, 2, 3]]
+
+
+def test_static_transforms_hold_across_a_clock_that_is_set_and_moving_ones_do_not():
+    log = np.arange(0, 10, 0.1)
+    clock = columns(log, {})
+    later = log >= 5
+    clock.fields["header.stamp"][later] -= 100 * NS  # set back while it recorded
+    topics = {
+        "/tf": transforms([(1.0, "map", "odom", 7, 0, 0, 0)]),
+        "/tf_static": transforms([(-600.0, "odom", "base_link", 1, 0, 0, 0)]),
+    }
+    edges = Edges.of(Frames(), topics)
+    segments, report = align(
+        {"/clock": clock, **edges.topics}, Clock(), edges.static, frozenset(edges.topics)
+    )
+    assert report.jumps == 1
+    tree = Tree(Frames(max_age_s=1e6), edges, segments)
+    after = START_NS - 93 * NS
+    found = tree.place("base_link", [*at(2.0), np.array([after])])
+    assert found.problem.tolist() == ["", "no transform from map to odom yet"]
+    assert found.translation_m[0, 0] == 8.0
 
 
 def test_the_future_is_not_seen():
