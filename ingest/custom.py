@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import TYPE_CHECKING, Any, Literal
 
 import duckdb
@@ -27,7 +28,7 @@ Reduce = Literal["min", "max", "mean", "sum", "count", "yaw"]
 NUMBER = pa.float64()
 LIST = pa.list_(pa.field("element", pa.float32()))
 # Columns that a store's views add to a transition's, and that labelling adds.
-_TAKEN = {"logged_ns", "row_", "observation_size"} | {column.name for column in COLUMNS}
+_TAKEN = {"logged_ns", "row_"} | {column.name for column in COLUMNS}
 QUATERNION = ("x", "y", "z", "w")
 
 
@@ -60,6 +61,8 @@ class CustomSignal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             )
         if self.reduce not in (None, "yaw") and not path.lists:
             raise ValueError(f"path {self.path!r} gives one value: there is nothing to reduce")
+        if not self.unit:
+            raise ValueError('unit is empty: say "1" for what has none')
         if self.max_age_s is not None and not self.max_age_s > 0:
             raise ValueError(f"max_age_s must be above 0, got {self.max_age_s}")
 
@@ -138,6 +141,7 @@ def refuse_other_signals(have: Mapping[str, Any], schema: pa.Schema, where: str)
             )
 
 
+@cache
 def _reserved() -> set[str]:
     with duckdb.connect() as connection:
         rows = connection.sql(

@@ -122,6 +122,18 @@ def test_a_quaternion_becomes_its_yaw():
     assert column(table, fields, [0.0])[5] == pytest.approx(0.3)
 
 
+def test_lists_survive_the_table_where_some_are_null(tmp_path):
+    ranges = ragged([[1.0, 2.0], [], [3.0]])
+    table = signal("s", "ranges[]", "max_age_s = 0.5")
+    steps = steps_with(table, {"ranges": ranges}, [0.5, 2.0, 4.0])
+    pq.write_table(steps.custom.table, tmp_path / "t.parquet")
+    read = pq.read_table(tmp_path / "t.parquet")["s"].to_pylist()
+    assert read == steps.custom.table["s"].to_pylist()
+    assert [read[i] for i in (0, 3, 7, 10, 14, 20, 25)] == [
+        None, [1.0, 2.0], None, [], None, [3.0], None,
+    ]  # fmt: skip
+
+
 def test_a_topic_that_is_not_there_gives_nulls_and_is_said():
     from restock.ingest.sources import stand_ins
 
@@ -152,6 +164,7 @@ def test_the_future_is_not_seen():
         (signal("s", "a[]", 'reduce = "yaw"'), "takes one quaternion"),
         (signal("s", "a[]", 'reduce = "median"'), "`signals.s.reduce`: Invalid enum value"),
         (signal("s", "a", "max_age_s = 0"), "max_age_s must be above 0"),
+        (signal("s", "a", "unit = ''"), 'unit is empty: say "1"'),
         (signal("s", "a", "units = 'm'"), "unknown key `signals.s.units`"),
         (signal("s", "a", "values = { a = 'b' }"), "`signals.s.values[...]`: Expected `float`"),
         ('[signals.s]\ntopic = "/x"\n', "missing key `signals.s."),
