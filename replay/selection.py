@@ -181,6 +181,7 @@ def _of_panel(panel: Panel, continuous: bool) -> Selection:
         provenance={
             "store": panel.header.store,
             "store_version": panel.store_version,
+            "other_stores": msgspec.to_builtins(panel.header.others),
             "panel": panel.id,
             "labels_version": panel.header.labels_version,
             **_of_task(task, continuous),

@@ -54,9 +54,9 @@ def test_every_example_is_run_and_explained() -> None:
 
 
 def test_stable_baselines3_dqn() -> None:
-    done = example("sb3_dqn").main(steps=400, num_envs=2)
-    assert done["env_steps"] == 400
-    assert done["updates"] >= 30
+    done = example("sb3_dqn").main(steps=320, num_envs=2)
+    assert done["env_steps"] == 320
+    assert done["updates"] >= 25
     assert isinstance(done["success"], bool)
 
 
@@ -79,9 +79,9 @@ def test_stable_baselines3_with_a_mixture(panel: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("mixed", [False, True])
 def test_tianshous_collectors_and_dqn(panel: Path, tmp_path: Path, mixed: bool) -> None:
     given = {"panel": str(panel), "run": str(tmp_path / "run")} if mixed else {}
-    done = example("tianshou_dqn").main(steps=192, num_envs=2, **given)
-    assert done["env_steps"] >= 192
-    assert done["update_steps"] >= 20
+    done = example("tianshou_dqn").main(steps=96, num_envs=2, **given)
+    assert done["env_steps"] >= 96
+    assert done["update_steps"] >= 10
     assert (tmp_path / "run" / "strata.parquet").is_file() == mixed
 
 

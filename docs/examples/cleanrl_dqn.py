@@ -118,6 +118,8 @@ def main(
         "env_steps": step + num_envs,
         "updates": updates,
         "episodes": len(returns),
+        "return_first_100": float(np.mean(returns[:100])) if returns else None,
+        "return_last_100": float(np.mean(returns[-100:])) if returns else None,
         "loss": loss.item(),
     }
 
