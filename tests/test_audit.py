@@ -484,6 +484,16 @@ def test_the_verb_refuses_what_is_no_store(
     assert "not a store" in capsys.readouterr().err
 
 
+def test_the_verb_refuses_a_run_that_is_none_and_a_file_it_cannot_write(
+    store_path: Path, panels: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = str(store_path)
+    assert cli.main(["audit", store, "--run", str(panels["time"])]) == 2
+    assert "is not a run directory" in capsys.readouterr().err
+    assert cli.main(["audit", store, "--junit", str(tmp_path / "nowhere" / "x.xml")]) == 2
+    assert "cannot be written" in capsys.readouterr().err
+
+
 def test_junit_is_as_its_readers_expect() -> None:
     """The rules of junit-10.xsd that concern us: names of elements, attributes, and the counts."""
     rows = [{"source_file": "a\x00b\x1b[31m\ud800<&>", "rows": 3}]

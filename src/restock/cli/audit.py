@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from restock.errors import ExitCode
+from restock.errors import ConfigError, ExitCode, RunError
 
 if TYPE_CHECKING:
     from restock.replay.audit import Finding
@@ -38,7 +38,7 @@ class Audit:
     strict: bool = False
     """Let warnings fail, too."""
     rows: int = 5
-    """Offending rows shown of each audit (at most 10)."""
+    """Offending rows shown of each audit, 10 at most; `restock sql` shows them all."""
     json: bool = False
     """Print one JSON document."""
     junit: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -48,19 +48,21 @@ class Audit:
         """Run the audits, print them, and say with the exit code whether one failed."""
         from restock.cli import output
         from restock.replay.audit import junit_xml, load_audits, load_thresholds, run_audits
-        from restock.replay.places import open_place
+        from restock.replay.places import RUN_CONFIG, open_place
 
         beside = {"panel": self.panel, "run": self.run_dir}
         given = {name: path for name, path in beside.items() if path is not None}
         if self.capacity:
             return self._capacity()
+        if self.run_dir is not None and not (self.run_dir / RUN_CONFIG).is_file():
+            raise RunError("is not a run directory", where=str(self.run_dir))
         audits, thresholds = load_audits(self.audits), load_thresholds(self.thresholds)
         with open_place(self.store, beside=given, only_store=True) as connection:
             findings = run_audits(connection, audits, thresholds, beside=given)
         failing = {"fail", "warn"} if self.strict else {"fail"}
         failed = [finding for finding in findings if finding.status in failing]
         if self.junit is not None:
-            self.junit.write_text(junit_xml(findings, f"audit {self.store}"), encoding="utf-8")
+            self._write_junit(self.junit, junit_xml(findings, f"audit {self.store}"))
         if self.json:
             output.print_json(
                 {
@@ -72,6 +74,12 @@ class Audit:
         else:
             _print(findings, self.rows)
         return int(ExitCode.FAILED if failed else ExitCode.OK)
+
+    def _write_junit(self, path: Path, text: str) -> None:
+        try:
+            path.write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise ConfigError(f"cannot be written: {error.strerror}", where=str(path)) from error
 
     def _capacity(self) -> int:
         from restock.cli import output
