@@ -157,7 +157,11 @@ class StoreWriter:
         ]
 
     def _write(self, rows: pa.Table, path: str) -> int:
-        """Write a Parquet file; returns its size in bytes."""
+        """Write a Parquet file; returns its size in bytes.
+
+        Lists of fixed size become plain lists, which every engine that knows Delta reads.
+        """
+        rows = rows.cast(_delta_schema(rows.schema).with_metadata(rows.schema.metadata))
         try:
             return self.path.write(
                 rows,
@@ -339,13 +343,13 @@ def _float_columns(schema: pa.Schema) -> list[str]:
     for field in schema:
         if pa.types.is_floating(field.type):
             paths.append(field.name)
-        elif pa.types.is_fixed_size_list(field.type):
+        elif pa.types.is_list(field.type) and pa.types.is_floating(field.type.value_type):
             paths.append(f"{field.name}.list.element")
     return paths
 
 
 def _delta_schema(schema: pa.Schema) -> pa.Schema:
-    """Delta knows no list of fixed size; the Parquet keeps it."""
+    """The same columns without lists of fixed size, which Delta does not know."""
     return pa.schema(
         [
             field.with_type(pa.list_(field.type.value_type))

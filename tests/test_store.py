@@ -74,7 +74,7 @@ def test_the_old_rows_can_still_be_read_at_the_old_version(tmp_path):
     version = writer.write(*one(1, "a"))
     writer.write(*one(1, "b"))
     files = DeltaTable(str(tmp_path / "s" / "transitions"), version=version).file_uris()
-    assert pq.read_table(files[0].removeprefix("file://")).equals(one(1, "a")[1])
+    assert pq.read_table(files[0].removeprefix("file://")).to_pylist() == one(1, "a")[1].to_pylist()
 
 
 def test_an_old_version_keeps_its_manifests(tmp_path):
