@@ -25,6 +25,7 @@ from restock.replay.strata import rules_of
 from restock.train.batches import Batches, Logs
 from restock.train.log_draws import LogDraws
 from restock.train.loop import TrainingInterrupted, train
+from restock.train.session import Session
 
 HALVES = "[[strata]]\nname = 'nominal'\nshare = 0.5\n[[strata]]\nname = 'rare'\nshare = 0.5\n"
 
@@ -274,41 +275,51 @@ def toy_logs(built: Panel) -> Logs:
     return Logs.of_panel(built, PlannedDraws(60 * 32, 350 * 32, 200, 1600))
 
 
-def test_a_run_on_everything_at_once_resumes_bit_for_bit(table: pa.Table, tmp_path: Path) -> None:
-    built = panel(table, tmp_path / "p", EVERYTHING)
-    settings = config(replay={"logs_share": None}, schedule={"env_steps": 1600})
-    whole = run_to_end(tmp_path / "whole", settings, logs=toy_logs(built))
-    for calls in (40, 150):
-        asked = iter(range(calls))
-        path = tmp_path / f"cut{calls}"
-        live = session(path, settings, logs=toy_logs(built))
-        with pytest.raises(TrainingInterrupted):
-            train(live, stop=lambda asked=asked: next(asked, None) is None)  # type: ignore[misc]
-        live.close()
-        again = session(path, settings, logs=toy_logs(built), resume=True)
-        train(again)
-        again.close()
-        assert_same_run(whole, again)
+SETTINGS = config(replay={"logs_share": None}, schedule={"env_steps": 1600})
 
 
-def test_the_run_records_the_shares_in_force(table: pa.Table, tmp_path: Path) -> None:
-    built = panel(table, tmp_path / "p", EVERYTHING)
-    settings = config(replay={"logs_share": None})
-    live = run_to_end(tmp_path / "a", settings, logs=toy_logs(built))
-    shares = pq.read_table(tmp_path / "a" / "shares.parquet").to_pylist()
-    assert len(shares) > 4 * len(built.strata)
-    for first in range(0, len(shares), len(built.strata)):
-        mine = shares[first : first + len(built.strata)]
+@pytest.fixture(scope="module")
+def whole(table: pa.Table, tmp_path_factory: pytest.TempPathFactory) -> tuple[Session, Panel]:
+    """A run on everything at once."""
+    path = tmp_path_factory.mktemp("runs")
+    built = panel(table, path / "panel", EVERYTHING)
+    return run_to_end(path / "whole", SETTINGS, logs=toy_logs(built)), built
+
+
+def test_a_run_on_everything_at_once_resumes_bit_for_bit(
+    whole: tuple[Session, Panel], tmp_path: Path
+) -> None:
+    undisturbed, built = whole
+    asked = iter(range(150))
+    path = tmp_path / "cut"
+    live = session(path, SETTINGS, logs=toy_logs(built))
+    with pytest.raises(TrainingInterrupted):
+        train(live, stop=lambda: next(asked, None) is None)
+    live.close()
+    again = session(path, SETTINGS, logs=toy_logs(built), resume=True)
+    train(again)
+    again.close()
+    assert_same_run(undisturbed, again)
+
+
+def test_the_run_records_the_shares_in_force(whole: tuple[Session, Panel]) -> None:
+    live, built = whole
+    path, size = live.run.path, len(built.strata)
+    shares = pq.read_table(path / "shares.parquet").to_pylist()
+    assert len(shares) > 4 * size
+    for first in range(0, len(shares), size):
+        mine = shares[first : first + size]
         assert sum(row["share"] for row in mine) == pytest.approx(1)
         assert all(row["replays_max"] <= 40 for row in mine)
-    last = shares[-len(built.strata) :]
-    np.testing.assert_allclose([row["share"] for row in last], live.batches.diet.shares)  # type: ignore[union-attr]
+    last = shares[-size:]
+    assert live.batches.diet is not None
+    np.testing.assert_allclose([row["share"] for row in last], live.batches.diet.shares)
     assert [row["share"] for row in last] != [row["planned_share"] for row in last]
     assert last[0]["logs_share"] < 0.4 < shares[0]["logs_share"]
     # What was asked for is what was drawn.
-    strata = pq.read_table(tmp_path / "a" / "strata.parquet").to_pylist()
+    strata = pq.read_table(path / "strata.parquet").to_pylist()
     for row in strata:
         if row["source"] == "logs" and row["phase"] == "online":
             assert row["drawn_share"] == pytest.approx(row["quota_share"], abs=0.03)
-    ages = pq.read_table(tmp_path / "a" / "ages.parquet").to_pylist()
+    ages = pq.read_table(path / "ages.parquet").to_pylist()
     assert max(row["bucket"] for row in ages if row["unit"] == "env_steps") <= 9  # 2 ** 9 <= 900

@@ -179,7 +179,7 @@ def test_group_dro_feeds_the_worst_and_starves_none() -> None:
     np.testing.assert_allclose(groups.shares, [0.8, 0.2, 0.0], atol=1e-9)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(st.data())
 def test_adaptive_shares_stay_within_floor_and_ceiling(data: st.DataObject) -> None:
     size = data.draw(st.integers(2, 6))
