@@ -9,8 +9,7 @@ every batch, and so leaves a run directory with the same tables as `restock trai
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
-from importlib.metadata import version
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,41 +23,16 @@ from restock.replay.panel import Panel
 from restock.train.batches import Batch, Logs
 from restock.train.fresh_meta import FreshMeta
 from restock.train.info_labels import InfoLabels
+from restock.train.library_run import NullsForNaN, create_run, episode_row, known
 from restock.train.log_draws import Drawing, LogDraws
 from restock.train.loss import Loss
 from restock.train.record import FeedRecord
-from restock.train.run import Run, now_ns, software_versions
+from restock.train.run import Run
 from restock.train.run_tables import TABLES
 
 Ints = NDArray[np.int64]
 _NO_ROWS: Ints = np.empty(0, np.int64)
 NO_LOGS = Drawing(_NO_ROWS, _NO_ROWS, None, np.empty(0))
-_TOLD = (
-    *("episode_seed", "perturbation", "block", "success", "bumps"),
-)  # of an episode that ended, by the infos of its last step
-
-
-class _Sink:
-    """A run whose NaNs are nulls: what a library keeps to itself is not known here."""
-
-    def __init__(self, run: Run) -> None:
-        self.run = run
-
-    def append(self, table: str, rows: Sequence[Mapping[str, Any]]) -> None:
-        self.run.append(table, [{k: _known(v) for k, v in row.items()} for row in rows])
-
-    def append_columns(self, table: str, columns: Mapping[str, Any]) -> None:
-        self.run.append_columns(table, {k: _known_column(v) for k, v in columns.items()})
-
-
-def _known_column(values: Any) -> Any:
-    if isinstance(values, np.ndarray) and values.dtype.kind == "f" and np.isnan(values).any():
-        return [_known(value) for value in values.tolist()]
-    return _known(values)
-
-
-def _known(value: Any) -> Any:
-    return None if isinstance(value, float) and value != value else value
 
 
 class MixedFeed:
@@ -96,17 +70,17 @@ class MixedFeed:
         audit_share: float,
         log_every: int,
     ) -> None:
-        known = load_profile(profile)
+        definition = load_profile(profile)
         self.panel = Panel.open(panel) if isinstance(panel, str | Path) else panel
         if logs_share is not None and not 0 <= logs_share <= 1:
             raise ConfigError(f"logs_share must be in [0, 1], got {logs_share:g}")
         self.logs_share = logs_share
         if self.panel is not None:
-            _check(self.panel, known.task.hash, profile, observation_size)
+            _check(self.panel, definition.task.hash, profile, observation_size)
         self.logs = Logs.of_panel(self.panel) if self.panel is not None else None
         self.seed, self.log_every, self.audit_share = seed, log_every, audit_share
         self.rng = np.random.default_rng([seed, 1])
-        self.labels = InfoLabels(known.conditions, num_envs)
+        self.labels = InfoLabels(definition.conditions, num_envs)
         self.num_envs, self.library = num_envs, library
         self.env_steps = self.batches = self.invalid_steps = 0
         self._draws: LogDraws | None = None
@@ -116,25 +90,13 @@ class MixedFeed:
         self._begun = time.monotonic()
         self.run: Run | None = None
         if run is not None:
-            self.run = Run.create(
-                Path(run),
-                {
-                    "created_ns": now_ns(),
-                    "library": {"name": library, "version": version(library)},
-                    "config": {
-                        "logs_share": self.logs_share,
-                        "seed": seed,
-                        "audit_share": audit_share,
-                        "num_envs": num_envs,
-                    },
-                    "panel": _fed(self.panel),
-                    "task_hash": known.task.hash,
-                    "labels_version": known.labels_version,
-                    "profile": {"name": known.name, "hash": known.hash},
-                    "seeds": {"run": seed},
-                    "versions": software_versions() | {library: version(library)},
-                },
-            )
+            settings = {
+                "logs_share": logs_share,
+                "seed": seed,
+                "audit_share": audit_share,
+                "num_envs": num_envs,
+            }
+            self.run = create_run(Path(run), library, definition, self.panel, settings)
         self.record: FeedRecord | None = None
         self.fresh: Any = None
 
@@ -142,7 +104,7 @@ class MixedFeed:
         """Say what the fresh rows are: a `FreshRing`, or a `FreshMeta`."""
         self.fresh = fresh
         if self.run is not None:
-            sink: Any = _Sink(self.run)
+            sink: Any = NullsForNaN(self.run)
             self.record = FeedRecord(
                 sink, self.logs, fresh, audit_share=self.audit_share, seed=self.seed
             )
@@ -157,7 +119,7 @@ class MixedFeed:
         ):
             self.labels.step(env, info, ended=bool(over), key=key)
             if over and self.run is not None:
-                self._episodes[key] = _told(env, key, info) | {
+                self._episodes[key] = episode_row(env, key, info) | {
                     "env_steps": self.env_steps,
                     "gradient_steps": self.batches,
                 }
@@ -263,7 +225,7 @@ class MixedFeed:
         self.label(all_of_them=True)
         means = self.record.flush(self.env_steps, self.batches, self._phase)
         if self._open:
-            known = {
+            row = {
                 "env_steps": self.env_steps,
                 "gradient_steps": self.batches,
                 "wall_s": time.monotonic() - self._begun,
@@ -271,10 +233,10 @@ class MixedFeed:
                 "updates": self._open,
                 "ring_rows": len(self.fresh),
                 "episodes": len(self._episodes),
-                **{name: _known(value) for name, value in means.items()},
+                **{name: known(value) for name, value in means.items()},
             }
             blank = dict.fromkeys(TABLES["progress"].names)
-            self.run.append("progress", [blank | known])
+            self.run.append("progress", [blank | row])
         if self._episodes:
             blank = dict.fromkeys(TABLES["episodes"].names)
             rows = [blank | row for row in self._episodes.values()]
@@ -298,34 +260,3 @@ def _check(panel: Panel, task_hash: str, profile: str, observation_size: int) ->
             where=str(panel.path),
             remedy=f"ingest the logs with `--profile {profile}` and mix anew",
         )
-
-
-def _fed(panel: Panel | None) -> dict[str, Any] | None:
-    if panel is None:
-        return None
-    return {
-        "path": str(panel.path.resolve()),
-        "id": panel.id,
-        "store_version": panel.store_version,
-        "rows": len(panel),
-        "n_step": panel.n_step,
-        "discount": panel.discount,
-        "labels_version": panel.header.labels_version,
-        "strata": {stratum.name: stratum.share for stratum in panel.strata},
-    }
-
-
-def _told(env: int, key: int, info: Mapping[str, Any]) -> dict[str, Any]:
-    """A row of `episodes`, as far as the last step's info tells."""
-    columns = set(TABLES["episodes"].names)
-    told = {"env": env, "episode": key, "conditions": []}
-    told |= {name: _plain(info[name]) for name in _TOLD if name in info}
-    if "episode_condition" in info:
-        told["true_condition"] = _plain(info["episode_condition"])
-    if "episode_steps" in info:
-        told["steps"] = _plain(info["episode_steps"])
-    return {name: value for name, value in told.items() if name in columns}
-
-
-def _plain(value: Any) -> Any:
-    return value.item() if hasattr(value, "item") else value
