@@ -130,7 +130,7 @@ def input_problems(
         f"{what} ({', '.join(names)})" + (f": {hints[what]}" if hints.get(what) else "")
         for what, names in itertools.chain(needed.items(), wrong.items())
     ]
-    return lacking + fields + _transform_problems(profile, available)
+    return lacking + fields + _transform_problems(profile, available, leaves or {})
 
 
 def near(topic: str, available: Mapping[str, Any]) -> str:
@@ -149,11 +149,19 @@ def _field_problems(name: str, source: Input, leaves: Sequence[Leaf]) -> list[st
     ]
 
 
-def _transform_problems(profile: Profile, available: Mapping[str, Any]) -> list[str]:
+def _transform_problems(
+    profile: Profile, available: Mapping[str, Any], leaves: Mapping[str, Sequence[Leaf]]
+) -> list[str]:
     """Whether there are transforms at all, where the pose is to come from them."""
     pose, frames = profile.inputs.pose, profile.frames
-    if frames is None or (pose is not None and pose.topic in available):
+    if frames is None:
         return []
-    if any(topic in available and available[topic].expected for topic in profile.transform_topics):
-        return []
+    others = [
+        f"{topic} holds {available[topic].type}, not transforms (frames)"
+        for topic in profile.transform_topics
+        if topic in leaves and not set(FIELDS) <= {leaf.path for leaf in leaves[topic]}
+    ]
+    seen = any(t in available and available[t].expected for t in profile.transform_topics)
+    if others or seen or (pose is not None and pose.topic in available):
+        return others
     return [f"no message of {frames.topic} or {frames.static_topic} (pose, by [frames])"]

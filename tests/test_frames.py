@@ -303,6 +303,21 @@ def test_what_a_profile_may_not_say_of_frames(frames, said):
     assert said in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("topic", "said"),
+    [
+        ("/odom", "/odom holds nav_msgs/msg/Odometry, not transforms (frames)"),
+        ("/tff", "no message of /tff or /tff (pose, by [frames])"),
+    ],
+)
+def test_what_is_no_topic_of_transforms_is_named(topic, said, tmp_path, capsys):
+    profile = tmp_path / "p.toml"
+    frames = f'[frames]\ntopic = "{topic}"\nstatic_topic = "{topic}"\n[clock]'
+    profile.write_text(framed(frames=frames))
+    assert main(["profile", "check", str(profile), str(SAMPLE)]) == 2
+    assert said in capsys.readouterr().err
+
+
 def test_on_the_sample_log_transforms_and_localisation_agree(tmp_path, capsys):
     """Rows, labels and scores from /tf are those from /amcl_pose."""
     profile = tmp_path / "p.toml"
