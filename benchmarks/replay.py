@@ -1,6 +1,6 @@
 """What sampling costs beside other libraries' buffers, in one interleaved run.
 
-    python benchmarks/replay.py [--quick] [--json] [--check]
+    python benchmarks/replay.py [--quick] [--json] [--check] [--only SECTION]
 
 Every contender fills a batch of 256 rows of equal width from a million rows in memory, on one
 thread: uniformly, by quota, and by priority with weights and the update of the priorities. Figures
@@ -274,7 +274,9 @@ def cold_panel(count: int, batches: int) -> dict[str, float]:
         # The natural mixture: with boosted strata most rows come from those held in memory.
         shares = np.array([len(members) for members in stratum_rows]) / count
         rng = np.random.default_rng(0)
-        chunked = ChunkedSampler(rows, stratum_rows, shares, BATCH, rng, memory_bytes=64 << 20)
+        chunked = ChunkedSampler(
+            rows, stratum_rows, shares, BATCH, rng, chunk_rows=8192, memory_bytes=128 << 20
+        )
         began = time.perf_counter()
         for _ in range(batches):
             chunked.draw()
@@ -362,32 +364,14 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="fewer rows and rounds")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--check", action="store_true", help="exit 1 where a target is missed")
+    parser.add_argument("--only", choices=SECTIONS, action="append", help="may be repeated")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    quick = args.quick
-    rounds, draws = (5, 200) if quick else (15, 640)
-    count = 200_000 if quick else 1_000_000
-    us, left_out = million(count, rounds, draws)
-    gc.collect()
-    result: dict[str, Any] = {
-        "rows": count,
-        "batch": BATCH,
-        "row_floats": row_width(OBSERVATION),
-        "cpu_us_per_batch": us,
-        "left_out": left_out,
-        "rows_per_cpu_s": {name: BATCH / value * 1e6 for name, value in us.items()},
-        "ratios": {
-            name: us[slower] / us[faster]
-            for name, (slower, faster, _) in TARGETS.items()
-            if slower in us
-        },
-        "quotas / uniform": us["quotas"] / us["uniform"],
-        "many_rows": ten_million(1_000_000 if quick else 10_000_000, rounds, draws),
-        "panel_build": panel_build(20_000 if quick else 200_000),
-        "record": record_share(*((5, 100) if quick else (15, 500))),
-        "cold_panel": cold_panel(100_000 if quick else 1_000_000, 300 if quick else 4000),
-        "fresh_ring": fresh_ring(500 if quick else 5000),
-    }
+    result: dict[str, Any] = {}
+    for name in args.only or SECTIONS:
+        print(f"measuring {name} …", file=sys.stderr)
+        result[name] = SECTIONS[name](args.quick)
+        gc.collect()
     result["missed"] = missed(result)
     if args.json:
         print(json.dumps(result, indent=1))
@@ -396,37 +380,73 @@ def main() -> int:
     return 1 if args.check and result["missed"] else 0
 
 
+def sampling(quick: bool) -> dict[str, Any]:
+    """Batches from a million rows beside the other libraries'."""
+    count = 200_000 if quick else 1_000_000
+    us, left_out = million(count, *_turns(quick))
+    return {
+        "rows": count,
+        "batch": BATCH,
+        "row_floats": row_width(OBSERVATION),
+        "cpu_us_per_batch": us,
+        "left_out": left_out,
+        "ratios": {
+            name: us[slower] / us[faster]
+            for name, (slower, faster, _) in TARGETS.items()
+            if slower in us
+        },
+        "quotas / uniform": us["quotas"] / us["uniform"],
+    }
+
+
+def _turns(quick: bool) -> tuple[int, int]:
+    """Rounds, and draws of each contender in one."""
+    return (5, 128) if quick else (9, 192)
+
+
+SECTIONS: dict[str, Callable[[bool], dict[str, Any]]] = {
+    "sampling": sampling,
+    "many_rows": lambda quick: ten_million(1_000_000 if quick else 10_000_000, *_turns(quick)),
+    "panel_build": lambda quick: panel_build(20_000 if quick else 200_000),
+    "record": lambda quick: record_share(*((5, 100) if quick else (15, 300))),
+    "cold_panel": lambda quick: cold_panel(*((200_000, 300) if quick else (1_000_000, 3000))),
+    "fresh_ring": lambda quick: fresh_ring(500 if quick else 5000),
+}
+
+
 def missed(result: dict[str, Any]) -> list[str]:
     """The targets of the design that these figures miss."""
+    ratios = result["sampling"]["ratios"] if "sampling" in result else {}
     found = [
         f"{name}: {ratio:.2f}, at least {TARGETS[name][2]:g}"
-        for name, ratio in result["ratios"].items()
+        for name, ratio in ratios.items()
         if ratio < TARGETS[name][2]
     ]
-    for where, ratio in (
-        (f"{result['rows']:,} rows", result["quotas / uniform"]),
-        (f"{result['many_rows']['rows']:,} rows", result["many_rows"]["quotas / uniform"]),
-    ):
-        if ratio > QUOTA_TARGET:
-            found.append(f"quotas / uniform at {where}: {ratio:.2f}, at most {QUOTA_TARGET:g}")
-    if (share := result["record"]["share"]) > RECORD_TARGET:
+    for part in (result[name] for name in ("sampling", "many_rows") if name in result):
+        if (ratio := part["quotas / uniform"]) > QUOTA_TARGET:
+            where = f"quotas / uniform at {part['rows']:,} rows"
+            found.append(f"{where}: {ratio:.2f}, at most {QUOTA_TARGET:g}")
+    if "record" in result and (share := result["record"]["share"]) > RECORD_TARGET:
         found.append(f"record: {share:.1%} of an update, at most {RECORD_TARGET:.0%}")
     return found
 
 
 def show(result: dict[str, Any]) -> None:
     """The figures as a table and lines, for people."""
-    us = result["cpu_us_per_batch"]
-    print(f"{result['rows']:,} rows of {result['row_floats']} floats, batch {result['batch']}")
-    for name, value in us.items():
-        print(f"  {name:22} {value:10.1f} us of CPU a batch {value / us['uniform']:8.2f} x uniform")
-    for name, why in result["left_out"].items():
-        print(f"  {name:22} left out: {why}")
-    for name, ratio in result["ratios"].items():
-        print(f"  {name:38} {ratio:6.2f}  (target {TARGETS[name][2]:g})")
-    for name in ("many_rows", "panel_build", "record", "cold_panel", "fresh_ring"):
-        figures = ", ".join(f"{key} {value:,.4g}" for key, value in result[name].items())
-        print(f"{name}: {figures}")
+    for section, figures in result.items():
+        if section == "sampling":
+            us = figures["cpu_us_per_batch"]
+            print(f"{figures['rows']:,} rows of {figures['row_floats']} floats, batch {BATCH}")
+            for name, value in us.items():
+                times = value / us["uniform"]
+                print(f"  {name:22} {value:10.1f} us of CPU a batch {times:8.2f} x uniform")
+            for name, why in figures["left_out"].items():
+                print(f"  {name:22} left out: {why}")
+            for name, ratio in figures["ratios"].items():
+                print(f"  {name:38} {ratio:6.2f}  (target {TARGETS[name][2]:g})")
+        elif section != "missed":
+            line = ", ".join(f"{key} {value:,.4g}" for key, value in figures.items())
+            print(f"{section}: {line}")
     print("\n".join(f"missed: {line}" for line in result["missed"]) or "all targets met")
 
 

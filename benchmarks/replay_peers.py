@@ -87,6 +87,7 @@ def _torchrl(columns: Columns, batch: int, sampler: Any) -> Any:
     from tensordict import TensorDict
     from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
+    logging.getLogger("torchrl").setLevel(logging.ERROR)
     count = columns.count
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(count), sampler=sampler, batch_size=batch, priority_key="td"
@@ -184,7 +185,6 @@ def prioritised(columns: Columns, batch: int, errors: np.ndarray) -> dict[str, D
 
 
 def _installed(makers: dict[str, Any], *given: Any) -> dict[str, Draw | str]:
-    logging.getLogger("torchrl").setLevel(logging.ERROR)
     made: dict[str, Draw | str] = {}
     for name, maker in makers.items():
         try:

@@ -14,6 +14,7 @@ the block, and the weights are those of that distribution.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -218,7 +219,10 @@ class Priorities:
         chunk = np.minimum(np.searchsorted(ends, at, "right"), len(chunks) - 1)
         rest = (at - (ends[chunk] - chunks[chunk])).astype(np.float32)
         inside = self._priority[first : first + len(chunks) * CHUNK].reshape(-1, CHUNK)[chunk]
-        upto = _UPTO @ inside.T  # (CHUNK, n)
+        upto = np.ascontiguousarray(inside.T)  # (CHUNK, n)
+        # Not by a product with ones: BLAS would wake its threads, which costs more than the sums.
+        for before, here in itertools.pairwise(upto):
+            here += before
         # As many of the chunk's members are passed as sums up to them are at or below the rest.
         member = np.add.reduce(upto[:-1] <= rest, axis=0, dtype=np.int8)
         place: Ints = chunk * CHUNK + member
@@ -239,9 +243,6 @@ class Priorities:
         self._new[self._filled] = state["new"]
         self._largest = np.array(state["largest"], np.float32)
         self._any_new, self._stale_new = True, bool(state["stale_new"])
-
-
-_UPTO: F32 = np.tril(np.ones((CHUNK, CHUNK), np.float32))
 
 
 def _weights(drawn: F32, priority: F32, total: float, beta: float) -> F32:
