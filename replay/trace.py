@@ -166,6 +166,9 @@ def _of_twin(
             "condition": found.episode["true_condition"],
             "seed": found.episode["episode_seed"],
         }
+        found.notes.append(
+            "the twin lays the episode out again from its spec; the actions taken are not kept"
+        )
         if found.episode["perturbation"] != "nominal":
             found.notes.append(
                 f"its perturbation {found.episode['perturbation']!r} is part of what lays it out"
