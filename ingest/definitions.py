@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -20,9 +21,14 @@ from restock.errors import RecordingError
 from restock.ingest.fields import DTYPES, CannotDecode, FieldType, Many, MessageType
 from restock.ingest.storage import Channel
 
+# The IDL parser's time is exponential in how deep these nest; rosidl writes none of either.
+_QUOTED = re.compile(r'"(?:\\.|[^"\\])*(?:"|\Z)|//[^\n]*|/\*.*?(?:\*/|\Z)', re.DOTALL)
+_ANNOTATION = re.compile(r"@\s*\w[\w:]*\s*\(")
+_NESTED = re.compile(r"(?:<[^<>]*){4}")
+
 DEFAULT_DISTRO = "humble"
 _STORES = {store.value.removeprefix("ros2_"): store for store in Stores}
-LONGEST_DEFINITION = 4 << 20
+LONGEST_DEFINITION = 512 << 10  # real ones have up to some 50 kB, and the parser is slow
 LONGEST_ARRAY = 1 << 20
 
 EMPTY = "structure_needs_at_least_one_member"  # stands in a message without fields
@@ -132,6 +138,8 @@ def _embedded(name: str, form: str, definition: bytes, distro: str) -> RosType:
         rule = "=" * 80 + "\n"
         if form != "ros2idl":
             types.update(get_types_from_msg(text, name))
+        elif _costly(text):
+            raise CannotDecode("its definition nests brackets, which is not read")
         elif text.startswith(f"{rule}IDL: "):
             for part in text.split(rule)[1:]:
                 types.update(get_types_from_idl(part.split("\n", 1)[1]))
@@ -149,6 +157,11 @@ def _embedded(name: str, form: str, definition: bytes, distro: str) -> RosType:
     found = RosType(name, source, types)
     found.leaves()  # refuses what cannot be read
     return found
+
+
+def _costly(idl: str) -> bool:
+    bare = _ANNOTATION.sub(" ", _QUOTED.sub(" ", idl))
+    return "(" in bare or _NESTED.search(bare) is not None
 
 
 def _named(types: dict[str, Any]) -> set[str]:

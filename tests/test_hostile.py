@@ -20,7 +20,10 @@ from mcap.writer import CompressionType, Writer
 
 from restock.cli import main
 from restock.errors import RecordingError, visible
+from restock.ingest.definitions import message_type
+from restock.ingest.fields import CannotDecode
 from restock.ingest.readers import open_recording
+from restock.ingest.storage import Channel
 
 # -- sqlite: programs in place of tables ----------------------------------------------------------
 
@@ -302,6 +305,30 @@ with open_recording(sys.argv[1]) as recording:
     recording.read({topic: recording.leaves(topic) for topic in recording.topics})
     print(sum(a.decoded + sum(a.reasons.values()) for a in recording.accounts.values()))
 """
+
+
+IDL = "module pkg {{ module msg {{ {} struct T {{ {} double x; }}; }}; }};"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        IDL.format("const uint8 N = " + "(" * 9 + "1" + ")" * 9 + ";", ""),
+        IDL.format("", "sequence<" * 20 + "double" + ">" * 20 + " y;"),
+        IDL.format('const string S = "' + "\\\\" * 99_999, ""),
+        "/*" * 99_999 + "(",
+    ],
+)
+def test_idl_that_would_take_its_parser_hours_is_refused(text: str) -> None:
+    channel = Channel(1, "/t", "pkg/msg/T", "cdr", "ros2idl", text.encode())
+    with pytest.raises(CannotDecode, match=r"nests brackets|cannot be parsed"):
+        message_type(channel, "humble")
+
+
+def test_brackets_in_annotations_and_comments_are_no_hindrance() -> None:
+    text = '@verbatim (language="comment", text="(a (b")  double y;  // sequence<(<<<<'
+    channel = Channel(1, "/t", "pkg/msg/T", "cdr", "ros2idl", IDL.format("", text + "\n").encode())
+    assert [leaf.path for leaf in message_type(channel, "humble").leaves()] == ["y", "x"]
 
 
 # -- metadata.yaml ------------------------------------------------------------------------------
