@@ -260,3 +260,22 @@ def test_a_panel_of_several_steps_is_refused(panel_of: Callable[..., Panel]) -> 
 def test_without_logs_and_without_steps_there_is_nothing_to_draw() -> None:
     with pytest.raises(MixtureError, match="no fresh row to draw"):
         MixtureVectorReplayBuffer(100, 1).sample_indices(4)
+
+
+def test_commands_of_logs_stand_beside_continuous_fresh_ones(panel: Panel) -> None:
+    commands = np.linspace(-1, 1, 2 * len(panel)).reshape(-1, 2)
+    buffer = MixtureVectorReplayBuffer(50, 1, panel=panel, logs_share=0.5, commands=commands)
+    seen = np.zeros((1, TASK.observation_size), np.float32)
+    row = Batch(
+        obs=seen,
+        act=np.array([[0.25, -0.5]]),
+        rew=np.array([0.0]),
+        terminated=np.array([False]),
+        truncated=np.array([False]),
+        obs_next=seen,
+        info=np.array([{}]),
+    )
+    buffer.add(row, buffer_ids=[0])
+    batch, index = buffer.sample(8)
+    np.testing.assert_allclose(batch.act[4:], [[0.25, -0.5]] * 4)
+    np.testing.assert_allclose(batch.act[:4], commands[index[:4] - 50], rtol=1e-6)
