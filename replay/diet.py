@@ -99,7 +99,7 @@ class Diet:
         portions += mixture.sources.parts.values()
         self._moves = any(knots(portion) for portion in portions)
         self._work_out(mixture.shortfall)
-        self.planned_shares, self.planned_logs_share = self.shares.copy(), self.logs_share
+        self.planned_shares = self.shares.copy()
         if mixture.adaptive is not None:
             for source in self.sources:
                 floors = np.array([rule.floor for rule in source.rules])

@@ -19,7 +19,6 @@ class SharePlan:
 
     wanted: F64  # after floors and caps
     got: F64  # sums to 1
-    limit: F64  # the most a stratum's rows can bear
     scale: float  # of the logs' part of a batch: below 1 only where the mixture shrinks
     notes: tuple[str, ...]  # per stratum, why it got less or more than wanted
 
@@ -69,7 +68,7 @@ def within_limits(
     missing = 1.0 - granted.sum()
     short = wanted > limit + 1e-12
     if missing <= 1e-9:
-        return SharePlan(wanted, wanted, limit, 1.0, ("",) * len(wanted))
+        return SharePlan(wanted, wanted, 1.0, ("",) * len(wanted))
     if shortfall == "refuse":
         raise MixtureError(
             f"not enough rows: {complaints()}",
@@ -83,18 +82,16 @@ def within_limits(
     notes = np.where(short, "short of rows", "")
     if shortfall == "shrink":
         return SharePlan(
-            wanted, granted / granted.sum(), limit, float(granted.sum()), tuple(notes.tolist())
+            wanted, granted / granted.sum(), float(granted.sum()), tuple(notes.tolist())
         )
     roof = np.maximum(granted, np.minimum(limit, caps))
     scale = min(float(roof.sum()), 1.0)
     if scale < 1.0 - 1e-9:  # every stratum is at its limit: what is left cannot come from the logs
         notes = np.where(short, "short of rows", np.where(roof > 0, "gives all it can", ""))
-        return SharePlan(wanted, roof / scale, limit, scale, tuple(notes.tolist()))
+        return SharePlan(wanted, roof / scale, scale, tuple(notes.tolist()))
     got = scaled_within(granted, granted, roof)
     more = (got > granted + 1e-9) & ~short
-    return SharePlan(
-        wanted, got, limit, 1.0, tuple(np.where(more, "took the surplus", notes).tolist())
-    )
+    return SharePlan(wanted, got, 1.0, tuple(np.where(more, "took the surplus", notes).tolist()))
 
 
 def wanted_shares(rules: Sequence[StratumRule], rows: Ints, env_steps: float = 0) -> F64:
@@ -120,7 +117,9 @@ def wanted_shares(rules: Sequence[StratumRule], rows: Ints, env_steps: float = 0
     high = np.where(flexible, [rule.cap for rule in rules], 0.0)
     if low.sum() > rest + 1e-9 or high.sum() < rest - 1e-9:
         raise MixtureError(
-            f"floors ({low.sum():g}) and caps ({high.sum():g}) leave no way to share out {rest:g}"
+            f"the strata's floors sum to {low.sum():g} and their caps to {high.sum():g}, which leave"
+            f" no way to share out {rest:g}",
+            remedy="lower a floor, or raise a cap",
         )
     return given + rest_within(base, low, high, max(rest, 0.0))
 
