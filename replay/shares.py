@@ -117,8 +117,8 @@ def wanted_shares(rules: Sequence[StratumRule], rows: Ints, env_steps: float = 0
     high = np.where(flexible, [rule.cap for rule in rules], 0.0)
     if low.sum() > rest + 1e-9 or high.sum() < rest - 1e-9:
         raise MixtureError(
-            f"the strata's floors sum to {low.sum():g} and their caps to {high.sum():g}, which leave"
-            f" no way to share out {rest:g}",
+            f"the strata's floors sum to {low.sum():g} and their caps to {high.sum():g}, which"
+            f" leave no way to share out {rest:g}",
             remedy="lower a floor, or raise a cap",
         )
     return given + rest_within(base, low, high, max(rest, 0.0))
