@@ -1,9 +1,9 @@
 """What the SQL of a condition may say: an expression over the steps of its episode, nothing else.
 
 Profiles are passed between strangers, so a condition is read before it is run: no query inside,
-no other table, no function that looks outside the row's data (files, settings, time, chance) or that
-grows without bound. It stays in its episode, and a `pre` condition looks at no later step. Beside that DuckDB runs it
-without access to files and with its settings locked.
+no other table, no function that looks outside the row's data (files, settings, time, chance) or
+that grows without bound. It stays in its episode, and a `pre` condition looks at no later step.
+Beside that DuckDB runs it without access to files and with its settings locked.
 """
 
 from __future__ import annotations
