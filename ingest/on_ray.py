@@ -8,6 +8,8 @@ system, or a store on S3.
 from __future__ import annotations
 
 import os
+import re
+import socket
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +21,7 @@ from restock.ingest.batch import AGAIN, Result, out_of_memory
 if TYPE_CHECKING:
     from restock.ingest.batch import Job
 
+CONNECT_S = 5
 ENVIRONMENT = "AWS_"  # what the tasks are given of this process's environment
 
 
@@ -65,6 +68,7 @@ def _cluster(workers: int) -> Iterator[Any]:
         yield ray
         return
     address = os.environ.get("RAY_ADDRESS")
+    _expect(address)
     quiet: dict[str, Any] = {"logging_level": "error", "log_to_driver": False}
     try:
         if address:
@@ -82,6 +86,20 @@ def _cluster(workers: int) -> Iterator[Any]:
         yield ray
     finally:
         ray.shutdown()
+
+
+def _expect(address: str | None) -> None:
+    """Knock at a cluster's door: Ray itself would wait for minutes."""
+    found = re.fullmatch(r"(?:ray://)?([^:/]+):(\d+)", address or "")
+    if found is None:  # none, or a word like "auto"
+        return
+    try:
+        socket.create_connection((found[1], int(found[2])), timeout=CONNECT_S).close()
+    except (OSError, OverflowError) as error:
+        raise ConfigError(
+            f"no Ray cluster at {address}: {error}",
+            remedy="check RAY_ADDRESS, or unset it to start one here",
+        ) from error
 
 
 def _task(job: Job, path: Path, folder: str, environment: dict[str, str]) -> Result:

@@ -91,3 +91,11 @@ def test_without_ray_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ConfigError, match=r"pip install 'restock\[ray\]'"):
         list(run_on_ray(Job(load_profile("warehouse_amr"), None), [Path("x.mcap")]))
+
+
+def test_a_cluster_that_is_not_there_is_said_so(monkeypatch):
+    ray = pytest.importorskip("ray")
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
+    with pytest.raises(ConfigError, match=r"no Ray cluster at 127\.0\.0\.1:1: .*refused"):
+        list(run_on_ray(Job(load_profile("warehouse_amr"), None), [Path("x.mcap")]))
