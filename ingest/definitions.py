@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 from rosbags.interfaces import Nodetype
@@ -30,6 +30,7 @@ DEFAULT_DISTRO = "humble"
 _STORES = {store.value.removeprefix("ros2_"): store for store in Stores}
 LONGEST_DEFINITION = 512 << 10  # real ones have up to some 50 kB, and the parser is slow
 LONGEST_ARRAY = 1 << 20
+KEPT = 1024  # types as recordings define them
 
 EMPTY = "structure_needs_at_least_one_member"  # stands in a message without fields
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
@@ -130,7 +131,7 @@ def _from_distro(name: str, distro: str) -> RosType:
     return found
 
 
-@cache
+@lru_cache(KEPT)
 def _embedded(name: str, form: str, definition: bytes, distro: str) -> RosType:
     try:
         text = definition.decode()

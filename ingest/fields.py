@@ -17,6 +17,7 @@ from restock.errors import RecordingError, visible
 
 DEEPEST = 24  # nested messages; real ones reach 6
 MOST_FIELDS = 20_000
+LONGEST_WHY = 300  # it may quote a definition
 
 DTYPES: dict[str, np.dtype[Any]] = {
     "bool": np.dtype(np.bool_),
@@ -40,7 +41,7 @@ class CannotDecode(Exception):
     """A type that cannot be decoded, and why: the topic is skipped, the recording is not."""
 
     def __init__(self, why: str) -> None:
-        super().__init__(visible(why))
+        super().__init__(visible(why if len(why) <= LONGEST_WHY else f"{why[:LONGEST_WHY]}…"))
 
 
 @dataclass(frozen=True)

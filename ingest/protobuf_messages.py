@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 from graphlib import CycleError, TopologicalSorter
 from itertools import chain
 from typing import Any
@@ -25,6 +25,7 @@ from restock.ingest.rows import Unparsable, objects
 
 LARGEST = 256 << 20  # bytes of a message
 LONGEST_DEFINITION = 4 << 20
+KEPT = 256  # types: each keeps its pool
 TIMES = ("google.protobuf.Timestamp", "google.protobuf.Duration")
 
 _BASES = {
@@ -70,7 +71,7 @@ def _field(field: Any) -> FieldType:
     return FieldType(field.name, _BASES[field.cpp_type], None, many)
 
 
-@cache
+@lru_cache(KEPT)
 def protobuf_type(name: str, definition: bytes) -> ProtobufType:
     """The type of this name in a serialised FileDescriptorSet.
 
