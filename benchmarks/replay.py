@@ -401,7 +401,7 @@ def sampling(quick: bool) -> dict[str, Any]:
 
 def _turns(quick: bool) -> tuple[int, int]:
     """Rounds, and draws of each contender in one."""
-    return (5, 128) if quick else (9, 192)
+    return (5, 128) if quick else (7, 384)
 
 
 SECTIONS: dict[str, Callable[[bool], dict[str, Any]]] = {

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from restock.errors import MixtureError
 from restock.replay.layout import F32, F64, Bools, Ints
 from restock.replay.priorities import Lap, Per, Priorities, Rule
-from restock.replay.sampler import BLOCK, QuotaSampler
+from restock.replay.sampler import QuotaSampler
 
-FEW_ROWS = 100_000  # below, sums are refreshed more often: it costs little, and the rows come round
-FEW_ROWS_BLOCK = 8
+# Of batches drawn from one state of the priorities. A block draws at most a sixteenth of the rows,
+# so that few come again before what was learnt of them counts; many rows cost more to sum.
+FEWEST, MOST = 8, 128
 
 
 class PrioritySampler(QuotaSampler):
@@ -23,8 +24,8 @@ class PrioritySampler(QuotaSampler):
     Args:
         rule: `Per()` or `Lap()`, of all strata or of each, (S,). A stratum that has None is drawn
             from as `replacement` says.
-        refresh_every: batches drawn from one state of the priorities; None: 64, or 8 below 100,000
-            rows. 1 draws every batch from the priorities as they are.
+        refresh_every: batches drawn from one state of the priorities; None: as many as a sixteenth
+            of the rows make, within 8 and 128. 1 draws every batch from the priorities as they are.
 
     After each draw, `drawn_weights` (B,) are the importance weights of the distribution that the
     batch was really drawn from, and `update` takes the |TD errors| of what was learnt.
@@ -53,7 +54,8 @@ class PrioritySampler(QuotaSampler):
         again = [own or rule is not None for own, rule in zip(given, rules, strict=True)]
         super().__init__(stratum_rows, shares, batch_size, rng, weights=weights, replacement=again)
         if refresh_every is None:
-            refresh_every = BLOCK if self.sizes.sum() >= FEW_ROWS else FEW_ROWS_BLOCK
+            some = int(self.sizes.sum()) // (16 * batch_size)
+            refresh_every = min(max(some, FEWEST), MOST)
         if refresh_every < 1:
             raise MixtureError(f"refresh_every must be at least 1, got {refresh_every}")
         self.block = refresh_every
