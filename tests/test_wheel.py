@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-SHIPPED = {".py", ".sql", ".toml", ".jinja", ".typed"}
+SHIPPED = {".py", ".sql", ".toml", ".json", ".jinja", ".typed"}
 
 
 @pytest.fixture(scope="module")

@@ -126,7 +126,7 @@ def _unlabelled(first: Feed, second: Feed, limits: Limits) -> list[Check]:
     if most <= limits.unlabelled:
         return []
     name = "unlabelled share of fresh rows"
-    return [Check(name, "whole run", *shares, most, 0.0, most, limits.unlabelled)]
+    return [Check(name, "whole run", shares[0], shares[1], most, 0.0, most, limits.unlabelled)]
 
 
 def _episodes(first: Feed, second: Feed, limits: Limits) -> list[Check]:
