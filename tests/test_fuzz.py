@@ -16,6 +16,7 @@ FOUND = sorted((FUZZ / "found").iterdir())
 
 
 def target() -> ModuleType:
+    sys.path.insert(0, str(FUZZ))  # as for a script in that folder
     spec = importlib.util.spec_from_file_location("fuzz_readers", FUZZ / "readers.py")
     assert spec is not None
     assert spec.loader is not None
@@ -25,7 +26,7 @@ def target() -> ModuleType:
 
 
 READERS = target()
-SEEDS = list(READERS.seeds())
+SEEDS: list[bytes] = list(READERS.seeds())
 
 
 @pytest.mark.parametrize("path", FOUND, ids=lambda path: path.name)
