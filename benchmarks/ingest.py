@@ -1,6 +1,6 @@
 """Recordings to columns and to a store: Restock beside its peers, as CPU time over decompression.
 
-    python benchmarks/ingest.py [--quick] [--json] [--check]
+    python benchmarks/ingest.py [--quick] [--json] [--check] [--rounds N]
 
 All contestants read the same generated log (20 minutes of it, 2 with `--quick`) in one process,
 one after the other in every round; their values are compared along the way. Then the whole of
