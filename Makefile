@@ -3,12 +3,13 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-.PHONY: demo test test-slow lint sample-logs clean
+.PHONY: demo test test-slow neighbours lint sample-logs clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo         recordings in, a fine-tuned policy and a report out (build/demo/report.html)"
 	@echo "make test         the tests (make test-slow: the slow ones too)"
+	@echo "make neighbours   a Python with d3rlpy and lerobot, for the tests that read exports with them"
 	@echo "make lint         ruff and mypy"
 	@echo "make sample-logs  record sample_logs/ anew from its seed"
 
@@ -32,6 +33,17 @@ test: $(VENV)/.dev
 test-slow: $(VENV)/.dev
 	$(BIN)/python -m pytest -m ''
 
+# d3rlpy pins an old gymnasium and lerobot a CUDA torch: the tests that read exports back with the
+# real libraries use a Python of their own, where there is one.
+neighbours: .venv-neighbours/.ready
+
+.venv-neighbours/.ready: Makefile
+	$(PYTHON) -m venv .venv-neighbours
+	.venv-neighbours/bin/pip install --quiet --disable-pip-version-check 'torch>=2.6,<2.14' \
+		'd3rlpy>=2.8' datasets pandas av draccus einops jsonlines psutil deepdiff pillow safetensors packaging
+	.venv-neighbours/bin/pip install --quiet --disable-pip-version-check --no-deps lerobot accelerate
+	@touch $@
+
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -41,4 +53,4 @@ sample-logs: $(VENV)/.runtime
 	$(BIN)/python sample_logs/make.py
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info
+	rm -rf $(VENV) .venv-neighbours build dist *.egg-info
