@@ -14,6 +14,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext, SpawnContext
 from multiprocessing.process import BaseProcess
@@ -90,6 +91,12 @@ def side_by_side(
         for worker in pool:
             worker.process.join(PATIENCE_S)
             worker.process.kill()
+
+
+def warm_up() -> None:
+    """Let the server of processes import what they need, while this process does."""
+    if isinstance(_context(), ForkServerContext):
+        forkserver.ensure_running()
 
 
 def _serve(pipe: Connection, work: Callable[[Path], T]) -> None:

@@ -53,6 +53,10 @@ class Ingest:
 
     def run(self) -> int:
         """Ingest each recording; the exit code for them all."""
+        from restock.ingest.workers import warm_up
+
+        if self.workers > 1 and self.engine == "processes":
+            warm_up()
         from restock.cli import output
         from restock.ingest.batch import Job, ingest_all
         from restock.ingest.profile import load_profile
