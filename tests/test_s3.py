@@ -135,7 +135,7 @@ def _write(place: str, recording: int, ingest: str) -> None:
 
 def test_writers_at_the_same_time_lose_nothing_and_double_nothing(place):
     """Processes that all make the store, two of them with the same recording."""
-    context = multiprocessing.get_context("forkserver")
+    context = multiprocessing.get_context("spawn")
     jobs = [(1, "a"), (1, "b"), (2, "a"), (3, "a")]
     processes = [context.Process(target=_write, args=(place, *job)) for job in jobs]
     for process in processes:
@@ -172,11 +172,12 @@ def _write_for_ever(place: str) -> None:
 
 def test_a_killed_writer_leaves_the_last_whole_commit(place):
     StoreWriter(place).write(*one(1, "first"))
-    context = multiprocessing.get_context("forkserver")
+    context = multiprocessing.get_context("spawn")
     process = context.Process(target=_write_for_ever, args=(place,))
     process.start()
-    while "-first" in next(iter(shown(place))):
-        time.sleep(0.01)  # until it is at work
+    while "-first" in next(iter(shown(place))):  # until it is at work
+        assert process.is_alive()
+        time.sleep(0.01)
     time.sleep(0.2)
     assert process.pid is not None
     os.kill(process.pid, signal.SIGKILL)
