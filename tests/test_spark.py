@@ -43,7 +43,9 @@ def spark() -> Iterator[Any]:
     server = sail.SparkConnectServer("127.0.0.1", 0)
     server.start(background=True)
     _, port = server.listening_address
-    yield session.builder.remote(f"sc://127.0.0.1:{port}").getOrCreate()
+    connected = session.builder.remote(f"sc://127.0.0.1:{port}").getOrCreate()
+    yield connected
+    connected.stop()  # before its server: at exit the client would look for that for minutes
     server.stop()
 
 
