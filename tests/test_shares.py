@@ -105,7 +105,8 @@ def test_priorities_part_the_rows(data: st.DataObject) -> None:
     member = np.array(flags, np.bool_).reshape(count, size)
     priority = data.draw(st.lists(st.integers(0, 3), min_size=size, max_size=size))
     strata = [
-        Stratum(StratumRule(name=f"s{i}"), "true", None, p, "pre", "none") for i, p in enumerate(priority)
+        Stratum(StratumRule(name=f"s{i}"), "true", None, p, "pre", "none")
+        for i, p in enumerate(priority)
     ]
     code = assign(member, strata)
     for row in range(count):
