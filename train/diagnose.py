@@ -10,7 +10,8 @@ networks disagree. The evaluations' own steps (`held_out`), which no replay has,
     L    mean |Q - Q_target| / mean |Q|
     S    |TD| with the online network bootstrapping / |TD| with the target network
 
-The limits were set on faults planted in the twin; docs/diagnose.md has the confusion table.
+The limits are first values, from healthy runs and one with too slow a target; benchmarks/
+planted_faults.py plants seven faults, by which they are to be set.
 """
 
 from __future__ import annotations
