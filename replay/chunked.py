@@ -63,8 +63,7 @@ class ChunkedSampler:
         if chunk_rows < 1:
             raise MixtureError(f"chunk_rows must be at least 1, got {chunk_rows}")
         self.sizes: Ints = np.array([len(members) for members in stratum_rows], np.int64)
-        self.quotas = Quotas(shares, batch_size)
-        self._check_shares(self.quotas.shares)
+        self.quotas = Quotas(shares, batch_size, self.sizes)
         self.rng = rng
         self._file = RowFile(rows)
         row_bytes = 4 * self._file.width + 16  # with its number and its place in the order
@@ -130,19 +129,11 @@ class ChunkedSampler:
         Raises:
             MixtureError: shares that are no distribution, or a share on an empty stratum.
         """
-        self._check_shares(Quotas(shares, self.batch_size).shares)
         self.quotas.set_shares(shares)
 
     def set_batch_size(self, batch_size: int) -> None:
         """Batches of another size from the next one on."""
         self.quotas.set_batch_size(batch_size)
-
-    def _check_shares(self, shares: F64) -> None:
-        for stratum in np.flatnonzero((shares > 0) & (self.sizes == 0)).tolist():
-            raise MixtureError(
-                f"stratum {stratum} has a share of {shares[stratum]:g} and no rows",
-                remedy="give it share 0, or let `restock mix` redistribute it",
-            )
 
     def close(self) -> None:
         """Close the panel's file."""

@@ -62,8 +62,7 @@ class DeviceSampler:
             raise MixtureError(f"{len(stratum_rows)} strata but {len(shares)} shares")
         self.device = torch.device(device)
         self.sizes: Ints = np.array([len(rows) for rows in stratum_rows], np.int64)
-        self.quotas = Quotas(shares, batch_size)
-        self._check_shares(self.quotas.shares)
+        self.quotas = Quotas(shares, batch_size, self.sizes)
         strata = len(self.sizes)
         whole = rule is None or isinstance(rule, Per | Lap)
         self.rules: list[Rule | None] = [rule] * strata if whole else list(rule)  # type: ignore
@@ -145,12 +144,10 @@ class DeviceSampler:
         Raises:
             MixtureError: shares that are no distribution, or a share on an empty stratum.
         """
-        given = Quotas(shares, self.batch_size).shares
-        if np.array_equal(given, self.quotas.shares):
-            return
-        self._check_shares(given)
-        self._hand_back()
-        self.quotas.set_shares(shares)
+        given = self.quotas.checked(shares)
+        if not np.array_equal(given, self.quotas.shares):
+            self._hand_back()
+            self.quotas.set_shares(given)
 
     def set_batch_size(self, batch_size: int) -> None:
         """Batches of another size from the next one on; what was drawn ahead goes back."""
@@ -158,13 +155,6 @@ class DeviceSampler:
             self._hand_back()
             self.quotas.set_batch_size(batch_size)
             self._rows_ahead = self._strata_ahead = self._members.new_zeros((0, batch_size))
-
-    def _check_shares(self, shares: F64) -> None:
-        for stratum in np.flatnonzero((shares > 0) & (self.sizes == 0)).tolist():
-            raise MixtureError(
-                f"stratum {stratum} has a share of {shares[stratum]:g} and no rows",
-                remedy="give it share 0, or let `restock mix` redistribute it",
-            )
 
     def _priority_of(self, td_abs: Tensor, stratum: Tensor) -> Tensor:
         raised = torch.maximum(td_abs + self._epsilon[stratum], self._floor[stratum])

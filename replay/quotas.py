@@ -16,11 +16,18 @@ class Quotas:
 
     Shares and batch size may change between batches; what a stratum is owed stays owed.
 
+    Args:
+        sizes: rows of each stratum (S,), where a share on an empty one is to be refused.
+
     Raises:
-        MixtureError: shares that are no distribution, or a batch of no rows.
+        MixtureError: shares that are no distribution or on an empty stratum, or a batch of no rows.
     """
 
-    def __init__(self, shares: Sequence[float] | F64, batch_size: int) -> None:
+    def __init__(
+        self, shares: Sequence[float] | F64, batch_size: int, sizes: Ints | None = None
+    ) -> None:
+        self._strata = len(shares) if sizes is None else len(sizes)
+        self._empty = np.zeros(self._strata, np.bool_) if sizes is None else sizes == 0
         self.shares: F64 = np.empty(0)
         self.batch_size = 0
         self._mean: list[float] = []
@@ -37,18 +44,27 @@ class Quotas:
     def carry(self, owed: F64) -> None:
         self._carry = np.asarray(owed, np.float64).tolist()
 
-    def set_shares(self, shares: Sequence[float] | F64) -> None:
-        """Other shares (S,) from the next batch on; a stratum of share 0 is owed nothing."""
+    def checked(self, shares: Sequence[float] | F64) -> F64:
+        """Shares (S,) as `set_shares` would take them, summing to 1."""
         given = np.asarray(shares, np.float64)
         if given.ndim != 1 or not len(given) or not np.isfinite(given).all() or (given < 0).any():
             raise MixtureError(f"shares must be finite and not negative, got {shares!r}")
         if abs(given.sum() - 1.0) > 1e-6:
             raise MixtureError(f"shares must sum to 1, got {given.sum():.6g}")
-        if len(self.shares) and len(given) != len(self.shares):
-            raise MixtureError(f"{len(given)} shares for {len(self.shares)} strata")
+        if len(given) != self._strata:
+            raise MixtureError(f"{len(given)} shares for {self._strata} strata")
+        for stratum in np.flatnonzero((given > 0) & self._empty).tolist():
+            raise MixtureError(
+                f"stratum {stratum} has a share of {given[stratum]:g} and no rows",
+                remedy="give it share 0, or let `restock mix` redistribute it",
+            )
         total = given.sum()
         # Shares that were made to sum to 1 before stay the same to the last bit.
-        self.shares = given if abs(total - 1.0) < 1e-12 else given / total
+        return given if abs(total - 1.0) < 1e-12 else np.asarray(given / total)
+
+    def set_shares(self, shares: Sequence[float] | F64) -> None:
+        """Other shares (S,) from the next batch on; a stratum of share 0 is owed nothing."""
+        self.shares = self.checked(shares)
         self._mean = (self.shares * self.batch_size).tolist()
         drawn = self.shares > 0
         carry = np.where(drawn, self.carry, 0.0)

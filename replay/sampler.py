@@ -87,8 +87,7 @@ class QuotaSampler:
         if len(stratum_rows) != len(shares):
             raise MixtureError(f"{len(stratum_rows)} strata but {len(shares)} shares")
         self.sizes: Ints = np.array([len(rows) for rows in stratum_rows], np.int64)
-        self.quotas = Quotas(shares, batch_size)
-        self._check_shares(self.quotas.shares)
+        self.quotas = Quotas(shares, batch_size, self.sizes)
         self._members = [np.array(rows, np.int64) for rows in stratum_rows]
         last = max((int(rows.max(initial=-1)) for rows in self._members), default=-1)
         self.weights: F32 = np.ones(last + 1, np.float32) if weights is None else weights
@@ -136,12 +135,10 @@ class QuotaSampler:
         Raises:
             MixtureError: shares that are no distribution, or a share on an empty stratum.
         """
-        given = Quotas(shares, self.batch_size).shares
-        if np.array_equal(given, self.quotas.shares):
-            return
-        self._check_shares(given)
-        self._hand_back()
-        self.quotas.set_shares(shares)
+        given = self.quotas.checked(shares)
+        if not np.array_equal(given, self.quotas.shares):
+            self._hand_back()
+            self.quotas.set_shares(given)
 
     def set_batch_size(self, batch_size: int) -> None:
         """Batches of another size from the next one on; what was drawn ahead goes back."""
@@ -150,15 +147,6 @@ class QuotaSampler:
             self.quotas.set_batch_size(batch_size)
             self._ahead_rows = np.zeros((0, batch_size), np.int64)
             self._ahead_strata = np.zeros((0, batch_size), np.int64)
-
-    def _check_shares(self, shares: F64) -> None:
-        if len(shares) != len(self.sizes):
-            raise MixtureError(f"{len(shares)} shares for {len(self.sizes)} strata")
-        for stratum in np.flatnonzero((shares > 0) & (self.sizes == 0)).tolist():
-            raise MixtureError(
-                f"stratum {stratum} has a share of {shares[stratum]:g} and no rows",
-                remedy="give it share 0, or let `restock mix` redistribute it",
-            )
 
     def _draw_block(self) -> None:
         strata = len(self.sizes)
