@@ -17,11 +17,11 @@ from toy_twin import TASK as TOY_TASK
 from restock.errors import MixtureError
 from restock.replay.build import build_panel
 from restock.replay.diet import Diet, FedStratum, PlannedDraws
-from restock.replay.mixed import MixedSampler
 from restock.replay.mixture import Prioritised, parse_mixture
 from restock.replay.panel import Panel
 from restock.replay.ring import FreshRing
 from restock.replay.strata import rules_of
+from restock.replay.within import panel_sampler
 from restock.train.batches import Batches, Logs
 from restock.train.log_draws import LogDraws
 from restock.train.loop import TrainingInterrupted, train
@@ -249,7 +249,7 @@ def test_weights_follow_the_shares_in_force(table: pa.Table, tmp_path: Path) -> 
 
 def test_mixed_rules_keep_exact_quotas_and_their_own_ways() -> None:
     members = [np.arange(0, 50), np.arange(50, 90), np.arange(90, 100)]
-    sampler = MixedSampler(
+    sampler = panel_sampler(
         ["without_replacement", "per", "uniform"],
         members,
         np.array([0.5, 0.3, 0.2]),

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from restock.replay.chunked import ChunkedSampler
 from restock.replay.diet import Diet, FedStratum, PlannedDraws
 from restock.replay.layout import F32, F64, Ints
-from restock.replay.mixed import panel_sampler
 from restock.replay.mixture import Prioritised, Within
 from restock.replay.plan import outcome_column
 from restock.replay.sampler import Sampler
 from restock.replay.strata import rules_of
 from restock.replay.weights import WeightsInForce
+from restock.replay.within import panel_sampler
 from restock.train.checkpoint import generator_state, restore_generator
 
 if TYPE_CHECKING:
