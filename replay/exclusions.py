@@ -13,6 +13,7 @@ from restock.errors import MixtureError
 from restock.replay.candidates import bools, codes
 from restock.replay.layout import Bools, Ints
 from restock.replay.mixture import HeldOut, Mixture
+from restock.replay.splitmix import GOLDEN, splitmix64
 from restock.replay.strata import NO_STRATUM, Stratum
 
 DAY_NS = 86_400 * 10**9
@@ -184,9 +185,5 @@ def _hash(name: str, seed: int) -> int:
 
 
 def scramble(ids: Ints, seed: int) -> NDArray[np.uint64]:
-    """A fixed mixing of ids (splitmix64): the same on every machine, whatever the order."""
-    mixed = ids.astype(np.uint64) + np.uint64((seed * 0x9E3779B97F4A7C15 + 1) % 2**64)
-    mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    result: NDArray[np.uint64] = mixed ^ (mixed >> np.uint64(31))
-    return result
+    """A fixed mixing of ids: the same on every machine, whatever the order."""
+    return splitmix64(ids.astype(np.uint64) + np.uint64((seed * GOLDEN + 1) % 2**64))

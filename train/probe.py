@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from restock.replay.ring import FreshRing
+from restock.replay.splitmix import GOLDEN, splitmix64
 from restock.train.batches import Logs
 from restock.train.learner import Learner
 from restock.train.target import value_lag
@@ -111,8 +112,4 @@ class Probe:
 
 def _scramble(key: NDArray[np.int64]) -> NDArray[np.uint64]:
     """A fixed mixing of ids (splitmix64), so that the choice depends on ids, not on order."""
-    mixed = key.astype(np.uint64) + np.uint64(0x9E3779B97F4A7C15)
-    mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    result: NDArray[np.uint64] = mixed ^ (mixed >> np.uint64(31))
-    return result
+    return splitmix64(key.astype(np.uint64) + np.uint64(GOLDEN))
