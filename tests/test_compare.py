@@ -195,7 +195,12 @@ def test_another_feed_is_refused_unless_it_is_the_treatment(tmp_path, capsys) ->
 
 
 @pytest.mark.parametrize(
-    "changes", [{"panel__store_version": 4}, {"config__evaluation__seed": 91_000}]
+    "changes",
+    [
+        {"panel__store_version": 4},
+        {"panel__store": "another"},
+        {"config__evaluation__seed": 91_000},
+    ],
 )
 def test_even_mixtures_need_one_store_and_one_evaluation(tmp_path, capsys, changes) -> None:
     first = arm(tmp_path, "a", range(1))

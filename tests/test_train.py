@@ -59,6 +59,7 @@ def test_a_run_says_what_it_was_made_from(trained: Path, panel: Path) -> None:
     document = json.loads((trained / "config.json").read_text())
     header = json.loads((panel / "panel.json").read_text())
     assert document["panel"]["id"] == header["id"]
+    assert document["panel"]["store"] == header["store"]  # by which `restock compare` knows it
     assert document["task_hash"] == load_profile("warehouse_amr").task.hash
     assert document["target"] == {"rule": "polyak", "tau": 0.005, "effective_lag_updates": 200.0}
     assert document["seeds"]["run"] == 0

@@ -45,6 +45,7 @@ _KINDS: dict[str, Kind] = {
     "config": "feed",  # replay, schedule, env, epsilon: which rows there are and how often
     "panel.store": "store",
     "panel.store_version": "store",
+    "panel.others": "store",
     "panel.labels_version": "store",
     "panel.path": "free",
     "panel": "feed",

@@ -11,7 +11,7 @@ import numpy as np
 
 from restock.ingest.profile import Profile
 from restock.replay.panel import Panel
-from restock.train.run import Run, now_ns, software_versions
+from restock.train.run import Run, now_ns, panel_document, software_versions
 from restock.train.run_tables import TABLES
 
 # Of an episode that ended, by the info of its last step.
@@ -69,16 +69,8 @@ def known(value: Any) -> Any:
 def _fed(panel: Panel | None) -> dict[str, Any] | None:
     if panel is None:
         return None
-    return {
-        "path": str(panel.path.resolve()),
-        "id": panel.id,
-        "store_version": panel.store_version,
-        "rows": len(panel),
-        "n_step": panel.n_step,
-        "discount": panel.discount,
-        "labels_version": panel.header.labels_version,
-        "strata": {stratum.name: stratum.share for stratum in panel.strata},
-    }
+    strata = {stratum.name: stratum.share for stratum in panel.strata}
+    return {**panel_document(panel), "strata": strata}
 
 
 def episode_row(env: int, key: int, info: Mapping[str, Any]) -> dict[str, Any]:

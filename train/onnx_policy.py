@@ -6,7 +6,6 @@ action table in m/s and rad/s, the control period) stands in its metadata as JSO
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from restock.ingest.task import Task
 from restock.train.config import parse_config
 from restock.train.eval_run import load_agent
 from restock.train.network import Network, QNetwork
-from restock.train.run import Run
+from restock.train.run import Run, write_bytes
 
 FORMAT = "restock-policy/1"
 _OPSET = 18
@@ -58,13 +57,7 @@ def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
     }
     onnx.helper.set_model_props(model, said)
     onnx.checker.check_model(model, full_check=True)
-    temporary = out.with_name(f".{out.name}.{os.getpid()}.tmp")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        temporary.write_bytes(model.SerializeToString())
-        temporary.replace(out)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_bytes(out, model.SerializeToString())
     return {"path": str(out), "bytes": out.stat().st_size, **said}
 
 

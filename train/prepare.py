@@ -20,7 +20,7 @@ from restock.train.evaluate import Twin
 from restock.train.explore import AFTER_LOGS
 from restock.train.learner import open_device
 from restock.train.log_draws import diet_of
-from restock.train.run import Run, check_free, now_ns, software_versions
+from restock.train.run import Run, check_free, now_ns, panel_document, software_versions
 from restock.train.session import Session, open_session
 from restock.train.target import describe
 
@@ -189,14 +189,7 @@ def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dic
     if panel is not None:
         diet = diet_of(panel, planned_draws(config), config.replay.logs_share)
         fed = {
-            "path": str(panel.path.resolve()),
-            "id": panel.id,
-            "store_version": panel.store_version,
-            "rows": len(panel),
-            "n_step": panel.n_step,
-            "discount": panel.discount,
-            "labels_version": panel.header.labels_version,
-            "others": [msgspec.structs.asdict(store) for store in panel.header.others],
+            **panel_document(panel),
             # The mixture worked out for this run's own draws: shares as it begins.
             "strata": {
                 s.name: share for s, share in zip(panel.strata, diet.shares.tolist(), strict=True)

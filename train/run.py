@@ -15,13 +15,17 @@ import time
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from restock.errors import RunError
 from restock.train.run_tables import TABLES
+
+if TYPE_CHECKING:
+    from restock.replay.panel import Panel
 
 FORMAT = "restock-run/1"
 _LONG_TABLE = 4096  # rows
@@ -187,6 +191,22 @@ def software_versions() -> dict[str, str]:
     }
 
 
+def panel_document(panel: Panel) -> dict[str, Any]:
+    """What a run's `config.json` says of its panel, whoever trains."""
+    header = panel.header
+    return {
+        "path": str(panel.path.resolve()),
+        "id": panel.id,
+        "store": header.store,
+        "store_version": panel.store_version,
+        "others": [msgspec.structs.asdict(store) for store in header.others],
+        "rows": len(panel),
+        "n_step": panel.n_step,
+        "discount": panel.discount,
+        "labels_version": header.labels_version,
+    }
+
+
 def now_ns() -> int:
     """Wall time, to which the ages of logged rows refer."""
     return time.time_ns()
@@ -205,9 +225,15 @@ def write_table(table: pa.Table, path: Path) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Replace a text file in one step."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Replace a file in one step."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_bytes(content)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
