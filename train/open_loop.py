@@ -1,0 +1,171 @@
+"""Open-loop replay: logged commands driven again in the twin, beside what the robot did.
+
+The commands of each segment are driven in the twin's physics, which is told nothing on the way.
+The W steps before a segment begin with the logged motion, and are driven only so that ramps and
+late commands are under way when the K steps begin. Then the twin's pose is put on the logged pose,
+and the two go their ways.
+
+The floor is empty. Obstacles of a log are not known, racks of another floor are not there, and a
+pose that localisation has 3 cm wrong must not become a collision: what is asked is how the robot
+moves, and steps with contact are told by the signal `bumped`. Nor are slippery patches known.
+Without obstacles the motion does not depend on where it begins, so all segments are driven from one
+place and laid onto the map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.ingest.signals import localised_velocity, wrap_angle
+from restock.ingest.task import Task
+from restock.train.episode import Episode, EpisodeSpec
+from restock.train.layout import Warehouse
+from restock.train.log_segments import MOTION, POSE, Segments
+from restock.train.model import WHEEL_RADIUS_M, body_velocity, wheel_commands
+from restock.train.perturbation import Perturbation
+from restock.train.simulation import Simulation
+
+F64 = NDArray[np.float64]
+
+PREDICTED = (*POSE, *MOTION)  # what the twin says of each step
+ROBOTS = 512  # simulated at a time
+_START_M = 250.0
+_STRIPS = ((0.0, 499.95), (500.05, 1000.0))  # a warehouse has a rack: one of .1 m, far away
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """What P twins did under the commands of S segments.
+
+    `signals` has the names of `PREDICTED`, each (P, S, K + 1), without sensor noise; entry 0 of a
+    pose is the logged one.
+    """
+
+    perturbations: tuple[Perturbation, ...]
+    timestep_s: float
+    signals: dict[str, F64]
+    blown_up: NDArray[np.bool_]  # (P, S) the physics broke: the segment says nothing
+
+    @property
+    def pose(self) -> F64:
+        """Predicted x, y and heading, (P, S, K + 1, 3)."""
+        return np.stack([self.signals[name] for name in POSE], axis=-1)
+
+
+def replay(
+    segments: Segments,
+    perturbations: Sequence[Perturbation],
+    *,
+    timestep_s: float = 0.01,
+    nthread: int = 1,
+) -> Replayed:
+    """Drive every segment's commands under every perturbation: P x S robots on an empty floor.
+
+    The perturbations' own `timestep_s` and sensor noise are not looked at. The result does not
+    depend on `nthread`, nor on which other segments and perturbations are asked for.
+
+    Raises:
+        ConfigError: a timestep that does not divide .1 s, or a control period that the twin
+            cannot keep (no multiple of .1 s).
+    """
+    jobs = len(perturbations) * len(segments)
+    signals = {name: np.zeros((jobs, segments.horizon_steps + 1)) for name in PREDICTED}
+    blown_up = np.zeros(jobs, np.bool_)
+    simulation: Simulation | None = None
+    for begin in range(0, jobs, ROBOTS):
+        ids = np.arange(begin, min(begin + ROBOTS, jobs))
+        if simulation is None or simulation.num_envs != len(ids):
+            simulation = _simulation(len(ids), segments.task, timestep_s, nthread)
+        which, segment = np.divmod(ids, len(segments))
+        part = segments.take(segment)
+        for env, number in enumerate(which):
+            _place(simulation, env, perturbations[number], part)
+        moved, blown_up[ids] = _drive(simulation, part)
+        for name, values in moved.items():
+            signals[name][ids] = values
+    shape = (len(perturbations), len(segments))
+    return Replayed(
+        perturbations=tuple(perturbations),
+        timestep_s=timestep_s,
+        signals={name: values.reshape(*shape, -1) for name, values in signals.items()},
+        blown_up=blown_up.reshape(shape),
+    )
+
+
+def _simulation(robots: int, task: Task, timestep_s: float, nthread: int) -> Simulation:
+    floor = Warehouse(1000.0, 1000.0, aisle_y_m=_STRIPS, cross_x_m=_STRIPS)
+    return Simulation(robots, task, floor, timestep_s, nthread)
+
+
+def _place(simulation: Simulation, env: int, perturbation: Perturbation, part: Segments) -> None:
+    """Put robot `env` at the beginning of the warm-up of segment `env` of `part`, in motion."""
+    start = (_START_M, _START_M, 0.0)
+    spec = EpisodeSpec("nominal", 0, perturbation)
+    episode = Episode(spec, start, goal=start[:2], plan_m=np.array([start[:2], start[:2]]))
+    simulation.reset(env, episode, perturbation)
+    if part.still[env]:
+        return
+    speed, turn, gyro = part.before[env]
+    wheels = np.array(wheel_commands(speed, turn))
+    simulation.qvel[env, 0] = speed * simulation.radius_m[env] / WHEEL_RADIUS_M
+    simulation.qvel[env, 5] = gyro
+    simulation.qvel[env, 6:8] = wheels
+    # What was commanded earlier is not in the segment: as if it had been what the wheels do.
+    asked = np.array([speed, turn]) / simulation.controller.gain[env]
+    simulation.controller.commands[env] = simulation.controller.set_point[env] = asked
+
+
+def _drive(simulation: Simulation, part: Segments) -> tuple[dict[str, F64], NDArray[np.bool_]]:
+    """Predicted signals (N, K + 1) of N robots already placed, and whose physics broke (N,)."""
+    num, warmup = len(part), part.warmup_steps
+    pose = np.zeros((num, warmup + part.horizon_steps + 1, 3))
+    motion = {name: np.zeros((num, part.horizon_steps + 1)) for name in MOTION}
+    blown_up = np.zeros(num, np.bool_)
+    for step in range(pose.shape[1]):
+        if step:
+            simulation.drive(part.command[:, step - 1])
+            blown_up |= simulation.blown_up
+        pose[:, step] = simulation.pose()
+        if step >= warmup:
+            velocity, at = simulation.qvel, step - warmup
+            speed, turn = body_velocity(velocity[:, 6], velocity[:, 7])
+            motion["wheel_speed_mps"][:, at], motion["wheel_yaw_rate_radps"][:, at] = speed, turn
+            motion["gyro_yaw_rate_radps"][:, at] = velocity[:, 5]
+            motion["accel_x_mps2"][:, at] = simulation.accel[:, 0]
+    forward, lateral = _localised(pose, part.task.control_period_s, motion["wheel_speed_mps"])
+    motion["localised_speed_mps"], motion["localised_lateral_mps"] = forward, lateral
+    laid = _lay(pose[:, warmup:], part.pose[:, 0])
+    return {**{name: laid[..., i] for i, name in enumerate(POSE)}, **motion}, blown_up
+
+
+def _localised(pose: F64, period_s: float, wheel_speed: F64) -> tuple[F64, F64]:
+    """Speeds from poses (N, W + K + 1, 3) a period apart, as ingest has them; (N, K + 1) each.
+
+    Without a warm-up no pose is before the first, and the wheels say its speed.
+    """
+    steps = wheel_speed.shape[1]
+    stamp = np.broadcast_to(np.arange(pose.shape[1]) * round(period_s * 1e9), pose.shape[:2])
+    columns = {name: pose[..., i] for i, name in enumerate(POSE)} | {"pose_stamp_ns": stamp}
+    at = np.arange(pose.shape[1] - steps, pose.shape[1])
+    now = {name: values[:, at] for name, values in columns.items()}
+    before = {name: values[:, np.maximum(at - 1, 0)] for name, values in columns.items()}
+    return localised_velocity({**now, "wheel_speed_mps": wheel_speed}, before)
+
+
+def _lay(pose: F64, onto: F64) -> F64:
+    """Poses (N, K + 1, 3) moved as one so that each first is `onto` (N, 3)."""
+    turn = onto[:, 2] - pose[:, 0, 2]
+    cos, sin = np.cos(turn)[:, None], np.sin(turn)[:, None]
+    x, y = pose[..., 0] - pose[:, :1, 0], pose[..., 1] - pose[:, :1, 1]
+    return np.stack(
+        [
+            onto[:, :1] + cos * x - sin * y,
+            onto[:, 1:2] + sin * x + cos * y,
+            wrap_angle(pose[..., 2] + turn[:, None]),
+        ],
+        axis=-1,
+    )
