@@ -26,7 +26,7 @@ from restock.ingest.store import StoreWriter
 from restock.replay.store import Store
 from restock.train.crew import FleetCrew
 from restock.train.fleet import Driven, Fleet
-from restock.train.missions import BLOCK, FLEET, NATURAL, Driver, parse_shares, schedule
+from restock.train.missions import BLOCK, FLEET, NATURAL, parse_shares, schedule
 from restock.train.perturbation import Perturbation
 from restock.train.publish import LIDAR_LSB_M
 from restock.train.recorder import HARDWARE, NOISELESS, Plan, parse_rates, record
@@ -160,7 +160,7 @@ def test_both_formats_hold_the_same_drive(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("policy", ["planner", "operator"])
-def test_one_driver_alone_can_be_asked_for(tmp_path: Path, policy: Driver) -> None:
+def test_one_driver_alone_can_be_asked_for(tmp_path: Path, policy: str) -> None:
     summary = record(tmp_path / "log.mcap", Plan(missions=1, seed=3, policy=policy))
     assert set(summary.policies) == {f"{policy} 1"}
     assert summary.succeeded["nominal"] == summary.missions["nominal"] == 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.train.drivers import Guest
 from restock.train.missions import Mission
 from restock.train.operator_policy import Operator
 from restock.train.policies import Handover, PlannerFollower, Policy, RandomPolicy
@@ -20,10 +21,18 @@ class CarefulPlanner(PlannerFollower):
 
 
 class FleetCrew:
-    """The drivers of N robots that run side by side. A driver nobody needs is not asked."""
+    """The drivers of N robots that run side by side. A driver nobody needs is not asked.
 
-    def __init__(self, robots: int, *, seed: int) -> None:
-        self._seed = seed
+    Args:
+        epsilon: share of random actions of the scripted drivers; None: what each has of its own.
+        guest: drives the missions whose driver is none of the scripts.
+    """
+
+    def __init__(
+        self, robots: int, *, seed: int, epsilon: float | None = None, guest: Guest | None = None
+    ) -> None:
+        self._seed, self._guest = seed, guest
+        self._chance = {} if epsilon is None else {"epsilon": epsilon}
         self._drivers: dict[tuple[str, str, bool], Policy] = {}
         self._of: list[tuple[str, str, bool]] = [("planner", "1", False)] * robots
 
@@ -52,11 +61,13 @@ class FleetCrew:
         return self._drivers[key]
 
     def _make(self, name: str, version: str, handover: bool) -> Policy:
+        if self._guest is not None:
+            return self._guest
         # Every driver has dice of its own.
         seed = self._seed * 16 + len(self._drivers)
         if name == "random":
             return RandomPolicy(seed=seed)
         if name == "operator":
-            return Operator(seed=seed)
-        planner = (CarefulPlanner if version == "2" else PlannerFollower)(seed=seed)
-        return Handover(planner, Operator(seed=seed)) if handover else planner
+            return Operator(seed=seed, **self._chance)
+        planner = (CarefulPlanner if version == "2" else PlannerFollower)(seed=seed, **self._chance)
+        return Handover(planner, Operator(seed=seed, **self._chance)) if handover else planner

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from restock.train.drive import Drive, Motion
 from restock.train.episode import EpisodeSpec
 from restock.train.missions import Mission
-from restock.train.perturbation import Perturbation
+from restock.train.perturbation import Perturbation, Schedule
 from restock.train.simulation import BLOCK_S, Live
 from restock.train.vector_env import WarehouseVectorEnv
 
@@ -76,17 +76,16 @@ class Fleet:
     """N robots that drive missions in the twin, under one set of effective parameters.
 
     Args:
-        hardware: those parameters, for every mission.
+        hardware: those parameters, where a mission names none of its own.
         scan_hz: the lidar scans at every control tick, and above 5 Hz once more between two.
     """
 
     def __init__(
-        self, hardware: Perturbation, *, scan_hz: float = 10.0, robots: int = ROBOTS
+        self, hardware: Perturbation | Schedule, *, scan_hz: float = 10.0, robots: int = ROBOTS
     ) -> None:
         self.env = WarehouseVectorEnv(
             robots, perturbation=hardware, autoreset_mode=AutoresetMode.DISABLED
         )
-        self.hardware = hardware
         self.period_s = self.env.task.control_period_s
         self._scans_between = scan_hz * self.period_s > 1
         self._logs: list[_Log | None] = [None] * robots
@@ -127,7 +126,7 @@ class Fleet:
         """Give each of these robots its next mission; one without any drives on unrecorded."""
         env = self.env
         given = [next(missions, None) for _ in robots]
-        idle = EpisodeSpec("nominal", 0, self.hardware)
+        idle = EpisodeSpec("nominal", 0)
         env.set_episodes([idle if entry is None else entry[1].spec for entry in given])
         mask = np.zeros(env.num_envs, np.bool_)
         mask[robots] = True
@@ -172,15 +171,16 @@ class Fleet:
 
     def _measured(self, log: _Log, true_ranges_m: F64) -> F64:
         """A scan between ticks: the same noise and dropout, drawn anew."""
-        ranges = true_ranges_m + log.rng.normal(0, self.hardware.lidar_noise_m, len(true_ranges_m))
-        lost = log.rng.random(len(ranges)) < self.hardware.lidar_dropout
+        hardware = log.mission.spec.perturbation or self.env.perturbation
+        ranges = true_ranges_m + log.rng.normal(0, hardware.lidar_noise_m, len(true_ranges_m))
+        lost = log.rng.random(len(ranges)) < hardware.lidar_dropout
         return np.where(lost, np.inf, np.maximum(ranges, 0.0))
 
     def _finish(self, log: _Log, robot: int, info: Mapping[str, Any]) -> Driven:
         env = self.env
         goal = env.navigation.goals_m[robot]
         names = log.signals[0].keys()
-        hardware = self.hardware
+        hardware = log.mission.spec.perturbation or env.perturbation
         action = np.array(log.action, np.int64)
         drive = Drive(
             goal_m=(float(goal[0]), float(goal[1])),

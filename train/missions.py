@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from restock.errors import ConfigError
+from restock.train.drivers import HANDOVER
 from restock.train.episode import KINDS, EpisodeSpec
-from restock.train.perturbation import Perturbation
+from restock.train.perturbation import Perturbation, Schedule
 
 # What a site that runs well sees.
 NATURAL = {"nominal": 0.80, "wheel_slip": 0.07, "blocked_aisle": 0.07, "near_collision": 0.06}
@@ -19,7 +19,6 @@ NATURAL = {"nominal": 0.80, "wheel_slip": 0.07, "blocked_aisle": 0.07, "near_col
 FLEET = {"planner 1": 0.70, "planner 2": 0.18, "operator 1": 0.12}
 BLOCK = 20  # missions dealt at a time, so that every condition comes up in a short recording too
 
-Driver = Literal["handover", "planner", "operator", "random"]
 PAUSE_S = (4.0, 12.0)  # between missions, unrecorded
 
 
@@ -28,28 +27,43 @@ class Mission:
     """One mission to be driven and recorded."""
 
     spec: EpisodeSpec
-    driver: str  # planner, operator or random
+    driver: str  # planner, operator, random, or the name of a policy
     version: str
     handover: bool  # whether the operator takes over when the driver is stuck
     pause_s: float  # before the next mission
 
 
 def schedule(
-    seed: int, conditions: Mapping[str, float], driver: Driver, hardware: Perturbation
+    seed: int,
+    conditions: Mapping[str, float],
+    driver: str,
+    hardware: Perturbation | Schedule,
+    *,
+    version: str = "1",
 ) -> Iterator[Mission]:
-    """The missions of a recording, without end; the same for the same arguments."""
+    """The missions of a recording, without end; the same for the same arguments.
+
+    `driver` is `handover` (the fleet) or the name of whoever drives all of them.
+    """
     rng = np.random.Generator(np.random.PCG64([seed, 0x6D697373]))
     kinds = _deal(conditions, rng)
     drivers = _deal(FLEET, rng)
     while True:
-        name, version = next(drivers).split() if driver == "handover" else (driver, "1")
+        name, version = next(drivers).split() if driver == HANDOVER else (driver, version)
+        kind, mission_seed = next(kinds), int(rng.integers(1 << 31))
         yield Mission(
-            EpisodeSpec(next(kinds), int(rng.integers(1 << 31)), hardware),
+            EpisodeSpec(kind, mission_seed, _in_force(hardware, mission_seed)),
             name,
             version,
-            handover=driver == "handover" and name == "planner",
+            handover=driver == HANDOVER and name == "planner",
             pause_s=round(float(rng.uniform(*PAUSE_S)), 3),
         )
+
+
+def _in_force(hardware: Perturbation | Schedule, mission_seed: int) -> Perturbation:
+    if isinstance(hardware, Perturbation):
+        return hardware
+    return hardware.draw(np.random.default_rng([mission_seed, 1]))
 
 
 def _deal(shares: Mapping[str, float], rng: np.random.Generator) -> Iterator[str]:
@@ -102,4 +116,4 @@ def parse_shares(text: str) -> dict[str, float]:
     return shares
 
 
-__all__ = ["FLEET", "NATURAL", "Driver", "Mission", "parse_shares", "schedule"]
+__all__ = ["FLEET", "NATURAL", "Mission", "parse_shares", "schedule"]

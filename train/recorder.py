@@ -19,14 +19,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import ConfigError
+from restock.ingest.profile import load_profile
 from restock.train.bag_writer import Format, recording_sink
 from restock.train.crew import FleetCrew
 from restock.train.drive import Lidar
+from restock.train.drivers import HANDOVER, Chooser, Guest, check_epsilon, load_guest
 from restock.train.fleet import Fleet
 from restock.train.layout import Warehouse
-from restock.train.missions import NATURAL, Driver, schedule
+from restock.train.missions import NATURAL, schedule
 from restock.train.model import TRACK_M, WHEEL_RADIUS_M
-from restock.train.perturbation import Perturbation
+from restock.train.perturbation import (
+    PERTURBATIONS,
+    Perturbation,
+    Schedule,
+    load_perturbation,
+    load_schedule,
+)
 from restock.train.publish import Rates, Robot
 from restock.train.robot_topics import TOPICS
 from restock.train.simulation import LIDAR_BEAMS
@@ -74,9 +82,10 @@ class Plan:
     missions: int | None = None
     seed: int = 0
     conditions: Mapping[str, float] = field(default_factory=lambda: dict(NATURAL))
-    policy: Driver = "handover"
+    policy: str = HANDOVER  # or planner, operator, random, run:DIRECTORY, onnx:FILE
+    epsilon: float | None = None  # share of random actions; None: what each driver has of its own
     rates: Rates = field(default_factory=Rates)
-    hardware: Perturbation = HARDWARE
+    hardware: Perturbation | Schedule = HARDWARE  # a schedule draws one for every mission
     start_ns: int = FIRST_NS  # when the first mission starts
 
     def __post_init__(self) -> None:
@@ -89,6 +98,7 @@ class Plan:
                 raise ConfigError(f"{name} must be above 0, got {value}", where="recording")
         if self.seed < 0:
             raise ConfigError(f"seed must be 0 or more, got {self.seed}", where="recording")
+        check_epsilon(self.epsilon, self.policy)
 
     def describe(self) -> dict[str, Any]:
         """As JSON has it."""
@@ -99,6 +109,7 @@ class Plan:
             "seed": self.seed,
             "conditions": dict(self.conditions),
             "policy": self.policy,
+            "epsilon": self.epsilon,
             "rates_hz": {item.name: getattr(self.rates, item.name) for item in fields(Rates)},
             "hardware": self.hardware.name,
             "topics": [topic.name for topic in TOPICS],
@@ -141,19 +152,29 @@ class Summary:
 
 
 def record(
-    path: Path, plan: Plan, *, on_mission: Callable[[int, float], None] | None = None
+    path: Path,
+    plan: Plan,
+    *,
+    policy: Chooser | None = None,
+    on_mission: Callable[[int, float], None] | None = None,
 ) -> Summary:
     """Drive and write a recording; `on_mission(1, minutes)` is called after each mission.
 
+    A `policy` of your own drives in place of the one that the plan names: whatever has a `name`,
+    a `version` and `act(env, observation)`.
+
     Raises:
         RecordingError: there is something at `path`, or its folder cannot be written to.
+        ConfigError, RunError: the plan's policy cannot be loaded.
     """
     begun = time.perf_counter()
+    guest = load_policy(plan) if policy is None else _guest(plan, policy)
     fleet = Fleet(plan.hardware, scan_hz=plan.rates.scan)
     robot = _robot(plan, fleet)
     summary = Summary(path, plan)
-    missions = schedule(plan.seed, plan.conditions, plan.policy, plan.hardware)
-    crew = FleetCrew(fleet.env.num_envs, seed=plan.seed)
+    driver, version = (plan.policy, "1") if guest is None else (guest.name, guest.version)
+    missions = schedule(plan.seed, plan.conditions, driver, plan.hardware, version=version)
+    crew = FleetCrew(fleet.env.num_envs, seed=plan.seed, epsilon=plan.epsilon, guest=guest)
     start_ns = plan.start_ns
     with recording_sink(path, plan.format, TOPICS) as sink:
         static = robot.static(start_ns, _occupied(fleet.env.warehouse, MAP_CELL_M), MAP_CELL_M)
@@ -180,6 +201,39 @@ def record(
                 break
     summary.work_s = time.perf_counter() - begun
     return summary
+
+
+def load_policy(plan: Plan) -> Guest | None:
+    """The policy that the plan names; None where scripts drive.
+
+    Raises:
+        ConfigError, RunError: there is none, or it is one of another task.
+    """
+    task = load_profile("warehouse_amr").task
+    return load_guest(plan.policy, task, epsilon=plan.epsilon or 0.0, seed=plan.seed)
+
+
+def _guest(plan: Plan, policy: Chooser) -> Guest:
+    return Guest(policy, epsilon=plan.epsilon or 0.0, seed=plan.seed)
+
+
+def find_perturbation(name: str) -> Perturbation | Schedule:
+    """A ready-made perturbation by its name, or the perturbation or schedule of a TOML file.
+
+    Raises:
+        ConfigError: there is no such one, or the file holds no perturbation.
+    """
+    if name in PERTURBATIONS:
+        return PERTURBATIONS[name]
+    path = Path(name)
+    if path.suffix != ".toml":
+        raise ConfigError(
+            f"there is no perturbation {name!r}",
+            where="--perturbation",
+            remedy=f"give {', '.join(PERTURBATIONS)}, or a file that ends in .toml",
+        )
+    drawn = path.is_file() and "[ranges]" in path.read_text(encoding="utf-8", errors="replace")
+    return load_schedule(path) if drawn else load_perturbation(path)
 
 
 def parse_rates(text: str) -> Rates:

@@ -22,6 +22,7 @@ class Record:
 
         restock record --out drive.mcap --minutes 5
         restock record --out icy --missions 20 --conditions nominal=.5,wheel_slip=.5
+        restock record --out mine.mcap --policy run:runs/a --epsilon .05
     """
 
     out: Path
@@ -37,9 +38,15 @@ class Record:
     conditions: str | None = None
     """Shares of missions, e.g. nominal=.8,wheel_slip=.1,near_collision=.1 (default: the natural
     nominal=.8,wheel_slip=.07,blocked_aisle=.07,near_collision=.06)."""
-    policy: Literal["handover", "planner", "operator", "random"] = "handover"
-    """Who drives. handover is the fleet: planners, an operator who takes over when one is stuck,
-    and some missions that an operator drives throughout."""
+    policy: str = "handover"
+    """Who drives: handover, planner, operator, random, run:DIRECTORY (what that run kept), or
+    onnx:FILE. handover is the fleet: planners, an operator who takes over when one is stuck, and
+    some missions that an operator drives throughout."""
+    epsilon: float | None = None
+    """Share of random actions (default: the scripted drivers' own, none of a learned policy)."""
+    perturbation: str | None = None
+    """Effective parameters in place of the stand-in's: a name as in `restock eval`, or a TOML file
+    of a perturbation, or of a schedule that draws one for every mission."""
     rates: str | None = None
     """Messages a second of some topics, e.g. odom=20,scan=5."""
     exact: bool = False
@@ -54,10 +61,21 @@ class Record:
         from restock.cli import output
         from restock.train.bag_writer import refuse_existing
         from restock.train.missions import NATURAL, parse_shares
-        from restock.train.recorder import HARDWARE, NOISELESS, Plan, parse_rates, record
+        from restock.train.recorder import (
+            HARDWARE,
+            NOISELESS,
+            Plan,
+            find_perturbation,
+            load_policy,
+            parse_rates,
+            record,
+        )
 
         if self.minutes is not None and self.missions is not None:
             raise RestockError("--minutes and --missions exclude each other", remedy="give one")
+        if self.exact and self.perturbation is not None:
+            raise RestockError("--exact and --perturbation exclude each other", remedy="give one")
+        hardware = NOISELESS if self.exact else HARDWARE
         plan = Plan(
             format=self.format or ("mcap" if self.out.suffix == ".mcap" else "rosbag2"),
             minutes=5.0 if self.minutes is None and self.missions is None else self.minutes,
@@ -65,9 +83,13 @@ class Record:
             seed=self.seed,
             conditions=parse_shares(self.conditions) if self.conditions is not None else NATURAL,
             policy=self.policy,
+            epsilon=self.epsilon,
             rates=parse_rates(self.rates or ""),
-            hardware=NOISELESS if self.exact else HARDWARE,
+            hardware=(
+                hardware if self.perturbation is None else find_perturbation(self.perturbation)
+            ),
         )
+        load_policy(plan)  # what is wrong with it is said before anything is driven
         refuse_existing(self.out)
         if self.dry_run:
             wanted = {"path": str(self.out), "dry_run": True, **plan.describe()}
