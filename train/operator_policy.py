@@ -26,6 +26,8 @@ HORIZON = 6  # steps of the control period
 TOUCH_M = 0.05
 ROOMY_M = 0.12
 PERSON_MARGIN_M = 0.4
+STANDING_MARGIN_M = 0.2
+CAREFUL_M = 1.8  # from the robot's middle to a person's
 GENTLE_MPS = 0.45
 STANDING_MPS = 0.12
 
@@ -80,6 +82,12 @@ class Operator(SoftPolicy):
         stood = self._standing(env, pose) & alone
         score[stood] = tries[stood]
         return np.asarray(score.argmax(axis=1), np.int64)
+
+    def certain(self, env: WarehouseVectorEnv) -> NDArray[np.bool_]:
+        """No mistakes right beside people."""
+        people = env.simulation.traffic.position_m - env.simulation.pose()[:, None, :2]
+        near = np.hypot(people[..., 0], people[..., 1]) < CAREFUL_M
+        return np.asarray(near.any(axis=1), np.bool_)
 
     def sees_trouble(self, env: WarehouseVectorEnv) -> NDArray[np.bool_]:
         """Where (N,) pallets, people or slippery floor are still about."""
@@ -180,7 +188,8 @@ class Operator(SoftPolicy):
         ids = np.flatnonzero(traffic.active)
         if len(ids):
             later = (np.arange(HORIZON) + 1) * env.task.control_period_s
-            walking = traffic.state[ids] == WALKING
+            arrived = traffic.travelled_m[ids] >= traffic.length_m[ids]
+            walking = (traffic.state[ids] == WALKING) & ~arrived
             sign = np.where(walking, 1.0, np.where(traffic.state[ids] == RETREATING, -0.6, 0.0))
             speed = (traffic.speed_mps[ids] * sign)[..., None] * later  # (n, G, T)
             px = (
@@ -195,6 +204,8 @@ class Operator(SoftPolicy):
                 x[ids][:, None] - px[:, :, None, :, None], y[ids][:, None] - py[:, :, None, :, None]
             )
             gap = gap.min(axis=4) - traffic.radius_m[None, :, None, None]
+            standing = sign == 0.0  # one may pass nearer to who stands
+            gap += np.where(standing, PERSON_MARGIN_M - STANDING_MARGIN_M, 0.0)[:, :, None, None]
             people[ids] = gap.min(axis=1)
         return room.min(axis=3), people
 

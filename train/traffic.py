@@ -23,6 +23,7 @@ WAY_POINTS = 24
 FORKLIFT_RADIUS_M = 0.5  # of the circle that stands for it when it looks out
 YIELD_M = 0.5
 STANDING_M = 0.15  # how near an inattentive one comes to a robot that stands or backs off
+RETREAT_M = 2.0  # how far off the robot a retreat ends
 DRIVEN_AT_MPS = 0.15  # closing speed by which a robot is said to drive at someone
 WAIT_S = 2.0
 HIDDEN, WAITING, WALKING, RETREATING = 0, 1, 2, 3
@@ -189,7 +190,7 @@ class Traffic:
         hit = touched[ids, None] & (gap < 0.2) & ((state == WALKING) | (state == RETREATING))
         self.attentive[ids] |= hit  # having been touched, one looks out
         state = np.where((hit & toward) | (waited > WAIT_S), RETREATING, state)
-        state = np.where((state == RETREATING) & ((gap > 1.0) | (hit & ~toward)), WALKING, state)
+        state = np.where((state == RETREATING) & ((gap > RETREAT_M) | (hit & ~toward)), WALKING, state)
         pace = np.where(state == RETREATING, -0.6, np.where((state == WALKING) & ~held, 1.0, 0.0))
         travelled = self.travelled_m[ids] + pace * self.speed_mps[ids] * elapsed_s
         # Who is back at the start or at the end of the way leaves the floor, out of sight.
