@@ -20,7 +20,7 @@ from restock.ingest.signals import localised_velocity, wrap_angle
 from restock.ingest.task import Task, clearance_ahead
 from restock.train.model import body_velocity
 from restock.train.perturbation import Perturbation
-from restock.train.simulation import LIDAR_BEAMS, Simulation
+from restock.train.simulation import Simulation
 
 F64 = NDArray[np.float64]
 Ids = NDArray[np.int64]
@@ -38,12 +38,12 @@ class Sensing:
         self.simulation, self.task = simulation, task
         self.sectors = SectorMap.build(simulation.bearings_rad, task.sectors, task.body)
         num, steps = simulation.num_envs, task.time_limit_steps + 1
-        self._noise = np.zeros((num, steps, _SCALARS + LIDAR_BEAMS), np.float32)
+        self._noise = np.zeros((num, steps, _SCALARS + simulation.beams), np.float32)
         self._scale = np.zeros((num, _SCALARS))
         self._bias = np.zeros(num)
         self._range_noise_m = np.zeros(num)
         self._dropout_beyond = np.full(num, np.inf)
-        self.ranges_m = np.zeros((num, LIDAR_BEAMS))  # as measured at the last step
+        self.ranges_m = np.zeros((num, simulation.beams))  # as measured at the last step
         self.true_clearance_m = np.zeros(num)
 
     def reset(self, env: int, seeds: np.random.SeedSequence, perturbation: Perturbation) -> None:

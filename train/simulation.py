@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -40,6 +40,7 @@ from restock.train.traffic import Traffic
 
 F64 = NDArray[np.float64]
 Ids = NDArray[np.int64]
+Physics = Literal["mujoco", "warp"]  # warp: see `restock.train.warp_batch`
 
 BLOCK_S = 0.1
 REST_Z_M = 0.09756  # of the chassis frame, standing still
@@ -69,16 +70,25 @@ class Simulation:
     """N robots in N warehouses. Arrays lead with the environment."""
 
     def __init__(
-        self, num_envs: int, task: Task, warehouse: Warehouse, timestep_s: float, nthread: int
+        self,
+        num_envs: int,
+        task: Task,
+        warehouse: Warehouse,
+        timestep_s: float,
+        nthread: int,
+        *,
+        physics: Physics = "mujoco",
+        beams: int = LIDAR_BEAMS,
     ) -> None:
         self.num_envs, self.task, self.warehouse = num_envs, task, warehouse
+        self.beams = beams
         self.timestep_s = timestep_s
         self.substeps = round(BLOCK_S / timestep_s)
         self.blocks = round(task.control_period_s / BLOCK_S)
         _check_times(task, timestep_s, self.substeps, self.blocks)
         self.model, self.handles = build_model(warehouse, task.body, timestep_s)
         _no_log_file()
-        self.batch = Batch(self.model, num_envs, nthread)
+        self.batch = _batch(physics)(self.model, num_envs, nthread)
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._ctrl = self.batch.bind("ctrl")
         self._mocap_pos = self.batch.bind("mocap_pos")
@@ -99,8 +109,8 @@ class Simulation:
         self.left_friction = np.ones(num_envs)
         self.radius_m = np.full(num_envs, WHEEL_RADIUS_M)
 
-        bearings = np.arange(LIDAR_BEAMS) * (2 * np.pi / LIDAR_BEAMS) - np.pi
-        self.bearings_rad = bearings + np.pi / LIDAR_BEAMS
+        bearings = np.arange(beams) * (2 * np.pi / beams) - np.pi
+        self.bearings_rad = bearings + np.pi / beams
         self._beam = np.stack([np.cos(self.bearings_rad), np.sin(self.bearings_rad)], axis=-1)
         self._groups = np.zeros(6, np.uint8)
         self._groups[OBSTACLE_GROUP] = 1
@@ -307,10 +317,10 @@ class Simulation:
     # -- sensing --------------------------------------------------------------------------------
 
     def cast(self, ids: Ids) -> F64:
-        """True lidar ranges (n, LIDAR_BEAMS) in metres now; inf where nothing is hit."""
+        """True lidar ranges (n, beams) in metres now; inf where nothing is hit."""
         heading = yaw_of(self.qpos[ids, 3:7])
         cos, sin = np.cos(heading), np.sin(heading)
-        rays = np.zeros((len(ids), LIDAR_BEAMS, 3))
+        rays = np.zeros((len(ids), self.beams, 3))
         rays[..., 0] = cos[:, None] * self._beam[:, 0] - sin[:, None] * self._beam[:, 1]
         rays[..., 1] = sin[:, None] * self._beam[:, 0] + cos[:, None] * self._beam[:, 1]
         origin = np.full((len(ids), 1, 3), LIDAR_Z_M)
@@ -348,6 +358,18 @@ class Simulation:
         self.batch.state[:] = state["physics"]
         self._walked = state["walked"].copy()
         self._control[:, :, 2:] = self._still(np.arange(self.num_envs))
+
+
+def _batch(physics: Physics) -> Any:
+    if physics == "mujoco":
+        return Batch
+    if physics == "warp":
+        from restock.train.warp_batch import WarpBatch
+
+        return WarpBatch
+    raise ConfigError(
+        f"there is no physics {physics!r}", where="the twin", remedy="use mujoco or warp"
+    )
 
 
 def _quat(yaw_rad: F64) -> F64:

@@ -46,7 +46,7 @@ from restock.train.layout import Warehouse, default_warehouse
 from restock.train.navigation import Navigation
 from restock.train.perturbation import Perturbation, Schedule
 from restock.train.sensing import Sensing, Signals, add_motion, add_route
-from restock.train.simulation import Live, Simulation
+from restock.train.simulation import Live, Physics, Simulation
 from restock.train.truth import Truth
 
 DEFAULT_CONDITIONS: Mapping[str, float] = {
@@ -80,8 +80,10 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         warehouse: Warehouse | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         action: Face = "discrete",
+        physics: Physics = "mujoco",
     ) -> None:
-        """`conditions` are shares of episodes per kind; `nthread` 0 uses every core.
+        """`conditions` are shares of episodes per kind; `nthread` 0 uses every core; `physics`
+        "warp" steps on MuJoCo Warp's device: see docs/mjwarp.md.
 
         A `perturbation` holds for every episode whose spec has none of its own; a schedule draws
         one for each such episode (fixed episodes get its base). `env.specs` tells them.
@@ -114,7 +116,9 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         self.action_space = batch_space(self.single_action_space, num_envs)
 
         timestep = self.perturbation.timestep_s
-        self.simulation = Simulation(num_envs, self.task, self.warehouse, timestep, nthread)
+        self.simulation = Simulation(
+            num_envs, self.task, self.warehouse, timestep, nthread, physics=physics
+        )
         self.sensing = Sensing(self.simulation, self.task)
         self.truth = Truth(self.task, num_envs)
         self.navigation = Navigation(self.warehouse, num_envs, self.task)
