@@ -32,7 +32,10 @@ MOTION = (
     *("localised_speed_mps", "localised_lateral_mps"),
 )
 _COMMAND = ("command_speed_mps", "command_yaw_rate_radps")
-_BEFORE = ("wheel_speed_mps", "wheel_yaw_rate_radps", "gyro_yaw_rate_radps")
+_BEFORE = (
+    *("wheel_speed_mps", "wheel_yaw_rate_radps", "gyro_yaw_rate_radps"),
+    "localised_speed_mps",
+)
 LOGGED = ("stamp_ns", "pose_stamp_ns", *POSE, *MOTION, *_COMMAND, "bumped", "clearance_m")
 
 
@@ -57,7 +60,7 @@ class Segments:
     true_condition: NDArray[np.str_]  # (S, K) of a simulator; "" where not known
     command: F64  # (S, W + K, 2) speed m/s and yaw rate rad/s; stop where nothing was before
     still: NDArray[np.bool_]  # (S,) the robot stood before the first of the W steps
-    before: F64  # (S, 3) wheel speed, wheel yaw rate and gyro rate when the W steps begin
+    before: F64  # (S, 4) wheels' speed and yaw rate, gyro and localised speed as the W steps begin
     signals: dict[str, NDArray[Any]]  # (S, K + 1) each
     pose_fresh: NDArray[np.bool_]  # (S, K + 1) the pose was measured at its tick
     left_out: dict[str, int] = field(default_factory=dict)

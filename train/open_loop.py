@@ -33,8 +33,8 @@ F64 = NDArray[np.float64]
 
 PREDICTED = (*POSE, *MOTION)  # what the twin says of each step
 ROBOTS = 512  # simulated at a time
-_START_M = 250.0
-_STRIPS = ((0.0, 499.95), (500.05, 1000.0))  # a warehouse has a rack: one of .1 m, far away
+SLIPS_MPS = 0.2  # wheels and localisation this far apart: the floor's word is taken
+_SIDE_M = 60.0  # of the floor; who comes near its wall is put back in its middle
 
 
 @dataclass(frozen=True)
@@ -97,23 +97,24 @@ def replay(
 
 
 def _simulation(robots: int, task: Task, timestep_s: float, nthread: int) -> Simulation:
-    floor = Warehouse(1000.0, 1000.0, aisle_y_m=_STRIPS, cross_x_m=_STRIPS)
+    middle = (_SIDE_M / 2, _SIDE_M / 2)
+    floor = Warehouse(_SIDE_M, _SIDE_M, racks=(), segments=(), goals_m=(middle,), name="empty")
     return Simulation(robots, task, floor, timestep_s, nthread)
 
 
 def _place(simulation: Simulation, env: int, perturbation: Perturbation, part: Segments) -> None:
     """Put robot `env` at the beginning of the warm-up of segment `env` of `part`, in motion."""
-    start = (_START_M, _START_M, 0.0)
+    start = (_SIDE_M / 2, _SIDE_M / 2, 0.0)
     spec = EpisodeSpec("nominal", 0, perturbation)
     episode = Episode(spec, start, goal=start[:2], plan_m=np.array([start[:2], start[:2]]))
     simulation.reset(env, episode, perturbation)
     if part.still[env]:
         return
-    speed, turn, gyro = part.before[env]
-    wheels = np.array(wheel_commands(speed, turn))
-    simulation.qvel[env, 0] = speed * simulation.radius_m[env] / WHEEL_RADIUS_M
-    simulation.qvel[env, 5] = gyro
-    simulation.qvel[env, 6:8] = wheels
+    speed, turn, gyro, localised = part.before[env]
+    rolling = abs(speed - localised) < SLIPS_MPS
+    forward = speed * simulation.radius_m[env] / WHEEL_RADIUS_M if rolling else localised
+    simulation.qvel[env, 0], simulation.qvel[env, 5] = forward, gyro
+    simulation.qvel[env, 6:8] = wheel_commands(speed, turn)
     # What was commanded earlier is not in the segment: as if it had been what the wheels do.
     asked = np.array([speed, turn]) / simulation.controller.gain[env]
     simulation.controller.commands[env] = simulation.controller.set_point[env] = asked
@@ -125,11 +126,17 @@ def _drive(simulation: Simulation, part: Segments) -> tuple[dict[str, F64], NDAr
     pose = np.zeros((num, warmup + part.horizon_steps + 1, 3))
     motion = {name: np.zeros((num, part.horizon_steps + 1)) for name in MOTION}
     blown_up = np.zeros(num, np.bool_)
+    shifted = np.zeros((num, 2))
     for step in range(pose.shape[1]):
         if step:
             simulation.drive(part.command[:, step - 1])
             blown_up |= simulation.blown_up
         pose[:, step] = simulation.pose()
+        pose[:, step, :2] += shifted
+        from_middle = simulation.qpos[:, :2] - _SIDE_M / 2
+        away = np.where(np.abs(from_middle) > _SIDE_M / 4, from_middle, 0.0)
+        shifted += away
+        simulation.qpos[:, :2] -= away
         if step >= warmup:
             velocity, at = simulation.qvel, step - warmup
             speed, turn = body_velocity(velocity[:, 6], velocity[:, 7])
