@@ -24,12 +24,13 @@ FORKLIFT, ICE, ROUTE, ROBOT, GOAL = (
 
 def draw_map(env: WarehouseVectorEnv, index: int) -> NDArray[np.uint8]:
     """One environment now, (H, W, 3) uint8, north up."""
-    canvas = _Canvas(env.warehouse)
+    floor = env.floor_of(index)
+    canvas = _Canvas(floor)
     sim = env.simulation
     for row in range(PATCHES):
         x, y, half_x, half_y, _ = sim.patches[index, row]
         canvas.box(x, y, half_x, half_y, 0.0, ICE)
-    for rack in env.warehouse.racks:
+    for rack in floor.racks:
         canvas.box(*rack.center, *rack.half_size, 0.0, RACK)
     for x, y in _dense(env.navigation.plans_m[index]):
         canvas.disc(x, y, 0.03, ROUTE)

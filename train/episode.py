@@ -33,14 +33,20 @@ BLOCKS = ("none", "partial", "full")
 PATH_M = (4.0, 11.0)
 PATCH_FRICTION = (0.02, 0.045)  # oil or wet ice on sealed concrete
 GAP_M = (0.80, 1.00)
+TURN_ROOM_M = 0.45  # that the body needs on both sides to turn on the spot
 
 
 class EpisodeSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What determines an episode. `perturbation` None: the environment's."""
+    """What determines an episode. `perturbation` None: the environment's.
+
+    `layout` is the name of a floor; None: the environment's, or the one of its floors that the seed
+    draws.
+    """
 
     condition: str
     seed: int
     perturbation: Perturbation | None = None
+    layout: str | None = None
 
     def __post_init__(self) -> None:
         if self.condition not in KINDS:
@@ -101,12 +107,17 @@ def _draw_way(
     rng: np.random.Generator, warehouse: Warehouse, planner: Planner
 ) -> tuple[tuple[float, float, float], tuple[float, float], F64]:
     for _ in range(200):
-        area = warehouse.segments[rng.integers(len(warehouse.segments))].area
+        segment = warehouse.starts[rng.integers(len(warehouse.starts))]
+        area = segment.lengthwise
+        aside = min(0.3, max(segment.width_m / 2 - TURN_ROOM_M, 0.0))
         x = rng.uniform(area.x_min + 0.4, area.x_max - 0.4)
-        y = area.center[1] + rng.uniform(-0.3, 0.3)
+        y = area.center[1] + rng.uniform(-aside, aside)
+        x, y = (x, y) if segment.along == "x" else (y, x)
         goal = tuple(warehouse.goals[rng.integers(len(warehouse.goals))])
         turn, anywhere = rng.normal(0.0, 0.3), rng.uniform(-np.pi, np.pi)
         free = rng.random() < 0.25
+        if segment.width_m < 2 * TURN_ROOM_M:
+            free, turn = False, 0.0
         if not PATH_M[0] <= planner.distance_m(x, y, goal) <= 1.3 * PATH_M[1]:
             continue
         plan = planner.plan(x, y, goal)
@@ -161,31 +172,45 @@ def _draw_block(
     rng: np.random.Generator, warehouse: Warehouse, plan: F64, *, full: bool
 ) -> F64 | None:
     """Pallets across an aisle that the plan runs through; None where there is no room for it."""
+    if not warehouse.segments:
+        return None
     spacing = length_m(plan) / (len(plan) - 1)
     arc = np.arange(len(plan)) * spacing
     segment = warehouse.segment_of(plan[:, 0], plan[:, 1])
     half_x, half_y = PALLET_HALF_M[:2]
     room = (arc >= 1.9) & (arc <= arc[-1] - 1.5) & (segment >= 0)
     edges = warehouse.segment_edges[np.maximum(segment, 0)]
-    room &= (plan[:, 0] > edges[:, 0] + half_x) & (plan[:, 0] < edges[:, 2] - half_x)
+    turned = warehouse.segment_along_y[np.maximum(segment, 0)]
+    edges = np.where(turned[:, None], edges[:, [1, 0, 3, 2]], edges)
+    along = np.where(turned, plan[:, 1], plan[:, 0])
+    room &= (along > edges[:, 0] + half_x) & (along < edges[:, 2] - half_x)
     places = np.flatnonzero(room)
     if not len(places):
         return None
     place = int(rng.choice(places))
-    area = warehouse.segments[segment[place]].area
+    area = warehouse.segments[segment[place]].lengthwise
     pallets = no_pallets()
-    x = plan[place, 0]
+    x = along[place]
     width = area.y_max - area.y_min
     if full:
+        # Between the racks in a narrow aisle, and without a gap to pass in a wide one.
+        near = min(half_y, max(width / 2 - half_y, 0.0))
+        apart = float(np.clip(width / 2 - 2 * half_y, 0.0, 0.2))
         for row in range(2):
             side = 1 if row else -1
-            y = area.center[1] + side * (half_y + rng.uniform(0.0, width / 2 - 2 * half_y))
+            y = area.center[1] + side * (near + rng.uniform(0.0, apart))
             pallets[row] = (x + rng.uniform(-0.1, 0.1), y, rng.normal(0.0, 0.03))
     else:
         gap = rng.uniform(*GAP_M)
+        if width < gap + 0.15:
+            return None
         side = rng.choice([-1.0, 1.0])
         y = area.center[1] + side * (width / 2 - gap - half_y)
         pallets[0] = (x, y, rng.normal(0.0, 0.02))
+    if turned[place]:
+        there = pallets[:, 0] > 0
+        pallets[there] = pallets[there][:, [1, 0, 2]]
+        pallets[there, 2] = np.pi / 2 - pallets[there, 2]
     return pallets
 
 

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from restock.ingest.scan import Body
 from restock.train.layout import Warehouse
 
+F64 = NDArray[np.float64]
+
 FLOOR_FRICTION = 0.8
 WHEEL_RADIUS_M = 0.10
 TRACK_M = 0.44  # between the wheels' contact points
@@ -38,6 +40,9 @@ PERSON_RADIUS_M = 0.25
 FORKLIFTS = 1
 FORKLIFT_HALF_M = (0.60, 0.40, 0.60)
 PARKED_M = (-50.0, -50.0, 1.0)  # where bodies wait that no episode uses
+PARKED_RACK_M = (-60.0, -60.0, 1.0)
+RACK_HALF_HEIGHT_M = 0.75
+WALL_HALF_HEIGHT_M = 0.5
 
 OBSTACLE_GROUP, ROBOT_GROUP, FLOOR_GROUP, DRAWN_GROUP = 0, 1, 2, 3
 _FLOOR, _ROLLING, _OBSTACLE, _CHASSIS = (1, 0), (0, 1), (2, 0), (0, 2)
@@ -50,6 +55,7 @@ class Handles:
     chassis_body: int
     wheel_bodies: tuple[int, int]  # left, right
     wheel_geoms: tuple[int, int]
+    building: slice  # the geoms of racks and walls
     pallets: slice  # of the mocap bodies
     people: slice
     forklifts: slice
@@ -58,9 +64,13 @@ class Handles:
 
 
 def build_model(
-    warehouse: Warehouse, body: Body, timestep_s: float = 0.01
+    warehouse: Warehouse, body: Body, timestep_s: float = 0.01, rack_slots: int | None = None
 ) -> tuple[mujoco.MjModel, Handles]:
-    """The compiled model. State: free joint of the chassis, left and right wheel hinge."""
+    """The compiled model. State: free joint of the chassis, left and right wheel hinge.
+
+    With `rack_slots` there are boxes for so many racks: those that the floor has none for lie
+    `PARKED_RACK_M` away, to be placed by `building_boxes`.
+    """
     spec = mujoco.MjSpec()
     option = spec.option
     option.timestep = timestep_s
@@ -72,14 +82,35 @@ def build_model(
     # One robot among a handful of boxes: both only cost time here (8 % and 3 % of a step).
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
-    _add_building(spec, warehouse)
+    _add_building(spec, warehouse, len(warehouse.racks) if rack_slots is None else rack_slots)
     _add_robot(spec, body)
     _add_mocap(spec)
     model = spec.compile()
     return model, _handles(model)
 
 
-def _add_building(spec: Any, warehouse: Warehouse) -> None:
+def building_boxes(warehouse: Warehouse, rack_slots: int) -> tuple[F64, F64]:
+    """Middles and half sizes (rack_slots + 4, 3) of racks and walls, in the model's order."""
+    thick, width, depth = warehouse.wall_m, warehouse.width_m, warehouse.depth_m
+    middle = np.full((rack_slots + 4, 3), PARKED_RACK_M)
+    half = np.full((rack_slots + 4, 3), 0.1)
+    for index, rack in enumerate(warehouse.racks):
+        middle[index] = (*rack.center, RACK_HALF_HEIGHT_M)
+        half[index] = (*rack.half_size, RACK_HALF_HEIGHT_M)
+    for index, (center, size) in enumerate(
+        (
+            ((-thick, depth / 2), (thick, depth / 2 + 2 * thick)),
+            ((width + thick, depth / 2), (thick, depth / 2 + 2 * thick)),
+            ((width / 2, -thick), (width / 2, thick)),
+            ((width / 2, depth + thick), (width / 2, thick)),
+        )
+    ):
+        middle[rack_slots + index] = (*center, WALL_HALF_HEIGHT_M)
+        half[rack_slots + index] = (*size, WALL_HALF_HEIGHT_M)
+    return middle, half
+
+
+def _add_building(spec: Any, warehouse: Warehouse, rack_slots: int) -> None:
     world = spec.worldbody
     world.add_light(pos=[warehouse.width_m / 2, warehouse.depth_m / 2, 8], dir=[0, 0, -1])
     world.add_geom(
@@ -92,35 +123,18 @@ def _add_building(spec: Any, warehouse: Warehouse) -> None:
         group=FLOOR_GROUP,
         **_mask(_FLOOR),
     )
-    for index, rack in enumerate(warehouse.racks):
-        _add_box(world, f"rack_{index}", rack.center, rack.half_size, 0.75, [0.36, 0.43, 0.53, 1])
-    thick, width, depth = warehouse.wall_m, warehouse.width_m, warehouse.depth_m
-    for name, center, half in (
-        ("wall_west", (-thick, depth / 2), (thick, depth / 2 + 2 * thick)),
-        ("wall_east", (width + thick, depth / 2), (thick, depth / 2 + 2 * thick)),
-        ("wall_south", (width / 2, -thick), (width / 2, thick)),
-        ("wall_north", (width / 2, depth + thick), (width / 2, thick)),
-    ):
-        _add_box(world, name, center, half, 0.5, [0.62, 0.64, 0.66, 1])
-
-
-def _add_box(
-    parent: Any,
-    name: str,
-    center: tuple[float, float],
-    half: tuple[float, float],
-    half_height: float,
-    rgba: list[float],
-) -> None:
-    parent.add_geom(
-        name=name,
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        pos=[*center, half_height],
-        size=[*half, half_height],
-        rgba=rgba,
-        group=OBSTACLE_GROUP,
-        **_mask(_OBSTACLE),
-    )
+    names = [f"rack_{index}" for index in range(rack_slots)]
+    names += [f"wall_{side}" for side in ("west", "east", "south", "north")]
+    for name, middle, half in zip(names, *building_boxes(warehouse, rack_slots), strict=True):
+        world.add_geom(
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=middle,
+            size=half,
+            rgba=[0.36, 0.43, 0.53, 1] if name.startswith("rack") else [0.62, 0.64, 0.66, 1],
+            group=OBSTACLE_GROUP,
+            **_mask(_OBSTACLE),
+        )
 
 
 def _add_robot(spec: Any, body: Body) -> None:
@@ -234,12 +248,19 @@ def _handles(model: mujoco.MjModel) -> Handles:
         chassis_body=model.body("chassis").id,
         wheel_bodies=(model.body("left_wheel").id, model.body("right_wheel").id),
         wheel_geoms=(model.geom("left_wheel").id, model.geom("right_wheel").id),
+        building=slice(model.geom("floor").id + 1, model.geom("wall_north").id + 1),
         pallets=mocap("pallet", PALLETS),
         people=mocap("person", PEOPLE),
         forklifts=mocap("forklift", FORKLIFTS),
         accelerometer=slice(accelerometer, accelerometer + 3),
         bumper=int(model.sensor("bumper").adr[0]),
     )
+
+
+def pallet_half_m(yaw_rad: F64) -> F64:
+    """Half sizes (..., 2) along x and y of pallets by heading (...): across, they are exchanged."""
+    across = np.abs(np.sin(yaw_rad))[..., None] > 0.7
+    return np.where(across, PALLET_HALF_M[1::-1], PALLET_HALF_M[:2])
 
 
 def wheel_commands(

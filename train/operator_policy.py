@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.ingest.route import view_route
-from restock.train.model import PALLET_HALF_M
+from restock.train.layout import Warehouse
+from restock.train.model import PALLET_HALF_M, pallet_half_m
 from restock.train.planner import PLAN_POINTS
 from restock.train.policies import Actions, SoftPolicy
 from restock.train.traffic import RETREATING, WALKING
@@ -96,7 +97,8 @@ class Operator(SoftPolicy):
         view = view_route(plans, pose[:, 0], pose[:, 1], np.zeros(len(pose)), _LOOK_M)
         ahead = view.look_ahead_m + pose[:, None, :2]  # heading 0: offsets in the map frame
         gap = np.abs(ahead[:, :, None] - env.simulation.pallets[:, None, :, :2])
-        in_way = (gap < np.array(PALLET_HALF_M[:2]) + 0.35).all(axis=-1)
+        half = pallet_half_m(env.simulation.pallets[:, None, :, 2])
+        in_way = (gap < half + 0.35).all(axis=-1)
         traffic = env.simulation.traffic
         people = traffic.position_m - pose[:, None, :2]
         near = in_way.reshape(len(pose), -1).any(axis=1)
@@ -139,7 +141,7 @@ class Operator(SoftPolicy):
             target = (float(goal[0]), float(goal[1]))
             pallets = env.simulation.pallets[index]
             pallets = pallets[pallets[:, 0] > 0]
-            planner = env.navigation.planner
+            planner = env.navigation.planner_of(index)
             way = (
                 planner.plan_around(x, y, target, pallets, PALLET_HALF_M[:2])
                 if len(pallets)
@@ -172,16 +174,18 @@ class Operator(SoftPolicy):
         cos, sin = np.cos(ends[..., 2, None]), np.sin(ends[..., 2, None])
         x = ends[..., 0, None] + cos * outline[:, 0] - sin * outline[:, 1]  # (N, A, T, K)
         y = ends[..., 1, None] + sin * outline[:, 0] + cos * outline[:, 1]
-        floor = env.warehouse
-        room = np.minimum(np.minimum(x, floor.width_m - x), np.minimum(y, floor.depth_m - y))
-        for rack in floor.racks:
-            room = np.minimum(room, _box_gap(x, y, rack.center, rack.half_size))
+        room = np.empty_like(x)
+        for ids, floor in env.by_floor():
+            room[ids] = _floor_gap(floor, x[ids], y[ids])
         pallets = env.simulation.pallets
         for column in range(pallets.shape[1]):
             ids = np.flatnonzero(pallets[:, column, 0] > 0)
             if len(ids):
                 middle = pallets[ids, column, :2][:, None, None, None]
-                gap = _box_gap(x[ids], y[ids], (middle[..., 0], middle[..., 1]), PALLET_HALF_M[:2])
+                half = pallet_half_m(pallets[ids, column, 2])[:, None, None, None]
+                gap = _box_gap(
+                    x[ids], y[ids], (middle[..., 0], middle[..., 1]), (half[..., 0], half[..., 1])
+                )
                 room[ids] = np.minimum(room[ids], gap)
         people = np.full(ends.shape[:3], 9.0)
         traffic = env.simulation.traffic
@@ -224,8 +228,19 @@ def _outline(half_length: float, half_width: float) -> F64:
     return np.stack([x, y], axis=-1)
 
 
+def _floor_gap(floor: Warehouse, x: F64, y: F64) -> F64:
+    """From points to the nearest rack or wall; negative inside."""
+    room = np.minimum(np.minimum(x, floor.width_m - x), np.minimum(y, floor.depth_m - y))
+    for rack in floor.racks:
+        room = np.minimum(room, _box_gap(x, y, rack.center, rack.half_size))
+    return room
+
+
 def _box_gap(
-    x: F64, y: F64, center: tuple[float | F64, float | F64], half: tuple[float, float]
+    x: F64,
+    y: F64,
+    center: tuple[float | F64, float | F64],
+    half: tuple[float | F64, float | F64],
 ) -> F64:
     """From points to an axis-aligned box; negative inside."""
     dx, dy = np.abs(x - center[0]) - half[0], np.abs(y - center[1]) - half[1]

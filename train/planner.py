@@ -3,14 +3,15 @@
 It knows the racks and the walls. Pallets, people and wet floors it does not: a wholly blocked
 aisle is found from the lidar (`find_blocks`) and then closed on the grid, and the plan made anew.
 Plans are shortest paths on a .1 m grid whose cells cost more near racks, one Dijkstra tree per
-goal and set of closures, cached; a plan is read off the tree, smoothed and resampled.
+goal and set of closures, cached; a plan is read off the tree, smoothed and resampled. One-way rules
+are directed edges; a robot that they shut in behind a block leaves against them.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from restock.train.layout import Warehouse
+from restock.train.layout import HEADINGS, Warehouse
 
 F64 = NDArray[np.float64]
 
@@ -28,6 +29,7 @@ ROBOT_RADIUS_M = 0.3  # half the width and a margin: no cell nearer to a rack is
 WIDE_M = 0.85  # from this clearance on, cells cost no more than their length
 NEAR_COST = 3.0  # how much more a cell at ROBOT_RADIUS_M costs
 _TREES_KEPT = 2048
+_TREES_KEPT_BYTES = 1 << 29  # of all planners that `planners` makes together
 
 Closure = tuple[int, int]  # aisle segment, and the place along it in steps of CLOSURE_STEP_M
 CLOSURE_STEP_M = 0.3
@@ -38,6 +40,7 @@ class Planner:
     """Plans for one warehouse. Shared by all environments; holds only a cache."""
 
     warehouse: Warehouse
+    trees_kept: int = _TREES_KEPT
     _trees: OrderedDict[tuple[int, tuple[Closure, ...]], tuple[F64, NDArray[np.int32]]] = field(
         default_factory=OrderedDict
     )
@@ -49,6 +52,11 @@ class Planner:
         )
         self._clearance_m = _rack_clearance(self.warehouse, self.shape)
         self._graph = self._build_graph(self._clearance_m)
+        self._unruled = (
+            Planner(replace(self.warehouse, one_way=()), max(self.trees_kept // 8, 8))
+            if self.warehouse.one_way
+            else None
+        )
 
     def plan(
         self,
@@ -60,9 +68,14 @@ class Planner:
         """The plan from a place to a goal, (PLAN_POINTS, 2), first point near the place.
 
         Where closures leave no way, those that shut the robot off are opened again: a robot
-        that believed everything shut would stand for ever.
+        that believed everything shut would stand for ever. A free place without a way by the
+        one-way rules gets one without them.
         """
         cell = self.cell(x_m, y_m)
+        if self._unruled is not None and self._clearance_m.flat[cell] >= ROBOT_RADIUS_M:
+            ruled = self._tree(self.cell(*goal), tuple(sorted(closures)))[0]
+            if not np.isfinite(ruled[cell]):
+                return self._unruled.plan(x_m, y_m, goal, closures)
         for kept in range(len(closures), -1, -1):
             distance, before = self._tree(self.cell(*goal), tuple(sorted(closures[:kept])))
             start = cell if np.isfinite(distance[cell]) else self._nearest(cell, distance)
@@ -139,42 +152,82 @@ class Planner:
         distance, before = csgraph.dijkstra(graph, indices=goal_cell, return_predecessors=True)
         tree = distance, before.astype(np.int32)
         self._trees[key] = tree
-        if len(self._trees) > _TREES_KEPT:
+        if len(self._trees) > self.trees_kept:
             self._trees.popitem(last=False)
         return tree
 
     def _closed_cells(self, closure: Closure) -> tuple[slice, slice]:
         segment, step = closure
-        area = self.warehouse.segments[segment].area
+        turned = self.warehouse.segments[segment].along == "y"
+        area = self.warehouse.segments[segment].lengthwise
         middle = area.x_min + (step + 0.5) * CLOSURE_STEP_M
         i0, i1 = (round((middle + side * 0.2) / CELL_M) for side in (-1, 1))
-        return slice(max(i0, 0), i1 + 1), slice(
-            int(area.y_min / CELL_M), int(area.y_max / CELL_M) + 1
-        )
+        along = slice(max(i0, 0), i1 + 1)
+        across = slice(int(area.y_min / CELL_M), int(area.y_max / CELL_M) + 1)
+        return (across, along) if turned else (along, across)
 
     def _build_graph(self, clearance_m: F64) -> sparse.csr_matrix:
-        """Cells joined to their eight neighbours, at length times the cost of both ends."""
+        """Cells joined to their eight neighbours, at length times the cost of both ends.
+
+        Edges run against the robot's way: trees grow from the goal.
+        """
         free = clearance_m >= ROBOT_RADIUS_M
         near = np.clip((WIDE_M - clearance_m) / (WIDE_M - ROBOT_RADIUS_M), 0.0, 1.0)
         cost = 1.0 + NEAR_COST * near**2
         index = np.arange(free.size).reshape(self.shape)
+        against = self._against_rules()
         rows, columns, weights = [], [], []
+        back_rows, back_columns, back_weights = [], [], []
         for di, dj in ((1, 0), (0, 1), (1, 1), (1, -1)):
             here = (slice(0, self.shape[0] - di), slice(max(-dj, 0), self.shape[1] - max(dj, 0)))
             there = (slice(di, None), slice(max(dj, 0), self.shape[1] + min(dj, 0)))
             both = free[here] & free[there]
-            rows.append(index[here][both])
-            columns.append(index[there][both])
+            one, other = index[here][both], index[there][both]
             length = CELL_M * np.hypot(di, dj)
-            weights.append(length * (cost[here][both] + cost[there][both]) / 2)
-        row, column, weight = map(np.concatenate, (rows, columns, weights))
-        return sparse.csr_matrix(
-            (
-                np.concatenate([weight, weight]),
-                (np.concatenate([row, column]), np.concatenate([column, row])),
-            ),
-            shape=(free.size, free.size),
-        )
+            weight = length * (cost[here][both] + cost[there][both]) / 2
+            # one -> other in the graph is the robot's way from `other` to `one`, by (-di, -dj).
+            for step, found, start, end in (
+                ((-di, -dj), (rows, columns, weights), one, other),
+                ((di, dj), (back_rows, back_columns, back_weights), other, one),
+            ):
+                kept = _allowed(against, step, one, other)
+                found[0].append(start[kept])
+                found[1].append(end[kept])
+                found[2].append(weight[kept])
+        parts = (rows + back_rows, columns + back_columns, weights + back_weights)
+        row, column, value = map(np.concatenate, parts)
+        return sparse.csr_matrix((value, (row, column)), shape=(free.size, free.size))
+
+    def _against_rules(self) -> list[tuple[tuple[int, int], NDArray[np.bool_]]]:
+        """Each one-way rule: its heading, and the cells (size,) that it holds in."""
+        x, y = _cell_middles(self.shape)
+        rules = []
+        for rule in self.warehouse.one_way:
+            area = rule.area
+            inside = (area.x_min < x) & (x < area.x_max) & (area.y_min < y) & (y < area.y_max)
+            rules.append((HEADINGS[rule.heading], inside.ravel()))
+        return rules
+
+
+def _allowed(
+    rules: list[tuple[tuple[int, int], NDArray[np.bool_]]],
+    step: tuple[int, int],
+    one: NDArray[np.int64],
+    other: NDArray[np.int64],
+) -> NDArray[np.bool_]:
+    """Which edges between cells a robot may take by `step`: none against a rule."""
+    allowed = np.ones(len(one), np.bool_)
+    for heading, inside in rules:
+        if heading[0] * step[0] + heading[1] * step[1] < 0:
+            allowed &= ~(inside[one] & inside[other])
+    return allowed
+
+
+def planners(floors: Sequence[Warehouse]) -> list[Planner]:
+    """A planner a floor; together their caches stay within some 500 MB."""
+    cells = max(round(f.width_m / CELL_M) * round(f.depth_m / CELL_M) for f in floors)
+    kept = _TREES_KEPT_BYTES // (12 * max(cells, 1) * len(floors))
+    return [Planner(floor, min(max(kept, 16), _TREES_KEPT)) for floor in floors]
 
 
 def _rack_clearance(warehouse: Warehouse, shape: tuple[int, int]) -> F64:
@@ -235,10 +288,11 @@ class BlockFinder:
 
     Within the aisle segment ahead, lidar returns that are neither rack nor wall are gathered up
     to `reach_m` away. If no free gap across the aisle is as wide as `passable_m`, and that is so
-    for `persistence` steps at the same place, the aisle is blocked there.
+    for `persistence` steps at the same place, the aisle is blocked there. Robots may be on several
+    floors: `floor` (N,) says on which of `warehouses` each is.
     """
 
-    warehouse: Warehouse
+    warehouses: Warehouse | Sequence[Warehouse]
     num: int
     reach_m: float = 2.0
     passable_m: float = 0.6
@@ -247,6 +301,9 @@ class BlockFinder:
     def __post_init__(self) -> None:
         self.seen = np.zeros(self.num, np.int64)  # steps in a row
         self.place = np.full((self.num, 2), -1, np.int64)  # of the last sighting: a closure
+        self.floor = np.zeros(self.num, np.int64)
+        if isinstance(self.warehouses, Warehouse):
+            self.warehouses = (self.warehouses,)
 
     def reset(self, ids: NDArray[np.int64]) -> None:
         self.seen[ids] = 0
@@ -258,16 +315,22 @@ class BlockFinder:
         pose: F64,
         hits_m: F64,
         valid: NDArray[np.bool_],
-        heading_x: F64,
+        heading: F64,
+        along_y: NDArray[np.bool_] | None = None,
     ) -> list[tuple[int, Closure]]:
         """Look at one scan of each robot in `ids`; returns (robot, closure) for blocks found.
 
         `pose` (n, 3) is localised, `hits_m` (n, B, 2) are the returns in the map frame, `valid`
-        (n, B) which of them are returns, and `heading_x` (n,) the sign of the way along x.
+        (n, B) which of them are returns, `heading` (n,) the sign of the way along x, or along y
+        where `along_y` (n,) says that it mostly runs that way.
         """
-        segment = self._segment_ahead(pose, heading_x)
-        edges = self.warehouse.segment_edges[segment]
-        x, y = hits_m[..., 0], hits_m[..., 1]
+        turned = np.zeros(len(ids), np.bool_) if along_y is None else along_y
+        segment, edges = self._segments_ahead(ids, pose, heading, turned)
+        swap = turned[:, None]
+        pose = np.where(swap, pose[:, [1, 0, 2]], pose)
+        heading_x = heading
+        x = np.where(swap, hits_m[..., 1], hits_m[..., 0])
+        y = np.where(swap, hits_m[..., 0], hits_m[..., 1])
         ahead = (x - pose[:, None, 0]) * heading_x[:, None]
         rack = 0.1  # returns this near to a rack are the rack
         own = (
@@ -298,8 +361,32 @@ class BlockFinder:
         self.seen[ids[found]] = 0
         return [(int(ids[k]), (int(place[k, 0]), int(place[k, 1]))) for k in found]
 
-    def _segment_ahead(self, pose: F64, heading_x: F64) -> NDArray[np.int64]:
-        """The aisle segment the robot is in, or the one just ahead of it."""
-        here = self.warehouse.segment_of(pose[:, 0], pose[:, 1])
-        ahead = self.warehouse.segment_of(pose[:, 0] + 0.8 * heading_x, pose[:, 1])
-        return np.where(here >= 0, here, ahead)
+    def _segments_ahead(
+        self,
+        ids: NDArray[np.int64],
+        pose: F64,
+        heading: F64,
+        turned: NDArray[np.bool_],
+    ) -> tuple[NDArray[np.int64], F64]:
+        """The aisle segment (n,) each robot is in, or the one just ahead of it; -1 for none.
+
+        With its edges (n, 4), x and y exchanged for robots that are `turned`. Only segments that
+        run the robot's way count.
+        """
+        segment = np.full(len(ids), -1, np.int64)
+        edges = np.zeros((len(ids), 4))
+        x, y = pose[:, 0], pose[:, 1]
+        then_x, then_y = x + 0.8 * heading * ~turned, y + 0.8 * heading * turned
+        floors = self.floor[ids]
+        for number in np.unique(floors):
+            warehouse = self.warehouses[number]
+            on = np.flatnonzero(floors == number)
+            if not len(warehouse.segments):
+                continue
+            for at_x, at_y in ((then_x[on], then_y[on]), (x[on], y[on])):
+                found = warehouse.segment_of(at_x, at_y)
+                fits = (found >= 0) & (warehouse.segment_along_y[found] == turned[on])
+                segment[on] = np.where(fits, found, segment[on])
+            edges[on] = warehouse.segment_edges[segment[on]]
+        edges = np.where(turned[:, None], edges[:, [1, 0, 3, 2]], edges)
+        return segment, edges

@@ -7,7 +7,7 @@ every substep. Results do not depend on the number of threads.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -33,6 +33,7 @@ from restock.train.model import (
     TRACK_M,
     WHEEL_RADIUS_M,
     build_model,
+    building_boxes,
     yaw_of,
 )
 from restock.train.perturbation import Perturbation
@@ -73,20 +74,23 @@ class Simulation:
         self,
         num_envs: int,
         task: Task,
-        warehouse: Warehouse,
+        floors: Warehouse | Sequence[Warehouse],
         timestep_s: float,
         nthread: int,
         *,
         physics: Physics = "mujoco",
         beams: int = LIDAR_BEAMS,
     ) -> None:
-        self.num_envs, self.task, self.warehouse = num_envs, task, warehouse
+        """On several `floors`, `reset` says on which of them each episode is."""
+        floors = (floors,) if isinstance(floors, Warehouse) else tuple(floors)
+        self.num_envs, self.task = num_envs, task
         self.beams = beams
         self.timestep_s = timestep_s
         self.substeps = round(BLOCK_S / timestep_s)
         self.blocks = round(task.control_period_s / BLOCK_S)
         _check_times(task, timestep_s, self.substeps, self.blocks)
-        self.model, self.handles = build_model(warehouse, task.body, timestep_s)
+        slots = max(len(floor.racks) for floor in floors)
+        self.model, self.handles = build_model(floors[0], task.body, timestep_s, slots)
         _no_log_file()
         self.batch = _batch(physics)(self.model, num_envs, nthread)
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
@@ -95,6 +99,8 @@ class Simulation:
         self._mocap_quat = self.batch.bind("mocap_quat")
         self._friction = self.batch.expand("geom_friction")
         self._masses = self._radii = False  # fields made per-simulation when first needed
+        self._building = [building_boxes(floor, slots) for floor in floors]
+        self._floor = np.zeros(num_envs, np.int64)  # whose building stands
 
         self.traffic = Traffic(num_envs, (task.body.length_m / 2, task.body.width_m / 2))
         self.patches = np.tile(NO_PATCH, (num_envs, PATCHES, 1)).astype(np.float64)
@@ -122,9 +128,10 @@ class Simulation:
 
     # -- layout ---------------------------------------------------------------------------------
 
-    def reset(self, env: int, episode: Episode, perturbation: Perturbation) -> None:
-        """Put one environment at the start of an episode."""
+    def reset(self, env: int, episode: Episode, perturbation: Perturbation, floor: int = 0) -> None:
+        """Put one environment at the start of an episode, on one of the floors."""
         ids = np.array([env])
+        self._build(env, floor)
         self.batch.reset(ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
         self.batch.warning[env] = 0
         self.place_robot(env, *episode.start)
@@ -147,6 +154,17 @@ class Simulation:
         self.accel[env] = 0.0
         self.time_s[env] = 0.0
         self.bumped[env] = self.slipped[env] = self.blown_up[env] = False
+
+    def _build(self, env: int, floor: int) -> None:
+        """Racks and walls of a floor: boxes of the one model, placed anew."""
+        if floor == self._floor[env]:
+            return
+        self._floor[env] = floor
+        where, (middle, half) = self.handles.building, self._building[floor]
+        self.batch.expand("geom_pos")[env, where] = middle
+        self.batch.expand("geom_size")[env, where] = half
+        self.batch.expand("geom_aabb")[env, where, 3:] = half
+        self.batch.expand("geom_rbound")[env, where] = np.sqrt((half**2).sum(axis=1))
 
     def place_robot(self, env: int, x_m: float, y_m: float, yaw_rad: float) -> None:
         """Stand the robot still at a pose."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from restock.ingest.route import view_route
 from restock.ingest.task import Task
-from restock.train.model import PALLET_HALF_M
+from restock.train.model import pallet_half_m
 
 F64 = NDArray[np.float64]
 
@@ -71,6 +71,6 @@ def _blocked(pose: F64, plans_m: F64, pallets: F64) -> NDArray[np.bool_]:
     view = view_route(plans_m, pose[:, 0], pose[:, 1], np.zeros(len(pose)), BLOCK_AHEAD_M)
     points = view.look_ahead_m + pose[:, None, :2]  # heading 0: offsets in the map frame
     gap = np.abs(points[:, :, None] - pallets[:, None, :, :2])
-    half = np.array(PALLET_HALF_M[:2]) + BODY_MARGIN_M
+    half = pallet_half_m(pallets[:, None, :, 2]) + BODY_MARGIN_M
     inside = (gap <= half).all(axis=-1).reshape(len(pose), -1)
     return np.asarray(inside.any(axis=1), np.bool_)

@@ -16,8 +16,8 @@ termination.
 - `signals`: the stored signals at t + 1, before any autoreset (`env.signals`: after it). Its
   `command_*` columns are the commands of [t, t + 1); `progress_m` along the plan in force at t;
 - `true_condition`: what was physically so over [t, t + 1); `episode_condition`, `block` (none,
-  partial, full), `episode_seed`, `perturbation` (its name), `episode_number` (place in
-  `set_episodes`, or -1);
+  partial, full), `episode_seed`, `perturbation` and `layout` (their names), `episode_number`
+  (place in `set_episodes`, or -1);
 - `success` (at the goal without any bump, at the episode's end), `bumps` (steps with a bump so
   far), `episode_steps`, `true_pose` (N, 3);
 - `invalid`: the physics blew up: the episode is truncated and the step must not enter replay;
@@ -27,7 +27,7 @@ termination.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -42,7 +42,8 @@ from restock.ingest.task import Task, observe, reached_goal, reward, terminated
 from restock.train.action_face import Face, action_face
 from restock.train.draw import draw_map
 from restock.train.episode import KINDS, Episode, EpisodeSpec, draw_episode
-from restock.train.layout import Warehouse, default_warehouse
+from restock.train.floors import open_floors
+from restock.train.layout import DEFAULT, Warehouse, default_warehouse
 from restock.train.navigation import Navigation
 from restock.train.perturbation import Perturbation, Schedule
 from restock.train.sensing import Sensing, Signals, add_motion, add_route
@@ -78,6 +79,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         render_mode: str | None = None,
         task: Task | None = None,
         warehouse: Warehouse | None = None,
+        layouts: str | Sequence[Warehouse] = DEFAULT,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         action: Face = "discrete",
         physics: Physics = "mujoco",
@@ -87,6 +89,10 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
 
         A `perturbation` holds for every episode whose spec has none of its own; a schedule draws
         one for each such episode (fixed episodes get its base). `env.specs` tells them.
+
+        `layouts` are floors, or what `restock.train.floors.open_floors` reads, such as
+        `generated:train`: an episode whose spec names none of them is on one that its seed draws.
+        `warehouse` is the one floor, in their place.
 
         Raises:
             ConfigError: an unknown condition, shares that are no shares, no environments, an
@@ -98,7 +104,10 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         self.num_envs = num_envs
         self.render_mode = render_mode
         self.task = task or load_profile("warehouse_amr").task
-        self.warehouse = warehouse or default_warehouse()
+        self.floors = _floors(warehouse, layouts)
+        self._layout_names = np.array([floor.name for floor in self.floors])
+        self._floor_index = {floor.name: index for index, floor in enumerate(self.floors)}
+        self.layout = np.zeros(num_envs, np.int64)  # of the running episodes, among the floors
         self.schedule = perturbation if isinstance(perturbation, Schedule) else None
         base = perturbation.base if isinstance(perturbation, Schedule) else perturbation
         self.perturbation = base or Perturbation()
@@ -117,11 +126,11 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
 
         timestep = self.perturbation.timestep_s
         self.simulation = Simulation(
-            num_envs, self.task, self.warehouse, timestep, nthread, physics=physics
+            num_envs, self.task, self.floors, timestep, nthread, physics=physics
         )
         self.sensing = Sensing(self.simulation, self.task)
         self.truth = Truth(self.task, num_envs)
-        self.navigation = Navigation(self.warehouse, num_envs, self.task)
+        self.navigation = Navigation(self.floors, num_envs, self.task)
         self.episodes: list[Episode | None] = [None] * num_envs
         self.specs: list[EpisodeSpec] = [EpisodeSpec("nominal", 0)] * num_envs
         self._fixed: list[EpisodeSpec] = []
@@ -140,6 +149,37 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         self.episode_condition = np.full(num_envs, "nominal", "U16")
         self.block = np.full(num_envs, "none", "U8")
         self.perturbation_name = np.full(num_envs, "nominal", "U32")
+
+    # -- floors ---------------------------------------------------------------------------------
+
+    @property
+    def warehouse(self) -> Warehouse:
+        """The floor, where there is one; the first of several."""
+        return self.floors[0]
+
+    def floor_of(self, env: int) -> Warehouse:
+        """The floor that an environment's episode is on."""
+        return self.floors[self.layout[env]]
+
+    def by_floor(self) -> Iterator[tuple[NDArray[np.int64], Warehouse]]:
+        """The environments on each floor, and the floor."""
+        for index in np.unique(self.layout):
+            yield np.flatnonzero(self.layout == index), self.floors[index]
+
+    def _floor_for(self, spec: EpisodeSpec) -> int:
+        """Which floor an episode is on: by name, or by its seed."""
+        if spec.layout is None:
+            if len(self.floors) == 1:
+                return 0
+            return int(np.random.default_rng([spec.seed, 2]).integers(len(self.floors)))
+        if spec.layout not in self._floor_index:
+            raise ConfigError(
+                f"an episode asks for layout {spec.layout!r}, which is none of the environment's"
+                f" {len(self.floors)}",
+                where=f"episode {spec.condition}/{spec.seed}",
+                remedy="make the environment with that layout",
+            )
+        return self._floor_index[spec.layout]
 
     # -- episodes -------------------------------------------------------------------------------
 
@@ -204,11 +244,13 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
                 where=f"episode {spec.condition}/{spec.seed}",
                 remedy="make the environment with that perturbation",
             )
-        episode = draw_episode(spec, self.warehouse, self.navigation.planner)
+        floor = self._floor_for(spec)
+        episode = draw_episode(spec, self.floors[floor], self.navigation.planners[floor])
         self.episodes[env], self.specs[env] = episode, spec
-        self.simulation.reset(env, episode, perturbation)
+        self.layout[env] = floor
+        self.simulation.reset(env, episode, perturbation, floor)
         self.sensing.reset(env, episode.noise, perturbation)
-        self.navigation.reset(env, episode)
+        self.navigation.reset(env, episode, floor)
         self.truth.reset(np.array([env]))
         self.episode_condition[env], self.block[env] = spec.condition, episode.block
         self.episode_seed[env] = spec.seed
@@ -295,6 +337,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
             "block": self.block.copy(),
             "episode_seed": self.episode_seed.copy(),
             "perturbation": self.perturbation_name.copy(),
+            "layout": self._layout_names[self.layout],
             "episode_number": self.episode_number.copy(),
             "episode_steps": self.steps.copy(),
             "bumps": self.bumps.copy(),
@@ -350,6 +393,26 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         from restock.train.env_state import set_state
 
         set_state(self, state)
+
+
+def _floors(
+    warehouse: Warehouse | None, layouts: str | Sequence[Warehouse]
+) -> tuple[Warehouse, ...]:
+    """The floors that were asked for. Raises ConfigError for none, or two of one name."""
+    if warehouse is not None:
+        if layouts != DEFAULT:
+            raise ConfigError("give a warehouse or layouts, not both", where="the twin")
+        return (warehouse,)
+    if layouts == DEFAULT:
+        return (default_warehouse(),)
+    floors = open_floors(layouts) if isinstance(layouts, str) else tuple(layouts)
+    if not floors or len({floor.name for floor in floors}) < len(floors):
+        raise ConfigError(
+            f"{len(floors)} layouts are none, or two have one name",
+            where="the twin",
+            remedy="give floors that differ in their name",
+        )
+    return floors
 
 
 def _bounded(observation: NDArray[np.float32]) -> NDArray[np.float32]:
