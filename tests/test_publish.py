@@ -104,6 +104,9 @@ def test_every_topic_has_its_rate(messages: list[Message]) -> None:
         "/ground_truth/condition": 21,
         "/cmd_vel": 21,  # 20 steps and the stop at the end
         "/diagnostics": 5,
+        "/ground_truth/perturbation": 1,
+        "/ground_truth/markers": 1,
+        "/ground_truth/traffic": 1,
     }
 
 

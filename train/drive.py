@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.ingest.signals import Columns
+from restock.train.scene import EMPTY, Scene
 
 F64 = NDArray[np.float64]
 
@@ -60,6 +61,7 @@ class Drive:
     true_condition: list[str]  # T
     policy: list[tuple[str, str, float]]  # T of (name, version, probability of the action)
     plans: list[tuple[int, F64]]  # (tick from which it is in force, (P, 2) points)
+    scene: Scene = EMPTY
     gyro_bias_radps: float = 0.0
     gyro_noise_radps: float = 0.0
     accel_noise_mps2: float = 0.0

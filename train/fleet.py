@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from restock.train.drive import Drive, Motion
 from restock.train.episode import EpisodeSpec
 from restock.train.missions import Mission
+from restock.train.model import CHASSIS_Z_M
 from restock.train.perturbation import Perturbation, Schedule
+from restock.train.scene import Scene
 from restock.train.simulation import BLOCK_S, Live
 from restock.train.vector_env import WarehouseVectorEnv
 
@@ -50,6 +52,7 @@ class Driven:
     reward: NDArray[np.float32]  # (T,)
     success: bool
     block: str
+    terminated: bool  # at its last step; else it was cut there
 
 
 @dataclass
@@ -70,6 +73,9 @@ class _Log:
     ranges_m: list[F64] = field(default_factory=list)
     plans: list[tuple[int, F64]] = field(default_factory=list)
     plan_number: int = -1
+    pallets: F64 = field(default_factory=lambda: np.zeros((0, 3)))
+    patches: F64 = field(default_factory=lambda: np.zeros((0, 5)))
+    traffic: list[F64] = field(default_factory=list)  # T + 1
 
 
 class Fleet:
@@ -113,7 +119,9 @@ class Fleet:
                     self._note_step(log, robot, info)
             for robot in ended.tolist():
                 if (log := self._logs[robot]) is not None:
-                    finished[log.place] = self._finish(log, robot, info)
+                    finished[log.place] = self._finish(
+                        log, robot, info, terminated=bool(terminated[robot])
+                    )
             if len(ended):
                 self._begin(ended, numbered, crew)
             while delivered in finished:
@@ -140,6 +148,8 @@ class Fleet:
             place, mission = entry
             log = _Log(place, mission, np.random.Generator(np.random.PCG64(mission.spec.seed)))
             log.motion.append(standing)
+            log.pallets = env.simulation.pallets[robot].copy()
+            log.patches = env.simulation.patches[robot].copy()
             self._logs[robot] = log
             self._note_tick(log, robot, env.signals)
             crew.begin(robot, mission)
@@ -164,6 +174,8 @@ class Fleet:
         log.observation.append(env.observation[robot].copy())
         log.scan_s.append(round(tick * self.period_s, 6))
         log.ranges_m.append(env.sensing.ranges_m[robot].copy())
+        traffic = env.simulation.traffic
+        log.traffic.append(np.column_stack([traffic.position_m[robot], traffic.heading_rad[robot]]))
         number = int(env.navigation.plan_number[robot])
         if number != log.plan_number:
             log.plans.append((tick, env.navigation.plans_m[robot].copy()))
@@ -176,7 +188,9 @@ class Fleet:
         lost = log.rng.random(len(ranges)) < hardware.lidar_dropout
         return np.where(lost, np.inf, np.maximum(ranges, 0.0))
 
-    def _finish(self, log: _Log, robot: int, info: Mapping[str, Any]) -> Driven:
+    def _finish(
+        self, log: _Log, robot: int, info: Mapping[str, Any], *, terminated: bool
+    ) -> Driven:
         env = self.env
         goal = env.navigation.goals_m[robot]
         names = log.signals[0].keys()
@@ -193,6 +207,14 @@ class Fleet:
             true_condition=log.truth,
             policy=log.policy,
             plans=log.plans,
+            scene=Scene(
+                pallets=log.pallets,
+                patches=log.patches,
+                traffic=np.array(log.traffic),
+                perturbation=hardware,
+                goal_radius_m=env.task.goal_radius_m,
+                body_m=(env.task.body.length_m, env.task.body.width_m, 2 * CHASSIS_Z_M),
+            ),
             gyro_bias_radps=hardware.gyro_bias_radps,
             gyro_noise_radps=hardware.gyro_noise_radps,
             accel_noise_mps2=hardware.accel_noise_mps2,
@@ -206,6 +228,7 @@ class Fleet:
             reward=np.array(log.reward, np.float32),
             success=bool(info["success"][robot]),
             block=str(info["block"][robot]),
+            terminated=terminated,
         )
 
 

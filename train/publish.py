@@ -24,6 +24,14 @@ from restock.ingest.signals import wrap_angle
 from restock.train import robot_topics as topics
 from restock.train.bag_writer import Message
 from restock.train.drive import Drive, Lidar
+from restock.train.scene import (
+    MARKERS,
+    PERTURBATION,
+    TRAFFIC,
+    mission_markers,
+    perturbation_text,
+    traffic_markers,
+)
 from restock.train.transport import send
 
 F64 = NDArray[np.float64]
@@ -52,6 +60,7 @@ class Rates:
     bumper: float = 10.0
     diagnostics: float = 1.0
     plan: float = 1.0  # and whenever it changes
+    traffic: float = 2.0  # while anyone moves
 
 
 @dataclass
@@ -82,6 +91,7 @@ class Robot:
             *self._bumper(drive),
             *self._ticks(drive),
             *self._diagnostics(drive),
+            *self._scene(drive),
         ]
         turned = drive.motion.wheel_angle_rad[-1] - drive.motion.wheel_angle_rad[0]
         self.wheel_angle_rad = self.wheel_angle_rad + turned
@@ -90,13 +100,19 @@ class Robot:
         found.sort(key=lambda message: message.log_ns)  # stable: ties keep the order above
         return found
 
-    def static(self, start_ns: int, occupied: NDArray[np.bool_], cell_m: float) -> list[Message]:
+    def static(
+        self,
+        start_ns: int,
+        occupied: NDArray[np.bool_],
+        cell_m: float,
+        origin_m: tuple[float, float] = (0.0, 0.0),
+    ) -> list[Message]:
         """What is sent once, when the recording starts: the sensors' places and the map."""
         self._start_ns = start_ns
         at = np.zeros(1)
         return [
             *self._send("/tf_static", at, [topics.static_transforms(start_ns, self.lidar.x_m)]),
-            *self._send("/map", at, [topics.occupancy_map(start_ns, occupied, cell_m)]),
+            *self._send("/map", at, [topics.occupancy_map(start_ns, occupied, cell_m, origin_m)]),
         ]
 
     def _announcements(self, drive: Drive) -> list[Message]:
@@ -251,6 +267,24 @@ class Robot:
             ]
             data.append(topics.diagnostics(self._stamp(time), status))
         return self._send("/diagnostics", times, data)
+
+    def _scene(self, drive: Drive) -> list[Message]:
+        """The parameters in force, what stands and lies, and who walks: on change, at its rate."""
+        scene, at, start_ns = drive.scene, np.zeros(1), self._stamp(0.0)
+        due = np.diff(np.floor(drive.tick_s * self.rates.traffic + 1e-6), prepend=-1) > 0
+        due = due[: len(scene.traffic)]
+        ticks = np.flatnonzero(due)
+        places = scene.traffic[ticks]
+        # The first clears what the mission before has left.
+        moved = np.ones(len(ticks), np.bool_)
+        moved[1:] = (places[1:] != places[:-1]).any(axis=(1, 2))
+        ticks, places = ticks[moved], places[moved]
+        times = drive.tick_s[ticks]
+        return [
+            *self._send(PERTURBATION, at, [topics.text(perturbation_text(scene.perturbation))]),
+            *self._send(MARKERS, at, [mission_markers(start_ns, scene, drive.goal_m)]),
+            *self._send(TRAFFIC, times, traffic_markers(self._stamps(times), places)),
+        ]
 
     def _sample(self, drive: Drive, rate_hz: float) -> tuple[F64, NDArray[np.intp]]:
         """When a sensor measures (n,), and the tick of each sample (n,), or -1 between ticks.

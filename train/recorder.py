@@ -177,7 +177,8 @@ def record(
     crew = FleetCrew(fleet.env.num_envs, seed=plan.seed, epsilon=plan.epsilon, guest=guest)
     start_ns = plan.start_ns
     with recording_sink(path, plan.format, TOPICS) as sink:
-        static = robot.static(start_ns, _occupied(fleet.env.warehouse, MAP_CELL_M), MAP_CELL_M)
+        cells = _occupied(fleet.env.warehouse, MAP_CELL_M)
+        static = robot.static(start_ns, cells, MAP_CELL_M, (-MAP_CELL_M, -MAP_CELL_M))
         sink.write(static)
         summary.topics.update(message.topic for message in static)
         for driven in fleet.drive(islice(missions, plan.missions), crew):
@@ -279,7 +280,7 @@ def _robot(plan: Plan, fleet: Fleet) -> Robot:
 
 
 def _occupied(warehouse: Warehouse, cell_m: float) -> NDArray[np.bool_]:
-    """The known map as cells, (rows of y, columns of x): the racks."""
+    """The known map as cells, (rows of y, columns of x): the racks, and one cell of wall around."""
     x = (np.arange(round(warehouse.width_m / cell_m)) + 0.5) * cell_m
     y = (np.arange(round(warehouse.depth_m / cell_m)) + 0.5) * cell_m
     cells = np.zeros((len(y), len(x)), np.bool_)
@@ -289,4 +290,4 @@ def _occupied(warehouse: Warehouse, cell_m: float) -> NDArray[np.bool_]:
             (rack.x_min <= x) & (x <= rack.x_max),
         )
         cells |= inside_y[:, None] & inside_x[None, :]
-    return cells
+    return np.pad(cells, 1, constant_values=True)

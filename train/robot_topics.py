@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from restock.train.bag_writer import Topic
 from restock.train.messages import MessageLayout, build, serialise, stamp
+from restock.train.scene import SCENE_TOPICS
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -37,6 +38,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("/ground_truth/condition", "std_msgs/msg/String"),
     Topic("/cmd_vel", "geometry_msgs/msg/Twist"),
     Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"),
+    *SCENE_TOPICS,
 )
 LASER_FRAME, IMU_FRAME = "laser_link", "imu_link"
 WHEEL_JOINTS = ("left_wheel_joint", "right_wheel_joint")
@@ -275,8 +277,13 @@ def _path_layout(points: int) -> MessageLayout:
     )
 
 
-def occupancy_map(stamp_ns: int, occupied: NDArray[np.bool_], resolution_m: float) -> bytes:
-    """The known map: cells (rows from y = 0 up, columns from x = 0), occupied or free."""
+def occupancy_map(
+    stamp_ns: int,
+    occupied: NDArray[np.bool_],
+    resolution_m: float,
+    origin_m: tuple[float, float] = (0.0, 0.0),
+) -> bytes:
+    """The known map: cells (rows north, columns east from `origin_m`), occupied or free."""
     return serialise(
         build(
             "nav_msgs/msg/OccupancyGrid",
@@ -286,6 +293,7 @@ def occupancy_map(stamp_ns: int, occupied: NDArray[np.bool_], resolution_m: floa
                 "resolution": resolution_m,
                 "width": occupied.shape[1],
                 "height": occupied.shape[0],
+                "origin": {"position": {"x": origin_m[0], "y": origin_m[1]}},
             },
             data=np.where(occupied, 100, 0).astype(np.int8).ravel(),
         )
