@@ -27,7 +27,7 @@ def test_the_two_clocks() -> None:
     only after the sync does it learn from what it learnt.
     """
     online, target = One(0.0), One(0.0)
-    clock = TargetUpdate(Hard(every=3), online, target)
+    clock = TargetUpdate(Hard(every=3), online.parameters(), target.parameters())
     history = []
     for step in range(1, 5):
         with torch.no_grad():
@@ -45,7 +45,7 @@ def test_the_two_clocks() -> None:
 
 def test_polyak_by_hand() -> None:
     online, target = One(1.0), One(0.0)
-    clock = TargetUpdate(Polyak(tau=0.1), online, target)
+    clock = TargetUpdate(Polyak(tau=0.1), online.parameters(), target.parameters())
     values = []
     for step in range(1, 4):
         assert clock.after(step)
@@ -58,15 +58,15 @@ def test_tau_of_one_is_a_hard_sync_of_every_update() -> None:
     torch.manual_seed(0)
     online = nn.Linear(4, 3)
     slow, hard = nn.Linear(4, 3), nn.Linear(4, 3)
-    TargetUpdate(Polyak(tau=1.0), online, slow).after(1)
-    TargetUpdate(Hard(every=1), online, hard).after(1)
+    TargetUpdate(Polyak(tau=1.0), online.parameters(), slow.parameters()).after(1)
+    TargetUpdate(Hard(every=1), online.parameters(), hard.parameters()).after(1)
     for a, b in zip(slow.parameters(), hard.parameters(), strict=True):
         assert torch.equal(a, b)
 
 
 def test_distance_is_relative_to_the_online_parameters() -> None:
     online, target = One(4.0), One(3.0)
-    clock = TargetUpdate(Hard(every=2), online, target)
+    clock = TargetUpdate(Hard(every=2), online.parameters(), target.parameters())
     assert clock.distance() == pytest.approx(0.25)
     clock.after(2)
     assert clock.distance() == 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,8 @@ from torch import Tensor
 
 from restock.errors import ConfigError
 from restock.train.config import LossConfig, TrainConfig
+from restock.train.flat import FlatParameters
+from restock.train.kernel import Kernel, UpdatePath, update_path
 from restock.train.loss import (
     Loss,
     conservative_penalty,
@@ -24,7 +27,21 @@ from restock.train.loss import (
     td_target,
 )
 from restock.train.network import Network, clone, make_network
+from restock.train.q_gradient import conservative_gradient, dqn_gradient, margin_gradient
 from restock.train.target import TargetUpdate
+
+_MOMENTS = ("exp_avg", "exp_avg_sq")  # of Adam, as PyTorch names them
+
+
+@dataclass(frozen=True)
+class _Terms:
+    """What `Learner.update` was given beside the rows."""
+
+    weight: Tensor | None
+    logged: int
+    conservative: float
+    return_to_go: Tensor | None
+    expert: Tensor | None
 
 
 class Learner:
@@ -34,7 +51,15 @@ class Learner:
     `[observation | next_observation | action | reward | discount]`.
     """
 
-    def __init__(self, config: TrainConfig, observation_size: int, actions: int) -> None:
+    def __init__(
+        self,
+        config: TrainConfig,
+        observation_size: int,
+        actions: int,
+        *,
+        path: UpdatePath | None = None,
+    ) -> None:
+        """`path` None takes the fastest that the config allows; both agree but for rounding."""
         self.device = open_device(config.device)
         self.loss: LossConfig = config.loss
         self.max_grad_norm = config.optimizer.max_grad_norm
@@ -45,12 +70,18 @@ class Learner:
             generator=torch.Generator().manual_seed(config.seed),
         ).to(self.device)
         self.target_network = clone(self.network)
-        self.target = TargetUpdate(config.target, self.network, self.target_network)
-        self.averaging = config.evaluation.averaging
         self.policy_network = clone(self.network)
+        self._flat = FlatParameters(self.network, learns=True)
+        self._policy = FlatParameters(self.policy_network, learns=False).values
+        slow = FlatParameters(self.target_network, learns=False).values
+        self.target = TargetUpdate(config.target, [self._flat.values], [slow])
+        self.averaging = config.evaluation.averaging
         self.optimizer = torch.optim.Adam(
-            self.network.parameters(), lr=config.optimizer.learning_rate, fused=True
+            [self._flat.values], lr=config.optimizer.learning_rate, fused=True
         )
+        self.path = path or update_path(config.network, config.device)
+        self._kernel = Kernel(self.network) if self.path == "kernel" else None
+        self._target_kernel = Kernel(self.target_network) if self.path == "kernel" else None
         self.gradient_steps = 0
 
     def update(
@@ -73,40 +104,95 @@ class Learner:
             return_to_go: (logged,) what the logs got from each of them on, for Cal-QL.
             expert: (logged,) bool, whether the margin term applies, or None: to none.
         """
+        terms = _Terms(weight, logged, conservative if logged else 0.0, return_to_go, expert)
+        if self._kernel is not None and self._target_kernel is not None:
+            loss = self._by_hand(self._kernel, self._target_kernel, rows, terms)
+        else:
+            loss = self._by_autograd(rows, terms)
+        if self.max_grad_norm is not None:
+            torch.nn.utils.clip_grad_norm_([self._flat.values], self.max_grad_norm)
+        self.optimizer.step()
+        self.gradient_steps += 1
+        self._average()
+        return loss
+
+    def _by_autograd(self, rows: Tensor, terms: _Terms) -> Loss:
+        """Fill the gradient from a graph: any network."""
         observation, next_observation, action, reward, discount = unpack(
             rows, self.network.observation_size
         )
         target = self._target(observation, next_observation, action, reward, discount)
+        logged, share = terms.logged, terms.logged / len(rows)
         losses, penalties = [], []
         for member in self.network.members:
             if member.quantiles:
                 spread = member.distribution(observation)
                 q = spread.mean(dim=2)
                 loss = quantile_loss(
-                    spread, action, target, weight=weight, huber_delta=self.loss.huber_delta
+                    spread, action, target, weight=terms.weight, huber_delta=self.loss.huber_delta
                 )
             else:
                 q = member(observation)
-                loss = dqn_loss(q, action, target, weight=weight, huber_delta=self.loss.huber_delta)
+                loss = dqn_loss(
+                    q, action, target, weight=terms.weight, huber_delta=self.loss.huber_delta
+                )
             losses.append(loss)
-            share = logged / len(rows)
-            if conservative > 0 and logged:
-                term = conservative_penalty(q[:logged], action[:logged], return_to_go)
-                penalties.append(conservative * term * share)
-            if expert is not None:
-                term = margin_penalty(q[:logged], action[:logged], expert, self.loss.margin_size)
+            if terms.conservative > 0:
+                term = conservative_penalty(q[:logged], action[:logged], terms.return_to_go)
+                penalties.append(terms.conservative * term * share)
+            if terms.expert is not None:
+                term = margin_penalty(
+                    q[:logged], action[:logged], terms.expert, self.loss.margin_size
+                )
                 penalties.append(self.loss.margin * term * share)
         loss = mean_loss(losses)
         value = loss.value
         if penalties:
             value = value + torch.stack(penalties).sum() / len(losses)
-        self.optimizer.zero_grad(set_to_none=True)
+        self._flat.gradient.zero_()
         value.backward()  # type: ignore[no-untyped-call]
-        if self.max_grad_norm is not None:
-            torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.max_grad_norm)
-        self.optimizer.step()
-        self.gradient_steps += 1
-        self._average()
+        return loss
+
+    @torch.no_grad()
+    def _by_hand(self, online: Kernel, slow: Kernel, rows: Tensor, terms: _Terms) -> Loss:
+        """Fill the gradient by the kernel: the plain network, with every term of the loss."""
+        observation, next_observation, action, reward, discount = unpack(
+            rows, self.network.observation_size
+        )
+        settings, logged = self.loss, terms.logged
+        if settings.munchausen:
+            (q,) = online.forward(observation)
+            slow_q, slow_next_q = slow.forward(observation, next_observation)
+            target = munchausen_target(
+                reward,
+                discount,
+                action,
+                slow_q,
+                slow_next_q,
+                scale=settings.munchausen,
+                temperature=settings.munchausen_temperature,
+                floor=settings.munchausen_floor,
+            )
+        elif settings.double:  # s and s' through the online network together
+            q, next_q = online.forward(observation, next_observation)
+            (slow_q,) = slow.forward(next_observation)
+            target = td_target(reward, discount, slow_q, next_q)
+        else:
+            (q,) = online.forward(observation)
+            (slow_q,) = slow.forward(next_observation)
+            target = td_target(reward, discount, slow_q)
+        loss = dqn_loss(q, action, target, weight=terms.weight, huber_delta=settings.huber_delta)
+        gradient = dqn_gradient(
+            loss.td, action, q.shape[1], weight=terms.weight, huber_delta=settings.huber_delta
+        )
+        share = logged / len(rows)
+        if terms.conservative > 0:
+            term = conservative_gradient(q[:logged], action[:logged], terms.return_to_go)
+            gradient[:logged].add_(term, alpha=terms.conservative * share)
+        if terms.expert is not None:
+            term = margin_gradient(q[:logged], action[:logged], terms.expert, settings.margin_size)
+            gradient[:logged].add_(term, alpha=settings.margin * share)
+        online.backward(gradient)
         return loss
 
     @torch.no_grad()
@@ -155,11 +241,7 @@ class Learner:
         Juditsky 1992). Until there are as many, it is the mean of all of them.
         """
         rate = max(self.averaging, 1.0 / self.gradient_steps)
-        torch._foreach_lerp_(
-            list[Tensor](self.policy_network.parameters()),
-            list[Tensor](self.network.parameters()),
-            rate,
-        )
+        self._policy.lerp_(self._flat.values, rate)
 
     @torch.no_grad()
     def td_error(self, rows: Tensor, *, online: bool = False) -> tuple[Tensor, Tensor, Tensor]:
@@ -188,12 +270,11 @@ class Learner:
 
     def state_dict(self) -> dict[str, Any]:
         """Tensors and JSON values, for a checkpoint."""
-        optimizer = self.optimizer.state_dict()["state"]
         return {
             "network": dict(self.network.state_dict()),
             "target_network": dict(self.target_network.state_dict()),
             "policy_network": dict(self.policy_network.state_dict()),
-            "optimizer": {str(index): dict(entry) for index, entry in optimizer.items()},
+            "optimizer": self._optimizer_state(),
             "gradient_steps": self.gradient_steps,
             "last_sync": self.target.last_sync,
         }
@@ -203,14 +284,29 @@ class Learner:
         self.network.load_state_dict(state["network"])
         self.target_network.load_state_dict(state["target_network"])
         self.policy_network.load_state_dict(state["policy_network"])
-        self.optimizer.load_state_dict(
-            {
-                "state": {int(index): dict(entry) for index, entry in state["optimizer"].items()},
-                "param_groups": self.optimizer.state_dict()["param_groups"],
-            }
-        )
+        self._load_optimizer_state(state["optimizer"])
         self.gradient_steps = int(state["gradient_steps"])
         self.target.last_sync = int(state["last_sync"])
+
+    def _optimizer_state(self) -> dict[str, dict[str, Tensor]]:
+        """Adam's moments a parameter, in the network's order, as if each were its own."""
+        if not (state := self.optimizer.state[self._flat.values]):
+            return {}
+        moments = zip(*(self._flat.views(state[name]) for name in _MOMENTS), strict=True)
+        return {
+            str(index): {"step": state["step"], **dict(zip(_MOMENTS, pair, strict=True))}
+            for index, pair in enumerate(moments)
+        }
+
+    def _load_optimizer_state(self, entries: Mapping[str, Mapping[str, Tensor]]) -> None:
+        self.optimizer.state.clear()
+        if not entries:
+            return
+        state = self.optimizer.state[self._flat.values]
+        ordered = [entries[str(index)] for index in range(len(entries))]
+        state["step"] = ordered[0]["step"].to(self.device, copy=True)
+        for name in _MOMENTS:
+            state[name] = self._flat.flat_of([entry[name] for entry in ordered])
 
 
 def unpack(rows: Tensor, observation_size: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

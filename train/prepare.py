@@ -18,6 +18,7 @@ from restock.train.config import TrainConfig, apply_overrides, load_config, pars
 from restock.train.episode import KINDS
 from restock.train.evaluate import Twin
 from restock.train.explore import AFTER_LOGS
+from restock.train.kernel import update_path
 from restock.train.learner import open_device
 from restock.train.log_draws import diet_of
 from restock.train.run import Run, check_free, now_ns, panel_document, software_versions
@@ -202,6 +203,7 @@ def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dic
         "config": msgspec.to_builtins(config),
         "panel": fed,
         "target": describe(config.target),
+        "update_path": update_path(config.network, config.device),
         "task_hash": profile.task.hash,
         "labels_version": profile.labels_version,
         "profile": {"name": profile.name, "hash": profile.hash},

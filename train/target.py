@@ -7,11 +7,11 @@ that the run's config, metrics and checkpoints all carry.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import msgspec
 import torch
-from torch import nn
 
 
 class Hard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="rule", tag="hard"):
@@ -68,13 +68,15 @@ def describe(rule: TargetRule) -> dict[str, Any]:
 
 
 class TargetUpdate:
-    """Applies a rule to a pair of networks."""
+    """Applies a rule to the parameters of a pair of networks, in the same order."""
 
-    def __init__(self, rule: TargetRule, online: nn.Module, target: nn.Module) -> None:
+    def __init__(
+        self, rule: TargetRule, online: Iterable[torch.Tensor], target: Iterable[torch.Tensor]
+    ) -> None:
         self.rule = rule
         self.last_sync = 0  # the update after which the target last moved
-        self._online: list[torch.Tensor] = list(online.parameters())
-        self._target: list[torch.Tensor] = list(target.parameters())
+        self._online = list(online)
+        self._target = list(target)
 
     @torch.no_grad()
     def after(self, gradient_step: int) -> bool:
