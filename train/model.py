@@ -74,7 +74,7 @@ def build_model(
     spec = mujoco.MjSpec()
     option = spec.option
     option.timestep = timestep_s
-    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.impratio = 10
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
