@@ -38,6 +38,7 @@ _KINDS: dict[str, Kind] = {
     "config.env.overlap": "free",
     "config.profile": "task",
     "config.target": "target",
+    "config.evaluation.off_policy": "free",
     "config.evaluation": "evaluation",
     "config.network": "algorithm",
     "config.loss": "algorithm",

@@ -149,6 +149,7 @@ class EvaluationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     episodes: int = 10  # per condition
     seed: int = 90_000  # of the first fixed episode; kept away from training seeds
     averaging: float = 0.001  # rate of the average of weights that is evaluated; 1: the last ones
+    off_policy: bool = False  # judge the offline policy on held-out logs before it drives
 
     def __post_init__(self) -> None:
         if self.every_env_steps < 1 or self.episodes < 1:

@@ -40,7 +40,7 @@ class Rows:
 class Fit:
     """How a model is fitted."""
 
-    iterations: int = 120
+    iterations: int = 240  # the time limit of the warehouse task, in steps
     updates: int = 25  # gradient steps an iteration
     batch_size: int = 256
     hidden: Sequence[int] = (128, 128)
@@ -65,6 +65,7 @@ def fitted_q(
     next_probability: F32,
     *,
     discount: float,
+    bounds: tuple[float, float] | None = None,
     fit: Fit = Fit(),
     seed: int = 0,
 ) -> QNetwork:
@@ -74,6 +75,7 @@ def fitted_q(
         rows: what was seen.
         next_probability: (N, A) the policy's, of each action in `next_observation`.
         discount: of one step.
+        bounds: between which every value is known to be.
         seed: of the network's beginning and of the batches.
     """
     actions = next_probability.shape[1]
@@ -100,6 +102,8 @@ def fitted_q(
                 with torch.no_grad():
                     value = (policy[some] * before(following[some])).sum(dim=1)
                 target = target + going_on[some] * value
+            if bounds is not None:
+                target = target.clamp(*bounds)
             q = network(observation[some]).gather(1, action[some, None])[:, 0]
             _descend(optimizer, nn.functional.smooth_l1_loss(q, target))
         decay.step()

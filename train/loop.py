@@ -22,6 +22,7 @@ from restock.train.evaluate import (
 )
 from restock.train.explore import epsilon_greedy
 from restock.train.guard import Fall, falls, roll_back
+from restock.train.judge_run import judge_session
 from restock.train.probe import Probe
 from restock.train.session import Interval, Session
 from restock.train.target import Hard
@@ -74,6 +75,8 @@ def train(
     if clock.evaluated_at < 0 and offline_updates:
         if session.interval.updates:
             _close_interval(session, "offline", notify)
+        if config.evaluation.off_policy:
+            judge_session(session)  # on held-out logs, before it drives
         _evaluate(session, notify)
 
     while clock.env_steps < schedule.env_steps and _time_left(session) and not clock.stopped:

@@ -123,6 +123,25 @@ TABLES: dict[str, pa.Schema] = {
         ("q_abs_mean", _F),
         ("q_lag", _F),  # mean |Q - Q_target| / mean |Q|
     ),
+    # One row a measure x condition x estimator: the offline policy judged on held-out logs.
+    "off_policy": _schema(
+        *_CLOCKS,
+        ("measure", _S),  # return | success
+        ("condition", _S),  # of the episode, or all
+        ("estimator", _S),  # logged | fqe | pdwis | wdr
+        ("value", _F),  # null where it is refused
+        ("low", _F),  # 95 %, over episodes
+        ("high", _F),
+        ("refused", _S),  # why, or null
+        ("episodes", _I),
+        ("ess", _F),  # the least that weights are worth at a step, in episodes
+        ("ess_steps", _I),  # for how many first steps they are worth enough
+        ("steps", _I),  # of the longest episode
+        ("horizon", _I),  # steps that are weighted; null: all
+        ("epsilon", _F),  # of the greedy policy made soft
+        ("discount", _F),
+        ("estimated_share", _F),  # of rows whose behaviour probability was cloned, not logged
+    ),
     # One row an evaluation x condition in which the guard saw a fall.
     "guard": _schema(
         *_CLOCKS,

@@ -1,10 +1,10 @@
-"""`restock eval`: success per condition, clean and perturbed, beside the planner and chance."""
+"""`restock eval`: a run's policy in the twin, against a baseline, or judged on logs alone."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -16,6 +16,10 @@ class Eval:
     Every policy meets the same seeded episodes of every condition, clean and under each
     perturbation. Prints success with 95 % Wilson intervals, contacts, time and return, blocked
     aisles apart by partly and wholly, and writes RUN/eval/episodes.parquet.
+
+    With --baseline it is compared with another run or a saved baseline on the same episodes.
+    With --on-logs nothing drives: the policy is judged on logged episodes that it did not learn
+    from (docs/off-policy.md), into RUN/eval/off_policy.parquet.
 
     Example: `restock eval runs/a --perturbations none,friction,latency`
     """
@@ -30,15 +34,47 @@ class Eval:
     """Comma-separated: agent (the run's best), planner, random, onnx:FILE, run:DIRECTORY."""
     seed: int = 10_000
     """Seed of the first episode; the same seeds for every policy."""
+    baseline: str | None = None
+    """Compare with this run, or a saved baseline, on the same episodes, per condition."""
+    margin: float = 0.05
+    """With --baseline: a success lower by more than this, and surely lower, is worse."""
+    check: bool = False
+    """With --baseline: exit 1 where something is worse, or cannot be compared."""
+    save_as_baseline: str | None = None
+    """Keep the evaluation as baselines/NAME.parquet (or in the .parquet file that is named)."""
+    drive: bool = True
+    """--no-drive takes the episodes that RUN/eval/episodes.parquet has."""
+    on_logs: str | None = None
+    """Judge it on a store's episodes, or on those that a panel holds out. "own": its own panel."""
+    epsilon: float = 0.1
+    """With --on-logs: chance of a random action of the policy that is judged, else greedy."""
+    horizon: int | None = None
+    """With --on-logs: how many steps importance weights reach; default all."""
     dry_run: bool = False
     """Check everything and print what would be driven; write nothing."""
     json: bool = False
     """Print the table and the settings as JSON."""
 
     def run(self) -> int:
-        from restock.cli.output import print_json, print_table, progress, say
+        if self.on_logs is not None:
+            return self._judge(self.on_logs)
+        return self._drive()
+
+    def _drive(self) -> int:
+        from restock.cli.output import print_json, progress
+        from restock.errors import ConfigError, ExitCode
         from restock.train.eval_run import evaluate, plan_evaluation, settings
         from restock.train.evaluate import summary_rows
+        from restock.train.regression import of_baseline, of_run, regressed, regression
+        from restock.train.regression import save_baseline as save
+
+        if self.check and self.baseline is None:
+            raise ConfigError(
+                "says nothing without --baseline",
+                where="--check",
+                remedy="name the run or the saved baseline to compare with",
+            )
+        baseline = of_baseline(self.baseline) if self.baseline is not None else None
 
         plan = plan_evaluation(
             self.run_path,
@@ -50,23 +86,63 @@ class Eval:
         if self.dry_run:
             print_json({**settings(plan), "episodes": plan.total})
             return 0
-        with progress("driving", plan.total) as advance:
-            results = evaluate(plan, advance)
-        rows = summary_rows(results)
+        document: dict[str, Any] = {}
+        if self.drive:
+            with progress("driving", plan.total) as advance:
+                rows = summary_rows(evaluate(plan, advance))
+            document = {**settings(plan), "results": rows}
+        compared = None
+        if baseline is not None:
+            compared = regression(baseline, of_run(self.run_path), margin=self.margin)
+            document |= {"baseline": baseline.name, "margin": self.margin, "regression": compared}
+        if self.save_as_baseline is not None:
+            document["saved"] = str(save(self.run_path, self.save_as_baseline))
         if self.json:
-            print_json({**settings(plan), "results": rows})
-            return 0
-        shown = [
-            {
-                **{name: row[name] for name in ("perturbation", "condition", "policy", "episodes")},
-                "success": f"{row['success']:.2f} [{row['success_low']:.2f}, "
-                f"{row['success_high']:.2f}]",
-                **{name: row[name] for name in ("bumps_per_episode", "time_s", "return")},
-            }
-            for row in _by_cell(rows)
-        ]
-        print_table(shown, title="success [95 % Wilson interval]; time of the successful ones")
-        say(f"written to {plan.run.path / 'eval' / 'episodes.parquet'}")
+            print_json(document)
+        else:
+            self._show(document)
+        failed = self.check and compared is not None and regressed(compared)
+        return int(ExitCode.FAILED if failed else ExitCode.OK)
+
+    def _show(self, document: dict[str, Any]) -> None:
+        from restock.cli.output import print_table, say
+        from restock.cli.regressed import show_regression
+
+        if (rows := document.get("results")) is not None:
+            shown = [
+                {
+                    **{
+                        name: row[name]
+                        for name in ("perturbation", "condition", "policy", "episodes")
+                    },
+                    "success": f"{row['success']:.2f} [{row['success_low']:.2f}, "
+                    f"{row['success_high']:.2f}]",
+                    **{name: row[name] for name in ("bumps_per_episode", "time_s", "return")},
+                }
+                for row in _by_cell(rows)
+            ]
+            print_table(shown, title="success [95 % Wilson interval]; time of the successful ones")
+            say(f"written to {self.run_path / 'eval' / 'episodes.parquet'}")
+        if "regression" in document:
+            show_regression(document["regression"], document["baseline"], self.margin)
+        if "saved" in document:
+            say(f"baseline saved as {document['saved']}")
+
+    def _judge(self, logs: str) -> int:
+        from restock.cli.judged import show_judged
+        from restock.cli.output import progress
+        from restock.errors import ConfigError
+        from restock.train.judge import Judging
+        from restock.train.judge_run import judge_run
+
+        try:
+            how = Judging(epsilon=self.epsilon, horizon=self.horizon)
+        except ValueError as error:
+            raise ConfigError(str(error), where="restock eval") from error
+        own = None if logs == "own" else logs
+        with progress("judging", 2) as advance:
+            judged = judge_run(self.run_path, own, how, advance, write=not self.dry_run)
+        show_judged(self.run_path, judged, how, as_json=self.json)
         return 0
 
 
