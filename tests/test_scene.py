@@ -149,3 +149,27 @@ def test_a_recording_holds_frames_map_and_scene_as_viewers_expect(
     assert sum("pallet" in names for names in shown) == done.missions["blocked_aisle"] == 1
     walking = [m for message in found[TRAFFIC] for m in message.markers if m.ns == "person"]
     assert len({(m.pose.position.x, m.pose.position.y) for m in walking}) > 2
+
+
+def test_the_foxglove_layout_shows_topics_that_recordings_have() -> None:
+    layout = json.loads((Path(__file__).parents[1] / "docs" / "foxglove.json").read_text())
+    panels = layout["configById"]
+
+    def placed(node: Any) -> list[str]:
+        if isinstance(node, str):
+            return [node]
+        assert node["direction"] in ("row", "column")
+        return placed(node["first"]) + placed(node["second"])
+
+    assert sorted(placed(layout["layout"])) == sorted(panels)
+    fields = [
+        path.get("value") or path["topicPath"]
+        for config in panels.values()
+        for path in [*config.get("paths", []), *([config] if "topicPath" in config else [])]
+    ]
+    topics = {topic.name for topic in TOPICS}
+    shown = set(panels["3D!floor"]["topics"])
+    assert shown <= topics
+    assert {"/map", "/scan", "/plan", MARKERS, TRAFFIC} <= shown
+    assert {field.partition(".")[0] for field in fields} <= topics
+    assert panels["3D!floor"]["fixedFrame"] == "map"
