@@ -54,9 +54,13 @@ class WarehouseEnv(gymnasium.Env[NDArray[np.float32], Any]):
         )
 
     def render(self) -> NDArray[np.uint8] | None:
-        """A top-down map, (H, W, 3) uint8."""
+        """A top-down map, or the frame of the `camera` that was asked for, (H, W, 3) uint8."""
         frames = self.vector.render()
         return frames[0] if frames else None
+
+    def close(self) -> None:
+        """Give back what `render` holds."""
+        self.vector.close()
 
 
 def _first(info: dict[str, Any]) -> dict[str, Any]:

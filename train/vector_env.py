@@ -40,6 +40,7 @@ from restock.errors import ConfigError
 from restock.ingest.profile import load_profile
 from restock.ingest.task import Task, observe, reached_goal, reward, terminated
 from restock.train.action_face import Face, action_face
+from restock.train.camera import Camera, View, check_view
 from restock.train.draw import draw_map
 from restock.train.episode import KINDS, Episode, EpisodeSpec, draw_episode
 from restock.train.floors import open_floors
@@ -83,6 +84,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         action: Face = "discrete",
         physics: Physics = "mujoco",
+        camera: View | None = None,
     ) -> None:
         """`conditions` are shares of episodes per kind; `nthread` 0 uses every core; `physics`
         "warp" steps on MuJoCo Warp's device: see docs/mjwarp.md.
@@ -94,6 +96,8 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         `generated:train`: an episode whose spec names none of them is on one that its seed draws.
         `warehouse` is the one floor, in their place.
 
+        `render()` draws a top-down map, or with a `camera` ("chase", "overhead") renders over EGL.
+
         Raises:
             ConfigError: an unknown condition, shares that are no shares, no environments, an
                 action space that is not there, or an autoreset mode other than SAME_STEP and
@@ -102,7 +106,9 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         if num_envs < 1:
             raise ConfigError(f"num_envs must be 1 or more, got {num_envs}", where="the twin")
         self.num_envs = num_envs
-        self.render_mode = render_mode
+        check_view(camera)
+        self.render_mode, self.view = render_mode, camera
+        self._camera: Camera | None = None
         self.task = task or load_profile("warehouse_amr").task
         self.floors = _floors(warehouse, layouts)
         self._layout_names = np.array([floor.name for floor in self.floors])
@@ -362,10 +368,24 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         }
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """A top-down map of every environment, (H, W, 3) uint8 each; needs no GL."""
+        """A frame of every environment, (H, W, 3) uint8 each; the top-down map needs no GL.
+
+        Raises:
+            ConfigError: a camera was asked for, and there is no EGL.
+        """
         if self.render_mode is None:
             return None
+        if self.view is not None:
+            if self._camera is None:
+                self._camera = Camera(self.view)
+            return tuple(self._camera.frame(self, env) for env in range(self.num_envs))
         return tuple(draw_map(self, env) for env in range(self.num_envs))
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Give the camera's context back; Gymnasium's `close` calls it."""
+        if self._camera is not None:
+            self._camera.close()
+            self._camera = None
 
     # -- recorders ------------------------------------------------------------------------------
 
