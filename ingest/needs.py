@@ -47,7 +47,7 @@ def wanted_fields(
             continue
         paths = wanted.setdefault(source.topic, [])
         if name != "scan":
-            paths += _paths(source)
+            paths += field_paths(source)
         if name in ("goal", "plan"):
             paths += [FRAME_ID]
     for topic in profile.transform_topics:
@@ -90,7 +90,7 @@ def _both(parts: Sequence[Reduction]) -> Reduction:
     return Reduction(tuple(dict.fromkeys(f for part in parts for f in part.fields)), apply)
 
 
-def _paths(source: Input) -> list[str]:
+def field_paths(source: Input) -> list[str]:
     """The field paths that an input reads."""
     found: list[str] = []
     for key, path in source.fields.items():
@@ -144,7 +144,7 @@ def _field_problems(name: str, source: Input, leaves: Sequence[Leaf]) -> list[st
     has = {leaf.path.removesuffix("[]") for leaf in leaves}
     return [
         f"`inputs.{name}.fields`: {source.topic}: {offer(path, sorted(has))}"
-        for path in _paths(source)
+        for path in field_paths(source)
         if path.removesuffix("[]") not in has
     ]
 

@@ -6,14 +6,14 @@ finite) is kept beside it as a reason, so that everything left out can be counte
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.ingest.align import ClockReport, align, ticks_of
+from restock.ingest.align import ClockReport, Segment, align, ticks_of
 from restock.ingest.clocks import TopicClock, topic_clocks
 from restock.ingest.columns import TopicColumns
 from restock.ingest.custom_columns import Custom, custom_signals
@@ -86,14 +86,8 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
     tree = Tree(profile.frames, edges, segments) if profile.frames else None
     if tree is not None:
         place_messages(sources, tree, segments)
-    filling = Filling(profile, sources, segments, ticks, tree)
-    signals = filling.fill()
-    follows, cut = filling.continuity()
-    before = np.arange(len(follows)) - follows  # the tick before, or itself
-    forward, lateral = localised_velocity(
-        signals, {name: signals[name][before] for name in signals if name.startswith("pose_")}
-    )
-    signals |= {"localised_speed_mps": forward, "localised_lateral_mps": lateral}
+    filled = fill_signals(profile, sources, segments, ticks, tree)
+    filling, signals = filled.filling, filled.signals
     action, residual = nearest_action(
         profile.task, signals["command_speed_mps"], signals["command_yaw_rate_radps"]
     )
@@ -102,8 +96,8 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
     return Steps(
         signals,
         filling.segment,
-        follows,
-        cut,
+        filled.follows,
+        filled.cut,
         list(filling.problem),
         list(filling.route_problem),
         filling.routing,
@@ -119,3 +113,32 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
         topic_clocks(topics, profile.clock.jump_s),
         frame_notes(profile, sources, edges) + custom.notes,
     )
+
+
+@dataclass(frozen=True)
+class Filled:
+    """The signals at T ticks, and what is asked about them afterwards."""
+
+    filling: Filling
+    signals: dict[str, NDArray[Any]]  # every signal, leading axis T
+    follows: Bools  # (T,) comes directly after the tick before, and both are usable
+    cut: list[str]  # (T,) why it does not follow, or ""
+
+
+def fill_signals(
+    profile: Profile,
+    sources: Sources,
+    segments: Sequence[Segment],
+    ticks: Sequence[Ints],
+    tree: Tree | None,
+) -> Filled:
+    """Every signal at the ticks of each segment, from the messages held at them."""
+    filling = Filling(profile, sources, segments, ticks, tree)
+    signals = filling.fill()
+    follows, cut = filling.continuity()
+    before = np.arange(len(follows)) - follows  # the tick before, or itself
+    forward, lateral = localised_velocity(
+        signals, {name: signals[name][before] for name in signals if name.startswith("pose_")}
+    )
+    signals |= {"localised_speed_mps": forward, "localised_lateral_mps": lateral}
+    return Filled(filling, signals, follows, cut)
