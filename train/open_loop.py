@@ -25,13 +25,14 @@ from restock.ingest.task import Task
 from restock.train.episode import Episode, EpisodeSpec
 from restock.train.layout import Warehouse
 from restock.train.log_segments import MOTION, POSE, Segments
-from restock.train.model import WHEEL_RADIUS_M, body_velocity, wheel_commands
+from restock.train.model import TRACK_M, WHEEL_RADIUS_M, body_velocity, wheel_commands
 from restock.train.perturbation import Perturbation
 from restock.train.simulation import Simulation
 
 F64 = NDArray[np.float64]
 
 PREDICTED = (*POSE, *MOTION)  # what the twin says of each step
+_SLIDING = "sliding_mps"
 ROBOTS = 512  # simulated at a time
 SLIPS_MPS = 0.2  # wheels and localisation this far apart: the floor's word is taken
 _SIDE_M = 60.0  # of the floor; who comes near its wall is put back in its middle
@@ -48,6 +49,7 @@ class Replayed:
     perturbations: tuple[Perturbation, ...]
     timestep_s: float
     signals: dict[str, F64]
+    sliding_mps: F64  # (P, S, K + 1) of the faster sliding wheel over the floor, along the robot
     blown_up: NDArray[np.bool_]  # (P, S) the physics broke: the segment says nothing
 
     @property
@@ -73,7 +75,9 @@ def replay(
             cannot keep (no multiple of .1 s).
     """
     jobs = len(perturbations) * len(segments)
-    signals = {name: np.zeros((jobs, segments.horizon_steps + 1)) for name in PREDICTED}
+    signals = {
+        name: np.zeros((jobs, segments.horizon_steps + 1)) for name in (*PREDICTED, _SLIDING)
+    }
     blown_up = np.zeros(jobs, np.bool_)
     simulation: Simulation | None = None
     for begin in range(0, jobs, ROBOTS):
@@ -88,10 +92,12 @@ def replay(
         for name, values in moved.items():
             signals[name][ids] = values
     shape = (len(perturbations), len(segments))
+    shaped = {name: values.reshape(*shape, -1) for name, values in signals.items()}
     return Replayed(
         perturbations=tuple(perturbations),
         timestep_s=timestep_s,
-        signals={name: values.reshape(*shape, -1) for name, values in signals.items()},
+        sliding_mps=shaped.pop(_SLIDING),
+        signals=shaped,
         blown_up=blown_up.reshape(shape),
     )
 
@@ -124,7 +130,7 @@ def _drive(simulation: Simulation, part: Segments) -> tuple[dict[str, F64], NDAr
     """Predicted signals (N, K + 1) of N robots already placed, and whose physics broke (N,)."""
     num, warmup = len(part), part.warmup_steps
     pose = np.zeros((num, warmup + part.horizon_steps + 1, 3))
-    motion = {name: np.zeros((num, part.horizon_steps + 1)) for name in MOTION}
+    motion = {name: np.zeros((num, part.horizon_steps + 1)) for name in (*MOTION, _SLIDING)}
     blown_up = np.zeros(num, np.bool_)
     shifted = np.zeros((num, 2))
     for step in range(pose.shape[1]):
@@ -143,10 +149,22 @@ def _drive(simulation: Simulation, part: Segments) -> tuple[dict[str, F64], NDAr
             motion["wheel_speed_mps"][:, at], motion["wheel_yaw_rate_radps"][:, at] = speed, turn
             motion["gyro_yaw_rate_radps"][:, at] = velocity[:, 5]
             motion["accel_x_mps2"][:, at] = simulation.accel[:, 0]
+            motion[_SLIDING][:, at] = _sliding(simulation, pose[:, step, 2])
     forward, lateral = _localised(pose, part.task.control_period_s, motion["wheel_speed_mps"])
     motion["localised_speed_mps"], motion["localised_lateral_mps"] = forward, lateral
     laid = _lay(pose[:, warmup:], part.pose[:, 0])
     return {**{name: laid[..., i] for i, name in enumerate(POSE)}, **motion}, blown_up
+
+
+def _sliding(simulation: Simulation, yaw_rad: F64) -> F64:
+    """How fast a wheel's rim moves over the floor, (N,) m/s, the larger of the two wheels."""
+    velocity = simulation.qvel
+    forward = np.cos(yaw_rad) * velocity[:, 0] + np.sin(yaw_rad) * velocity[:, 1]
+    turn = velocity[:, 5] * (TRACK_M / 2)
+    ground = np.stack([forward - turn, forward + turn], axis=-1)
+    rim = velocity[:, 6:8] * simulation.radius_m[:, None]
+    faster: F64 = np.abs(rim - ground).max(axis=1)
+    return faster
 
 
 def _localised(pose: F64, period_s: float, wheel_speed: F64) -> tuple[F64, F64]:

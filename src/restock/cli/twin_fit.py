@@ -1,0 +1,160 @@
+"""`restock twin fit`: effective parameters of the robot, from what it was told and what it did."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+if TYPE_CHECKING:
+    from restock.train.fit import Fit as Fitted
+
+
+@dataclass
+class Fit:
+    """Fit the twin's robot to a store's logs, and write a perturbation that training uses.
+
+    Drives the logged commands again in the twin, open loop on an empty floor, and looks for the
+    friction, payload, wheel radius, track, latency and gain under which it moves as the robot
+    did: first over the whole ranges on few segments, then by least squares on all. What the log
+    does not tell stays as it was, with the reason; a quarter of the log is held out to show the
+    gap before and after. See docs/calibration.md.
+
+    Example: `restock twin fit store/ --out fitted.toml`
+    """
+
+    store: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
+    """The store."""
+    out: Path | None = None
+    """Where the perturbation goes, as TOML; with --per-recording a schedule over the robots.
+    Nothing is overwritten."""
+    parameters: str | None = None
+    """Which ones, e.g. latency_s,gain (default: all but left_friction_scale)."""
+    recording: tuple[str, ...] = ()
+    """Only these recordings, by their ids."""
+    per_recording: bool = False
+    """Fit each recording by itself, for robots that differ."""
+    base: Path | None = None
+    """A perturbation (TOML) with what is not fitted, and to compare with; default the nominal."""
+    timestep_s: float | None = None
+    """Physics timestep to fit at; values are effective, so the one training uses (default: the
+    base's, .01)."""
+    horizon_s: float = 3.0
+    """Length of the segments that are driven again."""
+    held_out: float = 0.25
+    """Share of the log kept from the fit: whole recordings of four or more, else each one's end."""
+    search: int = 64
+    """Points of the coarse search, a power of two."""
+    segments: int = 200
+    """Fit so many segments at most."""
+    seed: int = 0
+    """Of the search, the draw of segments and the bootstrap."""
+    threads: int = 1
+    """For the physics; the result does not depend on it."""
+    task: str | None = None
+    """Hash of the task whose rows are fitted, where the store has several."""
+    dry_run: bool = False
+    """Fit and print, and write nothing."""
+    json: bool = False
+    """Print one JSON document: {"fits": [{"estimates", "warnings", "held_out", …}], "out"}."""
+
+    def run(self) -> int:
+        """Fit, print, write."""
+        from restock.cli import output
+        from restock.errors import ConfigError, ExitCode
+        from restock.replay.store import Store
+        from restock.train.fit_files import recordings_of, write
+
+        if self.out is not None and self.out.exists():
+            raise ConfigError("is there already", where=str(self.out), remedy="name another --out")
+        with Store(self.store) as store:
+            groups: list[tuple[str, ...]] = [self.recording]
+            if self.per_recording:
+                groups = [(name,) for name in recordings_of(store, self.recording, self.task)]
+            fits = [self._fit(store, group) for group in groups]
+        out = None if self.dry_run else self.out
+        if out is not None:
+            write(out, fits)
+        if self.json:
+            output.print_json({"fits": [item.describe() for item in fits], "out": out})
+        else:
+            for item in fits:
+                _show(item)
+        if out is not None:
+            output.say(f"wrote {out}")
+        return ExitCode.OK
+
+    def _fit(self, store: Any, recordings: tuple[str, ...]) -> Fitted:
+        from restock.cli import output
+        from restock.train.fit import fit
+        from restock.train.fit_parameters import DEFAULT, parse_parameters
+        from restock.train.perturbation import load_perturbation
+
+        name = "fitted" if self.out is None else self.out.stem
+        return fit(
+            store,
+            parameters=DEFAULT if self.parameters is None else parse_parameters(self.parameters),
+            base=None if self.base is None else load_perturbation(self.base),
+            recordings=recordings,
+            task_hash=self.task,
+            timestep_s=self.timestep_s,
+            horizon_s=self.horizon_s,
+            held_out=self.held_out,
+            search_points=self.search,
+            most_segments=self.segments,
+            seed=self.seed,
+            nthread=self.threads,
+            name=f"{name} {recordings[0]}" if self.per_recording else name,
+            on_progress=output.say,
+        )
+
+
+def _show(fit: Fitted) -> None:
+    from restock.cli import output
+
+    rows = [
+        {
+            "parameter": item.name,
+            "unit": item.unit,
+            "before": getattr(fit.base, item.name),
+            "effective": item.value,
+            "95 % from": item.low,
+            "to": item.high,
+            "": "fitted" if item.fitted else "not fitted",
+        }
+        for item in fit.estimates
+    ]
+    title = (
+        f"{', '.join(fit.recordings)}  {fit.segments} segments of {fit.clusters} clusters"
+        f"  timestep {fit.timestep_s:g} s"
+    )
+    output.print_table(rows, title=title)
+    output.print_table(
+        [
+            {"signal": name, "unit": item["unit"], "before": item["before"], "after": item["after"]}
+            for name, item in fit.noise.items()
+        ],
+        title="median deviation from the log, in the segments fitted",
+    )
+    if fit.held_out:
+        output.print_table(
+            [
+                {
+                    "held out, after s": gap.horizon_s,
+                    "segments": gap.segments,
+                    "before m": gap.before_m,
+                    "after m": gap.after_m,
+                    "95 % from": gap.low_m,
+                    "to": gap.high_m,
+                }
+                for gap in fit.held_out
+            ],
+            title="median distance from the logged position",
+        )
+    for line in fit.warnings:
+        output.stdout().print(f"warning: {line}")
+    if fit.left_out:
+        left = ", ".join(f"{count:,} {reason}" for reason, count in fit.left_out.items())
+        output.stdout().print(f"left out, in segments: {left}")

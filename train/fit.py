@@ -1,0 +1,391 @@
+"""Calibration: the effective parameters under which the twin does what a log's robot did.
+
+Commands of the log are driven open loop and the motion is compared (`restock.train.open_loop`,
+`restock.train.mismatch`). The search is coarse in one batch over the whole ranges, then least
+squares. A parameter that the log does not tell stays as it was, with the reason. Values are
+effective: they hold for the timestep at which they were fitted, which is the one training uses.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.errors import ConfigError, StoreError
+from restock.replay.store import Store
+from restock.train.fit_parameters import DEFAULT, PARAMETERS, Coordinates
+from restock.train.fit_scope import HELD_OUT, Scope, cuts, scope, sides, usable
+from restock.train.fit_solver import Problem, Solution, noise, search, solve
+from restock.train.fit_uncertainty import Uncertainty, profile, uncertainty
+from restock.train.log_segments import Segments, segments
+from restock.train.mismatch import CHANNELS, Mismatch, position_gap_m
+from restock.train.open_loop import replay
+from restock.train.perturbation import Perturbation
+
+F64 = NDArray[np.float64]
+
+HORIZON_S = 3.0
+FEWEST = 8  # segments
+SMALL = 16  # segments of the coarse search
+HELD_OUT_S = (1.0, 3.0, 6.0)
+SLIDES_MPS = 0.05
+CONFOUNDED = 0.95
+ILL_CONDITIONED = 1e6
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One parameter: its value, its 95 % interval, and whether the log told it."""
+
+    name: str
+    unit: str
+    value: float
+    low: float | None
+    high: float | None
+    fitted: bool  # False: as in the base
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Of held-out segments: how far replayed and logged position end apart, in metres."""
+
+    horizon_s: float
+    segments: int
+    before_m: float  # median over the segments, under the base
+    after_m: float  # under what was fitted
+    low_m: float  # 95 % of the latter, bootstrap over segments
+    high_m: float
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What a log says of the robot."""
+
+    perturbation: Perturbation
+    base: Perturbation
+    timestep_s: float
+    recordings: tuple[str, ...]
+    estimates: tuple[Estimate, ...]
+    warnings: tuple[str, ...]
+    held_out: tuple[Gap, ...]
+    noise: dict[str, dict[str, Any]]  # channel -> unit, before, after: median deviations
+    segments: int  # that were fitted
+    clusters: int  # that uncertainty was drawn over
+    condition: float  # of the information matrix
+    left_out: dict[str, int] = field(default_factory=dict)  # segments or steps, by reason
+    replays: int = 0
+    work_s: float = 0.0
+
+    def describe(self) -> dict[str, Any]:
+        """As JSON has it."""
+        return {
+            **{key: value for key, value in vars(self).items() if key != "base"},
+            "perturbation": msgspec.to_builtins(self.perturbation),
+            "base": msgspec.to_builtins(self.base),
+            "estimates": [vars(item) for item in self.estimates],
+            "held_out": [vars(item) for item in self.held_out],
+        }
+
+    def toml(self) -> str:
+        """The perturbation as TOML that training reads, with what is known of each value."""
+        said = {item.name: item for item in self.estimates}
+        lines = [
+            f"# Effective parameters, fitted to {', '.join(self.recordings)}",
+            f"# at a timestep of {self.timestep_s:g} s: {self.segments} segments.",
+        ]
+        lines += [f"# {warning}" for warning in self.warnings]
+        for name, value in msgspec.to_builtins(self.perturbation).items():
+            note = ""
+            if name in said and said[name].fitted:
+                note = f"  # 95 %: {said[name].low:.4g} to {said[name].high:.4g}"
+            elif name in said:
+                note = "  # not fitted"
+            lines.append(f"{name} = {_toml(value)}{note}")
+        return "\n".join(lines) + "\n"
+
+
+def fit(
+    store: Store,
+    *,
+    parameters: Sequence[str] = DEFAULT,
+    base: Perturbation | None = None,
+    recordings: Sequence[str] = (),
+    task_hash: str | None = None,
+    timestep_s: float | None = None,
+    horizon_s: float = HORIZON_S,
+    held_out: float = HELD_OUT,
+    search_points: int = 64,
+    most_segments: int = 200,
+    seed: int = 0,
+    nthread: int = 1,
+    name: str = "fitted",
+    on_progress: Callable[[str], None] | None = None,
+) -> Fit:
+    """Fit `parameters` to the recordings of a store (all, if none is named).
+
+    `base` holds what is not fitted, and is what "before" means. `held_out` is the share of the
+    log that is kept from the fit, to measure the gap on. Of more than `most_segments`, as many are
+    drawn. The same arguments give the same result.
+
+    Raises:
+        ConfigError: no such parameter or recording, or none that this log could tell.
+        StoreError: no rows, rows of several tasks, or too few segments of ordinary driving.
+    """
+    begun = time.perf_counter()
+    say = on_progress or (lambda text: None)
+    base = base or Perturbation()
+    step_s = base.timestep_s if timestep_s is None else timestep_s
+    for parameter in parameters:
+        if parameter not in PARAMETERS:
+            raise ConfigError(f"{parameter!r} cannot be fitted", where="parameters",
+                              remedy=f"name some of {', '.join(PARAMETERS)}")  # fmt: skip
+    task = store.task(task_hash)
+    found = scope(store, task, parameters, recordings)
+    if not found.names:
+        raise ConfigError(
+            "none of these parameters can be told by this log: "
+            + "; ".join(f"{key}: {why}" for key, why in found.refused.items()),
+            where=str(store.path),
+            remedy="name others with --parameters, or use another log",
+        )
+    every = segments(store, horizon_s, recordings=recordings, task_hash=task_hash)
+    if not len(every):
+        raise StoreError(
+            f"no stretch of {horizon_s:g} s: {every.left_out}", where=str(store.path),
+            remedy="give a shorter horizon, or ingest more driving",
+        )  # fmt: skip
+    cut = cuts(every, held_out, seed)
+    good, left = usable(every)
+    before, _ = sides(good, cut)
+    chosen = np.flatnonzero(before)
+    if len(chosen) < FEWEST:
+        raise StoreError(
+            f"{len(chosen)} segments of {horizon_s:g} s to fit, fewer than {FEWEST}"
+            f" (of {len(every)}; left out: {left or 'none'}, and held out)",
+            where=str(store.path),
+            remedy="ingest more driving, or give a shorter horizon",
+        )
+    rng = np.random.Generator(np.random.PCG64(seed))
+    if len(chosen) > most_segments:
+        left["more than are used"] = len(chosen) - most_segments
+        chosen = np.sort(rng.permutation(chosen)[:most_segments])
+    used = good.take(chosen)
+    left |= {f"steps: {reason}": count for reason, count in every.left_out.items()}
+
+    mismatch = Mismatch(used, found.channels, timestep_s=step_s, nthread=nthread)
+    small = Mismatch(
+        used.take(rng.permutation(len(used))[:SMALL]),
+        found.channels,
+        timestep_s=step_s,
+        nthread=nthread,
+    )
+    coordinates = Coordinates(found.names, base, task)
+    z = _coarse(small, coordinates, search_points, seed, say)
+    kept: list[Estimate] = []
+    while True:
+        solution = _fine(mismatch, coordinates, z, say)
+        known = uncertainty(solution, used.episode_id, seed)
+        width = known.half / coordinates.known
+        worst = int(np.argmax(width))
+        if width[worst] <= 1 or len(coordinates) == 1:
+            break
+        estimate, stays = _unknown(mismatch, solution, known, worst, step_s)
+        if not stays:
+            break
+        say(f"{estimate.name} is not told by this log")
+        kept.append(estimate)
+        coordinates = coordinates.without(estimate.name)
+        z = np.delete(solution.z, worst)
+    perturbation = msgspec.structs.replace(
+        coordinates.perturbation(solution.z), name=name, timestep_s=step_s
+    )
+    estimates = [_estimate(solution, known, index) for index in range(len(coordinates))]
+    warned = list(found.notes)
+    warned += [f"{key} is not fitted: {why}" for key, why in found.refused.items()]
+    warned += [f"{item.name} is not fitted: {item.note}" for item in kept]
+    warned += _warnings(solution, known)
+    refused = [
+        Estimate(key, PARAMETERS[key].unit, getattr(base, key), None, None, False, why)
+        for key, why in found.refused.items()
+    ]
+    order = list(parameters)
+    return Fit(
+        perturbation=perturbation,
+        base=base,
+        timestep_s=step_s,
+        recordings=tuple(str(item) for item in np.unique(every.recording_id)),
+        estimates=tuple(
+            sorted([*estimates, *kept, *refused], key=lambda item: order.index(item.name))
+        ),
+        warnings=tuple(warned),
+        held_out=_held_out(
+            store, cut, found, base, perturbation, step_s, nthread, recordings, task_hash, seed, say
+        )
+        if held_out
+        else (),
+        noise=_noise(mismatch, base, perturbation),
+        segments=len(used),
+        clusters=known.clusters,
+        condition=known.condition,
+        left_out=left,
+        replays=mismatch.replays + small.replays,
+        work_s=time.perf_counter() - begun,
+    )
+
+
+def _coarse(
+    small: Mismatch, coordinates: Coordinates, points: int, seed: int, say: Callable[[str], None]
+) -> F64:
+    """The best point (n,) of a search over the whole ranges, on few segments."""
+    say(f"searching {points} points on {len(small.segments)} segments")
+    problem = Problem(small, coordinates, {name: CHANNELS[name][1] for name in small.channels})
+    starts = search(problem, points, best=3, seed=seed)
+    ends = [solve(problem, start, iterations=6) for start in starts]
+    return min(ends, key=lambda end: end[1])[0]
+
+
+def _fine(
+    mismatch: Mismatch, coordinates: Coordinates, z: F64, say: Callable[[str], None]
+) -> Solution:
+    """Least squares on all segments: twice, for the noise is known only after the first."""
+    for iterations in (10, 15):
+        scale = noise(mismatch.of([coordinates.perturbation(z)]))
+        problem = Problem(mismatch, coordinates, scale)
+        z, value = solve(problem, z, iterations)
+        say(f"least squares on {len(mismatch.segments)} segments: cost {value:.1f}")
+    return Solution(
+        coordinates=coordinates,
+        z=z,
+        residual=problem.residual(z[:, None])[:, 0],
+        jacobian=problem.jacobian(z[:, None], np.zeros(0)),
+        segment=problem.segment,
+        scale=scale,
+    )
+
+
+def _unknown(
+    mismatch: Mismatch, solution: Solution, known: Uncertainty, index: int, timestep_s: float
+) -> tuple[Estimate, bool]:
+    """A parameter that is known too little, and whether it stays as in the base.
+
+    It does where the base explains the log as well as any other value.
+    """
+    coordinates = solution.coordinates
+    parameter = coordinates.parameters[index]
+    problem = Problem(mismatch, coordinates, solution.scale)
+    low, high = profile(problem, solution, index)
+    ends = [_value(solution, index, end) for end in (low, high)]
+    start = coordinates.point(coordinates.base)[index]
+    stays = low - 1e-9 <= start <= high + 1e-9 or high - low > 0.9
+    unit = f" {parameter.unit}" if parameter.unit else ""
+    reason = f"{ends[0]:.3g} to {ends[1]:.3g}{unit} explain the log as well"
+    if parameter.name in ("friction_scale", "left_friction_scale"):
+        now = coordinates.perturbation(solution.z)
+        sliding = replay(
+            mismatch.segments, [now], timestep_s=timestep_s, nthread=mismatch.nthread
+        ).sliding_mps
+        share = float((sliding > SLIDES_MPS).mean())
+        reason += f" (wheels slide in {share:.1%} of the steps)"
+    else:
+        other = _partner(known.correlation, index)
+        if other is not None:
+            pair, value = coordinates.names[other], known.correlation[index, other]
+            reason += f" (its correlation with {pair} is {value:.2f})"
+    base = float(getattr(coordinates.base, parameter.name))
+    told = Estimate(parameter.name, parameter.unit, base, ends[0], ends[1], False, reason)
+    return told, bool(stays)
+
+
+def _partner(correlation: F64, index: int) -> int | None:
+    """Which other parameter this one is confounded with most, if with any."""
+    others = np.abs(correlation[index]).copy()
+    others[index] = 0.0
+    at = int(np.argmax(others)) if len(others) > 1 else index
+    return at if others[at] > 0.8 else None
+
+
+def _estimate(solution: Solution, known: Uncertainty, index: int) -> Estimate:
+    parameter = solution.coordinates.parameters[index]
+    low, middle, high = (
+        _value(solution, index, solution.z[index] + way * known.half[index]) for way in (-1, 0, 1)
+    )
+    return Estimate(parameter.name, parameter.unit, middle, low, high, True)
+
+
+def _value(solution: Solution, index: int, z: float) -> float:
+    point = solution.z.copy()
+    point[index] = min(max(z, 0.0), 1.0)
+    return float(solution.coordinates.values(point)[index])
+
+
+def _warnings(solution: Solution, known: Uncertainty) -> list[str]:
+    found = []
+    names, z = solution.coordinates.names, solution.z
+    for index, name in enumerate(names):
+        value = _value(solution, index, z[index])
+        if z[index] < 1e-6 or z[index] > 1 - 1e-6:
+            found.append(f"{name} is at the end of its range, {value:g}")
+        if known.half[index] > solution.coordinates.known[index]:
+            found.append(f"{name} is known little: see its interval")
+        for other in range(index):
+            if abs(known.correlation[index, other]) > CONFOUNDED:
+                found.append(
+                    f"{names[other]} and {name} are confounded: their correlation is"
+                    f" {known.correlation[index, other]:.2f}"
+                )
+    if known.condition > ILL_CONDITIONED:
+        found.append(
+            f"ill-conditioned: the information's condition number is {known.condition:.1e}"
+        )
+    return found
+
+
+def _held_out(
+    store: Store, cut: dict[str, int], found: Scope, base: Perturbation, fitted: Perturbation,
+    timestep_s: float, nthread: int, recordings: Sequence[str], task_hash: str | None, seed: int,
+    say: Callable[[str], None],
+) -> tuple[Gap, ...]:  # fmt: skip
+    """The gap of position on what the fit has not seen, at 1, 3 and 6 s."""
+    gaps = []
+    if "position" not in found.channels:
+        return ()
+    say("replaying what was held out")
+    for horizon_s in HELD_OUT_S:
+        every = segments(store, horizon_s, recordings=recordings, task_hash=task_hash)
+        good, _ = usable(every)
+        _, after = sides(good, cut) if len(good) else (None, np.zeros(0, np.bool_))
+        if not after.any():
+            continue
+        held: Segments = good.take(after)
+        replayed = replay(held, [base, fitted], timestep_s=timestep_s, nthread=nthread)
+        end = position_gap_m(held, replayed)[:, :, -1]
+        rng = np.random.Generator(np.random.PCG64(seed))
+        drawn = np.median(end[1][rng.integers(end.shape[1], size=(1000, end.shape[1]))], axis=1)
+        low, high = np.quantile(drawn, [0.025, 0.975])
+        before, now = (float(np.median(item)) for item in end)
+        gaps.append(Gap(horizon_s, len(held), before, now, float(low), float(high)))
+    return tuple(gaps)
+
+
+def _noise(mismatch: Mismatch, base: Perturbation, fitted: Perturbation) -> dict[str, Any]:
+    """Median deviations of each channel before and after."""
+    found = mismatch.of([base, fitted])
+    return {
+        name: {
+            "unit": CHANNELS[name][0],
+            "before": float(np.median(np.abs(found[name][0]))),
+            "after": float(np.median(np.abs(found[name][1]))),
+        }
+        for name in mismatch.channels
+    }
+
+
+def _toml(value: Any) -> str:
+    return msgspec.json.encode(value).decode() if isinstance(value, str) else repr(value)
