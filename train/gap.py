@@ -333,8 +333,8 @@ def _not_done(
         said.append(
             "What the lidar sees was not compared: the log was driven on another floor than the"
             f" twin's (their clearances differ by {differs:.2f} in the median, {AGREES:g} is the"
-            " most). Steps were driven on an empty floor; the rewards for clearance and bumps are"
-            " the log's own where clearance makes them."
+            " most). Steps were driven on an empty floor: clearances in their rewards are the log's"
+            " own, and nothing is bumped into."
         )
     if steps.task.goal != "route":
         said.append(

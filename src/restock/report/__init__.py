@@ -16,6 +16,8 @@ import jinja2
 from restock.report.card import as_markdown, replay_card
 from restock.report.facts import gather
 from restock.report.page import page
+from restock.report.twin_gap import gap_page
+from restock.train.gap_files import read_gap
 from restock.train.run import write_text
 
 
@@ -25,14 +27,27 @@ def build_report(run: Path, out: Path | None = None) -> Path:
     Raises:
         RunError: no run there, or one with nothing to report on yet.
     """
-    facts = gather(run)
+    return _write_page(page(gather(run)), out if out is not None else run / "report.html")
+
+
+def write_gap_page(folder: Path, out: Path | None = None) -> Path:
+    """Write the page of a measured gap (`restock twin gap --out FOLDER`); returns its path.
+
+    Raises:
+        RunError: there is none in `folder`.
+    """
+    return _write_page(
+        gap_page(read_gap(folder)), out if out is not None else folder / "index.html"
+    )
+
+
+def _write_page(content: dict[str, Any], out: Path) -> Path:
     template = (files("restock.report") / "page.html.jinja").read_text(encoding="utf-8")
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    out = out if out is not None else run / "report.html"
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_text(out, environment.from_string(template).render(page(facts)))
+    write_text(out, environment.from_string(template).render(content))
     return out
 
 
@@ -49,4 +64,4 @@ def write_card(run: Path) -> tuple[dict[str, Any], str]:
     return card, markdown
 
 
-__all__ = ["build_report", "write_card"]
+__all__ = ["build_report", "write_card", "write_gap_page"]

@@ -10,6 +10,7 @@ from restock.report.charts import words
 from restock.report.facts import Facts, span
 from restock.report.feed import fed
 from restock.report.sections import critic, floor_map, learning, provenance, success
+from restock.report.twin_gap import run_section
 
 
 def page(facts: Facts) -> dict[str, Any]:
@@ -20,9 +21,11 @@ def page(facts: Facts) -> dict[str, Any]:
         learning(facts),
         critic(facts),
         floor_map(facts),
+        run_section(facts),
         provenance(facts),
     ]
     return {
+        "kicker": "run report",
         "title": facts.run.name,
         "headline": _headline(facts),
         "lead": _lead(facts),

@@ -1,0 +1,158 @@
+"""`restock twin gap`: how far the twin is from the logs, and where not to trust it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+if TYPE_CHECKING:
+    from restock.train.gap import Gap as Measured
+
+
+@dataclass
+class Gap:
+    """Drive a store's logged commands again in the twin, and say how far it is from the log.
+
+    Per condition: how far pose and signals are off after 1, 3 and 6 s, open loop, and how far
+    observation and reward are off after one step from each logged state; of the nominal twin, and
+    with --perturbation of a calibrated one beside it. Beside them odometry, dead-reckoned, and
+    the floor that localisation noise sets. Names the conditions in which the twin should not be
+    trusted, by the limits below, each with 95 % confidence over episodes. See docs/calibration.md.
+
+    Exit code 0 whatever the gap; with --check 1 where a condition is untrusted.
+
+    Example: `restock twin gap store/ --perturbation fitted.toml --out store/gap`
+    """
+
+    store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
+    """The store."""
+    perturbation: Path | None = None
+    """The calibrated twin, e.g. what `restock twin fit` wrote."""
+    out: Path | None = None
+    """A folder for gap.json, Parquet tables and a page (index.html). `restock report` shows what
+    it finds in RUN/gap or STORE/gap. A gap measured before is replaced."""
+    horizons: str = "1,3,6"
+    """Seconds to drive open loop."""
+    trust_horizon_s: float = 3.0
+    """Trust is judged at this one."""
+    trust_position_m: float = 0.2
+    """Trusted where nine in ten segments end within this of the log."""
+    trust_reward: float = 1.0
+    """Trusted where the one-step reward is off by less than so many times the reward's spread."""
+    min_segments: int = 20
+    """With fewer a condition is unknown."""
+    min_episodes: int = 5
+    """From fewer a condition is unknown."""
+    most: int = 400
+    """Segments a condition and horizon at most, drawn evenly; of single steps five times as many.
+    """
+    seed: int = 0
+    """Of that draw, the floor's noise and the bootstrap."""
+    timestep_s: float | None = None
+    """Physics timestep (default: the perturbation's, .01)."""
+    threads: int = 1
+    """For the physics; the result does not depend on it."""
+    task: str | None = None
+    """Hash of the task whose rows are compared, where the store has several."""
+    check: bool = False
+    """Exit 1 where a condition is untrusted."""
+    json: bool = False
+    """Print one JSON document: {"untrusted", "verdicts", "paths", "observations", "rewards",
+    "not_done", "about"}."""
+
+    def run(self) -> int:
+        """Measure, print, write."""
+        from restock.cli import output
+        from restock.errors import ExitCode
+        from restock.replay.store import Store
+        from restock.report import write_gap_page
+        from restock.train.gap import GapPlan, measure_gap
+        from restock.train.gap_files import check_place, write_gap
+        from restock.train.perturbation import load_perturbation
+        from restock.train.trust import Limits
+
+        calibrated = None if self.perturbation is None else load_perturbation(self.perturbation)
+        given = calibrated.timestep_s if calibrated is not None else 0.01
+        limits = Limits(
+            self.trust_horizon_s,
+            self.trust_position_m,
+            self.trust_reward,
+            self.min_segments,
+            self.min_episodes,
+        )
+        plan = GapPlan(
+            horizons_s=_seconds(self.horizons),
+            most=self.most,
+            limits=limits,
+            seed=self.seed,
+            timestep_s=given if self.timestep_s is None else self.timestep_s,
+            nthread=self.threads,
+        )
+        if self.out is not None:
+            check_place(self.out)
+        with Store(self.store) as store:
+            gap = measure_gap(store, calibrated, plan, task_hash=self.task, tell=output.say)
+        if self.out is not None:
+            write_gap(gap, self.out)
+            output.say(f"wrote {write_gap_page(self.out)}")
+        if self.json:
+            output.print_json(gap.document())
+        else:
+            _show(gap)
+        return int(ExitCode.FAILED if self.check and gap.untrusted else ExitCode.OK)
+
+
+def _seconds(text: str) -> tuple[float, ...]:
+    from restock.errors import ConfigError
+
+    try:
+        return tuple(sorted({float(part) for part in text.split(",") if part.strip()}))
+    except ValueError:
+        raise ConfigError(
+            f"{text!r} are no seconds", where="--horizons", remedy="write them like 1,3,6"
+        ) from None
+
+
+def _show(gap: Measured) -> None:
+    from restock.cli.output import print_table, stdout
+    from restock.report.twin_gap import headline
+
+    positions: dict[tuple[str, float], dict[str, Any]] = {}
+    for row in gap.paths:
+        if row["quantity"] == "position":
+            key = (row["condition"], row["horizon_s"])
+            line = positions.setdefault(
+                key,
+                {"condition": key[0], "after s": key[1], "segments": row["segments"]},
+            )
+            line[row["source"]] = row["median"]
+            line[f"{row['source']} p90"] = row["p90"]
+    print_table(
+        list(positions.values()),
+        title="metres from the logged position: median and 90th percentile",
+    )
+    rewards = [
+        {
+            "condition": row["condition"],
+            "twin": row["source"],
+            "steps": row["steps"],
+            "reward off by": row["mean_gap"],
+            "bias": row["bias"],
+            "reward's spread": row["logged_spread"],
+        }
+        for row in gap.rewards
+        if row["term"] == "reward"
+    ]
+    print_table(rewards, title="reward after one step from the logged state")
+    print_table(
+        [
+            {"condition": found.condition, "twin": found.verdict, "why": "; ".join(found.reasons)}
+            for found in gap.verdicts
+        ]
+    )
+    for line in gap.not_done:
+        stdout().print(f"- {line}", markup=False, soft_wrap=True)
+    stdout().print(headline(gap), markup=False)

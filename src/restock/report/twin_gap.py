@@ -1,0 +1,274 @@
+"""The gap between twin and logs: a section of a run's report, and a page by itself."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import altair as alt
+
+from restock import __version__
+from restock.errors import RestockError
+from restock.report import charts
+from restock.report.blocks import Section, section, table
+from restock.report.charts import words
+from restock.report.facts import Facts
+from restock.train.gap import Gap
+from restock.train.gap_files import DOCUMENT, FOLDER, read_gap
+from restock.train.trust import TRUSTED, UNDECIDED, UNKNOWN, UNTRUSTED
+
+COLOURS = {
+    "nominal": "#b45309",
+    "calibrated": "#0f766e",
+    "odometry": "#64748b",
+    "floor": "#cbd5e1",
+    "persistence": "#94a3b8",
+}
+_MEANING = {
+    TRUSTED: "shown to be within the limits",
+    UNTRUSTED: "shown to be beyond a limit",
+    UNDECIDED: "the interval holds a limit: more logs would decide",
+    UNKNOWN: "too few segments or episodes to say",
+}
+
+
+def find_gap(facts: Facts) -> Gap | None:
+    """The gap measured for a run: RUN/gap, or the gap folder of the store its panel is from."""
+    places = [facts.run / FOLDER]
+    if facts.panel is not None and "://" not in str(facts.panel.header.store):
+        places.append(Path(facts.panel.header.store) / FOLDER)
+    for place in places:
+        if (place / DOCUMENT).is_file():
+            try:
+                return read_gap(place)
+            except RestockError as error:
+                facts.missing.append(f"Not shown, since it could not be read: {error}")
+    return None
+
+
+def run_section(facts: Facts) -> Section | None:
+    """The section of a run's report; None where no gap was measured."""
+    gap = find_gap(facts)
+    if gap is None:
+        return None
+    found = gap_section(gap)
+    if facts.panel is not None and gap.about["store_version"] != facts.panel.header.store_version:
+        found["intro"] += (
+            f" It was measured at version {gap.about['store_version']} of the store; the run's"
+            f" panel is of version {facts.panel.header.store_version}."
+        )
+    return found
+
+
+def gap_page(gap: Gap) -> dict[str, Any]:
+    """Everything the page's template asks for, of a gap alone."""
+    about = gap.about
+    return {
+        "kicker": "gap between twin and logs",
+        "title": f"Twin and logs of {about['store']}",
+        "headline": headline(gap),
+        "lead": f"{about['rows']:,} logged steps of {about['episodes']:,} episodes, driven again in"
+        f" the twin. Judged is the {about['judged']} twin.",
+        "cards": [
+            {"value": str(sum(v.verdict == kind for v in gap.verdicts)), "label": f"{kind}: {said}"}
+            for kind, said in _MEANING.items()
+        ],
+        "sections": [gap_section(gap), _steps_section(gap), _signals_section(gap)],
+        "footer": f"restock {__version__} · written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC from"
+        f" {about['store']}, version {about['store_version']}",
+    }
+
+
+def headline(gap: Gap) -> str:
+    """One sentence: where not to trust the twin."""
+    names = ", ".join(words(name) for name in gap.untrusted)
+    if names:
+        return f"Do not trust the twin in: {names}"
+    if all(found.verdict == UNKNOWN for found in gap.verdicts):
+        return "Too little could be driven again to judge the twin in any condition"
+    if all(found.verdict == TRUSTED for found in gap.verdicts):
+        return "The twin is within its limits in every logged condition"
+    return "No condition is shown to be beyond the limits; not all are shown to be within"
+
+
+def gap_section(gap: Gap) -> Section:
+    """Pose gaps by horizon and condition, the verdicts and what could not be done."""
+    limits = gap.about["limits"]
+    shown = [
+        {**row, "condition": words(row["condition"]), "horizon": f"after {row['horizon_s']:g} s"}
+        for row in gap.paths
+        if row["quantity"] == "position" and row["median"] is not None
+    ]
+    rows = [
+        {
+            "condition": words(found.condition),
+            "verdict": found.verdict,
+            "segments": found.segments,
+            "episodes": found.episodes,
+            f"90 % within, {limits['horizon_s']:g} s": _interval(found.position_p90, "m"),
+            "reward gap / spread": _interval(found.reward_ratio, ""),
+            "why": "; ".join(found.reasons),
+        }
+        for found in gap.verdicts
+    ]
+    return section(
+        "twin-gap",
+        "Can the twin be trusted?",
+        intro="Logged commands, driven again in the twin without a look at what the robot did."
+        " Odometry is the logged wheels, dead-reckoned: a twin should beat it. The floor is what a"
+        " perfect twin would show through localisation noise. Trusted is a condition in which nine"
+        f" in ten segments of {limits['horizon_s']:g} s end within {limits['position_m']:g} m of"
+        f" the log, and the one-step reward is off by less than {limits['reward_ratio']:g} times"
+        " its own spread, both with 95 % confidence over episodes.",
+        callout=headline(gap) + "." if gap.untrusted else "",
+        figures=[
+            {
+                "title": "How far from the log it ends",
+                "svg": _positions(shown),
+                "caption": "Dots are medians with 95 % intervals over episodes, ticks the 90th"
+                " percentile. A segment counts for every condition it meets.",
+            }
+        ]
+        if shown
+        else [],
+        tables=[
+            table(
+                rows,
+                numbers={"segments", "episodes"},
+                caption=" ".join(gap.not_done),
+            )
+        ],
+    )
+
+
+def _positions(rows: list[dict[str, Any]]) -> str:
+    sources = charts.ordered(rows, "source", COLOURS)
+    conditions = list(dict.fromkeys(row["condition"] for row in rows))
+    base = charts.plot(rows).encode(
+        y=alt.Y("condition:N", sort=conditions, title=None, axis=alt.Axis(grid=False, ticks=False)),
+        yOffset=alt.YOffset("source:N", sort=sources),
+        color=alt.Color("source:N", scale=charts.scale(sources, COLOURS), sort=sources),
+    )
+    bars = base.mark_rule(strokeWidth=3, opacity=0.45).encode(
+        x=alt.X("median_low:Q", title="metres"), x2="median_high:Q"
+    )
+    dots = base.mark_circle(size=60, opacity=1).encode(x=alt.X("median:Q"))
+    ticks = base.mark_tick(thickness=2, size=9).encode(x=alt.X("p90:Q"))
+    layered = alt.layer(bars, dots, ticks).properties(width=250, height=60 * len(conditions))
+    horizons = list(dict.fromkeys(row["horizon"] for row in rows))
+    return charts.svg(layered.facet(column=alt.Column("horizon:N", sort=horizons)))
+
+
+def _steps_section(gap: Gap) -> Section:
+    """One step: reward by term, and observation by component."""
+    sources = list(gap.about["twins"])
+    rewards = [
+        {
+            "condition": words(row["condition"]),
+            "term": words(row["term"]),
+            "logged mean": _number(row["logged_mean"]),
+            "logged spread": _number(row["logged_spread"]),
+            **{
+                f"{source}": _cell(gap.rewards, source, "mean_gap", condition=row["condition"],
+                                   term=row["term"])
+                for source in sources
+            },
+        }
+        for row in gap.rewards
+        if row["source"] == sources[-1]
+        and (row["term"] == "reward" or _any(gap, row["condition"], row["term"]))
+    ]  # fmt: skip
+    observed = _grouped(gap)
+    return section(
+        "one-step",
+        "One step from each logged state",
+        intro="The twin is put into the logged state, drives the logged action for one control"
+        " period, and the task's own functions make observation and reward of it. Mean absolute"
+        " differences; persistence is what saying “nothing changes” would miss.",
+        tables=[
+            table(
+                rewards,
+                numbers={"logged mean", "logged spread", *sources},
+                title="Reward, by term",
+                caption="Terms that are the same on both sides everywhere are left out.",
+            ),
+            table(
+                observed,
+                numbers={*sources, "persistence"},
+                title="Observation, by component, in nominal driving",
+                caption="Sectors of the lidar are taken together; observations.parquet has each"
+                " component and condition.",
+            ),
+        ],
+    )
+
+
+def _signals_section(gap: Gap) -> Section:
+    sources = [name for name in COLOURS if any(row["source"] == name for row in gap.paths)]
+    rows = []
+    for row in gap.paths:
+        if row["source"] == "floor":
+            key = {name: row[name] for name in ("condition", "quantity", "horizon_s")}
+            rows.append(
+                {
+                    "condition": words(row["condition"]),
+                    "signal": words(row["quantity"].rsplit("_", 1)[0]),
+                    "unit": row["unit"],
+                    "horizon": f"{row['horizon_s']:g} s",
+                    "segments": row["segments"],
+                    **{name: _cell(gap.paths, name, "median", **key) for name in sources},
+                }
+            )
+    return section(
+        "signals",
+        "Pose and signals, by horizon",
+        intro="Medians over segments: of a pose at the horizon's end, of a signal the root mean"
+        " square on the way.",
+        tables=[table(rows, numbers={"segments", *sources})],
+    )
+
+
+def _grouped(gap: Gap) -> list[dict[str, Any]]:
+    """Observation gaps in nominal driving, lidar sectors averaged."""
+    sums: dict[str, dict[str, list[float]]] = {}
+    for row in gap.observations:
+        if row["condition"] == "nominal" and row["mean_gap"] is not None:
+            name = row["component"]
+            for lidar in ("clearance_", "closing_"):
+                name = f"{lidar[:-1]} (all sectors)" if name.startswith(lidar) else name
+            sums.setdefault(name, {}).setdefault(row["source"], []).append(row["mean_gap"])
+    return [
+        {"component": words(name)}
+        | {source: f"{sum(values) / len(values):.4f}" for source, values in by.items()}
+        for name, by in sums.items()
+    ]
+
+
+def _any(gap: Gap, condition: str, term: str) -> bool:
+    return any(
+        row["mean_gap"]
+        for row in gap.rewards
+        if (row["condition"], row["term"]) == (condition, term)
+    )
+
+
+def _cell(rows: list[dict[str, Any]], source: str, value: str, **key: Any) -> str:
+    for row in rows:
+        if row["source"] == source and all(row[name] == part for name, part in key.items()):
+            return _number(row[value])
+    return ""
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.3f}"
+
+
+def _interval(found: Any, unit: str) -> str:
+    if found.value != found.value:
+        return ""
+    text = f"{found.value:.2f} {unit}".strip()
+    return text if found.low != found.low else f"{text} [{found.low:.2f}, {found.high:.2f}]"
+
+
+__all__ = ["find_gap", "gap_page", "gap_section", "headline", "run_section"]
