@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from restock.ingest.align import NS, Held, Samples, Segment
 from restock.ingest.clearance import BEAMS, SECTORS, scan_reduction
 from restock.ingest.frames import Tree
+from restock.ingest.perturbed import Perturbed
 from restock.ingest.profile import Profile
 from restock.ingest.reading import Fields
 from restock.ingest.routing import LARGEST, Routing, plan_ends, plan_problems, same_goals
@@ -103,6 +104,14 @@ class Filling:
         held = self._hold("true_condition", lead_s=self.task.control_period_s / 2)
         rows = zip(held.row, held.fresh, strict=True)
         return [said[row] if known else None for row, known in rows]
+
+    def perturbed(self) -> Perturbed:
+        """The simulator's parameters in force at each tick, and what could not be read."""
+        if not self.sources.present("perturbation"):
+            return Perturbed.unknown(len(self.tick_ns))
+        held = self._hold("perturbation", lead_s=PROVENANCE_LEAD_S)
+        row = np.where(held.fresh, held.row, -1).astype(np.int64)
+        return Perturbed.read(self.sources.texts("perturbation"), row)
 
     def _hold(self, name: str, *, lead_s: float = 0.0) -> Held:
         """An input's latest message at every tick (or a lead after it), segment by segment."""

@@ -138,6 +138,7 @@ def _lead_s(name: str, profile: Profile) -> float:
     """How much after the tick an input may come: provenance alone, never what the robot knew."""
     leads = {
         "behaviour_policy": PROVENANCE_LEAD_S,
+        "perturbation": PROVENANCE_LEAD_S,
         "true_condition": profile.task.control_period_s / 2,
     }
     return leads.get(name, 0.0)

@@ -21,6 +21,7 @@ INPUT_FIELDS: dict[str, dict[str, bool]] = {
     "bumper": {"pressed": True},
     "behaviour_policy": {"text": True},
     "true_condition": {"text": True},
+    "perturbation": {"text": True},
 }
 
 # What stands in for an input that a profile leaves out, or marks optional and a recording lacks.
@@ -30,6 +31,7 @@ FALLBACKS: dict[str, str] = {
     "bumper": "never pressed",
     "behaviour_policy": "the profile's behaviour_policy",
     "true_condition": "unknown: labels are not scored",
+    "perturbation": "unknown: null, as of hardware",
 }
 POSE_FALLBACK = "from transforms, by [frames]"
 ROUTE_FALLBACK = "none: the task has no goal, progress is forward displacement"
@@ -58,6 +60,7 @@ class Inputs(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bumper: Input | None = None
     behaviour_policy: Input | None = None
     true_condition: Input | None = None
+    perturbation: Input | None = None
 
     def items(self) -> Iterator[tuple[str, Input]]:
         for name in self.__struct_fields__:

@@ -87,11 +87,18 @@ KINDS: dict[str, tuple[Kind, ...]] = {
     "true_condition": (
         Kind("std_msgs/msg/String", {"text": "data"}, ("ground_truth", "true_cond"), must=True),
     ),
+    "perturbation": (Kind("std_msgs/msg/String", {"text": "data"}, ("perturbation",), must=True),),
 }
 REQUIRED = ("command", "wheels", "pose")
 MOTION = "nav_msgs/msg/Odometry"
-SPENT = ("goal", "plan", "behaviour_policy", "true_condition")  # nothing else is in them
-LATCHED = ("goal", "plan", "behaviour_policy")
+SPENT = (
+    "goal",
+    "plan",
+    "behaviour_policy",
+    "true_condition",
+    "perturbation",
+)  # nothing else is in them
+LATCHED = ("goal", "plan", "behaviour_policy", "perturbation")
 
 Roles = dict[str, list[tuple[TopicInfo, Kind]]]  # input -> …, best first
 

@@ -48,6 +48,13 @@ COVERAGE: tuple[Column, ...] = (
     Column("condition", pa.string(), "the one condition of highest priority, or 'nominal'"),
     Column("conditions", pa.list_(pa.string()), "every condition that holds; empty if nominal"),
     Column("true_condition", pa.string(), "from the simulator, to score labels", nullable=True),
+    Column("perturbation", pa.string(), "name of the twin's parameters in force", nullable=True),
+    Column(
+        "perturbation_values",
+        pa.map_(pa.string(), pa.float64()),
+        "those that are not the nominal twin's; null for hardware",
+        nullable=True,
+    ),
     Column("zone", pa.string(), "named part of the map, or 'elsewhere'"),
     Column("behaviour_policy", pa.string(), "who acted: planner, operator, dqn, …"),
     Column("behaviour_version", pa.string(), "version of that policy", nullable=True),

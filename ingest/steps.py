@@ -19,6 +19,7 @@ from restock.ingest.columns import TopicColumns
 from restock.ingest.custom_columns import Custom, custom_signals
 from restock.ingest.filling import Filling
 from restock.ingest.frames import Tree
+from restock.ingest.perturbed import Perturbed
 from restock.ingest.profile import Profile
 from restock.ingest.routing import Routing
 from restock.ingest.signals import localised_velocity
@@ -47,6 +48,7 @@ class Steps:
     policy_version: list[str | None]  # (T,)
     probability: list[float | None]  # (T,)
     truth: list[str | None]  # (T,) true condition, where a simulator said it
+    perturbed: Perturbed  # (T,) a simulator's parameters in force
     clock: ClockReport
     commands_between: int  # commands that got no tick of their own
     custom: Custom  # the profile's own signals
@@ -92,6 +94,7 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
         profile.task, signals["command_speed_mps"], signals["command_yaw_rate_radps"]
     )
     policy, version, probability = filling.behaviour()
+    perturbed = filling.perturbed()
     custom = custom_signals(profile.signals, topics, segments, ticks)
     return Steps(
         signals,
@@ -107,11 +110,12 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
         version,
         probability,
         filling.truth(),
+        perturbed,
         report,
         between,
         custom,
         topic_clocks(topics, profile.clock.jump_s),
-        frame_notes(profile, sources, edges) + custom.notes,
+        frame_notes(profile, sources, edges) + custom.notes + perturbed.notes,
     )
 
 

@@ -94,6 +94,7 @@ def transitions(
     def each(values: Sequence[Any]) -> list[Any]:
         return [values[index] for index in tick]
 
+    names, values = steps.perturbed.columns(tick)
     columns: dict[str, Any] = {
         "transition_id": (number << STEP_BITS) + tick,
         "recording_id": [provenance.recording_id] * count,
@@ -109,6 +110,8 @@ def transitions(
         "condition": [named[row] for row in begin],
         "conditions": _names(rows.labels, begin),
         "true_condition": each(steps.truth),
+        "perturbation": names,
+        "perturbation_values": values,
         "zone": profile.zone_of(now["pose_x_m"], now["pose_y_m"]),
         "behaviour_policy": each(steps.policy),
         "behaviour_version": each(steps.policy_version),

@@ -17,13 +17,27 @@ from restock.replay.strata import Stratum
 META_COLUMNS = (
     *("transition_id", "recording_id", "episode_id", "step_index", "stamp_ns", "logged_ns"),
     *("condition", "zone", "behaviour_policy", "behaviour_version", "action_probability"),
-    *("action", "reward", "terminated", "truncated"),
+    *("action", "reward", "terminated", "truncated", "perturbation"),
 )
-_TEXT = ("recording_id", "episode_id", "condition", "zone", "behaviour_policy", "behaviour_version")
+# Of which rows from before they were kept have none.
+_LATER = ("perturbation",)
+_TEXT = (
+    *("recording_id", "episode_id", "condition", "zone", "behaviour_policy", "behaviour_version"),
+    "perturbation",
+)
 _CODED = pa.dictionary(pa.int32(), pa.string())
 BATCH_ROWS = 65_536  # read at a time
 # Of a view of several stores, which one a row is from (`replay.stores`).
 STORE_COLUMN = "mixture_store"
+
+
+def meta_columns(connection: duckdb.DuckDBPyConnection) -> str:
+    """META_COLUMNS of the connection's `transitions`, for a SELECT."""
+    has = connection.sql("FROM transitions LIMIT 0").columns
+    return ", ".join(
+        f"NULL::VARCHAR AS {name}" if name in _LATER and name not in has else name
+        for name in META_COLUMNS
+    )
 
 
 def read_candidates(
@@ -55,7 +69,7 @@ def read_candidates(
     )
     store = STORE_COLUMN if several_stores else "0"
     query = (
-        f"SELECT {', '.join(META_COLUMNS)}, task_hash, ({store})::INTEGER AS store,"
+        f"SELECT {meta_columns(connection)}, task_hash, ({store})::INTEGER AS store,"
         " coalesce(condition, '') <> '' AND conditions IS NOT NULL AS labelled,"
         f" {tests} FROM transitions {ORDER}"
     )

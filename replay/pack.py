@@ -21,9 +21,10 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from restock.errors import PanelError
+from restock.replay.candidates import meta_columns
 from restock.replay.layout import Ints, row_columns, row_width
 from restock.replay.mixture import Mixture
-from restock.replay.plan import META_COLUMNS, Plan
+from restock.replay.plan import Plan
 from restock.replay.scratch import BATCH_ROWS, ORDER, STRETCH, Steps
 from restock.replay.strata import NO_STRATUM
 
@@ -161,7 +162,7 @@ class Packer:
         to_go = None
         if self.mixture.return_to_go:
             to_go = self.steps.returns_to_go(self.mixture.discount)
-        columns = ", ".join(META_COLUMNS)
+        columns = meta_columns(self.connection)
         reader = self.connection.sql(f"SELECT {columns} FROM transitions {ORDER}").to_arrow_reader(
             BATCH_ROWS
         )

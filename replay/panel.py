@@ -171,8 +171,8 @@ class Panel:
     def meta(self) -> pa.Table:
         """Beside each packed row (n,): transition_id, recording_id, episode_id, step_index,
         stamp_ns, logged_ns, condition, zone, behaviour_policy, behaviour_version,
-        action_probability, action, reward (of one step), terminated, truncated, stratum,
-        stratum_code (its place in `strata`), horizon, weight; where the mixture says so,
+        action_probability, action, reward (of one step), terminated, truncated, perturbation,
+        stratum, stratum_code (its place in `strata`), horizon, weight; where the mixture says so,
         return_to_go and return_to_go_whole (it ran to a termination); and what adaptive shares
         need (state_code, probability_of_…)."""
         if self._meta is None:

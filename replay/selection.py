@@ -192,7 +192,7 @@ def _of_panel(panel: Panel, continuous: bool) -> Selection:
 def _panel_batches(panel: Panel) -> Iterator[pa.RecordBatch]:
     """A panel's rows in order, as a query would give them."""
     text = {"recording_id", "episode_id", "condition", "zone", "behaviour_policy"}
-    text.add("behaviour_version")
+    text |= {"behaviour_version", "perturbation"}
     meta = panel.meta.cast(
         pa.schema([f.with_type(pa.string()) if f.name in text else f for f in panel.meta.schema])
     )

@@ -15,6 +15,11 @@ from restock.ingest.location import Location
 from restock.ingest.store import RECORDINGS, TRANSITIONS
 from restock.replay.store import is_store
 
+_LATER = {
+    "perturbation": "CAST(NULL AS STRING) AS perturbation",
+    "perturbation_values": "CAST(NULL AS MAP<STRING, DOUBLE>) AS perturbation_values",
+}
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -45,6 +50,10 @@ def install_views(session: SparkSession | Any, store: str | Path, *, scheme: str
             else f"{scheme}://{place.table(name).removeprefix('s3://')}"
         )
         table = session.read.format("delta").load(address)
+        if name == TRANSITIONS:  # rows of an older store have no such columns: null
+            table = table.selectExpr(
+                "*", *(sql for column, sql in _LATER.items() if column not in table.columns)
+            )
         table.createOrReplaceTempView(f"stored_{name}")
     for statement in statements():
         session.sql(statement)

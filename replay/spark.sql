@@ -191,6 +191,51 @@ LEFT JOIN seen ON named.condition = seen.seen_condition
 LEFT JOIN by_episode ON named.condition = by_episode.part_condition
 ORDER BY rows DESC, condition;
 
+CREATE OR REPLACE TEMPORARY VIEW coverage_by_perturbation AS
+WITH cells AS (
+    SELECT
+        perturbation,
+        count(*) AS rows,
+        count(DISTINCT transitions.episode_id) AS episodes,
+        count(DISTINCT transitions.recording_id) AS recordings,
+        sort_array(collect_set(condition)) AS conditions,
+        avg(reward) AS reward_mean,
+        count(DISTINCT CASE WHEN success THEN transitions.episode_id END) AS succeeded,
+        count(DISTINCT CASE WHEN success IS NOT NULL THEN transitions.episode_id END) AS judged
+    FROM transitions
+    JOIN (SELECT episode_id AS of_episode, success FROM episodes) AS outcomes
+        ON transitions.episode_id = outcomes.of_episode
+    GROUP BY perturbation
+)
+SELECT
+    perturbation,
+    rows,
+    rows / sum(rows) OVER () AS share,
+    episodes,
+    recordings,
+    conditions,
+    reward_mean,
+    succeeded / nullif(judged, 0) AS success_share
+FROM cells
+ORDER BY rows DESC, perturbation NULLS LAST;
+
+CREATE OR REPLACE TEMPORARY VIEW perturbation_ranges AS
+WITH entries AS (
+    SELECT perturbation, episode_id, explode(perturbation_values) AS (field, value)
+    FROM transitions
+)
+SELECT
+    perturbation,
+    field,
+    count(*) AS rows,
+    count(DISTINCT episode_id) AS episodes,
+    min(value) AS value_min,
+    avg(value) AS value_mean,
+    max(value) AS value_max
+FROM entries
+GROUP BY perturbation, field
+ORDER BY perturbation NULLS LAST, field;
+
 CREATE OR REPLACE TEMPORARY VIEW missing_cells AS
 WITH names AS (
     SELECT condition AS of_condition FROM conditions

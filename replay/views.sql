@@ -14,7 +14,12 @@ SELECT
     * EXCLUDE (clock_offset_ns)
     REPLACE (observation::FLOAT[] AS observation, next_observation::FLOAT[] AS next_observation),
     stamp_ns + coalesce(clock_offset_ns, 0) AS logged_ns
-FROM stored_transitions
+FROM (
+    FROM stored_transitions
+    UNION ALL BY NAME -- rows of an older store have no such columns: null
+    SELECT NULL::VARCHAR AS perturbation, NULL::MAP(VARCHAR, DOUBLE) AS perturbation_values
+    WHERE false
+)
 JOIN (SELECT ingest_id, clock_offset_ns FROM stored_recordings) USING (ingest_id);
 
 -- The discrete actions of each task, from the definition the recordings carry.
@@ -155,6 +160,43 @@ FROM conditions
 FULL JOIN seen USING (condition)
 FULL JOIN by_episode USING (condition)
 ORDER BY rows DESC, condition;
+
+-- One line a perturbation of the twin; null is hardware, or a simulator that did not say.
+CREATE OR REPLACE VIEW coverage_by_perturbation AS
+SELECT
+    perturbation,
+    count(*) AS rows,
+    count(*) / sum(count(*)) OVER () AS share,
+    count(DISTINCT episode_id) AS episodes,
+    count(DISTINCT recording_id) AS recordings,
+    list_sort(list(DISTINCT condition)) AS conditions,
+    avg(reward) AS reward_mean,
+    (count(DISTINCT episode_id) FILTER (success))
+        / nullif(count(DISTINCT episode_id) FILTER (success IS NOT NULL), 0) AS success_share
+FROM transitions
+JOIN (SELECT episode_id, success FROM episodes) USING (episode_id)
+GROUP BY perturbation
+ORDER BY rows DESC, perturbation;
+
+-- How far each field of a perturbation reached, over the episodes in which it was not nominal.
+CREATE OR REPLACE VIEW perturbation_ranges AS
+SELECT
+    perturbation,
+    field,
+    count(*) AS rows,
+    count(DISTINCT episode_id) AS episodes,
+    min(value) AS value_min,
+    avg(value) AS value_mean,
+    max(value) AS value_max
+FROM (
+    SELECT perturbation, episode_id, entry.key AS field, entry.value AS value
+    FROM (
+        SELECT perturbation, episode_id, unnest(map_entries(perturbation_values)) AS entry
+        FROM transitions
+    )
+)
+GROUP BY perturbation, field
+ORDER BY perturbation, field;
 
 -- Condition x action cells without a single row; cells_below(n) for those with fewer than n.
 CREATE OR REPLACE VIEW missing_cells AS

@@ -57,6 +57,8 @@ def recording_transitions(
         "condition": primary(labels, CONDITIONS),
         "conditions": held,
         "true_condition": [None] * rows,
+        "perturbation": np.where(np.arange(rows) % 3 > 0, "wet", None),
+        "perturbation_values": [[("friction_scale", 0.5)] if r % 3 else None for r in range(rows)],
         "zone": rng.choice(["aisle_1", "aisle_2", "cross"], rows),
         "behaviour_policy": np.where(rng.random(episodes)[episode] < 0.8, "planner", "operator"),
         "behaviour_version": ["1"] * rows,

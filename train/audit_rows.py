@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from restock.replay.ring import FreshRing
 from restock.train.batches import Batch, Coded, Logs
+from restock.train.fresh_perturbations import FreshPerturbations
 
 Columns = dict[str, Any]
 
@@ -39,6 +40,12 @@ def logged_rows(
         "condition": _names(logs.condition, row),
         "behaviour_policy": _names(logs.behaviour_policy, row),
         "behaviour_version": _names(logs.behaviour_version, row),
+        "perturbation": (
+            [logs.perturbation.known(place) for place in row.tolist()]
+            if logs.perturbation
+            else None
+        ),
+        "perturbation_values": None,
         **_learnt(columns, "log"),
     }
 
@@ -48,10 +55,12 @@ def fresh_rows(
     batch: Batch,
     ring: FreshRing,
     strata: Sequence[str],
+    perturbations: FreshPerturbations | None = None,
 ) -> Columns:
     """The same of its fresh rows. The last of `strata` has no condition yet."""
     slots, meta = batch.slots, ring.meta
     codes = columns["fresh_stratum"].tolist()
+    keys = meta["episode"][slots]
     return {
         "source": "fresh",
         "transition_id": None,
@@ -68,6 +77,8 @@ def fresh_rows(
             ring.behaviour_policies[code] for code in columns["fresh_policy"].tolist()
         ],
         "behaviour_version": [str(version) for version in meta["policy_version"][slots].tolist()],
+        "perturbation": perturbations.names(keys) if perturbations else None,
+        "perturbation_values": perturbations.values(keys) if perturbations else None,
         **_learnt(columns, "fresh"),
     }
 

@@ -53,6 +53,11 @@ class Coded:
     def name(self, row: int) -> str:
         return str(self.names[self.codes[row]])
 
+    def known(self, row: int) -> str | None:
+        """The same, or None where the column has none."""
+        code = self.codes[row]
+        return str(self.names[code]) if code < len(self.names) - 1 else None
+
 
 @dataclass(frozen=True)
 class Logs:
@@ -72,6 +77,7 @@ class Logs:
     behaviour_version: Coded
     episode: Coded
 
+    perturbation: Coded | None = None  # of the twin; null for hardware
     panel: Panel | None = None  # where they are from
     planned: PlannedDraws = _UNPLANNED  # what the run will draw
     huber_delta: float = 1.0  # of the run's loss: the floor of LAP's priorities
@@ -106,6 +112,11 @@ class Logs:
             behaviour_policy=Coded.of(meta["behaviour_policy"]),
             behaviour_version=Coded.of(meta["behaviour_version"]),
             episode=Coded.of(meta["episode_id"]),
+            perturbation=Coded.of(
+                meta["perturbation"]
+                if "perturbation" in meta.column_names  # a panel from before has no such column
+                else pa.chunked_array([pa.nulls(len(meta), pa.string())])
+            ),
             panel=panel,
             planned=planned,
             huber_delta=huber_delta,

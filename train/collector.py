@@ -22,8 +22,11 @@ from restock.ingest.task import Task
 from restock.replay.ring import FreshRing
 from restock.train.evaluate import Twin
 from restock.train.fresh_log import FreshLog
+from restock.train.fresh_perturbations import FreshPerturbations, values_entries
+from restock.train.layout import DEFAULT
 
 _EPISODES_PER_QUERY = 8
+_NO_VALUES = ("{}",)  # of a twin that has only a name for them
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,9 @@ class Ended:
     bumps: int
     steps: int
     signals: dict[str, NDArray[Any]]  # (steps + 1,) each
+    perturbation_values: str = "{}"  # JSON: those that are not nominal
+    layout: str = DEFAULT
+    zones: list[str] | None = None  # (steps + 1,) on its layout; None: what the profile says
 
 
 class Collector:
@@ -79,6 +85,7 @@ class Collector:
         self._sent: tuple[NDArray[np.int64], NDArray[np.float32]] | None = None
         self._future: Future[Any] | None = None
         self._result: Any = None
+        self.perturbations = FreshPerturbations()
         self.log: FreshLog | None = None
         self._saved_log: Mapping[str, Any] | None = None
 
@@ -168,6 +175,8 @@ class Collector:
         self._return += reward
         self._bumps += bumped & ~self._touching
         self._touching = bumped
+        values = info.get("perturbation_values", _NO_VALUES * self.env.num_envs)
+        self.perturbations.note(keys, info["perturbation"], values)
         finished = []
         for place in np.flatnonzero(ended):
             count = int(self._steps[place])
@@ -181,6 +190,9 @@ class Collector:
                     env=int(place),
                     episode_seed=int(info["episode_seed"][place]),
                     perturbation=str(info["perturbation"][place]),
+                    perturbation_values=str(values[place]),
+                    layout=str(info["layout"][place]) if "layout" in info else DEFAULT,
+                    zones=self._zones(info, int(place), count),
                     true_condition=str(info["episode_condition"][place]),
                     block=str(info["block"][place]),
                     undiscounted_return=float(self._return[place]),
@@ -206,6 +218,13 @@ class Collector:
         self._unlabelled.extend(finished)
         return finished
 
+    def _zones(self, info: Mapping[str, Any], env: int, count: int) -> list[str] | None:
+        """`LAYOUT/zone` of an ended episode's steps: the profile's are of the default floor."""
+        if "floor" not in info or (floor := info["floor"][env]).name == DEFAULT:
+            return None
+        x, y = (self._history[f"pose_{axis}_m"][env, : count + 1] for axis in "xy")
+        return [f"{floor.name}/{zone}" for zone in floor.zone_of(x, y)]
+
     def _drop(self, keys: NDArray[np.int64], invalid: NDArray[np.bool_]) -> None:
         """A step whose physics blew up must not be learnt from: its row repeats the one before."""
         ring = self.ring
@@ -222,6 +241,7 @@ class Collector:
         if not waiting or (len(waiting) < _EPISODES_PER_QUERY and not all_of_them):
             return []
         self._unlabelled = []
+        self.perturbations.forget(self.ring.meta["episode"][: len(self.ring)])
         labels = label(steps_table(waiting), self.conditions)
         if self.log is not None:
             self.log.labelled(waiting, labels)
@@ -243,6 +263,8 @@ class Collector:
                     "env": episode.env,
                     "episode_seed": episode.episode_seed,
                     "perturbation": episode.perturbation,
+                    "perturbation_values": values_entries(episode.perturbation_values),
+                    "layout": episode.layout,
                     "true_condition": episode.true_condition,
                     "block": episode.block,
                     "conditions": [name for name, held in labels.items() if held[inside].any()],
@@ -267,6 +289,7 @@ class Collector:
             "touching": self._touching,
             "invalid_steps": self.invalid_steps,
             "history": self._history,
+            "perturbations": self.perturbations.state_dict(),
             "log": self.log.state_dict() if self.log is not None else None,
             "unlabelled": [
                 {name: getattr(episode, name) for name in Ended.__dataclass_fields__}
@@ -285,6 +308,7 @@ class Collector:
         self._history = {name: np.array(values) for name, values in state["history"].items()}
         self._unlabelled = [Ended(**episode) for episode in state["unlabelled"]]
         self._saved_log = state.get("log")
+        self.perturbations.load_state_dict(state.get("perturbations", {}))
 
 
 def ring_conditions(conditions: Sequence[Condition]) -> list[str]:

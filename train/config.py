@@ -17,6 +17,7 @@ import msgspec
 
 from restock.errors import ConfigError
 from restock.train.explore import LinearEpsilon
+from restock.train.perturbation import find_perturbation
 from restock.train.target import Polyak, TargetRule
 
 # Shares of true conditions among the episodes of the twin.
@@ -134,6 +135,9 @@ class EnvConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     num_envs: int = 16
     conditions: dict[str, float] = msgspec.field(default_factory=lambda: dict(DEFAULT_CONDITIONS))
     overlap: bool = True  # simulate on one thread while learning on another; same result
+    layouts: str = "default"  # floors: generated:train, FILE.toml, map.yaml; docs/layouts.md
+    # A ready-made one's name, a TOML file, or its table; of a schedule, one drawn an episode.
+    perturbation: str | dict[str, Any] = "nominal"
 
     def __post_init__(self) -> None:
         if self.num_envs < 1:
@@ -142,6 +146,8 @@ class EnvConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError("env.conditions must be shares, none below 0")
         if sum(self.conditions.values()) <= 0:
             raise ValueError("env.conditions must have a share above 0")
+        if not isinstance(self.perturbation, str):
+            find_perturbation(self.perturbation, where="env.perturbation")
 
 
 class EvaluationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -149,6 +155,7 @@ class EvaluationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     episodes: int = 10  # per condition
     seed: int = 90_000  # of the first fixed episode; kept away from training seeds
     averaging: float = 0.001  # rate of the average of weights that is evaluated; 1: the last ones
+    layouts: str | None = None  # None: env.layouts, with generated:train's validation floors
     off_policy: bool = False  # judge the offline policy on held-out logs before it drives
 
     def __post_init__(self) -> None:

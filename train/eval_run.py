@@ -21,6 +21,7 @@ from restock.train import checkpoint
 from restock.train.config import TrainConfig, parse_config
 from restock.train.episode import KINDS, EpisodeSpec
 from restock.train.evaluate import EpisodeResult, GreedyPolicy, Policy, run_episodes
+from restock.train.floors import held_out, open_floors
 from restock.train.network import make_network
 from restock.train.perturbation import PERTURBATIONS, Perturbation
 from restock.train.run import Run, write_table
@@ -45,6 +46,7 @@ class Plan:
     first_seed: int = FIRST_SEED
     num_envs: int = 32
     nthread: int = 0  # all cores
+    layouts: str = "default"
 
     @property
     def total(self) -> int:
@@ -59,8 +61,9 @@ def plan_evaluation(
     perturbations: Sequence[str] = (CLEAN,),
     episodes: int = 20,
     first_seed: int = FIRST_SEED,
+    layouts: str | None = None,
 ) -> Plan:
-    """Check a request.
+    """Check a request. `layouts` None: the run's, with training floors' test split.
 
     Raises:
         RunError: no such run, or it kept no policy yet.
@@ -96,7 +99,9 @@ def plan_evaluation(
         tuple(dict.fromkeys(perturbations)),
         episodes,
         first_seed,
+        layouts=layouts or held_out(config.env.layouts, "test"),
     )
+    open_floors(plan.layouts)
     for name in plan.policies:
         if _is_path("--policies", name):
             make_policy(name, plan)  # what is wrong with it is said before anything is driven
@@ -113,7 +118,13 @@ def evaluate(plan: Plan, progress: Callable[[int], None] | None = None) -> Resul
 
     profile = load_profile(plan.config.profile)
     task = profile.task
-    env = WarehouseVectorEnv(plan.num_envs, nthread=plan.nthread, task=task, seed=plan.first_seed)
+    env = WarehouseVectorEnv(
+        plan.num_envs,
+        nthread=plan.nthread,
+        task=task,
+        seed=plan.first_seed,
+        layouts=plan.layouts,
+    )
     # One queue a policy, over all perturbations: few environments then wait for the last episodes.
     asked = [
         (perturbation, EpisodeSpec(kind, plan.first_seed + index, _perturb(perturbation)))
@@ -185,8 +196,8 @@ def episodes_table(results: Results) -> pa.Table:
     rows = [
         {
             "policy": policy,
-            "perturbation": perturbation,
             **result.row,
+            "perturbation": perturbation,
             "end_x_m": result.end_x_m,
             "end_y_m": result.end_y_m,
             "failure": result.failure,
@@ -208,4 +219,5 @@ def settings(plan: Plan) -> dict[str, Any]:
         },
         "episodes_per_kind": plan.episodes,
         "first_seed": plan.first_seed,
+        "layouts": plan.layouts,
     }

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.train.episode import EpisodeSpec
+from restock.train.fresh_perturbations import values_entries
 from restock.train.learner import greedy_actions
 from restock.train.network import Network
 from restock.train.stats import wilson
@@ -75,6 +76,9 @@ class EpisodeResult:
     end_x_m: float
     end_y_m: float
     failure: str | None  # stuck | timeout | bump | cut
+    perturbation: str = "nominal"
+    perturbation_values: str = "{}"  # JSON: those that are not nominal
+    layout: str = "default"
 
     @property
     def row(self) -> dict[str, Any]:
@@ -83,6 +87,9 @@ class EpisodeResult:
             "condition": self.condition,
             "block": self.block,
             "episode_seed": self.episode_seed,
+            "perturbation": self.perturbation,
+            "layout": self.layout,
+            "perturbation_values": values_entries(self.perturbation_values),
             "success": self.success,
             "bumps": self.bumps,
             "time_s": self.time_s,
@@ -140,7 +147,11 @@ def run_episodes(
                 end = track[place, min(count, time_limit_steps)]
                 before = track[place, max(count - window, 0)]
                 success = bool(info["success"][place])
+                values = info.get("perturbation_values")
                 results[index] = EpisodeResult(
+                    perturbation=str(info["perturbation"][place]),
+                    layout=str(info["layout"][place]) if "layout" in info else "default",
+                    perturbation_values="{}" if values is None else str(values[place]),
                     condition=specs[index].condition,
                     block=str(info["block"][place]),
                     episode_seed=specs[index].seed,

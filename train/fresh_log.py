@@ -75,6 +75,10 @@ class FreshLog:
             "count": count,
             "terminated": terminated and not broken,
             "version": int(self._version[env]),
+            "perturbation": episode.perturbation,
+            "layout": episode.layout,
+            "zones": None if episode.zones is None else episode.zones[: count + 1],
+            "perturbation_values": episode.perturbation_values,
             "observation": self._observation[env, : count + 1].copy(),
             **{name: column[env, :count].copy() for name, column in self._steps.items()},
         }

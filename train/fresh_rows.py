@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 import hashlib
+import json
 import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,11 +14,13 @@ from typing import Any
 import msgspec
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from restock.errors import RunError
 from restock.ingest.conditions import NOMINAL, primary
 from restock.ingest.episode_rows import ENDS, EpisodeRows, packed
 from restock.ingest.manifest import conditions_json, definitions, score_rows, software_version
+from restock.ingest.perturbed import Perturbed
 from restock.ingest.profile import Profile
 from restock.ingest.schema import SIGNAL_COLUMNS, STEP_BITS, recording_schema, transition_schema
 from restock.ingest.scores import score
@@ -127,6 +130,7 @@ def _rows(
     for_good = np.array([bool(episode["terminated"]) for episode in episodes])[rows.episode[begin]]
     version = [f"{run.name}@{int(episode['version'])}" for episode in episodes]
     named = primary(rows.labels, profile.conditions) or [NOMINAL] * len(rows.tick)
+    perturbed, values = _perturbed(episodes).columns(rows.episode[begin])
     now = {name: column[begin] for name, column in rows.signals.items()}
     number = int(recording_id, 16) >> (64 - (63 - STEP_BITS))
     columns: dict[str, Any] = {
@@ -144,7 +148,9 @@ def _rows(
         "condition": [named[row] for row in begin],
         "conditions": [[name for name, holds in rows.labels.items() if holds[r]] for r in begin],
         "true_condition": each("truth").tolist(),
-        "zone": profile.zone_of(now["pose_x_m"], now["pose_y_m"]),
+        "perturbation": perturbed,
+        "perturbation_values": values,
+        "zone": _zones(rows, episodes, profile)[begin].tolist(),
         "behaviour_policy": POLICY,
         "behaviour_version": [version[episode] for episode in rows.episode[begin]],
         "action_probability": each("probability"),
@@ -164,7 +170,32 @@ def _rows(
     return table.replace_schema_metadata({ENDS: packed(rows.ends_table())})
 
 
+def _zones(
+    rows: EpisodeRows, episodes: Sequence[Mapping[str, Any]], profile: Profile
+) -> NDArray[np.object_]:
+    """The zone of every step: the profile's on the floor that it describes, else the layout's."""
+    names = profile.zone_of(rows.signals["pose_x_m"], rows.signals["pose_y_m"])
+    zones = np.array(names, object)
+    for number, episode in enumerate(episodes):
+        if (said := episode.get("zones")) is not None:
+            zones[rows.episode == number] = said
+    return zones
+
+
+def _perturbed(episodes: Sequence[Mapping[str, Any]]) -> Perturbed:
+    """What was in force in each episode; those that an older run kept do not know."""
+    said = [
+        (str(episode["perturbation"]), json.loads(episode["perturbation_values"]))
+        if "perturbation" in episode
+        else None
+        for episode in episodes
+    ]
+    return Perturbed(said, np.arange(len(said), dtype=np.int64))
+
+
 def _array(values: Any, kind: pa.DataType, count: int) -> pa.Array:
+    if isinstance(values, pa.Array):
+        return values
     if isinstance(values, str):
         return pa.repeat(pa.scalar(values, kind), count)
     if pa.types.is_fixed_size_list(kind):

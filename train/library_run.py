@@ -11,6 +11,7 @@ import numpy as np
 
 from restock.ingest.profile import Profile
 from restock.replay.panel import Panel
+from restock.train.fresh_perturbations import values_entries
 from restock.train.run import Run, now_ns, panel_document, software_versions
 from restock.train.run_tables import TABLES
 
@@ -80,6 +81,8 @@ def episode_row(env: int, key: int, info: Mapping[str, Any]) -> dict[str, Any]:
     told |= {name: _plain(info[name]) for name in _TOLD if name in info}
     if "episode_condition" in info:
         told["true_condition"] = _plain(info["episode_condition"])
+    if "perturbation_values" in info:
+        told["perturbation_values"] = values_entries(str(_plain(info["perturbation_values"])))
     if "episode_steps" in info:
         told["steps"] = _plain(info["episode_steps"])
     return {name: value for name, value in told.items() if name in columns}

@@ -6,8 +6,10 @@ small noise as every robot has.
 
 from __future__ import annotations
 
+import tomllib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -36,6 +38,8 @@ RANGES: dict[str, tuple[float, float]] = {
     "accel_noise_mps2": (0.0, 2.0),
     "timestep_s": (0.0005, 0.02),
 }
+
+_FIELDS = f"the fields are name, {', '.join(RANGES)}"
 
 
 class Perturbation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -66,6 +70,14 @@ class Perturbation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             value = getattr(self, field)
             if not low <= value <= high:
                 raise ValueError(f"{field} must be in [{low}, {high}], got {value}")
+
+    def changed(self) -> dict[str, float]:
+        """The fields that are not the nominal twin's: what every transition keeps."""
+        found = {field: getattr(self, field) for field in RANGES}
+        return {field: value for field, value in found.items() if value != NOMINAL[field]}
+
+
+NOMINAL: dict[str, float] = {field: getattr(Perturbation(), field) for field in RANGES}
 
 
 class Schedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -110,6 +122,42 @@ def load_schedule(path: Path) -> Schedule:
     return _load(path, Schedule)
 
 
+def find_perturbation(asked: str | Mapping[str, Any], *, where: str) -> Perturbation | Schedule:
+    """A ready-made perturbation by its name, what a TOML file holds, or what a table says.
+
+    Raises:
+        ConfigError: there is no such one, or it is none.
+    """
+    if not isinstance(asked, str):
+        return _convert(asked, where)
+    if asked in PERTURBATIONS:
+        return PERTURBATIONS[asked]
+    path = Path(asked)
+    if path.suffix != ".toml":
+        raise ConfigError(
+            f"there is no perturbation {asked!r}",
+            where=where,
+            remedy=f"give {', '.join(PERTURBATIONS)}, or a file that ends in .toml",
+        )
+    try:
+        found = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(
+            f"cannot be read: {error.strerror}", where=asked, remedy="check the path"
+        ) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"is not TOML: {error}", where=asked) from error
+    return _convert(found, asked)
+
+
+def _convert(table: Mapping[str, Any], where: str) -> Perturbation | Schedule:
+    kind = Schedule if "ranges" in table else Perturbation
+    try:
+        return msgspec.convert(table, kind)
+    except msgspec.ValidationError as error:
+        raise ConfigError(str(error), where=where, remedy=_FIELDS) from error
+
+
 def _load(path: Path, kind: type[T]) -> T:
     try:
         return msgspec.toml.decode(path.read_bytes(), type=kind)
@@ -118,9 +166,7 @@ def _load(path: Path, kind: type[T]) -> T:
             f"cannot be read: {error.strerror}", where=str(path), remedy="check the path"
         ) from error
     except (msgspec.ValidationError, msgspec.DecodeError) as error:
-        raise ConfigError(
-            str(error), where=str(path), remedy=f"the fields are name, {', '.join(RANGES)}"
-        ) from error
+        raise ConfigError(str(error), where=str(path), remedy=_FIELDS) from error
 
 
 # Ready-made ones for evaluation: each changes one thing, by about what a fleet shows.

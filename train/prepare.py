@@ -18,9 +18,11 @@ from restock.train.config import TrainConfig, apply_overrides, load_config, pars
 from restock.train.episode import KINDS
 from restock.train.evaluate import Twin
 from restock.train.explore import AFTER_LOGS
+from restock.train.floors import held_out, open_floors
 from restock.train.kernel import update_path
 from restock.train.learner import open_device
 from restock.train.log_draws import diet_of
+from restock.train.perturbation import PERTURBATIONS, find_perturbation
 from restock.train.run import Run, check_free, now_ns, panel_document, software_versions
 from restock.train.session import Session, open_session
 from restock.train.target import describe
@@ -53,6 +55,8 @@ class Prepared:
                 self.profile,
                 min(_EVALUATION_ENVS, self.config.evaluation.episodes * len(KINDS)),
                 nthread=0,
+                layouts=self.config.evaluation.layouts
+                or held_out(self.config.env.layouts, "validation"),
             ),
             logs=_logs(self.panel, self.config) if self.panel is not None else None,
             resume=self.resumed is not None,
@@ -86,6 +90,8 @@ def prepare_new(
     check_free(out)
     config = load_config(config_path, overrides)
     open_device(config.device)
+    for layouts in {config.env.layouts, config.evaluation.layouts or config.env.layouts}:
+        open_floors(layouts)  # what is wrong with one is said before anything is written
     profile = load_profile(config.profile)
     panel = open_panel(panel_path, config, profile) if panel_path is not None else None
     config = _resolve(config, panel)
@@ -146,16 +152,24 @@ def open_panel(path: Path, config: TrainConfig, profile: Profile) -> Panel:
     return panel
 
 
-def make_twin(config: TrainConfig, profile: Profile, num_envs: int, nthread: int = 1) -> Twin:
-    """The warehouse, as training uses it."""
+def make_twin(
+    config: TrainConfig,
+    profile: Profile,
+    num_envs: int,
+    nthread: int = 1,
+    layouts: str | None = None,
+) -> Twin:
+    """The warehouse, as training uses it; on other floors where `layouts` names them."""
     from restock.train.vector_env import WarehouseVectorEnv
 
     twin: Twin = WarehouseVectorEnv(
         num_envs,
+        perturbation=find_perturbation(config.env.perturbation, where="env.perturbation"),
         conditions=config.env.conditions,
         seed=config.seed,
         nthread=nthread,
         task=profile.task,
+        layouts=layouts or config.env.layouts,
     )
     return twin
 
@@ -166,7 +180,11 @@ def _resolve(config: TrainConfig, panel: Panel | None) -> TrainConfig:
     if epsilon.start is None:
         learns_first = panel is not None and config.schedule.offline_updates > 0
         epsilon = msgspec.structs.replace(epsilon, start=AFTER_LOGS if learns_first else 1.0)
-    return msgspec.structs.replace(config, epsilon=epsilon)
+    env = config.env
+    if env.perturbation not in PERTURBATIONS:  # what is in a file may change: the run keeps it
+        found = find_perturbation(env.perturbation, where="env.perturbation")
+        env = msgspec.structs.replace(env, perturbation=msgspec.to_builtins(found))
+    return msgspec.structs.replace(config, epsilon=epsilon, env=env)
 
 
 def planned_draws(config: TrainConfig) -> PlannedDraws:

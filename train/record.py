@@ -19,6 +19,7 @@ from restock.train.batches import Batch, Logs
 from restock.train.checkpoint import generator_state, restore_generator
 from restock.train.drawn import Drawn, as_columns, from_state, to_state
 from restock.train.fed_episodes import episode_columns
+from restock.train.fresh_perturbations import FreshPerturbations
 from restock.train.loss import Loss
 from restock.train.run import Run
 
@@ -31,6 +32,7 @@ class FeedRecord:
 
     Args:
         audit_share: of all batches, chosen by `seed`.
+        perturbations: in force in the ring's episodes, where they are known.
     """
 
     def __init__(
@@ -41,8 +43,10 @@ class FeedRecord:
         *,
         audit_share: float,
         seed: int,
+        perturbations: FreshPerturbations | None = None,
     ) -> None:
         self.run, self.logs, self.ring = run, logs, ring
+        self.perturbations = perturbations
         self.audit_share = audit_share
         self._rng = np.random.default_rng([seed, 4])
         self._age_days = (
@@ -261,7 +265,7 @@ class FeedRecord:
             logged = logged_rows(columns, self.logs, self._age_days)
             parts.append((slice(0, batch.logged), logged))
         if len(batch.slots):
-            fresh = fresh_rows(columns, batch, self.ring, self._fresh_strata)
+            fresh = fresh_rows(columns, batch, self.ring, self._fresh_strata, self.perturbations)
             parts.append((slice(batch.logged, len(packed)), fresh))
         for place, own in parts:
             self.run.append_columns(

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import pyarrow as pa
 
+from restock.ingest.perturbed import VALUES
+
 _CLOCKS = [("env_steps", pa.int64()), ("gradient_steps", pa.int64())]
 _F, _I, _S, _B = pa.float64(), pa.int64(), pa.string(), pa.bool_()
 
@@ -157,6 +159,8 @@ TABLES: dict[str, pa.Schema] = {
         ("env", pa.int32()),  # the environment it ran in
         ("episode_seed", _I),  # with true_condition and perturbation, what lays it out again
         ("perturbation", _S),  # its name
+        ("layout", _S),
+        ("perturbation_values", VALUES),  # those that are not nominal
         ("true_condition", _S),
         ("block", _S),  # none | partial | full
         ("conditions", pa.list_(_S)),  # labels that held at some step, as the robot can sense
@@ -183,6 +187,8 @@ TABLES: dict[str, pa.Schema] = {
         ("condition", _S),  # null while a fresh row's episode has not ended
         ("behaviour_policy", _S),
         ("behaviour_version", _S),
+        ("perturbation", _S),  # of the twin; null for hardware
+        ("perturbation_values", VALUES),  # fresh; of a logged row the store has them
         ("action", pa.int16()),
         ("reward", _F),  # the row's n-step return
         ("discount", _F),
@@ -198,6 +204,9 @@ TABLES: dict[str, pa.Schema] = {
         ("condition", _S),
         ("block", _S),
         ("episode_seed", _I),
+        ("perturbation", _S),
+        ("layout", _S),
+        ("perturbation_values", VALUES),
         ("success", _B),
         ("bumps", _I),
         ("time_s", _F),
@@ -210,6 +219,8 @@ TABLES: dict[str, pa.Schema] = {
 EVAL_EPISODES = _schema(
     ("policy", _S),
     ("perturbation", _S),
+    ("layout", _S),
+    ("perturbation_values", VALUES),
     ("condition", _S),
     ("block", _S),
     ("episode_seed", _I),

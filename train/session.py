@@ -191,6 +191,7 @@ def open_session(
         device=learner.device,
     )
     executor = ThreadPoolExecutor(1, "twin") if config.env.overlap else None
+    collector = Collector(env, ring, conditions, task, executor)
     session = Session(
         run=run,
         config=config,
@@ -200,8 +201,15 @@ def open_session(
         learner=learner,
         ring=ring,
         batches=batches,
-        collector=Collector(env, ring, conditions, task, executor),
-        feed=FeedRecord(run, logs, ring, audit_share=config.record.audit_share, seed=seed),
+        collector=collector,
+        feed=FeedRecord(
+            run,
+            logs,
+            ring,
+            audit_share=config.record.audit_share,
+            seed=seed,
+            perturbations=collector.perturbations,
+        ),
         events=Events(run.path / "tensorboard", enabled=False),
         probe=Probe.of_logs(logs, config.record.probe_rows) if logs is not None else None,
         exploration=np.random.default_rng([seed, 5]),

@@ -16,8 +16,8 @@ termination.
 - `signals`: the stored signals at t + 1, before any autoreset (`env.signals`: after it). Its
   `command_*` columns are the commands of [t, t + 1); `progress_m` along the plan in force at t;
 - `true_condition`: what was physically so over [t, t + 1); `episode_condition`, `block` (none,
-  partial, full), `episode_seed`, `perturbation` and `layout` (their names), `episode_number`
-  (place in `set_episodes`, or -1);
+  partial, full), `episode_seed`, `perturbation` and `layout` (their names), `floor` (the layout
+  itself), `episode_number` (place in `set_episodes`, or -1); `perturbation_values`, as JSON those that are not nominal;
 - `success` (at the goal without any bump, at the episode's end), `bumps` (steps with a bump so
   far), `episode_steps`, `true_pose` (N, 3);
 - `invalid`: the physics blew up: the episode is truncated and the step must not enter replay;
@@ -27,6 +27,7 @@ termination.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -112,6 +113,8 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         self.task = task or load_profile("warehouse_amr").task
         self.floors = _floors(warehouse, layouts)
         self._layout_names = np.array([floor.name for floor in self.floors])
+        self._floor_objects = np.empty(len(self.floors), object)
+        self._floor_objects[:] = self.floors
         self._floor_index = {floor.name: index for index, floor in enumerate(self.floors)}
         self.layout = np.zeros(num_envs, np.int64)  # of the running episodes, among the floors
         self.schedule = perturbation if isinstance(perturbation, Schedule) else None
@@ -155,6 +158,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         self.episode_condition = np.full(num_envs, "nominal", "U16")
         self.block = np.full(num_envs, "none", "U8")
         self.perturbation_name = np.full(num_envs, "nominal", "U32")
+        self.perturbation_values = np.full(num_envs, "{}", object)  # JSON, what is not nominal
 
     # -- floors ---------------------------------------------------------------------------------
 
@@ -165,7 +169,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
 
     def floor_of(self, env: int) -> Warehouse:
         """The floor that an environment's episode is on."""
-        return self.floors[self.layout[env]]
+        return self.floors[int(self.layout[env])]
 
     def by_floor(self) -> Iterator[tuple[NDArray[np.int64], Warehouse]]:
         """The environments on each floor, and the floor."""
@@ -261,6 +265,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         self.episode_condition[env], self.block[env] = spec.condition, episode.block
         self.episode_seed[env] = spec.seed
         self.perturbation_name[env] = perturbation.name
+        self.perturbation_values[env] = json.dumps(perturbation.changed())
         self.episodes_begun[env] += 1
 
     # -- gymnasium ------------------------------------------------------------------------------
@@ -343,7 +348,9 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
             "block": self.block.copy(),
             "episode_seed": self.episode_seed.copy(),
             "perturbation": self.perturbation_name.copy(),
+            "perturbation_values": self.perturbation_values.copy(),
             "layout": self._layout_names[self.layout],
+            "floor": self._floor_objects[self.layout],
             "episode_number": self.episode_number.copy(),
             "episode_steps": self.steps.copy(),
             "bumps": self.bumps.copy(),
