@@ -124,7 +124,8 @@ def segments(
         if not len(at):
             left["too short a stretch"] += int(end - begin)
             continue
-        left["end of a stretch"] += int(end - at[-1] - horizon - 1)
+        left["warm-up"] += lead
+        left["end of a stretch"] += int(end - begin - lead - len(at) * stride)
         starts.append(at)
         padded.append(np.full(len(at), begin))
     at = np.concatenate(starts) if starts else np.zeros(0, np.int64)
