@@ -49,7 +49,7 @@ class LossConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     discount: float = 0.97  # a step; a panel brings its own, which must agree
     n_step: int = 3  # of fresh rows; the panel's rows bring their own
     double: bool = True
-    huber_delta: float = 1.0
+    huber_delta: float = 10.0  # above what errors come to: at 1, rare heavy costs are half unseen
     conservative: float = 0.1  # weight of the CQL term on rows from logs, while offline
     conservative_online: float = 0.0  # … and the weight it goes to, linearly, once online
     conservative_steps: int = 20_000  # environment steps that this takes

@@ -30,6 +30,8 @@ def get_state(env: WarehouseVectorEnv) -> dict[str, Any]:
     arrays |= {f"signals.{name}": column.copy() for name, column in env.signals.items()}
     arrays |= {
         "sensing.ranges_m": env.sensing.ranges_m.copy(),
+        "sensing.pose": env.sensing.pose.copy(),
+        "sensing.pose_stamp_ns": env.sensing.pose_stamp_ns.copy(),
         "sensing.true_clearance_m": env.sensing.true_clearance_m.copy(),
         "truth.aftermath_s": env.truth.aftermath_s.copy(),
         "truth.blocked": env.truth.blocked.copy(),
@@ -40,6 +42,7 @@ def get_state(env: WarehouseVectorEnv) -> dict[str, Any]:
     }
     json = {
         "task_hash": env.task.hash,
+        "floors": [[floor.name, floor.hash] for floor in env.floors],
         "seed": env._seed,
         "conditions": env.conditions,
         "blown_up": env.blown_up,
@@ -65,6 +68,15 @@ def set_state(env: WarehouseVectorEnv, state: dict[str, Any]) -> None:
             where="state of the twin",
             remedy="make the environment as it was made when the state was saved",
         )
+    floors = [[floor.name, floor.hash] for floor in env.floors]
+    if (saved := json.get("floors", floors)) != floors:
+        changed = [name for name, digest in saved if [name, digest] not in floors]
+        raise RunError(
+            f"the saved state is of other floors: {', '.join(changed) or 'fewer'}"
+            f" of {len(saved)} is none of this one's {len(floors)}",
+            where="state of the twin",
+            remedy="make the environment with the layouts of then; a file may have changed since",
+        )
     env.set_conditions(json["conditions"])
     env._seed, env.blown_up = int(json["seed"]), int(json["blown_up"])
     env._fixed = msgspec.convert(json["fixed"], list[EpisodeSpec])
@@ -85,6 +97,8 @@ def set_state(env: WarehouseVectorEnv, state: dict[str, Any]) -> None:
     }
     for owner, name in (
         (env.sensing, "sensing.ranges_m"),
+        (env.sensing, "sensing.pose"),
+        (env.sensing, "sensing.pose_stamp_ns"),
         (env.sensing, "sensing.true_clearance_m"),
         (env.truth, "truth.aftermath_s"),
         (env.truth, "truth.blocked"),

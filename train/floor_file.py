@@ -33,28 +33,24 @@ Box = tuple[float, float, float, float]
 CELL_M = 0.05  # in which aisles are looked for
 
 
-class _Strict(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    pass
-
-
-class _Dock(_Strict):
+class _Dock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: str
     box_m: Box
 
 
-class _OneWay(_Strict):
+class _OneWay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     box_m: Box
     heading: Heading
 
 
-class _Aisle(_Strict):
+class _Aisle(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: str
     box_m: Box
     along: Axis
     aisle: int = 0
 
 
-class _File(_Strict):
+class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     width_m: float
     depth_m: float
     racks: list[Box]

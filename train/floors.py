@@ -182,6 +182,16 @@ def open_floors(text: str) -> tuple[Warehouse, ...]:
     return tuple(found)
 
 
+def held_out(text: str, split: Split) -> str:
+    """What `open_floors` reads, with the training floors replaced by those of another split."""
+    parts = [part.strip() for part in text.split(",")]
+    return ",".join(
+        f"{kind}:{split}" if kind in RECIPES and rest.partition(":")[0] == "train" else part
+        for part in parts
+        for kind, _, rest in [part.partition(":")]
+    )
+
+
 def open_floor(text: str) -> Warehouse:
     """One floor. Raises ConfigError where `text` names none, or several."""
     floors = open_floors(text)

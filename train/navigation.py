@@ -39,7 +39,7 @@ class Navigation:
 
     def planner_of(self, env: int) -> Planner:
         """The planner of the floor that a robot is on."""
-        return self.planners[self.floor[env]]
+        return self.planners[int(self.floor[env])]
 
     def reset(self, env: int, episode: Episode, floor: int = 0) -> None:
         """Begin an episode with its first plan."""

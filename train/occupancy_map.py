@@ -208,8 +208,7 @@ def _reachable(free: Cells, cell_m: float) -> Cells:
         return np.zeros_like(free)
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
-    largest: Cells = parts == int(np.argmax(sizes))
-    return largest
+    return np.asarray(parts == int(np.argmax(sizes)), np.bool_)
 
 
 def _holds(cells: Cells, cell_m: float, place: tuple[float, float]) -> bool:

@@ -141,7 +141,7 @@ class Operator(SoftPolicy):
             target = (float(goal[0]), float(goal[1]))
             pallets = env.simulation.pallets[index]
             pallets = pallets[pallets[:, 0] > 0]
-            planner = env.navigation.planner_of(index)
+            planner = env.navigation.planner_of(int(index))
             way = (
                 planner.plan_around(x, y, target, pallets, PALLET_HALF_M[:2])
                 if len(pallets)

@@ -176,8 +176,12 @@ class Planner:
         cost = 1.0 + NEAR_COST * near**2
         index = np.arange(free.size).reshape(self.shape)
         against = self._against_rules()
-        rows, columns, weights = [], [], []
-        back_rows, back_columns, back_weights = [], [], []
+        rows: list[NDArray[Any]] = []
+        columns: list[NDArray[Any]] = []
+        weights: list[NDArray[Any]] = []
+        back_rows: list[NDArray[Any]] = []
+        back_columns: list[NDArray[Any]] = []
+        back_weights: list[NDArray[Any]] = []
         for di, dj in ((1, 0), (0, 1), (1, 1), (1, -1)):
             here = (slice(0, self.shape[0] - di), slice(max(-dj, 0), self.shape[1] - max(dj, 0)))
             there = (slice(di, None), slice(max(dj, 0), self.shape[1] + min(dj, 0)))
@@ -302,8 +306,8 @@ class BlockFinder:
         self.seen = np.zeros(self.num, np.int64)  # steps in a row
         self.place = np.full((self.num, 2), -1, np.int64)  # of the last sighting: a closure
         self.floor = np.zeros(self.num, np.int64)
-        if isinstance(self.warehouses, Warehouse):
-            self.warehouses = (self.warehouses,)
+        given = self.warehouses
+        self.floors = (given,) if isinstance(given, Warehouse) else tuple(given)
 
     def reset(self, ids: NDArray[np.int64]) -> None:
         self.seen[ids] = 0
@@ -379,7 +383,7 @@ class BlockFinder:
         then_x, then_y = x + 0.8 * heading * ~turned, y + 0.8 * heading * turned
         floors = self.floor[ids]
         for number in np.unique(floors):
-            warehouse = self.warehouses[number]
+            warehouse = self.floors[number]
             on = np.flatnonzero(floors == number)
             if not len(warehouse.segments):
                 continue

@@ -17,7 +17,8 @@ termination.
   `command_*` columns are the commands of [t, t + 1); `progress_m` along the plan in force at t;
 - `true_condition`: what was physically so over [t, t + 1); `episode_condition`, `block` (none,
   partial, full), `episode_seed`, `perturbation` and `layout` (their names), `floor` (the layout
-  itself), `episode_number` (place in `set_episodes`, or -1); `perturbation_values`, as JSON those that are not nominal;
+  itself), `episode_number` (place in `set_episodes`, or -1); `perturbation_values`, as JSON those
+  that are not nominal;
 - `success` (at the goal without any bump, at the episode's end), `bumps` (steps with a bump so
   far), `episode_steps`, `true_pose` (N, 3);
 - `invalid`: the physics blew up: the episode is truncated and the step must not enter replay;

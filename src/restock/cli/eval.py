@@ -50,6 +50,9 @@ class Eval:
     """With --on-logs: chance of a random action of the policy that is judged, else greedy."""
     horizon: int | None = None
     """With --on-logs: how many steps importance weights reach; default all."""
+    layouts: str | None = None
+    """Floors to drive on, e.g. generated:test (default: the run's own; where it trained on
+    generated:train, the test floors)."""
     dry_run: bool = False
     """Check everything and print what would be driven; write nothing."""
     json: bool = False
@@ -82,6 +85,7 @@ class Eval:
             perturbations=_names(self.perturbations),
             episodes=self.episodes,
             first_seed=self.seed,
+            layouts=self.layouts,
         )
         if self.dry_run:
             print_json({**settings(plan), "episodes": plan.total})
