@@ -22,6 +22,7 @@ class BaseController:
         self.set_point = np.zeros((num_envs, 2))
         self.latency_s = np.zeros(num_envs)
         self.gain = np.ones(num_envs)
+        self.left_gain = np.ones(num_envs)
 
     def reset(self, env: int) -> None:
         """Stand still, as after a stop command long ago."""
@@ -57,6 +58,7 @@ class BaseController:
         self.set_point = asked[:, -1].copy()
         left, right = wheel_commands(asked[..., 0], asked[..., 1])
         speeds: F64 = np.stack([left, right], axis=-1) * self.gain[:, None, None]
+        speeds[..., 0] *= self.left_gain[:, None]
         return speeds
 
 

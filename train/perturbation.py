@@ -27,15 +27,22 @@ RANGES: dict[str, tuple[float, float]] = {
     "track_scale": (0.9, 1.1),
     "latency_s": (0.0, 0.5),
     "gain": (0.5, 1.5),
+    "left_gain": (0.5, 1.5),
+    "slope_x": (-0.15, 0.15),
+    "slope_y": (-0.15, 0.15),
     "lidar_noise_m": (0.0, 0.2),
     "lidar_dropout": (0.0, 0.9),
+    "lidar_period_s": (0.0, 2.0),
+    "localisation_period_s": (0.0, 2.0),
     "localisation_noise_m": (0.0, 0.2),
     "localisation_drift_m": (0.0, 0.5),
     "localisation_yaw_noise_rad": (0.0, 0.2),
     "encoder_noise_radps": (0.0, 2.0),
+    "encoder_bias_radps": (-1.0, 1.0),
     "gyro_noise_radps": (0.0, 0.5),
     "gyro_bias_radps": (-0.5, 0.5),
     "accel_noise_mps2": (0.0, 2.0),
+    "accel_bias_mps2": (-2.0, 2.0),
     "timestep_s": (0.0005, 0.02),
 }
 
@@ -54,15 +61,22 @@ class Perturbation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     track_scale: float = 1.0  # times the distance between the wheels, unknown likewise
     latency_s: float = 0.05  # from a command to the wheels' set point
     gain: float = 1.0  # of the wheel set points
+    left_gain: float = 1.0  # of the left wheel's, on top
+    slope_x: float = 0.0  # rise of the whole floor eastward, metres a metre
+    slope_y: float = 0.0  # and northward
     lidar_noise_m: float = 0.01  # standard deviation of a range
     lidar_dropout: float = 0.005  # share of beams without a return
+    lidar_period_s: float = 0.0  # between scans, in whole control steps; 0: one every step
+    localisation_period_s: float = 0.0  # between poses, likewise
     localisation_noise_m: float = 0.004  # standard deviation, anew at every step
     localisation_drift_m: float = 0.02  # standard deviation of an error that wanders over 3 s
     localisation_yaw_noise_rad: float = 0.004
     encoder_noise_radps: float = 0.03  # of a wheel's speed
+    encoder_bias_radps: float = 0.0  # of both wheels' speeds
     gyro_noise_radps: float = 0.005
     gyro_bias_radps: float = 0.0
     accel_noise_mps2: float = 0.05
+    accel_bias_mps2: float = 0.0
     timestep_s: float = 0.01  # of the physics; the same for every environment of a vector
 
     def __post_init__(self) -> None:

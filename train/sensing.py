@@ -40,7 +40,11 @@ class Sensing:
         num, steps = simulation.num_envs, task.time_limit_steps + 1
         self._noise = np.zeros((num, steps, _SCALARS + simulation.beams), np.float32)
         self._scale = np.zeros((num, _SCALARS))
-        self._bias = np.zeros(num)
+        self._bias = np.zeros((num, 3))  # of a wheel's speed, the gyroscope, the accelerometer
+        self._scan_every = np.ones(num, np.int64)  # steps
+        self._pose_every = np.ones(num, np.int64)
+        self.pose = np.zeros((num, 3))  # as localised last
+        self.pose_stamp_ns = np.zeros(num, np.int64)  # when that was
         self._range_noise_m = np.zeros(num)
         self._dropout_beyond = np.full(num, np.inf)
         self.ranges_m = np.zeros((num, simulation.beams))  # as measured at the last step
@@ -57,7 +61,10 @@ class Sensing:
             *(p.encoder_noise_radps, p.encoder_noise_radps),
             *(p.gyro_noise_radps, p.accel_noise_mps2),
         )
-        self._bias[env] = p.gyro_bias_radps
+        self._bias[env] = p.encoder_bias_radps, p.gyro_bias_radps, p.accel_bias_mps2
+        period_s = self.task.control_period_s
+        self._scan_every[env] = max(round(p.lidar_period_s / period_s), 1)
+        self._pose_every[env] = max(round(p.localisation_period_s / period_s), 1)
         self._range_noise_m[env] = p.lidar_noise_m
         # A beam is lost where its own noise falls in the tail of that probability.
         self._dropout_beyond[env] = (
@@ -83,23 +90,37 @@ class Sensing:
         lost = np.abs(beam) > self._dropout_beyond[ids, None]
         ranges = np.maximum(true_ranges + beam * self._range_noise_m[ids, None], 0.0)
         ranges[lost] = np.inf
+        stale = step % self._scan_every[ids] != 0
+        ranges[stale] = self.ranges_m[ids[stale]]
         self.ranges_m[ids] = ranges
         clearance = self.sectors.clearance(ranges, task.range_min_m, task.range_max_m)
         pose = sim.pose()[ids]
-        wheels = sim.qvel[ids, 6:8] + scalar[:, 5:7]
+        localised = np.column_stack(
+            [
+                pose[:, 0] + scalar[:, 0] + scalar[:, 3],
+                pose[:, 1] + scalar[:, 1] + scalar[:, 4],
+                wrap_angle(pose[:, 2] + scalar[:, 2]),
+            ]
+        )
+        bias = self._bias[ids]
+        wheels = sim.qvel[ids, 6:8] + scalar[:, 5:7] + bias[:, :1]
         speed, yaw_rate = body_velocity(wheels[:, 0], wheels[:, 1])
         period_ns = round(task.control_period_s * 1e9)
         stamp = FIRST_STAMP_NS + step * period_ns
+        fresh = step % self._pose_every[ids] == 0
+        self.pose[ids[fresh]] = localised[fresh]
+        self.pose_stamp_ns[ids[fresh]] = stamp[fresh]
+        held = self.pose[ids]
         return {
             "stamp_ns": stamp,
-            "pose_x_m": pose[:, 0] + scalar[:, 0] + scalar[:, 3],
-            "pose_y_m": pose[:, 1] + scalar[:, 1] + scalar[:, 4],
-            "pose_yaw_rad": wrap_angle(pose[:, 2] + scalar[:, 2]),
-            "pose_stamp_ns": stamp.copy(),
+            "pose_x_m": held[:, 0],
+            "pose_y_m": held[:, 1],
+            "pose_yaw_rad": held[:, 2],
+            "pose_stamp_ns": self.pose_stamp_ns[ids],
             "wheel_speed_mps": speed,
             "wheel_yaw_rate_radps": yaw_rate,
-            "gyro_yaw_rate_radps": sim.qvel[ids, 5] + self._bias[ids] + scalar[:, 7],
-            "accel_x_mps2": sim.accel[ids, 0] + scalar[:, 8],
+            "gyro_yaw_rate_radps": sim.qvel[ids, 5] + bias[:, 1] + scalar[:, 7],
+            "accel_x_mps2": sim.accel[ids, 0] + scalar[:, 8] + bias[:, 2],
             "sector_clearance_m": clearance,
             "clearance_m": clearance.min(axis=1),
             "bumped": sim.bumped[ids].copy(),

@@ -44,6 +44,7 @@ Ids = NDArray[np.int64]
 Physics = Literal["mujoco", "warp"]  # warp: see `restock.train.warp_batch`
 
 BLOCK_S = 0.1
+GRAVITY_MPS2 = 9.81
 REST_Z_M = 0.09756  # of the chassis frame, standing still
 LIDAR_BEAMS = 72
 _CONTROLLED = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_MOCAP_POS)
@@ -99,6 +100,7 @@ class Simulation:
         self._mocap_quat = self.batch.bind("mocap_quat")
         self._friction = self.batch.expand("geom_friction")
         self._masses = self._radii = False  # fields made per-simulation when first needed
+        self._sloped = False
         self._building = [building_boxes(floor, slots) for floor in floors]
         self._floor = np.zeros(num_envs, np.int64)  # whose building stands
 
@@ -180,6 +182,8 @@ class Simulation:
         self.set_floor_friction(env, FLOOR_FRICTION * perturbation.friction_scale)
         self.controller.latency_s[env] = perturbation.latency_s
         self.controller.gain[env] = perturbation.gain
+        self.controller.left_gain[env] = perturbation.left_gain
+        self._slope(env, perturbation)
         if perturbation.payload_kg or self._masses:
             self._masses = True
             body = self.handles.chassis_body
@@ -201,6 +205,17 @@ class Simulation:
                 place[env, body, 2] = radius - WHEEL_RADIUS_M
         if self._masses or self._radii:
             self.batch.set_const(np.array([env]))
+
+    def _slope(self, env: int, perturbation: Perturbation) -> None:
+        """Gravity along a sloping floor, as a force on the chassis in place of a tilted floor."""
+        rise = np.array([perturbation.slope_x, perturbation.slope_y])
+        if not rise.any() and not self._sloped:
+            return
+        self._sloped = True
+        body = self.handles.chassis_body
+        weight = (self.model.body_subtreemass[body] + perturbation.payload_kg) * GRAVITY_MPS2
+        force = self.batch.bind("xfrc_applied")
+        force[env, body, :2] = -weight * rise / np.sqrt(1 + rise @ rise)
 
     def set_floor_friction(self, env: int, friction: float) -> None:
         """The floor's friction coefficient where no patch lies."""
