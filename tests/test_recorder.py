@@ -11,7 +11,9 @@ from collections import Counter
 from itertools import islice
 from pathlib import Path
 
+import numpy as np
 import pytest
+from kept_run import kept_run
 from rosbags.highlevel import AnyReader
 
 from restock import cli
@@ -97,6 +99,13 @@ def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[
         (["--missions", "0"], "missions must be above 0"),
         (["--minutes", "1", "--missions", "1"], "exclude each other"),
         (["--seed", "-1"], "seed must be 0 or more"),
+        (["--policy", "fred"], "there is no policy 'fred'"),
+        (["--policy", "onnx:nowhere.onnx"], "nowhere.onnx: no such file"),
+        (["--policy", "random", "--epsilon", ".1"], "same probability already"),
+        (["--epsilon", "2"], "must be in [0, 1], got 2.0"),
+        (["--perturbation", "fog"], "there is no perturbation 'fog'"),
+        (["--perturbation", "friction", "--exact"], "exclude each other"),
+        (["--layouts", "moon"], "moon"),
     ],
 )
 def test_a_wrong_value_is_one_clear_message(
@@ -122,12 +131,12 @@ def test_a_recording_is_never_overwritten(
 def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "restock", "record", "--minutes", "600", "--out"]
     process = subprocess.Popen([*command, str(tmp_path / "log.mcap")], stderr=subprocess.PIPE)
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 240
     while not any(file.stat().st_size for file in tmp_path.rglob("log.mcap")):
         assert time.monotonic() < deadline, "nothing was ever written"
         time.sleep(0.1)
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=60)
+    _, said = process.communicate(timeout=240)
     assert process.returncode == ExitCode.INTERRUPTED
     assert b"interrupted" in said
     assert list(tmp_path.iterdir()) == []
@@ -149,3 +158,53 @@ def test_flags_from_python() -> None:
     assert parse_rates("").imu == 50
     with pytest.raises(ConfigError, match="give minutes or missions"):
         Plan()
+
+
+def test_missions_on_other_floors_come_with_their_maps(tmp_path: Path) -> None:
+    plan = Plan(missions=2, seed=3, policy="planner", layouts="generated:train:2")
+    done = record(tmp_path / "log.mcap", plan)
+    with AnyReader([tmp_path / "log.mcap"]) as reader:
+        sizes = [
+            (grid.info.width, grid.info.height)
+            for connection, _, data in reader.messages()
+            if connection.topic == "/map"
+            for grid in [reader.deserialize(data, connection.msgtype)]
+        ]
+    assert len(sizes) == len(set(sizes)) == done.topics["/map"] == 2
+
+
+class _Creeper:
+    """A policy of a user's own."""
+
+    name, version = "creeper", "3"
+
+    def act(self, env: object, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.full(len(observation), 1), np.full(len(observation), self.chance)
+
+    chance = 1.0
+
+
+def test_a_policy_of_your_own_drives_under_its_own_name(tmp_path: Path) -> None:
+    done = record(tmp_path / "log.mcap", Plan(missions=1, seed=3), policy=_Creeper())
+    assert set(done.policies) == {"creeper 3"}
+    unsure = _Creeper()
+    unsure.chance = 0.5
+    with pytest.raises(ConfigError, match="takes chances of its own"):
+        record(tmp_path / "b.mcap", Plan(missions=1, epsilon=0.1), policy=unsure)
+
+
+def test_an_exported_policy_has_the_tag_of_its_run(tmp_path: Path) -> None:
+    pytest.importorskip("onnx")
+    pytest.importorskip("onnxruntime")
+    from restock.train.drivers import load_guest
+    from restock.train.onnx_policy import export_onnx
+
+    run = kept_run(tmp_path / "learner")
+    export_onnx(run, tmp_path / "p.onnx")
+    task = load_profile("warehouse_amr").task
+    tags = {
+        (guest.name, guest.version)
+        for name in (f"run:{run}", f"onnx:{tmp_path / 'p.onnx'}")
+        if (guest := load_guest(name, task)) is not None
+    }
+    assert tags == {("dqn", "learner@7")}

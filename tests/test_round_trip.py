@@ -23,17 +23,15 @@ on one side alone: those entries, and no others, may differ by more, and they mu
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pyarrow as pa
 import pytest
-import torch
+from kept_run import kept_run
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
@@ -41,19 +39,15 @@ from restock.ingest.pipeline import ingest
 from restock.ingest.profile import load_profile
 from restock.ingest.store import StoreWriter
 from restock.replay.store import Store
-from restock.train import checkpoint
 from restock.train.bag_writer import Format
-from restock.train.config import TrainConfig
 from restock.train.crew import FleetCrew
 from restock.train.drivers import HANDOVER
 from restock.train.fleet import Driven, Fleet
 from restock.train.missions import Mission, schedule
-from restock.train.network import make_network
 from restock.train.perturbation import Perturbation, Schedule
 from restock.train.publish import ACCEL_LSB_MPS2, GYRO_LSB_RADPS, LIDAR_LSB_M
 from restock.train.recorder import HARDWARE, NOISELESS, Plan, load_policy, record
 from restock.train.robot_topics import TOPICS
-from restock.train.run import Run
 
 TASK = load_profile("warehouse_amr").task
 EQUAL = {"nominal": 1.0, "wheel_slip": 1.0, "blocked_aisle": 1.0, "near_collision": 1.0}
@@ -115,7 +109,7 @@ class Trip:
     def __post_init__(self) -> None:
         case, policy = self.case, self.case.policy
         if policy == "run:":
-            policy += str(_run(self.folder / "learner"))
+            policy += str(kept_run(self.folder / "learner"))
         self.plan = Plan(
             format=case.format,
             missions=MISSIONS,
@@ -156,26 +150,6 @@ class Trip:
 def _missions(plan: Plan, guest: Any) -> Any:
     driver, version = (plan.policy, "1") if guest is None else (guest.name, guest.version)
     return schedule(plan.seed, plan.conditions, driver, plan.hardware, version=version)
-
-
-def _run(path: Path) -> Path:
-    """A run that kept a policy, as `restock train` leaves it."""
-    config = TrainConfig()
-    made = Run.create(path, {"config": msgspec.to_builtins(config), "panel": None})
-    generator = torch.Generator().manual_seed(0)
-    network = make_network(config.network, TASK.observation_size, len(TASK.actions), generator)
-    made.best.parent.mkdir()
-    state: Mapping[str, Any] = {
-        "network": dict(network.state_dict()),
-        "observation_size": TASK.observation_size,
-        "actions": len(TASK.actions),
-        "task_hash": TASK.hash,
-        "env_steps": 0,
-        "gradient_steps": 7,
-        "score": {},
-    }
-    checkpoint.save(made.best, state)
-    return path
 
 
 @pytest.fixture(scope="module", params=CASES.values(), ids=list(CASES))

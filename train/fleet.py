@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from restock.train.drive import Drive, Motion
 from restock.train.episode import EpisodeSpec
+from restock.train.layout import DEFAULT, Warehouse
 from restock.train.missions import Mission
 from restock.train.model import CHASSIS_Z_M
 from restock.train.perturbation import Perturbation, Schedule
@@ -53,6 +54,7 @@ class Driven:
     success: bool
     block: str
     terminated: bool  # at its last step; else it was cut there
+    floor: Warehouse
 
 
 @dataclass
@@ -83,14 +85,24 @@ class Fleet:
 
     Args:
         hardware: those parameters, where a mission names none of its own.
+        layouts: the floors, as `restock.train.floors.open_floors` reads them; a mission that names
+            none is on one that its seed draws.
         scan_hz: the lidar scans at every control tick, and above 5 Hz once more between two.
     """
 
     def __init__(
-        self, hardware: Perturbation | Schedule, *, scan_hz: float = 10.0, robots: int = ROBOTS
+        self,
+        hardware: Perturbation | Schedule,
+        *,
+        layouts: str = DEFAULT,
+        scan_hz: float = 10.0,
+        robots: int = ROBOTS,
     ) -> None:
         self.env = WarehouseVectorEnv(
-            robots, perturbation=hardware, autoreset_mode=AutoresetMode.DISABLED
+            robots,
+            perturbation=hardware,
+            layouts=layouts,
+            autoreset_mode=AutoresetMode.DISABLED,
         )
         self.period_s = self.env.task.control_period_s
         self._scans_between = scan_hz * self.period_s > 1
@@ -229,6 +241,7 @@ class Fleet:
             success=bool(info["success"][robot]),
             block=str(info["block"][robot]),
             terminated=terminated,
+            floor=env.floor_of(robot),
         )
 
 

@@ -107,7 +107,7 @@ class Robot:
         cell_m: float,
         origin_m: tuple[float, float] = (0.0, 0.0),
     ) -> list[Message]:
-        """What is sent once, when the recording starts: the sensors' places and the map."""
+        """What is sent when a recording or a floor begins: the sensors' places and the map."""
         self._start_ns = start_ns
         at = np.zeros(1)
         return [

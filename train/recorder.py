@@ -25,7 +25,7 @@ from restock.train.crew import FleetCrew
 from restock.train.drive import Lidar
 from restock.train.drivers import HANDOVER, Chooser, Guest, check_epsilon, load_guest
 from restock.train.fleet import Fleet
-from restock.train.layout import Warehouse
+from restock.train.layout import DEFAULT, Warehouse
 from restock.train.missions import NATURAL, schedule
 from restock.train.model import TRACK_M, WHEEL_RADIUS_M
 from restock.train.perturbation import (
@@ -86,6 +86,7 @@ class Plan:
     epsilon: float | None = None  # share of random actions; None: what each driver has of its own
     rates: Rates = field(default_factory=Rates)
     hardware: Perturbation | Schedule = HARDWARE  # a schedule draws one for every mission
+    layouts: str = DEFAULT  # floors, as `restock.train.floors.open_floors` reads them
     start_ns: int = FIRST_NS  # when the first mission starts
 
     def __post_init__(self) -> None:
@@ -112,6 +113,7 @@ class Plan:
             "epsilon": self.epsilon,
             "rates_hz": {item.name: getattr(self.rates, item.name) for item in fields(Rates)},
             "hardware": self.hardware.name,
+            "layouts": self.layouts,
             "topics": [topic.name for topic in TOPICS],
         }
 
@@ -169,7 +171,7 @@ def record(
     """
     begun = time.perf_counter()
     guest = load_policy(plan) if policy is None else _guest(plan, policy)
-    fleet = Fleet(plan.hardware, scan_hz=plan.rates.scan)
+    fleet = Fleet(plan.hardware, layouts=plan.layouts, scan_hz=plan.rates.scan)
     robot = _robot(plan, fleet)
     summary = Summary(path, plan)
     driver, version = (plan.policy, "1") if guest is None else (guest.name, guest.version)
@@ -177,11 +179,14 @@ def record(
     crew = FleetCrew(fleet.env.num_envs, seed=plan.seed, epsilon=plan.epsilon, guest=guest)
     start_ns = plan.start_ns
     with recording_sink(path, plan.format, TOPICS) as sink:
-        cells = _occupied(fleet.env.warehouse, MAP_CELL_M)
-        static = robot.static(start_ns, cells, MAP_CELL_M, (-MAP_CELL_M, -MAP_CELL_M))
-        sink.write(static)
-        summary.topics.update(message.topic for message in static)
+        floor: Warehouse | None = None
         for driven in fleet.drive(islice(missions, plan.missions), crew):
+            if driven.floor is not floor:  # the map comes once, and again on another floor
+                floor = driven.floor
+                cells = _occupied(floor, MAP_CELL_M)
+                static = robot.static(start_ns, cells, MAP_CELL_M, (-MAP_CELL_M, -MAP_CELL_M))
+                sink.write(static)
+                summary.topics.update(message.topic for message in static)
             start_ns += 50_000_000  # after the latched messages, or the pause
             messages = robot.publish(driven.drive, start_ns)
             sink.write(messages)

@@ -47,6 +47,9 @@ class Record:
     perturbation: str | None = None
     """Effective parameters in place of the stand-in's: a name as in `restock eval`, or a TOML file
     of a perturbation, or of a schedule that draws one for every mission."""
+    layouts: str = "default"
+    """The floors: default, generated:train, FILE.toml, map.yaml, … as `restock train` takes them; a
+    mission is on one of them that its seed draws."""
     rates: str | None = None
     """Messages a second of some topics, e.g. odom=20,scan=5."""
     exact: bool = False
@@ -60,6 +63,7 @@ class Record:
         """Record, and print what was recorded."""
         from restock.cli import output
         from restock.train.bag_writer import refuse_existing
+        from restock.train.floors import open_floors
         from restock.train.missions import NATURAL, parse_shares
         from restock.train.recorder import (
             HARDWARE,
@@ -84,12 +88,14 @@ class Record:
             conditions=parse_shares(self.conditions) if self.conditions is not None else NATURAL,
             policy=self.policy,
             epsilon=self.epsilon,
+            layouts=self.layouts,
             rates=parse_rates(self.rates or ""),
             hardware=(
                 hardware if self.perturbation is None else find_perturbation(self.perturbation)
             ),
         )
         load_policy(plan)  # what is wrong with it is said before anything is driven
+        open_floors(plan.layouts)
         refuse_existing(self.out)
         if self.dry_run:
             wanted = {"path": str(self.out), "dry_run": True, **plan.describe()}
