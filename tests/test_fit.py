@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -15,10 +16,11 @@ from restock.errors import ConfigError, ExitCode, StoreError
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile import load_profile
 from restock.replay.store import Store
-from restock.train.fit import Estimate, Fit, fit
+from restock.train.fit import Estimate, Fit, _fine, _untold, fit
 from restock.train.fit_files import schedule, write
 from restock.train.fit_parameters import DEFAULT, PARAMETERS, Coordinates, parse_parameters
 from restock.train.fit_scope import cuts, sides, usable
+from restock.train.fit_uncertainty import uncertainty
 from restock.train.log_segments import Segments, segments
 from restock.train.mismatch import Mismatch, position_gap_m
 from restock.train.open_loop import replay
@@ -35,6 +37,8 @@ KNOWN = msgspec.structs.replace(
     wheel_radius_scale=0.97,
     latency_s=0.12,
     gain=0.95,
+    localisation_noise_m=0.002,
+    localisation_drift_m=0.005,
     timestep_s=0.01,
 )
 
@@ -95,10 +99,10 @@ def test_the_twin_that_was_recorded_without_noise_repeats_itself(noiseless: Path
     free = found.take(~found.signals["bumped"].any(axis=1))
     replayed = replay(free, [NOISELESS, KNOWN])
     same, other = position_gap_m(free, replayed)[:, :, -1]
-    assert same.max() < 0.002
-    assert np.median(other) > 0.1
+    assert same.max() < 0.005
+    assert np.median(other) > 0.05
     speed = replayed.signals["wheel_speed_mps"][0] - free.signals["wheel_speed_mps"]
-    assert np.abs(speed).max() < 0.002
+    assert np.abs(speed).max() < 0.01
 
 
 def test_a_replay_does_not_depend_on_what_else_is_replayed(log: Segments) -> None:
@@ -139,7 +143,7 @@ def test_known_latency_gain_and_wheels_are_recovered(known: Path, tmp_path: Path
         tolerance = {"latency_s": 0.006, "gain": 0.005, "wheel_radius_scale": 0.01}[item.name]
         assert item.value == pytest.approx(true, abs=tolerance)
     assert found.noise["wheel speed"]["after"] < 0.3 * found.noise["wheel speed"]["before"]
-    gap = found.held_out[-1]
+    gap = next(item for item in found.held_out if item.horizon_s == 3.0)
     assert gap.after_m < 0.5 * gap.before_m
 
     write(tmp_path / "fitted.toml", [found])
@@ -148,18 +152,22 @@ def test_known_latency_gain_and_wheels_are_recovered(known: Path, tmp_path: Path
         write(tmp_path / "fitted.toml", [found])
 
 
-def test_friction_of_a_grippy_floor_is_not_told_and_stays(known: Path) -> None:
-    base = msgspec.structs.replace(KNOWN, name="base")
-    found = recovered(
-        known, ("friction_scale", "gain"), base=base, horizon_s=2.0, search_points=0, held_out=0.0
+def test_friction_under_wheels_that_stand_is_not_told_and_stays(log: Segments) -> None:
+    some = log.take(np.arange(8))
+    standing = replace(
+        some,
+        command=np.zeros_like(some.command),
+        still=np.ones(8, np.bool_),
+        signals={name: np.zeros_like(values) for name, values in some.signals.items()},
     )
-    friction, gain = found.estimates
-    assert not friction.fitted
-    assert friction.value == base.friction_scale == found.perturbation.friction_scale
-    assert "wheels slide in" in friction.note
-    assert any("friction_scale is not fitted" in warning for warning in found.warnings)
-    assert gain.fitted
-    assert found.held_out == ()
+    mismatch = Mismatch(standing)
+    coordinates = Coordinates(("friction_scale",), Perturbation(), log.task)
+    solution = _fine(mismatch, coordinates, np.array([0.5]), lambda text: None)
+    told = _untold(mismatch, solution, uncertainty(solution, standing.episode_id, seed=0))
+    assert told is not None
+    assert not told.fitted
+    assert told.value == 1.0
+    assert told.note == "0.05 to 2 explain the log as well (wheels slide in 0.0% of the steps)"
 
 
 def test_a_schedule_of_several_fits_spans_what_all_of_them_told(tmp_path: Path) -> None:

@@ -192,17 +192,19 @@ def fit(
     while True:
         solution = _fine(mismatch, coordinates, z, say)
         known = uncertainty(solution, used.episode_id, seed)
-        width = known.half / coordinates.known
-        worst = int(np.argmax(width))
-        if width[worst] <= 1 or len(coordinates) == 1:
-            break
-        estimate, stays = _unknown(mismatch, solution, known, worst, step_s)
-        if not stays:
+        estimate = _untold(mismatch, solution, known)
+        if estimate is None:
             break
         say(f"{estimate.name} is not told by this log")
         kept.append(estimate)
-        coordinates = coordinates.without(estimate.name)
-        z = np.delete(solution.z, worst)
+        at = coordinates.names.index(estimate.name)
+        coordinates, z = coordinates.without(estimate.name), np.delete(solution.z, at)
+        if not len(coordinates):
+            raise ConfigError(
+                f"this log does not tell {estimate.name}: {estimate.note}",
+                where=str(store.path),
+                remedy="log more driving with changes of speed and direction",
+            )
     perturbation = msgspec.structs.replace(
         coordinates.perturbation(solution.z), name=name, timestep_s=step_s
     )
@@ -270,13 +272,24 @@ def _fine(
     )
 
 
-def _unknown(
-    mismatch: Mismatch, solution: Solution, known: Uncertainty, index: int, timestep_s: float
-) -> tuple[Estimate, bool]:
-    """A parameter that is known too little, and whether it stays as in the base.
+def _untold(mismatch: Mismatch, solution: Solution, known: Uncertainty) -> Estimate | None:
+    """The parameter that is known least of those that stay as in the base, if there is one.
 
-    It does where the base explains the log as well as any other value.
+    One does that is known too little, and whose value in the base explains the log as well.
     """
+    width = known.half / solution.coordinates.known
+    for index in np.argsort(-width):
+        if width[index] > 1:
+            estimate, stays = _unknown(mismatch, solution, known, int(index))
+            if stays:
+                return estimate
+    return None
+
+
+def _unknown(
+    mismatch: Mismatch, solution: Solution, known: Uncertainty, index: int
+) -> tuple[Estimate, bool]:
+    """What can be said of a parameter that is known little, and whether it stays."""
     coordinates = solution.coordinates
     parameter = coordinates.parameters[index]
     problem = Problem(mismatch, coordinates, solution.scale)
@@ -289,7 +302,7 @@ def _unknown(
     if parameter.name in ("friction_scale", "left_friction_scale"):
         now = coordinates.perturbation(solution.z)
         sliding = replay(
-            mismatch.segments, [now], timestep_s=timestep_s, nthread=mismatch.nthread
+            mismatch.segments, [now], timestep_s=mismatch.timestep_s, nthread=mismatch.nthread
         ).sliding_mps
         share = float((sliding > SLIDES_MPS).mean())
         reason += f" (wheels slide in {share:.1%} of the steps)"
@@ -357,7 +370,9 @@ def _held_out(
     if "position" not in found.channels:
         return ()
     say("replaying what was held out")
-    for horizon_s in HELD_OUT_S:
+    period_s = store.task(task_hash).control_period_s
+    for wanted_s in HELD_OUT_S:
+        horizon_s = max(round(wanted_s / period_s), 1) * period_s
         every = segments(store, horizon_s, recordings=recordings, task_hash=task_hash)
         good, _ = usable(every)
         _, after = sides(good, cut) if len(good) else (None, np.zeros(0, np.bool_))
@@ -370,7 +385,7 @@ def _held_out(
         drawn = np.median(end[1][rng.integers(end.shape[1], size=(1000, end.shape[1]))], axis=1)
         low, high = np.quantile(drawn, [0.025, 0.975])
         before, now = (float(np.median(item)) for item in end)
-        gaps.append(Gap(horizon_s, len(held), before, now, float(low), float(high)))
+        gaps.append(Gap(round(horizon_s, 6), len(held), before, now, float(low), float(high)))
     return tuple(gaps)
 
 

@@ -12,7 +12,7 @@ from restock.ingest.profile import load_profile
 from restock.ingest.task import Task
 from restock.replay.store import Store
 from restock.train.fit_parameters import PARAMETERS
-from restock.train.log_segments import Segments
+from restock.train.log_segments import BEFORE, POSE, Segments
 from restock.train.mismatch import CHANNELS
 
 TOUCHING_M = 0.05  # nearer to something than this a robot may be touching it
@@ -103,7 +103,9 @@ def usable(segments: Segments) -> tuple[Segments, dict[str, int]]:
     told = segments.true_condition != ""
     slips = np.where(told, segments.true_condition, segments.condition) == "wheel_slip"
     slippery = ~touched & ~near & slips.any(axis=1)
-    none = ~np.isfinite(segments.pose).all(axis=(1, 2)) | ~np.isfinite(segments.command).all((1, 2))
+    needed = [segments.command.reshape(len(segments), -1)]
+    needed += [segments.signals[name] for name in (*POSE, *BEFORE)]
+    none = ~np.isfinite(np.concatenate(needed, axis=1)).all(axis=1)
     reasons = {
         "bumped into something": touched,
         f"within {TOUCHING_M:g} m of something": near,

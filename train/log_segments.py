@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from typing import Any
 
+import duckdb
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,7 +33,7 @@ MOTION = (
     *("localised_speed_mps", "localised_lateral_mps"),
 )
 _COMMAND = ("command_speed_mps", "command_yaw_rate_radps")
-_BEFORE = (
+BEFORE = (
     *("wheel_speed_mps", "wheel_yaw_rate_radps", "gyro_yaw_rate_radps"),
     "localised_speed_mps",
 )
@@ -96,9 +97,10 @@ def segments(
     """Cut a store's episodes into segments of `horizon_s`.
 
     A segment begins every `stride_s` (default: the horizon, so that none overlap) where its steps
-    and those of the warm-up are all there, evenly in time, and its first pose is fresh. At an
-    episode's start the steps before are not needed if the robot stood still. A pose is fresh if
-    its age is the recording's usual one, within a quarter of a control period.
+    and those of the warm-up (rounded up to whole steps) are all there, evenly in time, and its
+    first pose is fresh. At an episode's start the steps before are not needed if the robot stood
+    still. A pose is fresh if its age is the recording's usual one, within a quarter of a control
+    period.
 
     Raises:
         ConfigError: a horizon or stride that is not some control periods, or no such recording.
@@ -108,7 +110,7 @@ def segments(
     task_hash = task_hash or task.hash
     horizon = _periods(task, horizon_s, "horizon_s")
     stride = horizon if stride_s is None else _periods(task, stride_s, "stride_s")
-    warmup = _periods(task, warmup_s, "warmup_s") if warmup_s else 0
+    warmup = int(np.ceil(warmup_s / task.control_period_s - 1e-9))
     rows = _read(store, task_hash, recordings)
     period_ns = round(task.control_period_s * 1e9)
     fresh = _fresh(rows, period_ns)
@@ -125,7 +127,7 @@ def segments(
             left["too short a stretch"] += int(end - begin)
             continue
         left["warm-up"] += lead
-        left["end of a stretch"] += int(end - begin - lead - len(at) * stride)
+        left["end of a stretch"] += max(int(end - begin) - lead - len(at) * stride, 0)
         starts.append(at)
         padded.append(np.full(len(at), begin))
     at = np.concatenate(starts) if starts else np.zeros(0, np.int64)
@@ -158,7 +160,7 @@ def segments(
         command=np.where(there[..., None], command[np.maximum(past, begin[:, None])], 0.0),
         still=at - warmup < begin,
         before=np.stack(
-            [rows[name][lead_row] for name in _BEFORE],
+            [rows[name][lead_row] for name in BEFORE],
             axis=-1,
         ),
         signals={name: rows[name][index] for name in LOGGED},
@@ -180,10 +182,17 @@ def _read(store: Store, task_hash: str, recordings: Sequence[str]) -> dict[str, 
                 remedy='restock sql STORE "FROM recordings" lists them',
             )
     text = files("restock.train").joinpath("log_segments.sql").read_text(encoding="utf-8")
-    found = store.connection.execute(
-        text.format(columns=", ".join(LOGGED)),
-        {"task_hash": task_hash, "recordings": list(recordings)},
-    )
+    try:
+        found = store.connection.execute(
+            text.format(columns=", ".join(LOGGED)),
+            {"task_hash": task_hash, "recordings": list(recordings)},
+        )
+    except duckdb.BinderException as error:
+        raise StoreError(
+            f"lacks a column: {str(error).splitlines()[0]}",
+            where=str(store.path),
+            remedy="ingest the recordings again with this version",
+        ) from error
     rows: dict[str, NDArray[Any]] = found.fetchnumpy()
     rows = {name: _plain(name, values) for name, values in rows.items()}
     if not len(rows["transition_id"]):

@@ -25,7 +25,7 @@ class Fit:
     Example: `restock twin fit store/ --out fitted.toml`
     """
 
-    store: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
+    store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
     """The store."""
     out: Path | None = None
     """Where the perturbation goes, as TOML; with --per-recording a schedule over the robots.
@@ -156,5 +156,10 @@ def _show(fit: Fitted) -> None:
     for line in fit.warnings:
         output.stdout().print(f"warning: {line}")
     if fit.left_out:
-        left = ", ".join(f"{count:,} {reason}" for reason, count in fit.left_out.items())
-        output.stdout().print(f"left out, in segments: {left}")
+        left = ", ".join(_count(reason, count) for reason, count in fit.left_out.items())
+        output.stdout().print(f"left out: {left}")
+
+
+def _count(reason: str, count: int) -> str:
+    kind, _, of_steps = reason.partition("steps: ")
+    return f"{count:,} segments {kind}" if kind else f"{count:,} steps ({of_steps})"
