@@ -95,12 +95,13 @@ def measure_gap(
     *,
     warehouse: Warehouse | None = None,
     task_hash: str | None = None,
+    notes: tuple[str, ...] = (),
     tell: Callable[[str], None] = lambda _: None,
 ) -> Gap:
     """Measure the gap of the nominal twin, and of a calibrated one beside it.
 
     `warehouse` is the floor that the log may have been driven on (default: the twin's own); what
-    the lidar sees is compared only where the two agree.
+    the lidar sees is compared only where the two agree. `notes` are said beside what was not done.
 
     Raises:
         ConfigError: a horizon that is not some control periods, or a control period that the twin
@@ -156,7 +157,7 @@ def measure_gap(
     }
     verdicts = _verdicts(steps, plan.limits, best, paths, path_rows, reward_rows, ratios)
     said = _not_done(steps, twins, stepped, plans, differs, noise.drift_m, calibrated, paths)
-    return Gap(about, path_rows, observation_rows, reward_rows, verdicts, said)
+    return Gap(about, path_rows, observation_rows, reward_rows, verdicts, (*said, *notes))
 
 
 def _floor_differs(

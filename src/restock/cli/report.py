@@ -21,6 +21,10 @@ class Report:
     intervals against planner and random (run `restock eval RUN` first), a map of where the logs
     have been and where the agent failed, and where all of it comes from.
 
+    A gap between twin and logs that `restock twin gap` measured into RUN/gap, or into the gap
+    folder of the panel's store, is a section of it. Of a STORE the page is about its gap alone,
+    and is STORE/gap/index.html.
+
     With --card instead the replay card: what the critic was fed on one page of Markdown, on
     stdout, and as RUN/replay_card.md and RUN/replay_card.json.
 
@@ -28,7 +32,7 @@ class Report:
     """
 
     run_directory: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """The directory that `restock train --out` wrote."""
+    """The directory that `restock train --out` wrote; or a store, for its gap alone."""
     out: Path | None = None
     """Where to write the page; default RUN/report.html. Replaces what is there."""
     card: bool = False
@@ -38,7 +42,10 @@ class Report:
 
     def run(self) -> int | None:
         from restock.errors import ConfigError
-        from restock.report import build_report, write_card
+        from restock.ingest.location import Location
+        from restock.replay.store import is_store
+        from restock.report import build_report, write_card, write_gap_page
+        from restock.train.gap_files import FOLDER
 
         if self.card:
             if self.out is not None:
@@ -51,7 +58,10 @@ class Report:
             else:
                 sys.stdout.write(markdown)
             return None
-        path = build_report(self.run_directory, self.out)
+        if is_store(Location.of(self.run_directory)):
+            path = write_gap_page(self.run_directory / FOLDER, self.out)
+        else:
+            path = build_report(self.run_directory, self.out)
         if self.json:
             print_json({"report": str(path), "bytes": path.stat().st_size})
         else:

@@ -10,6 +10,12 @@ import tyro
 
 if TYPE_CHECKING:
     from restock.train.gap import Gap as Measured
+    from restock.train.perturbation import Perturbation
+
+_IN_SAMPLE = (
+    "The twin was calibrated on most of these very logs: `restock twin fit` says what is left of"
+    " the gap on logs held out."
+)
 
 
 @dataclass
@@ -31,6 +37,8 @@ class Gap:
     """The store."""
     perturbation: Path | None = None
     """The calibrated twin, e.g. what `restock twin fit` wrote."""
+    fit: bool = False
+    """Calibrate the twin on this store first, as `restock twin fit STORE` does by default."""
     out: Path | None = None
     """A folder for gap.json, Parquet tables and a page (index.html). `restock report` shows what
     it finds in RUN/gap or STORE/gap. A gap measured before is replaced."""
@@ -66,7 +74,7 @@ class Gap:
     def run(self) -> int:
         """Measure, print, write."""
         from restock.cli import output
-        from restock.errors import ExitCode
+        from restock.errors import ConfigError, ExitCode
         from restock.replay.store import Store
         from restock.report import write_gap_page
         from restock.train.gap import GapPlan, measure_gap
@@ -74,8 +82,9 @@ class Gap:
         from restock.train.perturbation import load_perturbation
         from restock.train.trust import Limits
 
+        if self.fit and self.perturbation is not None:
+            raise ConfigError("give --fit or --perturbation, one of them", where="restock twin gap")
         calibrated = None if self.perturbation is None else load_perturbation(self.perturbation)
-        given = calibrated.timestep_s if calibrated is not None else 0.01
         limits = Limits(
             self.trust_horizon_s,
             self.trust_position_m,
@@ -88,13 +97,28 @@ class Gap:
             most=self.most,
             limits=limits,
             seed=self.seed,
-            timestep_s=given if self.timestep_s is None else self.timestep_s,
+            timestep_s=self._timestep_s(calibrated),
             nthread=self.threads,
         )
         if self.out is not None:
             check_place(self.out)
         with Store(self.store) as store:
-            gap = measure_gap(store, calibrated, plan, task_hash=self.task, tell=output.say)
+            notes: tuple[str, ...] = ()
+            if self.fit:
+                from restock.train.fit import fit
+
+                fitted = fit(
+                    store,
+                    task_hash=self.task,
+                    timestep_s=self.timestep_s,
+                    seed=self.seed,
+                    nthread=self.threads,
+                    on_progress=output.say,
+                )
+                calibrated, notes = fitted.perturbation, (_IN_SAMPLE, *fitted.warnings)
+            gap = measure_gap(
+                store, calibrated, plan, task_hash=self.task, notes=notes, tell=output.say
+            )
         if self.out is not None:
             write_gap(gap, self.out)
             output.say(f"wrote {write_gap_page(self.out)}")
@@ -103,6 +127,11 @@ class Gap:
         else:
             _show(gap)
         return int(ExitCode.FAILED if self.check and gap.untrusted else ExitCode.OK)
+
+    def _timestep_s(self, calibrated: Perturbation | None) -> float:
+        if self.timestep_s is not None:
+            return self.timestep_s
+        return 0.01 if calibrated is None else calibrated.timestep_s
 
 
 def _seconds(text: str) -> tuple[float, ...]:
