@@ -213,8 +213,8 @@ def _shape(array: Any) -> tuple[int, ...]:
 
 def _import() -> tuple[Any, Any]:
     try:
-        import mujoco_warp
-        import warp
+        import mujoco_warp  # type: ignore[import-not-found,unused-ignore]
+        import warp  # type: ignore[import-not-found,unused-ignore]
     except ImportError as error:
         raise ConfigError(
             'physics="warp" needs MuJoCo Warp, which is not installed',
