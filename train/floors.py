@@ -52,10 +52,10 @@ class Recipe:
 
     aisle_m: Range = (1.5, 2.3)  # width
     cross_m: Range = (2.0, 2.6)
-    rack_m: Range = (2.4, 4.2)  # along the aisle
+    rack_m: Range = (2.4, 3.6)  # along the aisle
     rack_deep_m: Range = (0.8, 1.4)
     aisles: tuple[int, int] = (3, 5)
-    cross_aisles: tuple[int, int] = (2, 3)
+    cross_aisles: tuple[int, int] = (3, 4)
     one_way: float = 0.4  # chance that a floor's inner aisles are one-way, in turns
     gap: float = 0.1  # chance that a rack is missing
     turned: float = 0.5  # chance that aisles run north and south
@@ -103,7 +103,7 @@ def generate(seed: int, recipe: Recipe | None = None, *, name: str | None = None
     aisle_y, depth = _strips([metres(recipe.aisle_m) for _ in range(aisles)], recipe, rng, "deep")
     cross_x, width = _strips([metres(recipe.cross_m) for _ in range(crosses)], recipe, rng, "long")
     racks = (aisles - 1) * (crosses - 1)
-    missing = frozenset(np.flatnonzero(rng.random(racks) < recipe.gap).tolist()[: racks // 3])
+    missing = frozenset(np.flatnonzero(rng.random(racks) < recipe.gap).tolist()[: racks // 4])
     wanted = int(rng.integers(recipe.docks[0], recipe.docks[1] + 1))
     rows = rng.permutation(aisles - 1)[:wanted]
     between = [(aisle_y[row][1] + aisle_y[row + 1][0]) / 2 for row in sorted(rows.tolist())]

@@ -126,6 +126,13 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
             raise ConfigError("autoreset is SameStep or Disabled", where="the twin")
         self.metadata = {**type(self).metadata, "autoreset_mode": self.autoreset_mode}
         self.set_conditions(conditions or DEFAULT_CONDITIONS)
+        bare = [floor.name for floor in self.floors if not floor.segments]
+        if bare and self.conditions.get("blocked_aisle"):
+            raise ConfigError(
+                f"{', '.join(bare)} has no aisle that pallets could close",
+                where="layouts",
+                remedy="give it aisles, or conditions without blocked_aisle",
+            )
 
         limit = np.full(self.task.observation_size, OBSERVATION_LIMIT, np.float32)
         self.single_observation_space = gymnasium.spaces.Box(-limit, limit, dtype=np.float32)
