@@ -1,49 +1,54 @@
-"""How long one update takes, beside CleanRL's logic and Stable-Baselines3, in one interleaved run.
+"""How long one update takes, beside other libraries, in one interleaved run.
 
-    python benchmarks/train.py [--quick] [--json] [--check]
+    python benchmarks/train.py [--batch 128] [--quick] [--json] [--check]
 
-Equal network (2 x 256, no LayerNorm, because Stable-Baselines3's MLP has none), equal batch, plain
-DQN targets, one thread. Then what Restock's own default adds: double DQN, LayerNorm, half of the
-batch from logs by quotas, and the record of what was fed. `--check` exits 1 where a target of the
-design is missed. Stable-Baselines3 is left out where it is not installed.
+Equal network (2 x 256 ReLU; no LayerNorm, which the peers' MLPs do not have), equal batch, Adam,
+plain DQN targets, one thread, sampling from a full buffer included: CleanRL's logic,
+Stable-Baselines3, Tianshou, TorchRL and d3rlpy, each where it is installed (d3rlpy in a Python of
+its own, `--neighbours`). Then Restock's own ways: by autograd, with LayerNorm, its default (double
+DQN, LayerNorm, half of the batch from logs by quotas), and that with the record of what was fed.
+Figures are CPU times. `--check` exits 1 where a target of the design is missed.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
-from torch.nn import functional
+from train_peers import (
+    ACTIONS,
+    DISCOUNT,
+    OBSERVATION,
+    ROWS,
+    Arrays,
+    Updates,
+    cleanrl,
+    d3rlpy,
+    data,
+    stable_baselines3,
+    tianshou,
+    torchrl,
+)
 
 from restock.replay.ring import FreshRing
 from restock.train.batches import Batches, Coded, Logs
 from restock.train.config import TrainConfig, parse_config
+from restock.train.kernel import UpdatePath
 from restock.train.learner import Learner
 from restock.train.record import FeedRecord
 from restock.train.run import Run
 
-OBSERVATION, ACTIONS, ROWS, DISCOUNT = 94, 10, 50_000, 0.97
-TARGETS = {"cleanrl": 1.6, "stable_baselines3": 1.9}
-FEED_TARGET = 0.06
-
-
-def data(rng: np.random.Generator) -> dict[str, np.ndarray]:
-    return {
-        "observation": rng.normal(size=(ROWS, OBSERVATION)).astype(np.float32),
-        "next_observation": rng.normal(size=(ROWS, OBSERVATION)).astype(np.float32),
-        "action": rng.integers(ACTIONS, size=(ROWS, 1)),
-        "reward": rng.normal(size=(ROWS, 1)).astype(np.float32),
-        "done": (rng.random((ROWS, 1)) < 0.02).astype(np.float32),
-    }
+TARGETS = {"cleanrl": 1.6, "stable_baselines3": 1.9}  # times Restock's update, at least
+IN_PLACE_TARGET = 1.1  # times the same arithmetic on one batch that lies ready, at most
+FEED_TARGET = 0.06  # of an update, at most
 
 
 def config(batch: int, **changes: Any) -> TrainConfig:
@@ -55,7 +60,13 @@ class Restock:
     """Restock's update; with `logs`, half of the batch from logs; with `run`, recorded."""
 
     def __init__(
-        self, settings: TrainConfig, arrays: dict[str, np.ndarray], *, run: Run | None, logs: bool
+        self,
+        settings: TrainConfig,
+        arrays: Arrays,
+        *,
+        run: Run | None = None,
+        logs: bool = False,
+        path: UpdatePath | None = None,
     ) -> None:
         ring = FreshRing(ROWS, 16, OBSERVATION, discount=DISCOUNT, conditions=("rare", "nominal"))
         discount = DISCOUNT * (1 - arrays["done"])
@@ -63,7 +74,7 @@ class Restock:
         ring.rows[:] = np.concatenate([*columns, arrays["reward"], discount], axis=1)
         ring.appended = ROWS
         shelf = self._logs(torch.from_numpy(ring.rows.copy())) if logs else None
-        self.learner = Learner(settings, OBSERVATION, ACTIONS)
+        self.learner = Learner(settings, OBSERVATION, ACTIONS, path=path)
         self.batches = Batches(
             shelf,
             ring,
@@ -107,92 +118,50 @@ class Restock:
                 self.feed.flush(step * 4, step, "online")
 
 
-class CleanRL:
-    """The update of CleanRL's `dqn.py`, with its buffer's gather and Restock's default tau."""
-
-    def __init__(self, batch: int, arrays: dict[str, np.ndarray]) -> None:
-        def network() -> nn.Module:
-            return nn.Sequential(
-                *(nn.Linear(OBSERVATION, 256), nn.ReLU()),
-                *(nn.Linear(256, 256), nn.ReLU(), nn.Linear(256, ACTIONS)),
-            )
-
-        self.batch, self.arrays = batch, arrays
-        self.network, self.target = network(), network()
-        self.target.load_state_dict(self.network.state_dict())
-        self.optimizer = torch.optim.Adam(self.network.parameters(), lr=3e-4)
-        self.rng = np.random.default_rng(0)
-
-    def __call__(self, updates: int) -> None:
-        for _ in range(updates):
-            index = self.rng.integers(ROWS, size=self.batch)
-            sample = {name: torch.tensor(column[index]) for name, column in self.arrays.items()}
-            with torch.no_grad():
-                best, _ = self.target(sample["next_observation"]).max(dim=1)
-                goal = sample["reward"].flatten() + DISCOUNT * best * (1 - sample["done"].flatten())
-            old = self.network(sample["observation"]).gather(1, sample["action"]).squeeze()
-            loss = functional.mse_loss(goal, old)
-            self.optimizer.zero_grad()
-            loss.backward()
-            self.optimizer.step()
-            for slow, fast in zip(self.target.parameters(), self.network.parameters(), strict=True):
-                slow.data.copy_(0.005 * fast.data + 0.995 * slow.data)
-
-
-def stable_baselines3(batch: int, arrays: dict[str, np.ndarray]) -> Callable[[int], None] | None:
-    try:
-        import gymnasium
-        from stable_baselines3 import DQN
-        from stable_baselines3.common.logger import Logger
-    except ImportError:
-        return None
-
-    class Still(gymnasium.Env[Any, Any]):
-        observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (OBSERVATION,), np.float32)
-        action_space = gymnasium.spaces.Discrete(ACTIONS)
-
-    model = DQN(
-        "MlpPolicy",
-        Still(),
-        learning_rate=3e-4,
-        buffer_size=ROWS,
-        batch_size=batch,
-        gamma=DISCOUNT,
-        tau=0.005,
-        policy_kwargs={"net_arch": [256, 256]},
-        device="cpu",
-    )
-    model.set_logger(Logger(None, []))
-    buffer = model.replay_buffer
-    buffer.observations[:, 0], buffer.next_observations[:, 0] = (
-        arrays["observation"],
-        arrays["next_observation"],
-    )
-    buffer.actions[:, 0], buffer.rewards[:] = arrays["action"], arrays["reward"]
-    buffer.dones[:], buffer.full = arrays["done"], True
-
-    from stable_baselines3.common.utils import polyak_update
+def in_place(settings: TrainConfig, arrays: Arrays) -> Updates:
+    """The arithmetic of an update alone: one batch, drawn beforehand, again and again."""
+    whole = Restock(settings, arrays)
+    learner, rows = whole.learner, whole.batches.draw_online().rows.clone()
 
     def update(updates: int) -> None:
         for _ in range(updates):
-            model.train(gradient_steps=1, batch_size=batch)
-            polyak_update(model.q_net.parameters(), model.q_net_target.parameters(), 0.005)
+            learner.update(rows)
+            learner.target.after(learner.gradient_steps)
 
     return update
 
 
-def measure(
-    contenders: dict[str, Callable[[int], None]], rounds: int, updates: int
-) -> dict[str, float]:
-    """Median microseconds an update, the contenders taking turns."""
+def products(batch: int) -> Updates:
+    """The matrix products of an update alone: two passes forward, one backward."""
+    sizes = [OBSERVATION, 256, 256, ACTIONS]
+    weights = [torch.randn(after, before) for before, after in itertools.pairwise(sizes)]
+    values = [torch.randn(batch, size) for size in sizes]
+    outs = [torch.empty_like(value) for value in values]
+    into = [torch.empty_like(weight) for weight in weights]
+
+    def update(updates: int) -> None:
+        for _ in range(updates):
+            for layer in (0, 1, 2) * 2:
+                torch.mm(values[layer], weights[layer].t(), out=outs[layer + 1])
+            for layer in (2, 1, 0):
+                torch.mm(values[layer + 1].t(), values[layer], out=into[layer])
+                if layer:
+                    torch.mm(values[layer + 1], weights[layer], out=outs[layer])
+
+    return update
+
+
+def measure(contenders: dict[str, Updates], rounds: int, updates: int) -> dict[str, float]:
+    """Median CPU microseconds an update, the contenders taking turns."""
     taken: dict[str, list[float]] = {name: [] for name in contenders}
     for run in contenders.values():
         run(updates)  # warm
     for _ in range(rounds):
         for name, run in contenders.items():
-            began = time.perf_counter()
-            run(updates)
-            taken[name].append((time.perf_counter() - began) / updates * 1e6)
+            began = time.process_time()
+            elsewhere = run(updates)
+            here = time.process_time() - began
+            taken[name].append((here if elsewhere is None else elsewhere) / updates * 1e6)
     return {name: float(np.median(values)) for name, values in taken.items()}
 
 
@@ -202,30 +171,50 @@ def main() -> int:
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--check", action="store_true")
     parser.add_argument("--batch", type=int, default=128)
+    parser.add_argument(
+        "--neighbours",
+        type=Path,
+        default=Path(".venv-neighbours/bin/python"),
+        help="a Python that has d3rlpy",
+    )
     args = parser.parse_args()
     torch.set_num_threads(1)
     arrays = data(np.random.default_rng(0))
     equal = config(args.batch, network={"layer_norm": False}, loss={"double": False})
+    normed, default = config(args.batch, loss={"double": False}), config(args.batch)
+    peers = {
+        "cleanrl": cleanrl(args.batch, arrays),
+        "stable_baselines3": stable_baselines3(args.batch, arrays),
+        "tianshou": tianshou(args.batch, arrays),
+        "torchrl": torchrl(args.batch, arrays),
+        "d3rlpy": d3rlpy(args.batch, arrays, args.neighbours),
+    }
     with tempfile.TemporaryDirectory() as folder:
         run = Run.create(Path(folder) / "run", {})
-        contenders: dict[str, Callable[[int], None]] = {
-            "restock": Restock(equal, arrays, run=None, logs=False),
-            "cleanrl": CleanRL(args.batch, arrays),
-            "restock_default": Restock(config(args.batch), arrays, run=None, logs=True),
-            "restock_default_recorded": Restock(config(args.batch), arrays, run=run, logs=True),
+        contenders: dict[str, Updates] = {
+            "products": products(args.batch),
+            "restock_in_place": in_place(equal, arrays),
+            "restock": Restock(equal, arrays),
+            "restock_autograd": Restock(equal, arrays, path="autograd"),
+            **{name: peer for name, peer in peers.items() if peer is not None},
+            "restock_layer_norm": Restock(normed, arrays),
+            "restock_layer_norm_autograd": Restock(normed, arrays, path="autograd"),
+            "restock_default": Restock(default, arrays, logs=True),
+            "restock_default_recorded": Restock(default, arrays, run=run, logs=True),
         }
-        peer = stable_baselines3(args.batch, arrays)
-        if peer is not None:
-            contenders["stable_baselines3"] = peer
         rounds, updates = (5, 40) if args.quick else (15, 200)
         us = measure(contenders, rounds, updates)
-    ratios = {name: us[name] / us["restock"] for name in TARGETS if name in us}
+    left_out = [name for name, peer in peers.items() if peer is None]
+    ratios = {name: us[name] / us["restock"] for name in peers if name in us}
+    over = us["restock"] / us["restock_in_place"]
     feed = us["restock_default_recorded"] / us["restock_default"] - 1
     missed = [
-        f"{name}: {ratios[name]:.2f}x, target {TARGETS[name]}x"
-        for name in ratios
-        if ratios[name] < TARGETS[name]
+        f"{name}: {ratios[name]:.2f}x, target {target}x"
+        for name, target in TARGETS.items()
+        if name in ratios and ratios[name] < target
     ]
+    if over > IN_PLACE_TARGET:
+        missed.append(f"over the arithmetic in place: {over:.2f}x, target {IN_PLACE_TARGET}x")
     if feed > FEED_TARGET:
         missed.append(f"record: {feed:.1%} of an update, target {FEED_TARGET:.0%}")
     if args.json:
@@ -235,6 +224,8 @@ def main() -> int:
                     "batch": args.batch,
                     "us_per_update": us,
                     "ratios": ratios,
+                    "over_in_place": over,
+                    "left_out": left_out,
                     "record_share": feed,
                     "missed": missed,
                 }
@@ -244,7 +235,11 @@ def main() -> int:
         for name, value in us.items():
             print(f"{name:28s} {value:7.0f} us an update")
         for name, value in ratios.items():
-            print(f"{name} / restock: {value:.2f}x (target {TARGETS[name]}x)")
+            target = f" (target {TARGETS[name]}x)" if name in TARGETS else ""
+            print(f"{name} / restock: {value:.2f}x{target}")
+        for name in left_out:
+            print(f"{name}: not installed, left out")
+        print(f"restock / in place: {over:.2f}x (target at most {IN_PLACE_TARGET}x)")
         print(f"record of what was fed: {feed:.1%} of an update (target at most {FEED_TARGET:.0%})")
     if args.check and missed:
         print("missed: " + "; ".join(missed), file=sys.stderr)
