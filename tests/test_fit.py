@@ -15,6 +15,7 @@ from restock import cli
 from restock.errors import ConfigError, ExitCode, StoreError
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile import load_profile
+from restock.ingest.store import StoreWriter
 from restock.replay.store import Store
 from restock.train.fit import Estimate, Fit, _fine, _untold, fit
 from restock.train.fit_files import schedule, write
@@ -49,7 +50,7 @@ def store_of(folder: Path, hardware: Perturbation, *, missions: int, seed: int =
         recording,
         Plan(missions=missions, seed=seed, conditions={"nominal": 1.0}, hardware=hardware),
     )
-    ingest(recording, load_profile("warehouse_amr"), folder / "store")
+    ingest(recording, load_profile("warehouse_amr"), store=StoreWriter(folder / "store"))
     return folder / "store"
 
 
@@ -260,7 +261,7 @@ def test_the_command_prints_json_and_a_dry_run_writes_nothing(
 @pytest.mark.skipif(not BAGS.is_dir(), reason="needs ../shared/bags")
 def test_another_robot_is_asked_only_for_what_it_shares_with_the_twin(tmp_path: Path) -> None:
     bag = BAGS / "turtlebot3-sim-humble"
-    ingest(bag, load_profile("turtlebot3"), tmp_path / "store")
+    ingest(bag, load_profile("turtlebot3"), store=StoreWriter(tmp_path / "store"))
     with Store(tmp_path / "store") as store:
         with pytest.raises(ConfigError, match="is not the twin's: its mass and its contacts"):
             fit(store, parameters=["payload_kg"])
