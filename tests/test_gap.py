@@ -88,7 +88,7 @@ def test_a_slippery_floor_is_named_and_a_dry_one_is_not(gap: Gap) -> None:
 def test_one_step_gaps_fall_with_the_true_parameters(gap: Gap) -> None:
     def of(component: str, source: str) -> float:
         return next(
-            row["mean_gap"]
+            float(row["mean_gap"])
             for row in gap.observations
             if (row["component"], row["condition"], row["source"]) == (component, "nominal", source)
         )
@@ -235,10 +235,12 @@ def test_quantiles_count_clusters_not_rows() -> None:
 
 
 def test_one_cluster_has_no_interval() -> None:
-    (median,) = quantiles([1.0, 2.0, 3.0], ["a"] * 3, [0.5], rng=np.random.default_rng(0))
+    (median,) = quantiles(
+        np.array([1.0, 2.0, 3.0]), np.full(3, "a"), [0.5], rng=np.random.default_rng(0)
+    )
     assert median.value == 2.0
     assert np.isnan(median.low)
-    mean = ratio([1.0, 3.0], [1.0, 1.0], ["a", "a"], rng=np.random.default_rng(0))
+    mean = ratio(np.array([1.0, 3.0]), np.ones(2), np.full(2, "a"), rng=np.random.default_rng(0))
     assert mean.value == 2.0
     assert np.isnan(mean.high)
 

@@ -182,6 +182,6 @@ def _show(gap: Measured) -> None:
             for found in gap.verdicts
         ]
     )
-    for line in gap.not_done:
-        stdout().print(f"- {line}", markup=False, soft_wrap=True)
+    for said in gap.not_done:
+        stdout().print(f"- {said}", markup=False, soft_wrap=True)
     stdout().print(headline(gap), markup=False)
