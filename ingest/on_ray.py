@@ -31,7 +31,7 @@ def run_on_ray(job: Job, paths: Sequence[Path], *, workers: int = 1) -> Iterator
     Raises:
         ConfigError: Ray is not installed, or the cluster does not answer.
     """
-    with _cluster(workers) as ray:
+    with cluster(workers) as ray:
         # A task that died may have committed: it is not tried again unasked.
         task = ray.remote(_task).options(num_cpus=1, max_retries=0)
         aws = {name: value for name, value in os.environ.items() if name.startswith(ENVIRONMENT)}
@@ -53,7 +53,7 @@ def run_on_ray(job: Job, paths: Sequence[Path], *, workers: int = 1) -> Iterator
 
 
 @contextmanager
-def _cluster(workers: int) -> Iterator[Any]:
+def cluster(workers: int) -> Iterator[Any]:
     """Ray, with a cluster to give tasks to."""
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # or Ray warns of it
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # reports to nobody unasked

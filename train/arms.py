@@ -21,14 +21,27 @@ from restock.errors import RunError
 from restock.train.feed_gate import Feed
 from restock.train.run import Run
 
-Treatment = Literal["algorithm", "target", "mixture"]
-Kind = Literal["algorithm", "target", "feed", "store", "evaluation", "task", "software", "free"]
+Treatment = Literal["algorithm", "target", "mixture", "method"]
+Kind = Literal[
+    "algorithm",
+    "target",
+    "feed",
+    "environment",
+    "store",
+    "evaluation",
+    "task",
+    "software",
+    "free",
+]
 
 # What each treatment allows to differ, besides what decides nothing.
 ALLOWED: Mapping[Treatment, frozenset[Kind]] = {
     "algorithm": frozenset({"algorithm"}),
     "target": frozenset({"target"}),
-    "mixture": frozenset({"feed"}),
+    "mixture": frozenset({"feed", "environment"}),
+    # Off-policy and policy-gradient methods have no replay in common: what is held is the twin,
+    # its conditions, the environment steps and the evaluation.
+    "method": frozenset({"algorithm", "target", "feed"}),
 }
 _KINDS: dict[str, Kind] = {
     "config.seed": "free",
@@ -43,6 +56,11 @@ _KINDS: dict[str, Kind] = {
     "config.network": "algorithm",
     "config.loss": "algorithm",
     "config.optimizer": "algorithm",
+    "config.env.conditions": "environment",
+    "config.env.perturbation": "environment",
+    "config.env.layouts": "environment",
+    "library.replay": "feed",
+    "library.target": "target",
     "config": "feed",  # replay, schedule, env, epsilon: which rows there are and how often
     "panel.store": "store",
     "panel.store_version": "store",

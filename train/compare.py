@@ -36,7 +36,7 @@ class Comparison:
     @property
     def gate(self) -> list[Check]:
         """The checks that the verdict is made of: of the feed too, unless it is the treatment."""
-        return self.totals + ([] if self.treatment == "mixture" else self.checks)
+        return _asked(self.treatment, self.totals, self.checks)
 
     def as_json(self) -> dict[str, Any]:
         """All of it."""
@@ -73,10 +73,16 @@ def compare(
     refused = [difference for difference in found if difference.kind not in allowed]
     totals = [_total(name, *(arm.totals[name] for arm in arms)) for name in arms[0].totals]
     checks = check_feeds(*feeds(*arms), limits, rng)
-    asked = totals + ([] if treatment == "mixture" else checks)
+    asked = _asked(treatment, totals, checks)
     verdict = "incomparable" if refused else worst([check.verdict for check in asked])
     source, rows = outcomes(*arms, rng) if verdict == "comparable" else (None, [])
     return Comparison(treatment, verdict, found, refused, totals, checks, source, rows)
+
+
+def _asked(treatment: Treatment, totals: list[Check], checks: list[Check]) -> list[Check]:
+    if treatment == "method":  # an update of one method is not one of another
+        return [check for check in totals if check.name == "env steps"]
+    return totals + ([] if treatment == "mixture" else checks)
 
 
 def _total(name: str, first: float, second: float) -> Check:

@@ -94,7 +94,7 @@ def prepare_new(
         open_floors(layouts)  # what is wrong with one is said before anything is written
     profile = load_profile(config.profile)
     panel = open_panel(panel_path, config, profile) if panel_path is not None else None
-    config = _resolve(config, panel)
+    config = resolve_config(config, panel)
     return Prepared(out, config, profile, panel, _document(config, profile, panel))
 
 
@@ -174,7 +174,7 @@ def make_twin(
     return twin
 
 
-def _resolve(config: TrainConfig, panel: Panel | None) -> TrainConfig:
+def resolve_config(config: TrainConfig, panel: Panel | None) -> TrainConfig:
     """What the config leaves to whether there is a panel: how to begin online."""
     epsilon = config.epsilon
     if epsilon.start is None:

@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
@@ -25,9 +25,11 @@ from restock.errors import ConfigError, RestockError, RunError
 from restock.train.arms import Treatment
 from restock.train.compare import Comparison, compare
 from restock.train.config import as_overrides
+from restock.train.library_arm import DONE, Library, LibraryArm, check_installed, resolve
 from restock.train.run import write_text
 
 Say = Callable[[str], None]
+Engine = Literal["processes", "ray"]
 
 
 class ArmConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -37,12 +39,18 @@ class ArmConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     mixture: str | None = None  # of the study's store: a shipped name or a TOML file
     panel: str | None = None  # one that is there already
     settings: dict[str, Any] = msgspec.field(default_factory=dict)  # of `restock train --set`
+    library: Library | None = None  # whose algorithm learns, in the same twin; None: Restock's
+    arguments: dict[str, Any] = msgspec.field(default_factory=dict)  # that algorithm's own
 
     def __post_init__(self) -> None:
         if not self.name or not all(c.isalnum() or c in "._-" for c in self.name):
             raise ValueError(f"arms.name must be letters, digits, . _ or -, got {self.name!r}")
         if self.mixture is not None and self.panel is not None:
             raise ValueError(f"arm {self.name!r} names a mixture and a panel: choose one")
+        if self.library is None and self.arguments:
+            raise ValueError(f"arm {self.name!r} has arguments, and no library to take them")
+        if self.library is not None and (self.mixture is not None or self.panel is not None):
+            raise ValueError(f"arm {self.name!r} is a library's, which learns from no logs here")
 
 
 class StudyEvaluation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -153,15 +161,30 @@ class Plan:
             "panel": str(panel) if panel is not None else None,
             "evaluation": msgspec.to_builtins(self.study.evaluation),
         }
+        if job.arm.library is not None:
+            asked |= {"library": job.arm.library, "arguments": job.arm.arguments}
         return json.dumps(asked, indent=1) + "\n"
 
 
-def run_study(plan: Plan, *, workers: int = 1, say: Say = lambda line: None) -> list[Comparison]:
+def run_study(
+    plan: Plan,
+    *,
+    workers: int = 1,
+    engine: Engine = "processes",
+    say: Say = lambda line: None,
+) -> list[Comparison]:
     """Do what is not done yet, then compare every arm with the baseline, in the order of the arms.
+
+    `engine` "ray" gives each run to a Ray cluster: see `restock.train.study_on_ray`.
 
     Raises:
         RunError: a run failed (its log says why), or was made by another version of the study.
+        ConfigError: a library that an arm trains with, or Ray, is not installed.
     """
+    for arm in plan.study.arms:
+        if arm.library is not None:
+            check_installed()
+            resolve(tuple(plan.settings(arm, plan.study.seeds[0])), arm.library)
     for job in plan.jobs:
         if job.done.exists() and job.done.read_text(encoding="utf-8") != plan.fingerprint(job):
             raise RunError(
@@ -173,14 +196,12 @@ def run_study(plan: Plan, *, workers: int = 1, say: Say = lambda line: None) -> 
         _build(plan, arm, say)
     todo = [job for job in plan.jobs if not job.done.exists()]
     say(f"{len(plan.jobs) - len(todo)} of {len(plan.jobs)} runs are there already")
-    with ThreadPoolExecutor(max_workers=workers) as pool:
-        futures = [pool.submit(_run, plan, job, say) for job in todo]
-        try:
-            for future in futures:
-                future.result()
-        finally:  # after a failure or Ctrl-C nothing more is begun; what runs checkpoints and ends
-            for future in futures:
-                future.cancel()
+    if engine == "ray":
+        from restock.train.study_on_ray import run_on_ray
+
+        run_on_ray(plan, todo, workers=workers, say=say)
+    else:
+        _run_here(plan, todo, workers, say)
     runs = {
         arm.name: [job.path for job in plan.jobs if job.arm.name == arm.name]
         for arm in plan.study.arms
@@ -191,6 +212,17 @@ def run_study(plan: Plan, *, workers: int = 1, say: Say = lambda line: None) -> 
         for arm in plan.study.arms
         if arm.name != base.name
     ]
+
+
+def _run_here(plan: Plan, todo: Sequence[Job], workers: int, say: Say) -> None:
+    with ThreadPoolExecutor(max_workers=workers) as pool:
+        futures = [pool.submit(run_job, plan, job, say) for job in todo]
+        try:
+            for future in futures:
+                future.result()
+        finally:  # after a failure or Ctrl-C nothing more is begun; what runs checkpoints and ends
+            for future in futures:
+                future.cancel()
 
 
 def _build(plan: Plan, arm: ArmConfig, say: Say) -> None:
@@ -208,21 +240,13 @@ def _build(plan: Plan, arm: ArmConfig, say: Say) -> None:
     _restock(["mix", store, "--mixture", name, "--out", str(out)], plan.out / "logs" / "mix.log")
 
 
-def _run(plan: Plan, job: Job, say: Say) -> None:
+def run_job(plan: Plan, job: Job, say: Say) -> None:
     """Train and evaluate one run; taken up from its checkpoint if it has one."""
     log = plan.out / "logs" / f"{job.path.name}.log"
-    panel = plan.panel(job.arm)
-    checkpoint = job.path / "checkpoints" / "latest.safetensors"
-    if (job.path / "config.json").exists() and not checkpoint.exists():
-        shutil.rmtree(job.path)  # cut before its first checkpoint: nothing to go on from
-    if checkpoint.exists():
-        arguments = ["train", "--resume", str(job.path)]
+    if job.arm.library is not None:
+        _train_library(plan, job, job.arm.library, log, say)
     else:
-        sets = [word for setting in plan.settings(job.arm, job.seed) for word in ("--set", setting)]
-        arguments = ["train", "--out", str(job.path), *sets]
-        arguments += ["--panel", str(panel)] if panel is not None else []
-    say(f"{job.path.name}: training")
-    _restock(arguments, log)
+        _train(plan, job, log, say)
     asked = plan.study.evaluation
     perturbations = ",".join(asked.perturbations)
     say(f"{job.path.name}: evaluating")
@@ -236,14 +260,46 @@ def _run(plan: Plan, job: Job, say: Say) -> None:
     write_text(job.done, plan.fingerprint(job))
 
 
+def _train_library(plan: Plan, job: Job, library: Library, log: Path, say: Say) -> None:
+    """Another library keeps no checkpoint to go on from: a run that was cut begins anew."""
+    if (job.path / DONE).exists():
+        return
+    if job.path.exists():
+        shutil.rmtree(job.path)
+    settings = tuple(plan.settings(job.arm, job.seed))
+    asked = LibraryArm(str(job.path), library, settings, job.arm.arguments)
+    say(f"{job.path.name}: training with {library}")
+    _command("restock.train.library_arm", [msgspec.json.encode(asked).decode()], log)
+
+
+def _train(plan: Plan, job: Job, log: Path, say: Say) -> None:
+    panel = plan.panel(job.arm)
+    checkpoint = job.path / "checkpoints" / "latest.safetensors"
+    if (job.path / "config.json").exists() and not checkpoint.exists():
+        shutil.rmtree(job.path)  # cut before its first checkpoint: nothing to go on from
+    if checkpoint.exists():
+        arguments = ["train", "--resume", str(job.path)]
+    else:
+        sets = [word for setting in plan.settings(job.arm, job.seed) for word in ("--set", setting)]
+        arguments = ["train", "--out", str(job.path), *sets]
+        arguments += ["--panel", str(panel)] if panel is not None else []
+    say(f"{job.path.name}: training")
+    _restock(arguments, log)
+
+
 def _restock(arguments: Sequence[str], log: Path) -> None:
     """One verb in a process of its own, its words in a log."""
+    _command("restock", arguments, log)
+
+
+def _command(module: str, arguments: Sequence[str], log: Path) -> None:
+    what = f"{module} {arguments[0]}" if module == "restock" else module
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("a", encoding="utf-8") as file:
-        file.write(f"$ restock {' '.join(arguments)}\n")
+        file.write(f"$ {module} {' '.join(arguments)}\n")
         file.flush()
         ended = subprocess.run(
-            [sys.executable, "-m", "restock", *arguments],
+            [sys.executable, "-m", module, *arguments],
             stdout=file,
             stderr=subprocess.STDOUT,
             stdin=subprocess.DEVNULL,
@@ -255,11 +311,10 @@ def _restock(arguments: Sequence[str], log: Path) -> None:
     if ended.returncode not in (0, 3):
         last = [line for line in log.read_text(encoding="utf-8").splitlines() if line.strip()][-3:]
         raise RestockError(
-            f"`restock {arguments[0]}` failed with exit code {ended.returncode}: "
-            + " / ".join(last),
+            f"`{what}` failed with exit code {ended.returncode}: " + " / ".join(last),
             where=str(log),
             remedy="mend it and run the study again: what is done is kept",
         )
 
 
-__all__ = ["ArmConfig", "Job", "Plan", "Study", "load_study", "run_study"]
+__all__ = ["ArmConfig", "Engine", "Job", "Plan", "Study", "load_study", "run_job", "run_study"]

@@ -39,6 +39,8 @@ def as_markdown(found: dict[str, Any]) -> str:
     ]
     for comparison in found["comparisons"]:
         lines += ["", f"## {comparison['arm']}", ""]
+        if found["treatment"] == "method":
+            lines += [_held(comparison), ""]
         if comparison["verdict"] != "comparable":
             why = ", ".join(comparison["refused"]) or ", ".join(
                 dict.fromkeys(
@@ -63,6 +65,20 @@ def as_markdown(found: dict[str, Any]) -> str:
                 f" [{low:+.2f}, {high:+.2f}]{apart} | {row['improvement']:.2f} |"
             )
     return "\n".join(lines) + "\n"
+
+
+def _held(comparison: dict[str, Any]) -> str:
+    """What a comparison of methods holds fixed, and what it does not."""
+    kinds = ("feed", "target", "algorithm")
+    differ = {
+        kind: [d["setting"] for d in comparison["differences"] if d["kind"] == kind]
+        for kind in kinds
+    }
+    words = {"feed": "replay", "target": "the target rule", "algorithm": "the algorithm"}
+    told = [f"{words[kind]} ({', '.join(names)})" for kind, names in differ.items() if names]
+    same = [words[kind] for kind in kinds[:2] if not differ[kind]]
+    fixed = ", ".join(["the environment and its conditions", "environment steps", *same])
+    return f"Held fixed: {fixed} and the evaluation. Not held: {'; '.join(told) or 'nothing'}."
 
 
 __all__ = ["as_markdown", "findings"]

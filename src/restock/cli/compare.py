@@ -20,7 +20,8 @@ class Compare:
     and `target` (the target rule) the arms must have been fed the same rows in the same mix,
     which an equivalence test over episodes decides, and been evaluated alike. Under `mixture` the
     feed is what is compared, and the store, the algorithm, the target rule, the evaluation and
-    the numbers of steps and updates must be the same.
+    the numbers of steps and updates must be the same. Under `method` all of how an arm learns may
+    differ (replay, target rule, updates); the twin, the environment steps and the evaluation not.
 
     Several seeds an arm show more: `restock compare runs/a1 runs/a2 --against runs/b1 runs/b2`
 
@@ -31,7 +32,7 @@ class Compare:
     """Two runs; or, with --against, all runs (seeds) of the first method."""
     against: tuple[Path, ...] = ()
     """The runs of the second method."""
-    treatment: Literal["algorithm", "target", "mixture"] = "algorithm"
+    treatment: Literal["algorithm", "target", "mixture", "method"] = "algorithm"
     """What is compared, and so may differ."""
     all_checks: bool = False
     """Show every check of the gate, not only the ones that decided."""
@@ -78,7 +79,8 @@ def _show(found: Comparison, all_checks: bool) -> None:
     checks = found.totals + found.checks
     shown = checks if all_checks else [c for c in checks if c.verdict != "comparable"]
     if shown:
-        judged = "" if found.treatment != "mixture" else " (the treatment: shown, not judged)"
+        feed = found.treatment in ("mixture", "method")
+        judged = " (the treatment: shown, not judged)" if feed else ""
         print_table([_check(check) for check in shown], title=f"what was fed{judged}")
     say(_sentence(found))
     if found.rows:
@@ -116,7 +118,10 @@ def _outcome(row: dict[str, Any]) -> dict[str, Any]:
 
 def _sentence(found: Comparison) -> str:
     if found.verdict == "comparable":
-        what = "settings, steps" if found.treatment == "mixture" else "settings, steps and feed"
+        what = {
+            "mixture": "settings, steps",
+            "method": "environment, environment steps and evaluation",
+        }.get(found.treatment, "settings, steps and feed")
         return f"COMPARABLE: {what} are the same within the limits, but for the {found.treatment}"
     if found.refused:
         names = ", ".join(difference.setting for difference in found.refused)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -28,6 +28,8 @@ class Study:
     """Where its panels, runs and logs go."""
     workers: int = 1
     """Runs at a time, each a process."""
+    engine: Literal["processes", "ray"] = "processes"
+    """`ray`: runs on a Ray cluster, RAY_ADDRESS's or one started here; needs `restock[ray]`."""
     dry_run: bool = False
     """Check the study and print what would be run; write nothing."""
     json: bool = False
@@ -60,7 +62,7 @@ class Study:
             else:
                 print_table(rows, title="what would be run")
             return 0
-        comparisons = run_study(plan, workers=self.workers, say=say)
+        comparisons = run_study(plan, workers=self.workers, engine=self.engine, say=say)
         found = findings(plan, comparisons)
         page = as_markdown(found)
         write_text(self.out / "study.md", page)
