@@ -260,7 +260,7 @@ def _fine(
     for iterations in (10, 15):
         scale = noise(mismatch.of([coordinates.perturbation(z)]))
         problem = Problem(mismatch, coordinates, scale)
-        z, value = solve(problem, z, iterations)
+        z, value, converged = solve(problem, z, iterations)
         say(f"least squares on {len(mismatch.segments)} segments: cost {value:.1f}")
     return Solution(
         coordinates=coordinates,
@@ -269,6 +269,7 @@ def _fine(
         jacobian=problem.jacobian(z[:, None], np.zeros(0)),
         segment=problem.segment,
         scale=scale,
+        converged=converged,
     )
 
 
@@ -353,6 +354,8 @@ def _warnings(solution: Solution, known: Uncertainty) -> list[str]:
                     f"{names[other]} and {name} are confounded: their correlation is"
                     f" {known.correlation[index, other]:.2f}"
                 )
+    if not solution.converged:
+        found.append("least squares had not converged: the intervals are too narrow")
     if known.condition > ILL_CONDITIONED:
         found.append(
             f"ill-conditioned: the information's condition number is {known.condition:.1e}"

@@ -20,6 +20,7 @@ from restock.train.mismatch import Mismatch
 F64 = NDArray[np.float64]
 
 ENOUGH = 0.02  # of the cost: what a parameter costs a fifth of its standard deviation away
+FREE = 0.01  # of the regulariser, where the Hessian's diagonal is about 1
 SOFT = 2.0  # noises from which on a residual counts by its size
 # Least noise of each channel: an exact simulator's residuals are those of the timestep.
 LEAST = {
@@ -66,6 +67,7 @@ class Solution:
     jacobian: F64  # (R, n)
     segment: NDArray[np.int64]  # (R,) of the residual
     scale: dict[str, float]  # noise of each channel, its correlation along the segment included
+    converged: bool
 
 
 class Problem:
@@ -110,14 +112,15 @@ def search(problem: Problem, points: int, best: int, seed: int) -> F64:
     return trial[np.argsort(value, kind="stable")[:best]]
 
 
-def solve(problem: Problem, start: F64, iterations: int) -> tuple[F64, float]:
-    """The least-squares solution (n,) from a start (n,), and its cost."""
+def solve(problem: Problem, start: F64, iterations: int) -> tuple[F64, float, bool]:
+    """The least-squares solution (n,) from a start (n,), its cost, and whether it converged."""
     size = len(problem.coordinates)
     steps: list[minimize.IterLog] = []
 
     def watch(trace: list[minimize.IterLog]) -> None:
         steps[:] = trace
-        if 0 < trace[-1].reduction < ENOUGH and len(trace) > 1:
+        free = trace[-1].regularizer <= FREE  # a held back step gains little anywhere
+        if free and 0 < trace[-1].reduction < ENOUGH and len(trace) > 1:
             raise _GoodEnough
 
     try:
@@ -138,7 +141,8 @@ def solve(problem: Problem, start: F64, iterations: int) -> tuple[F64, float]:
         )
     except _GoodEnough:
         found = steps[-1].candidate.reshape(start.shape)
-    return found, float(steps[-1].objective)
+        return found, float(steps[-1].objective), True
+    return found, float(steps[-1].objective), len(steps) <= iterations
 
 
 class _GoodEnough(Exception):
