@@ -27,6 +27,7 @@ def evaluated(
     task_hash: str = "t",
     perturbations: tuple[str, ...] = ("none", "friction"),
     shuffle: int = 0,
+    friction: float = 0.5,
 ) -> Path:
     """A run with an evaluation in which that share of each condition's episodes succeeded."""
     run = Run.create(path, {"config": {}, "panel": None, "task_hash": task_hash})
@@ -34,6 +35,9 @@ def evaluated(
         {
             "policy": policy,
             "perturbation": perturbation,
+            "perturbation_values": [("floor_friction", friction)]
+            if perturbation == "friction"
+            else None,
             "condition": condition,
             "block": ("partial" if index % 2 else "full")
             if condition == "blocked_aisle"
@@ -113,7 +117,14 @@ def test_pairing_tells_what_unpaired_shares_would_not(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "changes", [{"first_seed": 10_001}, {"episodes": 40}, {"perturbations": ("none",)}], ids=str
+    "changes",
+    [
+        {"first_seed": 10_001},
+        {"episodes": 40},
+        {"perturbations": ("none",)},
+        {"friction": 0.7},
+    ],
+    ids=str,
 )
 def test_other_episodes_are_refused(baseline: Path, tmp_path: Path, changes: dict) -> None:
     other = evaluated(tmp_path / "b", GOOD, **changes)

@@ -1,9 +1,10 @@
 -- Rows for judging a policy: those whose ids are in `asked`. What happens before and after a row
--- in its episode is of all its rows, asked for or not. The last row's `bumped` is not known.
+-- in its episode is of all its rows, asked for or not. A contact of the last row is not known, and
+-- one that the first row tells of was before the episode.
 WITH whole AS (
     SELECT *,
            coalesce(lead(bumped) OVER episode, false) AS bumps,
-           coalesce(bool_or(bumped) OVER episode_so_far, false) AS bumped_before
+           coalesce(bool_or(bumped AND step_index > 0) OVER episode_so_far, false) AS bumped_before
     FROM transitions
     WHERE episode_id IN (SELECT episode_id FROM transitions JOIN asked USING (transition_id))
     WINDOW episode AS (PARTITION BY episode_id ORDER BY step_index),

@@ -29,7 +29,8 @@ EVERY = "all"
 Verdict = Literal["better", "worse", "no difference shown", "refused"]
 _KEY = b"restock-baseline"
 _RESAMPLES = 2000
-_Episodes = dict[int, tuple[float, float]]  # seed -> success and return
+_Key = tuple[int, str]  # seed, and the values of the perturbation in force
+_Episodes = dict[_Key, tuple[float, float]]  # success and return
 
 
 @dataclass(frozen=True)
@@ -215,7 +216,8 @@ def _cells(table: pa.Table) -> dict[tuple[str, str], _Episodes]:
     for row in table.to_pylist():
         cell = row["perturbation"], cell_name(row["condition"], row["block"])
         result = float(row["success"]), float(row["return"])
-        cells.setdefault(cell, {})[int(row["episode_seed"])] = result
+        key = int(row["episode_seed"]), str(sorted(row["perturbation_values"] or ()))
+        cells.setdefault(cell, {})[key] = result
     return cells
 
 
