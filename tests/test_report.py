@@ -37,7 +37,7 @@ def filled(table: str, **values: object) -> dict[str, object]:
             row[field.name] = 0.5
         elif pa.types.is_integer(field.type):
             row[field.name] = 1
-        elif pa.types.is_list(field.type):
+        elif pa.types.is_list(field.type) or pa.types.is_map(field.type):
             row[field.name] = []
         else:
             row[field.name] = "x"
@@ -66,6 +66,15 @@ def run(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
             for n in steps
             for source in ("logs", "fresh")
             for name, rows in (("nominal", 90), (HOSTILE, 10))
+        ],
+    )
+    judged = {"fqe": {"refused": None}, "wdr": {"value": None, "refused": HOSTILE}}
+    made.append(
+        "off_policy",
+        [
+            filled("off_policy", condition=condition, estimator=name, **values)
+            for condition in ("all", "nominal")
+            for name, values in judged.items()
         ],
     )
     made.append("ages", [filled("ages", source="logs", unit="days", bucket=b) for b in (-1, 0, 3)])
@@ -126,6 +135,10 @@ def test_the_replay_card_answers_every_question(run: Path, capsys) -> None:
     assert card["ages"][0]["p50"] == "below 2"
     assert {row["stratum"] for row in card["strata"]} == {"nominal", HOSTILE}
     assert card["behaviour_policies"][0]["behaviour_policy"] == "planner"
+    assert [(row["estimator"], row["value"]) for row in card["off_policy"]] == [
+        ("fqe", 0.5),
+        ("wdr", None),
+    ]
     assert "flatters most" in card["imbalance"]
     assert json.loads((run / "replay_card.json").read_text()) == card
 

@@ -69,6 +69,16 @@ def replay_card(facts: Facts) -> dict[str, Any]:
             )
             / 2,
         },
+        "off_policy": [
+            {
+                name: row[name]
+                for name in (
+                    *("measure", "estimator", "value", "low", "high", "refused", "episodes"),
+                    *("ess", "horizon", "epsilon", "estimated_share"),
+                )
+            }
+            for row in facts.judged
+        ],
         "left_out": dict(panel.header.left_out) if panel is not None else None,
         "imbalance": flattery(facts) or None,
         "missing": list(facts.missing),
@@ -126,9 +136,24 @@ def as_markdown(card: dict[str, Any]) -> str:
         card["behaviour_policies"],
         {"source": "source", "behaviour_policy": "policy", "rows": "rows", "share": "share"},
     )
+    if card["off_policy"]:
+        lines += ["", "## Judged on held-out logs, before it drove", ""]
+        lines += _table(
+            [{**row, "value": _estimate(row)} for row in card["off_policy"]],
+            {"measure": "measure", "estimator": "estimator", "value": "value [95 %]"},
+        )
     if card["missing"]:
         lines += ["", "## Not known", "", *(f"- {_cell(line)}" for line in card["missing"])]
     return "\n".join(lines) + "\n"
+
+
+def _estimate(row: dict[str, Any]) -> str:
+    """A value with its interval, or why there is none."""
+    if row["value"] is None:
+        return f"refused: {row['refused']}"
+    if row["low"] is None:
+        return f"{row['value']:.2f}"
+    return f"{row['value']:.2f} [{row['low']:.2f}, {row['high']:.2f}]"
 
 
 def _panel(capacity: dict[str, Any]) -> str:
