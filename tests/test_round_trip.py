@@ -65,6 +65,10 @@ ROUGH = Schedule(
         gyro_noise_radps=0.02,
         gyro_bias_radps=0.03,
         accel_noise_mps2=0.2,
+        accel_bias_mps2=0.1,
+        encoder_bias_radps=0.05,
+        lidar_period_s=0.4,
+        localisation_period_s=0.4,
     ),
 )
 SINGLE = 2e-6  # what single precision leaves of poses on this floor
@@ -226,6 +230,13 @@ def test_who_drove_and_what_was_true_come_through(trip: Trip) -> None:
     truth = [name for drive in drives for name in drive.true_condition]
     assert trip.rows["true_condition"].to_pylist() == truth
     assert len(set(truth)) > 2
+    parameters = [_parameters(driven.mission) for driven in trip.driven]
+    assert trip.rows["perturbation"].to_pylist() == [
+        item.name for item, steps in zip(parameters, trip.steps, strict=True) for _ in range(steps)
+    ]
+    firsts = np.cumsum([0, *trip.steps[:-1]])
+    for first, item in zip(firsts.tolist(), parameters, strict=True):
+        assert dict(trip.rows["perturbation_values"][first].as_py()) == item.changed()
     if trip.case.policy == HANDOVER:
         assert len({name for name, _, _ in who}) > 1  # the operator took over somewhere
     else:

@@ -55,7 +55,7 @@ class Drive:
     motion: Motion
     tick_s: F64  # (T + 1,) from the start of the mission
     signals: Columns  # each (T + 1, …): what the policy saw
-    scan_s: F64  # (K,) when the lidar scanned; every tick is among them
+    scan_s: F64  # (K,) when the lidar scanned; the first tick is among them
     ranges_m: F64  # (K, B) as measured; inf where nothing came back
     command: F64  # (T, 2) speed_mps, yaw_rate_radps
     true_condition: list[str]  # T

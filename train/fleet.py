@@ -174,7 +174,7 @@ class Fleet:
     def _note_step(self, log: _Log, robot: int, info: Mapping[str, Any]) -> None:
         """What came of the action."""
         log.motion.extend(self._motion)
-        if self._scan is not None:
+        if self._scan is not None and not self._hardware(log).lidar_period_s:
             log.scan_s.append(round((len(log.action) - 1) * self.period_s + BLOCK_S, 6))
             log.ranges_m.append(self._measured(log, self._scan[robot]))
         self._note_tick(log, robot, info["signals"])
@@ -184,8 +184,10 @@ class Fleet:
         env, tick = self.env, len(log.action)
         log.signals.append({name: column[robot] for name, column in signals.items()})
         log.observation.append(env.observation[robot].copy())
-        log.scan_s.append(round(tick * self.period_s, 6))
-        log.ranges_m.append(env.sensing.ranges_m[robot].copy())
+        every = max(round(self._hardware(log).lidar_period_s / self.period_s), 1)
+        if tick % every == 0:  # else the robot goes on with the scan before
+            log.scan_s.append(round(tick * self.period_s, 6))
+            log.ranges_m.append(env.sensing.ranges_m[robot].copy())
         traffic = env.simulation.traffic
         log.traffic.append(np.column_stack([traffic.position_m[robot], traffic.heading_rad[robot]]))
         number = int(env.navigation.plan_number[robot])
@@ -193,9 +195,12 @@ class Fleet:
             log.plans.append((tick, env.navigation.plans_m[robot].copy()))
             log.plan_number = number
 
+    def _hardware(self, log: _Log) -> Perturbation:
+        return log.mission.spec.perturbation or self.env.perturbation
+
     def _measured(self, log: _Log, true_ranges_m: F64) -> F64:
         """A scan between ticks: the same noise and dropout, drawn anew."""
-        hardware = log.mission.spec.perturbation or self.env.perturbation
+        hardware = self._hardware(log)
         ranges = true_ranges_m + log.rng.normal(0, hardware.lidar_noise_m, len(true_ranges_m))
         lost = log.rng.random(len(ranges)) < hardware.lidar_dropout
         return np.where(lost, np.inf, np.maximum(ranges, 0.0))
@@ -206,7 +211,7 @@ class Fleet:
         env = self.env
         goal = env.navigation.goals_m[robot]
         names = log.signals[0].keys()
-        hardware = log.mission.spec.perturbation or env.perturbation
+        hardware = self._hardware(log)
         action = np.array(log.action, np.int64)
         drive = Drive(
             goal_m=(float(goal[0]), float(goal[1])),

@@ -158,6 +158,7 @@ class Robot:
         times, tick = self._sample(drive, self.rates.odom)
         rate = drive.motion.at(drive.motion.wheel_rate_radps, times)
         rate += self.rng.normal(0, drive.encoder_noise_radps, rate.shape)
+        rate += drive.scene.perturbation.encoder_bias_radps
         speed = rate.mean(axis=1) * self.wheel_radius_m
         turn = (rate[:, 1] - rate[:, 0]) * (self.wheel_radius_m / self.track_m)
         speed = _at_ticks(speed, tick, drive.signals["wheel_speed_mps"])
@@ -174,6 +175,7 @@ class Robot:
         gyro += self.rng.normal(0, drive.gyro_noise_radps, len(times))
         accel = drive.motion.at(drive.motion.accel_mps2, times)
         accel += self.rng.normal(0, drive.accel_noise_mps2, accel.shape)
+        accel[:, 0] += drive.scene.perturbation.accel_bias_mps2
         gyro = _at_ticks(gyro, tick, drive.signals["gyro_yaw_rate_radps"])
         ahead = _at_ticks(accel[:, 0], tick, drive.signals["accel_x_mps2"])
         data = topics.imu(
@@ -208,6 +210,10 @@ class Robot:
     def _localisation(self, drive: Drive, reckoned: F64) -> list[Message]:
         """/amcl_pose, and /tf with it: the localiser corrects `odom` within `map`."""
         times, tick = self._sample(drive, self.rates.amcl_pose)
+        age_s = (drive.signals["stamp_ns"] - drive.signals["pose_stamp_ns"]) * 1e-9
+        if drive.scene.perturbation.localisation_period_s:  # slow: nothing new at other times
+            fresh = (tick >= 0) & (age_s[tick] == 0)
+            times, tick = times[fresh], tick[fresh]
         seen = np.stack(
             [drive.signals[f"pose_{name}"] for name in ("x_m", "y_m", "yaw_rad")], axis=-1
         )
@@ -216,7 +222,6 @@ class Robot:
         between = drive.motion.at(drive.motion.pose, times)
         between += np.stack([np.interp(times, drive.tick_s, e) for e in error.T], axis=-1)
         x, y, yaw = _at_ticks(between, tick, seen).T
-        age_s = (drive.signals["stamp_ns"] - drive.signals["pose_stamp_ns"]) * 1e-9
         measured_s = times - _at_ticks(np.zeros(len(times)), tick, age_s)
         data = topics.localised_poses(
             self._stamps(measured_s), _f32(x), _f32(y), _f32(wrap_angle(yaw))

@@ -28,13 +28,7 @@ from restock.train.fleet import Fleet
 from restock.train.layout import DEFAULT, Warehouse
 from restock.train.missions import NATURAL, schedule
 from restock.train.model import TRACK_M, WHEEL_RADIUS_M
-from restock.train.perturbation import (
-    PERTURBATIONS,
-    Perturbation,
-    Schedule,
-    load_perturbation,
-    load_schedule,
-)
+from restock.train.perturbation import Perturbation, Schedule
 from restock.train.publish import Rates, Robot
 from restock.train.robot_topics import TOPICS
 from restock.train.simulation import LIDAR_BEAMS
@@ -221,25 +215,6 @@ def load_policy(plan: Plan) -> Guest | None:
 
 def _guest(plan: Plan, policy: Chooser) -> Guest:
     return Guest(policy, epsilon=plan.epsilon or 0.0, seed=plan.seed)
-
-
-def find_perturbation(name: str) -> Perturbation | Schedule:
-    """A ready-made perturbation by its name, or the perturbation or schedule of a TOML file.
-
-    Raises:
-        ConfigError: there is no such one, or the file holds no perturbation.
-    """
-    if name in PERTURBATIONS:
-        return PERTURBATIONS[name]
-    path = Path(name)
-    if path.suffix != ".toml":
-        raise ConfigError(
-            f"there is no perturbation {name!r}",
-            where="--perturbation",
-            remedy=f"give {', '.join(PERTURBATIONS)}, or a file that ends in .toml",
-        )
-    drawn = path.is_file() and "[ranges]" in path.read_text(encoding="utf-8", errors="replace")
-    return load_schedule(path) if drawn else load_perturbation(path)
 
 
 def parse_rates(text: str) -> Rates:

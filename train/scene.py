@@ -15,7 +15,6 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -79,10 +78,7 @@ EMPTY = Scene(
 
 def perturbation_text(perturbation: Perturbation) -> str:
     """`{"name", "values"}`: the fields that differ from the nominal twin's."""
-    nominal, found = Perturbation(), msgspec.to_builtins(perturbation)
-    name = found.pop("name")
-    values = {field: value for field, value in found.items() if value != getattr(nominal, field)}
-    return json.dumps({"name": name, "values": values})
+    return json.dumps({"name": perturbation.name, "values": perturbation.changed()})
 
 
 def mission_markers(stamp_ns: int, scene: Scene, goal_m: tuple[float, float]) -> bytes:

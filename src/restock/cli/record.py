@@ -65,11 +65,11 @@ class Record:
         from restock.train.bag_writer import refuse_existing
         from restock.train.floors import open_floors
         from restock.train.missions import NATURAL, parse_shares
+        from restock.train.perturbation import find_perturbation
         from restock.train.recorder import (
             HARDWARE,
             NOISELESS,
             Plan,
-            find_perturbation,
             load_policy,
             parse_rates,
             record,
@@ -91,7 +91,9 @@ class Record:
             layouts=self.layouts,
             rates=parse_rates(self.rates or ""),
             hardware=(
-                hardware if self.perturbation is None else find_perturbation(self.perturbation)
+                hardware
+                if self.perturbation is None
+                else find_perturbation(self.perturbation, where="--perturbation")
             ),
         )
         load_policy(plan)  # what is wrong with it is said before anything is driven
