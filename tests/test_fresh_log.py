@@ -24,6 +24,7 @@ from restock.train import checkpoint
 from restock.train.collector import Collector, ring_conditions
 from restock.train.fresh_log import FreshLog, episode_files
 from restock.train.fresh_rows import flush
+from restock.train.perturbation import Schedule
 from restock.train.vector_env import WarehouseVectorEnv
 
 ENVS, LONGEST = 3, 25
@@ -41,7 +42,8 @@ class Collecting:
         shipped = load_profile("warehouse_amr")
         task = msgspec.structs.replace(shipped.task, time_limit_steps=LONGEST)
         self.profile: Profile = msgspec.structs.replace(shipped, task=task)
-        self.env = WarehouseVectorEnv(ENVS, seed=1, task=task)
+        drawn = Schedule(ranges={"payload_kg": (10.0, 60.0)}, name="laden")
+        self.env = WarehouseVectorEnv(ENVS, seed=1, task=task, perturbation=drawn)
         self.ring = FreshRing(
             500,
             ENVS,
@@ -110,6 +112,10 @@ def test_a_flushed_run_is_a_recording_like_any_other(
         assert row["behaviour_policy"] == "dqn"
         began = ring.meta["policy_version"][slot] - row["step_index"]
         assert row["behaviour_version"] == f"run@{began}"
+    assert {row["perturbation"] for row in rows} == {"laden"}
+    payloads = {row["episode_index"]: dict(row["perturbation_values"]) for row in rows}
+    assert {tuple(values) for values in payloads.values()} == {("payload_kg",)}
+    assert len({values["payload_kg"] for values in payloads.values()}) == 2 * ENVS
     last = [row for row in rows if row["truncated"] or row["terminated"]]
     assert [row["step_index"] for row in last] == [LONGEST - 1] * 2 * ENVS
     stamps = np.array([row["stamp_ns"] for row in rows])

@@ -298,6 +298,8 @@ def test_audit_rows_hold_what_the_row_was(undisturbed: Session) -> None:
         else:
             assert row["behaviour_policy"] == "dqn"
             assert row["age_env_steps"] >= 0
+            assert row["perturbation"] == "worn"
+            assert dict(row["perturbation_values"]) == {"gain": 0.9}
             assert row["age_gradient_steps"] >= 0
             assert row["ring_slot"] is not None
 

@@ -118,7 +118,8 @@ class ToyTwin:
             "episode_number": self.number.copy(),
             "block": np.array(["none"] * self.num_envs, object),
             "episode_seed": np.array([s.seed for s in self._specs]),
-            "perturbation": np.array(["nominal"] * self.num_envs, object),
+            "perturbation": np.array(["worn"] * self.num_envs, object),
+            "perturbation_values": np.array(['{"gain": 0.9}'] * self.num_envs, object),
             "episode_condition": np.array([s.condition for s in self._specs], object),
             "final_obs": np.array([None] * self.num_envs, object),
         }
