@@ -17,20 +17,17 @@ from numpy.typing import NDArray
 
 from restock.errors import ConfigError, StoreError
 from restock.replay.store import Store
-from restock.train.clustered import NOT_KNOWN, Estimate, quantiles, ratio
+from restock.train.clustered import NOT_KNOWN, Estimate
+from restock.train.gap_rows import Rows, estimate, observation_rows, path_rows, reward_rows
 from restock.train.layout import Warehouse, default_warehouse
 from restock.train.logged_steps import NOMINAL, LoggedSteps, logged_steps
 from restock.train.one_step import AGREES, OneStep, agreement, one_step
-from restock.train.path_gap import QUANTITIES, PathGap, measured_noise, path_gap
+from restock.train.path_gap import PathGap, measured_noise, path_gap
 from restock.train.perturbation import Perturbation
 from restock.train.plan_memory import PlanMemory, rebuild_plans
 from restock.train.trust import UNTRUSTED, Limits, Verdict, judge
 
-Rows = list[dict[str, Any]]
-F64 = NDArray[np.float64]
-
 BEFORE, AFTER = "nominal", "calibrated"
-PERSISTENCE = "persistence"
 HORIZONS_S = (1.0, 3.0, 6.0)
 _LOOKED_AT = 200  # nominal rows whose lidar says whether the floor is the twin's
 
@@ -135,9 +132,9 @@ def measure_gap(
         warehouse=None if differs > AGREES else warehouse,
         timestep_s=plan.timestep_s, nthread=plan.nthread,
     )  # fmt: skip
-    path_rows = _path_rows(paths, rng)
-    observation_rows = _observation_rows(steps, stepped, chosen, rng)
-    reward_rows, ratios = _reward_rows(steps, stepped, chosen, rng)
+    moved = path_rows(paths, rng)
+    observed = observation_rows(steps, stepped, chosen, rng)
+    earned, ratios = reward_rows(steps, stepped, chosen, rng)
     about = {
         "store": str(store.path),
         "store_version": store.version,
@@ -155,9 +152,9 @@ def measure_gap(
         "steps_left_out": int((~steps.followed).sum()),
         "plan_error_m": plans.error_m,
     }
-    verdicts = _verdicts(steps, plan.limits, best, paths, path_rows, reward_rows, ratios)
+    verdicts = _verdicts(steps, plan.limits, best, moved, earned, ratios)
     said = _not_done(steps, twins, stepped, plans, differs, noise.drift_m, calibrated, paths)
-    return Gap(about, path_rows, observation_rows, reward_rows, verdicts, (*said, *notes))
+    return Gap(about, moved, observed, earned, verdicts, (*said, *notes))
 
 
 def _floor_differs(
@@ -183,126 +180,30 @@ def _steps_to_compare(
     return rows, {name: mask[rows] for name, mask in masks.items()}
 
 
-def _path_rows(paths: list[PathGap], rng: np.random.Generator) -> Rows:
-    found = []
-    for path in paths:
-        for condition, mask in path.holds.items():
-            for source, gaps in path.gaps.items():
-                for quantity, values in gaps.items():
-                    known = mask & np.isfinite(values)
-                    episode = path.episode_id[known]
-                    median, p90 = quantiles(values[known], episode, (0.5, 0.9), rng=rng)
-                    found.append(
-                        {
-                            "condition": condition,
-                            "horizon_s": path.horizon_s,
-                            "quantity": quantity,
-                            "unit": QUANTITIES[quantity],
-                            "source": source,
-                            "segments": int(known.sum()),
-                            "episodes": len(np.unique(episode)),
-                            **_spread_out("median", median),
-                            **_spread_out("p90", p90),
-                        }
-                    )
-    return found
-
-
-def _observation_rows(
-    steps: LoggedSteps,
-    stepped: OneStep,
-    chosen: Mapping[str, NDArray[np.bool_]],
-    rng: np.random.Generator,
-) -> Rows:
-    """Mean absolute gap of every component that the twin could get wrong."""
-    seen = {name: side.observation for name, side in stepped.twins.items()}
-    seen |= {PERSISTENCE: stepped.now}
-    found = []
-    for column, component in enumerate(steps.task.observation_names):
-        if component.startswith("previous_action_"):  # the action that was applied
-            continue
-        if component.startswith(("clearance_", "closing_")) and not stepped.lidar:
-            continue
-        if component.startswith(("near_", "far_", "goal_")) and steps.task.goal != "route":
-            continue
-        for condition, mask in chosen.items():
-            rows = mask & stepped.valid
-            episode = steps.episode_id[stepped.rows[rows]]
-            for source, values in seen.items():
-                off = np.abs(values[rows, column] - stepped.logged.observation[rows, column])
-                mean = ratio(off, np.ones(len(off)), episode, rng=rng)
-                found.append(
-                    {
-                        "condition": condition,
-                        "component": component,
-                        "source": source,
-                        "steps": int(rows.sum()),
-                        **_spread_out("mean_gap", mean),
-                    }
-                )
-    return found
-
-
-def _reward_rows(
-    steps: LoggedSteps,
-    stepped: OneStep,
-    chosen: Mapping[str, NDArray[np.bool_]],
-    rng: np.random.Generator,
-) -> tuple[Rows, dict[tuple[str, str], Estimate]]:
-    """Gaps by term, and by (condition, source) the whole gap over the reward's own spread."""
-    found, ratios = [], {}
-    for condition, mask in chosen.items():
-        rows = mask & stepped.valid
-        episode = steps.episode_id[stepped.rows[rows]]
-        logged = {"reward": stepped.logged.reward, **stepped.logged.terms}
-        for source, side in stepped.twins.items():
-            for term, values in {"reward": side.reward, **side.terms}.items():
-                off = values[rows] - logged[term][rows]
-                there = logged[term][rows]
-                spread = np.abs(there - np.median(there)) if len(there) else there
-                mean = ratio(np.abs(off), np.ones(len(off)), episode, rng=rng)
-                if term == "reward":
-                    ratios[condition, source] = ratio(np.abs(off), spread, episode, rng=rng)
-                found.append(
-                    {
-                        "condition": condition,
-                        "term": term,
-                        "source": source,
-                        "steps": int(rows.sum()),
-                        **_spread_out("mean_gap", mean),
-                        "bias": float(off.mean()) if len(off) else None,
-                        "logged_mean": float(there.mean()) if len(there) else None,
-                        "logged_spread": float(spread.mean()) if len(spread) else None,
-                    }
-                )
-    return found, ratios
-
-
 def _verdicts(
     steps: LoggedSteps,
     limits: Limits,
     best: str,
-    paths: list[PathGap],
-    path_rows: Rows,
-    reward_rows: Rows,
+    moved: Rows,
+    earned: Rows,
     ratios: Mapping[tuple[str, str], Estimate],
 ) -> tuple[Verdict, ...]:
     at = {
         row["condition"]: row
-        for row in path_rows
+        for row in moved
         if (row["horizon_s"], row["quantity"], row["source"])
         == (limits.horizon_s, "position", best)
     }
     worth = {
         row["condition"]: row["mean_gap"]
-        for row in reward_rows
+        for row in earned
         if (row["term"], row["source"]) == ("reward", best)
     }
     verdicts = []
     for condition in steps.conditions:
         row = at.get(condition)
         gap = worth.get(condition)
-        p90 = NOT_KNOWN if row is None else _estimate(row, "p90")
+        p90 = NOT_KNOWN if row is None else estimate(row, "p90")
         verdicts.append(
             judge(
                 condition,
@@ -365,14 +266,3 @@ def _not_done(
         " the floor alone, dry."
     )
     return tuple(said)
-
-
-def _spread_out(name: str, found: Estimate) -> dict[str, float | None]:
-    """An estimate as values of a row; NaN as None."""
-    values = {name: found.value, f"{name}_low": found.low, f"{name}_high": found.high}
-    return {key: None if np.isnan(value) else value for key, value in values.items()}
-
-
-def _estimate(row: Mapping[str, Any], name: str) -> Estimate:
-    values = (row[name], row[f"{name}_low"], row[f"{name}_high"])
-    return Estimate(*(float("nan") if value is None else float(value) for value in values))
