@@ -140,7 +140,8 @@ class Warehouse:
                 remedy="join racks that touch, or cut the floor",
             )
         areas = [("rack", rack) for rack in self.racks]
-        areas += [(item.name, item.area) for item in (*self.segments, *self.docks)]
+        areas += [(segment.name, segment.area) for segment in self.segments]
+        areas += [(dock.name, dock.area) for dock in self.docks]
         areas += [("one-way part", rule.area) for rule in self.one_way]
         areas += self.cross_zones
         for what, box in areas:

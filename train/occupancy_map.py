@@ -192,7 +192,8 @@ def _racks(free: Cells, cell_m: float, where: str) -> tuple[Cells, float, tuple[
             return free, cell_m, racks
         padded = np.pad(free, [(0, size % 2) for size in free.shape])
         pairs = padded.reshape(padded.shape[0] // 2, 2, padded.shape[1] // 2, 2)
-        free, cell_m = pairs.all(axis=(1, 3)), cell_m * 2
+        free = np.asarray(pairs.all(axis=(1, 3)), np.bool_)
+        cell_m *= 2
     raise ConfigError(
         f"its obstacles take more than {MAX_RACKS} boxes, even at {cell_m / 2:g} m a cell",
         where=where,

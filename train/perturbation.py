@@ -165,9 +165,10 @@ def find_perturbation(asked: str | Mapping[str, Any], *, where: str) -> Perturba
 
 
 def _convert(table: Mapping[str, Any], where: str) -> Perturbation | Schedule:
-    kind = Schedule if "ranges" in table else Perturbation
     try:
-        return msgspec.convert(table, kind)
+        if "ranges" in table:
+            return msgspec.convert(table, Schedule)
+        return msgspec.convert(table, Perturbation)
     except msgspec.ValidationError as error:
         raise ConfigError(str(error), where=where, remedy=_FIELDS) from error
 

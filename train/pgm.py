@@ -61,7 +61,8 @@ def read_pgm(path: Path) -> NDArray[np.float64]:
         raise ConfigError(f"is cut short: {len(values):,} of {count:,} pixels", where=str(path))
     if values.max() > largest or values.min() < 0:
         raise ConfigError(f"has a pixel outside 0 to {largest}", where=str(path))
-    return (values / largest).reshape(height, width)
+    shares: NDArray[np.float64] = values.astype(np.float64) / largest
+    return shares.reshape(height, width)
 
 
 def _number(data: bytes, place: int, name: str, path: Path) -> tuple[int, int]:

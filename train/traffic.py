@@ -190,7 +190,9 @@ class Traffic:
         hit = touched[ids, None] & (gap < 0.2) & ((state == WALKING) | (state == RETREATING))
         self.attentive[ids] |= hit  # having been touched, one looks out
         state = np.where((hit & toward) | (waited > WAIT_S), RETREATING, state)
-        state = np.where((state == RETREATING) & ((gap > RETREAT_M) | (hit & ~toward)), WALKING, state)
+        state = np.where(
+            (state == RETREATING) & ((gap > RETREAT_M) | (hit & ~toward)), WALKING, state
+        )
         pace = np.where(state == RETREATING, -0.6, np.where((state == WALKING) & ~held, 1.0, 0.0))
         travelled = self.travelled_m[ids] + pace * self.speed_mps[ids] * elapsed_s
         # Who is back at the start or at the end of the way leaves the floor, out of sight.
