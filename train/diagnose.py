@@ -142,7 +142,7 @@ def diagnose(runs: Sequence[Run], limits: Limits = Limits()) -> Diagnosis:
     last = [found[-1] for found, own in zip(windows, causes, strict=True) if own == cause]
     last = last or [found[-1] for found in windows]
     return Diagnosis(
-        cause, causes, windows, _evidence(last, limits), _experiment(cause, last, limits)
+        cause, causes, windows, _evidence(last[0], limits), _experiment(cause, last, limits)
     )
 
 
@@ -215,17 +215,15 @@ def _value_bound(run: Run) -> float:
     return largest / (1 - discount) if largest > 0 else float("inf")
 
 
-def _evidence(windows: Sequence[Window], limits: Limits) -> list[str]:
-    """What the last windows show, for people."""
-    said = []
-    for window in windows[:1]:
-        said.append(
-            f"after {window.gradient_steps:,} updates: median G {window.gap_median:.2f},"
-            f" L {window.lag:.3f}, S {window.clock:.2f},"
-            f" max |Q| {window.q_abs_max:.3g} of at most {window.q_bound:.3g}"
-        )
-        for condition, found in window.bad(limits).items():
-            said += [f"{condition}: {what}" for what in found]
+def _evidence(window: Window, limits: Limits) -> list[str]:
+    """What a window shows, for people."""
+    said = [
+        f"after {window.gradient_steps:,} updates: median G {window.gap_median:.2f},"
+        f" L {window.lag:.3f}, S {window.clock:.2f},"
+        f" max |Q| {window.q_abs_max:.3g} of at most {window.q_bound:.3g}"
+    ]
+    for condition, found in window.bad(limits).items():
+        said += [f"{condition}: {what}" for what in found]
     return said
 
 
