@@ -41,7 +41,7 @@ def test_a_study_runs_every_arm_once_and_ends_in_a_comparison(tmp_path: Path, ca
     assert main(argv) == 1
     found = json.loads(capsys.readouterr().out)
     (comparison,) = found["comparisons"]
-    assert (comparison["arm"], found["baseline"]) == ("dueling", "plain")
+    assert (comparison["arm"], comparison["baseline"]) == ("dueling", "plain")
     assert comparison["verdict"] in ("inconclusive", "incomparable")
     assert [d["setting"] for d in comparison["differences"]] == ["config.network.dueling"]
     assert "Not compared" in (out / "study.md").read_text()
@@ -78,6 +78,51 @@ def test_the_plan_is_shown_before_anything_is_run(tmp_path: Path, capsys) -> Non
     assert not (tmp_path / "o").exists()
 
 
+def test_an_arm_may_have_a_baseline_and_a_treatment_of_its_own(tmp_path: Path, capsys) -> None:
+    # coverage against uniform as mixtures; the same mixture with a margin, as an algorithm.
+    (tmp_path / "s.toml").write_text("""
+treatment = "mixture"
+baseline = "uniform"
+seeds = [0]
+[[arms]]
+name = "margin"
+treatment = "algorithm"
+baseline = "coverage"
+[[arms]]
+name = "uniform"
+[[arms]]
+name = "coverage"
+[[arms]]
+name = "method"
+treatment = "method"
+""")
+    argv = ["study", str(tmp_path / "s.toml"), "--out", str(tmp_path / "o"), "--dry-run", "--json"]
+    assert main(argv) == 0
+    assert [row["against"] for row in json.loads(capsys.readouterr().out)] == [
+        *("coverage (algorithm)", None),
+        *("uniform (mixture)", "uniform (method)"),
+    ]
+
+
+@pytest.mark.slow
+def test_each_comparison_is_judged_by_its_own_treatment(tmp_path: Path, capsys) -> None:
+    arm = '\n[[arms]]\nname = "again"\nbaseline = "dueling"\ntreatment = "method"'
+    text = SMALL.replace('treatment = "algorithm"', 'treatment = "target"') + arm
+    (tmp_path / "s.toml").write_text(text)
+    out = tmp_path / "out"
+    assert main(["study", str(tmp_path / "s.toml"), "--out", str(out), "--json"]) == 1
+    dueling, again = json.loads(capsys.readouterr().out)["comparisons"]
+    assert (dueling["baseline"], dueling["treatment"]) == ("plain", "target")
+    assert (dueling["verdict"], dueling["refused"]) == (
+        "incomparable",
+        ["config.network.dueling"],
+    )
+    assert (again["baseline"], again["verdict"]) == ("dueling", "comparable")
+    page = (out / "study.md").read_text()
+    assert 'they differ in config.network.dueling, which treatment = "target"' in page
+    assert "## again against dueling" in page
+
+
 def test_panels_of_mixtures_are_the_studys_own(tmp_path: Path) -> None:
     arms = '[[arms]]\nname = "a"\nmixture = "uniform"\n[[arms]]\nname = "b"\npanel = "p"\n'
     (tmp_path / "s.toml").write_text(f'store = "../s"\n{arms}')
@@ -96,6 +141,16 @@ def test_panels_of_mixtures_are_the_studys_own(tmp_path: Path) -> None:
         ('[[arms]]\nname = "../a"\n[[arms]]\nname = "b"', "must be letters"),
         ('[[arms]]\nname = "a"\nmixture = "u"\n[[arms]]\nname = "b"', "and the study no store"),
         ('baseline = "c"\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "is none of the arms"),
+        (
+            '[[arms]]\nname = "a"\n[[arms]]\nname = "b"\nbaseline = "c"',
+            "'c' is none of the arms",
+        ),
+        ('[[arms]]\nname = "a"\n[[arms]]\nname = "b"\nbaseline = "b"', "'b' is its own baseline"),
+        (
+            '[[arms]]\nname = "a"\ntreatment = "method"\n[[arms]]\nname = "b"',
+            "'a' is the study's baseline, and is compared with no other",
+        ),
+        ('[[arms]]\nname = "a"\n[[arms]]\nname = "b"\ntreatment = "luck"', "Invalid enum value"),
         ('seeds = [1, 1]\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "each once"),
         ('[settings]\nseed = 3\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "must not set seed"),
         ('worker = 2\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "unknown field `worker`"),

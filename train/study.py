@@ -1,35 +1,19 @@
-"""A study: arms x seeds, each a run of its own, ending in one comparison through the gate.
-
-A study is a TOML file and a directory. What is there already is not done again: a panel that was
-built, a run that has ended, an evaluation that was driven. So a study that was interrupted, or got
-another seed or arm, goes on where it was.
-"""
+"""A study as its TOML file asks for it: arms x seeds, and what each arm is compared with."""
 
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import subprocess
-import sys
 import tomllib
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 
-from restock.errors import ConfigError, RestockError, RunError
+from restock.errors import ConfigError
 from restock.train.arms import Treatment
-from restock.train.compare import Comparison, compare
 from restock.train.config import as_overrides
-from restock.train.library_arm import DONE, Library, LibraryArm, check_installed, resolve
-from restock.train.run import write_text
-
-Say = Callable[[str], None]
-Engine = Literal["processes", "ray"]
+from restock.train.library_arm import Library
 
 
 class ArmConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -41,6 +25,8 @@ class ArmConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     settings: dict[str, Any] = msgspec.field(default_factory=dict)  # of `restock train --set`
     library: Library | None = None  # whose algorithm learns, in the same twin; None: Restock's
     arguments: dict[str, Any] = msgspec.field(default_factory=dict)  # that algorithm's own
+    treatment: Treatment | None = None  # of its comparison; None: the study's
+    baseline: str | None = None  # the arm it is compared with; None: the study's
 
     def __post_init__(self) -> None:
         if not self.name or not all(c.isalnum() or c in "._-" for c in self.name):
@@ -59,6 +45,15 @@ class StudyEvaluation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     seed: int = 10_000
 
 
+@dataclass(frozen=True)
+class Pair:
+    """One comparison of a study."""
+
+    arm: ArmConfig
+    baseline: ArmConfig
+    treatment: Treatment
+
+
 class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The whole file."""
 
@@ -66,8 +61,8 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     doc: str = ""
     store: str | None = None  # that mixtures are of
     seeds: tuple[int, ...] = (0, 1, 2)
-    treatment: Treatment = "mixture"
-    baseline: str | None = None  # the arm the others are compared with; None: the first
+    treatment: Treatment = "mixture"  # where an arm names none
+    baseline: str | None = None  # where an arm names none; None: the first arm
     settings: dict[str, Any] = msgspec.field(default_factory=dict)  # of every arm
     evaluation: StudyEvaluation = StudyEvaluation()
 
@@ -75,8 +70,17 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         names = [arm.name for arm in self.arms]
         if len(names) < 2 or len(set(names)) != len(names):
             raise ValueError(f"arms must be two or more, each with its own name, got {names}")
-        if self.baseline is not None and self.baseline not in names:
-            raise ValueError(f"baseline {self.baseline!r} is none of the arms {names}")
+        for baseline in (self.baseline, *(arm.baseline for arm in self.arms)):
+            if baseline is not None and baseline not in names:
+                raise ValueError(f"baseline {baseline!r} is none of the arms {names}")
+        for arm in self.arms:
+            if arm.baseline == arm.name:
+                raise ValueError(f"arm {arm.name!r} is its own baseline")
+        if self.base.treatment is not None or self.base.baseline is not None:
+            raise ValueError(
+                f"arm {self.base.name!r} is the study's baseline, and is compared with no other:"
+                " it takes neither treatment nor baseline"
+            )
         if not self.seeds or len(set(self.seeds)) != len(self.seeds):
             raise ValueError(f"seeds must be one or more, each once, got {list(self.seeds)}")
         if self.store is None and any(arm.mixture for arm in self.arms):
@@ -88,7 +92,24 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def base(self) -> ArmConfig:
-        return next((a for a in self.arms if a.name == self.baseline), self.arms[0])
+        """The arm that the others are compared with, unless they name one of their own."""
+        return self._arm(self.baseline) if self.baseline is not None else self.arms[0]
+
+    @property
+    def pairs(self) -> list[Pair]:
+        """What is compared with what, in the order of the arms."""
+        return [
+            Pair(
+                arm,
+                self._arm(arm.baseline) if arm.baseline is not None else self.base,
+                arm.treatment or self.treatment,
+            )
+            for arm in self.arms
+            if arm.name != self.base.name
+        ]
+
+    def _arm(self, name: str) -> ArmConfig:
+        return next(arm for arm in self.arms if arm.name == name)
 
 
 def load_study(path: Path) -> Study:
@@ -143,6 +164,10 @@ class Plan:
             for arm in self.study.arms
         ]
 
+    def runs(self, arm: ArmConfig) -> list[Path]:
+        """The run directories of an arm, one a seed."""
+        return [job.path for job in self.jobs if job.arm.name == arm.name]
+
     def panel(self, arm: ArmConfig) -> Path | None:
         """Where an arm's panel is, or will be."""
         if arm.panel is not None:
@@ -166,155 +191,4 @@ class Plan:
         return json.dumps(asked, indent=1) + "\n"
 
 
-def run_study(
-    plan: Plan,
-    *,
-    workers: int = 1,
-    engine: Engine = "processes",
-    say: Say = lambda line: None,
-) -> list[Comparison]:
-    """Do what is not done yet, then compare every arm with the baseline, in the order of the arms.
-
-    `engine` "ray" gives each run to a Ray cluster: see `restock.train.study_on_ray`.
-
-    Raises:
-        RunError: a run failed (its log says why), or was made by another version of the study.
-        ConfigError: a library that an arm trains with, or Ray, is not installed.
-    """
-    for arm in plan.study.arms:
-        if arm.library is not None:
-            check_installed()
-            resolve(tuple(plan.settings(arm, plan.study.seeds[0])), arm.library)
-    for job in plan.jobs:
-        if job.done.exists() and job.done.read_text(encoding="utf-8") != plan.fingerprint(job):
-            raise RunError(
-                "was made for other settings than the study now has",
-                where=str(job.path),
-                remedy="remove it, or give the study another --out",
-            )
-    for arm in plan.study.arms:
-        _build(plan, arm, say)
-    todo = [job for job in plan.jobs if not job.done.exists()]
-    say(f"{len(plan.jobs) - len(todo)} of {len(plan.jobs)} runs are there already")
-    if engine == "ray":
-        from restock.train.study_on_ray import run_on_ray
-
-        run_on_ray(plan, todo, workers=workers, say=say)
-    else:
-        _run_here(plan, todo, workers, say)
-    runs = {
-        arm.name: [job.path for job in plan.jobs if job.arm.name == arm.name]
-        for arm in plan.study.arms
-    }
-    base = plan.study.base
-    return [
-        compare(runs[base.name], runs[arm.name], treatment=plan.study.treatment)
-        for arm in plan.study.arms
-        if arm.name != base.name
-    ]
-
-
-def _run_here(plan: Plan, todo: Sequence[Job], workers: int, say: Say) -> None:
-    with ThreadPoolExecutor(max_workers=workers) as pool:
-        futures = [pool.submit(run_job, plan, job, say) for job in todo]
-        try:
-            for future in futures:
-                future.result()
-        finally:  # after a failure or Ctrl-C nothing more is begun; what runs checkpoints and ends
-            for future in futures:
-                future.cancel()
-
-
-def _build(plan: Plan, arm: ArmConfig, say: Say) -> None:
-    """An arm's panel, if it is a mixture that has not been packed yet."""
-    out = plan.panel(arm)
-    if out is None or out.exists() or arm.mixture is None or plan.study.store is None:
-        return
-    store = plan.study.store
-    if "://" not in store:
-        store = str(plan.folder / store)
-    mixture = plan.folder / arm.mixture
-    name = str(mixture) if mixture.is_file() else arm.mixture
-    say(f"packing {name} for {arm.name}")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    _restock(["mix", store, "--mixture", name, "--out", str(out)], plan.out / "logs" / "mix.log")
-
-
-def run_job(plan: Plan, job: Job, say: Say) -> None:
-    """Train and evaluate one run; taken up from its checkpoint if it has one."""
-    log = plan.out / "logs" / f"{job.path.name}.log"
-    if job.arm.library is not None:
-        _train_library(plan, job, job.arm.library, log, say)
-    else:
-        _train(plan, job, log, say)
-    asked = plan.study.evaluation
-    perturbations = ",".join(asked.perturbations)
-    say(f"{job.path.name}: evaluating")
-    _restock(
-        [
-            *("eval", str(job.path), "--policies", "agent", "--perturbations", perturbations),
-            *("--episodes", str(asked.episodes), "--seed", str(asked.seed)),
-        ],
-        log,
-    )
-    write_text(job.done, plan.fingerprint(job))
-
-
-def _train_library(plan: Plan, job: Job, library: Library, log: Path, say: Say) -> None:
-    """Another library keeps no checkpoint to go on from: a run that was cut begins anew."""
-    if (job.path / DONE).exists():
-        return
-    if job.path.exists():
-        shutil.rmtree(job.path)
-    settings = tuple(plan.settings(job.arm, job.seed))
-    asked = LibraryArm(str(job.path), library, settings, job.arm.arguments)
-    say(f"{job.path.name}: training with {library}")
-    _command("restock.train.library_arm", [msgspec.json.encode(asked).decode()], log)
-
-
-def _train(plan: Plan, job: Job, log: Path, say: Say) -> None:
-    panel = plan.panel(job.arm)
-    checkpoint = job.path / "checkpoints" / "latest.safetensors"
-    if (job.path / "config.json").exists() and not checkpoint.exists():
-        shutil.rmtree(job.path)  # cut before its first checkpoint: nothing to go on from
-    if checkpoint.exists():
-        arguments = ["train", "--resume", str(job.path)]
-    else:
-        sets = [word for setting in plan.settings(job.arm, job.seed) for word in ("--set", setting)]
-        arguments = ["train", "--out", str(job.path), *sets]
-        arguments += ["--panel", str(panel)] if panel is not None else []
-    say(f"{job.path.name}: training")
-    _restock(arguments, log)
-
-
-def _restock(arguments: Sequence[str], log: Path) -> None:
-    """One verb in a process of its own, its words in a log."""
-    _command("restock", arguments, log)
-
-
-def _command(module: str, arguments: Sequence[str], log: Path) -> None:
-    what = f"{module} {arguments[0]}" if module == "restock" else module
-    log.parent.mkdir(parents=True, exist_ok=True)
-    with log.open("a", encoding="utf-8") as file:
-        file.write(f"$ {module} {' '.join(arguments)}\n")
-        file.flush()
-        ended = subprocess.run(
-            [sys.executable, "-m", module, *arguments],
-            stdout=file,
-            stderr=subprocess.STDOUT,
-            stdin=subprocess.DEVNULL,
-            env={**os.environ, "NO_COLOR": "1"},
-            check=False,
-        )
-    if ended.returncode == 130:
-        raise KeyboardInterrupt
-    if ended.returncode not in (0, 3):
-        last = [line for line in log.read_text(encoding="utf-8").splitlines() if line.strip()][-3:]
-        raise RestockError(
-            f"`{what}` failed with exit code {ended.returncode}: " + " / ".join(last),
-            where=str(log),
-            remedy="mend it and run the study again: what is done is kept",
-        )
-
-
-__all__ = ["ArmConfig", "Engine", "Job", "Plan", "Study", "load_study", "run_job", "run_study"]
+__all__ = ["ArmConfig", "Job", "Pair", "Plan", "Study", "StudyEvaluation", "load_study"]

@@ -12,7 +12,8 @@ from pathlib import Path
 
 from restock.errors import RestockError, RunError
 from restock.ingest.on_ray import cluster
-from restock.train.study import Job, Plan, Say, run_job
+from restock.train.study import Job, Plan
+from restock.train.study_run import Say, run_job
 
 
 def run_on_ray(plan: Plan, jobs: Sequence[Job], *, workers: int, say: Say) -> None:

@@ -11,48 +11,36 @@ from restock.train.study import Plan
 
 def findings(plan: Plan, comparisons: Sequence[Comparison]) -> dict[str, Any]:
     """The study and every comparison, as JSON values."""
-    base = plan.study.base
-    others = [arm for arm in plan.study.arms if arm.name != base.name]
     return {
         "doc": plan.study.doc,
-        "treatment": plan.study.treatment,
-        "baseline": base.name,
         "seeds": list(plan.study.seeds),
-        "runs": {
-            arm.name: [str(job.path) for job in plan.jobs if job.arm.name == arm.name]
-            for arm in plan.study.arms
-        },
+        "runs": {arm.name: [str(path) for path in plan.runs(arm)] for arm in plan.study.arms},
         "comparisons": [
-            {"arm": arm.name, **comparison.as_json()}
-            for arm, comparison in zip(others, comparisons, strict=True)
+            {"arm": pair.arm.name, "baseline": pair.baseline.name, **comparison.as_json()}
+            for pair, comparison in zip(plan.study.pairs, comparisons, strict=True)
         ],
     }
 
 
 def as_markdown(found: dict[str, Any]) -> str:
     """The same for people."""
-    lines = [f"# Study: {found['doc'] or ', '.join(found['runs'])}", ""]
+    lines = [f"# Study: {', '.join(found['runs'])}", ""]
+    lines += [found["doc"], ""] if found["doc"] else []
     lines += [
-        f"Treatment: {found['treatment']}. Every arm against **{found['baseline']}**,"
-        f" {len(found['seeds'])} seeds each, on the same episodes. Intervals are 95 %, over seeds"
-        " and episodes.",
+        f"Seeds of each arm: {', '.join(map(str, found['seeds']))}. All are evaluated on the same"
+        " episodes. Intervals are 95 %, over seeds and episodes; bold where they exclude 0.",
     ]
     for comparison in found["comparisons"]:
-        lines += ["", f"## {comparison['arm']}", ""]
-        if found["treatment"] == "method":
+        baseline, treatment = comparison["baseline"], comparison["treatment"]
+        lines += ["", f"## {comparison['arm']} against {baseline}", ""]
+        lines += [f"Compared: the {treatment}.", ""]
+        if treatment == "method":
             lines += [_held(comparison), ""]
         if comparison["verdict"] != "comparable":
-            why = ", ".join(comparison["refused"]) or ", ".join(
-                dict.fromkeys(
-                    check["name"]
-                    for check in comparison["checks"]
-                    if check["verdict"] == comparison["verdict"]
-                )
-            )
-            lines += [f"Not compared: {comparison['verdict']} in {why}."]
+            lines += [_refusal(comparison)]
             continue
         lines += [
-            f"| perturbation | condition | {found['baseline']} | {comparison['arm']} | difference |"
+            f"| perturbation | condition | {baseline} | {comparison['arm']} | difference |"
             " P(better) |",
             "| --- | --- | --- | --- | --- | --- |",
         ]
@@ -65,6 +53,18 @@ def as_markdown(found: dict[str, Any]) -> str:
                 f" [{low:+.2f}, {high:+.2f}]{apart} | {row['improvement']:.2f} |"
             )
     return "\n".join(lines) + "\n"
+
+
+def _refusal(comparison: dict[str, Any]) -> str:
+    """Why the gate let no outcomes through."""
+    if comparison["refused"]:
+        return (
+            f"Not compared: they differ in {', '.join(comparison['refused'])}, which"
+            f' treatment = "{comparison["treatment"]}" does not allow.'
+        )
+    verdict = comparison["verdict"]
+    names = [check["name"] for check in comparison["checks"] if check["verdict"] == verdict]
+    return f"Not compared: {verdict} in {', '.join(dict.fromkeys(names))}."
 
 
 def _held(comparison: dict[str, Any]) -> str:

@@ -41,16 +41,22 @@ class Study:
         from restock.cli.output import plain, print_json, print_table, say
         from restock.errors import ConfigError, ExitCode
         from restock.train.run import write_text
-        from restock.train.study import Plan, load_study, run_study
+        from restock.train.study import Plan, load_study
         from restock.train.study_page import as_markdown, findings
+        from restock.train.study_run import run_study
 
         if self.workers < 1:
             raise ConfigError(f"must be at least 1, got {self.workers}", where="--workers")
         plan = Plan(load_study(self.study), self.study.parent, self.out)
         if self.dry_run:
+            against = {
+                pair.arm.name: f"{pair.baseline.name} ({pair.treatment})"
+                for pair in plan.study.pairs
+            }
             rows = [
                 {
                     "run": str(job.path),
+                    "against": against.get(job.arm.name),
                     "panel": str(plan.panel(job.arm) or "none"),
                     "settings": " ".join(plan.settings(job.arm, job.seed)),
                     "done": job.done.exists(),
