@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -140,6 +141,13 @@ def test_the_last_measurement_before_a_command_is_what_the_policy_saw(
         np.testing.assert_allclose(
             held["/scan"].ranges, drive.ranges_m[2 * tick], atol=LIDAR_LSB_M / 2 + 1e-6
         )
+
+
+def test_a_plan_that_another_replaces_is_not_sent_again_at_that_tick(drive: Drive) -> None:
+    # In floating point a plan of 1.2 s, sent every second, is due a last bit before 2.2 s.
+    changed = replace(drive, plans=[(6, np.zeros((5, 2))), (11, np.ones((7, 2)))])
+    found = _decoded(_robot().publish(changed, START_NS))["/plan"]
+    assert [len(value.poses) for _, value in found] == [5, 7, 7]
 
 
 def test_a_bump_between_two_ticks_is_in_their_interval_alone(messages: list[Message]) -> None:

@@ -125,7 +125,9 @@ class Robot:
         for start_s, until_s, (_, points) in zip(
             starts, [*starts[1:], end_s], drive.plans, strict=True
         ):
-            times = np.arange(start_s, max(until_s, start_s + 1e-6), 1 / self.rates.plan)
+            # Not at `until_s` itself, where the next one comes: it may be a last bit too late.
+            until_s = max(until_s - TICK_TOLERANCE_S, start_s + TICK_TOLERANCE_S)
+            times = np.arange(start_s, until_s, 1 / self.rates.plan)
             messages = [topics.plan(self._stamp(time), points) for time in times.tolist()]
             found += self._send("/plan", times, messages)
         changed = [
@@ -203,7 +205,7 @@ class Robot:
             angle_increment_rad=lidar.angle_increment_rad,
             range_min_m=lidar.range_min_m,
             range_max_m=lidar.range_max_m,
-            scan_time_s=1 / self.rates.scan,
+            scan_time_s=max(1 / self.rates.scan, drive.scene.perturbation.lidar_period_s),
         )
         return self._send("/scan", drive.scan_s, data)
 
