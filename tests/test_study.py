@@ -9,6 +9,9 @@ import pytest
 
 from restock.cli import main
 from restock.errors import ConfigError
+from restock.train import study_run
+from restock.train.arms import Difference
+from restock.train.compare import Comparison
 from restock.train.study import Plan, load_study
 
 SMALL = """
@@ -104,23 +107,42 @@ treatment = "method"
     ]
 
 
-@pytest.mark.slow
-def test_each_comparison_is_judged_by_its_own_treatment(tmp_path: Path, capsys) -> None:
+def test_each_comparison_is_judged_by_its_own_treatment(
+    tmp_path: Path, capsys, monkeypatch
+) -> None:
     arm = '\n[[arms]]\nname = "again"\nbaseline = "dueling"\ntreatment = "method"'
-    text = SMALL.replace('treatment = "algorithm"', 'treatment = "target"') + arm
-    (tmp_path / "s.toml").write_text(text)
+    (tmp_path / "s.toml").write_text(SMALL + arm)
     out = tmp_path / "out"
+    plan = Plan(load_study(tmp_path / "s.toml"), tmp_path, out)
+    for job in plan.jobs:  # all were trained and evaluated before
+        job.path.mkdir(parents=True)
+        job.done.write_text(plan.fingerprint(job))
+    dueling = Difference("config.network.dueling", "algorithm", False, True)
+
+    def judged(first, second, *, treatment):
+        asked.append((first[0].name, second[0].name, treatment))
+        if treatment == "algorithm":
+            return Comparison(treatment, "incomparable", [dueling], [dueling], [], [], None, [])
+        return Comparison(treatment, "comparable", [dueling], [], [], [], "evaluation", [])
+
+    asked: list[tuple[str, str, str]] = []
+    monkeypatch.setattr(study_run, "compare", judged)
     assert main(["study", str(tmp_path / "s.toml"), "--out", str(out), "--json"]) == 1
-    dueling, again = json.loads(capsys.readouterr().out)["comparisons"]
-    assert (dueling["baseline"], dueling["treatment"]) == ("plain", "target")
-    assert (dueling["verdict"], dueling["refused"]) == (
-        "incomparable",
-        ["config.network.dueling"],
+    assert asked == [("plain-0", "dueling-0", "algorithm"), ("dueling-0", "again-0", "method")]
+    first, second = json.loads(capsys.readouterr().out)["comparisons"]
+    assert (first["arm"], first["baseline"], first["treatment"]) == (
+        "dueling",
+        "plain",
+        "algorithm",
     )
-    assert (again["baseline"], again["verdict"]) == ("dueling", "comparable")
+    assert (second["arm"], second["baseline"], second["treatment"]) == (
+        *("again", "dueling"),
+        "method",
+    )
     page = (out / "study.md").read_text()
-    assert 'they differ in config.network.dueling, which treatment = "target"' in page
+    assert 'they differ in config.network.dueling, which treatment = "algorithm"' in page
     assert "## again against dueling" in page
+    assert "Not held: the algorithm (config.network.dueling)" in page
 
 
 def test_panels_of_mixtures_are_the_studys_own(tmp_path: Path) -> None:
