@@ -23,7 +23,7 @@ from restock.train.episode import KINDS, EpisodeSpec
 from restock.train.evaluate import EpisodeResult, GreedyPolicy, Policy, run_episodes
 from restock.train.floors import held_out, open_floors
 from restock.train.network import make_network
-from restock.train.perturbation import PERTURBATIONS, Perturbation
+from restock.train.perturbation import PERTURBATIONS, Perturbation, Schedule, find_perturbation
 from restock.train.run import Run, write_table
 from restock.train.run_tables import EVAL_EPISODES
 
@@ -41,7 +41,7 @@ class Plan:
     run: Run
     config: TrainConfig
     policies: tuple[str, ...]
-    perturbations: tuple[str, ...]
+    perturbations: dict[str, Perturbation | None]  # by the name or file that was asked for
     episodes: int  # per kind of episode
     first_seed: int = FIRST_SEED
     num_envs: int = 32
@@ -82,7 +82,7 @@ def plan_evaluation(
                 f"there is no {', '.join(map(repr, unknown))}" if unknown else "names nothing",
                 where=flag,
                 remedy=f"choose from {', '.join(there)}"
-                + (", onnx:FILE, run:DIRECTORY" if flag == "--policies" else ""),
+                + (", onnx:FILE, run:DIRECTORY" if flag == "--policies" else ", FILE.toml"),
             )
     if episodes < 1:
         raise ConfigError(f"must be at least 1, got {episodes}", where="--episodes")
@@ -96,7 +96,7 @@ def plan_evaluation(
         run,
         config,
         tuple(dict.fromkeys(policies)),
-        tuple(dict.fromkeys(perturbations)),
+        {name: _perturb(name) for name in perturbations},
         episodes,
         first_seed,
         layouts=layouts or held_out(config.env.layouts, "test"),
@@ -109,7 +109,9 @@ def plan_evaluation(
 
 
 def _is_path(flag: str, name: str) -> bool:
-    return flag == "--policies" and name.startswith(("onnx:", "run:"))
+    if flag == "--policies":
+        return name.startswith(("onnx:", "run:"))
+    return name.endswith(".toml")
 
 
 def evaluate(plan: Plan, progress: Callable[[int], None] | None = None) -> Results:
@@ -127,8 +129,8 @@ def evaluate(plan: Plan, progress: Callable[[int], None] | None = None) -> Resul
     )
     # One queue a policy, over all perturbations: few environments then wait for the last episodes.
     asked = [
-        (perturbation, EpisodeSpec(kind, plan.first_seed + index, _perturb(perturbation)))
-        for perturbation in plan.perturbations
+        (name, EpisodeSpec(kind, plan.first_seed + index, perturbation))
+        for name, perturbation in plan.perturbations.items()
         for index in range(plan.episodes)
         for kind in KINDS
     ]
@@ -149,7 +151,28 @@ def evaluate(plan: Plan, progress: Callable[[int], None] | None = None) -> Resul
 
 
 def _perturb(name: str) -> Perturbation | None:
-    return None if name == CLEAN else PERTURBATIONS[name]
+    """The parameters that episodes are driven under; None: as they are.
+
+    Raises:
+        ConfigError: no such name or file, a schedule, or another timestep than evaluation's.
+    """
+    if name == CLEAN:
+        return None
+    found = find_perturbation(name, where="--perturbations")
+    if isinstance(found, Schedule):
+        raise ConfigError(
+            "is a schedule: policies are compared under the same parameters",
+            where=name,
+            remedy="give the TOML file of one perturbation",
+        )
+    if found.timestep_s != Perturbation().timestep_s:
+        raise ConfigError(
+            f"holds for a timestep of {found.timestep_s:g} s, the evaluation runs at"
+            f" {Perturbation().timestep_s:g} s",
+            where=name,
+            remedy="effective parameters are those of a timestep: fit them at this one",
+        )
+    return found
 
 
 def make_policy(name: str, plan: Plan) -> Policy:
@@ -214,8 +237,8 @@ def settings(plan: Plan) -> dict[str, Any]:
         "run": str(plan.run.path),
         "policies": list(plan.policies),
         "perturbations": {
-            name: msgspec.to_builtins(PERTURBATIONS["nominal" if name == CLEAN else name])
-            for name in plan.perturbations
+            name: msgspec.to_builtins(perturbation or Perturbation())
+            for name, perturbation in plan.perturbations.items()
         },
         "episodes_per_kind": plan.episodes,
         "first_seed": plan.first_seed,

@@ -25,7 +25,7 @@ VERBS = {
     "audit": "is the coverage good enough? exit 1 if not",
     "mix": "a pinned replay panel with quotas per stratum",
     "export": "transitions as a data set for Minari, d3rlpy, LeRobot, Parquet or NumPy",
-    "twin": "fit the twin's robot to the logs",
+    "twin": "the twin's floors (layout), its robot fitted to logs (fit), and how far it is (gap)",
     "train": "offline warm-up on the panel, then online in the twin",
     "eval": "success per condition, clean and perturbed",
     "study": "methods x mixtures x seeds, ending in one comparison",

@@ -29,7 +29,8 @@ class Eval:
     episodes: int = 20
     """Episodes per kind (nominal, wheel_slip, blocked_aisle, near_collision)."""
     perturbations: str = "none,friction,latency"
-    """Comma-separated: none, friction, latency, payload, wheels, sensors."""
+    """Comma-separated: none, friction, latency, payload, wheels, sensors, or FILE.toml (as
+    `restock twin fit` writes it)."""
     policies: str = "agent,planner,random"
     """Comma-separated: agent (the run's best), planner, random, onnx:FILE, run:DIRECTORY."""
     seed: int = 10_000
