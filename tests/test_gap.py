@@ -18,7 +18,7 @@ from restock.ingest.profile import load_profile
 from restock.ingest.store import StoreWriter
 from restock.replay.store import Store
 from restock.report import write_gap_page
-from restock.train.clustered import Estimate, quantiles, ratio
+from restock.train.clustered import NOT_KNOWN, Estimate, quantiles, ratio
 from restock.train.gap import AFTER, BEFORE, Gap, GapPlan, measure_gap
 from restock.train.gap_files import read_gap, write_gap
 from restock.train.layout import default_warehouse
@@ -257,20 +257,18 @@ FINE, WORSE = Estimate(0.3, 0.2, 0.4), Estimate(1.5, 1.2, 1.8)
 
 
 @pytest.mark.parametrize(
-    ("position_p90", "reward", "matters", "segments", "verdict"),
+    ("position_p90", "reward", "segments", "verdict"),
     [
-        (GOOD, FINE, True, 50, TRUSTED),
-        (BAD, FINE, True, 50, UNTRUSTED),
-        (GOOD, WORSE, True, 50, UNTRUSTED),
-        (GOOD, WORSE, False, 50, TRUSTED),
-        (OPEN, FINE, True, 50, UNDECIDED),
-        (OPEN, WORSE, True, 50, UNTRUSTED),
-        (BAD, WORSE, True, 19, UNKNOWN),
+        (GOOD, FINE, 50, TRUSTED),
+        (BAD, FINE, 50, UNTRUSTED),
+        (GOOD, WORSE, 50, UNTRUSTED),
+        (GOOD, NOT_KNOWN, 50, TRUSTED),
+        (OPEN, FINE, 50, UNDECIDED),
+        (OPEN, WORSE, 50, UNTRUSTED),
+        (BAD, WORSE, 19, UNKNOWN),
     ],
 )
-def test_the_rule(
-    position_p90: Estimate, reward: Estimate, matters: bool, segments: int, verdict: str
-) -> None:
+def test_the_rule(position_p90: Estimate, reward: Estimate, segments: int, verdict: str) -> None:
     found = judge(
         "wheel_slip",
         limits=Limits(),
@@ -278,7 +276,6 @@ def test_the_rule(
         episodes=10,
         position_p90=position_p90,
         reward_ratio=reward,
-        reward_matters=matters,
     )
     assert found.verdict == verdict
     assert bool(found.reasons) == (verdict != TRUSTED)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
+from dataclasses import asdict
 from html.parser import HTMLParser
 from itertools import pairwise
 from pathlib import Path
@@ -21,8 +23,12 @@ from restock.replay.store import Store
 from restock.report import build_report
 from restock.report.facts import gather
 from restock.report.feed import flattery
+from restock.train.clustered import Estimate
+from restock.train.gap import Gap
+from restock.train.gap_files import write_gap
 from restock.train.run import Run
 from restock.train.run_tables import EVAL_EPISODES, TABLES
+from restock.train.trust import Limits, Verdict
 
 HOSTILE = "<script>alert(1)</script>"
 
@@ -218,6 +224,35 @@ def test_every_section_has_its_figures(html: str) -> None:
     ):
         part = html.split(f'<section id="{section}">')[1].split("</section>")[0]
         assert part.count("<svg") == figures, section
+
+
+def test_a_measured_gap_is_a_section(run: Path, tmp_path: Path) -> None:
+    position = {"condition": "nominal", "horizon_s": 3.0, "quantity": "position", "unit": "m"}
+    position |= {"source": "nominal", "segments": 40, "episodes": 9}
+    position |= {f"{q}{end}": 0.5 for q in ("median", "p90") for end in ("", "_low", "_high")}
+    far = Estimate(0.5, 0.4, 0.6)
+    gap = Gap(
+        about={"limits": asdict(Limits()), "store_version": 7, "twins": {"nominal": {}}},
+        paths=[position],
+        observations=[],
+        rewards=[],
+        verdicts=(Verdict("nominal", "untrusted", ("it is far off",), 40, 9, far, far),),
+        not_done=(f"No {HOSTILE} was compared.",),
+    )
+    copy = shutil.copytree(run, tmp_path / "run")
+    write_gap(gap, copy / "gap")
+    page = build_report(copy).read_text(encoding="utf-8")
+    part = page.split('<section id="twin-gap">')[1].split("</section>")[0]
+    for words in (
+        *("Do not trust the twin in: nominal.", "it is far off", "0.50 m [0.40, 0.60]"),
+        *("nominal twin", "measured at version 7", "No &lt;script&gt;alert(1)&lt;/script&gt; was"),
+    ):
+        assert words in part, words
+    assert part.count("<svg") == 1
+    (copy / "gap" / "gap.json").write_text("{}")
+    page = build_report(copy).read_text(encoding="utf-8")
+    assert '<section id="twin-gap">' not in page
+    assert "no gap that can be read" in page
 
 
 def test_drawn_shares_are_over_the_whole_run(run: Path) -> None:

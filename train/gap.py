@@ -152,7 +152,7 @@ def measure_gap(
         "steps_left_out": int((~steps.followed).sum()),
         "plan_error_m": plans.error_m,
     }
-    verdicts = _verdicts(steps, plan.limits, best, moved, earned, ratios)
+    verdicts = _verdicts(steps, plan.limits, best, moved, ratios)
     said = _not_done(steps, twins, stepped, plans, differs, noise.drift_m, calibrated, paths)
     return Gap(about, moved, observed, earned, verdicts, (*said, *notes))
 
@@ -185,7 +185,6 @@ def _verdicts(
     limits: Limits,
     best: str,
     moved: Rows,
-    earned: Rows,
     ratios: Mapping[tuple[str, str], Estimate],
 ) -> tuple[Verdict, ...]:
     at = {
@@ -194,15 +193,9 @@ def _verdicts(
         if (row["horizon_s"], row["quantity"], row["source"])
         == (limits.horizon_s, "position", best)
     }
-    worth = {
-        row["condition"]: row["mean_gap"]
-        for row in earned
-        if (row["term"], row["source"]) == ("reward", best)
-    }
     verdicts = []
     for condition in steps.conditions:
         row = at.get(condition)
-        gap = worth.get(condition)
         p90 = NOT_KNOWN if row is None else estimate(row, "p90")
         verdicts.append(
             judge(
@@ -212,7 +205,6 @@ def _verdicts(
                 episodes=row["episodes"] if row else 0,
                 position_p90=p90,
                 reward_ratio=ratios.get((condition, best), NOT_KNOWN),
-                reward_matters=gap is not None and gap >= abs(steps.task.rewards.step),
             )
         )
     return tuple(verdicts)

@@ -84,8 +84,13 @@ def reward_rows(
     chosen: Mapping[str, NDArray[np.bool_]],
     rng: np.random.Generator,
 ) -> tuple[Rows, dict[tuple[str, str], Estimate]]:
-    """Gaps by term, and by (condition, source) the whole gap over the reward's own spread."""
+    """Gaps by term, and by (condition, source) the whole gap over the reward's own spread.
+
+    The spread is the distance of a step's reward from the median, taken to be a step's cost at
+    least: standing still earns the same at every step, and next to that any gap is large.
+    """
     found, ratios = [], {}
+    least = abs(steps.task.rewards.step)
     for condition, mask in chosen.items():
         rows = mask & stepped.valid
         episode = steps.episode_id[stepped.rows[rows]]
@@ -97,7 +102,9 @@ def reward_rows(
                 spread = np.abs(there - np.median(there)) if len(there) else there
                 mean = ratio(np.abs(off), np.ones(len(off)), episode, rng=rng)
                 if term == "reward":
-                    ratios[condition, source] = ratio(np.abs(off), spread, episode, rng=rng)
+                    ratios[condition, source] = ratio(
+                        np.abs(off), np.maximum(spread, least), episode, rng=rng
+                    )
                 found.append(
                     {
                         "condition": condition,

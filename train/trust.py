@@ -22,7 +22,7 @@ class Limits:
 
     horizon_s: float = 3.0
     position_m: float = 0.2  # nine in ten segments of that horizon end this near
-    reward_ratio: float = 1.0  # one-step reward gap over the reward's own spread
+    reward_ratio: float = 1.0  # one-step reward gap over the reward's own spread, see `gap_rows`
     segments: int = 20  # fewer say nothing
     episodes: int = 5
 
@@ -48,17 +48,14 @@ def judge(
     episodes: int,
     position_p90: Estimate,
     reward_ratio: Estimate,
-    reward_matters: bool,
 ) -> Verdict:
-    """The verdict on one condition.
-
-    `reward_matters`: the mean reward gap is worth a step's cost or more. A smaller one is not held
-    against the twin, whatever the spread: standing still earns the same at every step.
-    """
+    """The verdict on one condition."""
     off, open_ = [], []
     if segments < limits.segments or episodes < limits.episodes:
-        few = f"{segments} segments of {limits.horizon_s:g} s from {episodes} episodes; needs"
-        few += f" {limits.segments} from {limits.episodes}"
+        few = (
+            f"too few: segments of {limits.horizon_s:g} s {segments} (at least {limits.segments}),"
+            f" from episodes {episodes} (at least {limits.episodes})"
+        )
         return Verdict(condition, UNKNOWN, (few,), segments, episodes, position_p90, reward_ratio)
     checks = [
         (
@@ -69,7 +66,7 @@ def judge(
             f" {limits.horizon_s:g} s; the limit is {limits.position_m:g} m",
         )
     ]
-    if reward_matters and not math.isnan(reward_ratio.value):
+    if not math.isnan(reward_ratio.value):
         checks.append(
             (
                 reward_ratio,

@@ -147,7 +147,7 @@ def _seconds(text: str) -> tuple[float, ...]:
 
 def _show(gap: Measured) -> None:
     from restock.cli.output import print_table, stdout
-    from restock.report.twin_gap import headline
+    from restock.report.twin_gap import headline, source_name
 
     positions: dict[tuple[str, float], dict[str, Any]] = {}
     for row in gap.paths:
@@ -157,8 +157,8 @@ def _show(gap: Measured) -> None:
                 key,
                 {"condition": key[0], "after s": key[1], "segments": row["segments"]},
             )
-            line[row["source"]] = row["median"]
-            line[f"{row['source']} p90"] = row["p90"]
+            line[source_name(row["source"])] = row["median"]
+            line[f"{source_name(row['source'])} p90"] = row["p90"]
     print_table(
         list(positions.values()),
         title="metres from the logged position: median and 90th percentile",
@@ -166,7 +166,7 @@ def _show(gap: Measured) -> None:
     rewards = [
         {
             "condition": row["condition"],
-            "twin": row["source"],
+            "source": source_name(row["source"]),
             "steps": row["steps"],
             "reward off by": row["mean_gap"],
             "bias": row["bias"],
@@ -178,7 +178,11 @@ def _show(gap: Measured) -> None:
     print_table(rewards, title="reward after one step from the logged state")
     print_table(
         [
-            {"condition": found.condition, "twin": found.verdict, "why": "; ".join(found.reasons)}
+            {
+                "condition": found.condition,
+                "verdict": found.verdict,
+                "why": "; ".join(found.reasons),
+            }
             for found in gap.verdicts
         ]
     )

@@ -14,15 +14,15 @@ from restock.report import charts
 from restock.report.blocks import Section, section, table
 from restock.report.charts import words
 from restock.report.facts import Facts
-from restock.train.gap import Gap
+from restock.train.gap import AFTER, BEFORE, Gap
 from restock.train.gap_files import DOCUMENT, FOLDER, read_gap
 from restock.train.trust import TRUSTED, UNDECIDED, UNKNOWN, UNTRUSTED
 
 COLOURS = {
-    "nominal": "#b45309",
-    "calibrated": "#0f766e",
+    "nominal twin": "#b45309",
+    "calibrated twin": "#0f766e",
     "odometry": "#64748b",
-    "floor": "#cbd5e1",
+    "floor": "#2563eb",
     "persistence": "#94a3b8",
 }
 _MEANING = {
@@ -31,6 +31,11 @@ _MEANING = {
     UNDECIDED: "the interval holds a limit: more logs would decide",
     UNKNOWN: "too few segments or episodes to say",
 }
+
+
+def source_name(source: str) -> str:
+    """A source as people read it: nominal is the name of a condition too."""
+    return f"{source} twin" if source in (BEFORE, AFTER) else source
 
 
 def find_gap(facts: Facts) -> Gap | None:
@@ -68,8 +73,8 @@ def gap_page(gap: Gap) -> dict[str, Any]:
         "kicker": "gap between twin and logs",
         "title": f"Twin and logs of {about['store']}",
         "headline": headline(gap),
-        "lead": f"{about['rows']:,} logged steps of {about['episodes']:,} episodes, driven again in"
-        f" the twin. Judged is the {about['judged']} twin.",
+        "lead": f"{_count(about['rows'], 'logged step')} of {_count(about['episodes'], 'episode')},"
+        f" driven again in the twin. Judged is the {source_name(about['judged'])}.",
         "cards": [
             {"value": str(sum(v.verdict == kind for v in gap.verdicts)), "label": f"{kind}: {said}"}
             for kind, said in _MEANING.items()
@@ -96,7 +101,12 @@ def gap_section(gap: Gap) -> Section:
     """Pose gaps by horizon and condition, the verdicts and what could not be done."""
     limits = gap.about["limits"]
     shown = [
-        {**row, "condition": words(row["condition"]), "horizon": f"after {row['horizon_s']:g} s"}
+        {
+            **row,
+            "condition": words(row["condition"]),
+            "source": source_name(row["source"]),
+            "horizon": f"after {row['horizon_s']:g} s",
+        }
         for row in gap.paths
         if row["quantity"] == "position" and row["median"] is not None
     ]
@@ -133,11 +143,8 @@ def gap_section(gap: Gap) -> Section:
         if shown
         else [],
         tables=[
-            table(
-                rows,
-                numbers={"segments", "episodes"},
-                caption=" ".join(gap.not_done),
-            )
+            table(rows, numbers={"segments", "episodes"}),
+            table([{"what else to know": said} for said in gap.not_done]),
         ],
     )
 
@@ -170,15 +177,20 @@ def _steps_section(gap: Gap) -> Section:
             "logged mean": _number(row["logged_mean"]),
             "logged spread": _number(row["logged_spread"]),
             **{
-                f"{source}": _cell(gap.rewards, source, "mean_gap", condition=row["condition"],
-                                   term=row["term"])
+                source_name(source): _cell(
+                    gap.rewards,
+                    source,
+                    "mean_gap",
+                    condition=row["condition"],
+                    term=row["term"],
+                )
                 for source in sources
             },
         }
         for row in gap.rewards
         if row["source"] == sources[-1]
         and (row["term"] == "reward" or _any(gap, row["condition"], row["term"]))
-    ]  # fmt: skip
+    ]
     observed = _grouped(gap)
     return section(
         "one-step",
@@ -189,13 +201,13 @@ def _steps_section(gap: Gap) -> Section:
         tables=[
             table(
                 rewards,
-                numbers={"logged mean", "logged spread", *sources},
+                numbers={"logged mean", "logged spread", *map(source_name, sources)},
                 title="Reward, by term",
                 caption="Terms that are the same on both sides everywhere are left out.",
             ),
             table(
                 observed,
-                numbers={*sources, "persistence"},
+                numbers={*map(source_name, sources), "persistence"},
                 title="Observation, by component, in nominal driving",
                 caption="Sectors of the lidar are taken together; observations.parquet has each"
                 " component and condition.",
@@ -205,7 +217,7 @@ def _steps_section(gap: Gap) -> Section:
 
 
 def _signals_section(gap: Gap) -> Section:
-    sources = [name for name in COLOURS if any(row["source"] == name for row in gap.paths)]
+    sources = list(dict.fromkeys(row["source"] for row in gap.paths))
     rows = []
     for row in gap.paths:
         if row["source"] == "floor":
@@ -217,7 +229,10 @@ def _signals_section(gap: Gap) -> Section:
                     "unit": row["unit"],
                     "horizon": f"{row['horizon_s']:g} s",
                     "segments": row["segments"],
-                    **{name: _cell(gap.paths, name, "median", **key) for name in sources},
+                    **{
+                        source_name(name): _cell(gap.paths, name, "median", **key)
+                        for name in sources
+                    },
                 }
             )
     return section(
@@ -225,7 +240,7 @@ def _signals_section(gap: Gap) -> Section:
         "Pose and signals, by horizon",
         intro="Medians over segments: of a pose at the horizon's end, of a signal the root mean"
         " square on the way.",
-        tables=[table(rows, numbers={"segments", *sources})],
+        tables=[table(rows, numbers={"segments", *map(source_name, sources)})],
     )
 
 
@@ -240,7 +255,7 @@ def _grouped(gap: Gap) -> list[dict[str, Any]]:
             sums.setdefault(name, {}).setdefault(row["source"], []).append(row["mean_gap"])
     return [
         {"component": words(name)}
-        | {source: f"{sum(values) / len(values):.4f}" for source, values in by.items()}
+        | {source_name(source): f"{sum(values) / len(values):.4f}" for source, values in by.items()}
         for name, by in sums.items()
     ]
 
@@ -261,7 +276,11 @@ def _cell(rows: list[dict[str, Any]], source: str, value: str, **key: Any) -> st
 
 
 def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.3f}"
+    return "" if value is None else f"{round(value, 3) + 0.0:.3f}"  # no -0.000
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def _interval(found: Any, unit: str) -> str:
@@ -271,4 +290,4 @@ def _interval(found: Any, unit: str) -> str:
     return text if found.low != found.low else f"{text} [{found.low:.2f}, {found.high:.2f}]"
 
 
-__all__ = ["find_gap", "gap_page", "gap_section", "headline", "run_section"]
+__all__ = ["find_gap", "gap_page", "gap_section", "headline", "run_section", "source_name"]
