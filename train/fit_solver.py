@@ -92,13 +92,32 @@ class Problem:
         return np.concatenate([np.repeat(np.arange(num), width) for width in widths])
 
     def jacobian(self, z: F64, residual: F64) -> F64:
-        """Difference quotients (R, n) at z (n, 1), at the nearest latency that can be driven."""
+        """Difference quotients (R, n) at z (n, 1), at the nearest latency that can be driven.
+
+        A wheel that breaks loose does so at a physics step, so wheel speeds jump as friction or
+        payload change. A jump is no slope: of these two, quotients are taken to both sides, and the
+        smaller one counts, or none where they disagree in sign.
+        """
         del residual  # it is between two latencies; this is at one
-        z = self.coordinates.drivable(z.reshape(-1), self.mismatch.timestep_s)
-        step = np.where(z + self.coordinates.steps <= 1.0, 1.0, -1.0) * self.coordinates.steps
-        points = np.column_stack([z, z[:, None] + np.diag(step)])
-        found = self.residual(points)
-        return (found[:, 1:] - found[:, :1]) / step
+        size, steps = len(self.coordinates), self.coordinates.steps
+        at = self.coordinates.drivable(z.reshape(-1), self.mismatch.timestep_s)
+        # Of the latency, to the side on which z lies: residuals are interpolated there.
+        forward = (at + steps <= 1.0) & (z.reshape(-1) >= at - 1e-9)
+        forward |= at - steps < 0.0
+        step = np.where(forward, steps, -steps)
+        both = [
+            index
+            for index, item in enumerate(self.coordinates.parameters)
+            if item.own_body and steps[index] <= at[index] <= 1.0 - steps[index]
+        ]
+        moves = [np.zeros((size, 1)), np.diag(step), -np.diag(step)[:, both]]
+        found = self.residual(at[:, None] + np.hstack(moves))
+        slope: F64 = (found[:, 1 : size + 1] - found[:, :1]) / step
+        back = (found[:, :1] - found[:, size + 1 :]) / step[both]
+        ahead = slope[:, both]
+        smaller = np.where(np.abs(ahead) < np.abs(back), ahead, back)
+        slope[:, both] = np.where(ahead * back > 0, smaller, 0.0)
+        return slope
 
 
 def search(problem: Problem, points: int, best: int, seed: int) -> F64:
@@ -134,7 +153,7 @@ def solve(problem: Problem, start: F64, iterations: int) -> tuple[F64, float, bo
             xtol=1e-3,
             gtol=1e-3,
             mu_factor=4.0,
-            mu_max=1e6,
+            mu_max=1e3,
             max_iter=iterations,
             verbose=minimize.Verbosity.SILENT,
             iter_callback=watch,
