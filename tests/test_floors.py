@@ -15,9 +15,11 @@ from hypothesis import strategies as st
 from scipy.sparse import csgraph
 
 import restock  # noqa: F401 - registers the environment
+from restock.cli import main
 from restock.errors import ConfigError, RunError
 from restock.train.episode import KINDS, EpisodeSpec, draw_episode
 from restock.train.floor_file import read_floor, write_floor
+from restock.train.floor_report import describe_floor
 from restock.train.floors import (
     RECIPES,
     SPLITS,
@@ -32,6 +34,7 @@ from restock.train.layout import OneWay, Warehouse, default_warehouse
 from restock.train.occupancy_map import cells_of, read_map, write_map
 from restock.train.pgm import read_pgm, write_pgm
 from restock.train.planner import BlockFinder, Planner
+from restock.train.prepare import prepare_new
 from restock.train.vector_env import WarehouseVectorEnv
 
 SEEDS = st.integers(0, 10_000)
@@ -215,6 +218,31 @@ def test_a_floor_with_racks_alone_gets_its_aisles_and_goals(tmp_path: Path) -> N
     (tmp_path / "hall.toml").write_text("width_m = 12.0\ndepth = 10.0\nracks = []\n")
     with pytest.raises(ConfigError, match="depth"):
         read_floor(tmp_path / "hall.toml")
+
+
+def test_what_does_not_fit_a_floor_is_refused_before_anything_is_driven(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    hall = tmp_path / "hall.toml"
+    hall.write_text("width_m = 12.0\ndepth_m = 10.0\nracks = [[5.8, 0.0, 6.2, 10.0]]\n")
+    said = "has no room for episodes of blocked_aisle"
+    with pytest.raises(ConfigError, match=said):
+        WarehouseVectorEnv(2, layouts=str(hall))
+    # A share of 0 is never trained on, yet evaluated.
+    shares = "env.conditions={nominal=1, blocked_aisle=0}"
+    with pytest.raises(ConfigError, match=said):
+        prepare_new(tmp_path / "run", None, None, [f"env.layouts={hall}", shares])
+    record = ["record", "--out", str(tmp_path / "a.mcap"), "--missions", "1"]
+    assert main([*record, "--layouts", str(hall)]) != 0
+    assert said in capsys.readouterr().err
+    # Without those conditions it is driven on, and what is sealed off is said.
+    assert main([*record, "--layouts", str(hall), "--conditions", "nominal=1"]) == 0
+    assert "60 of 120 goals cannot be reached" in capsys.readouterr().err
+    prepared = prepare_new(
+        tmp_path / "run", None, None, [f"env.layouts={hall}", "env.conditions={nominal=1}"]
+    )
+    assert "60 of 120 goals cannot be reached" in prepared.describe()
+    assert describe_floor(read_floor(hall))["unreachable_goals"] == 60
 
 
 def test_one_way_rules_turn_the_plan_and_a_shut_in_robot_leaves_against_them() -> None:

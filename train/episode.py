@@ -98,7 +98,7 @@ def draw_episode(spec: EpisodeSpec, warehouse: Warehouse, planner: Planner) -> E
                 return Episode(spec, start, goal, plan, walks=walks, noise=noise)
     raise ConfigError(
         f"no way of {PATH_M[0]} to {PATH_M[1]} m suits a {spec.condition} episode",
-        where="warehouse layout",
+        where=f"layout {warehouse.name}",
         remedy="use a larger floor",
     )
 
@@ -128,7 +128,7 @@ def _draw_way(
         return (float(x), float(y), float(yaw)), (float(goal[0]), float(goal[1])), plan
     raise ConfigError(
         f"no way of {PATH_M[0]} to {PATH_M[1]} m between aisles and goals",
-        where="warehouse layout",
+        where=f"layout {warehouse.name}",
         remedy="use a larger floor",
     )
 

@@ -21,6 +21,7 @@ from restock.train import checkpoint
 from restock.train.config import TrainConfig, parse_config
 from restock.train.episode import KINDS, EpisodeSpec
 from restock.train.evaluate import EpisodeResult, GreedyPolicy, Policy, run_episodes
+from restock.train.floor_report import refuse_unfit
 from restock.train.floors import held_out, open_floors
 from restock.train.network import make_network
 from restock.train.perturbation import PERTURBATIONS, Perturbation, Schedule, find_perturbation
@@ -101,7 +102,7 @@ def plan_evaluation(
         first_seed,
         layouts=layouts or held_out(config.env.layouts, "test"),
     )
-    open_floors(plan.layouts)
+    refuse_unfit(open_floors(plan.layouts), KINDS)
     for name in plan.policies:
         if _is_path("--policies", name):
             make_policy(name, plan)  # what is wrong with it is said before anything is driven

@@ -87,6 +87,7 @@ class Fleet:
         hardware: those parameters, where a mission names none of its own.
         layouts: the floors, as `restock.train.floors.open_floors` reads them; a mission that names
             none is on one that its seed draws.
+        conditions: the kinds of the missions to come (keys), which must fit on the floors.
         scan_hz: the lidar scans at every control tick, and above 5 Hz once more between two.
     """
 
@@ -95,6 +96,7 @@ class Fleet:
         hardware: Perturbation | Schedule,
         *,
         layouts: str = DEFAULT,
+        conditions: Mapping[str, float] | None = None,
         scan_hz: float = 10.0,
         robots: int = ROBOTS,
     ) -> None:
@@ -102,6 +104,7 @@ class Fleet:
             robots,
             perturbation=hardware,
             layouts=layouts,
+            conditions=conditions,
             autoreset_mode=AutoresetMode.DISABLED,
         )
         self.period_s = self.env.task.control_period_s

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -19,10 +21,6 @@ def describe_floor(floor: Warehouse) -> dict[str, Any]:
     A goal is unreachable where no robot gets there from the largest part of the floor, by its
     one-way rules. `hash` names the floor whatever it is called.
     """
-    planner = Planner(floor)
-    _, part = csgraph.connected_components(planner._graph, connection="strong")
-    cells = np.array([planner.cell(x, y) for x, y in floor.goals])
-    largest = np.bincount(part[cells]).argmax()
     widths = [segment.width_m for segment in floor.segments]
     return {
         "name": floor.name,
@@ -36,16 +34,55 @@ def describe_floor(floor: Warehouse) -> dict[str, Any]:
         "one_way_rules": len(floor.one_way),
         "docks": len(floor.docks),
         "goals": len(floor.goals),
-        "unreachable_goals": int((part[cells] != largest).sum()),
+        "unreachable_goals": unreachable_goals(floor),
         "map_origin": list(floor.map_origin),
-        "episodes": [kind for kind in KINDS if _fits(kind, floor, planner)],
+        "episodes": list(fitting_kinds(floor)),
     }
 
 
-def _fits(kind: str, floor: Warehouse, planner: Planner) -> bool:
-    """Whether an episode of this kind could be drawn."""
+def refuse_unfit(floors: Iterable[Warehouse], kinds: Iterable[str]) -> None:
+    """Raises ConfigError where a floor has no room for one of these kinds of episodes."""
+    kinds = tuple(kinds)
+    for floor in floors:
+        unfit = [kind for kind in kinds if kind not in fitting_kinds(floor)]
+        if unfit:
+            raise ConfigError(
+                f"{floor.name} has no room for episodes of {', '.join(unfit)}",
+                where="layouts",
+                remedy="train and record without these conditions, or give it more aisles or room;"
+                " `restock twin layout` says what fits on a floor",
+            )
+
+
+def sealed(floors: Iterable[Warehouse]) -> list[str]:
+    """A line a floor that has goals which no robot reaches: its episodes never go there."""
+    return [
+        f"{floor.name}: {count} of {len(floor.goals)} goals cannot be reached from the others"
+        for floor in floors
+        if (count := unreachable_goals(floor))
+    ]
+
+
+def unreachable_goals(floor: Warehouse) -> int:
+    """How many goals a robot cannot reach from the part with the most of them, and come back."""
+    planner = Planner(floor)
+    _, part = csgraph.connected_components(planner._graph, connection="strong")
+    cells = np.array([planner.cell(x, y) for x, y in floor.goals])
+    return len(cells) - int(np.bincount(part[cells]).max())
+
+
+@lru_cache(maxsize=1024)
+def fitting_kinds(floor: Warehouse) -> tuple[str, ...]:
+    """The kinds of episodes that could be drawn on a floor, whatever their seed (of three)."""
+    planner = Planner(floor)
+    return tuple(
+        kind for kind in KINDS if all(_fits(kind, seed, floor, planner) for seed in range(3))
+    )
+
+
+def _fits(kind: str, seed: int, floor: Warehouse, planner: Planner) -> bool:
     try:
-        draw_episode(EpisodeSpec(kind, 0), floor, planner)
+        draw_episode(EpisodeSpec(kind, seed), floor, planner)
     except ConfigError:
         return False
     return True

@@ -18,6 +18,7 @@ from restock.train.config import TrainConfig, apply_overrides, load_config, pars
 from restock.train.episode import KINDS
 from restock.train.evaluate import Twin
 from restock.train.explore import AFTER_LOGS
+from restock.train.floor_report import refuse_unfit, sealed
 from restock.train.floors import held_out, open_floors
 from restock.train.kernel import update_path
 from restock.train.learner import open_device
@@ -55,8 +56,7 @@ class Prepared:
                 self.profile,
                 min(_EVALUATION_ENVS, self.config.evaluation.episodes * len(KINDS)),
                 nthread=0,
-                layouts=self.config.evaluation.layouts
-                or held_out(self.config.env.layouts, "validation"),
+                layouts=_evaluation_layouts(self.config),
             ),
             logs=_logs(self.panel, self.config) if self.panel is not None else None,
             resume=self.resumed is not None,
@@ -74,6 +74,7 @@ class Prepared:
             f" {schedule.env_steps:,} environment steps"
             + (f" or {schedule.seconds:g} s" if schedule.seconds is not None else "")
             + f"; seed {config.seed}, {config.device}"
+            + "".join(f"\n{line}" for line in sealed(open_floors(config.env.layouts)))
         )
 
 
@@ -90,8 +91,10 @@ def prepare_new(
     check_free(out)
     config = load_config(config_path, overrides)
     open_device(config.device)
-    for layouts in {config.env.layouts, config.evaluation.layouts or config.env.layouts}:
-        open_floors(layouts)  # what is wrong with one is said before anything is written
+    for layouts in {config.env.layouts, _evaluation_layouts(config)}:
+        # What is wrong with one is said before anything is written. Evaluation drives all kinds
+        # that are named, whatever their share.
+        refuse_unfit(open_floors(layouts), config.env.conditions)
     profile = load_profile(config.profile)
     panel = open_panel(panel_path, config, profile) if panel_path is not None else None
     config = resolve_config(config, panel)
@@ -172,6 +175,10 @@ def make_twin(
         layouts=layouts or config.env.layouts,
     )
     return twin
+
+
+def _evaluation_layouts(config: TrainConfig) -> str:
+    return config.evaluation.layouts or held_out(config.env.layouts, "validation")
 
 
 def resolve_config(config: TrainConfig, panel: Panel | None) -> TrainConfig:

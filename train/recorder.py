@@ -165,7 +165,12 @@ def record(
     """
     begun = time.perf_counter()
     guest = load_policy(plan) if policy is None else _guest(plan, policy)
-    fleet = Fleet(plan.hardware, layouts=plan.layouts, scan_hz=plan.rates.scan)
+    fleet = Fleet(
+        plan.hardware,
+        layouts=plan.layouts,
+        conditions=plan.conditions,
+        scan_hz=plan.rates.scan,
+    )
     robot = _robot(plan, fleet)
     summary = Summary(path, plan)
     driver, version = (plan.policy, "1") if guest is None else (guest.name, guest.version)

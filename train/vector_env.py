@@ -45,6 +45,7 @@ from restock.train.action_face import Face, action_face
 from restock.train.camera import Camera, View, check_view
 from restock.train.draw import draw_map
 from restock.train.episode import KINDS, Episode, EpisodeSpec, draw_episode
+from restock.train.floor_report import refuse_unfit
 from restock.train.floors import open_floors
 from restock.train.layout import DEFAULT, Warehouse, default_warehouse
 from restock.train.navigation import Navigation
@@ -101,9 +102,9 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         `render()` draws a top-down map, or with a `camera` ("chase", "overhead") renders over EGL.
 
         Raises:
-            ConfigError: an unknown condition, shares that are no shares, no environments, an
-                action space that is not there, or an autoreset mode other than SAME_STEP and
-                DISABLED.
+            ConfigError: an unknown condition, shares that are no shares, a floor without room for
+                a condition's episodes, no environments, an action space that is not there, or an
+                autoreset mode other than SAME_STEP and DISABLED.
         """
         if num_envs < 1:
             raise ConfigError(f"num_envs must be 1 or more, got {num_envs}", where="the twin")
@@ -126,13 +127,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
             raise ConfigError("autoreset is SameStep or Disabled", where="the twin")
         self.metadata = {**type(self).metadata, "autoreset_mode": self.autoreset_mode}
         self.set_conditions(conditions or DEFAULT_CONDITIONS)
-        bare = [floor.name for floor in self.floors if not floor.segments]
-        if bare and self.conditions.get("blocked_aisle"):
-            raise ConfigError(
-                f"{', '.join(bare)} has no aisle that pallets could close",
-                where="layouts",
-                remedy="give it aisles, or conditions without blocked_aisle",
-            )
+        refuse_unfit(self.floors, [kind for kind, share in self.conditions.items() if share])
 
         limit = np.full(self.task.observation_size, OBSERVATION_LIMIT, np.float32)
         self.single_observation_space = gymnasium.spaces.Box(-limit, limit, dtype=np.float32)

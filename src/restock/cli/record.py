@@ -63,6 +63,7 @@ class Record:
         """Record, and print what was recorded."""
         from restock.cli import output
         from restock.train.bag_writer import refuse_existing
+        from restock.train.floor_report import refuse_unfit, sealed
         from restock.train.floors import open_floors
         from restock.train.missions import NATURAL, parse_shares
         from restock.train.perturbation import find_perturbation
@@ -97,12 +98,15 @@ class Record:
             ),
         )
         load_policy(plan)  # what is wrong with it is said before anything is driven
-        open_floors(plan.layouts)
+        floors = open_floors(plan.layouts)
+        refuse_unfit(floors, [kind for kind, share in plan.conditions.items() if share])
         refuse_existing(self.out)
         if self.dry_run:
             wanted = {"path": str(self.out), "dry_run": True, **plan.describe()}
             output.print_json(wanted) if self.json else _print_plan(wanted)
             return
+        for line in sealed(floors):
+            output.say(line)
         total = plan.minutes if plan.minutes is not None else float(plan.missions or 0)
         with output.progress(f"recording {self.out.name}", total) as advance:
 
