@@ -32,7 +32,7 @@ from restock.train.run import Run, panel_document
 TASK = load_profile("warehouse_amr").task
 MIXTURE = parse_mixture("[each_condition]\nshare = 'natural'\n[held_out]\nshare = 0.3\n")
 NETWORK = NetworkConfig(hidden=(16,))
-QUICK = Fit(iterations=2, updates=2, batch_size=32, hidden=(8,))
+QUICK = Fit(iterations=2, updates=2, batch_size=32, hidden=(8,), cloning_updates=50)
 
 
 def chances(table: pa.Table, chance: float) -> pa.Table:

@@ -235,7 +235,9 @@ def test_fitted_q_is_the_same_again_for_the_same_seed() -> None:
 
 def test_cloning_finds_the_behaviour() -> None:
     seen, _ = rows(600, 10)
-    network = cloned_behaviour(seen.observation, seen.action, ACTIONS, updates=400, fit=TABULAR)
+    network = cloned_behaviour(
+        seen.observation, seen.action, ACTIONS, fit=replace(TABULAR, cloning_updates=400)
+    )
     logits = values(network, np.eye(STATES, dtype=np.float32)[:-1])
     chance = np.exp(logits) / np.exp(logits).sum(axis=1, keepdims=True)
     np.testing.assert_allclose(chance, BEHAVIOUR[:-1], atol=0.05)

@@ -226,6 +226,13 @@ def test_every_section_has_its_figures(html: str) -> None:
         assert part.count("<svg") == figures, section
 
 
+def test_estimates_from_logs_are_on_the_page_with_what_was_refused(html: str) -> None:
+    part = html.split('<section id="learning">')[1].split("</section>")[0]
+    assert "Judged on held-out logs" in part
+    assert "0.50 [0.50, 0.50]" in part
+    assert "refused: &lt;script&gt;" in part
+
+
 def test_a_measured_gap_is_a_section(run: Path, tmp_path: Path) -> None:
     position = {"condition": "nominal", "horizon_s": 3.0, "quantity": "position", "unit": "m"}
     position |= {"source": "nominal", "segments": 40, "episodes": 9}

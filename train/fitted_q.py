@@ -46,6 +46,7 @@ class Fit:
     hidden: Sequence[int] = (128, 128)
     layer_norm: bool = True
     learning_rate: float = 1e-3  # falls to a tenth over the iterations
+    cloning_updates: int = 1500  # of the behaviour, where its probabilities are not logged
 
 
 def soft_greedy(network: Network, observation: F32, epsilon: float) -> F32:
@@ -116,7 +117,6 @@ def cloned_behaviour(
     action: NDArray[np.int64],
     actions: int,
     *,
-    updates: int = 1500,
     fit: Fit = Fit(),
     seed: int = 0,
 ) -> QNetwork:
@@ -131,7 +131,7 @@ def cloned_behaviour(
     )  # fmt: skip
     seen, taken = torch.from_numpy(observation), torch.from_numpy(action)
     optimizer = torch.optim.Adam(network.parameters(), lr=fit.learning_rate, fused=True)
-    for _ in range(updates):
+    for _ in range(fit.cloning_updates):
         some = torch.randint(len(taken), (fit.batch_size,), generator=generator)
         _descend(optimizer, nn.functional.cross_entropy(network(seen[some]), taken[some]))
     return network

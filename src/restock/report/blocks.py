@@ -48,6 +48,15 @@ def table(
     }
 
 
+def estimate(row: dict[str, Any]) -> str:
+    """A value with its interval, or why there is none."""
+    if row["value"] is None:
+        return f"refused: {row['refused']}"
+    if row["low"] is None:
+        return f"{row['value']:.2f}"
+    return f"{row['value']:.2f} [{row['low']:.2f}, {row['high']:.2f}]"
+
+
 def percent(value: float | None) -> str:
     if value is None:
         return ""

@@ -12,6 +12,7 @@ from typing import Any
 
 import msgspec
 
+from restock.report.blocks import estimate
 from restock.report.facts import Facts, Rows
 from restock.report.feed import flattery
 
@@ -139,21 +140,12 @@ def as_markdown(card: dict[str, Any]) -> str:
     if card["off_policy"]:
         lines += ["", "## Judged on held-out logs, before it drove", ""]
         lines += _table(
-            [{**row, "value": _estimate(row)} for row in card["off_policy"]],
+            [{**row, "value": estimate(row)} for row in card["off_policy"]],
             {"measure": "measure", "estimator": "estimator", "value": "value [95 %]"},
         )
     if card["missing"]:
         lines += ["", "## Not known", "", *(f"- {_cell(line)}" for line in card["missing"])]
     return "\n".join(lines) + "\n"
-
-
-def _estimate(row: dict[str, Any]) -> str:
-    """A value with its interval, or why there is none."""
-    if row["value"] is None:
-        return f"refused: {row['refused']}"
-    if row["low"] is None:
-        return f"{row['value']:.2f}"
-    return f"{row['value']:.2f} [{row['low']:.2f}, {row['high']:.2f}]"
 
 
 def _panel(capacity: dict[str, Any]) -> str:

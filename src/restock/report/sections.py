@@ -7,9 +7,9 @@ from typing import Any
 from markupsafe import Markup
 
 from restock.report import charts, floor
-from restock.report.blocks import Section, count, section, table, target_rule
+from restock.report.blocks import Section, count, estimate, section, table, target_rule
 from restock.report.charts import words
-from restock.report.facts import CELL_M, Facts, pretty, span
+from restock.report.facts import CELL_M, Facts, Rows, pretty, span
 from restock.train.layout import default_warehouse
 
 
@@ -126,7 +126,33 @@ def learning(facts: Facts) -> Section:
             "caption": "A low loss alone says little: a frozen target has the lowest loss of all.",
         }
     )
-    return section("learning", "How did it learn?", figures=figures, two=True)
+    return section(
+        "learning", "How did it learn?", figures=figures, two=True, tables=_judged(facts.judged)
+    )
+
+
+def _judged(rows: Rows) -> list[dict[str, Any]]:
+    """Off-policy estimates, where a run has them."""
+    if not rows:
+        return []
+    shown = [
+        {
+            "measure": row["measure"],
+            "estimator": row["estimator"],
+            "value [95 %]": estimate(row),
+            "episodes": row["episodes"],
+        }
+        for row in rows
+    ]
+    return [
+        table(
+            shown,
+            numbers={"episodes"},
+            title="Judged on held-out logs, before it drove",
+            caption="Over all conditions; an estimate is refused where the weights leave too few"
+            " episodes to say.",
+        )
+    ]
 
 
 def critic(facts: Facts) -> Section | None:
