@@ -134,6 +134,7 @@ def test_known_latency_gain_and_wheels_are_recovered(known: Path, tmp_path: Path
         base=base,
         horizon_s=2.0,
         search_points=4,
+        most_segments=12,
     )
     for item in found.estimates:
         true = getattr(KNOWN, item.name)
@@ -200,7 +201,7 @@ def test_a_schedule_of_several_fits_spans_what_all_of_them_told(tmp_path: Path) 
 def test_bumps_and_slippery_patches_are_not_ordinary_driving(log: Segments) -> None:
     log.signals["bumped"][:] = False
     log.signals["clearance_m"][:] = 1.0
-    log.true_condition[:] = "nominal"
+    log = replace(log, true_condition=np.full(log.true_condition.shape, "nominal", "<U20"))
     log.signals["bumped"][0, 3] = True
     log.signals["clearance_m"][1, 0] = 0.01
     log.true_condition[2, 1] = "wheel_slip"
@@ -251,6 +252,7 @@ def test_the_command_prints_json_and_a_dry_run_writes_nothing(
 ) -> None:
     out = tmp_path / "fitted.toml"
     line = ["twin", "fit", str(known), "--parameters", "gain", "--horizon-s", "2", "--search", "0"]
+    line += ["--segments", "8", "--held-out", "0"]
     assert cli.main([*line, "--out", str(out), "--dry-run", "--json"]) == ExitCode.OK
     said = json.loads(capsys.readouterr().out)
     assert [item["name"] for item in said["fits"][0]["estimates"]] == ["gain"]
