@@ -118,12 +118,13 @@ def test_each_comparison_is_judged_by_its_own_treatment(
         job.path.mkdir(parents=True)
         job.done.write_text(plan.fingerprint(job))
     dueling = Difference("config.network.dueling", "algorithm", False, True)
+    own = [Difference(f"library.arguments.{n}", "algorithm", None, 1) for n in ("gamma", "tau")]
 
     def judged(first, second, *, treatment):
         asked.append((first[0].name, second[0].name, treatment))
         if treatment == "algorithm":
             return Comparison(treatment, "incomparable", [dueling], [dueling], [], [], None, [])
-        return Comparison(treatment, "comparable", [dueling], [], [], [], "evaluation", [])
+        return Comparison(treatment, "comparable", [dueling, *own], [], [], [], "evaluation", [])
 
     asked: list[tuple[str, str, str]] = []
     monkeypatch.setattr(study_run, "compare", judged)
@@ -142,7 +143,7 @@ def test_each_comparison_is_judged_by_its_own_treatment(
     page = (out / "study.md").read_text()
     assert 'they differ in config.network.dueling, which treatment = "algorithm"' in page
     assert "## again against dueling" in page
-    assert "Not held: the algorithm (config.network.dueling)" in page
+    assert "Not held: the algorithm (config.network.dueling, library.arguments)." in page
 
 
 def test_panels_of_mixtures_are_the_studys_own(tmp_path: Path) -> None:

@@ -96,7 +96,8 @@ def check_feeds(first: Feed, second: Feed, limits: Limits, rng: np.random.Genera
                 if any(fed):  # one arm was not fed at all then
                     checks.append(Check(name, part, None, None, 1.0, 1.0, 1.0, limit))
                 continue
-            a, b = a / a.sum(1, keepdims=True), b / b.sum(1, keepdims=True)
+            with np.errstate(invalid="ignore"):  # a resample without a row: NaN, so inconclusive
+                a, b = a / a.sum(1, keepdims=True), b / b.sum(1, keepdims=True)
             checks.append(_distance(name, part, a, b, limit, limits))
             if tenth is None:
                 checks += _ratios(first.cells, name, a, b, limits)

@@ -41,7 +41,7 @@ def as_markdown(found: dict[str, Any]) -> str:
             continue
         lines += [
             f"| perturbation | condition | {baseline} | {comparison['arm']} | difference |"
-            " P(better) |",
+            " P(higher return) |",
             "| --- | --- | --- | --- | --- | --- |",
         ]
         for row in comparison["outcomes"]:
@@ -70,10 +70,13 @@ def _refusal(comparison: dict[str, Any]) -> str:
 def _held(comparison: dict[str, Any]) -> str:
     """What a comparison of methods holds fixed, and what it does not."""
     kinds = ("feed", "target", "algorithm")
-    differ = {
-        kind: [d["setting"] for d in comparison["differences"] if d["kind"] == kind]
-        for kind in kinds
-    }
+    differ: dict[str, list[str]] = {kind: [] for kind in kinds}
+    for difference in comparison["differences"]:
+        name = difference["setting"]
+        if name.startswith("library.arguments."):  # its own: one name for all of them
+            name = "library.arguments"
+        if name not in differ.get(difference["kind"], [name]):
+            differ[difference["kind"]].append(name)
     words = {"feed": "replay", "target": "the target rule", "algorithm": "the algorithm"}
     told = [f"{words[kind]} ({', '.join(names)})" for kind, names in differ.items() if names]
     same = [words[kind] for kind in kinds[:2] if not differ[kind]]
