@@ -107,7 +107,7 @@ def test_a_file_that_is_not_text(tmp_path):
 def test_what_stands_in_is_said():
     assert load_profile("warehouse_amr").fallbacks == {}
     assert set(load_profile("turtlebot3").fallbacks) == {
-        "bumper", "behaviour_policy", "true_condition", "goal", "plan",
+        "bumper", "behaviour_policy", "true_condition", "perturbation", "goal", "plan",
     }  # fmt: skip
 
 
