@@ -128,3 +128,24 @@ def test_what_is_no_policy_of_this_task_is_refused(run: Path, tmp_path: Path, ca
         OnnxPolicy(out, changed)
     assert main(["eval", str(run), "--policies", f"onnx:{tmp_path / 'text.onnx'}"]) == 2
     assert not (run / "eval").exists() or not list((run / "eval").glob("*.tmp"))
+
+
+def test_eval_takes_a_perturbation_from_a_file(run: Path, tmp_path: Path, capsys) -> None:
+    wet = tmp_path / "wet.toml"
+    wet.write_text('name = "wet"\nfriction_scale = 0.5\n')
+    argv = ["eval", str(run), "--dry-run", "--json", "--perturbations"]
+    assert main([*argv, f"none,{wet}"]) == 0
+    said = json.loads(capsys.readouterr().out)["perturbations"]
+    assert {name: table["friction_scale"] for name, table in said.items()} == {
+        "none": 1.0,
+        str(wet): 0.5,
+    }
+    for text, why in (
+        ("[ranges]\ngain = [0.9, 1.0]\n", "is a schedule"),
+        ("timestep_s = 0.005\n", "holds for a timestep of 0.005 s"),
+        ("grip = 1.0\n", "grip"),
+    ):
+        wet.write_text(text)
+        assert main([*argv, str(wet)]) == 2
+        assert why in capsys.readouterr().err.replace("\n", " ")
+    assert main([*argv, str(tmp_path / "none.toml")]) == 2
