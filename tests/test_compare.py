@@ -109,6 +109,9 @@ def make_run(
                 "time_s": 10.0,
                 "return": won.astype(float),
                 "best": True,
+                "perturbation": "none",
+                "layout": None,
+                "perturbation_values": None,
             },
         )
     run.flush()
