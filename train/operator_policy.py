@@ -31,6 +31,7 @@ STANDING_MARGIN_M = 0.2
 CAREFUL_M = 1.8  # from the robot's middle to a person's
 GENTLE_MPS = 0.45
 STANDING_MPS = 0.12
+PATIENCE_STEPS = 20  # with somebody in the way; then it moves about, to be let pass
 
 
 class Operator(SoftPolicy):
@@ -80,7 +81,7 @@ class Operator(SoftPolicy):
         tries = self._rng.random(score.shape) * 0.5 - 10.0 * hits
         tries[:, 0] -= 1.0
         tries[:, table[:, 0] < 0] += 1.0
-        stood = self._standing(env, pose) & alone
+        stood = self._standing(env, pose) & (alone | (self._still > PATIENCE_STEPS))
         score[stood] = tries[stood]
         return np.asarray(score.argmax(axis=1), np.int64)
 

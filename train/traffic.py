@@ -22,6 +22,7 @@ AGENTS = PEOPLE + FORKLIFTS  # the people first
 WAY_POINTS = 24
 FORKLIFT_RADIUS_M = 0.5  # of the circle that stands for it when it looks out
 YIELD_M = 0.5
+PASSING_M = 0.6  # from a plan to the side of who stands by it: half the robot and a margin
 STANDING_M = 0.15  # how near an inattentive one comes to a robot that stands or backs off
 RETREAT_M = 2.0  # how far off the robot a retreat ends
 DRIVEN_AT_MPS = 0.15  # closing speed by which a robot is said to drive at someone
@@ -52,7 +53,7 @@ def draw_walks(
             if oncoming
             else _crossing(rng, warehouse, plan, crossings[rng.integers(len(crossings))], 0.3)
         )
-    if crossings and rng.random() < 0.35:
+    if crossings and rng.random() < 0.65:  # there is room for half of them
         place = crossings[rng.integers(len(crossings))]
         walks[PEOPLE] = _crossing(rng, warehouse, plan, place, 0.6)
     return tuple(walks) if any(walk is not None for walk in walks) else None
@@ -81,6 +82,10 @@ def _crossing(
     if min(reach) < 1.0 and max(reach) < 2.0:
         return None
     start, end = place - across * min(reach[0], 4.0), place + across * min(reach[1], 4.0)
+    ends = np.stack([start, end])
+    off_plan = np.hypot(*(ends[:, None] - plan[None]).transpose(2, 0, 1)).min(axis=1)
+    if off_plan.min() < half_width_m + PASSING_M:
+        return None  # who waits or has arrived there would leave no room to pass
     speed = rng.uniform(0.5, 1.1)
     arrival_s = float(np.hypot(*(place - start))) / speed + rng.uniform(-0.6, 0.6)
     return Walk(
