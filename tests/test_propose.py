@@ -50,13 +50,13 @@ def proposed(recording: Path, folder: Path, capsys: pytest.CaptureFixture[str]) 
 def test_of_the_sample_bag_and_with_all_its_signals(tmp_path, capsys):
     recording = SAMPLES / "amr_tuesday"
     file = proposed(recording, tmp_path, capsys)
-    assert check(file, recording, capsys)["transitions"] == 729
+    assert check(file, recording, capsys)["transitions"] == 740
     text = file.read_text()
     count = len(re.findall(r"^# \[signals\.", text, re.M))
     assert count >= 8
     file.write_text(with_all_signals(text))
     outcome = check(file, recording, capsys)
-    assert outcome["transitions"] == 729
+    assert outcome["transitions"] == 740
     assert len(outcome["signals"]) == count
     for signal in outcome["signals"]:
         assert signal["steps"] > 0, signal["name"]

@@ -16,13 +16,11 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from restock.train.robot_topics import TOPICS
-from restock.train.scene import SCENE_TOPICS
 
 SAMPLES = Path(__file__).parents[1] / "sample_logs"
 MAKE = SAMPLES / "make.py"
 RECORDINGS = ("amr_monday.mcap", "amr_tuesday")
-# The scene came after these recordings: make it all of TOPICS when they are recorded anew.
-RECORDED = {topic.name for topic in TOPICS} - {topic.name for topic in SCENE_TOPICS}
+ALL = {topic.name for topic in TOPICS}
 
 
 @pytest.fixture(scope="module")
@@ -39,12 +37,12 @@ def test_the_files_are_those_of_the_manifest(manifest: dict[str, Any]) -> None:
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_every_topic_is_there_and_every_message_decodes(name: str) -> None:
     with AnyReader([SAMPLES / name]) as reader:
-        assert {connection.topic for connection in reader.connections} >= RECORDED
+        assert {connection.topic for connection in reader.connections} == ALL
         decoded = {
             connection.topic: reader.deserialize(data, connection.msgtype)
             for connection, _, data in reader.messages()
         }
-    assert decoded.keys() >= RECORDED
+    assert decoded.keys() == ALL
     assert decoded["/scan"].header.frame_id == "laser_link"
 
 
@@ -66,7 +64,7 @@ def test_another_decoder_reads_every_topic_by_the_definitions_in_the_file() -> N
             channel.topic: message
             for _, channel, _, message in islice(reader.iter_decoded_messages(), 2000)
         }
-    assert seen.keys() >= RECORDED
+    assert seen.keys() == ALL
     assert len(seen["/scan"].ranges) == 72
 
 
