@@ -272,8 +272,8 @@ def test_they_are_columns_of_the_table_with_units(store, capsys):
     rows = ask(store, "SELECT unnest(signals, recursive := true) FROM recordings", capsys)
     said = [(row["name"], row["unit"], row["type"], row["messages"]) for row in rows]
     assert said == [
-        ("left_radps", "rad/s", "number", 154),
-        ("beams_m", "m", "list", 741),
+        ("left_radps", "rad/s", "number", 156),
+        ("beams_m", "m", "list", 750),
         ("battery_v", "V", "number", 36),
     ]
 
