@@ -296,3 +296,19 @@ def test_all_of_a_known_robot_is_recovered(tmp_path: Path) -> None:
             true_value = getattr(true, item.name)
             assert item.value == pytest.approx(true_value, abs=within[item.name]), item
     assert found.held_out[-1].after_m < 0.25 * found.held_out[-1].before_m
+
+
+@pytest.mark.slow
+def test_friction_that_a_dry_log_does_not_tell_is_not_fitted_at_an_end_of_its_range(
+    tmp_path: Path,
+) -> None:
+    """The search once stopped at twice the floor's friction there, and called that fitted."""
+    logs = Path(__file__).parents[1] / "sample_logs" / "amr_monday.mcap"
+    ingest(logs, load_profile("warehouse_amr"), store=StoreWriter(tmp_path / "store"))
+    with Store(tmp_path / "store") as store:
+        found = fit(store)
+    (friction,) = (item for item in found.estimates if item.name == "friction_scale")
+    assert not friction.fitted
+    assert found.perturbation.friction_scale == 1.0
+    (after,) = (gap for gap in found.held_out if gap.horizon_s == 6.0)
+    assert after.after_m < 0.6 * after.before_m

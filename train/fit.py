@@ -298,8 +298,13 @@ def _unknown(
     ends = [_value(solution, index, end) for end in (low, high)]
     start = coordinates.point(coordinates.base)[index]
     stays = low - 1e-9 <= start <= high + 1e-9 or high - low > 0.9
+    # At an end of its range, and the residuals there do not move with it: where it got to is the
+    # search's doing, whatever the jumps of the cost on the way to the base say.
+    lost = known.half[index] > 1 and not 1e-9 < solution.z[index] < 1 - 1e-9
     unit = f" {parameter.unit}" if parameter.unit else ""
     reason = f"{ends[0]:.3g} to {ends[1]:.3g}{unit} explain the log as well"
+    if lost and not stays:
+        reason = "at the end of its range the log does not change with it"
     if parameter.name in ("friction_scale", "left_friction_scale"):
         now = coordinates.perturbation(solution.z)
         sliding = replay(
@@ -314,7 +319,7 @@ def _unknown(
             reason += f" (its correlation with {pair} is {value:.2f})"
     base = float(getattr(coordinates.base, parameter.name))
     told = Estimate(parameter.name, parameter.unit, base, ends[0], ends[1], False, reason)
-    return told, bool(stays)
+    return told, bool(stays or lost)
 
 
 def _partner(correlation: F64, index: int) -> int | None:
