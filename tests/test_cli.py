@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from restock import cli
+from restock.cli.output import print_table
 from restock.errors import ExitCode, RecordingError
 
 ROOT = Path(__file__).parents[1]
@@ -99,3 +100,11 @@ def test_starting_up_loads_none_of_the_heavy_libraries() -> None:
     )
     done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True)
     assert done.stdout.strip().endswith("[]")
+
+
+def test_a_title_wider_than_its_table_stays_on_one_line(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    title = "success [bold] against the baseline, " + "paired by episode, " * 20
+    print_table([{"a": 1}], title=title)
+    assert capsys.readouterr().out.splitlines()[0] == title.rstrip()

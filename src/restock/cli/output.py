@@ -75,9 +75,9 @@ def print_csv(rows: Sequence[Row], columns: Sequence[str] | None = None) -> None
 def print_table(
     rows: Sequence[Row], columns: Sequence[str] | None = None, *, title: str | None = None
 ) -> None:
-    """A table on stdout; numbers to the right."""
+    """A table on stdout, its title on a line of its own; numbers to the right."""
     names = list(columns if columns is not None else rows[0] if rows else ())
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for name in names:
         numeric = any(_is_number(row[name]) for row in rows)
         table.add_column(name, justify="right" if numeric else "left", overflow="fold")
@@ -85,6 +85,8 @@ def print_table(
         table.add_row(*(cell(row[name]) for name in names))
     console = stdout()
     with console.capture() as captured:
+        if title is not None:  # rich's own would be wrapped to the table's width
+            console.print(visible(title), style="table.title", markup=False, soft_wrap=True)
         console.print(table)
     # rich pads every line to the table's width; a pipe has no use for that.
     lines = captured.get().splitlines()
