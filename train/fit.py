@@ -166,9 +166,10 @@ def fit(
     before, _ = sides(good, cut)
     chosen = np.flatnonzero(before)
     if len(chosen) < FEWEST:
+        counts = {"held out": len(good) - len(chosen), **left}
         raise StoreError(
-            f"{len(chosen)} segments of {horizon_s:g} s to fit, fewer than {FEWEST}"
-            f" (of {len(every)}; left out: {left or 'none'}, and held out)",
+            f"{len(chosen)} segments of {horizon_s:g} s to fit, fewer than {FEWEST} (of"
+            f" {len(every)}: {', '.join(f'{count} {why}' for why, count in counts.items())})",
             where=str(store.path),
             remedy="ingest more driving, or give a shorter horizon",
         )
