@@ -7,7 +7,6 @@ later. Every field has its meaning in a comment; `docs/train.md` explains the ch
 from __future__ import annotations
 
 import copy
-import json
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,6 +18,7 @@ from restock.errors import ConfigError
 from restock.train.explore import LinearEpsilon
 from restock.train.perturbation import find_perturbation
 from restock.train.target import Polyak, TargetRule
+from restock.train.toml_values import toml_value
 
 # Shares of true conditions among the episodes of the twin.
 DEFAULT_CONDITIONS = {
@@ -261,14 +261,8 @@ def as_overrides(document: Mapping[str, Any], prefix: str = "") -> list[str]:
         if isinstance(value, Mapping) and prefix + key != "target":
             found += as_overrides(value, f"{prefix}{key}.")
         elif value is not None:
-            found.append(f"{prefix}{key}={_toml(value)}")
+            found.append(f"{prefix}{key}={toml_value(value)}")
     return found
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + "}"
-    return json.dumps(value)  # numbers, booleans, strings and lists are the same in TOML
 
 
 def parse_config(document: dict[str, Any], *, where: str) -> TrainConfig:

@@ -27,6 +27,7 @@ from restock.train.log_segments import Segments, segments
 from restock.train.mismatch import CHANNELS, Mismatch, position_gap_m
 from restock.train.open_loop import replay
 from restock.train.perturbation import Perturbation
+from restock.train.toml_values import toml_value
 
 F64 = NDArray[np.float64]
 
@@ -107,7 +108,7 @@ class Fit:
                 note = f"  # 95 %: {said[name].low:.4g} to {said[name].high:.4g}"
             elif name in said:
                 note = "  # not fitted"
-            lines.append(f"{name} = {_toml(value)}{note}")
+            lines.append(f"{name} = {toml_value(value)}{note}")
         return "\n".join(lines) + "\n"
 
 
@@ -409,7 +410,3 @@ def _noise(mismatch: Mismatch, base: Perturbation, fitted: Perturbation) -> dict
         }
         for name in mismatch.channels
     }
-
-
-def _toml(value: Any) -> str:
-    return msgspec.json.encode(value).decode() if isinstance(value, str) else repr(value)

@@ -13,6 +13,7 @@ from restock.errors import ConfigError, StoreError
 from restock.replay.store import Store
 from restock.train.fit import Fit
 from restock.train.perturbation import Perturbation, Schedule
+from restock.train.toml_values import toml_value
 
 
 def recordings_of(store: Store, wanted: Sequence[str], task_hash: str | None) -> list[str]:
@@ -78,15 +79,14 @@ def _schedule_toml(fits: Sequence[Fit]) -> str:
     made = schedule(fits)
     lines = [
         f"# Fitted to {len(fits)} recordings, each by itself, at {fits[0].timestep_s:g} s.",
-        f'name = "{made.name}"',
+        f"name = {toml_value(made.name)}",
         "",
         "[ranges]",
-        *(f"{name} = [{low!r}, {high!r}]" for name, (low, high) in made.ranges.items()),
+        *(f"{name} = {toml_value(ends)}" for name, ends in made.ranges.items()),
         "",
         "[base]",
     ]
     for name, value in msgspec.to_builtins(made.base).items():
         if value != getattr(Perturbation(), name):
-            text = msgspec.json.encode(value).decode() if isinstance(value, str) else repr(value)
-            lines.append(f"{name} = {text}")
+            lines.append(f"{name} = {toml_value(value)}")
     return "\n".join(lines) + "\n"

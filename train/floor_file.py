@@ -28,6 +28,7 @@ from restock.errors import ConfigError
 from restock.train.corridors import find_crossings, find_goals, find_segments
 from restock.train.layout import Axis, Dock, Heading, OneWay, Rect, Segment, Warehouse, bays
 from restock.train.occupancy_map import cells_of
+from restock.train.toml_values import toml_value
 
 Box = tuple[float, float, float, float]
 CELL_M = 0.05  # in which aisles are looked for
@@ -115,19 +116,15 @@ def read_floor(path: Path) -> Warehouse:
 
 def floor_toml(floor: Warehouse) -> str:
     """A floor as TOML that reads back equal."""
-    encode = msgspec.json.encode
-
-    def text(value: object) -> str:
-        return encode(value).decode()
 
     def box(area: Rect) -> str:
-        return text([float(e) for e in (area.x_min, area.y_min, area.x_max, area.y_max)])
+        return toml_value([float(e) for e in (area.x_min, area.y_min, area.x_max, area.y_max)])
 
     lines = [
-        f"name = {text(floor.name)}",
+        f"name = {toml_value(floor.name)}",
         f"width_m = {float(floor.width_m)!r}",
         f"depth_m = {float(floor.depth_m)!r}",
-        f"map_origin = {text([float(value) for value in floor.map_origin])}",
+        f"map_origin = {toml_value([float(value) for value in floor.map_origin])}",
         "racks = [",
         *(f"  {box(rack)}," for rack in floor.racks),
         "]",
@@ -135,20 +132,30 @@ def floor_toml(floor: Warehouse) -> str:
         *(f"  {box(crossing)}," for crossing in floor.crossings),
         "]",
         "goals = [",
-        *(f"  {text([float(x), float(y)])}," for x, y in floor.goals_m),
+        *(f"  {toml_value([float(x), float(y)])}," for x, y in floor.goals_m),
         "]",
     ]
     if not floor.segments:
         lines.append("aisle = []")
     for segment in floor.segments:
-        lines += ["", "[[aisle]]", f"name = {text(segment.name)}", f"box_m = {box(segment.area)}"]
-        lines += [f"along = {text(segment.along)}", f"aisle = {segment.aisle}"]
+        lines += [
+            "",
+            "[[aisle]]",
+            f"name = {toml_value(segment.name)}",
+            f"box_m = {box(segment.area)}",
+        ]
+        lines += [f"along = {toml_value(segment.along)}", f"aisle = {segment.aisle}"]
     for name, area in floor.cross_zones:
-        lines += ["", "[[zone]]", f"name = {text(name)}", f"box_m = {box(area)}"]
+        lines += ["", "[[zone]]", f"name = {toml_value(name)}", f"box_m = {box(area)}"]
     for dock in floor.docks:
-        lines += ["", "[[dock]]", f"name = {text(dock.name)}", f"box_m = {box(dock.area)}"]
+        lines += ["", "[[dock]]", f"name = {toml_value(dock.name)}", f"box_m = {box(dock.area)}"]
     for rule in floor.one_way:
-        lines += ["", "[[one_way]]", f"box_m = {box(rule.area)}", f"heading = {text(rule.heading)}"]
+        lines += [
+            "",
+            "[[one_way]]",
+            f"box_m = {box(rule.area)}",
+            f"heading = {toml_value(rule.heading)}",
+        ]
     return "\n".join(lines) + "\n"
 
 
