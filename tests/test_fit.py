@@ -247,6 +247,14 @@ def test_what_cannot_be_fitted_is_named(known: Path) -> None:
             fit(store, parameters=["gain"], horizon_s=0.35)
 
 
+def test_a_task_that_the_store_lacks_is_refused_recording_by_recording_too(
+    known: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = ["twin", "fit", str(known), "--per-recording", "--task", "none"]
+    assert cli.main(line) == ExitCode.USAGE
+    assert "not of none" in capsys.readouterr().err
+
+
 def test_the_command_prints_json_and_a_dry_run_writes_nothing(
     known: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

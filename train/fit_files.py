@@ -10,28 +10,9 @@ import msgspec
 import numpy as np
 
 from restock.errors import ConfigError, StoreError
-from restock.replay.store import Store
 from restock.train.fit import Fit
 from restock.train.perturbation import Perturbation, Schedule
 from restock.train.toml_values import toml_value
-
-
-def recordings_of(store: Store, wanted: Sequence[str], task_hash: str | None) -> list[str]:
-    """The ids of the store's recordings of a task, or those of them that are wanted."""
-    task_hash = task_hash or store.task().hash
-    rows = store.sql(
-        "SELECT DISTINCT recording_id FROM transitions"
-        f" WHERE task_hash = '{task_hash}' ORDER BY recording_id"
-    ).fetchall()
-    known = [str(row[0]) for row in rows]
-    for name in wanted:
-        if name not in known:
-            raise ConfigError(
-                f"no recording {name!r}",
-                where=str(store.path),
-                remedy='restock sql STORE "FROM recordings" lists them',
-            )
-    return list(wanted) or known
 
 
 def schedule(fits: Sequence[Fit]) -> Schedule:

@@ -169,18 +169,33 @@ def segments(
     )
 
 
-def _read(store: Store, task_hash: str, recordings: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """The steps of the store's episodes, in order, as columns."""
-    known = {
-        row[0] for row in store.sql("SELECT DISTINCT recording_id FROM transitions").fetchall()
-    }
-    for recording in recordings:
-        if recording not in known:
+def recordings_of(store: Store, wanted: Sequence[str], task_hash: str | None) -> list[str]:
+    """The ids of the store's recordings of a task, or those of them that are wanted.
+
+    Raises:
+        ConfigError: one that is wanted is not there.
+        StoreError: no rows, or rows of several tasks and no `task_hash`.
+    """
+    task = store.task(task_hash)
+    task_hash = task_hash or task.hash
+    rows = store.connection.execute(
+        "SELECT DISTINCT recording_id FROM transitions WHERE task_hash = ? ORDER BY recording_id",
+        [task_hash],
+    ).fetchall()
+    known = [str(row[0]) for row in rows]
+    for name in wanted:
+        if name not in known:
             raise ConfigError(
-                f"no recording {recording!r}",
+                f"no recording {name!r} of task {task_hash}",
                 where=str(store.path),
                 remedy='restock sql STORE "FROM recordings" lists them',
             )
+    return list(wanted) or known
+
+
+def _read(store: Store, task_hash: str, recordings: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """The steps of the store's episodes, in order, as columns."""
+    recordings_of(store, recordings, task_hash)
     text = files("restock.train").joinpath("log_segments.sql").read_text(encoding="utf-8")
     try:
         found = store.connection.execute(

@@ -65,7 +65,8 @@ class Fit:
         from restock.cli import output
         from restock.errors import ConfigError, ExitCode
         from restock.replay.store import Store
-        from restock.train.fit_files import recordings_of, write
+        from restock.train.fit_files import write
+        from restock.train.log_segments import recordings_of
 
         if self.out is not None and self.out.exists():
             raise ConfigError("is there already", where=str(self.out), remedy="name another --out")
