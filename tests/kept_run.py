@@ -8,26 +8,35 @@ import msgspec
 import torch
 
 from restock.ingest.profile import load_profile
+from restock.replay.panel import Panel
 from restock.train import checkpoint
-from restock.train.config import TrainConfig
-from restock.train.network import make_network
-from restock.train.run import Run
+from restock.train.config import NetworkConfig, TrainConfig
+from restock.train.network import Network, make_network
+from restock.train.run import Run, panel_document
+
+TASK = load_profile("warehouse_amr").task
+NETWORK = NetworkConfig()
 
 
-def kept_run(path: Path) -> Path:
-    """A network of random weights, seed 0, as the best of gradient step 7."""
-    task, config = load_profile("warehouse_amr").task, TrainConfig()
-    made = Run.create(path, {"config": msgspec.to_builtins(config), "panel": None})
+def kept_network(settings: NetworkConfig = NETWORK) -> Network:
+    """What `kept_run` keeps: random weights, seed 0."""
     generator = torch.Generator().manual_seed(0)
-    network = make_network(config.network, task.observation_size, len(task.actions), generator)
+    return make_network(settings, TASK.observation_size, len(TASK.actions), generator)
+
+
+def kept_run(path: Path, network: NetworkConfig = NETWORK, panel: Panel | None = None) -> Path:
+    """That network as the best of gradient step 7, as if it had learnt from the panel."""
+    config = msgspec.structs.replace(TrainConfig(), network=network)
+    fed = None if panel is None else panel_document(panel)
+    made = Run.create(path, {"config": msgspec.to_builtins(config), "panel": fed})
     made.best.parent.mkdir()
     checkpoint.save(
         made.best,
         {
-            "network": dict(network.state_dict()),
-            "observation_size": task.observation_size,
-            "actions": len(task.actions),
-            "task_hash": task.hash,
+            "network": dict(kept_network(network).state_dict()),
+            "observation_size": TASK.observation_size,
+            "actions": len(TASK.actions),
+            "task_hash": TASK.hash,
             "env_steps": 0,
             "gradient_steps": 7,
             "score": {},

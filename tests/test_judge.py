@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from conftest import recording_transitions, write_store
+from kept_run import kept_network, kept_run
 
 from restock.cli import main
 from restock.errors import RunError
@@ -21,13 +22,11 @@ from restock.replay.build import build_panel
 from restock.replay.mixture import parse_mixture
 from restock.replay.panel import Panel
 from restock.replay.store import Store
-from restock.train import checkpoint
-from restock.train.config import NetworkConfig, TrainConfig
+from restock.train.config import NetworkConfig
 from restock.train.fitted_q import Fit, soft_greedy
 from restock.train.held_episodes import Steps, find_evidence, read_steps
 from restock.train.judge import Judging, judge
 from restock.train.network import make_network
-from restock.train.run import Run, panel_document
 
 TASK = load_profile("warehouse_amr").task
 MIXTURE = parse_mixture("[each_condition]\nshare = 'natural'\n[held_out]\nshare = 0.3\n")
@@ -53,31 +52,6 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def panel(store: Path) -> Panel:
     with Store(store) as opened:
         return build_panel(opened, MIXTURE, store.parent / "panel")
-
-
-def run_of(path: Path, panel: Panel | None) -> Path:
-    """A run that kept a policy, as if it had learnt from the panel."""
-    config = msgspec.structs.replace(TrainConfig(), network=NETWORK)
-    document = {"config": msgspec.to_builtins(config)}
-    fed = panel_document(panel) if panel is not None else None
-    made = Run.create(path, document | {"panel": fed})
-    network = make_network(
-        NETWORK, TASK.observation_size, len(TASK.actions), torch.Generator().manual_seed(0)
-    )
-    made.best.parent.mkdir()
-    checkpoint.save(
-        made.best,
-        {
-            "network": dict(network.state_dict()),
-            "observation_size": TASK.observation_size,
-            "actions": len(TASK.actions),
-            "task_hash": TASK.hash,
-            "env_steps": 0,
-            "gradient_steps": 7,
-            "score": {},
-        },
-    )
-    return path
 
 
 @pytest.fixture(autouse=True)
@@ -150,9 +124,7 @@ def test_weights_are_of_logged_probabilities_and_of_cloned_ones_where_there_are_
     panel: Panel,
 ) -> None:
     evidence = find_evidence(panel, TASK)
-    network = make_network(
-        NETWORK, TASK.observation_size, len(TASK.actions), torch.Generator().manual_seed(0)
-    )
+    network = kept_network(NETWORK)
     rows = judge(network, evidence, discount=0.97, fit=QUICK)
     unknown = np.isnan(evidence.held.probability)
     assert 0 < unknown.mean() < 1
@@ -189,7 +161,7 @@ def test_soft_greedy_is_a_distribution_with_its_chance_on_the_best() -> None:
 def test_the_verb_judges_and_says_why_it_refuses(
     store: Path, panel: Panel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = run_of(tmp_path / "a", panel)
+    run = kept_run(tmp_path / "a", NETWORK, panel)
     argv = ["eval", str(run), "--on-logs", "own"]
     assert main([*argv, "--dry-run"]) == 0
     assert not (run / "eval").exists()
@@ -216,9 +188,7 @@ def test_the_verb_judges_and_says_why_it_refuses(
 
 def test_a_horizon_gives_an_answer_where_the_whole_was_refused(panel: Panel) -> None:
     evidence = find_evidence(panel, TASK)
-    network = make_network(
-        NETWORK, TASK.observation_size, len(TASK.actions), torch.Generator().manual_seed(0)
-    )
+    network = kept_network(NETWORK)
     evidence = replace(evidence, held=_known(evidence.held))
     how = Judging(epsilon=1.0, horizon=1)
     rows = judge(network, evidence, discount=0.97, measures=("return",), how=how, fit=QUICK)

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-import torch
+from kept_run import kept_network, kept_run
 
 from restock.errors import ConfigError
 from restock.ingest.live import LiveObserver
@@ -21,23 +21,13 @@ from restock.ingest.profile import load_profile
 from restock.ingest.store import StoreWriter
 from restock.ingest.transforms import Frames
 from restock.replay.store import Store
-from restock.train import checkpoint
-from restock.train.config import TrainConfig
 from restock.train.evaluate import GreedyPolicy
-from restock.train.network import make_network
-from restock.train.run import Run
 
 ROOT = Path(__file__).parents[1]
 BAG = ROOT / "sample_logs" / "amr_tuesday"
 EXAMPLE = ROOT / "docs" / "examples" / "ros2_policy.py"
 PROFILE = load_profile("warehouse_amr")
 TASK = PROFILE.task
-NETWORK = make_network(
-    TrainConfig().network,
-    TASK.observation_size,
-    len(TASK.actions),
-    torch.Generator().manual_seed(0),
-)
 
 
 @pytest.fixture(scope="module")
@@ -47,21 +37,7 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("onnxruntime")
     from restock.train.onnx_policy import export_onnx
 
-    path = tmp_path_factory.mktemp("runs") / "a"
-    made = Run.create(path, {"config": msgspec.to_builtins(TrainConfig()), "panel": None})
-    made.best.parent.mkdir()
-    checkpoint.save(
-        made.best,
-        {
-            "network": dict(NETWORK.state_dict()),
-            "observation_size": TASK.observation_size,
-            "actions": len(TASK.actions),
-            "task_hash": TASK.hash,
-            "env_steps": 0,
-            "gradient_steps": 7,
-            "score": {},
-        },
-    )
+    path = kept_run(tmp_path_factory.mktemp("runs") / "a")
     out = path.parent / "policy.onnx"
     export_onnx(path, out)
     return out
@@ -100,7 +76,7 @@ def test_the_node_sees_what_ingest_stores_and_acts_as_torch_does(
     live = np.stack([decisions[at][0].observation for at in times])
     assert not any(decisions[at][0].problem for at in times)
     np.testing.assert_allclose(live, stored, rtol=1e-6, atol=1e-6)
-    greedy, _ = GreedyPolicy(NETWORK).act(None, stored)
+    greedy, _ = GreedyPolicy(kept_network()).act(None, stored)
     assert [decisions[at][1] for at in times] == greedy.tolist()
     assert len(set(greedy.tolist())) > 1
     # What it published is the action table's.

@@ -9,15 +9,14 @@ import msgspec
 import numpy as np
 import pytest
 import torch
+from kept_run import kept_run
 
 from restock.cli import main
 from restock.errors import ConfigError
 from restock.ingest.profile import load_profile
-from restock.train import checkpoint
-from restock.train.config import NetworkConfig, TrainConfig
+from restock.train.config import NetworkConfig
 from restock.train.network import make_network
 from restock.train.onnx_policy import OnnxPolicy, to_onnx
-from restock.train.run import Run
 
 onnx = pytest.importorskip("onnx")
 runtime = pytest.importorskip("onnxruntime")
@@ -52,26 +51,7 @@ def test_values_are_those_of_torch(settings: dict[str, object]) -> None:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that kept a policy."""
-    path = tmp_path_factory.mktemp("runs") / "a"
-    config = TrainConfig()
-    made = Run.create(path, {"config": msgspec.to_builtins(config), "panel": None})
-    network = make_network(
-        config.network, TASK.observation_size, len(TASK.actions), torch.Generator().manual_seed(0)
-    )
-    made.best.parent.mkdir()
-    checkpoint.save(
-        made.best,
-        {
-            "network": dict(network.state_dict()),
-            "observation_size": TASK.observation_size,
-            "actions": len(TASK.actions),
-            "task_hash": TASK.hash,
-            "env_steps": 0,
-            "gradient_steps": 7,
-            "score": {},
-        },
-    )
-    return path
+    return kept_run(tmp_path_factory.mktemp("runs") / "a")
 
 
 def test_the_file_says_how_to_use_it(run: Path, tmp_path: Path, capsys) -> None:
