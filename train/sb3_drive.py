@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -59,11 +60,6 @@ def _made(kind: Any, config: TrainConfig, arguments: dict[str, Any], **ours: Any
         ) from error
 
 
-def _linears(*parts: Any) -> list[Any]:
-    modules = [module for part in parts for module in part.modules()]
-    return [module for module in modules if isinstance(module, torch.nn.Linear)]
-
-
 def dqn(
     config: TrainConfig, arguments: dict[str, Any], run: Run, evaluations: Evaluations
 ) -> tuple[int, int]:
@@ -87,17 +83,10 @@ def dqn(
     buffer.critic = dqn_critic(model)
     buffer.feed.run = run
     buffer.feed.keep_record(buffer.ring)
-
-    def evaluate() -> None:
-        linears = _linears(model.q_net.q_net)
-        network = as_network(config, evaluations.task, linears)
-        evaluations.drive(network, model.num_timesteps, buffer.feed.batches)
-
-    model.learn(config.schedule.env_steps, callback=_Every(evaluations, evaluate))
+    drive = _Drive(config, evaluations, [model.q_net.q_net], lambda: buffer.feed.batches)
+    model.learn(config.schedule.env_steps, callback=drive)
     buffer.close()
-    if evaluations.at != model.num_timesteps:
-        evaluate()
-    return model.num_timesteps, buffer.feed.batches
+    return drive.end()
 
 
 def ppo(
@@ -114,31 +103,42 @@ def ppo(
         },
     )
     fed = _OnPolicyFeed(config, run, model)
-
-    def evaluate() -> None:
-        policy = model.policy
-        linears = _linears(policy.mlp_extractor.policy_net, policy.action_net)
-        network = as_network(config, evaluations.task, linears)
-        evaluations.drive(network, model.num_timesteps, fed.updates)
-
-    model.learn(config.schedule.env_steps, callback=[fed, _Every(evaluations, evaluate)])
+    parts = [model.policy.mlp_extractor.policy_net, model.policy.action_net]
+    drive = _Drive(config, evaluations, parts, lambda: fed.updates)
+    model.learn(config.schedule.env_steps, callback=[fed, drive])
     fed.close()
-    if evaluations.at != model.num_timesteps:
-        evaluate()
-    return model.num_timesteps, fed.updates
+    return drive.end()
 
 
-class _Every(BaseCallback):
-    """Evaluates when it is due."""
+class _Drive(BaseCallback):
+    """Evaluates what the linear layers of `parts` make when it is due, and at the end."""
 
-    def __init__(self, evaluations: Evaluations, evaluate: Any) -> None:
+    def __init__(
+        self,
+        config: TrainConfig,
+        evaluations: Evaluations,
+        parts: list[torch.nn.Module],
+        updates: Callable[[], int],
+    ) -> None:
         super().__init__()
-        self.evaluations, self.evaluate = evaluations, evaluate
+        self.config, self.evaluations, self.updates = config, evaluations, updates
+        modules = [module for part in parts for module in part.modules()]
+        self.linears = [module for module in modules if isinstance(module, torch.nn.Linear)]
 
     def _on_step(self) -> bool:
         if self.evaluations.due(self.num_timesteps):
-            self.evaluate()
+            self._evaluate()
         return True
+
+    def end(self) -> tuple[int, int]:
+        """How many environment steps and updates were made, the last of them evaluated."""
+        if self.evaluations.at != self.num_timesteps:
+            self._evaluate()
+        return self.num_timesteps, self.updates()
+
+    def _evaluate(self) -> None:
+        network = as_network(self.config, self.evaluations.task, self.linears)
+        self.evaluations.drive(network, self.num_timesteps, self.updates())
 
 
 class _OnPolicyFeed(BaseCallback):
