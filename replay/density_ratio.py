@@ -29,6 +29,7 @@ from scipy.optimize import minimize
 from scipy.special import log_softmax, softmax
 
 from restock.replay.layout import F32, F64, Ints
+from restock.replay.store import passed_in
 
 FIT_ROWS = 20_000  # of each outcome, chosen by id
 PENALTY = 1e-3  # L2, on standardised features
@@ -188,8 +189,7 @@ def _observations(
     order = np.argsort(wanted)
     ordered = wanted[order]
     find: Callable[[Ints], Ints] = lambda found: order[np.searchsorted(ordered, found)]  # noqa: E731
-    connection.register("ratio_ids", pa.table({"transition_id": wanted}))
-    try:
+    with passed_in(connection, ratio_ids=pa.table({"transition_id": wanted})):
         reader = connection.sql(
             "SELECT transition_id, observation FROM transitions"
             " WHERE transition_id IN (SELECT transition_id FROM ratio_ids)"
@@ -198,5 +198,3 @@ def _observations(
             flat = batch.column("observation").flatten().to_numpy(zero_copy_only=False)
             size = len(flat) // max(batch.num_rows, 1)
             yield flat.reshape(-1, size), at[find(batch.column("transition_id").to_numpy())]
-    finally:
-        connection.unregister("ratio_ids")

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -206,6 +207,18 @@ def _manifests(place: Location, recordings: DeltaTable, rows: Sequence[str]) -> 
     gone = sorted(set(filter(OWN_PATH.fullmatch, rows)) - set(active))
     found = place.files.get_file_info([f"{RECORDINGS}/{path}" for path in gone])
     return active + [path for path, info in zip(gone, found, strict=True) if info.is_file]
+
+
+@contextmanager
+def passed_in(connection: duckdb.DuckDBPyConnection, **tables: pa.Table) -> Iterator[None]:
+    """Tables that the connection's SQL sees by their names, for as long as the block runs."""
+    for name, table in tables.items():
+        connection.register(name, table)
+    try:
+        yield
+    finally:
+        for name in tables:
+            connection.unregister(name)
 
 
 def read_parquet(

@@ -22,7 +22,7 @@ from restock.errors import RunError, StoreError
 from restock.ingest.location import Location
 from restock.ingest.task import Task
 from restock.replay.panel import HEADER, HELD_OUT, Panel
-from restock.replay.store import Store
+from restock.replay.store import Store, passed_in
 from restock.train.fitted_q import Rows
 
 Bools = NDArray[np.bool_]
@@ -160,11 +160,8 @@ def _open(logs: str | None, trained: Panel | None, task: Task) -> tuple[Store, I
 def read_steps(connection: duckdb.DuckDBPyConnection, ids: Ints) -> Steps:
     """The rows of these ids, by recording, episode and step."""
     query = files("restock.train").joinpath("held_episodes.sql").read_text(encoding="utf-8")
-    connection.register("asked", pa.table({"transition_id": ids}))
-    try:
+    with passed_in(connection, asked=pa.table({"transition_id": ids})):
         table = connection.sql(query).to_arrow_table()
-    finally:
-        connection.unregister("asked")
     names = np.asarray(table["episode_id"].to_pylist(), str)
     new = np.ones(len(names), np.bool_)
     new[1:] = names[1:] != names[:-1]
@@ -210,9 +207,8 @@ def _store_of(panel: Panel) -> Store:
 def _unseen(store: Store, trained: Panel, asked: Ints) -> tuple[Ints, int]:
     """Those of the rows whose episode has no row in the panel; and how many episodes had."""
     fed = pa.table({"episode_id": trained.meta["episode_id"].cast(pa.string())})
-    store.connection.register("asked", pa.table({"transition_id": asked}))
-    store.connection.register("fed", fed.group_by("episode_id").aggregate([]))
-    try:
+    ids = pa.table({"transition_id": asked})
+    with passed_in(store.connection, asked=ids, fed=fed.group_by("episode_id").aggregate([])):
         seen = store.connection.sql(
             "SELECT count(DISTINCT episode_id) FROM transitions"
             " SEMI JOIN asked USING (transition_id) SEMI JOIN fed USING (episode_id)"
@@ -221,22 +217,16 @@ def _unseen(store: Store, trained: Panel, asked: Ints) -> tuple[Ints, int]:
             "SELECT transition_id FROM transitions"
             " SEMI JOIN asked USING (transition_id) ANTI JOIN fed USING (episode_id)"
         ).fetchnumpy()["transition_id"]
-    finally:
-        store.connection.unregister("asked")
-        store.connection.unregister("fed")
     return np.asarray(rest, np.int64), int(seen[0][0])
 
 
 def _halves(store: Store, asked: Ints) -> tuple[Ints, Ints]:
     """Rows to judge by, and rows for the models: episodes by hash."""
-    store.connection.register("asked", pa.table({"transition_id": asked}))
-    try:
+    with passed_in(store.connection, asked=pa.table({"transition_id": asked})):
         found = store.connection.sql(
             "SELECT transition_id, hash(episode_id) % 2 = 0 AS judged"
             " FROM transitions SEMI JOIN asked USING (transition_id)"
         ).fetchnumpy()
-    finally:
-        store.connection.unregister("asked")
     ids, judged = np.asarray(found["transition_id"], np.int64), np.asarray(found["judged"])
     return ids[judged], ids[~judged]
 

@@ -22,7 +22,7 @@ from restock.ingest.schema import SIGNAL_COLUMNS
 from restock.ingest.signals import Columns
 from restock.ingest.store import TRANSITIONS
 from restock.ingest.task import Task
-from restock.replay.store import Store
+from restock.replay.store import Store, passed_in
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -109,14 +109,11 @@ def logged_steps(store: Store, task_hash: str | None = None) -> LoggedSteps:
 def observations(store: Store, transition_id: Ints, size: int) -> tuple[F32, F32]:
     """Observation and next observation of these rows, (n, D) each, in this order."""
     wanted = pa.table({"transition_id": transition_id, "place": np.arange(len(transition_id))})
-    store.connection.register("wanted_rows", wanted)
-    try:
+    with passed_in(store.connection, wanted=wanted):
         table = store.connection.sql(
-            "SELECT observation, next_observation FROM wanted_rows"
+            "SELECT observation, next_observation FROM wanted"
             " JOIN transitions USING (transition_id) ORDER BY place"
         ).to_arrow_table()
-    finally:
-        store.connection.unregister("wanted_rows")
     now, after = (_vectors(table[name], size) for name in ("observation", "next_observation"))
     return now, after
 
