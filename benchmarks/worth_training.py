@@ -40,7 +40,7 @@ from restock.train.evaluate import Policy, run_episodes
 from restock.train.operator_policy import Operator
 from restock.train.policies import PlannerFollower, RandomPolicy
 from restock.train.run import Run
-from restock.train.stats import wilson
+from restock.train.stats import percentiles, wilson
 from restock.train.traffic import PEOPLE
 from restock.train.vector_env import WarehouseVectorEnv
 
@@ -134,8 +134,7 @@ def interval(values: NDArray[np.float64], rng: np.random.Generator) -> tuple[flo
         ].mean()
         for _ in range(RESAMPLES)
     ]
-    low, high = np.quantile(draws, [0.025, 0.975])
-    return float(low), float(high)
+    return percentiles(np.array(draws))
 
 
 def groups(cells: list[str]) -> Iterator[tuple[str, NDArray[np.int64]]]:
@@ -245,7 +244,7 @@ def table(values: dict[str, NDArray[np.float64]], cells: list[str]) -> list[dict
             runs = rng.integers(len(measured), size=len(measured))
             drawn = [ids[rng.integers(len(ids), size=len(ids))] for ids in conditions]
             draws.append(overall(measured[runs, :, 0], drawn).mean())
-        low, high = (float(x) for x in np.quantile(draws, [0.025, 0.975]))
+        low, high = percentiles(np.array(draws))
         rows.append(
             {
                 "driver": driver,

@@ -27,6 +27,7 @@ from restock.train.log_segments import Segments, segments
 from restock.train.mismatch import CHANNELS, Mismatch, position_gap_m
 from restock.train.open_loop import replay
 from restock.train.perturbation import Perturbation
+from restock.train.stats import bootstrap, median
 from restock.train.toml_values import toml_value
 
 F64 = NDArray[np.float64]
@@ -392,10 +393,9 @@ def _held_out(
         replayed = replay(held, [base, fitted], timestep_s=timestep_s, nthread=nthread)
         end = position_gap_m(held, replayed)[:, :, -1]
         rng = np.random.Generator(np.random.PCG64(seed))
-        drawn = np.median(end[1][rng.integers(end.shape[1], size=(1000, end.shape[1]))], axis=1)
-        low, high = np.quantile(drawn, [0.025, 0.975])
-        before, now = (float(np.median(item)) for item in end)
-        gaps.append(Gap(round(horizon_s, 6), len(held), before, now, float(low), float(high)))
+        interval = bootstrap([end[1]], median, rng=rng, resamples=1000)
+        before, now = (median(item) for item in end)
+        gaps.append(Gap(round(horizon_s, 6), len(held), before, now, *interval))
     return tuple(gaps)
 
 

@@ -21,6 +21,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.train.stats import percentiles
+
 F64 = NDArray[np.float64]
 
 FQE, PDWIS, WDR, LOGGED = "fqe", "pdwis", "wdr", "logged"
@@ -188,7 +190,6 @@ def estimate(
     near = logged.until(horizon)
     refused = gate.refusal(near)
     counts = rng.multinomial(len(logged), np.full(len(logged), 1 / len(logged)), size=resamples)
-    tail = (1 - confidence) / 2
     found = []
     for name, of, estimator in (
         (LOGGED, logged, observed),
@@ -201,13 +202,9 @@ def estimate(
             continue
         value = float(estimator(of, once(len(logged)))[0])
         draws = estimator(of, counts.astype(np.float64))
-        low, high = np.quantile(draws, [tail, 1 - tail]) if len(logged) > 1 else (None, None)
-        found.append(Estimate(name, value, _number(low), _number(high)))
+        interval = percentiles(draws, confidence) if len(logged) > 1 else (None, None)
+        found.append(Estimate(name, value, *interval))
     return found
-
-
-def _number(value: float | None) -> float | None:
-    return None if value is None else float(value)
 
 
 __all__ = ["Estimate", "Gate", "Logged", "doubly_robust", "estimate", "fitted", "per_decision"]

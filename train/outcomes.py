@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from restock.errors import RunError
 from restock.train.arms import Arm
 from restock.train.run import Run
-from restock.train.stats import iqm, probability_of_improvement
+from restock.train.stats import iqm, percentiles, probability_of_improvement
 
 Cell = tuple[str, str]  # perturbation, condition (with the kind of block)
 _RESAMPLES = 2000
@@ -63,7 +63,7 @@ def _row(
             arm[rng.integers(len(arm), size=len(arm))][:, episodes, 0].mean() for arm in (a, b)
         ]
         differences[index] = means[1] - means[0]
-    low, high = np.quantile(differences, [0.025, 0.975])
+    low, high = percentiles(differences)
     # Episode by episode, over all pairs of runs.
     better = [
         probability_of_improvement(b[:, index, 1], a[:, index, 1]) for index in range(a.shape[1])
@@ -75,8 +75,8 @@ def _row(
         "runs": [len(a), len(b)],
         "success": [float(a[..., 0].mean()), float(b[..., 0].mean())],
         "difference": float(b[..., 0].mean() - a[..., 0].mean()),
-        "difference_low": float(low),
-        "difference_high": float(high),
+        "difference_low": low,
+        "difference_high": high,
         "return_iqm": [iqm(a[..., 1]), iqm(b[..., 1])],
         "improvement": float(np.mean(better)),
     }

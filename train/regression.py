@@ -22,7 +22,7 @@ from restock.errors import RunError
 from restock.train.evaluate import cell_name
 from restock.train.run import Run, write_table
 from restock.train.run_tables import EVAL_EPISODES
-from restock.train.stats import iqm
+from restock.train.stats import iqm, percentiles
 
 FOLDER = Path("baselines")  # where names are looked up, in the working directory
 EVERY = "all"
@@ -151,7 +151,7 @@ def _row(
         [d[rng.integers(len(d), size=(_RESAMPLES, len(d)))].mean(axis=1) for d in difference],
         axis=0,
     )
-    low, high = (float(bound) for bound in np.quantile(draws, [0.025, 0.975]))
+    low, high = percentiles(draws)
     middle = float(np.mean([d.mean() for d in difference]))
     success = [float(np.mean([pair[:, arm, 0].mean() for pair in pairs])) for arm in (0, 1)]
     together = np.concatenate(pairs)[:, :, 1]

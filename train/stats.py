@@ -46,6 +46,10 @@ def mean(values: NDArray[Any]) -> float:
     return float(np.mean(values))
 
 
+def median(values: NDArray[Any]) -> float:
+    return float(np.median(values))
+
+
 def bootstrap(
     strata: Sequence[NDArray[Any]],
     statistic: Callable[[F64], float] = mean,
@@ -66,6 +70,11 @@ def bootstrap(
     for index in range(resamples):
         sample = [group[rng.integers(len(group), size=len(group))] for group in groups]
         draws[index] = statistic(np.concatenate(sample))
+    return percentiles(draws, confidence)
+
+
+def percentiles(draws: NDArray[Any], confidence: float = 0.95) -> tuple[float, float]:
+    """The percentile interval of a statistic's bootstrap draws (R,)."""
     tail = (1 - confidence) / 2
     low, high = np.quantile(draws, [tail, 1 - tail])
     return float(low), float(high)
