@@ -8,6 +8,7 @@ import msgspec
 import torch
 
 from restock.ingest.profile import load_profile
+from restock.ingest.task import Task
 from restock.replay.panel import Panel
 from restock.train import checkpoint
 from restock.train.config import NetworkConfig, TrainConfig
@@ -18,25 +19,31 @@ TASK = load_profile("warehouse_amr").task
 NETWORK = NetworkConfig()
 
 
-def kept_network(settings: NetworkConfig = NETWORK) -> Network:
+def kept_network(settings: NetworkConfig = NETWORK, task: Task = TASK) -> Network:
     """What `kept_run` keeps: random weights, seed 0."""
     generator = torch.Generator().manual_seed(0)
-    return make_network(settings, TASK.observation_size, len(TASK.actions), generator)
+    return make_network(settings, task.observation_size, len(task.actions), generator)
 
 
-def kept_run(path: Path, network: NetworkConfig = NETWORK, panel: Panel | None = None) -> Path:
+def kept_run(
+    path: Path,
+    network: NetworkConfig = NETWORK,
+    panel: Panel | None = None,
+    profile: str = "warehouse_amr",
+) -> Path:
     """That network as the best of gradient step 7, as if it had learnt from the panel."""
-    config = msgspec.structs.replace(TrainConfig(), network=network)
+    task = load_profile(profile).task
+    config = msgspec.structs.replace(TrainConfig(), network=network, profile=profile)
     fed = None if panel is None else panel_document(panel)
     made = Run.create(path, {"config": msgspec.to_builtins(config), "panel": fed})
     made.best.parent.mkdir()
     checkpoint.save(
         made.best,
         {
-            "network": dict(kept_network(network).state_dict()),
-            "observation_size": TASK.observation_size,
-            "actions": len(TASK.actions),
-            "task_hash": TASK.hash,
+            "network": dict(kept_network(network, task).state_dict()),
+            "observation_size": task.observation_size,
+            "actions": len(task.actions),
+            "task_hash": task.hash,
             "env_steps": 0,
             "gradient_steps": 7,
             "score": {},

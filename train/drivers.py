@@ -89,42 +89,21 @@ def load_guest(name: str, task: Task, *, epsilon: float = 0.0, seed: int = 0) ->
         ConfigError: no such policy, or one of another task.
         RunError: a run without a policy, or a damaged one.
     """
-    kind, _, path = name.partition(":")
-    if kind == "run" and path:
-        return Guest(_of_run(Path(path), task), epsilon=epsilon, seed=seed, name=LEARNED)
-    if kind == "onnx" and path:
-        from restock.train.onnx_policy import OnnxPolicy
-
-        policy = OnnxPolicy(Path(path), task)
-        if policy.version:  # exported by Restock: the same policy has the same tag from either
-            return Guest(policy, epsilon=epsilon, seed=seed, name=LEARNED)
-        digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()[:12]
-        return Guest(policy, epsilon=epsilon, seed=seed, name="onnx", version=digest)
     if name in (HANDOVER, *SCRIPTED):
         return None
-    raise ConfigError(
-        f"there is no policy {name!r}",
-        where="--policy",
-        remedy=f"give {', '.join((HANDOVER, *SCRIPTED))}, run:DIRECTORY or onnx:FILE",
-    )
+    from restock.train.eval_run import load_policy
 
-
-def _of_run(path: Path, task: Task) -> Chooser:
-    from restock.ingest.profile import load_profile
-    from restock.train.config import parse_config
-    from restock.train.eval_run import load_agent
-    from restock.train.run import Run
-
-    run = Run.open(path)
-    agent = load_agent(run)
-    own = load_profile(parse_config(run.document["config"], where=str(path)).profile).task
-    if own.hash != task.hash:
+    policy = load_policy(name, task)
+    if policy is None:
         raise ConfigError(
-            f"was trained on task {own.hash}, the fleet drives task {task.hash}",
-            where=str(path),
-            remedy="record with a policy of the profile warehouse_amr",
+            f"there is no policy {name!r}",
+            where="--policy",
+            remedy=f"give {', '.join((HANDOVER, *SCRIPTED))}, run:DIRECTORY or onnx:FILE",
         )
-    return agent
+    if policy.version:  # made by Restock: the same policy has the same tag from a run or a file
+        return Guest(policy, epsilon=epsilon, seed=seed, name=LEARNED)
+    digest = hashlib.sha256(Path(name.removeprefix("onnx:")).read_bytes()).hexdigest()[:12]
+    return Guest(policy, epsilon=epsilon, seed=seed, name="onnx", version=digest)
 
 
 def check_epsilon(epsilon: float | None, policy: str) -> None:

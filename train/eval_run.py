@@ -17,6 +17,7 @@ import pyarrow as pa
 
 from restock.errors import ConfigError, RunError
 from restock.ingest.profile import load_profile
+from restock.ingest.task import Task
 from restock.train import checkpoint
 from restock.train.config import TrainConfig, parse_config
 from restock.train.episode import KINDS, EpisodeSpec
@@ -111,7 +112,8 @@ def plan_evaluation(
 
 def _is_path(flag: str, name: str) -> bool:
     if flag == "--policies":
-        return name.startswith(("onnx:", "run:"))
+        kind, _, path = name.partition(":")
+        return kind in ("onnx", "run") and bool(path)
     return name.endswith(".toml")
 
 
@@ -177,21 +179,41 @@ def _perturb(name: str) -> Perturbation | None:
 
 
 def make_policy(name: str, plan: Plan) -> Policy:
-    """The run's kept policy, or a scripted one."""
+    """The run's kept policy, a scripted one, or one that is named."""
     from restock.train.policies import PlannerFollower, RandomPolicy
 
-    kind, _, path = name.partition(":")
     if name == "agent":
         return load_agent(plan.run)
-    if kind == "run":
-        return load_agent(Run.open(Path(path)))
-    if kind == "onnx":
-        from restock.train.onnx_policy import OnnxPolicy
-
-        return OnnxPolicy(Path(path), load_profile(plan.config.profile).task)
     if name == "planner":
         return PlannerFollower(epsilon=0.0, seed=plan.first_seed)
-    return RandomPolicy(seed=plan.first_seed)
+    named = load_policy(name, load_profile(plan.config.profile).task)
+    return RandomPolicy(seed=plan.first_seed) if named is None else named
+
+
+def load_policy(name: str, task: Task) -> Policy | None:
+    """The policy that `run:DIRECTORY` (its best) or `onnx:FILE` names; None for other names.
+
+    Raises:
+        ConfigError: no such file, or a policy of another task.
+        RunError: no such run, one without a policy, or a damaged one.
+    """
+    kind, _, path = name.partition(":")
+    if kind == "onnx" and path:
+        from restock.train.onnx_policy import OnnxPolicy
+
+        return OnnxPolicy(Path(path), task)
+    if kind != "run" or not path:
+        return None
+    run = Run.open(Path(path))
+    agent = load_agent(run)
+    own = load_profile(parse_config(run.document["config"], where=path).profile).task
+    if own.hash != task.hash:
+        raise ConfigError(
+            f"was trained on task {own.hash}, this is {task.hash}",
+            where=path,
+            remedy="name a run of this task",
+        )
+    return agent
 
 
 def load_agent(run: Run) -> GreedyPolicy:
