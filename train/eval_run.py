@@ -8,7 +8,7 @@ episodes from and from those that chose the checkpoint.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from restock.train import checkpoint
 from restock.train.config import TrainConfig, parse_config
 from restock.train.episode import KINDS, EpisodeSpec
 from restock.train.evaluate import EpisodeResult, GreedyPolicy, Policy, run_episodes
-from restock.train.floor_report import refuse_unfit
+from restock.train.floor_report import refuse_unfit, unfit_kinds
 from restock.train.floors import held_out, open_floors
 from restock.train.network import make_network
 from restock.train.perturbation import PERTURBATIONS, Perturbation, Schedule, find_perturbation
@@ -49,11 +49,17 @@ class Plan:
     num_envs: int = 32
     nthread: int = 0  # all cores
     layouts: str = "default"
+    left_out: dict[str, list[str]] = field(default_factory=dict)  # kinds -> floors without room
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of episodes that every floor has room for."""
+        return tuple(kind for kind in KINDS if kind not in self.left_out)
 
     @property
     def total(self) -> int:
         """Episodes to drive."""
-        return len(self.policies) * len(self.perturbations) * len(KINDS) * self.episodes
+        return len(self.policies) * len(self.perturbations) * len(self.kinds) * self.episodes
 
 
 def plan_evaluation(
@@ -69,7 +75,8 @@ def plan_evaluation(
 
     Raises:
         RunError: no such run, or it kept no policy yet.
-        ConfigError: a policy or perturbation that does not exist, or no episodes.
+        ConfigError: a policy or perturbation that does not exist, floors without room for any
+            kind of episode, or no episodes.
     """
     run = Run.open(path)
     config = parse_config(run.document["config"], where=str(path / "config.json"))
@@ -94,6 +101,8 @@ def plan_evaluation(
             where=str(path),
             remedy=f"go on with `restock train --resume {path}`",
         )
+    layouts = layouts or held_out(config.env.layouts, "test")
+    floors = open_floors(layouts)
     plan = Plan(
         run,
         config,
@@ -101,9 +110,11 @@ def plan_evaluation(
         {name: _perturb(name) for name in perturbations},
         episodes,
         first_seed,
-        layouts=layouts or held_out(config.env.layouts, "test"),
+        layouts=layouts,
+        left_out=unfit_kinds(floors),
     )
-    refuse_unfit(open_floors(plan.layouts), KINDS)
+    if not plan.kinds:
+        refuse_unfit(floors, KINDS)
     for name in plan.policies:
         if _is_path("--policies", name):
             make_policy(name, plan)  # what is wrong with it is said before anything is driven
@@ -119,7 +130,7 @@ def _is_path(flag: str, name: str) -> bool:
 
 def evaluate(plan: Plan, progress: Callable[[int], None] | None = None) -> Results:
     """Drive all episodes, and write them to the run's `eval/episodes.parquet`."""
-    from restock.train.vector_env import WarehouseVectorEnv
+    from restock.train.vector_env import DEFAULT_CONDITIONS, WarehouseVectorEnv
 
     profile = load_profile(plan.config.profile)
     task = profile.task
@@ -129,13 +140,14 @@ def evaluate(plan: Plan, progress: Callable[[int], None] | None = None) -> Resul
         task=task,
         seed=plan.first_seed,
         layouts=plan.layouts,
+        conditions={kind: DEFAULT_CONDITIONS[kind] for kind in plan.kinds},
     )
     # One queue a policy, over all perturbations: few environments then wait for the last episodes.
     asked = [
         (name, EpisodeSpec(kind, plan.first_seed + index, perturbation))
         for name, perturbation in plan.perturbations.items()
         for index in range(plan.episodes)
-        for kind in KINDS
+        for kind in plan.kinds
     ]
     results: Results = {}
     for policy in plan.policies:
@@ -266,4 +278,6 @@ def settings(plan: Plan) -> dict[str, Any]:
         "episodes_per_kind": plan.episodes,
         "first_seed": plan.first_seed,
         "layouts": plan.layouts,
+        "kinds": list(plan.kinds),
+        "left_out": plan.left_out,
     }

@@ -54,6 +54,16 @@ def refuse_unfit(floors: Iterable[Warehouse], kinds: Iterable[str]) -> None:
             )
 
 
+def unfit_kinds(floors: Iterable[Warehouse]) -> dict[str, list[str]]:
+    """The kinds of episodes that some floor has no room for, and the names of those floors."""
+    found: dict[str, list[str]] = {}
+    for floor in floors:
+        for kind in KINDS:
+            if kind not in fitting_kinds(floor):
+                found.setdefault(kind, []).append(floor.name)
+    return found
+
+
 def sealed(floors: Iterable[Warehouse]) -> list[str]:
     """A line a floor that has goals which no robot reaches: its episodes never go there."""
     return [

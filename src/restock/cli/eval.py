@@ -13,9 +13,9 @@ import tyro
 class Eval:
     """Drive a run's kept policy through fixed episodes, beside the scripted planner and chance.
 
-    Every policy meets the same seeded episodes of every condition, clean and under each
-    perturbation. Prints success with 95 % Wilson intervals, contacts, time and return, blocked
-    aisles apart by partly and wholly, and writes RUN/eval/episodes.parquet.
+    Every policy meets the same seeded episodes of every condition that its floors have room for,
+    clean and under each perturbation. Prints success with 95 % Wilson intervals, contacts, time and
+    return, blocked aisles apart by partly and wholly, and writes RUN/eval/episodes.parquet.
 
     With --baseline it is compared with another run or a saved baseline on the same episodes.
     With --on-logs nothing drives: the policy is judged on logged episodes that it did not learn
@@ -65,7 +65,7 @@ class Eval:
         return self._drive()
 
     def _drive(self) -> int:
-        from restock.cli.output import print_json, progress
+        from restock.cli.output import print_json, progress, say
         from restock.errors import ConfigError, ExitCode
         from restock.train.eval_run import evaluate, plan_evaluation, settings
         from restock.train.evaluate import summary_rows
@@ -93,6 +93,8 @@ class Eval:
             return 0
         document: dict[str, Any] = {}
         if self.drive:
+            for kind, floors in plan.left_out.items():
+                say(f"left out: {kind}, no room for it on {', '.join(floors)}")
             with progress("driving", plan.total) as advance:
                 rows = summary_rows(evaluate(plan, advance))
             document = {**settings(plan), "results": rows}
