@@ -25,13 +25,15 @@ from restock.train.diagnose import diagnose
 from restock.train.run import Run
 
 STRATUM = "blocked_aisle"
+# Of the training episodes: none in the stratum, the rest as a run has them by default.
+LACKING = "env.conditions={nominal=0.4, wheel_slip=0.2, near_collision=0.2, blocked_aisle=0}"
 BUFFER, TARGET, DIVERGENCE = {"BUFFER", "BOTH"}, {"TARGET", "BOTH", "DIVERGENCE"}, {"DIVERGENCE"}
 # fault -> what may be said of it, and the settings that plant it
 FAULTS: dict[str, tuple[set[str], list[str]]] = {
     "healthy": ({"HEALTHY"}, []),
-    "stratum removed": (BUFFER, [f"env.conditions.{STRATUM}=0"]),
-    "stratum stale": (BUFFER, [f"env.conditions.{STRATUM}=0"]),
-    "stratum mislabelled": (BUFFER, [f"env.conditions.{STRATUM}=0"]),
+    "stratum removed": (BUFFER, [LACKING]),
+    "stratum stale": (BUFFER, [LACKING]),
+    "stratum mislabelled": (BUFFER, [LACKING]),
     "target frozen": (TARGET, ["target={rule='hard', every=1000000}"]),
     "target too slow": (TARGET, ["target={rule='polyak', tau=0.00003}"]),
     "target too fast": (TARGET, ["target={rule='polyak', tau=1.0}"]),

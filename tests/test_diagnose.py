@@ -30,6 +30,9 @@ def make_run(
     q_abs_max: float = 10.0,
     shares: Mapping[str, float] | None = None,
     quota_met: float = 1.0,
+    agreement: Mapping[str, float] | None = None,
+    unexplained: Mapping[str, float] | None = None,
+    strata: bool = True,  # named as the conditions are; else there is one of all rows
     until: int | None = None,  # the window in which the symptoms end
 ) -> Run:
     """A run whose evaluations show these figures, as training writes them."""
@@ -49,14 +52,30 @@ def make_run(
                         **clocks,
                         "condition": name,
                         "rows": 200,
+                        "rows_met": round(SHARES[name] * 1000),
                         "td_abs_mean": held_out,
                         "td_online_abs_mean": held_out * (clock if ill else 1.0),
                         "q_abs_mean": 1.0,
                         "q_lag": lag if ill else 0.05,
+                        "logs_agreement": (agreement or {}).get(name, 0.8),
+                        "logs_unexplained": (unexplained or {}).get(name, 0.45),
                     }
                 ],
             )
             if share:
+                run.append(
+                    "conditions",
+                    [
+                        {
+                            **dict.fromkeys(run.table("conditions").schema.names),
+                            **clocks,
+                            "source": "logs",
+                            "condition": name,
+                            "drawn_rows": round(share * 10_000),
+                            "td_abs_mean": replay_td,
+                        }
+                    ],
+                )
                 run.append(
                     "strata",
                     [
@@ -64,7 +83,7 @@ def make_run(
                             **dict.fromkeys(run.table("strata").schema.names),
                             **clocks,
                             "source": "logs",
-                            "stratum": name,
+                            "stratum": name if strata else "all",
                             "quota_share": share / quota_met,
                             "drawn_rows": round(share * 10_000),
                             "td_abs_mean": replay_td,
@@ -97,6 +116,13 @@ def make_run(
         ({}, "HEALTHY"),
         ({"gap": {"blocked_aisle": 6.0}}, "BUFFER"),
         ({"shares": {n: s for n, s in SHARES.items() if n != "blocked_aisle"}}, "BUFFER"),
+        ({"shares": {**SHARES, "blocked_aisle": 0.005}}, "BUFFER"),  # a tenth is met
+        ({"shares": {**SHARES, "blocked_aisle": 0.02}}, "HEALTHY"),
+        ({"agreement": {"blocked_aisle": 0.1}}, "BUFFER"),
+        ({"unexplained": {"blocked_aisle": 1.2}}, "BUFFER"),
+        ({"unexplained": dict.fromkeys(CONDITIONS, 1.2)}, "HEALTHY"),  # a noisy robot is no fault
+        ({"strata": False}, "HEALTHY"),
+        ({"strata": False, "gap": {"blocked_aisle": 6.0}}, "BUFFER"),
         ({"lag": 0.9}, "TARGET"),
         ({"lag": 0.0}, "TARGET"),  # no target network at all
         ({"clock": 8.0}, "TARGET"),

@@ -255,6 +255,13 @@ def test_every_drawn_row_is_counted(undisturbed: Session) -> None:
     last = {(row["source"], row["stratum"]): row["total_drawn_rows"] for row in drawn.to_pylist()}
     assert sum(last.values()) == steps * 32
     assert sum(pq.read_table(path / "policies.parquet")["rows"].to_pylist()) == steps * 32
+    by_condition = pq.read_table(path / "conditions.parquet").to_pylist()
+    assert sum(row["drawn_rows"] for row in by_condition) == steps * 32
+    own = {(r["gradient_steps"], r["source"], r["stratum"]): r for r in drawn.to_pylist()}
+    for row in by_condition:  # the strata of this panel are conditions
+        stratum = own[row["gradient_steps"], row["source"], row["condition"]]
+        for name in ("phase", "drawn_rows", "drawn_share", "effective_share", "td_abs_mean"):
+            assert row[name] == pytest.approx(stratum[name]), name
     fed = pq.read_table(path / "fed_episodes.parquet").to_pylist()
     assert sum(row["drawn_rows"] for row in fed) == steps * 32
     assert {row["episode"] for row in fed if row["source"] == "logs"} == {"a/0"}

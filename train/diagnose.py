@@ -10,8 +10,13 @@ networks disagree. The evaluations' own steps (`held_out`), which no replay has,
     L    mean |Q - Q_target| / mean |Q|
     S    |TD| with the online network bootstrapping / |TD| with the target network
 
-The limits are first values, from healthy runs and one with too slow a target; benchmarks/
-planted_faults.py plants seven faults, by which they are to be set.
+A network that generalises, or learns few rows by heart, hides what is wrong with its replay from
+all of these. So three figures look at the rows, not at the critic (`restock.train.log_fidelity`):
+how much of replay a condition is, beside how often it is met; how many of its logged rows look like
+it; and whether their next observations follow from them.
+
+Each figure is its median over the last evaluations. The limits are from faults planted in the twin
+(benchmarks/planted_faults.py; the table is in docs/diagnose.md).
 """
 
 from __future__ import annotations
@@ -29,7 +34,7 @@ from restock.errors import RunError
 from restock.train.run import Run
 
 Cause = Literal["HEALTHY", "BUFFER", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED"]
-WINDOWS = 3  # in a row must agree
+WINDOWS = 3  # the last, that figures are the median of
 _LEAST_ROWS = 20  # held out, for a condition to be judged
 
 
@@ -37,31 +42,36 @@ _LEAST_ROWS = 20  # held out, for a condition to be judged
 class Limits:
     """From where on a figure is a symptom."""
 
-    gap: float = 2.0  # G_k of a condition; O_k where replay has none of it
-    relative: float = 2.0  # and G_k over the median G
-    gap_median: float = 3.0  # below which the median G must be, for a buffer failure
+    gap: float = 3.0  # G_k of a condition; O_k where replay has none of it
+    relative: float = 3.0  # and G_k over the median G
     gap_everywhere: float = 6.0  # the median G: everything is worse held out
     lag: float = 0.25  # L: the target is far behind
     no_lag: float = 0.002  # L below this: there is no target network to speak of
     clock: float = 2.0  # S
-    absent_share: float = 0.001  # of replay: less of a condition is none
+    supply: float = 0.1  # a condition's share of replay over its share of what driving meets
+    agreement: float = 0.4  # of a condition's logged rows that look like it
+    unexplained: float = 0.9  # of the variance of its next observations …
+    unexplained_relative: float = 1.6  # … and over the median condition's
     quota_met: float = 0.5  # a smaller part of a quota is worth saying beside a gap
 
 
 @dataclass(frozen=True)
 class Symptom:
-    """One condition in one window."""
+    """One condition in one window, or over several."""
 
     condition: str
     gap: float | None  # G_k
     outlier: float  # O_k
     replay_share: float
+    met_share: float | None  # of the evaluations' steps
+    agreement: float | None  # of its logged rows with its held-out ones
+    unexplained: float | None  # of the variance of its logged rows' next observations
     quota_met: float | None
 
 
 @dataclass(frozen=True)
 class Window:
-    """What one evaluation shows."""
+    """What one evaluation shows, or several."""
 
     gradient_steps: int
     symptoms: list[Symptom]
@@ -77,12 +87,12 @@ class Window:
 
     def bad(self, limits: Limits) -> dict[str, list[str]]:
         """The conditions whose replay is in doubt, with what is wrong, for people."""
+        follows = [s.unexplained for s in self.symptoms if s.unexplained is not None]
+        usual = median(follows) if follows else 0.0
         found = {}
         for symptom in self.symptoms:
-            said = []
+            said = [*self._supply(symptom, limits), *self._rows(symptom, usual, limits)]
             relative = self.relative(symptom)
-            if symptom.replay_share < limits.absent_share:
-                said.append(f"is {symptom.replay_share:.2%} of replay")
             if relative is not None and symptom.gap is not None:
                 if symptom.gap >= limits.gap and relative >= limits.relative:
                     said.append(
@@ -100,18 +110,50 @@ class Window:
                 found[symptom.condition] = said
         return found
 
+    def _supply(self, symptom: Symptom, limits: Limits) -> list[str]:
+        met = symptom.met_share
+        if met is None:  # a run from before it was kept
+            return [] if symptom.replay_share else ["is not in replay"]
+        if symptom.replay_share >= limits.supply * met:
+            return []
+        return [f"is {symptom.replay_share:.2%} of replay and {met:.1%} of what driving meets"]
+
+    def _rows(self, symptom: Symptom, usual: float, limits: Limits) -> list[str]:
+        said = []
+        if symptom.agreement is not None and symptom.agreement < limits.agreement:
+            said.append(
+                f"of its logged rows {symptom.agreement:.0%} look like it: is the label right?"
+            )
+        rest = symptom.unexplained
+        if (
+            rest is not None
+            and rest >= limits.unexplained
+            and rest >= limits.unexplained_relative * usual
+        ):
+            said.append(
+                f"its logged rows leave {rest:.0%} of their next observations unexplained"
+                f" ({usual:.0%} is usual): do they belong together?"
+            )
+        return said
+
+    def target(self, limits: Limits) -> bool:
+        """Whether the target is in doubt."""
+        clocks = not limits.no_lag <= self.lag < limits.lag or self.clock >= limits.clock
+        return clocks or self.gap_median >= limits.gap_everywhere
+
+    @property
+    def diverged(self) -> bool:
+        """Whether values are beyond what rewards can add up to."""
+        return not np.isfinite(self.q_abs_max) or self.q_abs_max > self.q_bound
+
     def cause(self, limits: Limits) -> Cause:
-        """The rule, on one window."""
-        if not np.isfinite(self.q_abs_max) or self.q_abs_max > self.q_bound:
+        """The rule."""
+        if self.diverged:
             return "DIVERGENCE"
         bad = self.bad(limits)
-        clocks = not limits.no_lag <= self.lag < limits.lag or self.clock >= limits.clock
-        target = clocks or self.gap_median >= limits.gap_everywhere
-        buffer = 0 < len(bad) <= len(self.symptoms) / 2 and self.gap_median < limits.gap_median
-        if target and buffer:
-            return "BOTH"
-        if target:
-            return "TARGET"
+        buffer = 0 < len(bad) <= len(self.symptoms) / 2
+        if self.target(limits):
+            return "BOTH" if buffer else "TARGET"
         if buffer:
             return "BUFFER"
         return "UNDETERMINED" if bad else "HEALTHY"
@@ -123,6 +165,7 @@ class Diagnosis:
 
     cause: Cause
     runs: list[Cause]  # each run's own
+    figures: list[Window]  # each run's, over its last windows
     windows: list[list[Window]]  # each run's, in time
     evidence: list[str]
     experiment: str  # what would confirm it
@@ -135,25 +178,55 @@ def diagnose(runs: Sequence[Run], limits: Limits = Limits()) -> Diagnosis:
         RunError: a run has no evaluation after its updates.
     """
     windows = [windows_of(run) for run in runs]
-    causes = [_of_run(found, limits) for found in windows]
+    figures = [over(found[-WINDOWS:]) for found in windows]
+    causes = [_of_run(found, own, limits) for found, own in zip(windows, figures, strict=True)]
     ((cause, votes), *_) = Counter(causes).most_common()
     if votes <= len(causes) / 2:
         cause = "UNDETERMINED"
-    last = [found[-1] for found, own in zip(windows, causes, strict=True) if own == cause]
-    last = last or [found[-1] for found in windows]
+    shown = [own for own, said in zip(figures, causes, strict=True) if said == cause] or figures
     return Diagnosis(
-        cause, causes, windows, _evidence(last[0], limits), _experiment(cause, last, limits)
+        cause,
+        causes,
+        figures,
+        windows,
+        _evidence(shown[0], limits),
+        _experiment(cause, shown, limits),
     )
 
 
-def _of_run(windows: Sequence[Window], limits: Limits) -> Cause:
-    """What the last windows agree on."""
-    causes = {window.cause(limits) for window in windows[-WINDOWS:]}
-    if windows[-1].cause(limits) == "DIVERGENCE":
+def _of_run(windows: Sequence[Window], figures: Window, limits: Limits) -> Cause:
+    """What the last windows come to; those that do not agree on the target are not forced."""
+    if windows[-1].diverged:
         return "DIVERGENCE"
-    if len(windows) < WINDOWS or len(causes) > 1:
+    last = windows[-WINDOWS:]
+    if len(last) < WINDOWS or len({window.target(limits) for window in last}) > 1:
         return "UNDETERMINED"
-    return causes.pop()
+    return figures.cause(limits)
+
+
+def over(windows: Sequence[Window]) -> Window:
+    """The median of each figure over windows, of each condition over those in which it was met."""
+
+    def middle(name: str, of: Sequence[Any] = windows) -> Any:
+        known = [value for item in of if (value := getattr(item, name)) is not None]
+        return median(known) if known else None
+
+    conditions = dict.fromkeys(s.condition for window in windows for s in window.symptoms)
+    symptoms = []
+    for condition in conditions:
+        own = [s for window in windows for s in window.symptoms if s.condition == condition]
+        names = [name for name in Symptom.__dataclass_fields__ if name != "condition"]
+        symptoms.append(Symptom(condition, **{name: middle(name, own) for name in names}))
+    gaps = [symptom.gap for symptom in symptoms if symptom.gap is not None]
+    return Window(
+        gradient_steps=windows[-1].gradient_steps,
+        symptoms=symptoms,
+        gap_median=median(gaps) if gaps else 1.0,
+        lag=middle("lag"),
+        clock=middle("clock"),
+        q_abs_max=windows[-1].q_abs_max,
+        q_bound=windows[-1].q_bound,
+    )
 
 
 def windows_of(run: Run) -> list[Window]:
@@ -161,11 +234,11 @@ def windows_of(run: Run) -> list[Window]:
     import duckdb
 
     query = files("restock.train").joinpath("diagnose.sql").read_text(encoding="utf-8")
-    tables = {
-        name: str(run.path / f"{name}.parquet") for name in ("held_out", "strata", "progress")
-    }
     with duckdb.connect() as connection:
-        rows = connection.sql(query, params=tables).to_arrow_table().to_pylist()
+        names = ("held_out", "conditions", "strata", "progress")
+        for name in names:  # one that an older run has not is empty
+            connection.register(f"run_{name}", run.table(name))
+        rows = connection.sql(query).to_arrow_table().to_pylist()
     if not rows:
         raise RunError(
             "has no evaluation to diagnose",
@@ -186,6 +259,9 @@ def _window(rows: list[dict[str, Any]], bound: float) -> Window:
             row["held_out_td"] / row["replay_td"] if row["replay_td"] else None,
             row["held_out_td"] / max(middle, 1e-12),
             row["replay_share"] or 0.0,
+            row["met_share"],
+            row["agreement"],
+            row["unexplained"],
             row["quota_met"],
         )
         for row in judged

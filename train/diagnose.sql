@@ -1,43 +1,62 @@
--- What a diagnosis looks at: one row an evaluation (a window) and condition. $held_out, $strata and
--- $progress are the run's Parquet files.
+-- What a diagnosis looks at: one row an evaluation (a window) and condition. run_held_out,
+-- run_conditions, run_strata and run_progress are the run's tables.
 WITH windows AS (
     SELECT gradient_steps AS until,
            coalesce(lag(gradient_steps) OVER (ORDER BY gradient_steps), 0) AS since
-    FROM (SELECT DISTINCT gradient_steps FROM read_parquet($held_out))
-), replay AS (  -- of the same condition, logged and fresh together, in the window before
-    SELECT until, stratum AS condition, sum(drawn_rows) AS replay_rows,
-           sum(td_abs_mean * drawn_rows) / nullif(sum(drawn_rows), 0) AS replay_td,
-           sum(quota_share * source_rows) FILTER (quota_share IS NOT NULL) AS asked_rows,
-           sum(drawn_rows) FILTER (quota_share IS NOT NULL) AS quota_rows
+    FROM (SELECT DISTINCT gradient_steps FROM run_held_out)
+), fed AS (  -- of the same condition, logged and fresh together, in the window before
+    SELECT gradient_steps, condition, drawn_rows, td_abs_mean FROM run_conditions
+    UNION ALL  -- a run from before that table was kept has its strata, which may be conditions
+    SELECT gradient_steps, stratum, drawn_rows, td_abs_mean FROM run_strata
+    WHERE NOT EXISTS (FROM run_conditions)
+), replay AS (
+    SELECT until, condition, sum(drawn_rows) AS replay_rows,
+           sum(td_abs_mean * drawn_rows) / nullif(sum(drawn_rows), 0) AS replay_td
+    FROM fed
+    JOIN windows ON gradient_steps > since AND gradient_steps <= until
+    GROUP BY ALL
+), quota AS (  -- what a stratum of that name was to get of its source, and got
+    SELECT until, stratum AS condition,
+           sum(drawn_rows) / nullif(sum(quota_share * source_rows), 0) AS quota_met
     FROM (
         SELECT *, sum(drawn_rows) OVER (PARTITION BY source, gradient_steps) AS source_rows
-        FROM read_parquet($strata)
+        FROM run_strata
     )
     JOIN windows ON gradient_steps > since AND gradient_steps <= until
+    WHERE quota_share IS NOT NULL
     GROUP BY ALL
 ), clock AS (
     SELECT until, max(target_q_lag) AS lag, max(q_abs_max) AS q_abs_max
-    FROM read_parquet($progress)
+    FROM run_progress
     JOIN windows ON gradient_steps > since AND gradient_steps <= until
     WHERE updates > 0
     GROUP BY ALL
 ), drawn AS (
     SELECT until, sum(replay_rows) AS all_rows FROM replay GROUP BY until
+), held_out AS (  -- runs from before the last three were kept have none of them
+    SELECT * FROM run_held_out
+    UNION ALL BY NAME
+    SELECT NULL::BIGINT AS rows_met, NULL::DOUBLE AS logs_agreement, NULL::DOUBLE AS logs_unexplained
+    WHERE false
 )
 SELECT h.gradient_steps AS gradient_steps,
        h.condition AS condition,
        h.rows AS held_out_rows,
+       h.rows_met / nullif(sum(h.rows_met) OVER (PARTITION BY h.gradient_steps), 0) AS met_share,
+       h.logs_agreement AS agreement,
+       h.logs_unexplained AS unexplained,
        h.td_abs_mean AS held_out_td,
        h.td_online_abs_mean AS held_out_td_online,
        h.q_lag AS held_out_lag,
        coalesce(replay_rows, 0) AS replay_rows,
        coalesce(replay_rows, 0) / nullif(all_rows, 0) AS replay_share,
        replay_td,
-       quota_rows / nullif(asked_rows, 0) AS quota_met,
+       quota.quota_met AS quota_met,
        clock.lag AS lag,
        clock.q_abs_max AS q_abs_max
-FROM read_parquet($held_out) h
+FROM held_out h
 JOIN clock ON clock.until = h.gradient_steps
 LEFT JOIN drawn ON drawn.until = h.gradient_steps
+LEFT JOIN quota ON quota.until = h.gradient_steps AND quota.condition = h.condition
 LEFT JOIN replay ON replay.until = h.gradient_steps AND replay.condition = h.condition
 ORDER BY ALL

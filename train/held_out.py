@@ -2,7 +2,8 @@
 
 Replay measures itself: a critic that fits what it is fed has a low TD error there, whatever it is
 fed. The evaluation's episodes are fresh, of every condition, and never learnt from; what the critic
-gets wrong on them and not in replay is what replay lacks. `restock diagnose` reads it.
+gets wrong on them and not in replay is what replay lacks. They also say how often each condition is
+met when driving, and what its observations look like. `restock diagnose` reads it.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from restock.train.collector import Collector
 from restock.train.episode import EpisodeSpec
 from restock.train.evaluate import Twin
 from restock.train.learner import Learner
+from restock.train.log_fidelity import LogFidelity
 from restock.train.probe import Probe
 from restock.train.target import value_lag
 
@@ -61,11 +63,16 @@ class HeldOut(_Tapped):
     """The evaluation's twin, which keeps what is driven in it apart."""
 
     def __init__(
-        self, env: Twin, task: Task, conditions: Sequence[Condition], like: FreshRing
+        self,
+        env: Twin,
+        task: Task,
+        conditions: Sequence[Condition],
+        like: FreshRing,
+        logs: LogFidelity | None,
     ) -> None:
         self._inner = _Tapped(env)
         super().__init__(self._inner)
-        self._task, self._conditions, self._like = task, conditions, like
+        self._task, self._conditions, self._like, self._logs = task, conditions, like, logs
         self._collector = self._begin()
 
     def reset(self, *, seed: int | None = None) -> tuple[NDArray[Any], dict[str, Any]]:
@@ -83,9 +90,12 @@ class HeldOut(_Tapped):
     def measure(self, learner: Learner) -> list[dict[str, Any]]:
         """Rows for the run's `held_out`, one a condition, of the episodes since the last reset."""
         self._collector.label(all_of_them=True)
-        probe = Probe.of_ring(self._collector.ring, _ROWS)
+        ring = self._collector.ring
+        probe = Probe.of_ring(ring, _ROWS)
         if probe is None:
             return []
+        agreement = self._logs.agreement(probe) if self._logs is not None else {}
+        unexplained = self._logs.unexplained if self._logs is not None else {}
         rows = probe.rows.to(learner.device)
         td, q, slow = learner.td_error(rows)
         own = learner.td_error(rows, online=True)[0]
@@ -96,10 +106,13 @@ class HeldOut(_Tapped):
                 {
                     "condition": name,
                     "rows": part.stop - part.start,
+                    "rows_met": int(ring.strata.counts[ring.conditions.index(name)]),
                     "td_abs_mean": float(td[part].abs().mean()),
                     "td_online_abs_mean": float(own[part].abs().mean()),
                     "q_abs_mean": float(q[part].abs().mean()),
                     "q_lag": value_lag(q[part], slow[part]),
+                    "logs_agreement": agreement.get(name),
+                    "logs_unexplained": unexplained.get(name),
                 }
             )
         return found

@@ -122,6 +122,9 @@ class FeedRecord:
             timing=logs.timings,
             quota=kept["log_quota"].tolist(),
         )
+        condition = logs.condition
+        codes = condition.codes[kept["log_row"]]
+        self._conditions("logs", condition.names, codes, kept, {**clocks, "phase": phase})
         if self._age_days is not None:
             self._ages("logs", "days", self._age_days[kept["log_row"]], clocks)
         self._episodes("logs", logs.episode.codes[kept["log_row"]], kept, logs.strata, clocks)
@@ -145,6 +148,8 @@ class FeedRecord:
             timing=[None] * len(names),
             quota=[None] * len(names),
         )
+        codes = kept["fresh_stratum"]  # a ring's strata are conditions
+        self._conditions("fresh", names, codes, kept, {**clocks, "phase": phase})
         for unit in ("env_steps", "gradient_steps"):
             self._ages("fresh", unit, kept[f"age_{unit}"].astype(np.float64), clocks)
         self._episodes("fresh", kept["fresh_key"] >> 20, kept, names, clocks)
@@ -201,6 +206,36 @@ class FeedRecord:
                 }
             )
         self.run.append("strata", rows)
+
+    def _conditions(
+        self,
+        source: str,
+        names: list[str],
+        code: NDArray[Any],
+        kept: dict[str, NDArray[Any]],
+        clocks: dict[str, Any],
+    ) -> None:
+        """`code` (n,) are the drawn rows' conditions."""
+        side = "log" if source == "logs" else "fresh"
+        drawn = np.bincount(code, minlength=len(names))
+        weight, td, q = (
+            np.bincount(code, values, minlength=len(names))
+            for values in (kept[f"{side}_weight"], np.abs(kept[f"{side}_td"]), kept[f"{side}_q"])
+        )
+        met = np.flatnonzero(drawn)
+        self.run.append_columns(
+            "conditions",
+            {
+                **clocks,
+                "source": source,
+                "condition": np.array(names, object)[met],
+                "drawn_rows": drawn[met],
+                "drawn_share": drawn[met] / len(code),
+                "effective_share": weight[met] / max(weight.sum(), 1e-12),
+                "td_abs_mean": td[met] / drawn[met],
+                "q_mean": q[met] / drawn[met],
+            },
+        )
 
     def _ages(
         self, source: str, unit: str, age: NDArray[np.float64], clocks: dict[str, int]

@@ -66,6 +66,18 @@ TABLES: dict[str, pa.Schema] = {
         ("reward_mean", _F),
         ("terminal_share", _F),
     ),
+    # One row an interval x source x condition, whatever the strata are: what batches held of each.
+    "conditions": _schema(
+        *_CLOCKS,
+        ("phase", _S),
+        ("source", _S),
+        ("condition", _S),
+        ("drawn_rows", _I),
+        ("drawn_share", _F),  # of its source's rows
+        ("effective_share", _F),  # after importance weights
+        ("td_abs_mean", _F),
+        ("q_mean", _F),
+    ),
     # One row an interval x stratum of the logs: the shares in force at its end, and what rows had.
     "shares": _schema(
         *_CLOCKS,
@@ -119,11 +131,14 @@ TABLES: dict[str, pa.Schema] = {
     "held_out": _schema(
         *_CLOCKS,
         ("condition", _S),
-        ("rows", _I),
+        ("rows", _I),  # that the critic was measured on
+        ("rows_met", _I),  # all of them: what driving meets
         ("td_abs_mean", _F),
         ("td_online_abs_mean", _F),  # as if the online network bootstrapped
         ("q_abs_mean", _F),
         ("q_lag", _F),  # mean |Q - Q_target| / mean |Q|
+        ("logs_agreement", _F),  # of the logs' rows, those that these steps' conditions confirm
+        ("logs_unexplained", _F),  # of the variance of their next observations
     ),
     # One row a measure x condition x estimator: the offline policy judged on held-out logs.
     "off_policy": _schema(

@@ -25,6 +25,7 @@ from restock.train.evaluate import Score, Twin
 from restock.train.events import Events
 from restock.train.held_out import HeldOut
 from restock.train.learner import Learner
+from restock.train.log_fidelity import LogFidelity
 from restock.train.log_terms import LogTerms
 from restock.train.probe import Probe
 from restock.train.record import FeedRecord
@@ -192,12 +193,13 @@ def open_session(
     )
     executor = ThreadPoolExecutor(1, "twin") if config.env.overlap else None
     collector = Collector(env, ring, conditions, task, executor)
+    fidelity = LogFidelity.of(logs, task.observation_size) if logs is not None else None
     session = Session(
         run=run,
         config=config,
         task=task,
         env=env,
-        evaluation_env=HeldOut(evaluation_env, task, conditions, ring),
+        evaluation_env=HeldOut(evaluation_env, task, conditions, ring, fidelity),
         learner=learner,
         ring=ring,
         batches=batches,

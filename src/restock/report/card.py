@@ -48,6 +48,16 @@ def replay_card(facts: Facts) -> dict[str, Any]:
         },
         "ages": [_ages(facts.ages, *key) for key in _keys(facts.ages, "source", "unit")],
         "target": facts.config.get("target") or settings.get("target"),
+        "conditions": [
+            {
+                name: row[name]
+                for name in (
+                    *("source", "condition", "drawn_rows", "drawn_share", "effective_share"),
+                    "td_abs_mean",
+                )
+            }
+            for row in facts.conditions
+        ],
         "strata": [
             {
                 name: row[name]
@@ -107,6 +117,18 @@ def as_markdown(card: dict[str, Any]) -> str:
     lines += ["| | |", "| --- | --- |"]
     lines += [f"| {name} | {_cell(value)} |" for name, value in facts.items()]
     lines += ["", "## Conditions in the sampled batches", ""]
+    lines += _table(
+        card["conditions"],
+        {
+            "source": "source",
+            "condition": "condition",
+            "drawn_rows": "rows",
+            "drawn_share": "drawn",
+            "effective_share": "after weights",
+            "td_abs_mean": "mean TD error at the end",
+        },
+    )
+    lines += ["", "## Strata: asked for and drawn", ""]
     lines += _table(
         card["strata"],
         {
@@ -200,7 +222,7 @@ def _ages(rows: Rows, source: str, unit: str) -> dict[str, Any]:
 def _table(rows: list[dict[str, Any]], columns: dict[str, str]) -> list[str]:
     if not rows:
         return ["nothing"]
-    numbers = {"available_rows", "rows"}
+    numbers = {"available_rows", "drawn_rows", "rows"}
     lines = [f"| {' | '.join(columns.values())} |", f"|{' --- |' * len(columns)}"]
     for row in rows:
         cells = []
@@ -210,6 +232,8 @@ def _table(rows: list[dict[str, Any]], columns: dict[str, str]) -> list[str]:
                 cells.append(_count(value))
             elif name.endswith("share"):
                 cells.append(_percent(value))
+            elif name == "td_abs_mean":
+                cells.append(f"{value:.3f}")
             else:
                 cells.append(_cell(value))
         lines.append(f"| {' | '.join(cells)} |")

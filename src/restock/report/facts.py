@@ -10,10 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import duckdb
+import pyarrow.parquet as pq
 
 from restock.errors import RestockError, RunError
 from restock.replay.panel import Panel, Stratum
 from restock.replay.store import Store, read_parquet
+from restock.train.floors import open_floors
+from restock.train.layout import DEFAULT, Warehouse
 from restock.train.run import Run
 from restock.train.run_tables import EVAL_EPISODES
 from restock.train.stats import wilson
@@ -21,7 +24,18 @@ from restock.train.stats import wilson
 Rows = list[dict[str, Any]]
 CELL_M = 0.25
 MOST_DOTS = 1500
-LISTS = ("fed", "ages", "policies", "learning", "td", "lag", "loss", "cells", "failures")
+LISTS = (
+    "fed",
+    "conditions",
+    "ages",
+    "policies",
+    "learning",
+    "td",
+    "lag",
+    "loss",
+    "cells",
+    "failures",
+)
 
 
 @dataclass
@@ -31,6 +45,7 @@ class Facts:
     run: Path
     config: dict[str, Any]
     fed: Rows
+    conditions: Rows  # in the batches, whatever the strata are
     ages: Rows
     policies: Rows
     learning: Rows
@@ -41,6 +56,7 @@ class Facts:
     cells: Rows  # of `restock eval`, with Wilson intervals as low and high
     failures: Rows
     panel: Panel | None = None
+    floor: Warehouse | None = None  # that the run drives on, where it is one
     visited: Rows = field(default_factory=list)
     rare: Rows = field(default_factory=list)
     recordings: Rows = field(default_factory=list)
@@ -63,11 +79,13 @@ def gather(path: Path) -> Facts:
     with duckdb.connect() as connection:
         for file in sorted(path.glob("*.parquet")):
             read_parquet(connection, file.stem, [file])
-        evaluated = path / "eval" / "episodes.parquet"
-        if evaluated.exists():
-            read_parquet(connection, "evaluated", [evaluated])
-        else:
-            connection.register("evaluated", EVAL_EPISODES.empty_table())
+        if not (path / "conditions.parquet").exists():  # a run from before it was kept
+            connection.register("conditions", run.table("conditions"))
+        file = path / "eval" / "episodes.parquet"
+        evaluated = pq.read_table(file, schema=EVAL_EPISODES) if file.exists() else None
+        connection.register(
+            "evaluated", EVAL_EPISODES.empty_table() if evaluated is None else evaluated
+        )
         queries = _queries()
         found = {name: _rows(connection, sql) for name, sql in queries.items()}
     if not found["loss"]:
@@ -89,6 +107,8 @@ def gather(path: Path) -> Facts:
     if not facts.cells:
         facts.missing.append("`restock eval` has not been run: success is of training only.")
     _add_panel(facts)
+    if facts.visited:
+        _add_floor(facts)
     return facts
 
 
@@ -107,6 +127,21 @@ def _add_panel(facts: Facts) -> None:
             facts.logged = _store_rows(store, "logged")
     except RestockError as error:
         facts.missing.append(f"Not shown, since it could not be read: {error}")
+
+
+def _add_floor(facts: Facts) -> None:
+    layouts = facts.config["config"].get("env", {}).get("layouts", DEFAULT)
+    try:
+        floors = open_floors(layouts)
+    except RestockError as error:
+        facts.missing.append(f"The floor is not drawn, since it could not be read: {error}")
+        return
+    if len(floors) == 1:
+        facts.floor = floors[0]
+    else:
+        facts.missing.append(
+            f"No floor is drawn: the run drives on {len(floors)} floors ({layouts})."
+        )
 
 
 def _store_rows(store: Store, name: str, **parameters: Any) -> Rows:

@@ -25,6 +25,21 @@ FROM drawn JOIN fed USING (source)
 GROUP BY source, stratum
 ORDER BY source DESC, available_share DESC NULLS LAST, stratum;
 
+-- name: conditions
+-- What batches held of each condition, whatever the strata are.
+WITH drawn AS (
+    SELECT *, sum(drawn_rows) OVER (PARTITION BY source, gradient_steps) AS source_rows
+    FROM conditions
+)
+SELECT source, condition, sum(drawn_rows) AS drawn_rows,
+       sum(drawn_rows) / sum(sum(drawn_rows)) OVER (PARTITION BY source) AS drawn_share,
+       sum(effective_share * source_rows) / sum(sum(drawn_rows)) OVER (PARTITION BY source)
+           AS effective_share,
+       last(td_abs_mean ORDER BY gradient_steps) AS td_abs_mean
+FROM drawn
+GROUP BY source, condition
+ORDER BY source DESC, drawn_share DESC;
+
 -- name: ages
 -- Age histogram per source: days for logs, environment steps for fresh rows.
 SELECT source, unit, bucket, sum(count) AS rows,
@@ -92,6 +107,6 @@ ORDER BY ALL;
 
 -- name: failures
 -- Where the agent's episodes ended that did not reach the goal.
-SELECT condition, perturbation, end_x_m, end_y_m, failure
+SELECT condition, perturbation, coalesce(layout, 'default') AS layout, end_x_m, end_y_m, failure
 FROM evaluated
 WHERE policy = 'agent' AND NOT success;

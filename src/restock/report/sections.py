@@ -10,7 +10,6 @@ from restock.report import charts, floor
 from restock.report.blocks import Section, count, estimate, section, table, target_rule
 from restock.report.charts import words
 from restock.report.facts import CELL_M, Facts, Rows, pretty, span
-from restock.train.layout import default_warehouse
 
 
 def success(facts: Facts) -> Section | None:
@@ -197,12 +196,16 @@ def critic(facts: Facts) -> Section | None:
 
 
 def floor_map(facts: Facts) -> Section | None:
-    if not facts.visited:
+    layout = facts.floor
+    if layout is None:
         return None
-    layout = default_warehouse()
     racks = [(r.x_min, r.y_min, r.x_max, r.y_max) for r in layout.racks]
     plan = floor.Floor(layout.width_m, layout.depth_m, racks)
-    failures = [row for row in facts.failures if row["perturbation"] == "none"]
+    failures = [
+        row
+        for row in facts.failures
+        if row["perturbation"] == "none" and row["layout"] == layout.name
+    ]
     conditions = {row["condition"] for row in facts.rare} | {row["condition"] for row in failures}
     known = [name for name in charts.CONDITION_COLOURS if name in conditions]
     return section(
@@ -213,14 +216,14 @@ def floor_map(facts: Facts) -> Section | None:
                 "title": "Where the logs have been",
                 "svg": floor.visited(plan, facts.visited, CELL_M),
                 "caption": f"{sum(row['rows'] for row in facts.visited):,} logged steps in cells of"
-                f" {CELL_M} m, darker where there are more (logarithmic).",
+                f" {CELL_M} m, on the floor {layout.name}, darker where there are more (logarithmic).",
             },
             {
                 "title": "Rare conditions in the logs (dots), the agent's failures (crosses)",
                 "svg": floor.events(plan, facts.rare, failures),
                 "caption": Markup(floor.legend(known + sorted(conditions - set(known))))
                 + Markup("<br>")
-                + f"{len(failures)} failed clean episodes.",
+                + f"{len(failures)} failed clean episodes there.",
             },
         ],
         two=True,
