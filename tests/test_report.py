@@ -312,6 +312,45 @@ def test_a_young_run_without_evaluation_still_has_a_page(tmp_path: Path) -> None
     assert "had no panel" in html
 
 
+def _on_floors(run: Path, path: Path, layouts: str, ended_on: str) -> str:
+    """The page of the run as if it had driven on other floors, its evaluation on `ended_on`."""
+    shutil.copytree(run, path)
+    document = json.loads((path / "config.json").read_text())
+    document["config"]["env"] = {"layouts": layouts}
+    (path / "config.json").write_text(json.dumps(document))
+    file = path / "eval" / "episodes.parquet"
+    table = pq.read_table(file)
+    column = pa.array([ended_on] * len(table))
+    pq.write_table(table.set_column(table.column_names.index("layout"), "layout", column), file)
+    return build_report(path).read_text(encoding="utf-8")
+
+
+def test_the_floor_that_is_drawn_is_the_runs_own(run: Path, tmp_path: Path) -> None:
+    hall = tmp_path / "hall.toml"
+    hall.write_text("width_m = 20.0\ndepth_m = 5.0\nracks = [[1.0, 2.0, 8.0, 3.0]]\n")
+    page = _on_floors(run, tmp_path / "a", str(hall), "hall.toml")
+    assert 'width="800" height="200"' in page
+    assert "run drives on, hall.toml" in page
+    assert "18 failed clean episodes there" in page
+    page = _on_floors(run, tmp_path / "b", str(hall), "default")
+    assert "0 failed clean episodes there" in page
+
+
+@pytest.mark.parametrize(
+    ("layouts", "said"),
+    [
+        ("generated:train:3", "drives on 3 floors"),
+        ("gone.toml", "gone.toml: cannot be read"),
+    ],
+)
+def test_a_floor_that_is_not_drawn_is_said(
+    run: Path, tmp_path: Path, layouts: str, said: str
+) -> None:
+    page = _on_floors(run, tmp_path / "a", layouts, "default")
+    assert said in page
+    assert "Where did it happen?" not in page
+
+
 def test_a_run_without_an_update_is_refused(tmp_path: Path) -> None:
     Run.create(tmp_path / "run", {"config": {}})
     with pytest.raises(RunError, match="no update to report on"):

@@ -82,10 +82,10 @@ def gather(path: Path) -> Facts:
         if not (path / "conditions.parquet").exists():  # a run from before it was kept
             connection.register("conditions", run.table("conditions"))
         file = path / "eval" / "episodes.parquet"
-        evaluated = pq.read_table(file, schema=EVAL_EPISODES) if file.exists() else None
-        connection.register(
-            "evaluated", EVAL_EPISODES.empty_table() if evaluated is None else evaluated
-        )
+        evaluated = EVAL_EPISODES.empty_table()
+        if file.exists():
+            evaluated = pq.read_table(file, schema=EVAL_EPISODES)
+        connection.register("evaluated", evaluated)
         queries = _queries()
         found = {name: _rows(connection, sql) for name, sql in queries.items()}
     if not found["loss"]:

@@ -216,7 +216,8 @@ def floor_map(facts: Facts) -> Section | None:
                 "title": "Where the logs have been",
                 "svg": floor.visited(plan, facts.visited, CELL_M),
                 "caption": f"{sum(row['rows'] for row in facts.visited):,} logged steps in cells of"
-                f" {CELL_M} m, on the floor {layout.name}, darker where there are more (logarithmic).",
+                f" {CELL_M} m, darker where there are more (logarithmic). Drawn on the floor that"
+                f" the run drives on, {layout.name}.",
             },
             {
                 "title": "Rare conditions in the logs (dots), the agent's failures (crosses)",
