@@ -17,7 +17,8 @@ from restock.ingest.pipeline import ingest
 from restock.ingest.profile import load_profile
 from restock.ingest.store import StoreWriter
 from restock.replay.store import Store
-from restock.train.fit import Estimate, Fit, _fine, _untold, fit
+from restock.train.fit import Estimate, Fit, _fine, fit
+from restock.train.fit_estimates import untold
 from restock.train.fit_files import schedule, write
 from restock.train.fit_parameters import DEFAULT, PARAMETERS, Coordinates, parse_parameters
 from restock.train.fit_scope import cuts, sides, usable
@@ -165,7 +166,7 @@ def test_friction_under_wheels_that_stand_is_not_told_and_stays(log: Segments) -
     mismatch = Mismatch(standing)
     coordinates = Coordinates(("friction_scale",), Perturbation(), log.task)
     solution = _fine(mismatch, coordinates, np.array([0.5]), lambda text: None)
-    told = _untold(mismatch, solution, uncertainty(solution, standing.episode_id, seed=0))
+    told = untold(mismatch, solution, uncertainty(solution, standing.episode_id, seed=0))
     assert told is not None
     assert not told.fitted
     assert told.value == 1.0

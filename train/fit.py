@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
@@ -19,16 +18,17 @@ from numpy.typing import NDArray
 
 from restock.errors import ConfigError, StoreError
 from restock.replay.store import Store
+from restock.train.fit_estimates import estimate, untold, warnings
 from restock.train.fit_parameters import DEFAULT, PARAMETERS, Coordinates
+from restock.train.fit_result import Estimate, Fit, Gap
 from restock.train.fit_scope import HELD_OUT, Scope, cuts, scope, sides, usable
 from restock.train.fit_solver import Problem, Solution, noise, search, solve
-from restock.train.fit_uncertainty import Uncertainty, profile, uncertainty
+from restock.train.fit_uncertainty import uncertainty
 from restock.train.log_segments import Segments, segments
 from restock.train.mismatch import CHANNELS, Mismatch, position_gap_m
 from restock.train.open_loop import replay
 from restock.train.perturbation import Perturbation
 from restock.train.stats import bootstrap, median
-from restock.train.toml_values import toml_value
 
 F64 = NDArray[np.float64]
 
@@ -36,81 +36,6 @@ HORIZON_S = 3.0
 FEWEST = 8  # segments
 SMALL = 16  # segments of the coarse search
 HELD_OUT_S = (1.0, 3.0, 6.0)
-SLIDES_MPS = 0.05
-CONFOUNDED = 0.95
-ILL_CONDITIONED = 1e6
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """One parameter: its value, its 95 % interval, and whether the log told it."""
-
-    name: str
-    unit: str
-    value: float
-    low: float | None
-    high: float | None
-    fitted: bool  # False: as in the base
-    note: str = ""
-
-
-@dataclass(frozen=True)
-class Gap:
-    """Of held-out segments: how far replayed and logged position end apart, in metres."""
-
-    horizon_s: float
-    segments: int
-    before_m: float  # median over the segments, under the base
-    after_m: float  # under what was fitted
-    low_m: float  # 95 % of the latter, bootstrap over segments
-    high_m: float
-
-
-@dataclass(frozen=True)
-class Fit:
-    """What a log says of the robot."""
-
-    perturbation: Perturbation
-    base: Perturbation
-    timestep_s: float
-    recordings: tuple[str, ...]
-    estimates: tuple[Estimate, ...]
-    warnings: tuple[str, ...]
-    held_out: tuple[Gap, ...]
-    noise: dict[str, dict[str, Any]]  # channel -> unit, before, after: median deviations
-    segments: int  # that were fitted
-    clusters: int  # that uncertainty was drawn over
-    condition: float  # of the information matrix
-    left_out: dict[str, int] = field(default_factory=dict)  # segments or steps, by reason
-    replays: int = 0
-    work_s: float = 0.0
-
-    def describe(self) -> dict[str, Any]:
-        """As JSON has it."""
-        return {
-            **{key: value for key, value in vars(self).items() if key != "base"},
-            "perturbation": msgspec.to_builtins(self.perturbation),
-            "base": msgspec.to_builtins(self.base),
-            "estimates": [vars(item) for item in self.estimates],
-            "held_out": [vars(item) for item in self.held_out],
-        }
-
-    def toml(self) -> str:
-        """The perturbation as TOML that training reads, with what is known of each value."""
-        said = {item.name: item for item in self.estimates}
-        lines = [
-            f"# Effective parameters, fitted to {', '.join(self.recordings)}",
-            f"# at a timestep of {self.timestep_s:g} s: {self.segments} segments.",
-        ]
-        lines += [f"# {warning}" for warning in self.warnings]
-        for name, value in msgspec.to_builtins(self.perturbation).items():
-            note = ""
-            if name in said and said[name].fitted:
-                note = f"  # 95 %: {said[name].low:.4g} to {said[name].high:.4g}"
-            elif name in said:
-                note = "  # not fitted"
-            lines.append(f"{name} = {toml_value(value)}{note}")
-        return "\n".join(lines) + "\n"
 
 
 def fit(
@@ -195,27 +120,27 @@ def fit(
     while True:
         solution = _fine(mismatch, coordinates, z, say)
         known = uncertainty(solution, used.episode_id, seed)
-        estimate = _untold(mismatch, solution, known)
-        if estimate is None:
+        lost = untold(mismatch, solution, known)
+        if lost is None:
             break
-        say(f"{estimate.name} is not told by this log")
-        kept.append(estimate)
-        at = coordinates.names.index(estimate.name)
-        coordinates, z = coordinates.without(estimate.name), np.delete(solution.z, at)
+        say(f"{lost.name} is not told by this log")
+        kept.append(lost)
+        at = coordinates.names.index(lost.name)
+        coordinates, z = coordinates.without(lost.name), np.delete(solution.z, at)
         if not len(coordinates):
             raise ConfigError(
-                f"this log does not tell {estimate.name}: {estimate.note}",
+                f"this log does not tell {lost.name}: {lost.note}",
                 where=str(store.path),
                 remedy="log more driving with changes of speed and direction",
             )
     perturbation = msgspec.structs.replace(
         coordinates.perturbation(solution.z), name=name, timestep_s=step_s
     )
-    estimates = [_estimate(solution, known, index) for index in range(len(coordinates))]
+    estimates = [estimate(solution, known, index) for index in range(len(coordinates))]
     warned = list(found.notes)
     warned += [f"{key} is not fitted: {why}" for key, why in found.refused.items()]
     warned += [f"{item.name} is not fitted: {item.note}" for item in kept]
-    warned += _warnings(solution, known)
+    warned += warnings(solution, known)
     refused = [
         Estimate(key, PARAMETERS[key].unit, getattr(base, key), None, None, False, why)
         for key, why in found.refused.items()
@@ -276,101 +201,6 @@ def _fine(
     )
 
 
-def _untold(mismatch: Mismatch, solution: Solution, known: Uncertainty) -> Estimate | None:
-    """The parameter that is known least of those that stay as in the base, if there is one.
-
-    One does that is known too little, and whose value in the base explains the log as well.
-    """
-    width = known.half / solution.coordinates.known
-    for index in np.argsort(-width):
-        if width[index] > 1:
-            estimate, stays = _unknown(mismatch, solution, known, int(index))
-            if stays:
-                return estimate
-    return None
-
-
-def _unknown(
-    mismatch: Mismatch, solution: Solution, known: Uncertainty, index: int
-) -> tuple[Estimate, bool]:
-    """What can be said of a parameter that is known little, and whether it stays."""
-    coordinates = solution.coordinates
-    parameter = coordinates.parameters[index]
-    problem = Problem(mismatch, coordinates, solution.scale)
-    low, high = profile(problem, solution, index)
-    ends = [_value(solution, index, end) for end in (low, high)]
-    start = coordinates.point(coordinates.base)[index]
-    stays = low - 1e-9 <= start <= high + 1e-9 or high - low > 0.9
-    # At an end of its range, and the residuals there do not move with it: where it got to is the
-    # search's doing, whatever the jumps of the cost on the way to the base say.
-    lost = known.half[index] > 1 and not 1e-9 < solution.z[index] < 1 - 1e-9
-    unit = f" {parameter.unit}" if parameter.unit else ""
-    reason = f"{ends[0]:.3g} to {ends[1]:.3g}{unit} explain the log as well"
-    if lost and not stays:
-        reason = "at the end of its range the log does not change with it"
-    if parameter.name in ("friction_scale", "left_friction_scale"):
-        now = coordinates.perturbation(solution.z)
-        sliding = replay(
-            mismatch.segments, [now], timestep_s=mismatch.timestep_s, nthread=mismatch.nthread
-        ).sliding_mps
-        share = float((sliding > SLIDES_MPS).mean())
-        reason += f" (wheels slide in {share:.1%} of the steps)"
-    else:
-        other = _partner(known.correlation, index)
-        if other is not None:
-            pair, value = coordinates.names[other], known.correlation[index, other]
-            reason += f" (its correlation with {pair} is {value:.2f})"
-    base = float(getattr(coordinates.base, parameter.name))
-    told = Estimate(parameter.name, parameter.unit, base, ends[0], ends[1], False, reason)
-    return told, bool(stays or lost)
-
-
-def _partner(correlation: F64, index: int) -> int | None:
-    """Which other parameter this one is confounded with most, if with any."""
-    others = np.abs(correlation[index]).copy()
-    others[index] = 0.0
-    at = int(np.argmax(others)) if len(others) > 1 else index
-    return at if others[at] > 0.8 else None
-
-
-def _estimate(solution: Solution, known: Uncertainty, index: int) -> Estimate:
-    parameter = solution.coordinates.parameters[index]
-    low, middle, high = (
-        _value(solution, index, solution.z[index] + way * known.half[index]) for way in (-1, 0, 1)
-    )
-    return Estimate(parameter.name, parameter.unit, middle, low, high, True)
-
-
-def _value(solution: Solution, index: int, z: float) -> float:
-    point = solution.z.copy()
-    point[index] = min(max(z, 0.0), 1.0)
-    return float(solution.coordinates.values(point)[index])
-
-
-def _warnings(solution: Solution, known: Uncertainty) -> list[str]:
-    found = []
-    names, z = solution.coordinates.names, solution.z
-    for index, name in enumerate(names):
-        value = _value(solution, index, z[index])
-        if z[index] < 1e-6 or z[index] > 1 - 1e-6:
-            found.append(f"{name} is at the end of its range, {value:g}")
-        if known.half[index] > solution.coordinates.known[index]:
-            found.append(f"{name} is known little: see its interval")
-        for other in range(index):
-            if abs(known.correlation[index, other]) > CONFOUNDED:
-                found.append(
-                    f"{names[other]} and {name} are confounded: their correlation is"
-                    f" {known.correlation[index, other]:.2f}"
-                )
-    if not solution.converged:
-        found.append("least squares had not converged: the intervals are too narrow")
-    if known.condition > ILL_CONDITIONED:
-        found.append(
-            f"ill-conditioned: the information's condition number is {known.condition:.1e}"
-        )
-    return found
-
-
 def _held_out(
     store: Store, cut: dict[str, int], found: Scope, base: Perturbation, fitted: Perturbation,
     timestep_s: float, nthread: int, recordings: Sequence[str], task_hash: str | None, seed: int,
@@ -410,3 +240,6 @@ def _noise(mismatch: Mismatch, base: Perturbation, fitted: Perturbation) -> dict
         }
         for name in mismatch.channels
     }
+
+
+__all__ = ["Estimate", "Fit", "Gap", "fit"]

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from restock.errors import ConfigError, StoreError
-from restock.train.fit import Fit
+from restock.train.fit_result import Fit
 from restock.train.perturbation import Perturbation, Schedule
 from restock.train.toml_values import toml_value
 
