@@ -62,7 +62,7 @@ def parts(count: int, steps: int) -> dict[str, float]:
         ("sensors and their noise", env.sensing, "sense"),
         ("navigation: plans, blocked aisles", env.navigation, "update"),
         ("traffic", sim.traffic, "advance"),
-        ("traffic", sim, "_walk"),
+        ("traffic", sim.scenery, "walk"),
         ("controller and friction", sim, "drive"),
         ("truth", env.truth, "look"),
         ("truth", env.truth, "conclude"),

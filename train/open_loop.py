@@ -118,7 +118,7 @@ def _place(simulation: Simulation, env: int, perturbation: Perturbation, part: S
         return
     speed, turn, gyro, localised = part.before[env]
     rolling = abs(speed - localised) < SLIPS_MPS
-    forward = speed * simulation.radius_m[env] / WHEEL_RADIUS_M if rolling else localised
+    forward = speed * simulation.body.radius_m[env] / WHEEL_RADIUS_M if rolling else localised
     simulation.qvel[env, 0], simulation.qvel[env, 5] = forward, gyro
     simulation.qvel[env, 6:8] = wheel_commands(speed, turn)
     # What was commanded earlier is not in the segment: as if it had been what the wheels do.
@@ -162,7 +162,7 @@ def _sliding(simulation: Simulation, yaw_rad: F64) -> F64:
     forward = np.cos(yaw_rad) * velocity[:, 0] + np.sin(yaw_rad) * velocity[:, 1]
     turn = velocity[:, 5] * (TRACK_M / 2)
     ground = np.stack([forward - turn, forward + turn], axis=-1)
-    rim = velocity[:, 6:8] * simulation.radius_m[:, None]
+    rim = velocity[:, 6:8] * simulation.body.radius_m[:, None]
     faster: F64 = np.abs(rim - ground).max(axis=1)
     return faster
 

@@ -23,28 +23,22 @@ from restock.train.episode import Episode
 from restock.train.friction import NO_PATCH, PATCHES, SLIPPERY_BELOW, friction_at
 from restock.train.layout import Warehouse
 from restock.train.model import (
-    CHASSIS_KG,
     FLOOR_FRICTION,
     LIDAR_Z_M,
     OBSTACLE_GROUP,
-    PALLET_HALF_M,
-    PALLETS,
-    PARKED_M,
     TRACK_M,
-    WHEEL_RADIUS_M,
     build_model,
-    building_boxes,
     yaw_of,
 )
 from restock.train.perturbation import Perturbation
-from restock.train.traffic import Traffic
+from restock.train.robot_body import RobotBody
+from restock.train.scenery import Scenery, quaternion
 
 F64 = NDArray[np.float64]
 Ids = NDArray[np.int64]
 Physics = Literal["mujoco", "warp"]  # warp: see `restock.train.warp_batch`
 
 BLOCK_S = 0.1
-GRAVITY_MPS2 = 9.81
 REST_Z_M = 0.09756  # of the chassis frame, standing still
 LIDAR_BEAMS = 72
 _CONTROLLED = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_MOCAP_POS)
@@ -96,17 +90,15 @@ class Simulation:
         self.batch = _batch(physics)(self.model, num_envs, nthread)
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._ctrl = self.batch.bind("ctrl")
-        self._mocap_pos = self.batch.bind("mocap_pos")
-        self._mocap_quat = self.batch.bind("mocap_quat")
         self._friction = self.batch.expand("geom_friction")
-        self._masses = self._radii = False  # fields made per-simulation when first needed
-        self._sloped = False
-        self._building = [building_boxes(floor, slots) for floor in floors]
-        self._floor = np.zeros(num_envs, np.int64)  # whose building stands
-
-        self.traffic = Traffic(num_envs, (task.body.length_m / 2, task.body.width_m / 2))
+        self._control = np.zeros((num_envs, self.substeps, 2 + 3 * self.model.nmocap))
+        half_m = task.body.length_m / 2, task.body.width_m / 2
+        self.scenery = Scenery(
+            self.batch, self.handles, floors, slots, half_m, self._control[:, :, 2:]
+        )
+        self.traffic, self.pallets = self.scenery.traffic, self.scenery.pallets
+        self.body = RobotBody(self.batch, self.model, self.handles, num_envs)
         self.patches = np.tile(NO_PATCH, (num_envs, PATCHES, 1)).astype(np.float64)
-        self.pallets = np.full((num_envs, PALLETS, 3), PARKED_M[0])
         self.controller = BaseController(num_envs, task.control_period_s, timestep_s, self.substeps)
         self.time_s = np.zeros(num_envs)
         self.bumped = np.zeros(num_envs, np.bool_)  # in the last control period
@@ -115,16 +107,13 @@ class Simulation:
         self.blown_up = np.zeros(num_envs, np.bool_)
         self.base_friction = np.full(num_envs, FLOOR_FRICTION)
         self.left_friction = np.ones(num_envs)
-        self.radius_m = np.full(num_envs, WHEEL_RADIUS_M)
 
         bearings = np.arange(beams) * (2 * np.pi / beams) - np.pi
         self.bearings_rad = bearings + np.pi / beams
         self._beam = np.stack([np.cos(self.bearings_rad), np.sin(self.bearings_rad)], axis=-1)
         self._groups = np.zeros(6, np.uint8)
         self._groups[OBSTACLE_GROUP] = 1
-        self._walked = np.zeros(0, np.int64)  # where traffic moved in the last block
         self._has_patches = np.zeros(num_envs, np.bool_)
-        self._control = np.zeros((num_envs, self.substeps, 2 + 3 * self._mocap_pos.shape[1]))
         self.callback: Callable[[Live], None] | None = None
         self.callback_period_s = 0.02
 
@@ -132,47 +121,26 @@ class Simulation:
 
     def reset(self, env: int, episode: Episode, perturbation: Perturbation, floor: int = 0) -> None:
         """Put one environment at the start of an episode, on one of the floors."""
-        ids = np.array([env])
-        self._build(env, floor)
-        self.batch.reset(ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+        self.scenery.build(env, floor)
+        self.batch.reset(np.array([env]), stage=int(mujoco.mjtStage.mjSTAGE_NONE))
         self.batch.warning[env] = 0
         self.place_robot(env, *episode.start)
         self.apply(env, perturbation)
         patches = episode.patches.copy()
         patches[:, 4] *= perturbation.patch_friction_scale
         self.patches[env] = patches
-        self.pallets[env] = episode.pallets
-        self._mocap_pos[env, :, :] = PARKED_M
-        self._mocap_quat[env, :, :] = (1.0, 0.0, 0.0, 0.0)
-        span = self.handles.pallets
-        self._mocap_pos[env, span, :2] = episode.pallets[:, :2]
-        self._mocap_pos[env, span, 2] = PALLET_HALF_M[2]
-        self._mocap_quat[env, span] = _quat(episode.pallets[:, 2])
-        self.traffic.reset(env, episode.walks)
-        self._show_traffic(ids)
-        self._control[env, :, 2:] = self._still(ids)[0]
+        self.scenery.reset(env, episode)
         self._has_patches[env] = (patches[:, 2] > 0).any()
         self.controller.reset(env)
         self.accel[env] = 0.0
         self.time_s[env] = 0.0
         self.bumped[env] = self.slipped[env] = self.blown_up[env] = False
 
-    def _build(self, env: int, floor: int) -> None:
-        """Racks and walls of a floor: boxes of the one model, placed anew."""
-        if floor == self._floor[env]:
-            return
-        self._floor[env] = floor
-        where, (middle, half) = self.handles.building, self._building[floor]
-        self.batch.expand("geom_pos")[env, where] = middle
-        self.batch.expand("geom_size")[env, where] = half
-        self.batch.expand("geom_aabb")[env, where, 3:] = half
-        self.batch.expand("geom_rbound")[env, where] = np.sqrt((half**2).sum(axis=1))
-
     def place_robot(self, env: int, x_m: float, y_m: float, yaw_rad: float) -> None:
         """Stand the robot still at a pose."""
         self.qpos[env] = 0.0
         self.qpos[env, :3] = x_m, y_m, REST_Z_M
-        self.qpos[env, 3:7] = _quat(np.array([yaw_rad]))[0]
+        self.qpos[env, 3:7] = quaternion(np.array([yaw_rad]))[0]
         self.qvel[env] = 0.0
         self._ctrl[env] = 0.0
 
@@ -183,39 +151,7 @@ class Simulation:
         self.controller.latency_s[env] = perturbation.latency_s
         self.controller.gain[env] = perturbation.gain
         self.controller.left_gain[env] = perturbation.left_gain
-        self._slope(env, perturbation)
-        if perturbation.payload_kg or self._masses:
-            self._masses = True
-            body = self.handles.chassis_body
-            mass, inertia = self.batch.expand("body_mass"), self.batch.expand("body_inertia")
-            scale = 1.0 + perturbation.payload_kg / CHASSIS_KG
-            mass[env, body] = self.model.body_mass[body] * scale
-            inertia[env, body] = self.model.body_inertia[body] * scale
-        if (perturbation.wheel_radius_scale, perturbation.track_scale) != (1, 1) or self._radii:
-            self._radii = True
-            radius = WHEEL_RADIUS_M * perturbation.wheel_radius_scale
-            self.radius_m[env] = radius
-            size, bound = self.batch.expand("geom_size"), self.batch.expand("geom_rbound")
-            place = self.batch.expand("body_pos")
-            for geom in self.handles.wheel_geoms:
-                size[env, geom, 0] = bound[env, geom] = radius
-            for body, side in zip(self.handles.wheel_bodies, (1, -1), strict=True):
-                place[env, body, 1] = side * TRACK_M / 2 * perturbation.track_scale
-                # So that the casters keep their share of the load.
-                place[env, body, 2] = radius - WHEEL_RADIUS_M
-        if self._masses or self._radii:
-            self.batch.set_const(np.array([env]))
-
-    def _slope(self, env: int, perturbation: Perturbation) -> None:
-        """Gravity along a sloping floor, as a force on the chassis in place of a tilted floor."""
-        rise = np.array([perturbation.slope_x, perturbation.slope_y])
-        if not rise.any() and not self._sloped:
-            return
-        self._sloped = True
-        body = self.handles.chassis_body
-        weight = (self.model.body_subtreemass[body] + perturbation.payload_kg) * GRAVITY_MPS2
-        force = self.batch.bind("xfrc_applied")
-        force[env, body, :2] = -weight * rise / np.sqrt(1 + rise @ rise)
+        self.body.apply(env, perturbation)
 
     def set_floor_friction(self, env: int, friction: float) -> None:
         """The floor's friction coefficient where no patch lies."""
@@ -234,7 +170,7 @@ class Simulation:
         touched = self.bumped.copy()
         for block in range(self.blocks):
             pose = self.pose()
-            self._walk(self.traffic.advance(pose, self.qvel[:, :2], touched, BLOCK_S))
+            self.scenery.walk(self.traffic.advance(pose, self.qvel[:, :2], touched, BLOCK_S))
             icy = np.flatnonzero(self._has_patches)
             slippery = self._write_friction(icy, pose[icy])
             touched = self._run(self.controller.wheel_speeds(block * BLOCK_S))
@@ -269,29 +205,6 @@ class Simulation:
         accel = records[0] if len(records) == 1 else np.concatenate(records, axis=1)
         self.accel = accel[:, self.substeps // 2 :].mean(axis=1)
         return touched
-
-    def _walk(self, ids: Ids) -> None:
-        """Show traffic in `ids` where it now is, at the end of the coming block.
-
-        On the way there it moves a little at every substep: a jump of a block's length would
-        strike the robot like a hammer.
-        """
-        self._control[self._walked, :, 2:] = self._still(self._walked)  # who stood still since
-        self._walked = ids
-        if not len(ids):
-            return
-        begin = self._mocap_pos[ids][:, None].copy()
-        self._show_traffic(ids)
-        end = self._mocap_pos[ids][:, None]
-        share = ((np.arange(self.substeps) + 1) / self.substeps)[None, :, None, None]
-        jumped = (np.abs(end - begin) > 1.0).any(axis=-1, keepdims=True)
-        path = np.where(jumped, end, begin + share * (end - begin))
-        self._control[ids, :, 2:] = path.reshape(len(ids), self.substeps, -1)
-
-    def _still(self, ids: Ids) -> F64:
-        """Mocap positions of `ids` as controls that keep them, (n, 1, 3 * nmocap)."""
-        still: F64 = self._mocap_pos[ids].reshape(len(ids), 1, 3 * self._mocap_pos.shape[1])
-        return still
 
     def live(self, accel: F64, pressed: NDArray[np.bool_]) -> Live:
         """The true state now."""
@@ -338,14 +251,8 @@ class Simulation:
         lateral = cos * velocity[:, 1] - sin * velocity[:, 0]
         turn = velocity[:, 5] * (TRACK_M / 2)
         ground = np.stack([forward - turn, forward + turn], axis=-1)
-        slip = np.hypot(velocity[:, 6:8] * self.radius_m[ids, None] - ground, lateral[:, None])
+        slip = np.hypot(velocity[:, 6:8] * self.body.radius_m[ids, None] - ground, lateral[:, None])
         return np.asarray((slippery & (slip > 0.15)).any(axis=1), np.bool_)
-
-    def _show_traffic(self, ids: Ids) -> None:
-        if len(ids):
-            people = slice(self.handles.people.start, self.handles.forklifts.stop)
-            self._mocap_pos[ids, people, :2] = self.traffic.position_m[ids]
-            self._mocap_quat[ids, people] = _quat(self.traffic.heading_rad[ids])
 
     # -- sensing --------------------------------------------------------------------------------
 
@@ -377,7 +284,7 @@ class Simulation:
         state = {name: getattr(self, name).copy() for name in self._ARRAYS}
         state |= {name: getattr(self.controller, name).copy() for name in self._CONTROLLER}
         state |= {f"traffic_{name}": getattr(self.traffic, name).copy() for name in self._TRAFFIC}
-        state["walked"] = self._walked.copy()
+        state["walked"] = self.scenery.walked.copy()
         return state | {"physics": self.batch.state.copy()}
 
     def set_state(self, state: dict[str, NDArray[Any]]) -> None:
@@ -389,8 +296,8 @@ class Simulation:
         for name in self._TRAFFIC:
             setattr(self.traffic, name, state[f"traffic_{name}"].copy())
         self.batch.state[:] = state["physics"]
-        self._walked = state["walked"].copy()
-        self._control[:, :, 2:] = self._still(np.arange(self.num_envs))
+        self.scenery.walked = state["walked"].copy()
+        self.scenery.stand_still(np.arange(self.num_envs))
 
 
 def _batch(physics: Physics) -> Any:
@@ -403,13 +310,6 @@ def _batch(physics: Physics) -> Any:
     raise ConfigError(
         f"there is no physics {physics!r}", where="the twin", remedy="use mujoco or warp"
     )
-
-
-def _quat(yaw_rad: F64) -> F64:
-    """Unit quaternions (..., 4), w first, of headings (...)."""
-    half = yaw_rad / 2
-    zero = np.zeros_like(half)
-    return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)
 
 
 def _check_times(task: Task, timestep_s: float, substeps: int, blocks: int) -> None:
