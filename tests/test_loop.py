@@ -15,12 +15,13 @@ import pytest
 import torch
 from toy_twin import CELLS, CONDITIONS, TASK, ToyTwin
 
-from restock.errors import ConfigError
+from restock.errors import ConfigError, RunError
 from restock.ingest.conditions import Condition
 from restock.replay.layout import row_width
 from restock.train import checkpoint
 from restock.train.batches import Coded, Logs
 from restock.train.config import TrainConfig, parse_config
+from restock.train.kept_checkpoints import earlier, go_back
 from restock.train.learner import Learner
 from restock.train.log_terms import LogTerms
 from restock.train.loop import TrainingInterrupted, train
@@ -227,6 +228,32 @@ def test_killed_after_a_checkpoint_and_resumed_is_bit_exact(
     train(again)
     again.close()
     assert_same_run(undisturbed, again)
+
+
+def test_an_earlier_checkpoint_leads_to_the_same_end(undisturbed: Session, tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    live = run_to_end(path, config())
+    kept = earlier(live.run.latest)
+    steps = live.config.record.checkpoint_every_env_steps
+    end = live.clock.env_steps
+    assert list(kept) == [(end - 1) // steps * steps - steps, (end - 1) // steps * steps]
+    with pytest.raises(RunError, match="no earlier checkpoint was taken after 7 env"):
+        go_back(live.run.latest, 7)
+    live.run.latest.write_bytes(b"half a file")
+    with pytest.raises(RunError, match=f"go back to an earlier one: --from-env-steps {max(kept)}"):
+        session(path, config(), resume=True)
+    go_back(live.run.latest, min(kept))
+    assert earlier(live.run.latest) == {}
+    again = session(path, config(), resume=True)
+    assert again.clock.env_steps == min(kept)
+    train(again)
+    again.close()
+    assert_same_run(undisturbed, again)
+
+
+def test_one_checkpoint_is_kept_where_one_is_asked_for(tmp_path: Path) -> None:
+    live = run_to_end(tmp_path / "run", config(record={"keep_checkpoints": 1}))
+    assert earlier(live.run.latest) == {}
 
 
 def test_half_of_each_online_batch_is_from_logs_by_quota(undisturbed: Session) -> None:

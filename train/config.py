@@ -183,11 +183,13 @@ class RecordConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     audit_share: float = 0.01  # of all batches, every row of which is recorded
     probe_rows: int = 64  # per condition, held fixed for the whole run
     checkpoint_every_env_steps: int = 40_000
+    keep_checkpoints: int = 3  # the latest and those before it; the best is kept besides
     tensorboard: bool = True
 
     def __post_init__(self) -> None:
-        if self.every_updates < 1 or self.checkpoint_every_env_steps < 1:
-            raise ValueError("record.every_updates and checkpoint_every_env_steps must be above 0")
+        for name in ("every_updates", "checkpoint_every_env_steps", "keep_checkpoints"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"record.{name} must be at least 1, got {getattr(self, name)}")
         if not 0 <= self.audit_share <= 1:
             raise ValueError(f"record.audit_share must be in [0, 1], got {self.audit_share}")
         if self.probe_rows < 0:

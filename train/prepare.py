@@ -20,6 +20,7 @@ from restock.train.evaluate import Twin
 from restock.train.explore import AFTER_LOGS
 from restock.train.floor_report import refuse_unfit, sealed
 from restock.train.floors import held_out, open_floors
+from restock.train.kept_checkpoints import check_earlier, go_back
 from restock.train.kernel import update_path
 from restock.train.learner import open_device
 from restock.train.log_draws import diet_of
@@ -41,10 +42,13 @@ class Prepared:
     panel: Panel | None
     document: dict[str, Any]  # config.json
     resumed: Run | None = None
+    from_env_steps: int | None = None  # of an earlier checkpoint than the latest
 
     def open(self) -> Session:
         """Make the run directory (or take up the old one), the twin and the learner."""
         run = self.resumed or Run.create(self.path, self.document)
+        if self.from_env_steps is not None:
+            go_back(run.latest, self.from_env_steps)
         return open_session(
             run,
             self.config,
@@ -101,11 +105,15 @@ def prepare_new(
     return Prepared(out, config, profile, panel, _document(config, profile, panel))
 
 
-def prepare_resumed(path: Path, overrides: Sequence[str] = ()) -> Prepared:
+def prepare_resumed(
+    path: Path, overrides: Sequence[str] = (), from_env_steps: int | None = None
+) -> Prepared:
     """A run to go on with; `overrides` may extend its budget or move it to another device.
 
+    `from_env_steps` names an earlier checkpoint than the latest: `Prepared.open` goes back to it.
+
     Raises:
-        RunError: no such run, or its panel or task changed since.
+        RunError: no such run or checkpoint, or its panel or task changed since.
     """
     run = Run.open(path)
     stored = run.document["config"]
@@ -128,7 +136,9 @@ def prepare_resumed(path: Path, overrides: Sequence[str] = ()) -> Prepared:
                 where=str(path),
                 remedy="put the old panel back, or start a new run",
             )
-    return Prepared(path, config, profile, panel, run.document, resumed=run)
+    if from_env_steps is not None:
+        check_earlier(run.latest, from_env_steps)
+    return Prepared(path, config, profile, panel, run.document, run, from_env_steps)
 
 
 def open_panel(path: Path, config: TrainConfig, profile: Profile) -> Panel:

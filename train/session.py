@@ -10,10 +10,12 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
 
+from restock.errors import RunError
 from restock.ingest.conditions import Condition
 from restock.ingest.task import Task
 from restock.replay.ring import FreshRing
@@ -24,6 +26,7 @@ from restock.train.config import TrainConfig
 from restock.train.evaluate import Score, Twin
 from restock.train.events import Events
 from restock.train.held_out import HeldOut
+from restock.train.kept_checkpoints import earlier, keep
 from restock.train.learner import Learner
 from restock.train.log_fidelity import LogFidelity
 from restock.train.log_terms import LogTerms
@@ -94,6 +97,7 @@ class Session:
 
     def save(self) -> None:
         """Write all state to the run's latest checkpoint, and the tables to match it."""
+        keep(self.run.latest, self.clock.checkpointed_at, self.config.record.keep_checkpoints)
         self.clock.checkpointed_at = self.clock.env_steps
         self.run.flush()
         self.events.flush()
@@ -119,7 +123,7 @@ class Session:
 
     def restore(self) -> None:
         """Go on from the run's latest checkpoint."""
-        state = checkpoint.load(self.run.latest)
+        state = self._latest()
         self.clock = Clock(**state["clock"])
         self.interval = Interval(**state["interval"])
         self.best = Score(**state["best"]) if state["best"] else None
@@ -134,6 +138,18 @@ class Session:
         checkpoint.restore_generator(self.exploration, state["exploration"])
         self.run.truncate(state["tables"])
         self._started = time.monotonic()
+
+    def _latest(self) -> dict[str, Any]:
+        try:
+            return checkpoint.load(self.run.latest)
+        except RunError as error:
+            if not (kept := earlier(self.run.latest)):
+                raise
+            raise RunError(
+                error.what,
+                where=error.where,
+                remedy=f"go back to an earlier one: --from-env-steps {max(kept)}",
+            ) from error
 
     def save_best(self, results: Score) -> None:
         """Keep the policy as it is now as the run's best."""

@@ -39,6 +39,9 @@ class Train:
     """One key of the config, e.g. --set optimizer.learning_rate=1e-4; may be repeated."""
     resume: Path | None = None
     """Go on with this run, from its latest checkpoint."""
+    from_env_steps: int | None = None
+    """With --resume: from the earlier checkpoint that was taken after so many environment steps
+    (record.keep_checkpoints says how many are kept); what came after it is forgotten."""
     env_steps: int | None = None
     """Budget in environment steps (schedule.env_steps)."""
     seconds: float | None = None
@@ -75,8 +78,10 @@ class Train:
                     "--resume goes on with the run's own panel, config and seed",
                     remedy="give only --env-steps, --seconds or --device beside it",
                 )
-            prepared = prepare_resumed(self.resume, overrides)
+            prepared = prepare_resumed(self.resume, overrides, self.from_env_steps)
         else:
+            if self.from_env_steps is not None:
+                raise RestockError("--from-env-steps goes with --resume RUN")
             if self.out is None:
                 raise RestockError(
                     "where should the run be written?", remedy="give --out RUN (or --resume RUN)"
