@@ -19,13 +19,14 @@ if TYPE_CHECKING:
 
 _ENV = (
     *("observation", "previous_action", "steps", "bumps", "episode_number", "episode_seed"),
-    *("episode_condition", "block", "perturbation_name", "episodes_begun", "_drawn"),
+    *("episode_condition", "block", "perturbation_name", "episodes_begun"),
 )
 
 
 def get_state(env: WarehouseVectorEnv) -> dict[str, Any]:
     """{"arrays": {name: array}, "json": {...}} of an environment that was reset."""
     arrays = {f"env.{name}": getattr(env, name).copy() for name in _ENV}
+    arrays["env._drawn"] = env.queue.drawn.copy()
     arrays |= {f"simulation.{name}": array for name, array in env.simulation.get_state().items()}
     arrays |= {f"signals.{name}": column.copy() for name, column in env.signals.items()}
     arrays |= {
@@ -43,12 +44,12 @@ def get_state(env: WarehouseVectorEnv) -> dict[str, Any]:
     json = {
         "task_hash": env.task.hash,
         "floors": [[floor.name, floor.hash] for floor in env.floors],
-        "seed": env._seed,
-        "conditions": env.conditions,
+        "seed": env.queue.seed,
+        "conditions": env.queue.conditions,
         "blown_up": env.blown_up,
         "specs": msgspec.to_builtins(env.specs),
-        "fixed": msgspec.to_builtins(env._fixed),
-        "next_fixed": env._next_fixed,
+        "fixed": msgspec.to_builtins(env.queue.fixed),
+        "next_fixed": env.queue.next_fixed,
         "closures": [[list(closure) for closure in found] for found in env.navigation.closures],
     }
     return {"arrays": arrays, "json": json}
@@ -78,9 +79,10 @@ def set_state(env: WarehouseVectorEnv, state: dict[str, Any]) -> None:
             remedy="make the environment with the layouts of then; a file may have changed since",
         )
     env.set_conditions(json["conditions"])
-    env._seed, env.blown_up = int(json["seed"]), int(json["blown_up"])
-    env._fixed = msgspec.convert(json["fixed"], list[EpisodeSpec])
-    env._next_fixed = int(json["next_fixed"])
+    env.queue.seed, env.blown_up = int(json["seed"]), int(json["blown_up"])
+    env.queue.fixed = msgspec.convert(json["fixed"], list[EpisodeSpec])
+    env.queue.next_fixed = int(json["next_fixed"])
+    env.queue.drawn = arrays["env._drawn"].copy()
     for index, spec in enumerate(msgspec.convert(json["specs"], list[EpisodeSpec])):
         env._lay_out(index, spec)
     for name in _ENV:

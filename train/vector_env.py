@@ -44,7 +44,8 @@ from restock.ingest.task import Task, observe, reached_goal, reward, terminated
 from restock.train.action_face import Face, action_face
 from restock.train.camera import Camera, View, check_view
 from restock.train.draw import draw_map
-from restock.train.episode import KINDS, Episode, EpisodeSpec, draw_episode
+from restock.train.episode import Episode, EpisodeSpec, draw_episode
+from restock.train.episode_queue import DEFAULT_CONDITIONS, EpisodeQueue
 from restock.train.floor_report import refuse_unfit
 from restock.train.floors import open_floors
 from restock.train.layout import DEFAULT, Warehouse, default_warehouse
@@ -54,12 +55,6 @@ from restock.train.sensing import Sensing, Signals, add_motion, add_route
 from restock.train.simulation import Live, Physics, Simulation
 from restock.train.truth import Truth
 
-DEFAULT_CONDITIONS: Mapping[str, float] = {
-    "nominal": 0.55,
-    "wheel_slip": 0.15,
-    "blocked_aisle": 0.15,
-    "near_collision": 0.15,
-}
 OBSERVATION_LIMIT = 20.0  # no sensor of this robot gives more; holds the space's bounds
 
 
@@ -119,15 +114,15 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         self._floor_objects[:] = self.floors
         self._floor_index = {floor.name: index for index, floor in enumerate(self.floors)}
         self.layout = np.zeros(num_envs, np.int64)  # of the running episodes, among the floors
-        self.schedule = perturbation if isinstance(perturbation, Schedule) else None
+        schedule = perturbation if isinstance(perturbation, Schedule) else None
         base = perturbation.base if isinstance(perturbation, Schedule) else perturbation
         self.perturbation = base or Perturbation()
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             raise ConfigError("autoreset is SameStep or Disabled", where="the twin")
         self.metadata = {**type(self).metadata, "autoreset_mode": self.autoreset_mode}
-        self.set_conditions(conditions or DEFAULT_CONDITIONS)
-        refuse_unfit(self.floors, [kind for kind, share in self.conditions.items() if share])
+        self.queue = EpisodeQueue(num_envs, conditions or DEFAULT_CONDITIONS, schedule, seed)
+        refuse_unfit(self.floors, [kind for kind, share in self.queue.conditions.items() if share])
 
         limit = np.full(self.task.observation_size, OBSERVATION_LIMIT, np.float32)
         self.single_observation_space = gymnasium.spaces.Box(-limit, limit, dtype=np.float32)
@@ -145,10 +140,6 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         self.navigation = Navigation(self.floors, num_envs, self.task)
         self.episodes: list[Episode | None] = [None] * num_envs
         self.specs: list[EpisodeSpec] = [EpisodeSpec("nominal", 0)] * num_envs
-        self._fixed: list[EpisodeSpec] = []
-        self._next_fixed = 0
-        self._seed = seed
-        self._drawn = np.zeros(num_envs, np.int64)  # episodes drawn so far, per environment
         self.blown_up = 0  # episodes that ended in a NaN or a blow-up
         self.signals: Signals = {}
         self.observation = np.zeros((num_envs, self.task.observation_size), np.float32)
@@ -198,44 +189,20 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
 
     def set_conditions(self, conditions: Mapping[str, float]) -> None:
         """Shares per kind of episode, for episodes that begin from now on."""
-        unknown = set(conditions) - set(KINDS)
-        total = sum(conditions.values())
-        if unknown or min(conditions.values(), default=-1) < 0 or total <= 0:
-            raise ConfigError(
-                f"conditions {dict(conditions)} are not shares per kind of episode",
-                where="the twin",
-                remedy=f"give numbers of at least 0, not all 0, for {', '.join(KINDS)}",
-            )
-        shares = np.array([conditions.get(kind, 0.0) for kind in KINDS])
-        self.conditions = {k: float(conditions[k]) for k in KINDS if k in conditions}
-        self._cumulative = np.cumsum(shares) / total
+        self.queue.set_conditions(conditions)
 
     def set_episodes(self, specs: Iterable[EpisodeSpec]) -> None:
         """Run these episodes, in order, from the next reset on; then episodes drawn as usual.
 
         `info["episode_number"]` names them by their place; -1 is an episode beyond their end.
         """
-        self._fixed, self._next_fixed = list(specs), 0
-
-    def _next_spec(self, env: int) -> EpisodeSpec:
-        if self._next_fixed < len(self._fixed):
-            spec = self._fixed[self._next_fixed]
-            self.episode_number[env] = self._next_fixed
-            self._next_fixed += 1
-            return spec
-        self.episode_number[env] = -1
-        draw = np.random.SeedSequence([self._seed, env, int(self._drawn[env])]).generate_state(3)
-        self._drawn[env] += 1
-        kind = np.searchsorted(self._cumulative, draw[0] / 2**32, side="right")
-        seed = int(draw[1]) << 20 ^ int(draw[2])
-        rng = np.random.default_rng([seed, 1])
-        drawn = self.schedule.draw(rng) if self.schedule else None
-        return EpisodeSpec(KINDS[int(kind)], seed, drawn)
+        self.queue.set_fixed(specs)
 
     def _begin(self, ids: NDArray[np.int64]) -> None:
         """Start the next episode of each environment in `ids`."""
         for env in ids.tolist():
-            self._lay_out(env, self._next_spec(env))
+            spec, self.episode_number[env] = self.queue.next(env)
+            self._lay_out(env, spec)
         self.steps[ids] = self.bumps[ids] = self.previous_action[ids] = 0
         first = self.sensing.sense(ids, self.steps[ids])
         add_motion(first, None)
@@ -283,8 +250,8 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         if mask is not None and self.signals:
             ids = np.flatnonzero(mask)
         if seed is not None:
-            self._seed = seed
-            self._drawn[ids] = 0
+            self.queue.seed = seed
+            self.queue.drawn[ids] = 0
         if len(ids) == self.num_envs:
             self.signals = {}
         else:
@@ -447,3 +414,6 @@ def _floors(
 
 def _bounded(observation: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.clip(np.nan_to_num(observation), -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+
+
+__all__ = ["DEFAULT_CONDITIONS", "OBSERVATION_LIMIT", "WarehouseVectorEnv"]
