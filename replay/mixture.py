@@ -20,6 +20,7 @@ Timing = Literal["pre", "post"]
 Share = float | Literal["natural", "equal"] | Schedule
 Correction = Literal["none", "beta", "full", "clipped", "density_ratio"]
 Shortfall = Literal["refuse", "redistribute", "shrink"]
+Unit = Literal["step", "episode"]
 Within = Literal["uniform", "without_replacement", "per", "lap"]
 
 
@@ -105,6 +106,8 @@ class StratumRule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     name: str  # a condition's name or "nominal", unless `where` says otherwise
     where: str | None = None  # SQL predicate over `transitions`
+    unit: Unit = "step"  # or all rows of the episodes that it holds in
+    min_steps: int = 1  # of an episode in which it must hold
     share: Share = "natural"  # of its source's part of a batch
     floor: float = 0.0
     cap: float = 1.0
@@ -119,12 +122,15 @@ class StratumRule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         _check_share(self.name, self.share, self.floor, self.cap)
+        _check_unit(self.name, self.unit, self.min_steps)
 
 
 class EachCondition(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A stratum for every condition of the store (and nominal) that `strata` does not name."""
 
     share: Literal["natural", "equal"] = "natural"
+    unit: Unit = "step"  # of the conditions; nominal is what is left
+    min_steps: int = 1
     floor: float = 0.0
     cap: float = 1.0
     correction: Correction | None = None
@@ -136,12 +142,21 @@ class EachCondition(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         _check_share("each_condition", self.share, self.floor, self.cap)
+        _check_unit("each_condition", self.unit, self.min_steps)
 
 
 def _check_share(name: str, share: Share, floor: float, cap: float) -> None:
     if isinstance(share, int | float):
         check(0 <= share <= 1, f"share of {name!r} must be in [0, 1], got {share:g}")
     check(0 <= floor <= cap <= 1, f"{name!r} needs 0 <= floor <= cap <= 1")
+
+
+def _check_unit(name: str, unit: Unit, min_steps: int) -> None:
+    check(min_steps >= 1, f"min_steps of {name!r} must be at least 1, got {min_steps}")
+    check(
+        unit == "episode" or min_steps == 1,
+        f'min_steps of {name!r} is of episodes: it needs unit = "episode"',
+    )
 
 
 class Mixture(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -69,6 +69,8 @@ def _rule_for(name: str, each: EachCondition) -> StratumRule:
     return StratumRule(
         name=name,
         share=each.share,
+        unit=each.unit,
+        min_steps=each.min_steps,
         floor=each.floor,
         cap=each.cap,
         correction=each.correction,
@@ -100,6 +102,11 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
             where="mixture",
             remedy=f"the store knows {', '.join([NOMINAL, *sorted(known)])}",
         )
+    if rule.unit == "episode":
+        # Chosen by what the whole episode met, not by what came of this step.
+        state_predicate, timing = None, "pre"
+        left_over = rule.name == NOMINAL and rule.where is None
+        predicate = "true" if left_over else _of_episodes(predicate, rule.min_steps)
     timing = rule.timing or timing
     default = mixture.correction.pre if timing == "pre" else mixture.correction.post
     return Stratum(
@@ -111,6 +118,12 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
         rule.correction or default,
         rule.within or mixture.within,
     )
+
+
+def _of_episodes(predicate: str, min_steps: int) -> str:
+    """Whether a row's episode has so many rows for which the predicate holds."""
+    holds = f"count(*) FILTER (WHERE ({predicate}\n)::BOOLEAN)"
+    return f"{holds} OVER (PARTITION BY episode_id) >= {min_steps}"
 
 
 def assign(

@@ -49,6 +49,34 @@ def test_every_row_is_in_one_stratum_or_left_out_for_one_reason(transitions: pa.
     assert sum(line.rows for line in plan.strata) == len(plan.panel_rows)
 
 
+@pytest.mark.parametrize("min_steps", [1, 4])
+def test_a_stratum_of_episodes_has_all_rows_of_those_that_met_it(
+    transitions: pa.Table, min_steps: int
+) -> None:
+    plan = planned(
+        transitions,
+        NO_HOLD + f"[each_condition]\nunit = 'episode'\nmin_steps = {min_steps}\n",
+    )
+    assert len(plan.panel_rows) == len(transitions)  # nominal is what is left
+    rows = taken(plan)
+    names = [line.stratum for line in plan.strata]
+    stratum = dict(
+        zip(
+            rows["transition_id"].to_pylist(),
+            (names[code] for code in plan.stratum.tolist()),
+            strict=True,
+        )
+    )
+    order = sorted(CONDITIONS, key=lambda condition: (condition.priority, condition.name))
+    for episode in transitions["episode_id"].unique().to_pylist():
+        own = transitions.filter(pc.equal(transitions["episode_id"], episode))
+        held = own["conditions"].to_pylist()
+        met = [c.name for c in order if sum(c.name in row for row in held) >= min_steps]
+        of_rows = {stratum[row] for row in own["transition_id"].to_pylist()}
+        assert of_rows == {met[0] if met else "nominal"}
+    assert {line.correction for line in plan.strata} == {"none"}
+
+
 def test_unsafe_rows_go_alone_or_with_their_episode(transitions: pa.Table) -> None:
     bumped = set(transitions.filter(transitions["bumped"])["transition_id"].to_pylist())
     assert bumped
