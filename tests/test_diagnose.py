@@ -118,7 +118,7 @@ def make_run(
         ({"shares": {n: s for n, s in SHARES.items() if n != "blocked_aisle"}}, "BUFFER"),
         ({"shares": {**SHARES, "blocked_aisle": 0.005}}, "BUFFER"),  # a tenth is met
         ({"shares": {**SHARES, "blocked_aisle": 0.02}}, "HEALTHY"),
-        ({"agreement": {"blocked_aisle": 0.1}}, "BUFFER"),
+        ({"agreement": {"blocked_aisle": 0.03}}, "BUFFER"),
         ({"unexplained": {"blocked_aisle": 1.2}}, "BUFFER"),
         ({"unexplained": dict.fromkeys(CONDITIONS, 1.2)}, "HEALTHY"),  # a noisy robot is no fault
         ({"strata": False}, "HEALTHY"),

@@ -36,6 +36,7 @@ from restock.train.run import Run
 Cause = Literal["HEALTHY", "BUFFER", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED"]
 WINDOWS = 3  # the last, that figures are the median of
 _LEAST_ROWS = 20  # held out, for a condition to be judged
+_LEAST_ALIKE = 50  # … for its look to be known
 
 
 @dataclass(frozen=True)
@@ -49,9 +50,9 @@ class Limits:
     no_lag: float = 0.002  # L below this: there is no target network to speak of
     clock: float = 2.0  # S
     supply: float = 0.1  # a condition's share of replay over its share of what driving meets
-    agreement: float = 0.4  # of a condition's logged rows that look like it
-    unexplained: float = 0.9  # of the variance of its next observations …
-    unexplained_relative: float = 1.6  # … and over the median condition's
+    agreement: float = 0.1  # of a condition's logged rows that look like it
+    unexplained: float = 1.0  # of the variance of its next observations: their mean explains more
+    unexplained_relative: float = 1.6  # and over that of the condition with the least
     quota_met: float = 0.5  # a smaller part of a quota is worth saying beside a gap
 
 
@@ -88,10 +89,10 @@ class Window:
     def bad(self, limits: Limits) -> dict[str, list[str]]:
         """The conditions whose replay is in doubt, with what is wrong, for people."""
         follows = [s.unexplained for s in self.symptoms if s.unexplained is not None]
-        usual = median(follows) if follows else 0.0
+        least = min(follows, default=0.0)
         found = {}
         for symptom in self.symptoms:
-            said = [*self._supply(symptom, limits), *self._rows(symptom, usual, limits)]
+            said = [*self._supply(symptom, limits), *self._rows(symptom, least, limits)]
             relative = self.relative(symptom)
             if relative is not None and symptom.gap is not None:
                 if symptom.gap >= limits.gap and relative >= limits.relative:
@@ -118,7 +119,7 @@ class Window:
             return []
         return [f"is {symptom.replay_share:.2%} of replay and {met:.1%} of what driving meets"]
 
-    def _rows(self, symptom: Symptom, usual: float, limits: Limits) -> list[str]:
+    def _rows(self, symptom: Symptom, least: float, limits: Limits) -> list[str]:
         said = []
         if symptom.agreement is not None and symptom.agreement < limits.agreement:
             said.append(
@@ -128,11 +129,11 @@ class Window:
         if (
             rest is not None
             and rest >= limits.unexplained
-            and rest >= limits.unexplained_relative * usual
+            and rest >= limits.unexplained_relative * least
         ):
             said.append(
                 f"its logged rows leave {rest:.0%} of their next observations unexplained"
-                f" ({usual:.0%} is usual): do they belong together?"
+                f" (another condition's {least:.0%}): do they belong together?"
             )
         return said
 
@@ -260,7 +261,7 @@ def _window(rows: list[dict[str, Any]], bound: float) -> Window:
             row["held_out_td"] / max(middle, 1e-12),
             row["replay_share"] or 0.0,
             row["met_share"],
-            row["agreement"],
+            row["agreement"] if row["held_out_rows"] >= _LEAST_ALIKE else None,
             row["unexplained"],
             row["quota_met"],
         )

@@ -21,7 +21,7 @@ from restock.train.batches import Logs
 from restock.train.probe import Probe
 
 ROWS = 512  # of each condition, chosen by hash
-_LEAST_ROWS = 20  # of a condition, to be judged
+_LEAST_ROWS = 50  # of a condition, to be judged
 _SHRINKAGE = 0.05  # of the covariance towards its diagonal's mean
 _RIDGE = 1.0  # on standardised features
 
