@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from restock.train.bag_writer import Message
 from restock.train.drive import Drive, Lidar, Motion
 from restock.train.messages import typestore
+from restock.train.odometer import Odometer
 from restock.train.publish import LIDAR_LSB_M, Rates, Robot
 from restock.train.robot_topics import TOPICS
 
@@ -69,7 +70,9 @@ def drive() -> Drive:
 
 def _robot() -> Robot:
     lidar = Lidar(-3.1, 0.07, 0.05, 10.0)
-    return Robot(np.random.default_rng(3), lidar, Rates(), wheel_radius_m=0.1, track_m=0.44)
+    return Robot(
+        np.random.default_rng(3), lidar, Rates(), Odometer(wheel_radius_m=0.1, track_m=0.44)
+    )
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ lets real recordings compress.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from restock.ingest.signals import wrap_angle
 from restock.train import robot_topics as topics
 from restock.train.bag_writer import Message
 from restock.train.drive import Drive, Lidar
+from restock.train.odometer import Odometer
 from restock.train.scene import (
     MARKERS,
     PERTURBATION,
@@ -37,7 +38,6 @@ from restock.train.transport import send
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-ENCODER_LSB_RAD = 2 * np.pi / 4096
 GYRO_LSB_RADPS = 2.0**-10
 ACCEL_LSB_MPS2 = 2.0**-8
 LIDAR_LSB_M = 2.0**-9  # some 2 mm
@@ -70,17 +70,14 @@ class Robot:
     rng: np.random.Generator
     lidar: Lidar
     rates: Rates
-    wheel_radius_m: float  # as the odometry believes it
-    track_m: float
-    odom_pose: F64 = field(default_factory=lambda: np.zeros(3))  # x, y, yaw where it stands
-    wheel_angle_rad: F64 = field(default_factory=lambda: np.zeros(2))
+    odometer: Odometer
     driven_s: float = 0.0
     _start_ns: int = 0  # of the mission at hand
 
     def publish(self, drive: Drive, start_ns: int) -> list[Message]:
         """All messages of one mission that starts at `start_ns`, in the order of log time."""
         self._start_ns = start_ns
-        reckoned = self._dead_reckoning(drive)  # (M, 3), at the motion's times
+        reckoned = self.odometer.dead_reckoning(drive.motion)  # (M, 3), at the motion's times
         found = [
             *self._announcements(drive),
             *self._odometry(drive, reckoned),
@@ -93,9 +90,7 @@ class Robot:
             *self._diagnostics(drive),
             *self._scene(drive),
         ]
-        turned = drive.motion.wheel_angle_rad[-1] - drive.motion.wheel_angle_rad[0]
-        self.wheel_angle_rad = self.wheel_angle_rad + turned
-        self.odom_pose = reckoned[-1]
+        self.odometer.carry_on(drive.motion, reckoned)
         self.driven_s += float(drive.tick_s[-1])
         found.sort(key=lambda message: message.log_ns)  # stable: ties keep the order above
         return found
@@ -138,31 +133,12 @@ class Robot:
         texts = [topics.behaviour_policy(*drive.policy[tick]) for tick in changed]
         return found + self._send("/behaviour_policy", drive.tick_s[changed], texts)
 
-    def _dead_reckoning(self, drive: Drive) -> F64:
-        """The pose in `odom` from the encoders alone, at every time of the motion, (M, 3)."""
-        ticks = np.floor((self.wheel_angle_rad + drive.motion.wheel_angle_rad) / ENCODER_LSB_RAD)
-        rolled = np.diff(ticks, axis=0) * (ENCODER_LSB_RAD * self.wheel_radius_m)  # (M - 1, 2)
-        turn = (rolled[:, 1] - rolled[:, 0]) / self.track_m
-        x, y, yaw = self.odom_pose
-        heading = yaw + np.concatenate([[0.0], np.cumsum(turn)])
-        ahead = rolled.mean(axis=1)
-        middle = heading[:-1] + turn / 2
-        return np.stack(
-            [
-                x + np.concatenate([[0.0], np.cumsum(ahead * np.cos(middle))]),
-                y + np.concatenate([[0.0], np.cumsum(ahead * np.sin(middle))]),
-                heading,
-            ],
-            axis=-1,
-        )
-
     def _odometry(self, drive: Drive, reckoned: F64) -> list[Message]:
         times, tick = self._sample(drive, self.rates.odom)
         rate = drive.motion.at(drive.motion.wheel_rate_radps, times)
         rate += self.rng.normal(0, drive.encoder_noise_radps, rate.shape)
         rate += drive.scene.perturbation.encoder_bias_radps
-        speed = rate.mean(axis=1) * self.wheel_radius_m
-        turn = (rate[:, 1] - rate[:, 0]) * (self.wheel_radius_m / self.track_m)
+        speed, turn = self.odometer.speeds(rate)
         speed = _at_ticks(speed, tick, drive.signals["wheel_speed_mps"])
         turn = _at_ticks(turn, tick, drive.signals["wheel_yaw_rate_radps"])
         x, y, yaw = drive.motion.at(reckoned, times).T
@@ -190,9 +166,8 @@ class Robot:
 
     def _joints(self, drive: Drive) -> list[Message]:
         times, _ = self._sample(drive, self.rates.joint_states)
-        angle = self.wheel_angle_rad + drive.motion.at(drive.motion.wheel_angle_rad, times)
+        angle = self.odometer.wheel_angles(drive.motion, times)
         rate = drive.motion.at(drive.motion.wheel_rate_radps, times)
-        angle = np.floor(angle / ENCODER_LSB_RAD) * ENCODER_LSB_RAD
         data = topics.joint_states(self._stamps(times), _f32(angle), _f32(rate))
         return self._send("/joint_states", times, data)
 

@@ -28,6 +28,7 @@ from restock.train.fleet import Fleet
 from restock.train.layout import DEFAULT, Warehouse
 from restock.train.missions import NATURAL, schedule
 from restock.train.model import TRACK_M, WHEEL_RADIUS_M
+from restock.train.odometer import Odometer
 from restock.train.perturbation import Perturbation, Schedule
 from restock.train.publish import Rates, Robot
 from restock.train.robot_topics import TOPICS
@@ -261,7 +262,7 @@ def _robot(plan: Plan, fleet: Fleet) -> Robot:
         x_m=fleet.env.task.body.lidar_x_m,
     )
     rng = np.random.Generator(np.random.PCG64([plan.seed, 0x726F62]))
-    return Robot(rng, lidar, plan.rates, WHEEL_RADIUS_M, TRACK_M)
+    return Robot(rng, lidar, plan.rates, Odometer(WHEEL_RADIUS_M, TRACK_M))
 
 
 def _occupied(warehouse: Warehouse, cell_m: float) -> NDArray[np.bool_]:
