@@ -1,24 +1,38 @@
 """The evidence: does coverage-aware replay of rare logs pay off? One command, start to end.
 
-    python benchmarks/evidence.py --out /tmp/evidence [--hours 4] [--workers 2]
+    python benchmarks/evidence.py --out /tmp/evidence [--hours 24] [--workers 2]
 
 Records hours of the stand-in fleet at natural rates (88 % of missions nominal, 4 % each of wheel
 slip, blocked aisles and near collisions), ingests them, and runs the study of benchmarks/evidence/:
 every arm with every seed at equal environment steps and updates. What is there is not done again.
-The result is OUT/study/study.md; docs/evidence.md discusses it.
+The comparisons are in OUT/study/study.md; the tables of docs/evidence.md are printed at the end.
 """
 
 from __future__ import annotations
 
 import argparse
 import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import duckdb
+import numpy as np
+
 from restock.cli import main as restock
+from restock.train.study import Plan, load_study
 
 HERE = Path(__file__).parent / "evidence"
 NATURAL = "nominal=.88,wheel_slip=.04,blocked_aisle=.04,near_collision=.04"
 RATES = "odom=10,imu=10,scan=5,joint_states=5,amcl_pose=5,tf=5,bumper=5"
+CELLS = ("nominal", "wheel_slip", "partly blocked", "wholly blocked", "near_collision")
+# Of one condition: each counts by half.
+RARE = {"wheel_slip": 2, "partly blocked": 1, "wholly blocked": 1, "near_collision": 2}
+CELL = """CASE WHEN condition <> 'blocked_aisle' THEN condition
+    WHEN block = 'partial' THEN 'partly blocked' ELSE 'wholly blocked' END"""
+RESAMPLES = 4000
 
 
 def main() -> int:
@@ -26,27 +40,112 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--hours", type=int, default=4, help="one recording each")
-    parser.add_argument("--workers", type=int, default=1, help="runs at a time")
+    parser.add_argument("--hours", type=int, default=24, help="one recording each")
+    parser.add_argument("--workers", type=int, default=1, help="recordings, then runs, at a time")
     options = parser.parse_args()
     logs = options.out / "logs"
     logs.mkdir(parents=True, exist_ok=True)
-    for hour in range(options.hours):
-        recording = logs / f"hour{hour + 1}.mcap"
-        if not recording.exists():
-            words = ["--minutes", "60", "--seed", str(101 + hour), "--rates", RATES]
-            _must(["record", "--out", str(recording), "--conditions", NATURAL, *words])
-    if not (options.out / "store").exists():
-        _must(["ingest", str(logs), "--store", str(options.out / "store")])
+    hours = [(logs / f"hour{hour}.mcap", 100 + hour) for hour in range(1, options.hours + 1)]
+    with ThreadPoolExecutor(options.workers) as pool:
+        list(pool.map(_record, *zip(*hours, strict=True)))
+    if not (options.out / "store").exists() and restock(
+        ["ingest", str(logs), "--store", str(options.out / "store")]
+    ) not in (0, 3):
+        return 1
     for file in HERE.glob("*.toml"):
         shutil.copy(file, options.out / file.name)
-    study = ["study", str(options.out / "study.toml"), "--out", str(options.out / "study")]
-    return restock([*study, "--workers", str(options.workers)])
+    study, out = options.out / "study.toml", options.out / "study"
+    code = restock(["study", str(study), "--out", str(out), "--workers", str(options.workers)])
+    plan = Plan(load_study(study), study.parent, out)
+    print(f"\n{ends(plan)}\n\n{curves(plan)}")
+    return code
 
 
-def _must(arguments: list[str]) -> None:
-    if restock(arguments) not in (0, 3):
-        raise SystemExit(f"restock {' '.join(arguments)} failed")
+def _record(recording: Path, seed: int) -> None:
+    if recording.exists():
+        return
+    words = ["--minutes", "60", "--seed", str(seed), "--rates", RATES, "--conditions", NATURAL]
+    command = [sys.executable, "-m", "restock", "record", "--out", str(recording), *words]
+    subprocess.run(command, check=True)
+
+
+def ends(plan: Plan) -> str:
+    """Success of each arm in each cell on the study's episodes, with 95 % intervals."""
+    lines = [
+        f"| | {' | '.join(CELLS)} | rare conditions |",
+        "| --- |" + " --- |" * (len(CELLS) + 1),
+    ]
+    for arm in plan.study.arms:
+        runs = [_successes(path / "eval" / "episodes.parquet") for path in plan.runs(arm)]
+        if not all(runs):
+            continue
+        weights: list[dict[str, int]] = [{cell: 1} for cell in CELLS] + [RARE]
+        said = " | ".join(_interval(runs, cells) for cells in weights)
+        lines.append(f"| `{arm.name}` | {said} |")
+    return "\n".join(lines)
+
+
+def curves(plan: Plan) -> str:
+    """Success in the rare conditions at each periodic evaluation, the mean over seeds."""
+    found: dict[str, dict[int, float]] = {}
+    for arm in plan.study.arms:
+        by_step: dict[int, list[float]] = {}
+        for path in plan.runs(arm):
+            if not (path / "evaluations.parquet").exists():
+                continue
+            rows = duckdb.sql(
+                f"SELECT env_steps, {CELL} AS cell, avg(success::INT) AS success"
+                " FROM read_parquet(?) GROUP BY ALL",
+                params=[str(path / "evaluations.parquet")],
+            ).fetchall()
+            for step in {row[0] for row in rows}:
+                here = {cell: success for at, cell, success in rows if at == step}
+                by_step.setdefault(step, []).append(_weighted(here))
+        found[arm.name] = {step: float(np.mean(values)) for step, values in by_step.items()}
+    steps = sorted({step for curve in found.values() for step in curve if step % 1000 == 0})
+    lines = [f"| steps | {' | '.join(f'{step:,}' for step in steps)} |"]
+    lines += ["| --- |" + " --- |" * len(steps)]
+    for name, curve in found.items():
+        cells = (f"{curve[step]:.2f}" if step in curve else "" for step in steps)
+        lines.append(f"| `{name}` | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _successes(path: Path) -> dict[str, np.ndarray]:
+    """0 or 1 of each episode of a run, by cell, in the order of the episodes' seeds."""
+    if not path.exists():
+        return {}
+    rows = duckdb.sql(
+        f"SELECT {CELL} AS cell, list(success::INT ORDER BY episode_seed)"
+        " FROM read_parquet(?) GROUP BY ALL",
+        params=[str(path)],
+    ).fetchall()
+    return {cell: np.array(values, np.float64) for cell, values in rows}
+
+
+def _weighted(success: dict[str, float], weights: dict[str, int] = RARE) -> float:
+    known = {cell: weight for cell, weight in weights.items() if cell in success}
+    return sum(success[cell] * weight for cell, weight in known.items()) / sum(known.values())
+
+
+def _interval(runs: Sequence[dict[str, np.ndarray]], weights: dict[str, int]) -> str:
+    """The mean over runs, and 95 % of its values with runs and episodes drawn anew: all
+    runs drove the same ones."""
+    rng = np.random.default_rng(0)
+    cells = {cell: np.stack([run[cell] for run in runs]) for cell in weights}  # (runs, episodes)
+    means = []
+    for _ in range(RESAMPLES):
+        chosen = rng.integers(len(runs), size=len(runs))
+        drawn = {
+            cell: float(
+                values[chosen][:, rng.integers(values.shape[1], size=values.shape[1])].mean()
+            )
+            for cell, values in cells.items()
+        }
+        means.append(_weighted(drawn, weights))
+    centre = _weighted({cell: float(values.mean()) for cell, values in cells.items()}, weights)
+    low, high = np.quantile(means, [0.025, 0.975])
+    return f"{centre:.2f} [{low:.2f}, {high:.2f}]"
 
 
 if __name__ == "__main__":
