@@ -4,6 +4,7 @@ the critic was fed."""
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -254,6 +255,42 @@ def test_an_earlier_checkpoint_leads_to_the_same_end(undisturbed: Session, tmp_p
 def test_one_checkpoint_is_kept_where_one_is_asked_for(tmp_path: Path) -> None:
     live = run_to_end(tmp_path / "run", config(record={"keep_checkpoints": 1}))
     assert earlier(live.run.latest) == {}
+
+
+GUIDED = {"guide": {"env_steps": 1000, "horizon_steps": 5}}
+
+
+def test_the_logs_behaviour_drives_first_and_hands_over(tmp_path: Path) -> None:
+    live = run_to_end(tmp_path / "run", config(**GUIDED))
+    meta = {name: values[: len(live.ring)] for name, values in live.ring.meta.items()}
+    cloned = meta["behaviour_policy"] == live.ring.behaviour_policies.index("cloned")
+    early = meta["env_step"] < 500
+    assert cloned[early].mean() > cloned[~early].mean() > 0
+    assert not cloned[meta["env_step"] >= 1000].any()
+    assert meta["episode_step"][cloned].max() < 5  # then the learner drives to the end
+    forward = live.ring.rows[: len(live.ring), -3] == 1  # as it is in 7 of 10 logged steps
+    assert forward[cloned].mean() == pytest.approx(0.7, abs=0.15)
+    chance = meta["action_probability"][cloned]
+    assert chance[forward[cloned]].mean() > 0.5 > chance[~forward[cloned]].mean() > 0
+    fed = pq.read_table(tmp_path / "run" / "policies.parquet").to_pylist()
+    assert {"dqn", "cloned"} <= {r["behaviour_policy"] for r in fed if r["source"] == "fresh"}
+
+
+def test_a_guided_run_resumes_bit_exact(tmp_path: Path) -> None:
+    whole = run_to_end(tmp_path / "whole", config(**GUIDED))
+    path = Path(shutil.copytree(whole.run.path, tmp_path / "cut"))
+    latest = path / "checkpoints" / "latest.safetensors"
+    go_back(latest, min(earlier(latest)))
+    again = session(path, config(**GUIDED), resume=True)
+    assert 0 < again.clock.env_steps < 1000  # while it still drives
+    train(again)
+    again.close()
+    assert_same_run(whole, again)
+
+
+def test_a_guide_needs_logs(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="about the logs' behaviour, and there are none"):
+        session(tmp_path / "run", config(**GUIDED), logs=None)
 
 
 def test_half_of_each_online_batch_is_from_logs_by_quota(undisturbed: Session) -> None:

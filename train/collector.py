@@ -82,7 +82,7 @@ class Collector:
         self._unlabelled: list[Ended] = []
         self.invalid_steps = 0  # whose physics blew up
         self.observation: NDArray[np.float32] = np.zeros(0, np.float32)
-        self._sent: tuple[NDArray[np.int64], NDArray[np.float32]] | None = None
+        self._sent: tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int16]] | None = None
         self._future: Future[Any] | None = None
         self._result: Any = None
         self.perturbations = FreshPerturbations()
@@ -109,8 +109,18 @@ class Collector:
         """Begin: the first observations (N, D)."""
         self.observation, _ = self.env.reset(seed=seed)
 
-    def start(self, action: NDArray[np.int64], probability: NDArray[np.float32]) -> None:
-        """Send one action per environment, (N,)."""
+    @property
+    def steps(self) -> NDArray[np.int64]:
+        """Of the episode under way in each environment so far, (N,)."""
+        return self._steps
+
+    def start(
+        self,
+        action: NDArray[np.int64],
+        probability: NDArray[np.float32],
+        policy: NDArray[np.int16] | int = 0,
+    ) -> None:
+        """Send one action per environment, (N,); `policy` is the ring's code of who chose it."""
         envs = np.arange(self.env.num_envs)
         now = self.env.signals
         for name, history in self._history.items():
@@ -118,7 +128,7 @@ class Collector:
         # The command in force over the step that begins, as a log has it.
         self._history["command_speed_mps"][envs, self._steps] = self._actions[action, 0]
         self._history["command_yaw_rate_radps"][envs, self._steps] = self._actions[action, 1]
-        self._sent = (action, probability)
+        self._sent = (action, probability, np.broadcast_to(np.int16(policy), action.shape))
         if self._executor is not None:
             self._future = self._executor.submit(self.env.step, action)
         else:
@@ -139,7 +149,7 @@ class Collector:
         result = self._future.result() if self._future is not None else self._result
         self._future = self._result = None
         observation, reward, terminated, truncated, info = result
-        (action, probability), self._sent = self._sent, None
+        (action, probability, policy), self._sent = self._sent, None
         ended = np.asarray(terminated | truncated, np.bool_)
         following = np.array(observation, copy=True)
         for place in np.flatnonzero(ended):  # SAME_STEP: `observation` is the next episode's first
@@ -154,6 +164,7 @@ class Collector:
             env_step=env_steps,
             gradient_step=acting_step,
             policy_version=acting_step,
+            behaviour_policy=policy,
             action_probability=probability,
         )
         if info["invalid"].any():
@@ -164,6 +175,7 @@ class Collector:
                 self._steps,
                 action=action,
                 probability=probability,
+                policy=policy,
                 reward=reward,
                 progress_m=info["progress_m"],
                 truth=info["true_condition"],

@@ -16,6 +16,7 @@ import msgspec
 
 from restock.errors import ConfigError
 from restock.train.explore import LinearEpsilon
+from restock.train.guide import GuideConfig
 from restock.train.perturbation import find_perturbation
 from restock.train.target import Polyak, TargetRule
 from restock.train.toml_values import toml_value
@@ -210,6 +211,7 @@ class TrainConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     replay: ReplayConfig = ReplayConfig()
     schedule: ScheduleConfig = ScheduleConfig()
     epsilon: LinearEpsilon = LinearEpsilon()
+    guide: GuideConfig = GuideConfig()
     env: EnvConfig = msgspec.field(default_factory=EnvConfig)
     evaluation: EvaluationConfig = EvaluationConfig()
     guard: GuardConfig = GuardConfig()

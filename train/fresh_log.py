@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from restock.train.collector import Ended
 
 Bools = NDArray[np.bool_]
-_STEP = ("action", "probability", "reward", "progress_m", "truth")
-_KINDS = {"action": "i2", "truth": "<U32"}
+_STEP = ("action", "probability", "policy", "reward", "progress_m", "truth")
+_KINDS = {"action": "i2", "policy": "i2", "truth": "<U32"}
 
 
 class FreshLog:
@@ -56,7 +56,7 @@ class FreshLog:
         self._observation[np.arange(len(at)), at] = observation
 
     def took(self, at: NDArray[np.int64], **values: NDArray[Any]) -> None:
-        """After it: action, probability, reward, progress_m and truth (N,)."""
+        """After it: action, probability, policy, reward, progress_m and truth (N,)."""
         for name, value in values.items():
             self._steps[name][np.arange(len(at)), at] = value
 
@@ -120,7 +120,7 @@ class FreshLog:
         self._whole = np.array(state["whole"], np.bool_)
         self._version = np.array(state["version"], np.int64)
         self._observation = np.array(state["observation"], np.float32)
-        self._steps = {name: np.array(column) for name, column in state["steps"].items()}
+        self._steps |= {name: np.array(column) for name, column in state["steps"].items()}
         self._waiting = {key: dict(episode) for key, episode in state["waiting"].items()}
         self.parts, self.dropped_steps = int(state["parts"]), int(state["dropped_steps"])
         for path in episode_files(self.folder)[self.parts :]:

@@ -26,10 +26,10 @@ from restock.ingest.schema import SIGNAL_COLUMNS, STEP_BITS, recording_schema, t
 from restock.ingest.scores import score
 from restock.ingest.store import StoreWriter
 from restock.train.fresh_log import read_episodes
+from restock.train.guide import POLICIES
 from restock.train.run import now_ns
 
 FORMAT = "twin"
-POLICY = "dqn"
 _MOVED = ("stamp_ns", "pose_stamp_ns")  # episodes begin at 0: laid out one after the other
 
 
@@ -151,7 +151,7 @@ def _rows(
         "perturbation": perturbed,
         "perturbation_values": values,
         "zone": _zones(rows, episodes, profile)[begin].tolist(),
-        "behaviour_policy": POLICY,
+        "behaviour_policy": _policies(episodes),
         "behaviour_version": [version[episode] for episode in rows.episode[begin]],
         "action_probability": each("probability"),
         "action_residual": np.zeros(len(begin), np.float32),  # the action is the command
@@ -168,6 +168,12 @@ def _rows(
     arrays = [_array(columns[field.name], field.type, len(begin)) for field in schema]
     table = pa.Table.from_arrays(arrays, schema=schema)
     return table.replace_schema_metadata({ENDS: packed(rows.ends_table())})
+
+
+def _policies(episodes: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Who chose each step; an older run had no guide."""
+    codes = [episode.get("policy", np.zeros(int(episode["count"]), int)) for episode in episodes]
+    return [POLICIES[code] for code in np.concatenate(codes)]
 
 
 def _zones(

@@ -11,6 +11,9 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from restock.errors import ExitCode, RestockError
 from restock.train.batches import Batch
 from restock.train.evaluate import (
@@ -94,7 +97,16 @@ def train(
             greedy, learner.network.actions, epsilon, session.exploration
         )
         acting_step = learner.gradient_steps
-        session.collector.start(action, probability)
+        policy: NDArray[np.int16] | int = 0
+        if session.guide is not None:  # for the first steps of an episode, as the logs' drivers did
+            action, probability, policy = session.guide.take_over(
+                action,
+                probability,
+                session.collector.observation,
+                session.collector.steps,
+                clock.env_steps,
+            )
+        session.collector.start(action, probability, policy)
 
         # 4. … while the learner learns from what the ring held before this step.
         for _ in range(_updates_due(session)):

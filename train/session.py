@@ -25,6 +25,7 @@ from restock.train.collector import Collector, ring_conditions
 from restock.train.config import TrainConfig
 from restock.train.evaluate import Score, Twin
 from restock.train.events import Events
+from restock.train.guide import POLICIES, Guide
 from restock.train.held_out import HeldOut
 from restock.train.kept_checkpoints import earlier, keep
 from restock.train.learner import Learner
@@ -84,6 +85,7 @@ class Session:
     executor: ThreadPoolExecutor | None
     logs: Logs | None
     log_terms: LogTerms
+    guide: Guide | None
     clock: Clock = field(default_factory=Clock)
     interval: Interval = field(default_factory=Interval)
     best: Score | None = None
@@ -116,6 +118,7 @@ class Session:
                 "env": self.env.get_state(),
                 "feed": self.feed.state_dict(),
                 "probe": self.probe.state_dict() if self.probe else None,
+                "guide": self.guide.state_dict() if self.guide else None,
                 "exploration": checkpoint.generator_state(self.exploration),
                 "tables": self.run.row_counts(),
             },
@@ -135,6 +138,8 @@ class Session:
         self.collector.load_state_dict(state["collector"])
         self.feed.load_state_dict(state["feed"])
         self.probe = Probe.from_state(state["probe"]) if state["probe"] else None
+        if self.guide is not None:
+            self.guide.load_state_dict(state["guide"])
         checkpoint.restore_generator(self.exploration, state["exploration"])
         self.run.truncate(state["tables"])
         self._started = time.monotonic()
@@ -197,6 +202,7 @@ def open_session(
         discount=config.loss.discount,
         n_step=config.loss.n_step,
         conditions=names,
+        behaviour_policies=POLICIES,
         reserved=dict.fromkeys(names, reserved),
     )
     batches = Batches(
@@ -234,6 +240,12 @@ def open_session(
         executor=executor,
         logs=logs,
         log_terms=LogTerms.of(config.loss, logs, learner.device),
+        guide=Guide.of(
+            config.guide,
+            logs,
+            (env.num_envs, task.observation_size, len(task.actions)),
+            seed,
+        ),
     )
     session.collector.check_conditions()
     if resume:
