@@ -69,6 +69,11 @@ class Symptom:
     unexplained: float | None  # of the variance of its logged rows' next observations
     quota_met: float | None
 
+    @property
+    def supply(self) -> float | None:
+        """Its share of replay over its share of what driving meets."""
+        return self.replay_share / self.met_share if self.met_share else None
+
 
 @dataclass(frozen=True)
 class Window:
@@ -112,12 +117,12 @@ class Window:
         return found
 
     def _supply(self, symptom: Symptom, limits: Limits) -> list[str]:
-        met = symptom.met_share
-        if met is None:  # a run from before it was kept
+        if symptom.supply is None:  # a run from before it was kept
             return [] if symptom.replay_share else ["is not in replay"]
-        if symptom.replay_share >= limits.supply * met:
+        if symptom.supply >= limits.supply:
             return []
-        return [f"is {symptom.replay_share:.2%} of replay and {met:.1%} of what driving meets"]
+        share, met = symptom.replay_share, symptom.met_share
+        return [f"is {share:.2%} of replay and {met:.1%} of what driving meets"]
 
     def _rows(self, symptom: Symptom, least: float, limits: Limits) -> list[str]:
         said = []
@@ -310,7 +315,7 @@ def _experiment(cause: Cause, windows: Sequence[Window], limits: Limits) -> str:
     return {
         "HEALTHY": "none needed: no figure is past its limit",
         "BUFFER": f"train again with more or corrected rows of {which} and the same target rule:"
-        " the gap must close there and nothing change elsewhere",
+        " what is said of them must be gone, and nothing else change",
         "TARGET": "train again with another target rule (target.tau 0.005) on the same panel:"
         " L and S must fall, or the median G",
         "BOTH": f"first change the target rule alone, then the rows of {which} alone: one clock"

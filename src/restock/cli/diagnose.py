@@ -16,10 +16,11 @@ if TYPE_CHECKING:
 class Diagnose:
     """Tell a failure of the buffer from a failure of the target.
 
-    Compares the critic's TD error on the periodic evaluations' own steps, which no replay has,
-    with that in replay, condition by condition, and the online network with the target network.
-    Says HEALTHY, BUFFER, TARGET, BOTH, DIVERGENCE or UNDETERMINED, on what evidence, and which
-    experiment would confirm it. Three evaluations in a row must agree, and most of the runs.
+    Compares replay with the periodic evaluations' own steps, which no replay has, condition by
+    condition: the critic's TD error, how often it is met, what it looks like. And the online
+    network with the target network. Says HEALTHY, BUFFER, TARGET, BOTH, DIVERGENCE or
+    UNDETERMINED, on what evidence, and which experiment would confirm it. Figures are of the last
+    three evaluations; most of the runs must agree.
 
     Example: `restock diagnose runs/a runs/a-seed1 runs/a-seed2`
     """
@@ -60,20 +61,19 @@ def _show(found: Diagnosis, paths: tuple[Path, ...]) -> None:
             {
                 "run": str(path),
                 "verdict": cause,
-                "updates": windows[-1].gradient_steps,
                 "condition": symptom.condition,
                 "share of replay": symptom.replay_share,
+                "supply": symptom.supply,
+                "agreement": symptom.agreement,
+                "unexplained": symptom.unexplained,
                 "G": symptom.gap,
-                "G / median": windows[-1].relative(symptom),
-                "median G": windows[-1].gap_median,
-                "L": windows[-1].lag,
-                "S": windows[-1].clock,
+                "G / median": figures.relative(symptom),
             }
-            for path, cause, windows in zip(paths, found.runs, found.windows, strict=True)
-            for symptom in windows[-1].symptoms
+            for path, cause, figures in zip(paths, found.runs, found.figures, strict=True)
+            for symptom in figures.symptoms
         ],
-        title="G: |TD| held out / in replay; L: lag of the target; S: |TD| by the online network"
-        " / by the target",
+        title="supply: share of replay / of what driving meets; agreement: logged rows that look"
+        " like it; unexplained: of their next observations; G: |TD| held out / in replay",
     )
     out = stdout()
     out.print(f"{found.cause}")
@@ -96,7 +96,14 @@ def _document(found: Diagnosis, paths: tuple[Path, ...]) -> dict[str, Any]:
         "evidence": found.evidence,
         "experiment": found.experiment,
         "runs": [
-            {"run": str(path), "cause": cause, "windows": [asdict(window) for window in windows]}
-            for path, cause, windows in zip(paths, found.runs, found.windows, strict=True)
+            {
+                "run": str(path),
+                "cause": cause,
+                "figures": asdict(figures),
+                "windows": [asdict(window) for window in windows],
+            }
+            for path, cause, figures, windows in zip(
+                paths, found.runs, found.figures, found.windows, strict=True
+            )
         ],
     }
