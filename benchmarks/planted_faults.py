@@ -12,7 +12,9 @@ taken up where they are, so that a table can be made again without training agai
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -115,7 +117,9 @@ def run_for(fault: str, seed: int, out: Path) -> Run:
 
 
 def _must(arguments: list[str]) -> None:
-    if restock(arguments) not in (0, 3):
+    with contextlib.redirect_stdout(sys.stderr):  # ours is the table
+        code = restock(arguments)
+    if code not in (0, 3):
         raise SystemExit(f"restock {' '.join(arguments)} failed")
 
 
