@@ -5,7 +5,7 @@
 Three faults of the buffer, all in the blocked aisles, which the twin's training episodes then lack:
 their logged rows are removed; stale (next observations and rewards of other rows of the stratum);
 or mislabelled (the label stands on nominal rows). Four of the target and the optimizer: frozen, too
-slow, no target at all (tau 1), learning rate a hundred times too high. Runs are kept in --out and
+slow, no target at all (tau 1), learning rate a thousand times too high. Runs are kept in --out and
 taken up where they are, so that a table can be made again without training again.
 """
 
@@ -39,7 +39,7 @@ FAULTS: dict[str, tuple[set[str], list[str]]] = {
     "target frozen": (TARGET, ["target={rule='hard', every=1000000}"]),
     "target too slow": (TARGET, ["target={rule='polyak', tau=0.00003}"]),
     "target too fast": (TARGET, ["target={rule='polyak', tau=1.0}"]),
-    "learning rate too high": (TARGET, ["optimizer.learning_rate=0.03"]),
+    "learning rate too high": (TARGET, ["optimizer.learning_rate=0.3"]),
 }
 SETTINGS = {
     "schedule.env_steps": 32_000,

@@ -32,6 +32,7 @@ def make_run(
     quota_met: float = 1.0,
     agreement: Mapping[str, float] | None = None,
     unexplained: Mapping[str, float] | None = None,
+    explained: float | None = 0.8,
     strata: bool = True,  # named as the conditions are; else there is one of all rows
     until: int | None = None,  # the window in which the symptoms end
 ) -> Run:
@@ -55,6 +56,7 @@ def make_run(
                         "rows_met": round(SHARES[name] * 1000),
                         "td_abs_mean": held_out,
                         "td_online_abs_mean": held_out * (clock if ill else 1.0),
+                        "explained": explained,
                         "q_abs_mean": 1.0,
                         "q_lag": lag if ill else 0.05,
                         "logs_agreement": (agreement or {}).get(name, 0.8),
@@ -130,6 +132,9 @@ def make_run(
         ({"lag": 0.9, "gap": {"blocked_aisle": 6.0}}, "BOTH"),
         ({"q_abs_max": 400.0}, "DIVERGENCE"),
         ({"q_abs_max": float("inf")}, "DIVERGENCE"),
+        ({"explained": 0.01}, "DIVERGENCE"),
+        ({"explained": 0.01, "lag": 0.9}, "TARGET"),
+        ({"explained": None}, "HEALTHY"),  # a run from before it was kept
         ({"windows": 2, "lag": 0.9}, "UNDETERMINED"),  # too few to agree
         ({"until": 3, "lag": 0.9}, "UNDETERMINED"),  # gone in the last one
         ({"until": 1, "lag": 0.9}, "HEALTHY"),  # a young critic's lag

@@ -49,6 +49,7 @@ class Limits:
     lag: float = 0.25  # L: the target is far behind
     no_lag: float = 0.002  # L below this: there is no target network to speak of
     clock: float = 2.0  # S
+    explained: float = 0.2  # of the targets' variance: a critic below it has learnt nothing
     supply: float = 0.1  # a condition's share of replay over its share of what driving meets
     agreement: float = 0.1  # of a condition's logged rows that look like it
     unexplained: float = 1.0  # of the variance of its next observations: their mean explains more
@@ -84,6 +85,7 @@ class Window:
     gap_median: float
     lag: float  # L
     clock: float  # S
+    explained: float | None  # of the targets' variance, the median condition's
     q_abs_max: float
     q_bound: float  # the largest value that rewards seen could add up to
 
@@ -147,14 +149,18 @@ class Window:
         clocks = not limits.no_lag <= self.lag < limits.lag or self.clock >= limits.clock
         return clocks or self.gap_median >= limits.gap_everywhere
 
-    @property
-    def diverged(self) -> bool:
-        """Whether values are beyond what rewards can add up to."""
-        return not np.isfinite(self.q_abs_max) or self.q_abs_max > self.q_bound
+    def diverged(self, limits: Limits) -> bool:
+        """Whether values are beyond what rewards can add up to, or say nothing of their targets."""
+        if not np.isfinite(self.q_abs_max) or self.q_abs_max > self.q_bound:
+            return True
+        # A frozen target can be far from what it is learnt from; then the target is at fault.
+        if self.explained is None or self.target(limits):
+            return False
+        return self.explained < limits.explained
 
     def cause(self, limits: Limits) -> Cause:
         """The rule."""
-        if self.diverged:
+        if self.diverged(limits):
             return "DIVERGENCE"
         bad = self.bad(limits)
         buffer = 0 < len(bad) <= len(self.symptoms) / 2
@@ -202,7 +208,7 @@ def diagnose(runs: Sequence[Run], limits: Limits = Limits()) -> Diagnosis:
 
 def _of_run(windows: Sequence[Window], figures: Window, limits: Limits) -> Cause:
     """What the last windows come to; those that do not agree on the target are not forced."""
-    if windows[-1].diverged:
+    if windows[-1].diverged(limits) and figures.diverged(limits):
         return "DIVERGENCE"
     last = windows[-WINDOWS:]
     if len(last) < WINDOWS or len({window.target(limits) for window in last}) > 1:
@@ -230,6 +236,7 @@ def over(windows: Sequence[Window]) -> Window:
         gap_median=median(gaps) if gaps else 1.0,
         lag=middle("lag"),
         clock=middle("clock"),
+        explained=middle("explained"),
         q_abs_max=windows[-1].q_abs_max,
         q_bound=windows[-1].q_bound,
     )
@@ -274,6 +281,7 @@ def _window(rows: list[dict[str, Any]], bound: float) -> Window:
     ]
     gaps = [symptom.gap for symptom in symptoms if symptom.gap is not None]
     weight = sum(row["held_out_rows"] for row in judged)
+    known = [row["explained"] for row in judged if row["explained"] is not None]
 
     def mean(name: str) -> float:
         return float(sum(row[name] * row["held_out_rows"] for row in judged) / weight)
@@ -284,6 +292,7 @@ def _window(rows: list[dict[str, Any]], bound: float) -> Window:
         gap_median=median(gaps) if gaps else 1.0,
         lag=max(rows[0]["lag"] or 0.0, mean("held_out_lag")),
         clock=mean("held_out_td_online") / max(mean("held_out_td"), 1e-12),
+        explained=median(known) if known else None,
         q_abs_max=rows[0]["q_abs_max"],
         q_bound=bound,
     )
@@ -297,11 +306,15 @@ def _value_bound(run: Run) -> float:
     return largest / (1 - discount) if largest > 0 else float("inf")
 
 
+def _told(explained: float | None) -> str:
+    return "" if explained is None else f" {explained:.0%} of the targets' variance explained,"
+
+
 def _evidence(window: Window, limits: Limits) -> list[str]:
     """What a window shows, for people."""
     said = [
         f"after {window.gradient_steps:,} updates: median G {window.gap_median:.2f},"
-        f" L {window.lag:.3f}, S {window.clock:.2f},"
+        f" L {window.lag:.3f}, S {window.clock:.2f},{_told(window.explained)}"
         f" max |Q| {window.q_abs_max:.3g} of at most {window.q_bound:.3g}"
     ]
     for condition, found in window.bad(limits).items():
@@ -321,7 +334,7 @@ def _experiment(cause: Cause, windows: Sequence[Window], limits: Limits) -> str:
         "BOTH": f"first change the target rule alone, then the rows of {which} alone: one clock"
         " at a time",
         "DIVERGENCE": "train again with a lower optimizer.learning_rate, then with a slower"
-        " target: values above what rewards can add up to are nobody's data",
+        " target: values above what rewards can add up to, or that say nothing, are nobody's data",
         "UNDETERMINED": "run longer, or more seeds: the last windows or the runs do not agree",
     }[cause]
 

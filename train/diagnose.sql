@@ -33,10 +33,11 @@ WITH windows AS (
     GROUP BY ALL
 ), drawn AS (
     SELECT until, sum(replay_rows) AS all_rows FROM replay GROUP BY until
-), held_out AS (  -- runs from before the last three were kept have none of them
+), held_out AS (  -- runs from before these were kept have none of them
     SELECT * FROM run_held_out
     UNION ALL BY NAME
-    SELECT NULL::BIGINT AS rows_met, NULL::DOUBLE AS logs_agreement, NULL::DOUBLE AS logs_unexplained
+    SELECT NULL::BIGINT AS rows_met, NULL::DOUBLE AS explained,
+           NULL::DOUBLE AS logs_agreement, NULL::DOUBLE AS logs_unexplained
     WHERE false
 )
 SELECT h.gradient_steps AS gradient_steps,
@@ -45,6 +46,7 @@ SELECT h.gradient_steps AS gradient_steps,
        h.rows_met / nullif(sum(h.rows_met) OVER (PARTITION BY h.gradient_steps), 0) AS met_share,
        h.logs_agreement AS agreement,
        h.logs_unexplained AS unexplained,
+       h.explained AS explained,
        h.td_abs_mean AS held_out_td,
        h.td_online_abs_mean AS held_out_td_online,
        h.q_lag AS held_out_lag,

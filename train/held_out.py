@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from restock.ingest.conditions import Condition
 from restock.ingest.task import Task
@@ -99,6 +100,7 @@ class HeldOut(_Tapped):
         rows = probe.rows.to(learner.device)
         td, q, slow = learner.td_error(rows)
         own = learner.td_error(rows, online=True)[0]
+        chosen = q.gather(1, rows[:, -3:-2].long())[:, 0]
         found = []
         for index, name in enumerate(probe.conditions):
             part = slice(probe.bounds[index], probe.bounds[index + 1])
@@ -109,6 +111,7 @@ class HeldOut(_Tapped):
                     "rows_met": int(ring.strata.counts[ring.conditions.index(name)]),
                     "td_abs_mean": float(td[part].abs().mean()),
                     "td_online_abs_mean": float(own[part].abs().mean()),
+                    "explained": _explained(td[part], chosen[part] - td[part]),
                     "q_abs_mean": float(q[part].abs().mean()),
                     "q_lag": value_lag(q[part], slow[part]),
                     "logs_agreement": agreement.get(name),
@@ -128,6 +131,12 @@ class HeldOut(_Tapped):
             conditions=like.conditions,
         )
         return Collector(self._inner, ring, self._conditions, self._task, None)
+
+
+def _explained(td: Tensor, target: Tensor) -> float | None:
+    """The share of the targets' variance (n,) that the critic explains; None where they are one."""
+    spread = float(target.var(unbiased=False))
+    return 1.0 - float(td.var(unbiased=False)) / spread if spread > 0 else None
 
 
 __all__ = ["HeldOut"]

@@ -135,6 +135,7 @@ TABLES: dict[str, pa.Schema] = {
         ("rows_met", _I),  # all of them: what driving meets
         ("td_abs_mean", _F),
         ("td_online_abs_mean", _F),  # as if the online network bootstrapped
+        ("explained", _F),  # 1 - Var(TD) / Var(target): below 0 a constant would be nearer
         ("q_abs_mean", _F),
         ("q_lag", _F),  # mean |Q - Q_target| / mean |Q|
         ("logs_agreement", _F),  # of the logs' rows, those that these steps' conditions confirm
