@@ -57,7 +57,7 @@ def main() -> int:
     study, out = options.out / "study.toml", options.out / "study"
     code = restock(["study", str(study), "--out", str(out), "--workers", str(options.workers)])
     plan = Plan(load_study(study), study.parent, out)
-    print(f"\n{ends(plan)}\n\n{curves(plan)}")
+    print(f"\n{ends(plan)}\n\n{curves(plan)}\n\n{leads(plan)}")
     return code
 
 
@@ -109,6 +109,49 @@ def curves(plan: Plan) -> str:
         cells = (f"{curve[step]:.2f}" if step in curve else "" for step in steps)
         lines.append(f"| `{name}` | {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def leads(plan: Plan) -> str:
+    """How far each arm is ahead of the baseline in the rare conditions, paired, by steps."""
+    base = [_rare_episodes(path) for path in plan.runs(plan.study.base)]
+    if not all(base):
+        return ""
+    steps = sorted(set.intersection(*map(set, base)))
+    lines = [f"| steps | {' | '.join(f'{step:,}' for step in steps)} |"]
+    lines.append("| --- |" + " --- |" * len(steps))
+    for arm in plan.study.arms:
+        own = [_rare_episodes(path) for path in plan.runs(arm)]
+        there = [step for step in steps if all(step in run for run in own)]
+        if arm == plan.study.base or len(there) < 2:
+            continue
+        said = dict.fromkeys(steps, "")
+        for step in there:
+            pairs = zip(own, base, strict=True)
+            said[step] = _lead(np.array([mine[step] - other[step] for mine, other in pairs]))
+        lines.append(f"| `{arm.name}` | {' | '.join(said.values())} |")
+    return "\n".join(lines)
+
+
+def _rare_episodes(path: Path) -> dict[int, np.ndarray]:
+    """0 or 1 of each rare episode of a run's periodic evaluations, by environment steps."""
+    rows = duckdb.sql(
+        "SELECT env_steps, list(success::INT ORDER BY condition, episode_seed)"
+        " FROM read_parquet(?) WHERE condition <> 'nominal' GROUP BY ALL",
+        params=[str(path / "evaluations.parquet")],
+    ).fetchall()
+    return {step: np.array(values, np.float64) for step, values in rows}
+
+
+def _lead(ahead: np.ndarray) -> str:
+    """The mean of (runs, episodes), and 95 % of it with both drawn anew."""
+    rng = np.random.default_rng(0)
+    runs, episodes = ahead.shape
+    means = [
+        ahead[rng.integers(runs, size=runs)][:, rng.integers(episodes, size=episodes)].mean()
+        for _ in range(RESAMPLES)
+    ]
+    low, high = np.quantile(means, [0.025, 0.975])
+    return f"{ahead.mean():+.2f} [{low:+.2f}, {high:+.2f}]"
 
 
 def _successes(path: Path) -> dict[str, np.ndarray]:
