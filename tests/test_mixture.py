@@ -109,7 +109,7 @@ def test_an_unknown_key_is_named_with_its_path(tmp_path: Path) -> None:
     (tmp_path / "m.toml").write_text("[[strata]]\nname = 'nominal'\nshair = 0.3\n")
     with pytest.raises(ConfigError, match=r"(?s)m\.toml.*shair.*strata\[0\]|strata\[\.\.\.\]"):
         load_mixture(tmp_path / "m.toml")
-    with pytest.raises(ConfigError, match="coverage, uniform"):
+    with pytest.raises(ConfigError, match="coverage, missions, uniform"):
         load_mixture("coverag")
 
 

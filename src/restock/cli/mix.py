@@ -31,7 +31,7 @@ class Mix:
     store: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")] = None
     """The store to take transitions from."""
     mixture: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "coverage"
-    """A TOML file, or a shipped mixture: coverage or uniform. See docs/mixture.md."""
+    """A TOML file, or a shipped mixture: coverage, missions or uniform. See docs/mixture.md."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
     """The panel's directory, which must not exist yet."""
     dry_run: bool = False
