@@ -128,7 +128,8 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--out", type=Path, required=True, help="where stores, panels and runs go")
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=int, default=3, help="how many")
+    parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--faults", default=",".join(FAULTS), help="comma-separated")
     parser.add_argument("--json", action="store_true")
     parser.add_argument(
@@ -136,11 +137,12 @@ def main() -> None:
     )
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
+    seeds = range(given.first_seed, given.first_seed + given.seeds)
     table: dict[str, dict[str, int]] = {}
     right = opposite = total = 0
     for fault in given.faults.split(","):
         expected = FAULTS[fault][0]
-        said = [diagnose([run_for(fault, seed, given.out)]).cause for seed in range(given.seeds)]
+        said = [diagnose([run_for(fault, seed, given.out)]).cause for seed in seeds]
         table[fault] = dict(Counter(said))
         total += len(said)
         right += sum(cause in expected or cause == "UNDETERMINED" for cause in said)

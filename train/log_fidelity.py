@@ -75,7 +75,8 @@ class LogFidelity:
         error = (target - features @ weights) ** 2
         found = {}
         for name, own in self._parts():
-            tested = np.flatnonzero(~fit)[np.isin(np.flatnonzero(~fit), np.arange(len(fit))[own])]
+            tested = np.arange(own.start, own.stop)
+            tested = tested[~fit[own]]
             spread = ((target[tested] - target[tested].mean(axis=0)) ** 2).sum()
             if spread > 0:
                 found[name] = float(error[tested].sum() / spread)
