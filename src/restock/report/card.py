@@ -125,7 +125,7 @@ def as_markdown(card: dict[str, Any]) -> str:
             "drawn_rows": "rows",
             "drawn_share": "drawn",
             "effective_share": "after weights",
-            "td_abs_mean": "mean TD error at the end",
+            "td_abs_mean": "mean absolute TD error at the end",
         },
     )
     lines += ["", "## Strata: asked for and drawn", ""]
