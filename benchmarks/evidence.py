@@ -22,6 +22,7 @@ import duckdb
 import numpy as np
 
 from restock.cli import main as restock
+from restock.train.stats import percentiles
 from restock.train.study import Plan, load_study
 
 HERE = Path(__file__).parent / "evidence"
@@ -150,7 +151,7 @@ def _lead(ahead: np.ndarray) -> str:
         ahead[rng.integers(runs, size=runs)][:, rng.integers(episodes, size=episodes)].mean()
         for _ in range(RESAMPLES)
     ]
-    low, high = np.quantile(means, [0.025, 0.975])
+    low, high = percentiles(np.array(means))
     return f"{ahead.mean():+.2f} [{low:+.2f}, {high:+.2f}]"
 
 
@@ -187,7 +188,7 @@ def _interval(runs: Sequence[dict[str, np.ndarray]], weights: dict[str, int]) ->
         }
         means.append(_weighted(drawn, weights))
     centre = _weighted({cell: float(values.mean()) for cell, values in cells.items()}, weights)
-    low, high = np.quantile(means, [0.025, 0.975])
+    low, high = percentiles(np.array(means))
     return f"{centre:.2f} [{low:.2f}, {high:.2f}]"
 
 

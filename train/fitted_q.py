@@ -137,6 +137,13 @@ def cloned_behaviour(
     return network
 
 
+def chances(clone: QNetwork, observation: F32) -> NDArray[np.float64]:
+    """The chance of each action (N, A) under a cloned behaviour."""
+    logits = values(clone, observation)
+    chance = np.exp(logits - logits.max(axis=1, keepdims=True))
+    return np.asarray(chance / chance.sum(axis=1, keepdims=True), np.float64)
+
+
 @torch.no_grad()
 def values(network: nn.Module, observation: F32) -> NDArray[np.float64]:
     """Action values (N, A), a part at a time: bounds memory."""
@@ -151,4 +158,4 @@ def _descend(optimizer: Any, loss: Tensor) -> None:
     optimizer.step()
 
 
-__all__ = ["Fit", "Rows", "cloned_behaviour", "fitted_q", "soft_greedy", "values"]
+__all__ = ["Fit", "Rows", "chances", "cloned_behaviour", "fitted_q", "soft_greedy", "values"]

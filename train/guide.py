@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from restock.errors import ConfigError
 from restock.train.batches import Logs
 from restock.train.checkpoint import generator_state, restore_generator
-from restock.train.fitted_q import Fit, cloned_behaviour, values
+from restock.train.fitted_q import Fit, chances, cloned_behaviour
 from restock.train.network import QNetwork
 
 POLICIES = ("dqn", "cloned")  # who acts, by its code in the ring
@@ -50,12 +50,19 @@ class Guide:
 
     @classmethod
     def of(
-        cls, config: GuideConfig, logs: Logs | None, size: tuple[int, int, int], seed: int
+        cls,
+        config: GuideConfig,
+        logs: Logs | None,
+        size: tuple[int, int, int],
+        seed: int,
+        *,
+        resume: bool = False,
     ) -> Guide | None:
         """Cloned from all rows of the logs alike; None where it never drives.
 
         Args:
             size: environments, observation values, actions.
+            resume: its weights come with the checkpoint, so nothing is cloned.
 
         Raises:
             ConfigError: there are no logs.
@@ -69,8 +76,9 @@ class Guide:
             )
         num_envs, observation_size, actions = size
         rows = logs.rows.numpy()
+        fit = Fit(cloning_updates=0) if resume else Fit()
         network = cloned_behaviour(
-            rows[:, :observation_size], rows[:, -3].astype(np.int64), actions, fit=Fit(), seed=seed
+            rows[:, :observation_size], rows[:, -3].astype(np.int64), actions, fit=fit, seed=seed
         )
         return cls(config, network, num_envs, seed)
 
@@ -87,17 +95,12 @@ class Guide:
         `action` and `probability` are the learner's; `step` (N,) counts in each episode from 0.
         """
         policy = np.zeros(len(action), np.int16)
-        if horizon := self.config.horizon(env_steps):
-            begins = np.flatnonzero(step == 0)
-            self._until[begins] = self._rng.integers(horizon + 1, size=len(begins))
-        else:
-            self._until[step == 0] = 0
+        begins, horizon = np.flatnonzero(step == 0), self.config.horizon(env_steps)
+        self._until[begins] = self._rng.integers(horizon + 1, size=len(begins))
         guided = np.flatnonzero(step < self._until)
         if not len(guided):
             return action, probability, policy
-        logits = values(self.network, np.ascontiguousarray(observation[guided]))
-        chance = np.exp(logits - logits.max(axis=1, keepdims=True))
-        chance /= chance.sum(axis=1, keepdims=True)
+        chance = chances(self.network, np.ascontiguousarray(observation[guided]))
         drawn = (self._rng.random((len(guided), 1)) > chance.cumsum(axis=1)).sum(axis=1)
         drawn = np.minimum(drawn, chance.shape[1] - 1)
         action, probability = action.copy(), probability.copy()

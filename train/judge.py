@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.train.fitted_q import Fit, cloned_behaviour, fitted_q, soft_greedy, values
+from restock.train.fitted_q import Fit, chances, cloned_behaviour, fitted_q, soft_greedy, values
 from restock.train.held_episodes import Evidence, Measure, Steps
 from restock.train.network import Network, QNetwork
 from restock.train.off_policy import Gate, Logged, estimate
@@ -151,9 +151,7 @@ def _behaviour(evidence: Evidence, actions: int, fit: Fit, seed: int) -> _Behavi
     if unknown.any():
         rows = evidence.model.rows
         clone = cloned_behaviour(rows.observation, rows.action, actions, fit=fit, seed=seed)
-        logits = values(clone, held.rows.observation[unknown])
-        chance = np.exp(logits - logits.max(axis=1, keepdims=True))
-        chance /= chance.sum(axis=1, keepdims=True)
+        chance = chances(clone, held.rows.observation[unknown])
         probability[unknown] = chance[np.arange(len(chance)), held.rows.action[unknown]]
     return _Behaviour(probability, int(unknown.sum()))
 

@@ -245,6 +245,7 @@ def open_session(
             logs,
             (env.num_envs, task.observation_size, len(task.actions)),
             seed,
+            resume=resume,
         ),
     )
     session.collector.check_conditions()
