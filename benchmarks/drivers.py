@@ -18,12 +18,12 @@ from typing import Any
 
 import numpy as np
 
-from restock.train.episode import KINDS, EpisodeSpec
-from restock.train.operator_policy import Operator
-from restock.train.perturbation import PERTURBATIONS
-from restock.train.policies import Handover, PlannerFollower, Policy, RandomPolicy
-from restock.train.stats import wilson
-from restock.train.vector_env import WarehouseVectorEnv
+from restock.stats import wilson
+from restock.train.twin.env.operator_policy import Operator
+from restock.train.twin.env.policies import Handover, PlannerFollower, Policy, RandomPolicy
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.physics.episode import KINDS, EpisodeSpec
+from restock.train.twin.physics.perturbation import PERTURBATIONS
 
 DRIVERS: dict[str, Callable[[], Policy]] = {
     "planner": PlannerFollower,

@@ -22,8 +22,8 @@ import duckdb
 import numpy as np
 
 from restock.cli import main as restock
-from restock.train.stats import percentiles
-from restock.train.study import Plan, load_study
+from restock.stats import percentiles
+from restock.train.study.study import Plan, load_study
 
 HERE = Path(__file__).parent / "evidence"
 NATURAL = "nominal=.88,wheel_slip=.04,blocked_aisle=.04,near_collision=.04"

@@ -29,8 +29,8 @@ import robot_log
 from ingest_memory import LIMIT_MB, LONG, LONGER, PLAIN, memory
 
 from restock.ingest.pipeline import ingest
-from restock.ingest.profile import load_profile
-from restock.ingest.store import StoreWriter
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.store.writer import StoreWriter
 
 FLOOR = "decompress only"
 OURS = "restock, all topics"

@@ -18,8 +18,8 @@ LIMIT_MB = 768  # of private memory set aside, used or not: beyond it is a Memor
 MEASURE = """
 import json, re, sys, time
 from restock.ingest.pipeline import ingest
-from restock.ingest.profile import load_profile
-from restock.ingest.store import StoreWriter
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.store.writer import StoreWriter
 outcome = ingest(sys.argv[1], load_profile("turtlebot3"), store=StoreWriter(sys.argv[2]))
 with open("/proc/self/status") as file:  # the system's ru_maxrss would count the parent's, too
     peak = int(re.search(r"VmHWM:\\s+(\\d+) kB", file.read())[1])

@@ -22,9 +22,9 @@ import numpy as np
 import pyarrow as pa
 
 from restock.cli import main as restock
-from restock.ingest.store import StoreWriter
-from restock.train.diagnose import diagnose
-from restock.train.run import Run
+from restock.ingest.store.writer import StoreWriter
+from restock.train.comparison.diagnose import diagnose
+from restock.train.run.run import Run
 
 STRATUM = "blocked_aisle"
 # Of the training episodes: none in the stratum, the rest as a run has them by default.

@@ -20,7 +20,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from restock.train.recorder import Plan, record
+from restock.train.twin.recording.recorder import Plan, record
 
 MOST_S_PER_MINUTE = 2.0
 MOST_GROWTH_MIB = 64

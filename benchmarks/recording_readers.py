@@ -15,11 +15,11 @@ from mcap_ros2.decoder import DecoderFactory
 from rerun.chunk import McapReader
 from rosbags.highlevel import AnyReader
 
-from restock.ingest.columns import FieldColumn, Ragged, equal, join, take
-from restock.ingest.definitions import message_type
-from restock.ingest.fields import Leaf
-from restock.ingest.readers import open_recording
-from restock.ingest.rows import RowDecoder
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.decoding.columns import FieldColumn, Ragged, equal, join, take
+from restock.ingest.decoding.definitions import message_type
+from restock.ingest.decoding.field_paths import Leaf
+from restock.ingest.decoding.row_by_row import RowDecoder
 
 PROFILE = {
     "/odom": ["header.stamp", "twist.twist.linear.x", "twist.twist.angular.z"],

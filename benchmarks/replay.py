@@ -27,13 +27,13 @@ import numpy as np
 import replay_peers
 import torch
 
-from restock.replay.chunked import ChunkedSampler
-from restock.replay.device import DeviceSampler
-from restock.replay.layout import row_width
-from restock.replay.per import PrioritySampler
-from restock.replay.priorities import Lap, Per
-from restock.replay.ring import FreshRing
-from restock.replay.sampler import QuotaSampler, Sampler, uniform_sampler
+from restock.replay.mixture.packed_row import row_width
+from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.chunked import ChunkedSampler
+from restock.replay.sampling.device import DeviceSampler
+from restock.replay.sampling.per import PrioritySampler
+from restock.replay.sampling.priorities import Lap, Per
+from restock.replay.sampling.sampler import QuotaSampler, Sampler, uniform_sampler
 
 OBSERVATION, ACTIONS, BATCH = 93, 9, 256
 SHARES = np.array([0.4, 0.2, 0.15, 0.1, 0.08, 0.04, 0.027, 0.003])  # of a batch
@@ -216,10 +216,10 @@ def panel_build(count: int) -> dict[str, float]:
     import pyarrow as pa
     from conftest import CONDITIONS, recording_transitions
 
-    from restock.ingest.scan import Body
-    from restock.ingest.task import Task
-    from restock.replay.build import build_panel
-    from restock.replay.mixture import load_mixture
+    from restock.ingest.task.scan import Body
+    from restock.ingest.task.task import Task
+    from restock.replay.mixture.mixture import load_mixture
+    from restock.replay.panel.build import build_panel
 
     actions = tuple((float(i), 0.0) for i in range(ACTIONS))
     task = Task(body=Body(length_m=0.7, width_m=0.5), actions=actions)
@@ -295,7 +295,7 @@ def cold_panel(count: int, batches: int) -> dict[str, float]:
 def record_share(rounds: int, updates: int) -> dict[str, float]:
     """An update of the default recipe with and without the record of what was fed."""
     import train as train_benchmark  # benchmarks/train.py
-    from restock.train.run import Run
+    from restock.train.run.run import Run
 
     arrays = train_benchmark.data(np.random.default_rng(0))
     settings = train_benchmark.config(128)

@@ -38,13 +38,13 @@ from train_peers import (
     torchrl,
 )
 
-from restock.replay.ring import FreshRing
-from restock.train.batches import Batches, Coded, Logs
-from restock.train.config import TrainConfig, parse_config
-from restock.train.kernel import UpdatePath
-from restock.train.learner import Learner
-from restock.train.record import FeedRecord
-from restock.train.run import Run
+from restock.replay.ring.ring import FreshRing
+from restock.train.dqn.config import TrainConfig, parse_config
+from restock.train.dqn.learner import Learner
+from restock.train.dqn.manual_backprop import UpdatePath
+from restock.train.feed.batch_record import FeedRecord
+from restock.train.feed.batches import Batches, Coded, Logs
+from restock.train.run.run import Run
 
 TARGETS = {"cleanrl": 1.6, "stable_baselines3": 1.9}  # times Restock's update, at least
 IN_PLACE_TARGET = 1.1  # times the same arithmetic on one batch that lies ready, at most

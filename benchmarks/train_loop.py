@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from restock.train.config import DEFAULT_CONDITIONS
+from restock.train.dqn.config import DEFAULT_CONDITIONS
 from restock.train.loop import TrainingInterrupted, train
 from restock.train.prepare import prepare_new
 

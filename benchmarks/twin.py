@@ -29,9 +29,9 @@ import numpy as np
 from twin_parts import parts
 
 import restock  # noqa: F401 - registers the environment
-from restock.train.sensing import Sensing
-from restock.train.simulation import LIDAR_BEAMS, Simulation
-from restock.train.vector_env import WarehouseVectorEnv
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.physics.sensing import Sensing
+from restock.train.twin.physics.simulation import LIDAR_BEAMS, Simulation
 
 PEERS = 8  # environments of Gymnasium's own vectors
 COUNTS = (8, 32, 128)

@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from restock.ingest.conditions import label
-from restock.ingest.profile import load_profile
-from restock.ingest.signals import STORED_SIGNALS
-from restock.train import sensing, vector_env
-from restock.train.vector_env import WarehouseVectorEnv
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.conditions import label
+from restock.ingest.task.signals import STORED_SIGNALS
+from restock.train.twin.env import vector_env
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.physics import sensing
 
 
 class Stopwatch:

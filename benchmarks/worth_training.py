@@ -34,15 +34,15 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from restock.cli import main as restock
-from restock.train.episode import KINDS, Episode, EpisodeSpec, draw_episode
-from restock.train.eval_run import load_agent
-from restock.train.evaluate import Policy, run_episodes
-from restock.train.operator_policy import Operator
-from restock.train.policies import PlannerFollower, RandomPolicy
-from restock.train.run import Run
-from restock.train.stats import percentiles, wilson
-from restock.train.traffic import PEOPLE
-from restock.train.vector_env import WarehouseVectorEnv
+from restock.stats import percentiles, wilson
+from restock.train.evaluation.eval_run import load_agent
+from restock.train.evaluation.evaluate import Policy, run_episodes
+from restock.train.run.run import Run
+from restock.train.twin.env.operator_policy import Operator
+from restock.train.twin.env.policies import PlannerFollower, RandomPolicy
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.physics.episode import KINDS, Episode, EpisodeSpec, draw_episode
+from restock.train.twin.physics.traffic import PEOPLE
 
 FIRST_SEED = 500_000
 AGENTS: dict[str, list[str]] = {

@@ -41,14 +41,14 @@ with (
     from seeds import seeds, small_mcap
 
     from restock.errors import RestockError
-    from restock.ingest.cdr import ColumnDecoder
-    from restock.ingest.columns import Batch, equal, take
-    from restock.ingest.decoders import decoder_of, type_of
+    from restock.ingest.containers.open_recording import open_recording
+    from restock.ingest.decoding.cdr import ColumnDecoder
+    from restock.ingest.decoding.channel import Channel
+    from restock.ingest.decoding.columns import Batch, equal, take
+    from restock.ingest.decoding.decoders import decoder_of, type_of
+    from restock.ingest.decoding.field_paths import CannotDecode
+    from restock.ingest.decoding.row_by_row import RowDecoder
     from restock.ingest.describe import describe
-    from restock.ingest.fields import CannotDecode
-    from restock.ingest.readers import open_recording
-    from restock.ingest.rows import RowDecoder
-    from restock.ingest.storage import Channel
 
 LONGEST_INPUT = 1 << 14
 SECONDS_EACH = 30

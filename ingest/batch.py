@@ -11,8 +11,8 @@ from typing import Literal
 
 from restock.errors import RecordingError, RestockError
 from restock.ingest.pipeline import Outcome, ingest
-from restock.ingest.profile import Profile
-from restock.ingest.store import StoreWriter
+from restock.ingest.profile.profile import Profile
+from restock.ingest.store.writer import StoreWriter
 from restock.ingest.workers import side_by_side
 
 Result = tuple[Path, "Outcome | RestockError"]

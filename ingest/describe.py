@@ -6,10 +6,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from restock.ingest.clocks import STAMP, topic_clock
-from restock.ingest.readers import open_recording
-from restock.ingest.reading import LATEST_NS
-from restock.ingest.recording import Recording
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.containers.recording import Recording
+from restock.ingest.containers.topic_reading import LATEST_NS
+from restock.ingest.steps.clocks import STAMP, topic_clock
 
 NANOSECONDS = 1_000_000_000
 JUMP_S = 1.0  # a change of (log time - stamp) that means a clock was set, as in profiles

@@ -16,18 +16,18 @@ import numpy as np
 import pyarrow as pa
 
 from restock.errors import RecordingError
-from restock.ingest.conditions import NOMINAL
-from restock.ingest.episodes import Split, split
-from restock.ingest.manifest import definitions, manifest_row, software_version
-from restock.ingest.needs import reductions, wanted_fields
-from restock.ingest.profile import Profile
-from restock.ingest.readers import open_recording
-from restock.ingest.recording import Recording
-from restock.ingest.schema import recording_schema
-from restock.ingest.scores import LabelScore, score
-from restock.ingest.steps import Steps, steps_of
-from restock.ingest.store import StoreWriter
-from restock.ingest.transitions import Provenance, recording_table
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.containers.recording import Recording
+from restock.ingest.profile.profile import Profile
+from restock.ingest.steps.episodes import Split, split
+from restock.ingest.steps.needs import reductions, wanted_fields
+from restock.ingest.steps.steps import Steps, steps_of
+from restock.ingest.store.manifest import definitions, manifest_row, software_version
+from restock.ingest.store.transitions import Provenance, recording_table
+from restock.ingest.store.writer import StoreWriter
+from restock.ingest.task.conditions import NOMINAL
+from restock.ingest.task.label_scores import LabelScore, score
+from restock.ingest.task.schema import recording_schema
 
 Status = Literal["written", "unchanged", "dry run"]
 

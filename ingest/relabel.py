@@ -17,12 +17,12 @@ import numpy as np
 import pyarrow as pa
 
 from restock.errors import ConfigError, StoreError
-from restock.ingest.conditions import NOMINAL, Condition, label, labels_version, primary
-from restock.ingest.episode_rows import episode_ends
-from restock.ingest.manifest import conditions_json, score_rows
-from restock.ingest.schema import recording_schema
-from restock.ingest.scores import LabelScore, score
-from restock.ingest.store import StoreWriter
+from restock.ingest.store.episode_rows import episode_ends
+from restock.ingest.store.manifest import conditions_json, score_rows
+from restock.ingest.store.writer import StoreWriter
+from restock.ingest.task.conditions import NOMINAL, Condition, label, labels_version, primary
+from restock.ingest.task.label_scores import LabelScore, score
+from restock.ingest.task.schema import recording_schema
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ import msgspec
 import pyarrow as pa
 
 from restock.errors import StoreError
-from restock.ingest.location import Location
-from restock.replay.panel import HEADER, HELD_OUT, META, Panel
-from restock.replay.store import Store, is_store, read_parquet
+from restock.ingest.store.location import Location
+from restock.replay.panel.panel import HEADER, HELD_OUT, META, Panel
+from restock.replay.store.store import Store, is_store, read_parquet
 
 RUN_CONFIG = "config.json"
 

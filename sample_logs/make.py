@@ -70,8 +70,8 @@ def run_on_baseline() -> int:
 
 def record_all(folder: Path, *, quick: bool) -> dict[str, object]:
     """Both recordings; returns what was recorded in each."""
-    from restock.train.publish import Rates
-    from restock.train.recorder import FIRST_NS, Plan, record
+    from restock.train.twin.recording.publish import Rates
+    from restock.train.twin.recording.recorder import FIRST_NS, Plan, record
 
     # Rates as a fleet thins its logs out to: the control clock's 5 Hz for most topics.
     monday = Rates(odom=10, imu=10, joint_states=5, scan=5, amcl_pose=5, tf=5, bumper=5, plan=0.5)

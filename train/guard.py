@@ -9,11 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from restock.train import checkpoint
-from restock.train.config import GuardConfig
-from restock.train.evaluate import Score
-from restock.train.learner import Learner
-from restock.train.run import Run
+from restock.train.dqn import checkpoint
+from restock.train.dqn.config import GuardConfig
+from restock.train.dqn.learner import Learner
+from restock.train.evaluation.evaluate import Score
+from restock.train.run.run import Run
 
 
 @dataclass(frozen=True)

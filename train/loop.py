@@ -15,20 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import ExitCode, RestockError
-from restock.train.batches import Batch
-from restock.train.evaluate import (
+from restock.train.dqn.target import Hard
+from restock.train.evaluation.evaluate import (
     GreedyPolicy,
     Score,
     fixed_episodes,
     run_episodes,
     score,
 )
-from restock.train.explore import epsilon_greedy
+from restock.train.evaluation.ope_run import judge_session
+from restock.train.feed.batches import Batch
+from restock.train.feed.probe import Probe
 from restock.train.guard import Fall, falls, roll_back
-from restock.train.judge_run import judge_session
-from restock.train.probe import Probe
 from restock.train.session import Interval, Session
-from restock.train.target import Hard
+from restock.train.twin.env.explore import epsilon_greedy
 
 Notify = Callable[[str, dict[str, Any]], None]  # an event's name ("progress", "evaluation"), values
 

@@ -10,24 +10,24 @@ from typing import Any
 import msgspec
 
 from restock.errors import PanelError, RunError
-from restock.ingest.profile import Profile, load_profile
-from restock.replay.diet import PlannedDraws
-from restock.replay.panel import Panel
-from restock.train.batches import Logs
-from restock.train.config import TrainConfig, apply_overrides, load_config, parse_config
-from restock.train.episode import KINDS
-from restock.train.evaluate import Twin
-from restock.train.explore import AFTER_LOGS
-from restock.train.floor_report import refuse_unfit, sealed
-from restock.train.floors import held_out, open_floors
-from restock.train.kept_checkpoints import check_earlier, go_back
-from restock.train.kernel import update_path
-from restock.train.learner import open_device
-from restock.train.log_draws import diet_of
-from restock.train.perturbation import PERTURBATIONS, find_perturbation
-from restock.train.run import Run, check_free, now_ns, panel_document, software_versions
+from restock.ingest.profile.profile import Profile, load_profile
+from restock.replay.panel.panel import Panel
+from restock.replay.sampling.share_controller import PlannedDraws
+from restock.train.dqn.config import TrainConfig, apply_overrides, load_config, parse_config
+from restock.train.dqn.learner import open_device
+from restock.train.dqn.manual_backprop import update_path
+from restock.train.dqn.target import describe
+from restock.train.evaluation.evaluate import Twin
+from restock.train.feed.batches import Logs
+from restock.train.feed.logged_sampler import diet_of
+from restock.train.run.kept_checkpoints import check_earlier, go_back
+from restock.train.run.run import Run, check_free, now_ns, panel_document, software_versions
 from restock.train.session import Session, open_session
-from restock.train.target import describe
+from restock.train.twin.env.explore import AFTER_LOGS
+from restock.train.twin.env.floor_report import refuse_unfit, sealed
+from restock.train.twin.floors.floors import held_out, open_floors
+from restock.train.twin.physics.episode import KINDS
+from restock.train.twin.physics.perturbation import PERTURBATIONS, find_perturbation
 
 _EVALUATION_ENVS = 16
 
@@ -173,7 +173,7 @@ def make_twin(
     layouts: str | None = None,
 ) -> Twin:
     """The warehouse, as training uses it; on other floors where `layouts` names them."""
-    from restock.train.vector_env import WarehouseVectorEnv
+    from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
     twin: Twin = WarehouseVectorEnv(
         num_envs,

@@ -16,24 +16,24 @@ import numpy as np
 import torch
 
 from restock.errors import RunError
-from restock.ingest.conditions import Condition
-from restock.ingest.task import Task
-from restock.replay.ring import FreshRing
-from restock.train import checkpoint
-from restock.train.batches import Batches, Logs
-from restock.train.collector import Collector, ring_conditions
-from restock.train.config import TrainConfig
-from restock.train.evaluate import Score, Twin
-from restock.train.events import Events
-from restock.train.guide import POLICIES, Guide
-from restock.train.held_out import HeldOut
-from restock.train.kept_checkpoints import earlier, keep
-from restock.train.learner import Learner
-from restock.train.log_fidelity import LogFidelity
-from restock.train.log_terms import LogTerms
-from restock.train.probe import Probe
-from restock.train.record import FeedRecord
-from restock.train.run import Run
+from restock.ingest.task.conditions import Condition
+from restock.ingest.task.task import Task
+from restock.replay.ring.ring import FreshRing
+from restock.train.dqn import checkpoint
+from restock.train.dqn.config import TrainConfig
+from restock.train.dqn.learner import Learner
+from restock.train.evaluation.evaluate import Score, Twin
+from restock.train.evaluation.evaluation_buffer import HeldOut
+from restock.train.feed.batch_record import FeedRecord
+from restock.train.feed.batches import Batches, Logs
+from restock.train.feed.collector import Collector, ring_conditions
+from restock.train.feed.log_fidelity import LogFidelity
+from restock.train.feed.log_terms import LogTerms
+from restock.train.feed.probe import Probe
+from restock.train.jump_start import POLICIES, Guide
+from restock.train.run.events import Events
+from restock.train.run.kept_checkpoints import earlier, keep
+from restock.train.run.run import Run
 
 
 @dataclass

@@ -17,20 +17,20 @@ except PackageNotFoundError:  # running from a source tree that was never instal
     __version__ = "0.0.0+unknown"
 
 if TYPE_CHECKING:
-    from restock.replay.store import Store
+    from restock.replay.store.store import Store
 
 __all__ = ["__version__", "open"]
 
 gymnasium.register(
     id="restock/Warehouse-v0",
-    entry_point="restock.train.single_env:WarehouseEnv",
-    vector_entry_point="restock.train.vector_env:WarehouseVectorEnv",
+    entry_point="restock.train.twin.env.single_env:WarehouseEnv",
+    vector_entry_point="restock.train.twin.env.vector_env:WarehouseVectorEnv",
 )
 
 
 def open(store: str) -> Store:
     """Open a store of transitions for reading: `restock.open("store").sql("FROM coverage")`."""
-    from restock.replay.store import Store
+    from restock.replay.store.store import Store
 
     return Store(store)
 

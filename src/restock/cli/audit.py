@@ -11,7 +11,7 @@ import tyro
 from restock.errors import ConfigError, ExitCode, RunError
 
 if TYPE_CHECKING:
-    from restock.replay.audit import Finding
+    from restock.replay.store.audit import Finding
 
 
 @dataclass
@@ -20,7 +20,7 @@ class Audit:
 
     Each audit is a query that returns offending rows, with a severity: an error fails, a warning
     warns, an info informs. Those that look at a panel or a run are skipped unless one is given.
-    The thresholds are in replay/audits.toml; docs/audit.md lists all audits.
+    The thresholds are in replay/store/audits.toml; docs/audit.md lists all audits.
     """
 
     store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
@@ -47,8 +47,8 @@ class Audit:
     def run(self) -> int:
         """Run the audits, print them, and say with the exit code whether one failed."""
         from restock.cli import output
-        from restock.replay.audit import junit_xml, load_audits, load_thresholds, run_audits
         from restock.replay.places import RUN_CONFIG, open_place
+        from restock.replay.store.audit import junit_xml, load_audits, load_thresholds, run_audits
 
         beside = {"panel": self.panel, "run": self.run_dir}
         given = {name: path for name, path in beside.items() if path is not None}
@@ -83,7 +83,7 @@ class Audit:
 
     def _capacity(self) -> int:
         from restock.cli import output
-        from restock.replay.capacity import recommend_capacity
+        from restock.replay.panel.capacity import recommend_capacity
         from restock.replay.places import open_place
 
         with open_place(self.store, only_store=True) as connection:

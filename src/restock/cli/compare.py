@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 if TYPE_CHECKING:
-    from restock.train.compare import Comparison
+    from restock.train.comparison.compare import Comparison
 
 
 @dataclass
@@ -42,7 +42,7 @@ class Compare:
     def run(self) -> int:
         from restock.cli.output import print_json
         from restock.errors import ConfigError, ExitCode
-        from restock.train.compare import compare
+        from restock.train.comparison.compare import compare
 
         first, second = self.runs, self.against
         if not second:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 if TYPE_CHECKING:
-    from restock.train.diagnose import Diagnosis
+    from restock.train.comparison.diagnose import Diagnosis
 
 
 @dataclass
@@ -35,9 +35,9 @@ class Diagnose:
     def run(self) -> int:
         from restock.cli.output import print_json
         from restock.errors import ConfigError
-        from restock.train.confirm import confirm
-        from restock.train.diagnose import diagnose
-        from restock.train.run import Run
+        from restock.train.comparison.confirm import confirm
+        from restock.train.comparison.diagnose import diagnose
+        from restock.train.run.run import Run
 
         if not self.runs:
             raise ConfigError("needs a run", where="restock diagnose")

@@ -67,10 +67,10 @@ class Eval:
     def _drive(self) -> int:
         from restock.cli.output import print_json, progress, say
         from restock.errors import ConfigError, ExitCode
-        from restock.train.eval_run import evaluate, plan_evaluation, settings
-        from restock.train.evaluate import summary_rows
-        from restock.train.regression import of_baseline, of_run, regressed, regression
-        from restock.train.regression import save_baseline as save
+        from restock.train.evaluation.eval_run import evaluate, plan_evaluation, settings
+        from restock.train.evaluation.evaluate import summary_rows
+        from restock.train.evaluation.regression import of_baseline, of_run, regressed, regression
+        from restock.train.evaluation.regression import save_baseline as save
 
         if self.check and self.baseline is None:
             raise ConfigError(
@@ -139,8 +139,8 @@ class Eval:
         from restock.cli.judged import show_judged
         from restock.cli.output import progress
         from restock.errors import ConfigError
-        from restock.train.judge import Judging
-        from restock.train.judge_run import judge_run
+        from restock.train.evaluation.ope import Judging
+        from restock.train.evaluation.ope_run import judge_run
 
         try:
             how = Judging(epsilon=self.epsilon, horizon=self.horizon)

@@ -40,7 +40,7 @@ class Export:
         from restock.cli import output
 
         if self.to == "onnx":
-            from restock.train.onnx_policy import export_onnx
+            from restock.train.evaluation.onnx_policy import export_onnx
 
             made = export_onnx(self.source, self.out)
             if self.json:
@@ -51,7 +51,7 @@ class Export:
                     f" ({made['bytes']:,} bytes)"
                 )
             return
-        from restock.replay.export_dataset import export_dataset
+        from restock.replay.export.dataset import export_dataset
 
         with output.progress(f"writing {self.to}", None) as advance:
             document = export_dataset(

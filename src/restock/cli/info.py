@@ -38,8 +38,8 @@ class Info:
     def run(self) -> int:
         """Describe each recording; the exit code of the worst of them."""
         from restock.cli import output
+        from restock.ingest.containers.open_recording import recordings_in
         from restock.ingest.describe import describe
-        from restock.ingest.readers import recordings_in
 
         if not self.paths:
             raise RecordingError("no path given", remedy="restock info PATH [PATH …]")

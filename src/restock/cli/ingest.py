@@ -59,8 +59,8 @@ class Ingest:
             warm_up()
         from restock.cli import output
         from restock.ingest.batch import Job, ingest_all
-        from restock.ingest.profile import load_profile
-        from restock.ingest.store import StoreWriter
+        from restock.ingest.profile.profile import load_profile
+        from restock.ingest.store.writer import StoreWriter
 
         if not self.paths:
             raise RecordingError("no path given", remedy="restock ingest PATH --store STORE")
@@ -97,7 +97,7 @@ class Ingest:
 
     def _recordings(self) -> tuple[list[Path], list[dict[str, Any]]]:
         """The recordings of all paths, each once, and the paths that have none."""
-        from restock.ingest.readers import recordings_in
+        from restock.ingest.containers.open_recording import recordings_in
 
         found: dict[Path, None] = {}
         failures: list[dict[str, Any]] = []
@@ -112,7 +112,7 @@ class Ingest:
 
 def as_json(outcome: Outcome) -> dict[str, Any]:
     """An outcome as `--json` prints it."""
-    from restock.ingest.scores import GOOD
+    from restock.ingest.task.label_scores import GOOD
 
     row = {
         key: value
@@ -141,7 +141,7 @@ def as_json(outcome: Outcome) -> dict[str, Any]:
 def show(outcome: Outcome) -> None:
     """One recording's counts, as tables on stdout."""
     from restock.cli import output
-    from restock.ingest.manifest import UNUSED
+    from restock.ingest.store.manifest import UNUSED
 
     row = outcome.manifest
     console = output.stdout()

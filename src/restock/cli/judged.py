@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from restock.train.judge import Judging
-    from restock.train.judge_run import Judged
+    from restock.train.evaluation.ope import Judging
+    from restock.train.evaluation.ope_run import Judged
 
 
 def show_judged(path: Path, judged: Judged, how: Judging, *, as_json: bool) -> None:

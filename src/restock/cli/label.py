@@ -12,8 +12,8 @@ import tyro
 from restock.errors import ExitCode
 
 if TYPE_CHECKING:
-    from restock.ingest.conditions import Condition
     from restock.ingest.relabel import Relabelled
+    from restock.ingest.task.conditions import Condition
 
 
 @dataclass
@@ -80,7 +80,7 @@ class Label:
 
     def _conditions_of(self) -> Any:
         from restock.errors import ConfigError
-        from restock.ingest.profile import load_profile
+        from restock.ingest.profile.profile import load_profile
 
         given = load_profile(self.profile) if self.profile is not None else None
 
@@ -101,7 +101,7 @@ class Label:
 
 def as_json(outcome: Relabelled) -> dict[str, Any]:
     """An outcome as `--json` prints it."""
-    from restock.ingest.manifest import score_rows
+    from restock.ingest.store.manifest import score_rows
 
     return {
         "recording_id": outcome.recording_id,

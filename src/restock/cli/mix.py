@@ -13,7 +13,7 @@ import tyro
 from restock.errors import MixtureError
 
 if TYPE_CHECKING:
-    from restock.replay.plan import Plan
+    from restock.replay.panel.plan import Plan
 
 _WIDE = 110  # columns of a terminal from which on the table says more
 
@@ -53,11 +53,11 @@ class Mix:
     def run(self) -> None:
         """Plan, and unless it is a dry run, pack."""
         from restock.cli import output
-        from restock.replay.build import open_source, write_panel
-        from restock.replay.mixture import load_mixture
-        from restock.replay.mixture_schema import shipped_schema
-        from restock.replay.plan import plan_panel
-        from restock.replay.store import Store
+        from restock.replay.mixture.mixture import load_mixture
+        from restock.replay.mixture.mixture_schema import shipped_schema
+        from restock.replay.panel.build import open_source, write_panel
+        from restock.replay.panel.plan import plan_panel
+        from restock.replay.store.store import Store
 
         if self.schema:
             sys.stdout.write(shipped_schema())
@@ -96,7 +96,7 @@ class Mix:
 
     def _verify(self, path: Path) -> None:
         from restock.cli import output
-        from restock.replay.panel import Panel
+        from restock.replay.panel.panel import Panel
 
         panel = Panel.open(path, verify=True)
         size = sum(record.bytes for record in panel.header.files.values())

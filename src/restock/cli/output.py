@@ -99,7 +99,7 @@ CLOCK_COLUMNS = ["log - stamp s", "clock"]
 
 def clock_cells(clock: Row | None) -> dict[str, str]:
     """A topic's clocks for a table: how far log time is ahead of its stamps, and what is odd."""
-    from restock.ingest.clocks import odd
+    from restock.ingest.steps.clocks import odd
 
     offset = None if clock is None else clock["offset_ns"]
     said = ["" if offset is None else f"{offset * 1e-9:,.3f}", "" if clock is None else odd(clock)]

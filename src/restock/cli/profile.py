@@ -52,8 +52,8 @@ class Profile:
 
     def _new(self) -> int:
         from restock.cli import output
-        from restock.ingest.propose import propose
-        from restock.ingest.readers import open_recording
+        from restock.ingest.containers.open_recording import open_recording
+        from restock.ingest.propose.propose import propose
 
         if self.out is not None and self.out.exists():
             raise ConfigError("is there already", where=str(self.out), remedy="name another --out")
@@ -75,10 +75,10 @@ class Profile:
     def _check(self) -> int:
         from restock.cli import output
         from restock.cli.ingest import as_json, show
-        from restock.ingest.needs import input_problems
+        from restock.ingest.containers.open_recording import open_recording
         from restock.ingest.pipeline import ingest
-        from restock.ingest.profile import load_profile
-        from restock.ingest.readers import open_recording
+        from restock.ingest.profile.profile import load_profile
+        from restock.ingest.steps.needs import input_problems
 
         profile = load_profile(self.paths[0])
         with open_recording(self.paths[1], typestore=self.typestore) as recording:
@@ -110,7 +110,7 @@ class Profile:
 def _inputs(profile: Any, topics: Any) -> list[dict[str, Any]]:
     """What the profile takes from where, and how many messages of it there are."""
 
-    from restock.ingest.needs import near
+    from restock.ingest.steps.needs import near
 
     def row(name: str, topic: str, kind: str, age: float | None, optional: bool) -> dict[str, Any]:
         return {

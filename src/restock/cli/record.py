@@ -62,12 +62,12 @@ class Record:
     def run(self) -> None:
         """Record, and print what was recorded."""
         from restock.cli import output
-        from restock.train.bag_writer import refuse_existing
-        from restock.train.floor_report import refuse_unfit, sealed
-        from restock.train.floors import open_floors
-        from restock.train.missions import NATURAL, parse_shares
-        from restock.train.perturbation import find_perturbation
-        from restock.train.recorder import (
+        from restock.train.twin.env.floor_report import refuse_unfit, sealed
+        from restock.train.twin.floors.floors import open_floors
+        from restock.train.twin.physics.perturbation import find_perturbation
+        from restock.train.twin.recording.bag_writer import refuse_existing
+        from restock.train.twin.recording.missions import NATURAL, parse_shares
+        from restock.train.twin.recording.recorder import (
             HARDWARE,
             NOISELESS,
             Plan,

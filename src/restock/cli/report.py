@@ -42,10 +42,10 @@ class Report:
 
     def run(self) -> int | None:
         from restock.errors import ConfigError
-        from restock.ingest.location import Location
-        from restock.replay.store import is_store
+        from restock.ingest.store.location import Location
+        from restock.replay.store.store import is_store
         from restock.report import build_report, write_card, write_gap_page
-        from restock.train.gap_files import FOLDER
+        from restock.train.twin.calibration.gap_files import FOLDER
 
         if self.card:
             if self.out is not None:

@@ -66,7 +66,7 @@ class Sql:
 
     def _answer(self, connection: duckdb.DuckDBPyConnection, text: str) -> None:
         from restock.cli import output
-        from restock.replay.query import fetch
+        from restock.replay.store.query import fetch
 
         columns, values = fetch(connection, text, where=str(self.path))
         rows = [dict(zip(columns, row, strict=True)) for row in values]
@@ -108,8 +108,8 @@ class Sql:
 
     def _export(self, out: Path) -> None:
         from restock.cli import output
-        from restock.replay.export import export_views
-        from restock.replay.store import Store
+        from restock.replay.store.export_views import export_views
+        from restock.replay.store.store import Store
 
         with Store(self.path) as store:
             export_views(store, out)

@@ -40,10 +40,10 @@ class Study:
 
         from restock.cli.output import plain, print_json, print_table, say
         from restock.errors import ConfigError, ExitCode
-        from restock.train.run import write_text
-        from restock.train.study import Plan, load_study
-        from restock.train.study_page import as_markdown, findings
-        from restock.train.study_run import run_study
+        from restock.files import write_text
+        from restock.train.study.study import Plan, load_study
+        from restock.train.study.study_page import as_markdown, findings
+        from restock.train.study.study_run import run_study
 
         if self.workers < 1:
             raise ConfigError(f"must be at least 1, got {self.workers}", where="--workers")

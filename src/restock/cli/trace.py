@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 if TYPE_CHECKING:
-    from restock.replay import trace as tracing
-    from restock.replay.origin import Origin
+    from restock.replay.trace import trace as tracing
+    from restock.replay.trace.origin import Origin
 
 _LONG = 6  # entries of a list that are printed
 _TABLES = ("clocks", "signals", "stand_ins")  # of a manifest: for `--json` and `restock sql`
@@ -47,7 +47,7 @@ class Trace:
     def run(self) -> None:
         """Trace, and print what was found."""
         from restock.cli import output
-        from restock.replay.trace import Where, audited_rows, trace
+        from restock.replay.trace.trace import Where, audited_rows, trace
 
         if self.row is None:
             listed = audited_rows(self.place, self.rows)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 if TYPE_CHECKING:
-    from restock.train.fresh_rows import Flushed
+    from restock.train.flush_fresh import Flushed
     from restock.train.loop import Outcome
     from restock.train.prepare import Prepared
 
@@ -98,8 +98,8 @@ class Train:
 def _train(prepared: Prepared, store: Path | None) -> tuple[Outcome, Flushed | None]:
     """Train to the end; then flush what the twin gave, where a store is given."""
     from restock.cli.output import progress, stderr
-    from restock.ingest.store import StoreWriter
-    from restock.train.fresh_rows import flush
+    from restock.ingest.store.writer import StoreWriter
+    from restock.train.flush_fresh import flush
     from restock.train.loop import train
 
     config = prepared.config

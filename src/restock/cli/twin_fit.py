@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 if TYPE_CHECKING:
-    from restock.train.fit import Fit as Fitted
+    from restock.train.twin.calibration.fit import Fit as Fitted
 
 
 @dataclass
@@ -64,9 +64,9 @@ class Fit:
         """Fit, print, write."""
         from restock.cli import output
         from restock.errors import ConfigError, ExitCode
-        from restock.replay.store import Store
-        from restock.train.fit_files import write
-        from restock.train.log_segments import recordings_of
+        from restock.replay.store.store import Store
+        from restock.train.twin.calibration.fit_files import write
+        from restock.train.twin.calibration.log_segments import recordings_of
 
         if self.out is not None and self.out.exists():
             raise ConfigError("is there already", where=str(self.out), remedy="name another --out")
@@ -89,9 +89,9 @@ class Fit:
 
     def _fit(self, store: Any, recordings: tuple[str, ...]) -> Fitted:
         from restock.cli import output
-        from restock.train.fit import fit
-        from restock.train.fit_parameters import DEFAULT, parse_parameters
-        from restock.train.perturbation import load_perturbation
+        from restock.train.twin.calibration.fit import fit
+        from restock.train.twin.calibration.fit_parameters import DEFAULT, parse_parameters
+        from restock.train.twin.physics.perturbation import load_perturbation
 
         name = "fitted" if self.out is None else self.out.stem
         return fit(

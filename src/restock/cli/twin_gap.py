@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 if TYPE_CHECKING:
-    from restock.train.gap import Gap as Measured
-    from restock.train.perturbation import Perturbation
+    from restock.train.twin.calibration.gap import Gap as Measured
+    from restock.train.twin.physics.perturbation import Perturbation
 
 _IN_SAMPLE = (
     "The twin was calibrated on most of these very logs: `restock twin fit` says what is left of"
@@ -75,12 +75,12 @@ class Gap:
         """Measure, print, write."""
         from restock.cli import output
         from restock.errors import ConfigError, ExitCode
-        from restock.replay.store import Store
+        from restock.replay.store.store import Store
         from restock.report import write_gap_page
-        from restock.train.gap import GapPlan, measure_gap
-        from restock.train.gap_files import check_place, write_gap
-        from restock.train.perturbation import load_perturbation
-        from restock.train.trust import Limits
+        from restock.train.twin.calibration.gap import GapPlan, measure_gap
+        from restock.train.twin.calibration.gap_files import check_place, write_gap
+        from restock.train.twin.calibration.trust import Limits
+        from restock.train.twin.physics.perturbation import load_perturbation
 
         if self.fit and self.perturbation is not None:
             raise ConfigError("give --fit or --perturbation, one of them", where="restock twin gap")
@@ -105,7 +105,7 @@ class Gap:
         with Store(self.store) as store:
             notes: tuple[str, ...] = ()
             if self.fit:
-                from restock.train.fit import fit
+                from restock.train.twin.calibration.fit import fit
 
                 fitted = fit(
                     store,

@@ -33,11 +33,11 @@ class Layout:
     def run(self) -> int:
         """Print, and write what was asked for."""
         from restock.cli import output
-        from restock.train.floor_file import write_floor
-        from restock.train.floor_picture import draw_floor, write_png
-        from restock.train.floor_report import describe_floor
-        from restock.train.floors import open_floor
-        from restock.train.occupancy_map import write_map
+        from restock.train.twin.env.floor_report import describe_floor
+        from restock.train.twin.floors.floor_file import write_floor
+        from restock.train.twin.floors.floor_picture import draw_floor, write_png
+        from restock.train.twin.floors.floors import open_floor
+        from restock.train.twin.floors.occupancy_map import write_map
 
         floor = open_floor(self.floor)
         maps = self.out is not None and self.out.suffix in (".yaml", ".yml")

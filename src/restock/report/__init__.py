@@ -13,12 +13,12 @@ from typing import Any
 
 import jinja2
 
+from restock.files import write_text
 from restock.report.card import as_markdown, replay_card
 from restock.report.facts import gather
 from restock.report.page import page
 from restock.report.twin_gap import gap_page
-from restock.train.gap_files import read_gap
-from restock.train.run import write_text
+from restock.train.twin.calibration.gap_files import read_gap
 
 
 def build_report(run: Path, out: Path | None = None) -> Path:

@@ -13,13 +13,13 @@ import duckdb
 import pyarrow.parquet as pq
 
 from restock.errors import RestockError, RunError
-from restock.replay.panel import Panel, Stratum
-from restock.replay.store import Store, read_parquet
-from restock.train.floors import open_floors
-from restock.train.layout import DEFAULT, Warehouse
-from restock.train.run import Run
-from restock.train.run_tables import EVAL_EPISODES
-from restock.train.stats import wilson
+from restock.replay.panel.panel import Panel, Stratum
+from restock.replay.store.store import Store, read_parquet
+from restock.stats import wilson
+from restock.train.run.run import Run
+from restock.train.run.run_tables import EVAL_EPISODES
+from restock.train.twin.floors.floors import open_floors
+from restock.train.twin.floors.layout import DEFAULT, Warehouse
 
 Rows = list[dict[str, Any]]
 CELL_M = 0.25

@@ -14,9 +14,9 @@ from restock.report import charts
 from restock.report.blocks import Section, section, table
 from restock.report.charts import words
 from restock.report.facts import Facts
-from restock.train.gap import AFTER, BEFORE, Gap
-from restock.train.gap_files import DOCUMENT, FOLDER, read_gap
-from restock.train.trust import TRUSTED, UNDECIDED, UNKNOWN, UNTRUSTED
+from restock.train.twin.calibration.gap import AFTER, BEFORE, Gap
+from restock.train.twin.calibration.gap_files import DOCUMENT, FOLDER, read_gap
+from restock.train.twin.calibration.trust import TRUSTED, UNDECIDED, UNKNOWN, UNTRUSTED
 
 COLOURS = {
     "nominal twin": "#b45309",

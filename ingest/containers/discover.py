@@ -1,0 +1,170 @@
+"""Which recordings are there: files, bag folders, folders of many, globs; what a file is."""
+
+from __future__ import annotations
+
+import glob
+import re
+from pathlib import Path
+from typing import Any, Literal
+
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from restock.errors import RecordingError, visible
+from restock.ingest.containers import mcap_records, sqlite_file
+
+Kind = Literal["mcap", "sqlite3", "ros1"]
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+ROS1_MAGIC = b"#ROSBAG V"
+LFS_MAGIC = b"version https://git-lfs"
+METADATA = "metadata.yaml"
+LARGEST_METADATA = 2 << 20  # real ones have some kB, and the parser is slow
+# What the YAML library raises of a document that is none, or of one that it does not expect.
+_NO_YAML = (
+    *(YAMLError, KeyError, IndexError, TypeError, ValueError, AttributeError, AssertionError),
+    *(RecursionError, OverflowError, NotImplementedError),
+)
+ENDINGS = (".mcap", ".db3", ".bag", ".mcap.zstd", ".db3.zstd", ".mcap.zst", ".db3.zst")
+
+
+def recordings_in(path: Path | str) -> list[Path]:
+    """The recordings at a path: a file, a bag's folder, a folder of many (searched deeply), or a
+    glob. A bag with all its split files is one recording, named by its folder.
+
+    Raises:
+        RecordingError: nothing there, or no recording in it.
+    """
+    path = Path(path)
+    if path.is_file():
+        return [path]
+    if path.is_dir():
+        found = _in_folder(path)
+        if not found:
+            raise RecordingError(
+                "no recording in this folder",
+                where=str(path),
+                remedy=f"recordings end in {', '.join(ENDINGS[:3])} or are rosbag2 folders",
+            )
+        return found
+    matches = sorted(Path(name) for name in glob.glob(str(path), recursive=True))  # noqa: PTH207
+    if matches:
+        every = [item for match in matches for item in _matched(match)]
+        return list(dict.fromkeys(every))
+    raise RecordingError("no such file or folder", where=str(path))
+
+
+def _matched(match: Path) -> list[Path]:
+    if match.is_dir():
+        return _in_folder(match)
+    return [match] if match.is_file() and is_storage_name(match) else []
+
+
+def _in_folder(folder: Path) -> list[Path]:
+    if is_bag(folder):
+        return [folder]
+    found = []
+    for item in sorted(folder.iterdir()):
+        if item.name.startswith("."):
+            continue
+        if item.is_dir() and not item.is_symlink():
+            found += _in_folder(item)
+        elif item.is_file() and is_storage_name(item):
+            found.append(item)
+    return found
+
+
+def is_storage_name(path: Path) -> bool:
+    """Whether a file is named like a recording."""
+    return path.name.endswith(ENDINGS)
+
+
+def is_bag(folder: Path) -> bool:
+    """Whether a folder is one rosbag2 bag: it has metadata.yaml, or split files of its name."""
+    if (folder / METADATA).is_file():
+        return True
+    files = [item for item in folder.iterdir() if item.is_file() and is_storage_name(item)]
+    split = re.compile(re.escape(folder.name) + r"_\d+\.")
+    return bool(files) and all(split.match(item.name) for item in files)
+
+
+def bag_files(folder: Path, metadata: dict[str, Any]) -> tuple[list[Path], list[str]]:
+    """A bag's storage files in order, and the names that its metadata lists but are not there.
+
+    The metadata's paths are not trusted: only files in the folder itself are read.
+    """
+    listed = metadata.get("relative_file_paths")
+    listed = listed if isinstance(listed, list) else []
+    names = [Path(name).name for name in listed if isinstance(name, str)]
+    present = {item.name: item for item in folder.iterdir() if item.is_file()}
+    there = {name: item for name, item in present.items() if is_storage_name(item)}
+    order = []
+    missing = []
+    for name in dict.fromkeys(names):
+        # File-mode compression adds its ending, to the names in some versions' metadata only.
+        options = (name, name + ".zstd", name + ".zst")
+        match = next((option for option in options if option in present), None)
+        if match is None:
+            missing.append(name)
+        elif match not in order:
+            order.append(match)
+    stems = {re.sub(r"\.zstd?$", "", name) for name in order}
+    rest = [name for name in there if re.sub(r"\.zstd?$", "", name) not in stems]
+    return [present[name] for name in (*order, *sorted(rest, key=_natural))], missing
+
+
+def _natural(name: str) -> list[Any]:
+    parts = re.split(r"(\d+)", name)
+    return [int(part) if index % 2 else part for index, part in enumerate(parts)]
+
+
+def read_metadata(folder: Path) -> tuple[dict[str, Any], str | None]:
+    """What metadata.yaml says, and what is wrong with it if it cannot be used."""
+    file = folder / METADATA
+    if not file.is_file():
+        return {}, f"no {METADATA}: read from the storage files alone"
+    try:
+        if file.stat().st_size > LARGEST_METADATA:
+            return {}, f"{METADATA} has {file.stat().st_size:,} bytes: not read"
+        document = YAML(typ="safe", pure=True).load(file.read_text(encoding="utf-8"))
+        found = document["rosbag2_bagfile_information"]
+    except _NO_YAML as error:
+        why = (str(error).splitlines() or [type(error).__name__])[0]
+        return {}, f"{METADATA} cannot be used: {visible(why[:200])}"
+    if not isinstance(found, dict):
+        return {}, f"{METADATA} cannot be used: not a mapping"
+    return found, None
+
+
+def kind_of(path: Path) -> Kind | Literal["zstd"]:
+    """What a file is, by its first bytes.
+
+    Raises:
+        RecordingError: it is not there, empty, a Git LFS pointer or no recording.
+    """
+    where = str(path)
+    try:
+        with path.open("rb") as file:
+            head = file.read(64)
+    except OSError as error:
+        raise RecordingError(f"cannot be read: {error.strerror}", where=where) from error
+    if not head:
+        raise RecordingError("an empty file", where=where, remedy="was its copy interrupted?")
+    if head.startswith(LFS_MAGIC):
+        raise RecordingError(
+            "a Git LFS pointer, not the recording itself",
+            where=where,
+            remedy="`git lfs pull` fetches the recording",
+        )
+    if head.startswith(mcap_records.MAGIC):
+        return "mcap"
+    if head.startswith(sqlite_file.MAGIC):
+        return "sqlite3"
+    if head.startswith(ROS1_MAGIC):
+        return "ros1"
+    if head.startswith(ZSTD_MAGIC):
+        return "zstd"
+    raise RecordingError(
+        "not a recording: its first bytes are those of no MCAP, sqlite3 or ROS 1 bag file",
+        where=where,
+        remedy="recordings are .mcap files, rosbag2 folders or their .db3 files, and .bag files",
+    )

@@ -1,0 +1,289 @@
+"""One MCAP chunk: bounded decompression, and where its messages are."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import lz4.frame
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from restock.ingest.containers.mcap_records import PREFIX, Malformed, Op, parse, walk
+from restock.ingest.decoding.columns import I64, gather
+
+# A chunk's uncompressed size is the file's word: beyond these it is refused, not allocated.
+LARGEST_CHUNK = 4 << 30
+PLAUSIBLE_SIZE = 64 << 20
+PLAUSIBLE_RATIO = 1000
+LATEST_NS = 2**63 - 1
+
+_HEAD = np.dtype(  # a message record up to its data
+    [
+        ("op", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("publish_time", "<u8"),
+    ]
+)
+HEAD_SIZE = _HEAD.itemsize  # 31
+_START = np.dtype([("op", "u1"), ("length", "<u8"), ("channel", "<u2")])
+_INDEX = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
+
+
+Positions: TypeAlias = dict[int, I64]  # of message records, by channel
+
+
+class BadChunk(Exception):
+    """A chunk whose content cannot be had."""
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Where a chunk is in the file, and what its record and its message index say."""
+
+    at: int  # of its record in the file
+    start: int  # of its (compressed) records
+    stop: int
+    size: int  # uncompressed
+    crc: int  # of the uncompressed records; 0 says unchecked
+    compression: str
+    span_ns: tuple[int, int]
+    index: dict[int, tuple[int, int]] = field(default_factory=dict)  # channel -> entries in file
+
+    def counts(self) -> dict[int, int]:
+        """Messages per channel, by the message index."""
+        return {
+            channel: (stop - start) // _INDEX.itemsize
+            for channel, (start, stop) in self.index.items()
+        }
+
+
+@dataclass
+class Messages:
+    """Messages of one channel in one buffer."""
+
+    start: I64
+    stop: I64
+    log_time_ns: I64
+    publish_time_ns: I64
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+
+def refuse_implausible(chunk: Chunk) -> None:
+    """Check the size that a chunk claims, before as much is set aside.
+
+    Raises:
+        BadChunk: it is more than so few bytes can hold.
+    """
+    stored = chunk.stop - chunk.start
+    limit = max(PLAUSIBLE_SIZE, PLAUSIBLE_RATIO * stored)
+    if chunk.size > min(limit, LARGEST_CHUNK):
+        raise BadChunk(f"{stored:,} bytes that claim to hold {chunk.size:,}")
+
+
+def inflate(chunk: Chunk, file: Any) -> bytes:
+    """The chunk's records, uncompressed and checked against its CRC.
+
+    Raises:
+        BadChunk: unknown compression, an implausible size, damaged data or a wrong CRC.
+    """
+    refuse_implausible(chunk)
+    data = _decompress(chunk.compression, file[chunk.start : chunk.stop], chunk.size)
+    if len(data) != chunk.size:
+        raise BadChunk(f"{len(data):,} bytes uncompressed, where it claims {chunk.size:,}")
+    _check(chunk, data)
+    return data
+
+
+def inflate_into(chunk: Chunk, file: Any, room: NDArray[np.uint8]) -> None:
+    """The same into `room`, which has the chunk's size: memory that is used again costs less.
+
+    Raises:
+        BadChunk: as `inflate`.
+    """
+    if chunk.compression == "zstd" and _unpack(file[chunk.start : chunk.stop], room):
+        _check(chunk, room.data)
+    else:  # whatever is wrong with it is found and named there
+        room[:] = np.frombuffer(inflate(chunk, file), np.uint8)
+
+
+def _unpack(stored: bytes, room: NDArray[np.uint8]) -> bool:
+    """Decompress zstd data that fills the room exactly; False where it does not."""
+    try:
+        with zstandard.ZstdDecompressor().stream_reader(stored) as reader:
+            at = 0
+            while at < len(room) and (count := reader.readinto(room.data[at:])):
+                at += count
+            return at == len(room) and not reader.read(1)
+    except zstandard.ZstdError:
+        return False
+
+
+def _check(chunk: Chunk, data: Any) -> None:
+    if chunk.crc and zlib.crc32(data) != chunk.crc:
+        raise BadChunk("its CRC does not match")
+
+
+def inflate_what_is_there(chunk: Chunk, file: Any) -> bytes:
+    """The part of a cut or damaged chunk that still decompresses; unchecked."""
+    stored = file[chunk.start : chunk.stop]
+    limit = min(chunk.size, max(PLAUSIBLE_SIZE, PLAUSIBLE_RATIO * len(stored)), LARGEST_CHUNK)
+    parts: list[bytes] = []
+    size = 0
+    step = 1 << 12  # small, so that damage costs no more than what is near it
+    if chunk.compression == "":
+        return bytes(stored[:limit])
+    decoder: Any
+    if chunk.compression == "zstd":
+        decoder = zstandard.ZstdDecompressor().decompressobj()
+    elif chunk.compression == "lz4":
+        decoder = lz4.frame.LZ4FrameDecompressor()
+    else:
+        return b""
+    for position in range(0, len(stored), step):
+        try:
+            part = decoder.decompress(stored[position : position + step])
+        except (zstandard.ZstdError, RuntimeError, EOFError, OSError):
+            break
+        parts.append(part)
+        size += len(part)
+        if size >= limit:
+            break
+    return b"".join(parts)[:limit]
+
+
+def _decompress(compression: str, stored: bytes, size: int) -> bytes:
+    if compression == "":
+        return stored
+    try:
+        if compression == "zstd":
+            if zstandard.frame_content_size(stored) > size:
+                raise BadChunk("it would decompress to more than it claims")
+            return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
+        if compression == "lz4":
+            data: bytes = lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=size + 1)
+            return data
+    except (zstandard.ZstdError, RuntimeError, EOFError, OSError) as error:
+        raise BadChunk(f"its {compression} data is damaged ({error})") from error
+    raise BadChunk(f"compression {compression!r} is not known")
+
+
+@dataclass(frozen=True)
+class Indexed:
+    """A channel's index entries in one chunk, which lies at buffer[base:base + size]."""
+
+    base: int
+    size: int
+    entries: bytes
+
+
+def indexed_messages(
+    buffer: NDArray[np.uint8], parts: Sequence[Indexed], channel: int
+) -> Messages | None:
+    """A channel's messages by its index entries in some chunks, which lie in this order.
+
+    None where the index does not fit what is there: then the chunks are to be walked.
+    """
+    if any(len(part.entries) % _INDEX.itemsize for part in parts):
+        return None
+    offset = np.frombuffer(b"".join(part.entries for part in parts), _INDEX)["offset"]
+    if not len(offset):
+        none = np.zeros(0, np.int64)
+        return Messages(none, none, none, none)
+    counts = [len(part.entries) // _INDEX.itemsize for part in parts]
+    base = np.repeat(np.array([part.base for part in parts], np.int64), counts)
+    size = np.repeat(np.array([part.size for part in parts], np.int64), counts)
+    room = np.maximum(size - HEAD_SIZE, 0).astype(np.uint64)
+    if (offset > room).any() or (size < HEAD_SIZE).any():
+        return None
+    # File order: entries are sorted by time. Chunk by chunk, so `base` and `size` stay right.
+    at = np.sort(offset.astype(np.int64) + base)
+    head = gather(buffer, at, _HEAD)
+    length = head["length"]
+    if (
+        (head["op"] != Op.MESSAGE).any()
+        or (head["channel"] != channel).any()
+        or (length > size.astype(np.uint64)).any()
+        or (length < HEAD_SIZE - PREFIX).any()
+    ):
+        return None
+    stop = at + PREFIX + length.astype(np.int64)
+    if (stop > base + size).any():
+        return None
+    return Messages(
+        at + HEAD_SIZE,
+        stop,
+        _stamps(head["log_time"]),
+        _stamps(head["publish_time"]),
+    )
+
+
+def _stamps(values: NDArray[Any]) -> I64:
+    """Times of 64 bits without a sign: what int64 cannot hold (2262) stays the last that it can."""
+    stamps: I64 = np.minimum(values, np.uint64(LATEST_NS)).astype(np.int64)
+    return stamps
+
+
+def walked_messages(part: Any) -> tuple[Positions, str | None]:
+    """Where the message records of an uncompressed chunk start, per channel, and what is cut."""
+    places: list[int] = []
+    note = places.append
+    length_at = struct.Struct("<xQ").unpack_from  # after the opcode
+    position, end = 0, len(part)
+    last = end - (PREFIX + 2)
+    while position <= last:
+        note(position)
+        position += PREFIX + length_at(part, position)[0]
+    if position > end:  # the last record is not whole
+        position = places.pop()
+    cut = None
+    if (
+        position != end
+        and position + PREFIX + int.from_bytes(part[position + 1 : position + PREFIX], "little")
+        != end
+    ):
+        cut = f"cut within a record, {end - position:,} bytes before its end"
+    found = np.array(places, np.int64)
+    head = gather(np.frombuffer(part, np.uint8), found, _START)
+    found = found[(head["op"] == Op.MESSAGE) & (head["length"] >= HEAD_SIZE - PREFIX)]
+    numbers = gather(np.frombuffer(part, np.uint8), found, _START)["channel"]
+    return {number: found[numbers == number] for number in np.unique(numbers).tolist()}, cut
+
+
+def messages_at(buffer: NDArray[np.uint8], positions: Any) -> Messages:
+    """Messages whose records start at these positions (which were walked, and so fit)."""
+    at = np.asarray(positions, np.int64)
+    head = gather(buffer, at, _HEAD)
+    return Messages(
+        at + HEAD_SIZE,
+        at + PREFIX + head["length"].astype(np.int64),
+        _stamps(head["log_time"]),
+        _stamps(head["publish_time"]),
+    )
+
+
+def definitions(buffer: Any, start: int, stop: int) -> tuple[dict[int, Any], dict[int, Any]]:
+    """The schema and channel records in buffer[start:stop], by id, up to what is cut."""
+    schemas: dict[int, Any] = {}
+    channels: dict[int, Any] = {}
+    try:
+        for opcode, at, end in walk(buffer, start, stop):
+            if opcode == Op.SCHEMA:
+                schema = parse(Op.SCHEMA, buffer, at, end)
+                low, high = schema["data"]
+                schemas[schema["id"]] = {**schema, "data": bytes(buffer[low:high])}
+            elif opcode == Op.CHANNEL:
+                channel = parse(Op.CHANNEL, buffer, at, end)
+                channels[channel["id"]] = channel
+    except Malformed:
+        pass
+    return schemas, channels

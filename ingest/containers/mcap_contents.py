@@ -1,0 +1,169 @@
+"""What is in an MCAP file: its chunks, loose messages, channels and counts, from one walk.
+
+The summary at a file's end is taken for what it says about channels and counts, never for where
+things are: the walk over the top-level records is cheap (a few records a chunk) and finds all
+there is in a file with a wrong summary, or none. See https://mcap.dev/spec.
+"""
+
+from __future__ import annotations
+
+import mmap
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from restock.ingest.containers.mapped import FORGET_BYTES, forget
+from restock.ingest.containers.mcap_chunk import HEAD_SIZE, Chunk
+from restock.ingest.containers.mcap_records import MAGIC, PREFIX, Malformed, Op, parse, walk
+from restock.ingest.decoding.channel import Extra
+
+# What the survey keeps is bounded, whatever a file is made of.
+MOST_CHUNKS = 1_000_000
+MOST_NAMED = 10_000  # attachments and metadata records; the others are counted
+MOST_DAMAGED = 100
+
+
+@dataclass
+class Contents:
+    """What the walk found."""
+
+    profile: str = ""
+    chunks: list[Chunk] = field(default_factory=list)
+    loose: dict[int, list[int]] = field(default_factory=dict)  # channel -> records outside chunks
+    schemas: dict[int, Any] = field(default_factory=dict)
+    channels: dict[int, Any] = field(default_factory=dict)
+    statistics: dict[str, Any] | None = None
+    data_end: tuple[int, int] = (0, 0)  # position, and CRC of the data section (0: unchecked)
+    cut: Malformed | None = None  # where and why the walk could not go on
+    cut_chunk: Chunk | None = None  # the chunk it could not pass, with what there is of it
+    resumed: bool = False  # beyond the cut, up to a whole summary
+    damaged: list[str] = field(default_factory=list)  # records that could not be parsed
+    extras: list[Extra] = field(default_factory=list)  # attachments and metadata records
+    unnamed: int = 0  # more of them
+
+    def indexed_counts(self) -> dict[int, int]:
+        """Messages per channel as far as they are known without looking into chunks."""
+        found = {channel: len(positions) for channel, positions in self.loose.items()}
+        for chunk in self.chunks:
+            for channel, count in chunk.counts().items():
+                found[channel] = found.get(channel, 0) + count
+        return found
+
+    def claimed_counts(self) -> dict[int, int] | None:
+        """Messages per channel by the statistics; None where they are missing or incomplete."""
+        if self.statistics is None or (self.cut is not None and not self.resumed):
+            return None
+        claimed: dict[int, int] = self.statistics["channel_message_counts"]
+        # Counts per channel are optional; the total is not.
+        return claimed if sum(claimed.values()) == self.statistics["message_count"] else None
+
+    def distrust_index(self) -> None:
+        """Forget the message indexes: every chunk is then walked."""
+        self.chunks = [replace(chunk, index={}) for chunk in self.chunks]
+
+
+def survey(file: mmap.mmap) -> Contents:
+    """Walk the file's top-level records."""
+    contents = Contents()
+    end = len(file)
+    finished = False
+    walked = 0
+    try:
+        for opcode, at, stop in walk(file, len(MAGIC), end):
+            if at - walked > FORGET_BYTES:
+                forget(file, walked, at)
+                walked = at
+            if opcode == Op.FOOTER:
+                finished = file[stop : stop + len(MAGIC)] == MAGIC
+                break
+            try:
+                take_record(contents, file, opcode, at, stop)
+            except Malformed as bad:
+                if len(contents.damaged) < MOST_DAMAGED:
+                    contents.damaged.append(f"record at byte {at - PREFIX:,}: {bad.what}")
+    except Malformed as cut:
+        contents.cut = cut
+    if not finished and contents.cut is None:
+        contents.cut = Malformed("its footer is missing", end)
+    if contents.cut is not None:
+        if contents.chunks:  # the index records after the last whole chunk may be cut off
+            contents.chunks[-1] = replace(contents.chunks[-1], index={})
+        contents.cut_chunk = cut_chunk_at(file, contents.cut.at, end)
+    return contents
+
+
+def take_record(contents: Contents, file: mmap.mmap, opcode: int, at: int, stop: int) -> None:
+    """Add a top-level record, whose content is file[at:stop].
+
+    Raises:
+        Malformed: its fields reach beyond it.
+    """
+    if opcode == Op.MESSAGE and stop - at >= HEAD_SIZE - PREFIX:
+        channel = int.from_bytes(file[at : at + 2], "little")
+        contents.loose.setdefault(channel, []).append(at - PREFIX)
+    elif opcode == Op.CHUNK:
+        if len(contents.chunks) >= MOST_CHUNKS:
+            raise Malformed(f"more than {MOST_CHUNKS:,} chunks: not read", at)
+        contents.chunks.append(_chunk(file, at, stop))
+    elif opcode == Op.MESSAGE_INDEX and contents.chunks:
+        index = parse(Op.MESSAGE_INDEX, file, at, stop)
+        contents.chunks[-1].index[index["channel_id"]] = index["records"]
+    elif opcode == Op.SCHEMA:
+        schema = parse(Op.SCHEMA, file, at, stop)
+        low, high = schema["data"]
+        contents.schemas[schema["id"]] = {**schema, "data": file[low:high]}
+    elif opcode == Op.CHANNEL:
+        channel_record = parse(Op.CHANNEL, file, at, stop)
+        contents.channels[channel_record["id"]] = channel_record
+    elif opcode == Op.STATISTICS:
+        contents.statistics = parse(Op.STATISTICS, file, at, stop)
+    elif opcode == Op.DATA_END:
+        contents.data_end = at - PREFIX, parse(Op.DATA_END, file, at, stop)["data_section_crc"]
+    elif opcode == Op.ATTACHMENT:
+        attached = parse(Op.ATTACHMENT, file, at, stop)
+        low, high = attached["data"]
+        _name(contents, Extra("attachment", attached["name"], attached["media_type"], high - low))
+    elif opcode == Op.METADATA:
+        named = parse(Op.METADATA, file, at, stop)
+        _name(contents, Extra("metadata", named["name"], "", stop - at))
+    elif opcode == Op.HEADER and not contents.profile:
+        contents.profile = parse(Op.HEADER, file, at, stop)["profile"]
+
+
+def _name(contents: Contents, extra: Extra) -> None:
+    if len(contents.extras) < MOST_NAMED:
+        contents.extras.append(extra)
+    else:
+        contents.unnamed += 1
+
+
+def _chunk(file: mmap.mmap, at: int, stop: int) -> Chunk:
+    record = parse(Op.CHUNK, file, at, stop)
+    return Chunk(
+        at,
+        record["records"][0],
+        record["records"][1],
+        record["uncompressed_size"],
+        record["uncompressed_crc"],
+        record["compression"],
+        (record["message_start_time"], record["message_end_time"]),
+    )
+
+
+def cut_chunk_at(file: mmap.mmap, at: int, end: int) -> Chunk | None:
+    """The chunk at a place, whatever its record's length says: its fields, and what there is of
+    its records before `end`. None where that is nothing."""
+    if at < 0 or at + PREFIX + 40 > end or file[at] != Op.CHUNK:
+        return None
+    head = at + PREFIX
+    start_ns, end_ns, size = (
+        int.from_bytes(file[head + place : head + place + 8], "little") for place in (0, 8, 16)
+    )
+    crc = int.from_bytes(file[head + 24 : head + 28], "little")
+    length = int.from_bytes(file[head + 28 : head + 32], "little")
+    records = head + 32 + length + 8
+    if records >= end:
+        return None
+    compression = file[head + 32 : head + 32 + length].decode("utf-8", "backslashreplace")
+    stored = int.from_bytes(file[records - 8 : records], "little")
+    stop = min(records + stored, end)
+    return Chunk(at, records, stop, size, crc, compression, (start_ns, end_ns))

@@ -1,0 +1,209 @@
+"""MCAP files, read a few chunks at a time; a damaged chunk costs only its own messages."""
+
+from __future__ import annotations
+
+import mmap
+import zlib
+from collections.abc import Collection, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.errors import RecordingError
+from restock.ingest.containers import mcap_chunk
+from restock.ingest.containers.mapped import FORGET_BYTES, forget
+from restock.ingest.containers.mcap_chunk import LATEST_NS, Chunk, Messages
+from restock.ingest.containers.mcap_contents import survey
+from restock.ingest.containers.mcap_group import Checks, ChunkReader, batch_of
+from restock.ingest.containers.mcap_records import MAGIC
+from restock.ingest.containers.mcap_salvage import resume
+from restock.ingest.decoding.channel import Channel, Integrity
+from restock.ingest.decoding.columns import Batch
+
+GROUP_BYTES = 8 << 20  # of chunks decoded together: enough to amortise numpy's calls
+
+
+class McapFile:
+    """One MCAP file, chunked or not, with or without summary, statistics and message index.
+
+    Raises:
+        RecordingError: no MCAP file, or cut short and not to be salvaged.
+    """
+
+    def __init__(self, path: Path, *, salvage: bool = False) -> None:
+        self.path = path
+        self._checks = Checks()
+        self.damage, self.notes = self._checks.damage, self._checks.notes
+        with path.open("rb") as file:
+            self._file = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        if self._file[: len(MAGIC)] != MAGIC:
+            raise RecordingError("not an MCAP file: its first bytes are wrong", where=str(path))
+        self._buffer: NDArray[np.uint8] = np.frombuffer(self._file, np.uint8)
+        self._contents = survey(self._file)
+        self.profile = self._contents.profile
+        for what in self._contents.damaged:
+            self._checks.damaged(what, {})
+        self._refuse_cut(salvage)
+        self.extras = self._contents.extras
+        if self._contents.unnamed:
+            self.notes.append(f"{self._contents.unnamed:,} more attachments and metadata records")
+        self._chunks = ChunkReader(self._file, self._checks, self._contents.cut_chunk)
+        self.counts = self._count()
+        self.channels = self._channels()
+        self.span_ns = self._span()
+
+    def _refuse_cut(self, salvage: bool) -> None:
+        cut = self._contents.cut
+        if cut is None:
+            return
+        what = f"cut short or damaged at byte {cut.at:,} of {len(self._file):,}: {cut.what}"
+        if not salvage:
+            raise RecordingError(
+                what, where=str(self.path), remedy="`--salvage` reads what can still be read of it"
+            )
+        self._checks.damaged(what, {})
+        for lost in resume(self._file, self._contents):
+            self._checks.damaged(lost, {})
+        if self._contents.cut_chunk:
+            self._contents.chunks.append(self._contents.cut_chunk)
+
+    # -- what is there ---------------------------------------------------------------------
+
+    def _count(self) -> dict[int, int]:
+        """By the statistics where there are any, else by the index, else by walking chunks."""
+        contents = self._contents
+        claimed = contents.claimed_counts()
+        found = contents.indexed_counts()
+        if claimed is not None:
+            indexed = all(chunk.index for chunk in contents.chunks)
+            if indexed and any(count > found.get(number, 0) for number, count in claimed.items()):
+                contents.distrust_index()  # it leaves messages out; look for them
+                return claimed
+            more = {number for number, count in found.items() if count > claimed.get(number, 0)}
+            if more:
+                self.notes.append("its statistics count fewer messages than it holds")
+            return {**claimed, **{number: found[number] for number in more}}
+        for chunk in contents.chunks:
+            if not chunk.index:
+                for number, positions in self._chunks.walk(chunk).items():
+                    found[number] = found.get(number, 0) + len(positions)
+        return found
+
+    def _channels(self) -> dict[int, Channel]:
+        contents = self._contents
+        needed = {channel for channel, count in self.counts.items() if count}
+        schemas, channels = contents.schemas, contents.channels
+        for chunk in contents.chunks:
+            if needed <= channels.keys() and all(
+                channels[channel]["schema_id"] in schemas.keys() | {0} for channel in needed
+            ):
+                break
+            data = self._chunks.inflate(chunk)
+            more_schemas, more_channels = mcap_chunk.definitions(data, 0, len(data))
+            schemas = {**more_schemas, **schemas}
+            channels = {**more_channels, **channels}
+        found = {}
+        for number, channel in channels.items():
+            schema = schemas.get(channel["schema_id"], {})
+            found[number] = Channel(
+                number,
+                channel["topic"],
+                schema.get("name", ""),
+                channel["message_encoding"],
+                schema.get("encoding", ""),
+                schema.get("data", b""),
+            )
+        for number in needed - found.keys():
+            what = f"{self.counts[number]} messages of channel {number}, which the file never names"
+            self._checks.damaged(what, {number: self.counts[number]})
+        return found
+
+    def _span(self) -> tuple[int, int] | None:
+        contents = self._contents
+        # A chunk without messages says 0 to 0.
+        spans = [chunk.span_ns for chunk in contents.chunks if any(chunk.span_ns)]
+        for _, messages in self._loose(contents.loose):
+            stamps = messages.log_time_ns
+            spans.append((int(stamps.min()), int(stamps.max())))
+        if not spans or not any(self.counts.values()):
+            return None
+        low, high = min(low for low, _ in spans), max(high for _, high in spans)
+        return min(low, LATEST_NS), min(high, LATEST_NS)
+
+    # -- integrity -------------------------------------------------------------------------
+
+    @property
+    def integrity(self) -> Integrity:
+        """Whether checksums vouch for what was read so far."""
+        return self._checks.integrity
+
+    def _check_loose(self) -> None:
+        """Messages outside chunks are vouched for by the CRC of the whole data section."""
+        position, crc = self._contents.data_end
+        if not crc:
+            self._checks.unchecked += 1
+            return
+        found = 0
+        for start in range(0, position, FORGET_BYTES):
+            stop = min(start + FORGET_BYTES, position)
+            found = zlib.crc32(self._buffer[start:stop].data, found)
+            forget(self._file, start, stop)
+        if found == crc:
+            self._checks.verified += 1
+        else:
+            self._checks.damaged("the CRC of its data section does not match", {})
+
+    # -- reading ---------------------------------------------------------------------------
+
+    def batches(self, channels: Collection[int]) -> Iterator[tuple[int, Batch]]:
+        """Loose messages first, then groups of chunks of about 8 MiB.
+
+        A batch is valid until the next one is asked for: its buffer is used again.
+        """
+        wanted = set(channels)
+        loose = wanted & self._contents.loose.keys()
+        if loose:
+            self._check_loose()
+        for channel, found in self._loose(loose):
+            yield channel, batch_of(self._buffer, [found])
+        for group in self._groups(wanted):
+            yield from self._chunks.read(group, wanted)
+            forget(self._file, group[0].at, group[-1].stop)
+
+    def _loose(self, channels: Collection[int]) -> Iterator[tuple[int, Messages]]:
+        """These channels' messages outside chunks, from about 8 MiB of the file at a time."""
+        places = {c: np.asarray(self._contents.loose[c], np.int64) for c in sorted(channels)}
+        if not places:
+            return
+        end = max(int(at[-1]) for at in places.values()) + 1
+        for start in range(min(int(at[0]) for at in places.values()), end, GROUP_BYTES):
+            stop = start + GROUP_BYTES
+            for channel, at in places.items():
+                low, high = np.searchsorted(at, (start, stop)).tolist()
+                if low < high:
+                    yield channel, mcap_chunk.messages_at(self._buffer, at[low:high])
+            forget(self._file, start, stop)
+
+    def _groups(self, wanted: set[int]) -> Iterator[list[Chunk]]:
+        group: list[Chunk] = []
+        size = 0
+        for chunk in self._contents.chunks:
+            known = self._chunks.walked.get(chunk.at, chunk.index)
+            if known and not known.keys() & wanted:
+                continue
+            group.append(chunk)
+            size += chunk.size
+            if size >= GROUP_BYTES:
+                yield group
+                group, size = [], 0
+        if group:
+            yield group
+
+    def close(self) -> None:
+        """Let go of the file; the arrays that were read from it stay valid."""
+        self._contents.loose.clear()
+        del self._buffer
+        with suppress(BufferError):  # a batch still looks into it: closed when that goes
+            self._file.close()

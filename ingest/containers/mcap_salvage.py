@@ -1,0 +1,156 @@
+"""Beyond the damage in an MCAP file: chunks that can be proven to be there are read again.
+
+Where the summary at the file's end is whole, its chunk index says where chunks are; a chunk's own
+record must say the same. Without one, a compressed chunk shows by the name of its compression and
+two lengths that must agree. Its CRC is checked when it is read, as always.
+"""
+
+from __future__ import annotations
+
+import mmap
+import zlib
+from collections.abc import Iterator
+from typing import Any
+
+from restock.ingest.containers.mcap_chunk import Chunk
+from restock.ingest.containers.mcap_contents import Contents, cut_chunk_at, take_record
+from restock.ingest.containers.mcap_records import MAGIC, PREFIX, Malformed, Op, parse, walk
+
+FOOTER_SIZE = PREFIX + 20
+BEFORE_COMPRESSION = PREFIX + 28  # of a chunk's record: times, size, CRC
+_NAMES = (b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4")
+
+
+def resume(file: mmap.mmap, contents: Contents) -> list[str]:
+    """Add what lies beyond the place where the walk ended; what is lost, in words.
+
+    Where nothing can be proven, the file is read up to the damage, and what there is of the
+    chunk that was cut.
+    """
+    cut = contents.cut
+    if cut is None:
+        return []
+    summary = _summary(file)
+    if summary is not None and summary.statistics is not None and summary.indexed:
+        return _by_index(file, contents, summary, cut.at)
+    return _by_scan(file, contents, cut.at)
+
+
+class _Summary:
+    """The records of the summary section."""
+
+    def __init__(self) -> None:
+        self.indexed: list[dict[str, Any]] = []  # chunk index records
+        self.definitions: list[tuple[int, int, int]] = []  # schemas, channels: opcode, start, stop
+        self.statistics: dict[str, Any] | None = None
+        self.start = 0
+
+
+def _summary(file: mmap.mmap) -> _Summary | None:
+    """The summary section, if it is whole."""
+    end = len(file) - len(MAGIC)
+    at = end - FOOTER_SIZE
+    if at < len(MAGIC) or file[end:] != MAGIC or file[at] != Op.FOOTER:
+        return None
+    footer = parse(Op.FOOTER, file, at + PREFIX, end)
+    found = _Summary()
+    found.start = footer["summary_start"]
+    if not len(MAGIC) <= found.start <= at:
+        return None
+    checked = memoryview(file)[found.start : at + PREFIX + 16]
+    try:
+        if footer["summary_crc"] and zlib.crc32(checked) != footer["summary_crc"]:
+            return None
+    finally:
+        checked.release()
+    try:
+        for opcode, start, stop in walk(file, found.start, at):
+            if opcode == Op.CHUNK_INDEX:
+                found.indexed.append(parse(Op.CHUNK_INDEX, file, start, stop))
+            elif opcode == Op.STATISTICS:
+                found.statistics = parse(Op.STATISTICS, file, start, stop)
+            elif opcode in (Op.SCHEMA, Op.CHANNEL):
+                found.definitions.append((opcode, start, stop))
+    except Malformed:
+        return None
+    return found
+
+
+def _by_index(file: mmap.mmap, contents: Contents, summary: _Summary, cut: int) -> list[str]:
+    """The chunks are those of the chunk index whose records say the same."""
+    lost = []
+    chunks = []
+    for record in summary.indexed:
+        at = record["chunk_start_offset"]
+        chunk = cut_chunk_at(file, at, min(at + record["chunk_length"], summary.start))
+        if (
+            chunk is None
+            or (chunk.size, chunk.compression)
+            != (record["uncompressed_size"], record["compression"])
+            or chunk.stop - chunk.start != record["compressed_size"]
+        ):
+            lost.append(f"chunk at byte {at:,} is lost: its record is damaged")
+        else:
+            chunks.append(chunk)
+    contents.chunks = sorted(chunks, key=lambda chunk: chunk.at)
+    for opcode, start, stop in summary.definitions:
+        take_record(contents, file, opcode, start, stop)
+    contents.statistics = summary.statistics
+    # Messages outside chunks that the walk took for such within the damage are none.
+    contents.loose = {
+        channel: whole
+        for channel, places in contents.loose.items()
+        if (whole := [at for at in places if at < cut and not _within(at, contents.chunks)])
+    }
+    contents.cut_chunk = None
+    contents.resumed = True
+    return lost
+
+
+def _within(at: int, chunks: list[Chunk]) -> bool:
+    return any(chunk.at <= at < chunk.stop for chunk in chunks)
+
+
+def _by_scan(file: mmap.mmap, contents: Contents, cut: int) -> list[str]:
+    """Go on at each next chunk that shows itself, walking from there to the next damage."""
+    lost = []
+    for at in _shown(file, cut + 1):
+        if at < cut:
+            continue  # within what was walked since
+        first = (
+            f"{at - cut:,} bytes from byte {cut:,} on are lost: reading goes on at the next chunk"
+        )
+        lost.append(first)
+        if contents.cut_chunk is not None:  # it ends where the next begins, at the latest
+            contents.cut_chunk = cut_chunk_at(file, contents.cut_chunk.at, at)
+            if contents.cut_chunk is not None:
+                contents.chunks.append(contents.cut_chunk)
+                contents.cut_chunk = None
+        try:
+            for opcode, start, stop in walk(file, at, len(file)):
+                cut = stop
+                if opcode == Op.FOOTER:
+                    contents.resumed = contents.statistics is not None
+                    return lost
+                take_record(contents, file, opcode, start, stop)
+        except Malformed as again:
+            cut = again.at
+            contents.cut_chunk = cut_chunk_at(file, cut, len(file))
+    return [*lost, f"{len(file) - cut:,} bytes from byte {cut:,} on are lost"]
+
+
+def _shown(file: mmap.mmap, start: int) -> Iterator[int]:
+    """Where chunks with a compression by name are, by two lengths that agree."""
+    nearest = {name: file.find(name, start) for name in _NAMES}
+    while places := {at: name for name, at in nearest.items() if at >= 0}:
+        place = min(places)
+        name = places[place]
+        nearest[name] = file.find(name, place + 1)
+        at = place - BEFORE_COMPRESSION
+        if at < start or file[at] != Op.CHUNK:
+            continue
+        length = int.from_bytes(file[at + 1 : at + PREFIX], "little")
+        inner = place + len(name)
+        stored = int.from_bytes(file[inner : inner + 8], "little")
+        if inner + 8 + stored == at + PREFIX + length <= len(file):
+            yield at

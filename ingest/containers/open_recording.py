@@ -1,0 +1,209 @@
+"""Opening recordings: from a path to columns, whatever the container.
+
+with open_recording(Path("logs/run.mcap")) as recording:
+    columns = recording.read({"/odom": ["twist.twist.linear.x", "header.stamp"]})
+columns["/odom"].fields["twist.twist.linear.x"]  # (N,) float64
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from restock.errors import RecordingError, visible
+from restock.ingest.containers import discover
+from restock.ingest.containers.compression import decompress_file
+from restock.ingest.containers.discover import METADATA, recordings_in
+from restock.ingest.containers.mcap_file import McapFile
+from restock.ingest.containers.message_account import Account, Loss, TopicInfo
+from restock.ingest.containers.recording import Recording
+from restock.ingest.containers.sqlite_file import SqliteFile
+from restock.ingest.decoding.channel import Damage, Storage
+from restock.ingest.decoding.columns import Ragged, TopicColumns
+from restock.ingest.decoding.decoders import READABLE
+from restock.ingest.decoding.definitions import DEFAULT_DISTRO, refuse_unknown
+
+
+def open_recording(
+    path: Path | str, *, typestore: str | None = None, salvage: bool = False
+) -> Recording:
+    """Open an MCAP file, a rosbag2 folder or one of its files, or a ROS 1 bag.
+
+    Args:
+        path: the file or folder.
+        typestore: the distribution ("humble", "jazzy", …) whose message definitions are used
+            where a recording carries none, as older sqlite3 bags do.
+        salvage: read what can still be read of a file that is cut short or damaged, instead of
+            refusing it; what is missing is in the recording's `losses`.
+
+    Raises:
+        RecordingError: no such file, empty, a Git LFS pointer, no recording, cut short (unless
+            `salvage`), or in a serialisation that is not CDR.
+    """
+    path = Path(path)
+    distro = typestore or DEFAULT_DISTRO
+    refuse_unknown(distro)  # before anything is opened
+    return _Opening(path, distro, salvage).open()
+
+
+class _Opening:
+    """Opens the files of one recording, and lets go of them again if one is refused."""
+
+    def __init__(self, path: Path, distro: str, salvage: bool) -> None:
+        self.path, self.distro, self.salvage = path, distro, salvage
+        self.storages: list[Storage] = []
+        self.kinds: list[str] = []
+        self.damage: list[Damage] = []
+        self.notes: list[str] = []
+        self.cleanup: list[Callable[[], None]] = []
+
+    def open(self) -> Recording:
+        try:
+            return self._open()
+        except BaseException:
+            for storage in self.storages:
+                storage.close()
+            for clean in self.cleanup:
+                clean()
+            raise
+
+    def _open(self) -> Recording:
+        metadata: dict[str, Any] = {}
+        if self.path.is_dir():
+            files, metadata = self._bag()
+        elif self.path.exists():
+            files = [self.path]
+        else:
+            raise RecordingError("no such file or folder", where=str(self.path))
+        for file in files:
+            self._open_file(file)
+        self._refuse_serialisation(metadata)
+        recording = Recording(self.path, self._format(), files, self.storages, self.distro)
+        recording.adopt(self.damage, self.notes, self.cleanup)
+        self._compare(recording, metadata)
+        return recording
+
+    def _bag(self) -> tuple[list[Path], dict[str, Any]]:
+        if not discover.is_bag(self.path):
+            raise RecordingError(
+                f"a folder that is no bag: it has no {METADATA}",
+                where=str(self.path),
+                remedy="name one recording, or use `recordings_in` to find those in a folder",
+            )
+        metadata, problem = discover.read_metadata(self.path)
+        if problem:
+            self.notes.append(problem)
+        files, missing = discover.bag_files(self.path, metadata)
+        if not files:
+            listed = f"; {METADATA} lists {', '.join(missing)}" if missing else ""
+            raise RecordingError(
+                f"a bag without its storage files{listed}",
+                where=str(self.path),
+                remedy="copy the whole folder",
+            )
+        for name in missing:
+            self.damage.append(Damage(f"{METADATA} lists {name}, which is not there"))
+        return files, metadata
+
+    def _open_file(self, file: Path, *, inner: bool = False) -> None:
+        kind = discover.kind_of(file)
+        if kind == "zstd":
+            if inner:
+                raise RecordingError("compressed twice", where=str(self.path))
+            self._open_compressed(file)
+        elif kind == "mcap":
+            self._add("mcap", McapFile(file, salvage=self.salvage))
+        elif kind == "sqlite3":
+            self._add("sqlite3", SqliteFile(file, salvage=self.salvage))
+        else:
+            from restock.ingest.containers.ros1_file import Ros1File
+
+            self._add("ros1", Ros1File(file))
+
+    def _open_compressed(self, file: Path) -> None:
+        folder = tempfile.TemporaryDirectory(prefix="restock-")
+        self.cleanup.append(folder.cleanup)
+        plain = Path(folder.name) / file.with_suffix("").name
+        if problem := decompress_file(file, plain, salvage=self.salvage):
+            self.damage.append(Damage(f"{file.name}: {problem}"))
+        try:
+            self._open_file(plain, inner=True)
+        except RecordingError as error:
+            raise RecordingError(
+                f"{error.what} (decompressed)", where=str(file), remedy=error.remedy
+            ) from error
+
+    def _add(self, kind: str, storage: Storage) -> None:
+        self.storages.append(storage)
+        self.kinds.append(kind)
+
+    def _format(self) -> str:
+        kind = self.kinds[0]
+        if any(other != kind for other in self.kinds):
+            raise RecordingError(
+                f"a bag of both {' and '.join(sorted(set(self.kinds)))} files",
+                where=str(self.path),
+                remedy="name its files one by one",
+            )
+        if kind == "mcap":
+            return "rosbag2-mcap" if self.path.is_dir() else "mcap"
+        return {"sqlite3": "rosbag2-sqlite3", "ros1": "ros1"}[kind]
+
+    def _refuse_serialisation(self, metadata: dict[str, Any]) -> None:
+        """rosbag2 can store what other middlewares serialise: only CDR can be decoded."""
+        ros2 = [
+            storage
+            for storage in self.storages
+            if isinstance(storage, SqliteFile)
+            or (isinstance(storage, McapFile) and storage.profile == "ros2")
+        ]
+        found = {channel.encoding for storage in ros2 for channel in storage.channels.values()}
+        said = [topic.get("serialization_format") for topic, _ in _claims(metadata)]
+        claimed = {name for name in said if isinstance(name, str)}
+        for formats in (found, claimed - {""}):
+            if formats and not formats & set(READABLE):
+                names = ", ".join(sorted(map(repr, formats)))
+                raise RecordingError(
+                    f"its messages are serialised as {names}, and only CDR is read",
+                    where=str(self.path),
+                    remedy="`ros2 bag convert` with that middleware installed rewrites it as cdr",
+                )
+
+    def _compare(self, recording: Recording, metadata: dict[str, Any]) -> None:
+        """metadata.yaml's counts are a claim about the files: differences are worth saying."""
+        for topic, count in _claims(metadata):
+            name = topic.get("name")
+            if not isinstance(name, str) or not isinstance(count, int):
+                continue
+            name = visible(name)  # as the files' own names are
+            info = recording.topics.get(name)
+            there = info.expected if info else 0
+            if there != count:
+                recording.notes.append(
+                    f"{METADATA} counts {count} messages on {name}, the files hold {there}"
+                )
+
+
+def _claims(metadata: dict[str, Any]) -> list[tuple[dict[str, Any], Any]]:
+    topics = metadata.get("topics_with_message_count")
+    if not isinstance(topics, list):
+        return []
+    return [
+        (topic["topic_metadata"], topic.get("message_count"))
+        for topic in topics
+        if isinstance(topic, dict) and isinstance(topic.get("topic_metadata"), dict)
+    ]
+
+
+__all__ = [
+    "Account",
+    "Loss",
+    "Ragged",
+    "Recording",
+    "TopicColumns",
+    "TopicInfo",
+    "open_recording",
+    "recordings_in",
+]

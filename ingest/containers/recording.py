@@ -1,0 +1,267 @@
+"""One recording, open: its topics, its columns, and the account of what became of each message.
+
+Whatever the container, messages come in the order of their log time, and what was expected, read,
+decoded and skipped is kept per topic.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from restock.errors import RecordingError
+from restock.ingest.containers.compression import decompressed
+from restock.ingest.containers.message_account import Account, Loss, TopicInfo
+from restock.ingest.containers.topic_reading import Reduction, TopicReading, together
+from restock.ingest.decoding.channel import Channel, Damage, Extra, Integrity, Storage
+from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.decoding.decoders import decoder_of, type_of
+from restock.ingest.decoding.field_paths import CannotDecode, Leaf, MessageType
+from restock.ingest.decoding.row_by_row import Decoder
+
+
+@dataclass(frozen=True)
+class _Stream:
+    """A channel of one of the recording's files."""
+
+    storage: Storage
+    channel: Channel
+
+    def payloads(self) -> Iterator[bytes]:
+        """Its messages as they are in the file, in file order."""
+        for _, batch in self.storage.batches([self.channel.id]):
+            for plain, _ in decompressed(batch):
+                yield from plain.payloads()
+
+
+class Recording:
+    """One recording, open: an MCAP file, or a bag with all its files.
+
+    `topics` names every topic with its type and count; `read` decodes some of them. After it
+    `accounts` says per topic what was expected, read, decoded and skipped, and `losses` what is
+    missing. Use as a context manager, or call `close`.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        format: str,
+        files: Sequence[Path],
+        storages: Sequence[Storage],
+        distro: str,
+    ) -> None:
+        self.path, self.format, self.files, self.distro = path, format, tuple(files), distro
+        self.accounts: dict[str, Account] = {}
+        self.notes: list[str] = []
+        self._storages = tuple(storages)
+        self._cleanup: list[Callable[[], None]] = []
+        self._bag_damage: list[Damage] = []
+        self._streams: dict[str, list[_Stream]] = {}
+        self._types: dict[tuple[int, int], MessageType] = {}  # by storage and channel
+        for storage in self._storages:
+            for channel in storage.channels.values():
+                self._streams.setdefault(channel.topic, []).append(_Stream(storage, channel))
+
+    def adopt(
+        self,
+        damage: Sequence[Damage],
+        notes: Sequence[str],
+        cleanup: Sequence[Callable[[], None]],
+    ) -> None:
+        """Take over what was found, and what is to be done at the end, from who opened it."""
+        self._bag_damage += damage
+        self.notes += [*notes, *(note for storage in self._storages for note in storage.notes)]
+        self._cleanup += cleanup
+
+    @cached_property
+    def recording_id(self) -> str:
+        """16 hex digits of the content of its files, in order: the same wherever it lies."""
+        digest = hashlib.blake2b(digest_size=8)
+        for file in self.files:
+            digest.update(str(file.stat().st_size).encode())
+            with file.open("rb") as content:
+                while block := content.read(1 << 20):
+                    digest.update(block)
+        return digest.hexdigest()
+
+    @cached_property
+    def topics(self) -> dict[str, TopicInfo]:
+        """Every topic by name, in alphabetical order."""
+        return {name: self._info(name) for name in sorted(self._streams)}
+
+    def _info(self, name: str) -> TopicInfo:
+        streams = self._streams[name]
+        first = streams[0].channel
+        expected = sum(stream.storage.counts.get(stream.channel.id, 0) for stream in streams)
+        try:
+            source, skipped = self._type(streams[0]).source, None
+        except CannotDecode as reason:
+            source, skipped = "", str(reason)
+        return TopicInfo(name, first.type, expected, first.encoding, source, skipped)
+
+    def _type(self, stream: _Stream) -> MessageType:
+        key = self._storages.index(stream.storage), stream.channel.id
+        if key not in self._types:
+            self._types[key] = type_of(stream.channel, self.distro, stream.payloads)
+        return self._types[key]
+
+    @property
+    def size_bytes(self) -> int:
+        """Of all its files."""
+        return sum(file.stat().st_size for file in self.files)
+
+    @property
+    def span_ns(self) -> tuple[int, int] | None:
+        """First and last log time; None in a recording without messages."""
+        spans = [storage.span_ns for storage in self._storages if storage.span_ns]
+        if not spans:
+            return None
+        return min(low for low, _ in spans), max(high for _, high in spans)
+
+    @property
+    def messages(self) -> int:
+        """Of all topics, by the container's own count."""
+        return sum(topic.expected for topic in self.topics.values())
+
+    @property
+    def integrity(self) -> Integrity:
+        """Whether checksums vouch for what was read; final after `read`."""
+        found = {storage.integrity for storage in self._storages}
+        if "damaged" in found or self._bag_damage:
+            return "damaged"
+        return "unverified" if "unverified" in found else "verified"
+
+    @property
+    def damage(self) -> list[Damage]:
+        """What of its files could not be read."""
+        return self._bag_damage + [item for storage in self._storages for item in storage.damage]
+
+    @property
+    def extras(self) -> list[Extra]:
+        """What its files hold beside messages: attachments and metadata records, by name."""
+        return [extra for storage in self._storages for extra in storage.extras]
+
+    @property
+    def losses(self) -> list[Loss]:
+        """What is missing: of the files, and of the topics that were read."""
+        found = [Loss(None, sum(item.messages.values()) or None, item.what) for item in self.damage]
+        for account in self.accounts.values():
+            found += [Loss(account.topic, n, reason) for reason, n in account.reasons.items() if n]
+        return found
+
+    def leaves(self, topic: str) -> list[str]:
+        """Every field path of a topic's messages; empty where it cannot be decoded."""
+        return [leaf.path for leaf in self.fields(topic)]
+
+    def fields(self, topic: str) -> list[Leaf]:
+        """Every field of a topic's messages, with its type; empty where it cannot be decoded."""
+        try:
+            return self._type(self._streams[topic][0]).leaves()
+        except CannotDecode:
+            return []
+
+    def read(
+        self,
+        wanted: Mapping[str, Sequence[str]],
+        reductions: Mapping[str, Reduction] | None = None,
+    ) -> dict[str, TopicColumns]:
+        """Columns of these topics: field paths to arrays (N, …) or Ragged, by log time.
+
+        A topic that cannot be decoded is not in the answer; `accounts` says why. `reductions`
+        names, of some of these topics, fields that are made into others as they are read: for
+        fields that are wide, and of which little is needed.
+
+        Raises:
+            RecordingError: the recording has no such topic, or its messages no such field.
+        """
+        unknown = [topic for topic in wanted if topic not in self._streams]
+        if unknown:
+            raise RecordingError(
+                f"no topic named {unknown[0]!r}",
+                where=str(self.path),
+                remedy=f"it has {', '.join(sorted(self._streams)) or 'none'}",
+            )
+        readings = {
+            topic: TopicReading(self.topics[topic], paths, (reductions or {}).get(topic))
+            for topic, paths in wanted.items()
+        }
+        for storage in self._storages:
+            self._read_storage(storage, readings)
+        columns = {}
+        for topic, reading in readings.items():
+            self.accounts[topic] = reading.close(self._lost(topic))
+            if reading.decodable:
+                columns[topic] = reading.columns()
+        for storage in self._storages:
+            self.notes += [note for note in storage.notes if note not in self.notes]
+        return columns
+
+    def _read_storage(
+        self,
+        storage: Storage,
+        readings: Mapping[str, TopicReading],
+    ) -> None:
+        decoders: dict[int, Decoder] = {}
+        topics: dict[int, str] = {}
+        for topic, reading in readings.items():
+            for stream in self._streams[topic]:
+                if stream.storage is not storage:
+                    continue
+                topics[stream.channel.id] = topic
+                try:
+                    decoder = self._decoder(topic, stream, reading.paths)
+                    reading.use(decoder.empty())
+                    decoders[stream.channel.id] = decoder
+                except CannotDecode as reason:
+                    count = storage.counts.get(stream.channel.id, 0)
+                    reading.skip(str(reason), count)
+        for channel, batch in together(storage.batches(list(decoders))):
+            readings[topics[channel]].take(decoders[channel].decode, batch)
+
+    def _decoder(self, topic: str, stream: _Stream, paths: Sequence[str]) -> Decoder:
+        channel, kind = stream.channel, self._type(stream)
+        if channel.type != self.topics[topic].type:
+            raise CannotDecode(f"it also carries {channel.type}, beside {self.topics[topic].type}")
+        try:
+            leaves = [kind.leaf(path) for path in paths]
+            first = self._type(self._streams[topic][0])
+            for leaf, before in zip(leaves, map(first.leaf, paths), strict=True):
+                if (leaf.kind, leaf.dims) != (before.kind, before.dims):
+                    raise CannotDecode(f"{leaf.path} is a {leaf.kind} here, a {before.kind} before")
+        except RecordingError as error:
+            raise RecordingError(
+                error.what, where=f"{self.path}, {topic}", remedy=error.remedy
+            ) from None
+        return decoder_of(channel, kind, leaves)
+
+    def _lost(self, topic: str) -> dict[str, int]:
+        """Messages of a topic that damage is known to have cost, by reason."""
+        lost: dict[str, int] = {}
+        for stream in self._streams[topic]:
+            for item in stream.storage.damage:
+                if count := item.messages.get(stream.channel.id):
+                    lost[item.what] = lost.get(item.what, 0) + count
+        return lost
+
+    def close(self) -> None:
+        """Let go of its files."""
+        for storage in self._storages:
+            storage.close()
+        for clean in self._cleanup:
+            clean()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()

@@ -1,0 +1,178 @@
+"""One topic being read: batches of payloads in, columns that grow out, and their account.
+
+Of a batch only the wanted fields stay, and of wide ones (a scan's ranges) only what a `Reduction`
+makes of them: what is in memory does not grow with a recording's bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from restock.ingest.containers.compression import decompressed
+from restock.ingest.containers.message_account import Account, TopicInfo
+from restock.ingest.decoding.columns import I64, Batch, FieldColumn, TopicColumns, take
+from restock.ingest.decoding.growing_columns import GrowingArray, GrowingColumn
+from restock.ingest.decoding.row_by_row import Decoded
+
+SMALL_ROWS = 1024  # batches of fewer messages are put together, up to
+TOGETHER_ROWS = 4096
+TOGETHER_BYTES = 4 << 20
+LATEST_NS = 2**63 - 1
+ABSURD = "logged at an absurd time, before 1970 or after 2262"
+
+Fields = Mapping[str, FieldColumn]
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """Fields of a topic that are read to be made into others, batch by batch, and not kept.
+
+    `apply` gets columns of N messages and answers with columns of N rows, each row made of its
+    own message alone, so that it does not matter which messages come together.
+    """
+
+    fields: tuple[str, ...]
+    apply: Callable[[Fields], dict[str, FieldColumn]]
+
+
+class TopicReading:
+    """What has come of one topic so far."""
+
+    def __init__(
+        self, topic: TopicInfo, wanted: Iterable[str], reduction: Reduction | None = None
+    ) -> None:
+        self._account = Account(topic.name, topic.type, topic.expected)
+        self._wanted, self._reduction = list(dict.fromkeys(wanted)), reduction
+        none = np.zeros(0, np.int64)
+        self._log, self._publish = GrowingArray(none), GrowingArray(none)
+        self._fields: dict[str, GrowingColumn] = {}
+        self.decodable = False
+
+    @property
+    def paths(self) -> list[str]:
+        """The fields to decode: those wanted, and those that are reduced."""
+        return list(dict.fromkeys([*self._wanted, *self._reduced]))
+
+    @property
+    def _reduced(self) -> tuple[str, ...]:
+        return self._reduction.fields if self._reduction else ()
+
+    def use(self, empty: Fields) -> None:
+        """Make columns for the fields decoded, even if no message comes."""
+        self.decodable = True
+        for path, column in self._kept(empty).items():
+            self._fields.setdefault(path, GrowingColumn(column))
+
+    def skip(self, reason: str, count: int) -> None:
+        """Messages that are not read at all."""
+        self._add({reason: count})
+
+    def take(self, decode: Callable[[Batch], Decoded], batch: Batch) -> None:
+        """Decode a batch and keep its columns."""
+        self._account.read += len(batch)
+        for plain, damaged in decompressed(batch):
+            if damaged:
+                self._add({"its zstd data is damaged": damaged})
+            self._take(decode, plain)
+
+    def _take(self, decode: Callable[[Batch], Decoded], batch: Batch) -> None:
+        account = self._account
+        sane = (batch.log_time_ns >= 0) & (batch.log_time_ns < LATEST_NS)
+        if not sane.all():
+            self._add({ABSURD: int((~sane).sum())})
+            batch = batch.select(np.flatnonzero(sane))
+        decoded = decode(batch)
+        self._add(decoded.bad)
+        account.decoded += len(decoded.rows)
+        self._log.add(batch.log_time_ns[decoded.rows], account.expected)
+        self._publish.add(batch.publish_time_ns[decoded.rows], account.expected)
+        for path, column in self._kept(decoded.fields).items():
+            self._fields[path].add(column, account.expected)
+
+    def _kept(self, fields: Fields) -> dict[str, FieldColumn]:
+        kept = {path: fields[path] for path in self._wanted}
+        if self._reduction:
+            kept |= self._reduction.apply({path: fields[path] for path in self._reduced})
+        return kept
+
+    def _add(self, reasons: Mapping[str, int]) -> None:
+        for reason, count in reasons.items():
+            self._account.reasons[reason] = self._account.reasons.get(reason, 0) + count
+
+    def close(self, lost: Mapping[str, int]) -> Account:
+        """The account, reconciled: what the container counts beyond what came is a loss too."""
+        account = self._account
+        self._add(lost)
+        unsaid = account.expected - account.decoded - sum(account.reasons.values())
+        if unsaid > 0:
+            self._add({"counted by the container, but not in it": unsaid})
+        return account
+
+    def columns(self) -> TopicColumns:
+        """All of it, in the order of log time."""
+        log, publish = self._log.array(), self._publish.array()
+        fields: dict[str, FieldColumn] = {}
+        order = None
+        self._account.log_backsteps = int((log[1:] < log[:-1]).sum())
+        if self._account.log_backsteps:
+            order = np.argsort(log, kind="stable")
+            log, publish = log[order], publish[order]
+        for path in list(self._fields):  # one by one: each lets go of its unordered self
+            column = self._fields.pop(path).column()
+            fields[path] = column if order is None else take(column, order)
+        return TopicColumns(log, publish, fields)
+
+
+@dataclass
+class _Held:
+    """Small batches of one channel, waiting for more."""
+
+    payloads: list[bytes] = field(default_factory=list)
+    log_time_ns: list[I64] = field(default_factory=list)
+    publish_time_ns: list[I64] = field(default_factory=list)
+    size: int = 0  # bytes
+
+    def add(self, batch: Batch) -> None:
+        self.payloads += batch.payloads()
+        self.log_time_ns.append(batch.log_time_ns)
+        self.publish_time_ns.append(batch.publish_time_ns)
+        self.size += _bytes(batch)
+
+    def batch(self) -> Batch:
+        return Batch.of(
+            self.payloads,
+            np.concatenate(self.log_time_ns),
+            np.concatenate(self.publish_time_ns),
+        )
+
+
+def together(batches: Iterable[tuple[int, Batch]]) -> Iterator[tuple[int, Batch]]:
+    """The same messages by channel, in the same order, with small batches put together.
+
+    Decoding has a price per batch, beside that per message: of a topic of few messages a second
+    there are only a handful in 8 MiB of a recording.
+    """
+    held: dict[int, _Held] = {}
+    for channel, batch in batches:
+        small = len(batch) < SMALL_ROWS and _bytes(batch) < TOGETHER_BYTES // 4
+        if small:
+            waiting = held.setdefault(channel, _Held())
+            waiting.add(batch)
+            if len(waiting.payloads) >= TOGETHER_ROWS or waiting.size >= TOGETHER_BYTES:
+                yield channel, held.pop(channel).batch()
+            continue
+        if channel in held:
+            yield channel, held.pop(channel).batch()
+        yield channel, batch
+    for channel, waiting in held.items():
+        yield channel, waiting.batch()
+
+
+def _bytes(batch: Batch) -> int:
+    return int((batch.stop - batch.start).sum())
+
+
+__all__ = ["Fields", "Reduction", "TopicReading", "together"]

@@ -1,0 +1,120 @@
+"""Message definitions compiled to column operations."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from typing import Any
+
+import numpy as np
+
+from restock.ingest.decoding.cdr_plan import Plan, Primitives, Repeat, Text
+from restock.ingest.decoding.cdr_run import Item, Run
+from restock.ingest.decoding.definitions import TIMES, RosType
+from restock.ingest.decoding.field_paths import DTYPES, CannotDecode, FieldType
+
+
+class _Compiler:
+    """Walks a definition and collects its operations."""
+
+    def __init__(self, message: RosType, wanted: Collection[str], ros1: bool) -> None:
+        self.message, self.wanted, self.ros1 = message, wanted, ros1
+
+    def plan(self, name: str, prefix: str) -> Plan:
+        """The plan of a message whose fields' paths start with `prefix`."""
+        plan = Plan([], {})
+        run: list[Item] = []
+        self._message(name, prefix, plan, run)
+        self._close(plan, run)
+        return plan
+
+    def _close(self, plan: Plan, run: list[Item]) -> None:
+        if run:
+            plan.operations.append(Run(list(run)))
+            run.clear()
+
+    def _message(self, name: str, prefix: str, plan: Plan, run: list[Item]) -> None:
+        fields = self.message.fields_of(name)
+        if not fields and not self.ros1:  # C and C++ know no empty structure: a byte stands in
+            run.append(Item(np.dtype(np.uint8), None, 1, None))
+        for part in fields:
+            self._field(part, prefix + part.name, plan, run)
+
+    def _field(self, part: FieldType, path: str, plan: Plan, run: list[Item]) -> None:
+        wanted = self._wanted(path)
+        if part.base and part.base != "string":
+            dtype = DTYPES[part.base]
+            if part.many is None or part.many.length is not None:
+                count = part.many.length if part.many else None
+                run.append(self._item(dtype, count, wanted))
+                self._note(plan, wanted, part.base, () if count is None else (count,))
+                return
+            self._close(plan, run)
+            plan.operations.append(Primitives(dtype, wanted, self.ros1))
+            self._note(plan, wanted, part.base, (None,))
+        elif part.many:
+            self._repeat(part, path, plan, run)
+        elif part.base:
+            self._close(plan, run)
+            plan.operations.append(Text(wanted, self.ros1))
+            self._note(plan, wanted, "string", ())
+        elif part.message in TIMES:
+            self._time(str(part.message), path, ".", plan, run)
+        else:
+            self._message(str(part.message), path + ".", plan, run)
+
+    def _repeat(self, part: FieldType, path: str, plan: Plan, run: list[Item]) -> None:
+        length = part.many.length if part.many else None
+        self._close(plan, run)
+        if part.base:
+            wanted = self._wanted(path)
+            inner = Plan([Text(wanted, self.ros1)], {})
+            self._note(inner, wanted, "string", ())
+        elif part.message in TIMES:
+            inner, inside = Plan([], {}), list[Item]()
+            self._time(str(part.message), path, "[].", inner, inside)
+            self._close(inner, inside)
+        else:
+            inner = self.plan(str(part.message), path + "[].")
+        if inner.operations or length is None:
+            plan.operations.append(Repeat(inner, length, self.ros1))
+        for inner_path, (kind, dims) in inner.paths.items():
+            plan.paths[inner_path] = (kind, (length, *dims))
+
+    def _time(self, name: str, path: str, dot: str, plan: Plan, run: list[Item]) -> None:
+        """Its two fields; wanted as nanoseconds of both, or each by its own path, or all."""
+        fields = self.message.fields_of(name)
+        bases = [field.base for field in fields]
+        if len(fields) != 2 or not all(base in ("int32", "uint32") for base in bases):
+            raise CannotDecode(f"{name} is defined otherwise than everywhere")
+        whole = self._wanted(path)
+        for part, one in zip(("sec", "nanosec"), fields, strict=True):
+            dtype = DTYPES[str(one.base)]
+            align = 1 if self.ros1 else 4
+            own = self._wanted(path + dot + one.name)
+            if whole is not None:
+                run.append(Item(dtype, None, align, whole, part, own))
+            else:
+                run.append(Item(dtype, None, align, own))
+            self._note(plan, own, str(one.base), ())
+        self._note(plan, whole, "time", ())
+
+    def _item(self, dtype: np.dtype[Any], count: int | None, wanted: str | None) -> Item:
+        return Item(dtype, count, 1 if self.ros1 else dtype.itemsize, wanted)
+
+    def _wanted(self, path: str) -> str | None:
+        return path if path in self.wanted else None
+
+    def _note(
+        self, plan: Plan, wanted: str | None, kind: str, dims: tuple[int | None, ...]
+    ) -> None:
+        if wanted is not None:
+            plan.paths[wanted] = (kind, dims)
+
+
+def compile_plan(message: RosType, wanted: Iterable[str], *, ros1: bool = False) -> Plan:
+    """The plan that reads these leaf paths of a message type (each as `Leaf.path` gives it).
+
+    Raises:
+        CannotDecode: the type uses something that cannot be read.
+    """
+    return _Compiler(message, frozenset(wanted), ros1).plan(message.name, "")

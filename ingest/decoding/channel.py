@@ -1,0 +1,86 @@
+"""What every container of messages offers: the seam between file formats and decoding.
+
+Names come out of files, and go to terminals, tables and reports: control characters in them are
+written out (`visible`) where they come in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
+
+from restock.errors import visible
+from restock.ingest.decoding.columns import Batch
+
+Integrity = Literal["verified", "unverified", "damaged"]
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One stream of messages of one type in one file."""
+
+    id: int
+    topic: str
+    type: str  # "nav_msgs/msg/Odometry"
+    encoding: str  # of the messages: "cdr", "json", "protobuf", "ros1", …
+    definition_format: str = ""  # "ros2msg", "ros2idl", "ros1msg", "jsonschema", "protobuf" or ""
+    definition: bytes = b""
+
+    def __post_init__(self) -> None:
+        for name in ("topic", "type", "encoding", "definition_format"):
+            object.__setattr__(self, name, visible(getattr(self, name)))
+
+
+@dataclass
+class Damage:
+    """What of a file could not be read, and how many messages that cost where it is known."""
+
+    what: str
+    messages: dict[int, int] = field(default_factory=dict)  # by channel id
+
+    def __post_init__(self) -> None:
+        self.what = visible(self.what)
+
+
+@dataclass(frozen=True)
+class Extra:
+    """What a file holds beside messages."""
+
+    kind: Literal["attachment", "metadata"]
+    name: str
+    media_type: str
+    size_bytes: int
+
+    def __post_init__(self) -> None:
+        for name in ("name", "media_type"):
+            object.__setattr__(self, name, visible(getattr(self, name)))
+
+
+class Storage(Protocol):
+    """One open file of messages.
+
+    `counts` is what the container itself says it holds, per channel id; `span_ns` the first and
+    last log time, or None when it holds no message. `damage` is final once everything asked for
+    has been read. `notes` are worth saying and lose nothing. `extras` are not read, but named.
+    """
+
+    channels: dict[int, Channel]
+    counts: dict[int, int]
+    span_ns: tuple[int, int] | None
+    damage: list[Damage]
+    notes: list[str]
+    extras: list[Extra]
+
+    @property
+    def integrity(self) -> Integrity:
+        """Whether checksums vouch for what was read so far."""
+        ...
+
+    def batches(self, channels: Collection[int]) -> Iterator[tuple[int, Batch]]:
+        """The messages of these channels, by channel, in file order within each channel."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the file."""
+        ...

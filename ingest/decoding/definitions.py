@@ -1,0 +1,175 @@
+"""ROS message definitions: from the text in a recording, or a named distribution's."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from typing import Any
+
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import (
+    Stores,
+    TypesysError,
+    get_types_from_idl,
+    get_types_from_msg,
+    get_typestore,
+)
+from rosbags.typesys.msg import normalize_msgtype
+
+from restock.errors import RecordingError
+from restock.ingest.decoding.channel import Channel
+from restock.ingest.decoding.field_paths import DTYPES, CannotDecode, FieldType, Many, MessageType
+
+# The IDL parser's time is exponential in how deep these nest; rosidl writes none of either.
+_QUOTED = re.compile(r'"(?:\\.|[^"\\])*(?:"|\Z)|//[^\n]*|/\*.*?(?:\*/|\Z)', re.DOTALL)
+_ANNOTATION = re.compile(r"@\s*\w[\w:]*\s*\(")
+_NESTED = re.compile(r"(?:<[^<>]*){4}")
+
+DEFAULT_DISTRO = "humble"
+_STORES = {store.value.removeprefix("ros2_"): store for store in Stores}
+LONGEST_DEFINITION = 512 << 10  # real ones have up to some 50 kB, and the parser is slow
+LONGEST_ARRAY = 1 << 20
+KEPT = 1024  # types as recordings define them
+
+EMPTY = "structure_needs_at_least_one_member"  # stands in a message without fields
+TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+
+
+@dataclass(frozen=True)
+class RosType(MessageType):
+    """A ROS message type with everything it is made of."""
+
+    name: str
+    source: str  # "embedded" or the distribution's name
+    raw: dict[str, Any]  # rosbags' Typesdict, which the row-wise decoder registers
+    times = TIMES
+
+    def fields_of(self, name: str) -> list[FieldType]:
+        if name not in self.raw:
+            raise CannotDecode(f"{name} is not defined in the recording or in {self.source!r}")
+        fields = [_field(field, description) for field, description in self.raw[name][1]]
+        return [] if [field.name for field in fields] == [EMPTY] else fields
+
+
+def _field(name: str, description: Any) -> FieldType:
+    node, rest = description
+    many = None
+    if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        (node, rest), length = rest
+        fixed = description[0] == Nodetype.ARRAY
+        if fixed and not 0 < length <= LONGEST_ARRAY:
+            raise CannotDecode(f"{name} is an array of {length:,}")
+        many = Many(length if fixed else None)
+    if node == Nodetype.NAME:
+        return FieldType(name, None, str(rest), many)
+    base = str(rest[0])
+    if base != "string" and base not in DTYPES:
+        raise CannotDecode(f"{name} is a {base}, which is not read")
+    return FieldType(name, base, None, many)
+
+
+def distro_types(distro: str) -> dict[str, Any]:
+    """A distribution's message definitions.
+
+    Raises:
+        RecordingError: no distribution of that name.
+    """
+    return dict(_distro_store(distro).fielddefs)
+
+
+def refuse_unknown(distro: str) -> None:
+    """Check a distribution's name, without loading its definitions.
+
+    Raises:
+        RecordingError: no distribution of that name.
+    """
+    if distro not in _STORES:
+        raise RecordingError(
+            f"no type store named {distro!r}",
+            remedy=f"there are {', '.join(sorted(_STORES.keys() - {'empty', 'latest'}))}",
+        )
+
+
+@cache
+def _distro_store(distro: str) -> Any:
+    refuse_unknown(distro)
+    return get_typestore(_STORES[distro])
+
+
+def message_type(channel: Channel, distro: str) -> RosType:
+    """The type of a channel's messages.
+
+    Raises:
+        CannotDecode: a service or action event, a type that nobody defines, or a definition
+            that cannot be parsed.
+    """
+    name = normalize_msgtype(channel.type) if channel.type else ""
+    for part, word in (("/srv/", "service"), ("/action/", "action")):
+        if part in name:
+            raise CannotDecode(f"{word} events are not read")
+    # An empty definition is that of a message without fields, or was left out by the writer.
+    embedded = channel.definition_format in ("ros2msg", "ros2idl", "ros1msg")
+    # Loading a distribution takes a quarter of a second: not where a recording says it all.
+    types = {} if embedded and channel.definition else distro_types(distro)
+    if embedded and (channel.definition or name not in types):
+        if len(channel.definition) > LONGEST_DEFINITION:
+            raise CannotDecode(f"its definition has {len(channel.definition):,} bytes")
+        return _embedded(name, channel.definition_format, channel.definition, distro)
+    if name not in types:
+        raise CannotDecode(
+            f"unknown type {channel.type or '(unnamed)'}: not defined in the recording"
+            f" nor in {distro!r}"
+        )
+    return _from_distro(name, distro)
+
+
+@cache
+def _from_distro(name: str, distro: str) -> RosType:
+    found = RosType(name, distro, distro_types(distro))
+    found.leaves()  # refuses what cannot be read
+    return found
+
+
+@lru_cache(KEPT)
+def _embedded(name: str, form: str, definition: bytes, distro: str) -> RosType:
+    try:
+        text = definition.decode()
+        types: dict[str, Any] = {}
+        rule = "=" * 80 + "\n"
+        if form != "ros2idl":
+            types.update(get_types_from_msg(text, name))
+        elif _costly(text):
+            raise CannotDecode("its definition nests brackets, which is not read")
+        elif text.startswith(f"{rule}IDL: "):
+            for part in text.split(rule)[1:]:
+                types.update(get_types_from_idl(part.split("\n", 1)[1]))
+        else:
+            types.update(get_types_from_idl(text))
+    except (TypesysError, UnicodeDecodeError, RecursionError, ValueError, IndexError) as error:
+        raise CannotDecode(f"its definition cannot be parsed: {_first_line(error)}") from error
+    if form == "ros1msg":  # time and duration are primitives there
+        types = {**distro_types("ros1_noetic"), **types}
+    source = "embedded"
+    missing = _named(types) - types.keys()
+    if missing:  # some writers leave out the messages inside; their sizes will tell if they differ
+        types = {**distro_types(distro), **types}
+        source = f"embedded, and {distro}"
+    found = RosType(name, source, types)
+    found.leaves()  # refuses what cannot be read
+    return found
+
+
+def _costly(idl: str) -> bool:
+    bare = _ANNOTATION.sub(" ", _QUOTED.sub(" ", idl))
+    return "(" in bare or _NESTED.search(bare) is not None
+
+
+def _named(types: dict[str, Any]) -> set[str]:
+    """The messages that fields of these types are made of."""
+    fields = [_field(*item) for _, items in types.values() for item in items]
+    return {field.message for field in fields if field.message}
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]

@@ -1,0 +1,1 @@
+"""How a robot's topics fill the signals."""

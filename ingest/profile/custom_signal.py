@@ -1,0 +1,150 @@
+"""Custom signals: values of any topic that become columns of the transitions, by the profile.
+
+`[signals.battery_v]` of a profile names the column `battery_v` and says where it comes from. At
+every step it is what the topic said last (at or before the step, at most `max_age_s` ago), or
+null. Conditions and queries see it as they see Restock's own signals; observation and reward do
+not.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import TYPE_CHECKING, Any, Literal
+
+import duckdb
+import msgspec
+import pyarrow as pa
+
+from restock.errors import StoreError
+from restock.ingest.profile.signal_paths import PathProblem, SignalPath
+from restock.ingest.task.schema import COLUMNS
+
+if TYPE_CHECKING:
+    from restock.ingest.decoding.field_paths import Leaf
+
+Reduce = Literal["min", "max", "mean", "sum", "count", "yaw"]
+NUMBER = pa.float64()
+LIST = pa.list_(pa.field("element", pa.float32()))
+# Columns that a store's views add to a transition's, and that labelling adds.
+_TAKEN = {"logged_ns", "row_"} | {column.name for column in COLUMNS}
+QUATERNION = ("x", "y", "z", "w")
+
+
+class CustomSignal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One `[signals.NAME]` of a profile."""
+
+    topic: str
+    type: str
+    path: str  # see `restock.ingest.profile.signal_paths`
+    unit: str  # "V", "m", "1", …
+    max_age_s: float | None = None  # None: latched, held until the next message
+    reduce: Reduce | None = None  # a list to one number; a quaternion to its yaw
+    values: dict[str, float] | None = None  # what a text, bool or number stands for
+    scale: float = 1.0  # stored = found * scale + offset
+    offset: float = 0.0
+    doc: str = ""
+
+    def __post_init__(self) -> None:
+        try:
+            path = SignalPath.read(self.path)
+        except PathProblem as problem:
+            raise ValueError(f"path {self.path!r} {problem}") from None
+        if self.reduce is None and path.lists > 1:
+            raise ValueError(
+                f"path {self.path!r} gives lists of lists: name one element, or say reduce"
+            )
+        if self.reduce == "yaw" and path.lists:
+            raise ValueError(
+                f'path {self.path!r} gives a list: reduce = "yaw" takes one quaternion'
+            )
+        if self.reduce not in (None, "yaw") and not path.lists:
+            raise ValueError(f"path {self.path!r} gives one value: there is nothing to reduce")
+        if not self.unit:
+            raise ValueError('unit is empty: say "1" for what has none')
+        if self.max_age_s is not None and not self.max_age_s > 0:
+            raise ValueError(f"max_age_s must be above 0, got {self.max_age_s}")
+
+    @property
+    def read(self) -> SignalPath:
+        return SignalPath.read(self.path)
+
+    @property
+    def ends(self) -> tuple[str, ...]:
+        """Fields of the message at the end of the path that are read, where it is a message."""
+        return QUATERNION if self.reduce == "yaw" else ()
+
+    @property
+    def is_list(self) -> bool:
+        return self.reduce is None and self.read.lists > 0
+
+    @property
+    def picks(self) -> bool:
+        """Whether it means one certain element, which a message may not have."""
+        return any(s.choice is not None and not s.choice.many for s in self.read.steps)
+
+    def wanted(self) -> list[str]:
+        """The field paths to read for it."""
+        return self.read.wanted(*self.ends)
+
+    def field(self, name: str) -> pa.Field:
+        """Its column, with unit and source in the metadata."""
+        about = {"unit": self.unit, "topic": self.topic, "path": self.path, "meaning": self.doc}
+        kind = LIST if self.is_list else NUMBER
+        return pa.field(name, kind, nullable=True, metadata={k: v for k, v in about.items() if v})
+
+    def problem(self, leaves: Sequence[Leaf]) -> str | None:
+        """Why messages with these fields do not have it, or None."""
+        try:
+            kinds = self.read.check(leaves, *self.ends)
+        except PathProblem as problem:
+            return str(problem)
+        if self.reduce == "yaw" and "string" in kinds:
+            return "is no quaternion"
+        return None
+
+
+def name_problem(name: str) -> str | None:
+    """Why a custom signal may not have this name, or None."""
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+        return "a name has small letters, digits and _"
+    if name in _TAKEN:
+        return "Restock has a column of that name: choose another"
+    if name in _reserved():
+        return "SQL has a word of that name: choose another"
+    return None
+
+
+def refuse_other_signals(have: Mapping[str, Any], schema: pa.Schema, where: str) -> None:
+    """See that a store's columns of custom signals mean what rows of this schema mean by them.
+
+    `have` are the fields of the store's table, as deltalake gives them.
+
+    Raises:
+        StoreError: one of the same name has another type or unit.
+    """
+    for field in schema:
+        unit = (field.metadata or {}).get(b"unit")
+        known = have.get(field.name)
+        if unit is None or known is None:
+            continue
+        mine = "list" if field.type == LIST else "number"
+        theirs = "list" if "Array" in type(known.type).__name__ else "number"
+        unit_there = known.metadata.get("unit", "")
+        if (mine, unit.decode()) != (theirs, unit_there):
+            raise StoreError(
+                f"its column `{field.name}` is a {theirs} in {unit_there or '1'},"
+                f" and `signals.{field.name}` of the profile a {mine} in {unit.decode()}",
+                where=where,
+                remedy="rename the signal in the profile, or use another store",
+            )
+
+
+@cache
+def _reserved() -> set[str]:
+    with duckdb.connect() as connection:
+        rows = connection.sql(
+            "SELECT keyword_name FROM duckdb_keywords() WHERE keyword_category = 'reserved'"
+        ).fetchall()
+    return {name for (name,) in rows}

@@ -1,0 +1,266 @@
+"""Paths of custom signals: what they say, and what they find in a topic's columns.
+
+A signal path names one value of a message, or a list of them:
+
+    battery.voltage                                  a field
+    covariance[0]   status[-1].level                 one element of an array or a sequence
+    velocity[left_wheel]                             the element whose sibling `name[]` says so
+    status[name=battery].values[key=voltage].value   the element in which a field says so
+    ranges[::4]   cells[2:10]   poses[].position.x   several elements: a list
+
+A path with a slice or `[]` gives a list a message; every other gives one value or, where the
+element is not there, none.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.ingest.decoding.columns import FieldColumn, Ragged, take
+
+if TYPE_CHECKING:
+    from restock.ingest.decoding.field_paths import Leaf
+
+Rows = NDArray[np.intp]
+NAMES = "name"  # the sibling that names elements, as in sensor_msgs/JointState
+_STEP = re.compile(r"([A-Za-z_]\w*)((?:\[[^\]]*\])?)(?:\.|$)")
+
+
+class PathProblem(Exception):
+    """A path that cannot be read, or that a message type does not have; says what there is."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which elements of a repeated field a path means; `which` None is all of them."""
+
+    which: int | slice | str | None
+    key: str | None = None  # the field of the element that must say `which`
+
+    @property
+    def many(self) -> bool:
+        return self.which is None or isinstance(self.which, slice)
+
+
+@dataclass(frozen=True)
+class Step:
+    """One field of a path, and which of its elements."""
+
+    name: str
+    choice: Choice | None = None
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a path found in N messages: V values, in the order of their messages."""
+
+    message: Rows  # (V,)
+    values: NDArray[Any]  # (V,)
+
+
+@dataclass(frozen=True)
+class SignalPath:
+    """A path, read. `text` is as it was written."""
+
+    text: str
+    steps: tuple[Step, ...]
+
+    @classmethod
+    def read(cls, text: str) -> SignalPath:
+        """Read a path.
+
+        Raises:
+            PathProblem: it is not written as one.
+        """
+        steps, at = [], 0
+        while at < len(text):
+            match = _STEP.match(text, at)
+            if match is None:
+                raise PathProblem(f"cannot be read at {text[at:]!r}: write fields as a.b[0].c")
+            steps.append(Step(match[1], _choice(match[2][1:-1]) if match[2] else None))
+            at = match.end()
+        if not steps or text.endswith("."):
+            raise PathProblem("ends without a field")
+        return cls(text, tuple(steps))
+
+    @property
+    def lists(self) -> int:
+        """How many of its steps mean several elements: with one or more it gives a list."""
+        return sum(step.choice is not None and step.choice.many for step in self.steps)
+
+    def leaf(self, upto: int | None = None, *more: str) -> str:
+        """The field path to read for it (or for a field beside its step `upto`)."""
+        steps = self.steps[:upto]
+        last = upto is None and not more
+        names = [
+            step.name + ("[]" if step.choice and not (last and step is steps[-1]) else "")
+            for step in steps
+        ]
+        return ".".join([*names, *more])
+
+    def beside(self) -> dict[int, str]:
+        """Place of a step -> the field that its choice looks at."""
+        found = {}
+        for place, step in enumerate(self.steps):
+            if step.choice is not None and isinstance(step.choice.which, str):
+                if step.choice.key is None:
+                    found[place] = self.leaf(place, NAMES)
+                else:
+                    found[place] = self.leaf(place + 1, step.choice.key)
+        return found
+
+    def wanted(self, *ends: str) -> list[str]:
+        """Every field path to read; `ends` are fields of the message at the path's end."""
+        values = [f"{self.leaf(len(self.steps))}.{end}" for end in ends] or [self.leaf()]
+        return [*values, *self.beside().values()]
+
+    def check(self, leaves: Sequence[Leaf], *ends: str) -> list[str]:
+        """The kinds (`float64`, `string`, …) that it finds in messages with these fields.
+
+        Raises:
+            PathProblem: there is no such field, or it repeats where the path says nothing.
+        """
+        kinds = {leaf.path: leaf.kind for leaf in leaves}
+        repeats = {
+            ".".join(part.removesuffix("[]") for part in leaf.path.split(".")[: place + 1])
+            for leaf in leaves
+            for place, field in enumerate(leaf.steps)
+            if field.many
+        }
+        for place in range(len(self.steps)):
+            step, bare = self.steps[place], ".".join(s.name for s in self.steps[: place + 1])
+            if step.choice is not None and bare not in repeats:
+                if any(_bare(path) == bare or _bare(path).startswith(bare + ".") for path in kinds):
+                    raise PathProblem(f"{step.name} does not repeat: write it without brackets")
+            elif step.choice is None and bare in repeats:
+                raise PathProblem(
+                    f"{step.name} repeats: write {step.name}[0] for one element,"
+                    f" {step.name}[] for a list of all"
+                )
+        for path in self.wanted(*ends):
+            if path not in kinds:
+                raise PathProblem(offer(path, list(kinds)))
+        for place, path in self.beside().items():
+            choice = self.steps[place].choice
+            if choice and (_bare(path) in repeats) == (choice.key is not None):
+                raise PathProblem(f"{path!r} cannot tell elements apart: it is not one a element")
+        return [kinds[path] for path in self.wanted(*ends)[: max(len(ends), 1)]]
+
+    def find(self, columns: Mapping[str, FieldColumn], end: str | None = None) -> Found:
+        """The values it means in these columns (those of `wanted`)."""
+        names = self.beside()
+        path = self.leaf() if end is None else f"{self.leaf(len(self.steps))}.{end}"
+        column, beside = columns[path], {place: columns[name] for place, name in names.items()}
+        count = len(column)
+        message: Rows = np.arange(count)
+        for place, step in enumerate(self.steps):
+            if step.choice is None:
+                continue
+            parent, position, column = _open(column)
+            # A field of the element opens with it; the names beside it stay at its parent.
+            inside = {p for p in beside if p > place or (p == place and step.choice.key)}
+            for other in inside:
+                beside[other] = _open(beside[other])[2]
+            keep = _chosen(step.choice, parent, position, beside.get(place), len(message))
+            column = take(column, keep)
+            beside = {p: take(c, keep) for p, c in beside.items() if p > place}
+            message = message[parent[keep]]
+        if isinstance(column, Ragged) or column.ndim > 1:
+            raise PathProblem("gives an array where it should give a number")
+        return Found(message, np.asarray(column))
+
+
+def _choice(text: str) -> Choice:
+    """What stands between brackets."""
+    text = text.strip()
+    if not text:
+        return Choice(None)
+    if re.fullmatch(r"-?\d+", text):
+        return Choice(int(text))
+    if re.fullmatch(r"(-?\d+)?:(-?\d+)?(:\d+)?", text):
+        parts = [int(part) if part else None for part in text.split(":")]
+        if parts[2:] == [0]:
+            raise PathProblem(f"[{text}]: a step of 0")
+        return Choice(slice(*parts))
+    key, equals, value = text.partition("=")
+    return Choice(value.strip(), key.strip()) if equals else Choice(text)
+
+
+def _open(column: FieldColumn) -> tuple[Rows, Rows, FieldColumn]:
+    """A column of repeated fields as its elements: their parents, places in them, and values."""
+    if isinstance(column, Ragged):
+        parent = np.repeat(np.arange(len(column)), column.lengths)
+        return parent, np.arange(len(parent)) - column.offsets[:-1][parent], column.values
+    count, length = column.shape[:2]
+    parent, position = np.divmod(np.arange(count * length), max(length, 1))
+    return parent, position, column.reshape(count * length, *column.shape[2:])
+
+
+def _chosen(
+    choice: Choice, parent: Rows, position: Rows, beside: FieldColumn | None, parents: int
+) -> Rows:
+    """Which of these elements are meant, in their order."""
+    which = choice.which
+    if which is None:
+        return np.arange(len(parent))
+    lengths = np.bincount(parent, minlength=parents)[parent]
+    if isinstance(which, int):
+        return np.flatnonzero(position == (which if which >= 0 else lengths + which))
+    if isinstance(which, slice):
+        step = which.step or 1
+        start = _bound(which.start, lengths, 0)
+        stop = _bound(which.stop, lengths, lengths)
+        inside = (position >= start) & (position < stop) & ((position - start) % step == 0)
+        return np.flatnonzero(inside)
+    assert beside is not None
+    if choice.key is not None:
+        return _first(np.flatnonzero(_says(np.asarray(beside), which)), parent)
+    owner, place, names = _open(beside)
+    named = _first(np.flatnonzero(_says(np.asarray(names), which)), owner)
+    wanted = np.full(parents, -1)
+    wanted[owner[named]] = place[named]
+    return np.flatnonzero(position == wanted[parent])
+
+
+def _bound(bound: int | None, lengths: Rows, otherwise: Any) -> Any:
+    if bound is None:
+        return otherwise
+    return bound if bound >= 0 else np.maximum(lengths + bound, 0)
+
+
+def _says(values: NDArray[Any], text: str) -> NDArray[np.bool_]:
+    if values.dtype.kind in "OU":
+        return np.asarray(values == text, np.bool_)
+    try:
+        return np.asarray(values == float(text), np.bool_)
+    except ValueError:
+        return np.zeros(len(values), np.bool_)
+
+
+def _first(rows: Rows, parent: Rows) -> Rows:
+    """Of these elements the first of each parent."""
+    return rows[np.unique(parent[rows], return_index=True)[1]]
+
+
+def _bare(path: str) -> str:
+    return path.replace("[]", "")
+
+
+def offer(path: str, paths: list[str]) -> str:
+    """That a path is not there, and what is."""
+    bare = {_bare(known): known for known in paths}
+    ends = {known.split(".")[-1]: known for known in paths}
+    near = [bare[name] for name in get_close_matches(_bare(path), bare, n=3)]
+    near = near or [ends[name] for name in get_close_matches(path.split(".")[-1], ends, n=3)]
+    said = f"no field {path!r}"
+    if near:
+        return f"{said}: did you mean {' or '.join(repr(name) for name in near)}?"
+    shown = ", ".join(paths[:12]) + (f" and {len(paths) - 12} more" if len(paths) > 12 else "")
+    return f"{said}: there are {shown}"

@@ -1,0 +1,1 @@
+"""A first profile for a robot nobody has described yet."""

@@ -1,0 +1,1 @@
+"""The control clock: causal holds, frames, routes and episodes."""

@@ -1,0 +1,105 @@
+"""A topic's laser scans to clearance per sector, while they are read: the ranges are not kept."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.errors import RecordingError
+from restock.ingest.containers.topic_reading import Fields, Reduction
+from restock.ingest.decoding.columns import FieldColumn, Ragged, cut, take
+from restock.ingest.task.scan import SectorMap
+from restock.ingest.task.task import Task
+
+# What is made of a scan, beside the message's own fields (whose names hold no space).
+SECTORS = "clearance of each sector"  # (N, sectors) float64, m
+BEAMS = "number of beams"  # (N,) int64
+
+_VALUES = 1 << 18  # ranges reduced at a time: what is in between stays in the processor's cache
+_MAPS = 64  # geometries that are remembered; a lidar has one
+
+
+def scan_reduction(task: Task, topic: str, fields: Mapping[str, str]) -> Reduction:
+    """What makes SECTORS and BEAMS of a topic's scans, by the `fields` of the profile's input.
+
+    Its `apply` raises RecordingError where an angle is not one number a message.
+    """
+    reducer = _ScanReducer(task, topic, fields)
+    return Reduction(tuple(dict.fromkeys(reducer.paths)), reducer)
+
+
+class _ScanReducer:
+    def __init__(self, task: Task, topic: str, fields: Mapping[str, str]) -> None:
+        self.task, self.topic = task, topic
+        keys = ("ranges_m", "angle_min_rad", "angle_increment_rad")
+        self.paths = [fields[key] for key in keys]
+        self._maps: dict[tuple[float, float, int], SectorMap] = {}
+
+    def __call__(self, fields: Fields) -> dict[str, FieldColumn]:
+        ranges = fields[self.paths[0]]
+        first, increment = (self._angle(fields, path) for path in self.paths[1:])
+        if isinstance(ranges, Ragged):
+            beams = ranges.lengths
+        else:
+            beams = np.full(len(ranges), ranges.shape[1] if ranges.ndim > 1 else 1, np.int64)
+        clearance = np.full((len(beams), self.task.sectors), float(self.task.range_max_m))
+        geometry = np.stack([first, increment, beams], axis=1)
+        if len(geometry) and (geometry == geometry[0]).all():
+            self._fill(clearance, ranges, None, geometry[0])
+        else:
+            kinds, kind = np.unique(geometry, axis=0, return_inverse=True)
+            for index, one in enumerate(kinds):
+                self._fill(clearance, ranges, np.flatnonzero(kind == index), one)
+        return {SECTORS: clearance, BEAMS: beams}
+
+    def _fill(
+        self,
+        clearance: NDArray[np.float64],
+        ranges: FieldColumn,
+        rows: NDArray[np.intp] | None,
+        geometry: NDArray[np.float64],
+    ) -> None:
+        """Clearance of these rows (None: of all), which have one geometry."""
+        first, increment, beams = float(geometry[0]), float(geometry[1]), int(geometry[2])
+        if not beams or not np.isfinite(first + increment):
+            return
+        sectors, task = self._map(first, increment, beams), self.task
+        count = len(clearance) if rows is None else len(rows)
+        some = max(_VALUES // beams, 1)
+        for start in range(0, count, some):
+            stop = min(start + some, count)
+            if rows is None:
+                here: Any = slice(start, stop)
+                part = cut(ranges, start, stop)
+            else:
+                here = rows[start:stop]
+                part = take(ranges, here)
+            values = part.values if isinstance(part, Ragged) else part
+            table = np.asarray(values).reshape(stop - start, beams)
+            clearance[here] = sectors.clearance(table, task.range_min_m, task.range_max_m)
+
+    def _map(self, first: float, increment: float, beams: int) -> SectorMap:
+        key = (first, increment, beams)
+        found = self._maps.get(key)
+        if found is None:
+            if len(self._maps) >= _MAPS:
+                self._maps.clear()
+            bearings = first + increment * np.arange(beams)
+            found = SectorMap.build(bearings, self.task.sectors, self.task.body)
+            self._maps[key] = found
+        return found
+
+    def _angle(self, fields: Fields, path: str) -> NDArray[np.float64]:
+        column = fields[path]
+        if isinstance(column, Ragged) or column.ndim != 1 or column.dtype.kind not in "biuf":
+            raise RecordingError(
+                f"{path!r} of {self.topic} is not one number a message",
+                remedy="mend `inputs.scan.fields` in the profile",
+            )
+        return np.asarray(column, np.float64)
+
+
+__all__ = ["BEAMS", "SECTORS", "scan_reduction"]

@@ -1,0 +1,115 @@
+"""The clocks of a recording's topics compared: log time against header stamps, and their faults.
+
+A recorder stamps a message when it receives it (log time), its sender may say when it sent it
+(publish time) and the message when it was measured (`header.stamp`). They can be different
+clocks: a constant apart (simulation time), zero, jumping, going back, repeating.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.ingest.decoding.columns import TopicColumns
+
+I64 = NDArray[np.int64]
+STAMP = "header.stamp"
+WIDE_NS = 100_000_000  # a spread of (log time - stamp) that is worth a look
+
+
+@dataclass(frozen=True)
+class TopicClock:
+    """What was seen of one topic's clocks. None: its messages carry no header stamp."""
+
+    topic: str
+    messages: int
+    publish_offset_ns: int | None  # log time - publish time, median; None without a message
+    offset_ns: int | None = None  # log time - header stamp, median, of stamps that are not zero
+    spread_ns: int | None = None  # … 1st to 99th percentile
+    jumps: int | None = None  # times that this difference changes by more than `jump_s`
+    backsteps: int | None = None  # stamps before that of the message received just before
+    duplicates: int | None = None  # messages whose stamp another one has, too
+    zero_stamps: int | None = None
+
+    def as_row(self) -> dict[str, str | int | bool | None]:
+        """Plain values, as `recordings.clocks` holds them (less what aligning found)."""
+        return {**asdict(self), "stamped": self.offset_ns is not None}
+
+
+def topic_clock(topic: str, columns: TopicColumns, jump_s: float) -> TopicClock:
+    """Compare one topic's clocks. Messages are in the order of their log time."""
+    log, publish = columns.log_time_ns, columns.publish_time_ns
+    count = len(log)
+    sent = median(log - publish) if count else None
+    stamps = columns.fields.get(STAMP)
+    if not isinstance(stamps, np.ndarray) or not count:
+        return TopicClock(topic, count, sent)
+    stamp = stamps.astype(np.int64)
+    told = stamp != 0
+    delay = log[told] - stamp[told]
+    found, repeats = np.unique(stamp, return_counts=True)
+    middle = median(delay) if len(delay) else 0
+    low, high = np.percentile(delay - middle, [1, 99]) if len(delay) else (0, 0)
+    return TopicClock(
+        topic,
+        count,
+        sent,
+        middle,
+        int(high - low),
+        len(jumps(log[told], delay, round(jump_s * 1e9))),
+        int((np.diff(stamp) < 0).sum()),
+        int((repeats[(repeats > 1) & (found != 0)] - 1).sum()),
+        int((~told).sum()),
+    )
+
+
+def odd(row: Mapping[str, Any]) -> str:
+    """What of a topic's clocks is worth a look, in words; "" for nothing."""
+    words = {
+        "jumps": "jumps",
+        "log_backsteps": "log time backsteps",
+        "backsteps": "backsteps",
+        "duplicates": "repeated stamps",
+        "zero_stamps": "zero stamps",
+        "off_clock": "left out",
+        "restamped": "put at log time",
+    }
+    said = [f"{row[key]:,} {word}" for key, word in words.items() if row.get(key)]
+    if (row["spread_ns"] or 0) > WIDE_NS:
+        said.append(f"spread over {row['spread_ns'] * 1e-9:.1f} s")
+    return ", ".join(said)
+
+
+_BLOCK = 1 << 16  # windows sorted at a time: bounds memory
+
+
+def topic_clocks(topics: Mapping[str, TopicColumns], jump_s: float) -> list[TopicClock]:
+    """Every topic's clocks compared."""
+    return [topic_clock(name, columns, jump_s) for name, columns in topics.items()]
+
+
+def median(delay_ns: I64) -> int:
+    """The (upper) median; in integers, for float64 holds a time of day to 256 ns only."""
+    return int(np.sort(delay_ns)[len(delay_ns) // 2])
+
+
+def jumps(log_time_ns: I64, delay_ns: I64, jump_ns: int) -> I64:
+    """The log times at which a topic's clock jumps.
+
+    A running median of five first: a single bad stamp is no jump.
+    """
+    if not (np.abs(np.diff(delay_ns)) > jump_ns).any():
+        return np.zeros(0, np.int64)  # medians of neighbours differ by no more than neighbours do
+    if len(delay_ns) >= 5:
+        padded = np.pad(delay_ns, 2, mode="edge")
+        windows = np.lib.stride_tricks.sliding_window_view(padded, 5)
+        delay_ns = delay_ns.copy()
+        for start in range(0, len(windows), _BLOCK):
+            part = np.sort(windows[start : start + _BLOCK], axis=1)
+            delay_ns[start : start + _BLOCK] = part[:, 2]
+    at = np.flatnonzero(np.abs(np.diff(delay_ns)) > jump_ns) + 1
+    return np.asarray(log_time_ns[at], np.int64)

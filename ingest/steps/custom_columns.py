@@ -1,0 +1,229 @@
+"""Custom signals of one recording: from messages to the columns of its steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from textwrap import shorten
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from restock.errors import RecordingError
+from restock.ingest.containers.topic_reading import Fields, Reduction
+from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, offsets_of
+from restock.ingest.profile.custom_signal import LIST, NUMBER, QUATERNION, CustomSignal, Reduce
+from restock.ingest.profile.signal_paths import Found, PathProblem
+from restock.ingest.steps.align import Samples, Segment
+from restock.ingest.task.signals import yaw_of
+
+
+@dataclass(frozen=True)
+class CustomColumn:
+    """A custom signal's values in one recording, message by message."""
+
+    signal: CustomSignal
+    values: Ragged  # (N,) of a signal that is no list: one value a message, or none
+    unread: Sequence[str] = ()  # of each message that has one: a text that is no number
+
+    @cached_property
+    def samples(self) -> NDArray[np.bool_]:
+        """(N,) which messages say something: those without the one element meant do not."""
+        if not self.signal.picks:
+            return np.ones(len(self.values), np.bool_)
+        return np.asarray(self.values.lengths > 0, np.bool_)
+
+    @property
+    def found(self) -> int:
+        """How many messages have it, as a number or a list of them."""
+        if self.signal.is_list:
+            return int((self.values.lengths > 0).sum())
+        return int(np.isfinite(np.asarray(self.values.values, np.float64)).sum())
+
+    def take(self, message: NDArray[np.intp], known: NDArray[np.bool_]) -> pa.Array:
+        """The values of these messages (T,), null where not `known` or not finite."""
+        if not len(self.values):
+            return pa.nulls(len(message), LIST if self.signal.is_list else NUMBER)
+        if not self.signal.is_list:
+            every = np.append(np.asarray(self.values.values, np.float64), np.nan)
+            has = self.values.lengths[message] > 0
+            values = every[np.where(has, self.values.offsets[message], -1)]
+            return pa.array(values, NUMBER, mask=~known | ~np.isfinite(values))
+        rows = self.values.take(message)
+        values = np.asarray(rows.values, np.float32)
+        flat = pa.array(values, pa.float32(), mask=~np.isfinite(values))
+        offsets = pa.array(rows.offsets, pa.int32())
+        return pa.ListArray.from_arrays(offsets, flat, type=LIST, mask=pa.array(~known))
+
+
+def custom_reduction(signals: Mapping[str, CustomSignal]) -> Reduction:
+    """What makes the columns of these signals, all of one topic, of its messages' fields."""
+    fields = [path for signal in signals.values() for path in signal.wanted()]
+
+    def apply(columns: Fields) -> dict[str, FieldColumn]:
+        found: dict[str, FieldColumn] = {}
+        for name, signal in signals.items():
+            found |= _per_message(name, signal, columns)
+        return found
+
+    return Reduction(tuple(dict.fromkeys(fields)), apply)
+
+
+def _per_message(name: str, signal: CustomSignal, columns: Fields) -> dict[str, FieldColumn]:
+    """A signal's values in N messages, and the texts among them that are no number.
+
+    Raises:
+        RecordingError: it is not a number a message, or a list of numbers.
+    """
+    path, count = signal.read, len(columns[signal.wanted()[0]])
+    texts: dict[str, FieldColumn] = {}
+    try:
+        if signal.reduce == "yaw":
+            parts = [path.find(columns, end) for end in QUATERNION]
+            x, y, z, w = (np.asarray(part.values, np.float64) for part in parts)
+            found = Found(parts[0].message, yaw_of(x, y, z, w))
+        else:
+            found = path.find(columns)
+            if signal.reduce == "count":
+                counts = np.bincount(found.message, minlength=count).astype(np.float64)
+                found = Found(np.arange(count), counts)
+            elif signal.values is not None or found.values.dtype.kind not in "biuf":
+                values, unread = _numbers(found.values, signal.values)
+                texts[f"{_key(name)}, no number"] = first = np.full(count, "", object)
+                first[found.message[unread]] = found.values[unread].astype(str)
+                found = Found(found.message, values)
+    except (PathProblem, ValueError, TypeError) as problem:
+        raise RecordingError(
+            f"`signals.{name}.path`: {signal.path!r} of {signal.topic} {problem}"
+        ) from None
+    if signal.reduce in ("min", "max", "mean", "sum"):
+        found = _reduced(found, signal.reduce)
+    stored = np.asarray(found.values, np.float64) * signal.scale + signal.offset
+    lengths = np.bincount(found.message, minlength=count)
+    return {
+        _key(name): Ragged(stored.astype(np.float32) if signal.is_list else stored,
+                           offsets_of(lengths)),
+        **texts,
+    }  # fmt: skip
+
+
+def _key(name: str) -> str:
+    """A signal among the columns of its topic; names of fields hold no space."""
+    return f"signal {name}"
+
+
+def _numbers(
+    values: NDArray[Any], mapping: Mapping[str, float] | None
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Values (V,) as numbers, NaN where they are none; and which of them say no number."""
+    kinds, inverse = np.unique(values.astype(str), return_inverse=True)
+    known = np.full(len(kinds), np.nan)
+    unread = np.zeros(len(kinds), np.bool_)
+    told = {key.lower(): value for key, value in mapping.items()} if mapping is not None else None
+    for index, text in enumerate(kinds.tolist()):
+        plain = text.removesuffix(".0") if values.dtype.kind == "f" else text
+        try:
+            known[index] = float(text) if told is None else told[plain.lower()]
+        except (ValueError, KeyError):
+            unread[index] = True
+    return known[inverse], unread[inverse]
+
+
+def _reduced(found: Found, how: Reduce | None) -> Found:
+    """The finite elements of each message as one number; a message without any has none."""
+    finite = np.isfinite(found.values)
+    values, owner = np.asarray(found.values, np.float64)[finite], found.message[finite]
+    message, start, counts = np.unique(owner, return_index=True, return_counts=True)
+    if not len(message):
+        return Found(message, values)
+    if how in ("min", "max"):
+        reduce = np.minimum if how == "min" else np.maximum
+        return Found(message, reduce.reduceat(values, start))
+    total = np.add.reduceat(values, start)
+    return Found(message, total / counts if how == "mean" else total)
+
+
+@dataclass(frozen=True)
+class Custom:
+    """The custom signals of a recording at its T steps."""
+
+    table: pa.Table  # T rows, a column a signal
+    columns: dict[str, CustomColumn]  # of the topics that the recording has
+
+    @property
+    def notes(self) -> list[str]:
+        """What of them could not be used, in words."""
+        return [
+            f"signals.{name}: {len(column.unread):,} of {len(column.values):,} messages say what"
+            f" is no number to it, such as {shorten(column.unread[0], 60)!r}"
+            for name, column in self.columns.items()
+            if column.unread
+        ]
+
+    def rows(self) -> list[dict[str, Any]]:
+        """What came of each, as `recordings.signals` holds it."""
+        found = []
+        for column in self.table.schema:
+            about = {key.decode(): text.decode() for key, text in (column.metadata or {}).items()}
+            read = self.columns.get(column.name)
+            found.append(
+                {
+                    "name": column.name,
+                    "unit": about.get("unit", ""),
+                    "type": "list" if column.type == LIST else "number",
+                    "topic": about["topic"],
+                    "path": about["path"],
+                    "meaning": about.get("meaning", ""),
+                    "messages": len(read.values) if read else 0,
+                    "found": read.found if read else 0,
+                    "unread": len(read.unread) if read else 0,
+                    "steps": len(self.table) - self.table[column.name].null_count,
+                }
+            )
+        return found
+
+    def take(self, ticks: NDArray[np.int64]) -> pa.Table:
+        """The columns at these ticks."""
+        return self.table.take(pa.array(ticks))
+
+
+def custom_signals(
+    signals: Mapping[str, CustomSignal],
+    topics: Mapping[str, TopicColumns],
+    segments: Sequence[Segment],
+    ticks: Sequence[NDArray[np.int64]],
+) -> Custom:
+    """Every custom signal at every tick of every segment, causally held; null where it is not."""
+    count = sum(len(stamps) for stamps in ticks)
+    found: dict[str, CustomColumn] = {}
+    table = pa.table({"tick": np.arange(count)})
+    for name, signal in signals.items():
+        array = pa.nulls(count, signal.field(name).type)
+        if signal.topic in topics:
+            column = found[name] = column_of(name, signal, topics[signal.topic])
+            parts = [
+                _at(column, segment.topics[signal.topic], stamps)
+                for segment, stamps in zip(segments, ticks, strict=True)
+            ]
+            array = pa.concat_arrays(parts) if parts else array
+        table = table.append_column(signal.field(name), array)
+    return Custom(table.drop_columns("tick"), found)
+
+
+def column_of(name: str, signal: CustomSignal, topic: TopicColumns) -> CustomColumn:
+    """A signal's values in its topic's columns."""
+    fields: Fields = topic.fields
+    if _key(name) not in fields:  # columns of whole messages, as no recording's reader gives them
+        fields = custom_reduction({name: signal}).apply(fields)
+    values, texts = fields[_key(name)], fields.get(f"{_key(name)}, no number", np.zeros(0))
+    assert isinstance(values, Ragged)
+    return CustomColumn(signal, values, [text for text in np.asarray(texts).tolist() if text])
+
+
+def _at(column: CustomColumn, samples: Samples, stamps: NDArray[np.int64]) -> pa.Array:
+    keep = column.samples[samples.row]
+    held = Samples(samples.stamp_ns[keep], samples.row[keep]).hold(stamps, column.signal.max_age_s)
+    return column.take(held.row, held.fresh)

@@ -1,0 +1,151 @@
+"""Steps to episodes: where one begins, where it ends, and whether it terminated or was cut.
+
+- The goal is reached (or a bump, where the task says so): **terminated**. The steps after it,
+  until there is another goal or the same one is ordered again, belong to no episode.
+- A new goal, a lost route, the time limit: **truncated**, on the tick at which that is so. That
+  tick ends the old episode, seen with the old goal and plan, and is the first of the next one.
+- A gap, a clock jump, a pose jump, an unusable tick, the end: **truncated** on the tick before.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.ingest.steps.steps import Steps
+from restock.ingest.task.task import Task, terminated
+
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Episode:
+    """Ticks `first` to `last`, both included; the last one only ends it."""
+
+    first: int
+    last: int
+    terminated: bool
+    ended_by: str
+    shared: bool  # the last tick is not used up: it begins the next episode, or is dropped
+
+
+@dataclass(frozen=True)
+class Split:
+    """All episodes of a recording, and the ticks that are in none, by reason.
+
+    ticks = transitions + episode ends that are not shared + dropped.
+    """
+
+    episodes: list[Episode]
+    dropped: dict[str, int]
+
+    @property
+    def transitions(self) -> int:
+        return sum(episode.last - episode.first for episode in self.episodes)
+
+    @property
+    def ends(self) -> int:
+        """Ticks that only end an episode."""
+        return sum(not episode.shared for episode in self.episodes)
+
+
+def split(task: Task, steps: Steps) -> Split:
+    """The episodes of a recording's steps."""
+    changed, routing = changed_route(steps), steps.routing
+    over_old = np.zeros(len(steps), np.bool_)
+    if len(changed):  # seen with the goal and plan of the tick before
+        goal, plan = routing.goal[changed - 1], routing.plan[changed - 1]
+        over_old[changed] = terminated(task, with_route(task, steps, changed, goal, plan))
+    return _Walk(task, steps, terminated(task, steps.signals), over_old).walk()
+
+
+def changed_route(steps: Steps) -> Ints:
+    """Ticks at which another goal is in force than at the tick before, or none."""
+    goal = steps.routing.goal
+    changed = np.flatnonzero(steps.follows[1:] & (goal[1:] != goal[:-1])) + 1
+    return changed[goal[changed - 1] >= 0]
+
+
+def with_route(
+    task: Task, steps: Steps, ticks: Ints, goal: Ints, plan: Ints
+) -> dict[str, NDArray[Any]]:
+    """The signals at these ticks as they are with this goal and plan in force."""
+    now = {name: column[ticks] for name, column in steps.signals.items()}
+    return now | steps.routing.signals(task, goal, plan, now)
+
+
+class _Walk:
+    """Goes over the ticks once, in order."""
+
+    def __init__(self, task: Task, steps: Steps, over: Bools, over_old: Bools) -> None:
+        self.task, self.steps, self.over, self.over_old = task, steps, over, over_old
+        self.goal = steps.routing.goal.tolist()
+        self.order = steps.routing.order.tolist()
+        self.episodes: list[Episode] = []
+        self.dropped: Counter[str] = Counter()
+        self.first: int | None = None  # of the open episode
+        self.done_with: tuple[int, int] | None = None  # the goal that was reached, and its order
+
+    def walk(self) -> Split:
+        follows = self.steps.follows.tolist()
+        for tick in range(len(self.steps)):
+            if self.first is None or not self._goes_on(tick, self.first, follows[tick]):
+                self._begin(tick)
+        if self.first is not None:
+            self._close(len(self.steps) - 1, "end of the recording")
+        return Split(self.episodes, dict(self.dropped))
+
+    def _goes_on(self, tick: int, first: int, follows: bool) -> bool:
+        """Whether the open episode uses this tick up; closes it if it ends here or before."""
+        if not follows:
+            self._close(tick - 1, self.steps.problem[tick] or self.steps.cut[tick])
+            return False
+        if self.goal[tick] != self.goal[first]:
+            over = bool(self.over_old[tick])
+            bump = self.task.bump_terminates and self.steps.signals["bumped"][tick]
+            ended = "bump" if bump else "goal"
+            cut = "new goal" if self.goal[tick] >= 0 else "no route"
+            self._close(tick, ended if over else cut, terminated=over, shared=True)
+            return False
+        if self.over[tick]:
+            reached = self._at_goal(tick)
+            self.done_with = (self.goal[tick], self.order[tick]) if reached else None
+            self._close(tick, "goal" if reached else "bump", terminated=True)
+            return True
+        if tick - first >= self.task.time_limit_steps:
+            self._close(tick, "time limit", shared=True)
+            return False
+        return True
+
+    def _begin(self, tick: int) -> None:
+        """Open an episode at this tick, or drop the tick."""
+        goal = self.goal[tick]
+        problem = self.steps.problem[tick] or self.steps.route_problem[tick]
+        if problem:
+            self.dropped[problem] += 1
+            return
+        wanted = (goal, self.order[tick])
+        if goal >= 0 and (wanted == self.done_with or self._at_goal(tick)):
+            self.done_with = wanted
+            self.dropped["goal already reached"] += 1
+            return
+        self.done_with, self.first = None, tick
+
+    def _at_goal(self, tick: int) -> bool:
+        distance = self.steps.signals["goal_distance_m"][tick]
+        return self.goal[tick] >= 0 and bool(distance <= self.task.goal_radius_m)
+
+    def _close(
+        self, last: int, ended_by: str, *, terminated: bool = False, shared: bool = False
+    ) -> None:
+        assert self.first is not None
+        if last == self.first:
+            self.dropped["a single step between two cuts"] += 1
+        else:
+            self.episodes.append(Episode(self.first, last, terminated, ended_by, shared))
+        self.first = None

@@ -1,0 +1,207 @@
+"""Poses from transforms: `/tf` and `/tf_static` resolved from frame to frame at given times.
+
+Every frame has one parent at a time. At a time each frame's transform is the latest at or before
+it (a causal hold, nothing is interpolated): from `/tf` at most `max_age_s` old, from `/tf_static`
+however old. What is looked up goes up from both frames to where their ways meet.
+
+A transform may be stamped ahead of when it was sent (localisation does so, to keep it usable
+until the next one): it counts from when it was received.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.ingest.steps.align import Segment
+from restock.ingest.steps.transforms import AXES, PARENT, TURN, Edges, Frames, plain
+
+F64 = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a frame is in the fixed frame, at each of T times."""
+
+    rotation: F64  # (T, 3, 3)
+    translation_m: F64  # (T, 3)
+    stamp_ns: Ints  # (T,) of the newest moving transform on the way; the time itself if none moves
+    problem: NDArray[Any]  # (T,) why it is not known, or ""
+
+    @classmethod
+    def nowhere(cls, count: int) -> Placement:
+        """In the fixed frame itself, until `fill` says otherwise."""
+        return cls(
+            np.tile(np.eye(3), (count, 1, 1)),
+            np.zeros((count, 3)),
+            np.zeros(count, np.int64),
+            np.full(count, "", object),
+        )
+
+    def fill(self, rows: Any, other: Placement, order: Any) -> None:
+        """Take these rows over, in this order, from another one."""
+        for mine, theirs in zip(self._parts(), other._parts(), strict=True):
+            mine[rows] = theirs[order]
+
+    def _parts(self) -> tuple[NDArray[Any], ...]:
+        return self.rotation, self.translation_m, self.stamp_ns, self.problem
+
+    @property
+    def yaw_rad(self) -> F64:
+        return np.arctan2(self.rotation[:, 1, 0], self.rotation[:, 0, 0])
+
+
+@dataclass
+class _Held:
+    """A frame's transform to its parent at T times."""
+
+    parent: Ints  # (T,) number of the parent frame; -1 is none
+    fresh: NDArray[np.bool_]
+    moving: NDArray[np.bool_]
+    stamp_ns: Ints
+    rotation: F64  # (T, 3, 3)
+    translation: F64  # (T, 3)
+
+
+@dataclass
+class Tree:
+    """The frames of a recording in time."""
+
+    frames: Frames
+    edges: Edges
+    segments: Sequence[Segment]
+    _numbers: dict[str, int] = field(default_factory=dict)  # frame -> its number
+
+    def place(self, frame: str, times: Sequence[Ints]) -> Placement:
+        """Where `frame` is in the fixed frame at these times of each segment."""
+        source, fixed = self._number(frame), self._number(self.frames.fixed)
+        count = sum(map(len, times))
+        out = Placement.nowhere(count)
+        out.stamp_ns[:] = np.concatenate([*times, np.zeros(0, np.int64)])
+        children = sorted(self.edges.only({frame, self.frames.fixed}).parents)
+        held = {self._number(child): self._hold(child, times) for child in children}
+        if not held:
+            out.problem[:] = self._apart([source], [fixed])
+            return out
+        ups = np.stack([one.parent for one in held.values()], axis=1)  # (T, C)
+        trees, which = np.unique(ups, axis=0, return_inverse=True)
+        for index, tree in enumerate(trees):
+            rows = np.flatnonzero(which.reshape(-1) == index)
+            parent = {child: int(up) for child, up in zip(held, tree, strict=True) if up >= 0}
+            self._fill(out, rows, held, _way(source, parent), _way(fixed, parent))
+        return out
+
+    def _fill(
+        self, out: Placement, rows: Ints, held: dict[int, _Held], up: list[int], other: list[int]
+    ) -> None:
+        """Place the times `rows`, at which the ways to the top are `up` and `other`."""
+        meet = next((frame for frame in up if frame in other), None)
+        if meet is None:
+            out.problem[rows] = self._apart(up, other)
+            return
+        there = self._compose(out, rows, held, up[: up.index(meet)])
+        back = self._compose(out, rows, held, other[: other.index(meet)])
+        inverse = np.swapaxes(back[0], 1, 2)
+        out.rotation[rows] = inverse @ there[0]
+        out.translation_m[rows] = np.einsum("nij,nj->ni", inverse, there[1] - back[1])
+        moving = [held[f] for f in (*up[: up.index(meet)], *other[: other.index(meet)])]
+        stamps = [
+            np.where(one.moving, one.stamp_ns, np.iinfo(np.int64).min)[rows] for one in moving
+        ]
+        if stamps:
+            newest = np.max(stamps, axis=0)
+            known = newest > np.iinfo(np.int64).min
+            out.stamp_ns[rows[known]] = newest[known]
+
+    def _compose(
+        self, out: Placement, rows: Ints, held: dict[int, _Held], way: list[int]
+    ) -> tuple[F64, F64]:
+        """The transforms along a way as one: rotation (N, 3, 3) and translation (N, 3)."""
+        rotation, translation = np.tile(np.eye(3), (len(rows), 1, 1)), np.zeros((len(rows), 3))
+        for frame in way:
+            one = held[frame]
+            step = one.rotation[rows]
+            translation = np.einsum("nij,nj->ni", step, translation) + one.translation[rows]
+            rotation = step @ rotation
+            names = f"{self._name(int(one.parent[rows[0]]))} -> {self._name(frame)}"
+            sane = np.isfinite(step).all(axis=(1, 2)) & np.isfinite(one.translation[rows]).all(1)
+            for bad, reason in ((~one.fresh[rows], "stale"), (~sane, "not finite")):
+                blamed = rows[bad & (out.problem[rows] == "")]
+                out.problem[blamed] = f"transform {names}: {reason}"
+        return rotation, translation
+
+    def _apart(self, up: list[int], other: list[int]) -> str:
+        return f"no transform from {self._name(other[-1])} to {self._name(up[-1])} yet"
+
+    def _hold(self, child: str, times: Sequence[Ints]) -> _Held:
+        """A frame's transform at these times: of `/tf` where it has said one, else the static."""
+        moving = self._of(f"{self.frames.topic} {child}", times, self.frames.max_age_s)
+        still = self._of(f"{self.frames.static_topic} {child}", times, None)
+        if moving is None or still is None:
+            only = moving if moving is not None else still
+            assert only is not None
+            only.moving[:] = moving is not None
+            return only
+        use = moving.parent >= 0
+        both = {}
+        for name in ("parent", "fresh", "stamp_ns", "rotation", "translation"):
+            a, b = getattr(moving, name), getattr(still, name)
+            both[name] = np.where(use.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+        return _Held(moving=use, **both)
+
+    def _of(self, name: str, times: Sequence[Ints], max_age_s: float | None) -> _Held | None:
+        columns = self.edges.topics.get(name)
+        if columns is None:
+            return None
+        parts = [
+            segment.topics[name].hold(stamps, max_age_s)
+            for segment, stamps in zip(self.segments, times, strict=True)
+        ]
+        row, known, fresh, age = (
+            np.concatenate([getattr(part, key) for part in parts])
+            for key in ("row", "known", "fresh", "age_ns")
+        )
+        fields = columns.fields
+        quaternion = [np.asarray(fields[part])[row] for part in TURN]
+        says = np.array([self._number(name) for name in np.asarray(fields[PARENT]).tolist()])
+        here = np.concatenate(times)
+        return _Held(
+            np.where(known, says[row], -1) if len(says) else np.full(len(row), -1),
+            fresh,
+            np.zeros(len(row), np.bool_),
+            here - age,
+            rotations(*quaternion),
+            np.stack([np.asarray(fields[axis])[row] for axis in AXES], axis=1),
+        )
+
+    def _number(self, frame: str) -> int:
+        return self._numbers.setdefault(plain(frame), len(self._numbers))
+
+    def _name(self, number: int) -> str:
+        return next(name for name, known in self._numbers.items() if known == number)
+
+
+def rotations(x: F64, y: F64, z: F64, w: F64) -> F64:
+    """Quaternions (N,) to rotation matrices (N, 3, 3); NaN where a quaternion has no length."""
+    with np.errstate(all="ignore"):
+        size = np.sqrt(x * x + y * y + z * z + w * w)
+        x, y, z, w = (np.where(size > 1e-9, part / size, np.nan) for part in (x, y, z, w))
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _way(frame: int, parent: Mapping[int, int]) -> list[int]:
+    """From a frame up to the top; a loop ends where it closes."""
+    way = [frame]
+    while way[-1] in parent and parent[way[-1]] not in way:
+        way.append(parent[way[-1]])
+    return way

@@ -1,0 +1,220 @@
+"""The observation on a running robot: messages as they come, by the same code as a recording's.
+
+A recording is read in columns, and its steps are made of all of them at once. On a robot there are
+the last few messages of each topic and the tick that is now. Both go through the same holds, fills
+and `restock.ingest.task.task.observe`; all that is different is who hands over the columns.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.errors import ConfigError
+from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, join
+from restock.ingest.profile.inputs import Input
+from restock.ingest.profile.profile import Profile
+from restock.ingest.steps.align import NS, Samples, Segment
+from restock.ingest.steps.clocks import median
+from restock.ingest.steps.needs import field_paths
+from restock.ingest.steps.sources import Sources
+from restock.ingest.steps.steps import fill_signals
+from restock.ingest.task.task import nearest_action, observe
+
+PROVENANCE = ("behaviour_policy", "true_condition", "perturbation")  # no robot acts by these
+_DELAYS = 200  # of each topic, of which the median counts
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What the robot knows at a tick."""
+
+    observation: NDArray[np.float32]  # (D,)
+    stamp_ns: int  # of the tick on the alignment clock
+    previous_action: int  # in force since the tick before; 0, stop, where there was none
+    problem: str  # why it must not be acted on, or ""
+
+
+@dataclass(frozen=True)
+class _Message:
+    log_time_ns: int
+    stamp_ns: int  # on the alignment clock
+    fields: dict[str, FieldColumn]  # one row each
+
+
+class LiveObserver:
+    """Takes messages as they are received, and makes the observation of a tick.
+
+    A message is any object with the fields of its ROS type as attributes (rclpy's, rosbags').
+    Messages are held back to what the tick before held: memory does not grow.
+
+    Raises:
+        ConfigError: the profile takes its pose, goals or plans from transforms, which are not
+            held here.
+    """
+
+    def __init__(self, profile: Profile) -> None:
+        if profile.frames is not None:
+            raise ConfigError(
+                "places messages by transforms ([frames]), which is not done live",
+                where=f"profile {profile.name!r}",
+                remedy="name a topic with the pose in the map frame under [inputs.pose]",
+            )
+        self.profile, self.task = profile, profile.task
+        self._inputs: dict[str, list[Input]] = {}
+        for name, source in profile.inputs.items():
+            if name not in PROVENANCE:
+                self._inputs.setdefault(source.topic, []).append(source)
+        self.left_out: dict[str, int] = {}  # messages whose stamps are off the clock, per topic
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: the clock was set, or the robot was put elsewhere."""
+        self._held: dict[str, list[_Message]] = {topic: [] for topic in self._inputs}
+        self._delays: dict[str, deque[int]] = {}
+        self._command: _Message | None = None  # the first since the last tick, or the last before
+        self._ticked = True
+        self._before_ns: int | None = None
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """What to subscribe to: topic -> message type."""
+        return {topic: sources[0].type for topic, sources in self._inputs.items()}
+
+    @property
+    def offset_ns(self) -> int:
+        """Log time less the alignment clock, as `restock.ingest.steps.align` finds it: of the topic
+        that comes with the least delay, the median."""
+        medians = [median(np.array(delays, np.int64)) for delays in self._delays.values()]
+        return min(medians, default=0)
+
+    def receive(self, topic: str, message: Any, log_time_ns: int) -> None:
+        """Take a message of one of `topics`, received at `log_time_ns`."""
+        sources = self._inputs[topic]
+        paths = dict.fromkeys(path for source in sources for path in field_paths(source))
+        latched = all(source.max_age_s is None for source in sources)
+        stamp_ns = self._stamp(topic, message, log_time_ns, latched)
+        if stamp_ns is None:
+            self.left_out[topic] = self.left_out.get(topic, 0) + 1
+            return
+        fields = {path: _column(message, path) for path in paths}
+        taken = _Message(log_time_ns, stamp_ns, fields)
+        if topic != self.profile.inputs.command.topic:
+            self._held[topic].append(taken)
+        elif self._ticked:
+            self._command, self._ticked = taken, False
+
+    def observe(self, now_ns: int) -> Observed:
+        """The observation of a tick at `now_ns`, by the clock of the messages' log times."""
+        stamp_ns = now_ns - (self.offset_ns if self.profile.clock.alignment != "log_time" else 0)
+        ticks = [stamp_ns] if self._before_ns is None else [self._before_ns, stamp_ns]
+        topics: dict[str, TopicColumns] = {}
+        samples: dict[str, Samples] = {}
+        for topic, held in self._held.items():
+            if topic == self.profile.inputs.command.topic:
+                topics[topic], samples[topic] = self._commands(ticks)
+            elif held or not self._optional(topic):
+                topics[topic] = _columns(held)
+                stamps = np.array([message.stamp_ns for message in held], np.int64)
+                order = np.argsort(stamps, kind="stable")
+                samples[topic] = Samples(stamps[order], order)
+        silent = [topic for topic, columns in topics.items() if not len(columns)]
+        if silent:
+            return self._unknown(stamp_ns, f"nothing received yet on {', '.join(sorted(silent))}")
+        sources = Sources(self.profile, topics)
+        segment = Segment(samples, self.offset_ns)
+        filled = fill_signals(self.profile, sources, [segment], [np.array(ticks, np.int64)], None)
+        last = len(ticks) - 1
+        before = last - int(filled.follows[last])
+        now, then = (
+            {name: column[[row]] for name, column in filled.signals.items()}
+            for row in (last, before)
+        )
+        action, _ = nearest_action(
+            self.task, then["command_speed_mps"], then["command_yaw_rate_radps"]
+        )
+        previous = int(action[0]) if before != last else 0
+        filling = filled.filling
+        problem = str(filling.problem[last] or filling.route_problem[last])
+        observation = observe(self.task, now, then, np.array([previous]))[0]
+        self._tick(stamp_ns)
+        return Observed(observation, stamp_ns, previous, problem)
+
+    def _unknown(self, stamp_ns: int, problem: str) -> Observed:
+        self._tick(stamp_ns)
+        return Observed(np.zeros(self.task.observation_size, np.float32), stamp_ns, 0, problem)
+
+    def _tick(self, stamp_ns: int) -> None:
+        """Let go of what neither this tick holds nor a later one will."""
+        self._before_ns, self._ticked = stamp_ns, True
+        for topic, held in self._held.items():
+            known = [message.stamp_ns for message in held if message.stamp_ns <= stamp_ns]
+            if known:
+                newest = max(known)
+                self._held[topic] = [m for m in held if m.stamp_ns >= newest]
+
+    def _commands(self, ticks: Sequence[int]) -> tuple[TopicColumns, Samples]:
+        """The command in force since the tick before; the one of this tick is still to come."""
+        fields: dict[str, FieldColumn] = {
+            path: np.zeros(1) for path in field_paths(self.profile.inputs.command)
+        }
+        if self._command is not None:
+            fields = self._command.fields
+        stamps = np.array(ticks, np.int64)
+        columns = TopicColumns(stamps[:1], stamps[:1], fields)
+        return columns, Samples(stamps, np.zeros(len(stamps), np.intp))
+
+    def _stamp(self, topic: str, message: Any, log_time_ns: int, latched: bool) -> int | None:
+        """When a message was measured, on the alignment clock; None where it is off it."""
+        if self.profile.clock.alignment == "log_time":
+            return log_time_ns
+        header = getattr(message, "header", None)
+        if header is None:
+            return log_time_ns - self.offset_ns
+        stamp_ns = int(header.stamp.sec) * NS + int(header.stamp.nanosec)
+        delay = log_time_ns - stamp_ns
+        jump_ns = round(self.profile.clock.jump_s * NS)
+        if self._delays and abs(delay - self.offset_ns) > jump_ns:
+            return log_time_ns - self.offset_ns if latched else None
+        if not latched:
+            self._delays.setdefault(topic, deque(maxlen=_DELAYS)).append(delay)
+        return stamp_ns
+
+    def _optional(self, topic: str) -> bool:
+        return all(source.optional for source in self._inputs[topic])
+
+
+def _columns(held: Sequence[_Message]) -> TopicColumns:
+    times = np.array([message.log_time_ns for message in held], np.int64)
+    paths = held[0].fields if held else {}
+    return TopicColumns(
+        times, times, {path: join([message.fields[path] for message in held]) for path in paths}
+    )
+
+
+def _column(message: Any, path: str) -> FieldColumn:
+    """One message's value at a field path, as a column of one row."""
+    head, repeated, tail = path.partition("[].")
+    value = _member(message, head.removesuffix("[]"))
+    if repeated:
+        value = [_member(item, tail) for item in value]
+    if isinstance(value, str | bool | int | float):
+        return np.array([value])
+    values = np.asarray(value)
+    if not values.ndim:
+        return values[None]
+    return Ragged(values, np.array([0, len(values)], np.int64))
+
+
+def _member(value: Any, path: str) -> Any:
+    for name in path.split("."):
+        value = getattr(value, name)
+    return value
+
+
+__all__ = ["LiveObserver", "Observed"]

@@ -1,0 +1,167 @@
+"""What a profile needs of a recording: fields to read, and why a recording does not fit."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Any
+
+from restock.errors import RecordingError
+from restock.ingest.containers.topic_reading import Fields, Reduction
+from restock.ingest.decoding.columns import FieldColumn
+from restock.ingest.profile.custom_signal import CustomSignal
+from restock.ingest.profile.inputs import Input
+from restock.ingest.profile.profile import Profile
+from restock.ingest.profile.signal_paths import offer
+from restock.ingest.steps.align import STAMP
+from restock.ingest.steps.clearance import scan_reduction
+from restock.ingest.steps.custom_columns import custom_reduction
+from restock.ingest.steps.transforms import FIELDS, FRAME_ID
+
+if TYPE_CHECKING:
+    from restock.ingest.decoding.field_paths import Leaf
+
+
+def wanted_fields(
+    profile: Profile, available: Mapping[str, Any], leaves: Mapping[str, Sequence[Leaf]]
+) -> dict[str, list[str]]:
+    """topic -> the field paths to keep for this profile, of the topics that are `available`.
+
+    `available` maps a topic to something with a `type` and an `expected` count, `leaves` to every
+    field of its messages. What `reductions` reads is not in it, unless it is kept too.
+
+    Raises:
+        RecordingError: a required topic is missing, holds another type than the profile says, or
+            its messages have no such field.
+    """
+    if problems := input_problems(profile, available, leaves):
+        have = ", ".join(sorted(available)) or "none"
+        raise RecordingError(
+            f"does not fit the profile {profile.name!r}: {'; '.join(problems)}",
+            remedy=f"its topics are {have}; choose another --profile or see `restock info`",
+        )
+    wanted: dict[str, list[str]] = {}
+    for name, source in profile.inputs.items():
+        if source.topic not in available:
+            continue
+        paths = wanted.setdefault(source.topic, [])
+        if name != "scan":
+            paths += field_paths(source)
+        if name in ("goal", "plan"):
+            paths += [FRAME_ID]
+    for topic in profile.transform_topics:
+        if topic in available:
+            wanted.setdefault(topic, []).extend(FIELDS)
+    for signal in profile.signals.values():
+        if signal.topic in available:
+            wanted.setdefault(signal.topic, [])
+    for topic, paths in wanted.items():
+        has = {leaf.path for leaf in leaves[topic]}
+        kept = [path for path in paths if path != FRAME_ID or path in has]
+        wanted[topic] = list(dict.fromkeys(kept + ([STAMP] if STAMP in has else [])))
+    return wanted
+
+
+def reductions(profile: Profile, available: Mapping[str, Any]) -> dict[str, Reduction]:
+    """topic -> what is made of its messages as they are read: clearance, and custom signals."""
+    parts: dict[str, list[Reduction]] = {}
+    if (scan := profile.inputs.scan) is not None and scan.topic in available:
+        parts.setdefault(scan.topic, []).append(
+            scan_reduction(profile.task, scan.topic, scan.fields)
+        )
+    signals: dict[str, dict[str, CustomSignal]] = {}
+    for name, signal in profile.signals.items():
+        if signal.topic in available:
+            signals.setdefault(signal.topic, {})[name] = signal
+    for topic, here in signals.items():
+        parts.setdefault(topic, []).append(custom_reduction(here))
+    return {topic: _both(some) for topic, some in parts.items()}
+
+
+def _both(parts: Sequence[Reduction]) -> Reduction:
+    """Several reductions of one topic as one."""
+    if len(parts) == 1:
+        return parts[0]
+
+    def apply(fields: Fields) -> dict[str, FieldColumn]:
+        return {name: column for part in parts for name, column in part.apply(fields).items()}
+
+    return Reduction(tuple(dict.fromkeys(f for part in parts for f in part.fields)), apply)
+
+
+def field_paths(source: Input) -> list[str]:
+    """The field paths that an input reads."""
+    found: list[str] = []
+    for key, path in source.fields.items():
+        found += [f"{path}.{axis}" for axis in "xyzw"] if key == "orientation" else [path]
+    return found
+
+
+def input_problems(
+    profile: Profile,
+    available: Mapping[str, Any],
+    leaves: Mapping[str, Sequence[Leaf]] | None = None,
+) -> list[str]:
+    """Why a recording with these topics (and fields) does not fit the profile, a line a topic."""
+    needed: dict[str, list[str]] = {}
+    wrong: dict[str, list[str]] = {}
+    fields: list[str] = []
+    for name, source in profile.inputs.items():
+        found = available.get(source.topic)
+        if (found is None or not found.expected) and not source.optional:
+            what = "no message of" if found is not None else "no topic"
+            needed.setdefault(f"{what} {source.topic}", []).append(name)
+        elif found is not None and found.type != source.type:
+            said = f"{source.topic} holds {found.type}, not {source.type}"
+            wrong.setdefault(said, []).append(name)
+        elif found is not None and leaves is not None:
+            fields += _field_problems(name, source, leaves[source.topic])
+    for name, signal in profile.signals.items():
+        found = available.get(signal.topic)
+        if found is not None and found.type != signal.type:
+            said = f"{signal.topic} holds {found.type}, not {signal.type}"
+            wrong.setdefault(said, []).append(f"signals.{name}")
+        elif found is not None and leaves is not None:
+            problem = signal.problem(leaves[signal.topic])
+            fields += [f"`signals.{name}.path`: {signal.topic}: {problem}"] if problem else []
+    hints = {what: near(what.split()[-1], available) for what in needed}
+    lacking = [
+        f"{what} ({', '.join(names)})" + (f": {hints[what]}" if hints.get(what) else "")
+        for what, names in itertools.chain(needed.items(), wrong.items())
+    ]
+    return lacking + fields + _transform_problems(profile, available, leaves or {})
+
+
+def near(topic: str, available: Mapping[str, Any]) -> str:
+    """A question about a topic that is nearly the one that is missing, or ""."""
+    found = [] if topic in available else get_close_matches(topic, available, n=1)
+    return f"did you mean {found[0]}?" if found else ""
+
+
+def _field_problems(name: str, source: Input, leaves: Sequence[Leaf]) -> list[str]:
+    """The fields of an input that its topic does not have, and what it has."""
+    has = {leaf.path.removesuffix("[]") for leaf in leaves}
+    return [
+        f"`inputs.{name}.fields`: {source.topic}: {offer(path, sorted(has))}"
+        for path in field_paths(source)
+        if path.removesuffix("[]") not in has
+    ]
+
+
+def _transform_problems(
+    profile: Profile, available: Mapping[str, Any], leaves: Mapping[str, Sequence[Leaf]]
+) -> list[str]:
+    """Whether there are transforms at all, where the pose is to come from them."""
+    pose, frames = profile.inputs.pose, profile.frames
+    if frames is None:
+        return []
+    others = [
+        f"{topic} holds {available[topic].type}, not transforms (frames)"
+        for topic in profile.transform_topics
+        if topic in leaves and not set(FIELDS) <= {leaf.path for leaf in leaves[topic]}
+    ]
+    seen = any(t in available and available[t].expected for t in profile.transform_topics)
+    if others or seen or (pose is not None and pose.topic in available):
+        return others
+    return [f"no message of {frames.topic} or {frames.static_topic} (pose, by [frames])"]

@@ -1,0 +1,118 @@
+"""Which goal and which plan are in force at each tick, and the signals that follow from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.ingest.task.route import RouteView, pad_plans, view_route
+from restock.ingest.task.signals import Columns
+from restock.ingest.task.task import Task, clearance_ahead
+
+F64 = NDArray[np.float64]
+Ints = NDArray[np.int64]
+# A number beyond this, in any unit that a signal has, is a fault and counts as not finite.
+LARGEST = 1e6
+_CHUNK = 4096  # poses at a time: bounds memory whatever the recording's length
+
+
+@dataclass(frozen=True)
+class Routing:
+    """The goals and plans of a recording, and which are in force at each of T ticks.
+
+    Without any, the way is straight ahead: look-ahead points on the robot's forward axis, and
+    nothing remaining.
+    """
+
+    goals_m: F64  # (G, 2)
+    plans_m: Sequence[F64]  # each (P, 2), map frame
+    goal: Ints  # (T,) index of a goal, the same for the same place; -1 is none
+    plan: Ints  # (T,) index of a plan; -1 is none
+    order: Ints  # (T,) the message that said so: a goal may be ordered again
+
+    @classmethod
+    def none(cls, ticks: int) -> Routing:
+        """No goal and no plan, ever."""
+        nowhere = np.full(ticks, -1, np.int64)
+        return cls(np.zeros((0, 2)), [], nowhere, nowhere, nowhere)
+
+    def view(self, task: Task, plan: Ints, pose: Columns) -> RouteView:
+        """Along plan `plan[i]` from pose i, for N poses."""
+        count = len(plan)
+        ahead = np.zeros((count, 2, 2))
+        ahead[:, :, 0] = task.near_m, task.far_m
+        remaining, offset = np.zeros(count), np.zeros(count)
+        planned = np.flatnonzero(plan >= 0)
+        for start in range(0, len(planned), _CHUNK):
+            rows = planned[start : start + _CHUNK]
+            used, inverse = np.unique(plan[rows], return_inverse=True)
+            padded = pad_plans([self.plans_m[index] for index in used])[inverse]
+            x, y, yaw = (pose[name][rows] for name in ("pose_x_m", "pose_y_m", "pose_yaw_rad"))
+            seen = view_route(padded, x, y, yaw, (task.near_m, task.far_m))
+            ahead[rows], offset[rows] = seen.look_ahead_m, seen.offset_m
+            remaining[rows] = seen.remaining_m
+        return RouteView(ahead, remaining, offset)
+
+    def signals(self, task: Task, goal: Ints, plan: Ints, now: Columns) -> dict[str, NDArray[Any]]:
+        """The route's signals for N steps that have `goal[i]` and `plan[i]` in force."""
+        seen = self.view(task, plan, now)
+        distance = np.zeros(len(goal))
+        aimed = np.flatnonzero(goal >= 0)
+        position = np.stack([now["pose_x_m"], now["pose_y_m"]], axis=-1)
+        distance[aimed] = np.linalg.norm(self.goals_m[goal[aimed]] - position[aimed], axis=-1)
+        near, far = seen.look_ahead_m[:, 0], seen.look_ahead_m[:, 1]
+        return {
+            "waypoint_near_x_m": near[:, 0],
+            "waypoint_near_y_m": near[:, 1],
+            "waypoint_far_x_m": far[:, 0],
+            "waypoint_far_y_m": far[:, 1],
+            "route_remaining_m": seen.remaining_m,
+            "goal_distance_m": distance,
+            "clearance_ahead_m": clearance_ahead(
+                task, now["sector_clearance_m"], near[:, 0], near[:, 1]
+            ),
+        }
+
+    def progress_m(self, task: Task, plan: Ints, now: Columns, after: Columns) -> F64:
+        """How much shorter plan `plan[i]` became from `now` to `after`; without one, how far
+        the robot moved forward (along the mean of its two headings)."""
+        shorter: F64 = now["route_remaining_m"] - self.view(task, plan, after).remaining_m
+        turn = after["pose_yaw_rad"] - now["pose_yaw_rad"]
+        heading = now["pose_yaw_rad"] + ((turn + np.pi) % (2 * np.pi) - np.pi) / 2
+        forward = np.cos(heading) * (after["pose_x_m"] - now["pose_x_m"])
+        forward = forward + np.sin(heading) * (after["pose_y_m"] - now["pose_y_m"])
+        return np.where(plan >= 0, shorter, forward)
+
+
+def same_goals(goals_m: F64, moved_m: float) -> Ints:
+    """Goals (G, 2) in the order they came -> for each the first of its run of equal goals (G,)."""
+    first = np.arange(len(goals_m), dtype=np.int64)
+    for index in range(1, len(goals_m)):
+        if np.linalg.norm(goals_m[index] - goals_m[first[index - 1]]) <= moved_m:
+            first[index] = first[index - 1]
+    return first
+
+
+def plan_problems(plans_m: Sequence[F64]) -> list[str]:
+    """What is wrong with each plan by itself, or ""."""
+    problems = []
+    for plan in plans_m:
+        if not len(plan):
+            problems.append("plan: empty")
+        else:
+            sane = (np.abs(plan) <= LARGEST).all()  # False for NaN
+            problems.append("" if sane else "plan: not finite")
+    return problems
+
+
+def plan_ends(plans_m: Sequence[F64]) -> F64:
+    """The last point of each plan (P, 2); NaN where it has none."""
+    ends = np.full((len(plans_m), 2), np.nan)
+    for index, plan in enumerate(plans_m):
+        if len(plan):
+            ends[index] = plan[-1]
+    return ends

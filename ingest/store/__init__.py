@@ -1,0 +1,1 @@
+"""Transitions and manifest, written to a Delta table in one commit."""

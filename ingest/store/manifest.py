@@ -1,0 +1,137 @@
+"""The manifest row of an ingest: what was read, by which definitions, and what became of it."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from restock.ingest.containers.recording import Recording
+from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.profile.profile import Profile
+from restock.ingest.steps.episodes import Split
+from restock.ingest.steps.sources import stand_ins
+from restock.ingest.steps.steps import Steps
+from restock.ingest.store.episode_rows import EpisodeRows
+from restock.ingest.store.transitions import Provenance
+from restock.ingest.task.conditions import Condition
+from restock.ingest.task.label_scores import LabelScore
+
+UNUSED = "not used by the profile"
+
+
+def software_version() -> str:
+    """Restock's version."""
+    try:
+        return version("restock")
+    except PackageNotFoundError:  # running from a source tree that was never installed
+        return "0.0.0+unknown"
+
+
+def definitions(profile: Profile) -> dict[str, str]:
+    """What rows depend on beside the recording."""
+    return {
+        "profile_hash": profile.hash,
+        "task_hash": profile.task.hash,
+        "labels_version": profile.labels_version,
+        "restock_version": software_version(),
+    }
+
+
+def manifest_row(
+    recording: Recording,
+    profile: Profile,
+    provenance: Provenance,
+    columns: Mapping[str, TopicColumns],
+    steps: Steps,
+    episodes: Split,
+    rows: EpisodeRows,
+    scores: Sequence[LabelScore],
+) -> dict[str, Any]:
+    """The row of `recordings`, by `restock.ingest.task.schema`."""
+    stamps, span = steps.signals["stamp_ns"], recording.span_ns or (0, 0)
+    dropped = sorted(episodes.dropped.items(), key=lambda item: (-item[1], item[0]))
+    instead = stand_ins(profile, columns)
+    return {
+        "recording_id": recording.recording_id,
+        "ingest_id": provenance.ingest_id,
+        "ingested_at": dt.datetime.now(dt.UTC),
+        "source_file": provenance.source_file,
+        "format": recording.format,
+        "integrity": recording.integrity,
+        "duration_s": (span[1] - span[0]) * 1e-9,
+        "start_stamp_ns": int(stamps.min()),
+        "end_stamp_ns": int(stamps.max()),
+        "clock": steps.clock.alignment,
+        "clock_offset_ns": steps.clock.offset_ns,
+        "clock_jumps": steps.clock.jumps,
+        "profile": profile.name,
+        **definitions(profile),
+        "ticks": len(steps),
+        "steps": len(np.unique(rows.tick)),
+        "episodes": len(episodes.episodes),
+        "transitions": episodes.transitions,
+        "episode_ends": episodes.ends,
+        "drops": [{"reason": reason, "count": count} for reason, count in dropped],
+        "topics": topic_rows(recording),
+        "stand_ins": [{"input": name, "instead": how} for name, how in instead.items()],
+        "label_scores": score_rows(scores),
+        "clocks": clock_rows(recording, steps),
+        "signals": steps.custom.rows(),
+        "task_json": msgspec.json.encode(profile.task).decode(),
+        "conditions_json": conditions_json(profile.conditions),
+    }
+
+
+def topic_rows(recording: Recording) -> list[dict[str, Any]]:
+    """Every topic: the messages the container counts, those decoded, and why not the rest."""
+    found = []
+    for name, info in recording.topics.items():
+        account = recording.accounts.get(name)
+        reason = info.skipped or UNUSED
+        if account is not None:
+            reason = "; ".join(f"{why}: {count}" for why, count in account.reasons.items() if count)
+        decoded = account.decoded if account is not None else 0
+        found.append(
+            {
+                "topic": name,
+                "type": info.type,
+                "expected": info.expected,
+                "decoded": decoded,
+                "skipped": max(info.expected - decoded, 0),
+                "reason": reason,
+            }
+        )
+    return found
+
+
+def clock_rows(recording: Recording, steps: Steps) -> list[dict[str, Any]]:
+    """Every topic's clocks, and what aligning did about its messages."""
+    report = steps.clock
+    return [
+        {
+            **one.as_row(),
+            "log_backsteps": recording.accounts[one.topic].log_backsteps,
+            "off_clock": report.off_clock.get(one.topic, 0),
+            "restamped": report.restamped.get(one.topic, 0),
+        }
+        for one in steps.clocks
+    ]
+
+
+def score_rows(scores: Sequence[LabelScore]) -> list[dict[str, Any]]:
+    """Scores as the manifest holds them."""
+    names = ("condition", "precision", "recall", "labelled", "support")
+    return [{name: getattr(score, name) for name in names} for score in scores]
+
+
+def conditions_json(conditions: Sequence[Condition]) -> str:
+    """Conditions as the manifest holds them: name, timing, priority and SQL."""
+    names = ("name", "timing", "priority", "sql")
+    return msgspec.json.encode(
+        [{name: getattr(condition, name) for name in names} for condition in conditions]
+    ).decode()

@@ -1,0 +1,193 @@
+"""The columns of the transition table: names, types, units and meanings.
+
+A row is one transition and stands alone: the observation after it is in the row, so rows stay
+whole under any filter, sort or engine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import pyarrow as pa
+
+from restock.ingest.task.signals import STORED_SIGNALS
+
+# transition_id = (a number from the recording's id) << STEP_BITS | (step of the recording)
+STEP_BITS = 25
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of the table. `observation` types get their length from the task."""
+
+    name: str
+    type: pa.DataType
+    meaning: str
+    nullable: bool = False
+
+
+_F32_LIST = pa.list_(pa.float32())
+
+IDENTITY: tuple[Column, ...] = (
+    Column("transition_id", pa.int64(), "unique in the store; the same after a re-ingest"),
+    Column("recording_id", pa.string(), "hash of the recording's content, 16 hex digits"),
+    Column("episode_id", pa.string(), "<recording_id>/<episode_index>"),
+    Column("episode_index", pa.int32(), "of the episode in its recording, from 0"),
+    Column("step_index", pa.int32(), "of the step in its episode, from 0"),
+)
+TRANSITION: tuple[Column, ...] = (
+    Column("observation", _F32_LIST, "what the robot knew at t; float32[D], see the task"),
+    Column("action", pa.int16(), "index of the discrete action in force over [t, t + 1)"),
+    Column("reward", pa.float32(), "of [t, t + 1)"),
+    Column("next_observation", _F32_LIST, "what the robot knew at t + 1; float32[D]"),
+    Column("terminated", pa.bool_(), "the episode ended for good at t + 1: do not bootstrap"),
+    Column("truncated", pa.bool_(), "the episode was cut at t + 1 (time, gap, end of recording)"),
+)
+COVERAGE: tuple[Column, ...] = (
+    Column("condition", pa.string(), "the one condition of highest priority, or 'nominal'"),
+    Column("conditions", pa.list_(pa.string()), "every condition that holds; empty if nominal"),
+    Column("true_condition", pa.string(), "from the simulator, to score labels", nullable=True),
+    Column("perturbation", pa.string(), "name of the twin's parameters in force", nullable=True),
+    Column(
+        "perturbation_values",
+        pa.map_(pa.string(), pa.float64()),
+        "those that are not the nominal twin's; null for hardware",
+        nullable=True,
+    ),
+    Column("zone", pa.string(), "named part of the map, or 'elsewhere'"),
+    Column("behaviour_policy", pa.string(), "who acted: planner, operator, dqn, …"),
+    Column("behaviour_version", pa.string(), "version of that policy", nullable=True),
+    Column("action_probability", pa.float32(), "behaviour policy's, of the action", nullable=True),
+    Column("action_residual", pa.float32(), "from the command to the discrete action, scaled"),
+    Column("progress_m", pa.float32(), "how much shorter the plan became over [t, t + 1)"),
+)
+PROVENANCE: tuple[Column, ...] = (
+    Column("ingest_id", pa.string(), "the ingest that wrote this row; joins `recordings`"),
+    Column("source_file", pa.string(), "path of the recording as it was given"),
+    Column("profile_hash", pa.string(), "of the profile that read it, 12 hex digits"),
+    Column("task_hash", pa.string(), "of the definition of observation, action and reward"),
+    Column("labels_version", pa.string(), "of the conditions that labelled it"),
+    Column("restock_version", pa.string(), "of the software that wrote the row"),
+)
+
+
+def _signal_type(dtype: str) -> pa.DataType:
+    return {"int64": pa.int64(), "bool": pa.bool_()}.get(dtype, pa.float32())
+
+
+# float32 holds a millimetre up to 16 km from the map's origin; stamps stay int64.
+SIGNAL_COLUMNS: tuple[Column, ...] = tuple(
+    Column(signal.name, _signal_type(signal.dtype), signal.meaning) for signal in STORED_SIGNALS
+)
+
+COLUMNS: tuple[Column, ...] = IDENTITY + TRANSITION + COVERAGE + SIGNAL_COLUMNS + PROVENANCE
+
+
+def steps_schema(custom: Sequence[pa.Field] = ()) -> pa.Schema:
+    """The steps as conditions see them: the stored signals, and a profile's custom ones."""
+    keys = [("episode_index", pa.int64()), ("step_index", pa.int64())]
+    own = [(column.name, column.type) for column in SIGNAL_COLUMNS]
+    return pa.schema([*(pa.field(*field) for field in keys + own), *custom])
+
+
+def transition_schema(observation_size: int, custom: Sequence[pa.Field] = ()) -> pa.Schema:
+    """The Arrow schema of rows whose observations have `observation_size` entries.
+
+    `custom` are the columns of a profile's own signals; they come last.
+    """
+    sized = pa.list_(pa.field("element", pa.float32()), observation_size)
+    return pa.schema(
+        [
+            pa.field(
+                column.name,
+                sized if column.type == _F32_LIST else column.type,
+                nullable=column.nullable,
+            )
+            for column in COLUMNS
+        ]
+        + list(custom)
+    )
+
+
+def _rows_of(**fields: pa.DataType) -> pa.DataType:
+    return pa.list_(pa.struct(list(fields.items())))
+
+
+# One row an ingest: what was read, by which definitions, and what became of it.
+RECORDING_COLUMNS: tuple[Column, ...] = (
+    Column("recording_id", pa.string(), "hash of the recording's content, 16 hex digits"),
+    Column("ingest_id", pa.string(), "of this ingest; joins `transitions`"),
+    Column("ingested_at", pa.timestamp("us", "UTC"), "when it was ingested"),
+    Column("source_file", pa.string(), "path of the recording as it was given"),
+    Column("format", pa.string(), "of its container: mcap, rosbag2-sqlite3, rosbag2-mcap, …"),
+    Column("integrity", pa.string(), "checksums: verified, unverified or damaged"),
+    Column("duration_s", pa.float64(), "from its first message to its last, by log time"),
+    Column("start_stamp_ns", pa.int64(), "of its first step, on the alignment clock"),
+    Column("end_stamp_ns", pa.int64(), "of its last step, on the alignment clock"),
+    Column("clock", pa.string(), "the alignment clock: header.stamp or log_time"),
+    Column("clock_offset_ns", pa.int64(), "log time less alignment clock"),
+    Column("clock_jumps", pa.int32(), "times that the alignment clock was set"),
+    Column("profile", pa.string(), "name of the profile that read it"),
+    Column("profile_hash", pa.string(), "of the profile, 12 hex digits"),
+    Column("task_hash", pa.string(), "of the definition of observation, action and reward"),
+    Column("labels_version", pa.string(), "of the conditions that labelled it"),
+    Column("restock_version", pa.string(), "of the software that wrote it"),
+    Column("ticks", pa.int64(), "of the control clock = transitions + episode_ends + drops"),
+    Column("steps", pa.int64(), "ticks that belong to an episode"),
+    Column("episodes", pa.int64(), "of one transition or more"),
+    Column("transitions", pa.int64(), "rows in `transitions`"),
+    Column("episode_ends", pa.int64(), "ticks that only end an episode"),
+    Column("drops", _rows_of(reason=pa.string(), count=pa.int64()), "ticks in no episode"),
+    Column(
+        "topics",
+        _rows_of(
+            topic=pa.string(), type=pa.string(), expected=pa.int64(), decoded=pa.int64(),
+            skipped=pa.int64(), reason=pa.string(),
+        ),
+        "messages by the container's count, rows decoded, and why the rest were not",
+    ),
+    Column(
+        "stand_ins",
+        _rows_of(input=pa.string(), instead=pa.string()),
+        "inputs that the recording does not fill, and what was used instead",
+    ),
+    Column(
+        "label_scores",
+        _rows_of(
+            condition=pa.string(), precision=pa.float64(), recall=pa.float64(),
+            labelled=pa.int64(), support=pa.int64(),
+        ),
+        "of the labels against the true condition; empty where that is not known",
+    ),
+    Column(
+        "clocks",
+        _rows_of(
+            topic=pa.string(), messages=pa.int64(), stamped=pa.bool_(), offset_ns=pa.int64(),
+            spread_ns=pa.int64(), publish_offset_ns=pa.int64(), jumps=pa.int64(),
+            log_backsteps=pa.int64(), backsteps=pa.int64(), duplicates=pa.int64(),
+            zero_stamps=pa.int64(), off_clock=pa.int64(), restamped=pa.int64(),
+        ),
+        "per topic read: log time against header stamp, and what is odd about the stamps",
+        nullable=True,
+    ),
+    Column(
+        "signals",
+        _rows_of(
+            name=pa.string(), unit=pa.string(), type=pa.string(), topic=pa.string(),
+            path=pa.string(), meaning=pa.string(), messages=pa.int64(), found=pa.int64(),
+            unread=pa.int64(), steps=pa.int64(),
+        ),
+        "custom signals: unit and source, messages, those that have it, steps that know it",
+        nullable=True,
+    ),
+    Column("task_json", pa.string(), "the task, as JSON"),
+    Column("conditions_json", pa.string(), "the conditions: name, timing, priority, sql, as JSON"),
+)  # fmt: skip
+
+
+def recording_schema() -> pa.Schema:
+    """The Arrow schema of the `recordings` table."""
+    return pa.schema(
+        [pa.field(column.name, column.type, column.nullable) for column in RECORDING_COLUMNS]
+    )

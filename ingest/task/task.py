@@ -1,0 +1,223 @@
+"""The task: signals to observation, discrete action, reward and termination. Defined once.
+
+Every function is pure and vectorised over its leading axis: the steps of a recording at ingest,
+the environments of a step in the twin. `now` holds the signals at time t, `before` those of the
+step before (the same as `now` at the start of an episode), `after` those at t + 1. Nothing that
+makes an observation sees `after`; reward and termination are what happened in [t, t + 1).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.ingest.task.scan import Body
+from restock.ingest.task.signals import Columns
+
+F32 = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+# How observation and reward are computed. Raised when that changes, so that rows made by
+# different code are never mixed unseen.
+TASK_CODE_VERSION = 1
+
+
+class Rewards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What each event of a step is worth."""
+
+    progress_per_m: float = 1.0  # along the plan in force at t, clipped to +-1 m a step
+    step: float = -0.02
+    action_change: float = -0.01
+    tight: float = -0.05  # clearance at t + 1 below tight_clearance_m
+    tight_clearance_m: float = 0.15
+    harsh: float = -0.05  # wheels changed speed faster than harsh_mps2 over the step
+    harsh_mps2: float = 3.0
+    slip_per_mps: float = -0.1  # times |wheel speed - localised speed| beyond 0.2 m/s
+    goal: float = 5.0
+    bump: float = -1.0  # the bumper was pressed
+
+
+class Task(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The definition of the task for one kind of robot: the `[task]` table of a profile."""
+
+    body: Body
+    actions: tuple[tuple[float, float], ...]  # (speed m/s, yaw rate rad/s); action 0 must be stop
+    goal: Literal["route", "none"] = "route"
+    control_period_s: float = 0.2
+    sectors: int = 36
+    range_min_m: float = 0.05
+    range_max_m: float = 4.0
+    near_m: float = 1.0  # along the plan, of the near waypoint
+    far_m: float = 2.2
+    goal_radius_m: float = 0.4
+    time_limit_steps: int = 240
+    bump_terminates: bool = False
+    rewards: Rewards = Rewards()
+
+    def __post_init__(self) -> None:
+        if not self.actions or self.actions[0] != (0.0, 0.0):
+            raise ValueError("actions must start with the stop action [0, 0]")
+        if self.control_period_s <= 0:
+            raise ValueError(f"control_period_s must be above 0, got {self.control_period_s}")
+        if self.sectors < 4 or self.sectors % 2:
+            raise ValueError(f"sectors must be even and at least 4, got {self.sectors}")
+
+    @property
+    def observation_names(self) -> list[str]:
+        """The name of every entry of the observation, in order."""
+        bearings = (np.arange(self.sectors) + 0.5) * (360 / self.sectors) - 180
+        return [
+            *("near_sin", "near_cos", "far_sin", "far_cos", "goal_distance"),
+            *("wheel_speed", "gyro_yaw_rate", "localised_speed", "slip_speed", "slip_yaw_rate"),
+            *("lateral_speed", "accel_x"),
+            *(f"previous_action_{index}" for index in range(len(self.actions))),
+            *(f"clearance_{bearing:+.0f}deg" for bearing in bearings),
+            *(f"closing_{bearing:+.0f}deg" for bearing in bearings),
+        ]
+
+    @property
+    def observation_size(self) -> int:
+        return 12 + len(self.actions) + 2 * self.sectors
+
+    @property
+    def action_names(self) -> list[str]:
+        """The actions for people, e.g. `0.8 m/s left 0.7`."""
+        return [_action_name(*action) for action in self.actions]
+
+    @property
+    def hash(self) -> str:
+        """Names the definition, its parameters and the version of this code: 12 hex digits."""
+        content = msgspec.json.encode([TASK_CODE_VERSION, self])
+        return hashlib.blake2b(content, digest_size=6).hexdigest()
+
+
+def observe(task: Task, now: Columns, before: Columns, previous_action: Ints) -> F32:
+    """The observation at t, (N, D) float32, from signals at t and t - 1 and the action before t."""
+    near = np.arctan2(now["waypoint_near_y_m"], now["waypoint_near_x_m"])
+    far = np.arctan2(now["waypoint_far_y_m"], now["waypoint_far_x_m"])
+    routed = 1.0 if task.goal == "route" else 0.0  # without a goal these entries are all zero
+    clearance = _nearness(now["sector_clearance_m"], task.range_max_m)
+    closing = clearance - _nearness(before["sector_clearance_m"], task.range_max_m)
+    scalars = np.stack(
+        [
+            np.sin(near) * routed,
+            np.cos(near) * routed,
+            np.sin(far) * routed,
+            np.cos(far) * routed,
+            np.clip(now["route_remaining_m"], 0.0, 10.0) / 10.0 * routed,
+            now["wheel_speed_mps"],
+            now["gyro_yaw_rate_radps"],
+            now["localised_speed_mps"],
+            now["wheel_speed_mps"] - now["localised_speed_mps"],
+            now["wheel_yaw_rate_radps"] - now["gyro_yaw_rate_radps"],
+            now["localised_lateral_mps"],
+            np.clip(now["accel_x_mps2"], -10.0, 10.0) / 5.0,
+        ],
+        axis=-1,
+    )
+    one_hot = np.eye(len(task.actions))[previous_action]
+    return np.concatenate([scalars, one_hot, clearance, closing], axis=-1).astype(np.float32)
+
+
+def nearest_action(
+    task: Task, speed_mps: NDArray[Any], yaw_rate_radps: NDArray[Any]
+) -> tuple[Ints, NDArray[np.float64]]:
+    """Commands (N,) to the nearest discrete action (N,), and how far from it they were (N,).
+
+    Distance is measured in units of the fastest action on each axis. Ties go to the first action.
+    """
+    table = np.asarray(task.actions, np.float64)  # (A, 2)
+    scale = np.maximum(np.abs(table).max(axis=0), 1e-9)
+    command = np.stack([speed_mps, yaw_rate_radps], axis=-1) / scale
+    distance = np.linalg.norm(command[:, None, :] - (table / scale)[None], axis=-1)
+    action = np.argmin(distance, axis=1)
+    return action.astype(np.int64), distance[np.arange(len(action)), action]
+
+
+def reached_goal(task: Task, after: Columns) -> Bools:
+    """Whether the robot is within the goal radius at t + 1, (N,)."""
+    if task.goal == "none":
+        return np.zeros(len(after["goal_distance_m"]), np.bool_)
+    reached: Bools = after["goal_distance_m"] <= task.goal_radius_m
+    return reached
+
+
+def terminated(task: Task, after: Columns) -> Bools:
+    """Whether the episode ends for good at t + 1, (N,): no value is to be bootstrapped there."""
+    over = reached_goal(task, after)
+    if task.bump_terminates:
+        over = over | after["bumped"].astype(np.bool_)
+    return over
+
+
+def reward(
+    task: Task,
+    now: Columns,
+    after: Columns,
+    progress_m: NDArray[Any],
+    action: Ints,
+    previous_action: Ints,
+) -> F32:
+    """The reward of [t, t + 1), (N,) float32.
+
+    `progress_m` (N,) is how much shorter the plan in force at t became (with a goal), or how far
+    the robot moved forward (without one).
+    """
+    parts = reward_parts(task, now, after, progress_m, action, previous_action)
+    return np.asarray(sum(parts.values()), np.float32)
+
+
+def reward_parts(
+    task: Task,
+    now: Columns,
+    after: Columns,
+    progress_m: NDArray[Any],
+    action: Ints,
+    previous_action: Ints,
+) -> dict[str, NDArray[Any]]:
+    """What each event of [t, t + 1) was worth, (N,) each, by the names of `Rewards`."""
+    weight = task.rewards
+    harsh = np.abs(after["wheel_speed_mps"] - now["wheel_speed_mps"]) / task.control_period_s
+    slip = np.abs(after["wheel_speed_mps"] - after["localised_speed_mps"])
+    progress = weight.progress_per_m * np.clip(progress_m, -1.0, 1.0)
+    return {
+        "progress_per_m": progress,
+        "step": np.full_like(progress, weight.step),
+        "action_change": weight.action_change * (action != previous_action),
+        "tight": weight.tight * (after["clearance_m"] < weight.tight_clearance_m),
+        "harsh": weight.harsh * (harsh > weight.harsh_mps2),
+        "slip_per_mps": weight.slip_per_mps * np.clip(slip - 0.2, 0.0, 2.0),
+        "goal": weight.goal * reached_goal(task, after),
+        "bump": weight.bump * after["bumped"],
+    }
+
+
+def clearance_ahead(
+    task: Task, sector_clearance_m: NDArray[Any], waypoint_x_m: Any, waypoint_y_m: Any
+) -> NDArray[np.float64]:
+    """The smallest clearance (N,) of the three sectors around the bearing of the near waypoint."""
+    bearing = np.arctan2(waypoint_y_m, waypoint_x_m)
+    middle = ((bearing + np.pi) * (task.sectors / (2 * np.pi))).astype(np.int64)
+    around = (middle[:, None] + np.array([-1, 0, 1])) % task.sectors
+    nearest: NDArray[np.float64] = np.take_along_axis(sector_clearance_m, around, axis=1).min(1)
+    return nearest
+
+
+def _nearness(clearance_m: NDArray[Any], range_max_m: float) -> NDArray[Any]:
+    """Clearance to [0, 1], with more resolution close by."""
+    return np.sqrt(np.clip(clearance_m / range_max_m, 0.0, 1.0))
+
+
+def _action_name(speed_mps: float, yaw_rate_radps: float) -> str:
+    if speed_mps == 0 and yaw_rate_radps == 0:
+        return "stop"
+    turn = f"{'left' if yaw_rate_radps > 0 else 'right'} {abs(yaw_rate_radps):g}"
+    if speed_mps == 0:
+        return f"turn {turn}"
+    drive = f"{'drive' if speed_mps > 0 else 'back'} {abs(speed_mps):g}"
+    return f"{drive} {turn}" if yaw_rate_radps else drive

@@ -1,0 +1,1 @@
+"""Transitions as data sets of other libraries."""

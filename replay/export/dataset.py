@@ -1,0 +1,124 @@
+"""The rows of a store or a panel as another library's data set.
+
+Each format is a module with one function `write(selection, found, out, counts)`, which returns
+notes for the user; what it needs from elsewhere is imported there, so that only the format asked
+for must be installed.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from importlib.util import find_spec
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+from restock.errors import StoreError
+from restock.replay.export.selection import Selection, open_selection
+from restock.replay.export.trajectory import Counts, Trajectory, count_episodes, trajectories
+
+# name -> (module, what must be installed, what a file's name must end with or "" for a directory)
+FORMATS: dict[str, tuple[str, str, str]] = {
+    "minari": ("minari_hdf5", "minari", ""),
+    "d3rlpy": ("d3rlpy_h5", "h5py", ".h5"),
+    "lerobot": ("lerobot_v3", "", ""),
+    "parquet": ("parquet", "", ".parquet"),
+    "npz": ("npz", "", ".npz"),
+}
+
+
+def export_dataset(
+    source: str | Path,
+    to: str,
+    out: str | Path,
+    *,
+    query: str | None = None,
+    panel: str | Path | None = None,
+    continuous: bool = False,
+    advance: Callable[[int], None] = lambda steps: None,
+) -> dict[str, Any]:
+    """Write a data set; all or nothing.
+
+    Args:
+        source: a store or a panel.
+        to: one of FORMATS.
+        out: a file or directory that must not exist yet.
+        query, panel, continuous: see `open_selection`.
+        advance: called with the number of steps written, as it goes on.
+
+    Returns what was written: the counts of `Counts`, `notes`, and the provenance that the data
+    set carries.
+
+    Raises:
+        StoreError: an unknown format, a library that is missing, something at `out`, no rows.
+        PanelError, QueryError: see `open_selection`.
+    """
+    module, needs, ending = FORMATS.get(to, ("", "", ""))
+    if not module:
+        raise StoreError(f"no format {to!r}", remedy=f"one of {', '.join(FORMATS)}")
+    if needs and find_spec(needs) is None:
+        raise StoreError(
+            f"the format {to} needs {needs}, which is not installed",
+            remedy=f"pip install {needs}, or `pip install restock[neighbours]`",
+        )
+    out = Path(out)
+    if ending and out.suffix != ending:
+        raise StoreError(f"the format {to} is a file that ends in {ending}", where=str(out))
+    if out.exists():
+        raise StoreError("already there", where=str(out), remedy="choose another name")
+    counts = Counts()
+    write = importlib.import_module(f"restock.replay.export.{module}").write
+    with open_selection(source, query=query, panel=panel, continuous=continuous) as selection:
+        found = _advancing(_trajectories(selection, counts), advance)
+        if (first := next(found, None)) is None:
+            raise StoreError("no whole transition is left of the rows", where=selection.where)
+        if first.observations.shape[1] != selection.observation_size:
+            raise StoreError(
+                f"observations have {first.observations.shape[1]} entries, those of its task"
+                f" {selection.observation_size}",
+                where=selection.where,
+                remedy="export the observations as they are stored",
+            )
+        out.parent.mkdir(parents=True, exist_ok=True)
+        partial = out.with_name(f".{out.stem}.{os.getpid()}.partial{ending}")
+        _remove(partial)
+        try:
+            notes = write(selection, chain([first], found), partial, counts)
+            partial.rename(out)
+        finally:
+            _remove(partial)
+    return {
+        "format": to,
+        "path": str(out),
+        **counts.describe(),
+        "notes": notes,
+        "provenance": selection.provenance,
+    }
+
+
+def _trajectories(selection: Selection, counts: Counts) -> Iterator[Trajectory]:
+    return count_episodes(
+        trajectories(
+            selection.batches,
+            continuous=selection.continuous,
+            counts=counts,
+            where=selection.where,
+        ),
+        counts,
+    )
+
+
+def _advancing(found: Iterator[Trajectory], advance: Callable[[int], None]) -> Iterator[Trajectory]:
+    for trajectory in found:
+        yield trajectory
+        advance(len(trajectory))
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

@@ -1,0 +1,248 @@
+"""LeRobot's dataset layout v3.0: `LeRobotDataset("restock/logs", root="OUT")`.
+
+    meta/info.json  meta/stats.json  meta/tasks.parquet
+    meta/episodes/chunk-000/file-000.parquet    one row an episode: where it is, and its statistics
+    data/chunk-000/file-000.parquet             one row a frame
+    meta/restock.json                           where it is from
+
+A frame is an observation and the action taken there. The layout has no frame for the observation
+after the last action, so `next.observation.state` keeps it in every frame.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from restock.replay.export.parquet import fixed_lists
+from restock.replay.export.selection import Selection
+from restock.replay.export.trajectory import Counts, Trajectory
+
+CODEBASE_VERSION = "v3.0"
+CHUNK_FILES, DATA_FILE_MB = 1000, 100
+TASK = "Drive along the planned route to its goal without touching anything."
+QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
+OWN = "restock."  # columns about a frame, not of it: without statistics
+PATTERN = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+
+Stats = dict[str, dict[str, NDArray[np.float64]]]
+
+
+def write(
+    selection: Selection, found: Iterator[Trajectory], out: Path, counts: Counts
+) -> list[str]:
+    """Write the directory `out`."""
+    (out / "meta").mkdir(parents=True)
+    data = _DataFiles(out)
+    episodes: list[dict[str, Any]] = []
+    every: list[Stats] = []
+    frames = 0
+    features: dict[str, dict[str, Any]] = {}
+    fps = 1 / selection.task.control_period_s
+    for number, trajectory in enumerate(found):
+        columns = _frames(trajectory, number, frames, fps)
+        features = features or _features(selection, columns)
+        stats = {
+            name: _stats(np.asarray(values))
+            for name, values in columns.items()
+            if not name.startswith(OWN)
+        }
+        place = data.add(_table(columns))
+        every.append(stats)
+        length = len(trajectory)
+        episodes.append(
+            {
+                "episode_index": number,
+                "tasks": [TASK],
+                "length": length,
+                "dataset_from_index": frames,
+                "dataset_to_index": frames + length,
+                "data/chunk_index": place[0],
+                "data/file_index": place[1],
+                "meta/episodes/chunk_index": 0,
+                "meta/episodes/file_index": 0,
+                "restock/episode_id": trajectory.episode_id,
+                "restock/first_step": trajectory.first_step,
+                "restock/terminated": trajectory.terminated,
+                "restock/cut": trajectory.cut,
+                **{
+                    f"stats/{name}/{kind}": value.tolist()
+                    for name, kinds in stats.items()
+                    for kind, value in kinds.items()
+                },
+            }
+        )
+        frames += length
+    data.close()
+    path = out / "meta/episodes" / PATTERN.format(chunk_index=0, file_index=0)
+    path.parent.mkdir(parents=True)
+    pq.write_table(pa.Table.from_pylist(episodes), path)
+    _write_tasks(out / "meta/tasks.parquet")
+    _write_json(out / "meta/stats.json", _json(_together(every)))
+    _write_json(out / "meta/restock.json", selection.provenance | {"counts": counts.describe()})
+    _write_json(
+        out / "meta/info.json",
+        {
+            "codebase_version": CODEBASE_VERSION,
+            "robot_type": None,
+            "total_episodes": len(episodes),
+            "total_frames": frames,
+            "total_tasks": 1,
+            "chunks_size": CHUNK_FILES,
+            "data_files_size_in_mb": DATA_FILE_MB,
+            "video_files_size_in_mb": 200,
+            "fps": round(fps) if abs(fps - round(fps)) < 1e-9 else fps,
+            "splits": {"train": f"0:{len(episodes)}"},
+            "data_path": f"data/{PATTERN}",
+            "video_path": None,
+            "features": features,
+        },
+    )
+    return []
+
+
+class _DataFiles:
+    """Frames in files of about DATA_FILE_MB; an episode is never split."""
+
+    def __init__(self, out: Path) -> None:
+        self._out, self._bytes = out, 0
+        self._place = (0, 0)
+        self._writer: pq.ParquetWriter | None = None
+
+    def add(self, table: pa.Table) -> tuple[int, int]:
+        """Append an episode; returns the chunk and the file it is in."""
+        if self._bytes and self._bytes + table.nbytes > DATA_FILE_MB * 2**20:
+            self.close()
+            chunk, file = self._place
+            self._place = (chunk, file + 1) if file + 1 < CHUNK_FILES else (chunk + 1, 0)
+            self._bytes = 0
+        if self._writer is None:
+            name = PATTERN.format(chunk_index=self._place[0], file_index=self._place[1])
+            path = self._out / "data" / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._writer = pq.ParquetWriter(path, table.schema)
+        self._writer.write_table(table)
+        self._bytes += table.nbytes
+        return self._place
+
+    def close(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+
+
+def _frames(t: Trajectory, number: int, first_frame: int, fps: float) -> dict[str, Any]:
+    """An episode's columns, (T,) or (T, k) each."""
+    steps = np.arange(len(t))
+    last = steps == len(t) - 1
+    return {
+        "observation.state": t.observations[:-1],
+        "action": t.actions,
+        "next.observation.state": t.observations[1:],
+        "next.reward": t.rewards,
+        "next.done": last,
+        "next.terminated": last & t.terminated,
+        "next.truncated": last & t.truncated,
+        **{
+            f"{OWN}{name}": ["" if v is None else str(v) for v in column]
+            if column.dtype == object
+            else column
+            for name, column in t.carried.items()
+        },
+        "timestamp": (steps / fps).astype(np.float32),
+        "frame_index": steps,
+        "episode_index": np.full(len(t), number),
+        "index": first_frame + steps,
+        "task_index": np.zeros(len(t), np.int64),
+    }
+
+
+def _features(selection: Selection, columns: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """info.json's `features`: dtype, shape and the names of entries of every column."""
+    names = {
+        "observation.state": selection.provenance["observation_names"],
+        "next.observation.state": selection.provenance["observation_names"],
+        "action": selection.provenance["action_names"] if selection.continuous else ["index"],
+    }
+    features = {}
+    for name, values in columns.items():
+        text = isinstance(values, list)
+        shape = [1] if text or values.ndim == 1 else [values.shape[1]]
+        dtype = "string" if text else str(values.dtype)
+        features[name] = {"dtype": dtype, "shape": shape, "names": names.get(name)}
+    return features
+
+
+def _table(columns: dict[str, Any]) -> pa.Table:
+    return pa.table(
+        {
+            name: fixed_lists(values)
+            if isinstance(values, np.ndarray) and values.ndim == 2
+            else pa.array(values)
+            for name, values in columns.items()
+        }
+    )
+
+
+def _stats(values: NDArray[Any]) -> dict[str, NDArray[np.float64]]:
+    """Of one episode's column: one entry per element, (k,) each."""
+    wide = values.reshape(len(values), -1).astype(np.float64)
+    stats = {
+        "min": wide.min(axis=0),
+        "max": wide.max(axis=0),
+        "mean": wide.mean(axis=0),
+        "std": wide.std(axis=0),
+        "count": np.array([len(wide)]),
+    }
+    quantiles = np.quantile(wide, QUANTILES, axis=0)
+    return stats | {f"q{int(q * 100):02d}": quantiles[i] for i, q in enumerate(QUANTILES)}
+
+
+def _together(every: list[Stats]) -> Stats:
+    """Of all episodes. Quantiles are means of the episodes' own, as LeRobot aggregates them."""
+    whole: Stats = {}
+    for name in every[0]:
+        parts = {kind: np.stack([stats[name][kind] for stats in every]) for kind in every[0][name]}
+        weight = parts["count"] / parts["count"].sum()  # (episodes, 1)
+        mean = (parts["mean"] * weight).sum(axis=0)
+        variance = ((parts["std"] ** 2 + (parts["mean"] - mean) ** 2) * weight).sum(axis=0)
+        whole[name] = {
+            "min": parts["min"].min(axis=0),
+            "max": parts["max"].max(axis=0),
+            "mean": mean,
+            "std": np.sqrt(variance),
+            "count": parts["count"].sum(axis=0),
+            **{k: (v * weight).sum(axis=0) for k, v in parts.items() if k.startswith("q")},
+        }
+    return whole
+
+
+def _json(stats: Stats) -> dict[str, Any]:
+    return {name: {k: v.tolist() for k, v in kinds.items()} for name, kinds in stats.items()}
+
+
+def _write_tasks(path: Path) -> None:
+    """A pandas frame whose index is the task's text, as LeRobot reads it."""
+    index = {"name": "task", "field_name": "task", "pandas_type": "unicode"}
+    about = {
+        "index_columns": ["task"],
+        "columns": [
+            {"name": "task_index", "field_name": "task_index", "pandas_type": "int64"}
+            | {"numpy_type": "int64", "metadata": None},
+            index | {"numpy_type": "object", "metadata": None},
+        ],
+        "column_indexes": [],
+    }
+    table = pa.table({"task_index": pa.array([0], pa.int64()), "task": [TASK]})
+    pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(about)}), path)
+
+
+def _write_json(path: Path, value: Any) -> None:
+    path.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")

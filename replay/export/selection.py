@@ -1,0 +1,242 @@
+"""What is exported: a panel, or the rows of a query to a store, in order."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import msgspec
+import numpy as np
+import pyarrow as pa
+
+from restock import __version__
+from restock.errors import PanelError, QueryError, StoreError
+from restock.ingest.task.task import Task
+from restock.replay.export.trajectory import (
+    CARRIED,
+    COMMAND,
+    NEXT_IS_NEXT,
+    REQUIRED,
+    missing_columns,
+)
+from restock.replay.panel.panel import HEADER, Panel
+from restock.replay.places import open_place
+from restock.replay.store.query import fetch, interruptible
+from restock.replay.store.query import query as run_query
+from restock.replay.store.store import Store
+
+BATCH_ROWS = 16_384
+EVERYTHING = "FROM transitions"
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Rows to export, sorted by episode and step."""
+
+    where: str
+    batches: Iterator[pa.RecordBatch]
+    task: Task
+    continuous: bool
+    command_range: tuple[tuple[float, float], tuple[float, float]]  # low, high; of the actions
+    provenance: dict[str, Any]  # of the data set, as JSON
+
+    @property
+    def observation_size(self) -> int:
+        return self.task.observation_size
+
+
+@contextmanager
+def open_selection(
+    path: str | Path,
+    *,
+    query: str | None = None,
+    panel: str | Path | None = None,
+    continuous: bool = False,
+) -> Iterator[Selection]:
+    """The rows of a panel, or of a query to a store.
+
+    Args:
+        path: a store or a panel.
+        query: SQL over the store's views that gives whole transitions; default all of them.
+        panel: whose tables the query may use: `panel.rows`, `panel.strata`.
+        continuous: the action is the command that was logged, not the index of the nearest.
+
+    Raises:
+        StoreError, PanelError: nothing there, rows of several tasks, no rows.
+        QueryError: a query that does not run or lacks columns.
+    """
+    path = Path(path)
+    if (path / HEADER).is_file():
+        if query is not None or panel is not None:
+            raise QueryError("a panel is exported as it is, without a query", where=str(path),
+                             remedy="query its store, with --panel beside it")  # fmt: skip
+        yield _of_panel(Panel.open(path), continuous)
+        return
+    text = (query or EVERYTHING).strip().rstrip(";")
+    beside: Mapping[str, str | Path] = {"panel": panel} if panel is not None else {}
+    with (
+        Store(path) as store,
+        open_place(path, beside=beside, only_store=True) as connection,
+    ):
+        yield _of_query(store, connection, text, panel, continuous)
+
+
+def _of_query(
+    store: Store,
+    connection: duckdb.DuckDBPyConnection,
+    text: str,
+    panel: str | Path | None,
+    continuous: bool,
+) -> Selection:
+    where = str(store.path)
+    asked = run_query(connection, text, where=where)
+    columns = asked.columns
+    if missing := missing_columns(columns, continuous=continuous):
+        raise QueryError(
+            f"the query gives no {', '.join(missing)}",
+            where=where,
+            remedy="select whole transitions, as `FROM transitions WHERE …` does; an export needs "
+            + ", ".join((*REQUIRED, *COMMAND) if continuous else REQUIRED),
+        )
+    for name, kind in zip(columns, asked.types, strict=True):
+        if name in ("observation", "next_observation") and not str(kind).endswith("]"):
+            raise QueryError(f"its {name} is a {kind}, not a list of numbers", where=where)
+    by_command = ", ".join(f"min({name}), max({name})" for name in COMMAND) if continuous else "0"
+    hashes = "list(DISTINCT task_hash)" if "task_hash" in columns else "NULL"
+    _, rows = fetch(
+        connection, f"SELECT count(*), {hashes}, {by_command} FROM ({text})", where=where
+    )
+    facts = rows[0]
+    if not facts[0]:
+        raise StoreError("the query gives no rows", where=where, remedy="nothing was written")
+    if facts[1] is not None and len(facts[1]) > 1:
+        raise StoreError(
+            f"the query gives rows of the tasks {', '.join(sorted(facts[1]))}",
+            where=where,
+            remedy="add WHERE task_hash = '…'",
+        )
+    task = store.task(facts[1][0] if facts[1] else None)
+    # Episodes in the order they were driven, where the query says; else by their name.
+    driven = ["recording_id", "episode_index"]
+    order = [*(driven if set(driven) <= set(columns) else []), "episode_id", "step_index"]
+    wanted = dict.fromkeys(
+        (*REQUIRED, *(COMMAND if continuous else ()), *(c for c in CARRIED if c in columns))
+    )
+    relation = run_query(
+        connection,
+        f"SELECT {', '.join(wanted)} FROM ({text}) ORDER BY {', '.join(order)}",
+        where=where,
+    )
+    seen = ((facts[2], facts[4]), (facts[3], facts[5])) if continuous else None
+    return Selection(
+        where=where,
+        batches=_batches(connection, relation, where),
+        task=task,
+        continuous=continuous,
+        command_range=_range(task, seen),
+        provenance={
+            "store": where,
+            "store_version": store.version,
+            "query": text,
+            "panel": Panel.open(panel).id if panel is not None else None,
+            **_of_task(task, continuous),
+        },
+    )
+
+
+def _batches(
+    connection: duckdb.DuckDBPyConnection, relation: duckdb.DuckDBPyRelation, where: str
+) -> Iterator[pa.RecordBatch]:
+    """A query's rows as they come; Ctrl-C stops it.
+
+    Raises QueryError for what goes wrong while it runs.
+    """
+    try:
+        reader = interruptible(connection, lambda: relation.to_arrow_reader(BATCH_ROWS))
+        while (batch := interruptible(connection, lambda: next(reader, None))) is not None:
+            yield batch
+    except (duckdb.Error, pa.ArrowException, OSError) as error:
+        raise QueryError(str(error).splitlines()[0], where=where) from error
+
+
+def _of_panel(panel: Panel, continuous: bool) -> Selection:
+    if continuous:
+        raise PanelError(
+            "a panel keeps the index of the action, not the command",
+            where=str(panel.path),
+            remedy="export its rows from the store: --panel PANEL --query"
+            ' "FROM transitions SEMI JOIN panel.rows USING (transition_id)"',
+        )
+    task = panel.task
+    return Selection(
+        where=str(panel.path),
+        batches=_panel_batches(panel),
+        task=task,
+        continuous=False,
+        command_range=_range(task, None),
+        provenance={
+            "store": panel.header.store,
+            "store_version": panel.store_version,
+            "other_stores": msgspec.to_builtins(panel.header.others),
+            "panel": panel.id,
+            "labels_version": panel.header.labels_version,
+            **_of_task(task, continuous),
+        },
+    )
+
+
+def _panel_batches(panel: Panel) -> Iterator[pa.RecordBatch]:
+    """A panel's rows in order, as a query would give them."""
+    text = {"recording_id", "episode_id", "condition", "zone", "behaviour_policy"}
+    text |= {"behaviour_version", "perturbation"}
+    meta = panel.meta.cast(
+        pa.schema([f.with_type(pa.string()) if f.name in text else f for f in panel.meta.schema])
+    )
+    # An episode's place in its recording is the number after the slash.
+    index = [int(name.rpartition("/")[2]) for name in meta["episode_id"].to_pylist()]
+    recording = meta["recording_id"].to_numpy()
+    row = np.lexsort((meta["step_index"].to_numpy(), index, recording))
+    meta = meta.take(pa.array(row))
+    horizon = meta["horizon"].to_numpy()
+    for begin in range(0, len(meta), BATCH_ROWS):
+        part = slice(begin, begin + BATCH_ROWS)
+        packed = panel.rows[row[part]]
+        table = meta.slice(begin, BATCH_ROWS)
+        columns = {
+            name: table[name].combine_chunks()
+            for name in (*REQUIRED, *CARRIED)
+            if name in table.column_names
+        }
+        for name in ("observation", "next_observation"):
+            values = np.ascontiguousarray(packed[:, panel.columns[name]])
+            columns[name] = pa.FixedSizeListArray.from_arrays(
+                pa.array(values.ravel()), panel.observation_size
+            )
+        columns[NEXT_IS_NEXT] = pa.array(horizon[part] == 1)
+        yield pa.RecordBatch.from_pydict(columns)
+
+
+def _range(
+    task: Task, seen: tuple[tuple[float, float], tuple[float, float]] | None
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """What the task's actions span, or more where commands went beyond it."""
+    table = np.asarray(task.actions)
+    low, high = table.min(axis=0), table.max(axis=0)
+    if seen is not None:
+        low, high = np.minimum(low, seen[0]), np.maximum(high, seen[1])
+    return (float(low[0]), float(low[1])), (float(high[0]), float(high[1]))
+
+
+def _of_task(task: Task, continuous: bool) -> dict[str, Any]:
+    return {
+        "task_hash": task.hash,
+        "task": msgspec.to_builtins(task),
+        "observation_names": task.observation_names,
+        "action": "command (m/s, rad/s)" if continuous else "index into task.actions",
+        "action_names": list(COMMAND) if continuous else task.action_names,
+        "restock_version": __version__,
+    }

@@ -1,0 +1,240 @@
+"""Transitions put back together into trajectories: what other libraries' formats hold.
+
+A trajectory is an unbroken run of steps of one episode with the observation after its last step.
+Where rows are missing (a query or a mixture left them out) an episode becomes several, each ended
+by a cut: truncated, for its return goes on where nobody looks.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from restock.errors import StoreError
+from restock.replay.mixture.packed_row import F32, Bools, Ints
+
+REQUIRED = (
+    *("episode_id", "step_index", "observation", "action", "reward", "next_observation"),
+    *("terminated", "truncated"),
+)
+COMMAND = ("command_speed_mps", "command_yaw_rate_radps")
+CARRIED = (  # of a row, where the query has it
+    *("transition_id", "stamp_ns", "condition", "zone", "behaviour_policy", "behaviour_version"),
+    *("action_probability", "action_residual"),
+)
+# A row of an n-step panel: whether `next_observation` is the one a single step later.
+NEXT_IS_NEXT = "next_is_next"
+
+ENDED, CUT, NO_NEXT = "episode ended", "rows are missing", "no observation one step later"
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """T steps and the observation after them."""
+
+    episode_id: str
+    first_step: int  # its place in the episode
+    observations: F32  # (T + 1, D)
+    actions: NDArray[Any]  # (T,) int64, or (T, 2) float32: m/s and rad/s
+    rewards: F32  # (T,)
+    terminated: bool  # after the last step; else truncated
+    cut: bool  # truncated because the rows after it are not in the selection
+    carried: dict[str, NDArray[Any]]  # (T,) each; text as objects
+
+    def __len__(self) -> int:
+        return len(self.rewards)
+
+    @property
+    def truncated(self) -> bool:
+        return not self.terminated
+
+
+@dataclass
+class Counts:
+    """What became of the rows read."""
+
+    rows: int = 0
+    transitions: int = 0
+    trajectories: int = 0
+    terminated: int = 0
+    truncated: int = 0  # by the episode's own end
+    cut: int = 0  # because rows are missing
+    episodes: int = 0
+    left_out: Counter[str] = field(default_factory=Counter)  # rows, by reason
+
+    def describe(self) -> dict[str, Any]:
+        """As JSON has it."""
+        names = ("rows", "transitions", "trajectories", "episodes", "terminated", "truncated")
+        return {name: getattr(self, name) for name in names} | {
+            "cut": self.cut,
+            "left_out": dict(self.left_out),
+        }
+
+
+def trajectories(
+    batches: Iterable[pa.RecordBatch], *, continuous: bool, counts: Counts, where: str
+) -> Iterator[Trajectory]:
+    """Trajectories of rows that come sorted by episode and step.
+
+    Args:
+        batches: rows with the columns of REQUIRED; of COMMAND too, for continuous actions.
+        continuous: actions are commands, not indices.
+        counts: filled on the way.
+        where: the source, for errors.
+
+    Memory: one batch and one episode.
+
+    Raises:
+        StoreError: a step of an episode that comes twice, or observations of several sizes.
+    """
+    left: pa.Table | None = None
+    for batch in batches:
+        counts.rows += len(batch)
+        table = pa.Table.from_batches([batch])
+        if left is not None and len(left):
+            table = pa.concat_tables([left, table])
+        rows = _Rows(table, continuous, where)
+        starts = rows.starts()
+        for begin, end in pairwise(starts.tolist()):
+            yield from _trajectory(rows, begin, end, counts)
+        left = table.slice(int(starts[-1])) if len(starts) else None
+    if left is not None and len(left):
+        yield from _trajectory(_Rows(left, continuous, where), 0, len(left), counts)
+
+
+class _Rows:
+    """Rows as arrays."""
+
+    def __init__(self, table: pa.Table, continuous: bool, where: str) -> None:
+        self.where = where
+        self.episode: NDArray[Any] = _whole(table, "episode_id", where)
+        self.step: Ints = np.asarray(_whole(table, "step_index", where), np.int64)
+        self.observation = observation_matrix(table["observation"], where)
+        self.next_observation = observation_matrix(table["next_observation"], where)
+        if self.observation.shape != self.next_observation.shape:
+            raise StoreError(
+                f"observations have {self.observation.shape[1]} entries, next observations"
+                f" {self.next_observation.shape[1]}",
+                where=where,
+                remedy="export the observations as they are stored",
+            )
+        self.terminated: Bools = np.asarray(_whole(table, "terminated", where), np.bool_)
+        self.truncated: Bools = np.asarray(_whole(table, "truncated", where), np.bool_)
+        self.reward: F32 = np.asarray(_whole(table, "reward", where), np.float32)
+        self.action: NDArray[Any] = (
+            np.stack(
+                [np.asarray(_whole(table, name, where), np.float32) for name in COMMAND], axis=1
+            )
+            if continuous
+            else np.asarray(_whole(table, "action", where), np.int64)
+        )
+        self.known: Bools = (
+            np.asarray(_whole(table, NEXT_IS_NEXT, where), np.bool_)
+            if NEXT_IS_NEXT in table.column_names
+            else np.ones(len(table), np.bool_)
+        )
+        self.carried = {name: _plain(table, name) for name in CARRIED if name in table.column_names}
+
+    def starts(self) -> Ints:
+        """Where trajectories begin, ascending; the first is 0."""
+        same = self.episode[1:] == self.episode[:-1]
+        if (again := same & (self.step[1:] == self.step[:-1])).any():
+            row = int(np.flatnonzero(again)[0])
+            raise StoreError(
+                f"step {self.step[row]} of episode {self.episode[row]} comes twice",
+                where=self.where,
+                remedy="select each transition once: a join may have doubled rows",
+            )
+        goes_on = same & (self.step[1:] == self.step[:-1] + 1)
+        goes_on &= ~(self.terminated[:-1] | self.truncated[:-1])
+        equal = np.all(
+            (self.next_observation[:-1] == self.observation[1:])
+            | (np.isnan(self.next_observation[:-1]) & np.isnan(self.observation[1:])),
+            axis=1,
+        )
+        goes_on &= equal | ~self.known[:-1]
+        return np.concatenate([[0], np.flatnonzero(~goes_on) + 1]).astype(np.int64)
+
+
+def _trajectory(rows: _Rows, begin: int, end: int, counts: Counts) -> Iterator[Trajectory]:
+    """The rows [begin, end) as one trajectory, or none where nothing is left of them."""
+    last = end - 1
+    over = bool(rows.terminated[last] or rows.truncated[last])
+    after = rows.next_observation[last]
+    if not rows.known[last]:  # then its own observation is the last one that is known
+        counts.left_out[NO_NEXT] += 1
+        end, after, over = last, rows.observation[last], False
+    if end == begin:
+        return
+    terminated = over and bool(rows.terminated[last])
+    inside = slice(begin, end)
+    counts.transitions += end - begin
+    counts.trajectories += 1
+    counts.terminated += terminated
+    counts.truncated += over and not terminated
+    counts.cut += not over
+    yield Trajectory(
+        episode_id=str(rows.episode[begin]),
+        first_step=int(rows.step[begin]),
+        observations=np.concatenate([rows.observation[inside], after[None]]),
+        actions=rows.action[inside],
+        rewards=rows.reward[inside],
+        terminated=terminated,
+        cut=not over,
+        carried={name: column[inside] for name, column in rows.carried.items()},
+    )
+
+
+def count_episodes(found: Iterable[Trajectory], counts: Counts) -> Iterator[Trajectory]:
+    """Pass trajectories on, counting the episodes they are of (they come episode by episode)."""
+    before: str | None = None
+    for trajectory in found:
+        counts.episodes += trajectory.episode_id != before
+        before = trajectory.episode_id
+        yield trajectory
+
+
+def observation_matrix(column: pa.ChunkedArray, where: str) -> F32:
+    """A list column (n lists) as (n, D) float32. Raises StoreError where lengths differ."""
+    array = column.combine_chunks()
+    if isinstance(array, pa.ChunkedArray):
+        array = array.combine_chunks()
+    lengths = set(pc.unique(pc.list_value_length(array)).to_pylist())
+    if array.null_count or len(lengths) > 1:
+        raise StoreError(
+            "observations are missing or of several sizes",
+            where=where,
+            remedy="export rows of one task: add WHERE task_hash = '…'",
+        )
+    size = lengths.pop() if lengths else 0
+    flat = np.asarray(array.flatten().to_numpy(zero_copy_only=False), np.float32)
+    return flat.reshape(len(array), size)
+
+
+def _whole(table: pa.Table, name: str, where: str) -> NDArray[Any]:
+    """A column that must not have nulls."""
+    if count := table[name].null_count:
+        raise StoreError(
+            f"{count} rows have no {name}", where=where, remedy=f"add WHERE {name} IS NOT NULL"
+        )
+    return _plain(table, name)
+
+
+def _plain(table: pa.Table, name: str) -> NDArray[Any]:
+    """A scalar column; whole numbers with nulls become float64, text objects."""
+    values: NDArray[Any] = table[name].to_numpy()
+    return values
+
+
+def missing_columns(columns: Sequence[str], *, continuous: bool) -> list[str]:
+    """Which of the needed columns are not there."""
+    needed = (*REQUIRED, *COMMAND) if continuous else REQUIRED
+    return [name for name in needed if name not in columns]

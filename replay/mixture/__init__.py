@@ -1,0 +1,1 @@
+"""What a learner is to be fed, as a file."""

@@ -1,0 +1,181 @@
+"""Shares of strata: what the mixture wants, within floors, caps and what the rows can bear."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from restock.errors import MixtureError
+from restock.replay.mixture.mixture import Mixture, Share, Shortfall, StratumRule
+from restock.replay.mixture.packed_row import F64, Bools, Ints
+from restock.replay.mixture.schedules import value_at
+
+
+@dataclass(frozen=True)
+class SharePlan:
+    """Shares of the logs' part of a batch, (S,) each."""
+
+    wanted: F64  # after floors and caps
+    got: F64  # sums to 1
+    scale: float  # of the logs' part of a batch: below 1 only where the mixture shrinks
+    notes: tuple[str, ...]  # per stratum, why it got less or more than wanted
+
+
+def plan_shares(
+    mixture: Mixture,
+    rules: Sequence[StratumRule],
+    rows: Ints,
+    episodes: Ints,
+    *,
+    draws: float,
+    env_steps: float = 0,
+) -> SharePlan:
+    """Shares from the mixture's rules and how many rows (S,) and episodes (S,) there are.
+
+    `draws` is how many rows will be drawn in all, `env_steps` when, for shares with a schedule.
+
+    Raises:
+        MixtureError: shares that cannot sum to 1, or a shortfall where the mixture refuses one.
+    """
+    wanted = wanted_shares(rules, rows, env_steps)
+    limit = row_limits(mixture, rules, rows, episodes, draws)
+    caps = np.array([rule.cap for rule in rules])
+
+    def complaints() -> str:
+        return "; ".join(
+            f"{rule.name} wants {wanted[i]:.1%}, its {rows[i]} rows in {episodes[i]} episodes can"
+            f" bear {limit[i]:.1%}"
+            for i, rule in enumerate(rules)
+            if wanted[i] > limit[i] + 1e-12
+        )
+
+    return within_limits(wanted, limit, caps, mixture.shortfall, complaints)
+
+
+def within_limits(
+    wanted: F64, limit: F64, caps: F64, shortfall: Shortfall, complaints: Callable[[], str]
+) -> SharePlan:
+    """What becomes of wanted shares (S,) where rows can bear no more than `limit` (S,).
+
+    `caps` (S,) bound what a stratum takes of the others' surplus; `complaints` says who is short.
+
+    Raises:
+        MixtureError: a shortfall where it is to be refused, or no rows at all.
+    """
+    granted = np.minimum(wanted, limit)
+    missing = 1.0 - granted.sum()
+    short = wanted > limit + 1e-12
+    if missing <= 1e-9:
+        return SharePlan(wanted, wanted, 1.0, ("",) * len(wanted))
+    if shortfall == "refuse":
+        raise MixtureError(
+            f"not enough rows: {complaints()}",
+            remedy='lower the shares, raise max_replays_per_row, or set shortfall = "redistribute"',
+        )
+    if granted.sum() <= 0:
+        raise MixtureError(
+            "no stratum has rows that may be drawn",
+            remedy="`restock audit` shows what the store holds; lower min_rows or the conditions",
+        )
+    notes = np.where(short, "short of rows", "")
+    if shortfall == "shrink":
+        return SharePlan(
+            wanted, granted / granted.sum(), float(granted.sum()), tuple(notes.tolist())
+        )
+    roof = np.maximum(granted, np.minimum(limit, caps))
+    scale = min(float(roof.sum()), 1.0)
+    if scale < 1.0 - 1e-9:  # every stratum is at its limit: what is left cannot come from the logs
+        notes = np.where(short, "short of rows", np.where(roof > 0, "gives all it can", ""))
+        return SharePlan(wanted, roof / scale, scale, tuple(notes.tolist()))
+    got = scaled_within(granted, granted, roof)
+    more = (got > granted + 1e-9) & ~short
+    return SharePlan(wanted, got, 1.0, tuple(np.where(more, "took the surplus", notes).tolist()))
+
+
+def wanted_shares(rules: Sequence[StratumRule], rows: Ints, env_steps: float = 0) -> F64:
+    """Given shares as they are; the rest to "equal" and "natural" strata, within floor and cap.
+
+    Raises:
+        MixtureError: shares that cannot sum to 1 within their floors and caps.
+    """
+    given = np.array(
+        [0.0 if isinstance(rule.share, str) else value_at(rule.share, env_steps) for rule in rules]
+    )
+    flexible = np.array([isinstance(rule.share, str) for rule in rules], np.bool_)
+    rest = 1.0 - float(given.sum())
+    if rest < -1e-6 or (rest > 1e-6 and not flexible.any()):
+        raise MixtureError(
+            f"the shares of the strata sum to {given.sum():g}, not 1",
+            remedy='give one stratum share = "natural" to take what is left',
+        )
+    if not flexible.any():
+        return np.asarray(given / given.sum(), np.float64)
+    base = _flexible_parts([rule.share for rule in rules], flexible, rows)
+    low = np.array([rule.floor for rule in rules]) * flexible
+    high = np.where(flexible, [rule.cap for rule in rules], 0.0)
+    if low.sum() > rest + 1e-9 or high.sum() < rest - 1e-9:
+        raise MixtureError(
+            f"the strata's floors sum to {low.sum():g} and their caps to {high.sum():g}, which"
+            f" leave no way to share out {rest:g}",
+            remedy="lower a floor, or raise a cap",
+        )
+    return given + rest_within(base, low, high, max(rest, 0.0))
+
+
+def _flexible_parts(shares: Sequence[Share], flexible: Bools, rows: Ints) -> F64:
+    """Relative sizes: an equal part each, the natural strata's parts pooled and split by rows."""
+    natural = np.array([share == "natural" for share in shares], np.bool_)
+    parts = flexible.astype(np.float64)
+    if natural.any():
+        pool = natural.sum() if (flexible & ~natural).any() else 1.0
+        held = np.where(natural, rows, 0)
+        parts[natural] = pool * held[natural] / max(int(held.sum()), 1)
+    return parts
+
+
+def rest_within(base: F64, low: F64, high: F64, total: float) -> F64:
+    """Shares proportional to `base`, each within [low, high], that sum to `total`."""
+    if total <= 0:
+        return np.zeros(len(base))
+    return total * scaled_within(base / max(base.sum(), 1e-12), low / total, high / total)
+
+
+def scaled_within(base: F64, low: F64, high: F64) -> F64:
+    """clip(factor * base, low, high) with the factor for which it sums to 1, by bisection.
+
+    Where even `high` on every positive part of the base is below 1, the others take the rest.
+    """
+    usable = np.where(base > 0, high, low)
+    if usable.sum() < 1.0:
+        short, room = 1.0 - usable.sum(), high - usable
+        return usable + (room * (short / room.sum()) if room.sum() > 0 else 0.0)
+    below, above = 0.0, 1.0
+    while np.clip(above * base, low, high).sum() < 1.0 and above < 1e15:
+        above *= 2.0
+    for _ in range(200):
+        middle = (below + above) / 2
+        if np.clip(middle * base, low, high).sum() < 1.0:
+            below = middle
+        else:
+            above = middle
+    shares = np.clip(above * base, low, high)
+    return np.asarray(shares / shares.sum(), np.float64)
+
+
+def row_limits(
+    mixture: Mixture,
+    rules: Sequence[StratumRule],
+    rows: Ints,
+    episodes: Ints,
+    draws: float,
+) -> F64:
+    """The largest share of `draws` each stratum's rows can bear, (S,)."""
+    limit = np.where(rows > 0, 1.0, 0.0)
+    if mixture.max_replays_per_row is not None and draws > 0:
+        limit = np.minimum(limit, mixture.max_replays_per_row * rows / draws)
+    for index, rule in enumerate(rules):
+        if rows[index] < rule.min_rows or episodes[index] < rule.min_episodes:
+            limit[index] = 0.0
+    return limit

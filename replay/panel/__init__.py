@@ -1,0 +1,1 @@
+"""A mixture and a store become a pinned set of packed rows."""

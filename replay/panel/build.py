@@ -1,0 +1,304 @@
+"""Build a panel: a plan's rows packed into one memory-mapped file, all or nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import platform
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import duckdb
+import msgspec
+import pyarrow as pa
+
+from restock import __version__
+from restock.errors import PanelError, StoreError
+from restock.ingest.store.location import Location
+from restock.ingest.task.conditions import NOMINAL, Condition, labels_version, shipped
+from restock.ingest.task.task import Task
+from restock.replay.mixture.mixture import Mixture
+from restock.replay.mixture.packed_row import PACKING_VERSION
+from restock.replay.panel.pack import Packer, packing_code
+from restock.replay.panel.panel import HEADER, HELD_OUT, META, ROWS, Header, Panel, Stratum
+from restock.replay.panel.plan import Plan, plan_panel
+from restock.replay.panel.scratch import Steps
+from restock.replay.panel.seal import FileRecord, seal
+from restock.replay.panel.stores import AllStores, PinnedStore, all_stores
+from restock.replay.store.store import Store
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where transitions come from: a connection with a view `transitions`, and what it is."""
+
+    connection: duckdb.DuckDBPyConnection
+    name: str
+    version: int
+    task_json: Callable[[str], str]  # task hash -> the task as JSON; "" where nothing is known
+    conditions: tuple[Condition, ...]
+    others: tuple[PinnedStore, ...] = ()  # whose rows are in the view too
+
+
+@contextmanager
+def open_source(
+    transitions: pa.Table | Store,
+    mixture: Mixture | None = None,
+    *,
+    task: Task | None = None,
+    conditions: Sequence[Condition] | None = None,
+    folder: Path | None = None,
+) -> Iterator[Source]:
+    """A store, or a table with the columns of `ingest.schema`, as a source of a panel.
+
+    A store comes with the other stores of `mixture`, whose relative paths begin at `folder`.
+    Without `conditions` a table's are the shipped ones that its labels name.
+    """
+    if isinstance(transitions, Store):
+        found = transitions.conditions() if conditions is None else tuple(conditions)
+        with contextlib.ExitStack() as opened:
+            stores = AllStores(transitions.connection, ())
+            if mixture is not None:
+                stores = opened.enter_context(all_stores(transitions, mixture, folder))
+            yield Source(
+                stores.connection,
+                _address(str(transitions.path)),
+                transitions.version,
+                transitions.task_json,
+                found,
+                stores.others,
+            )
+        return
+    with duckdb.connect() as connection:
+        connection.register("given", transitions)
+        connection.execute("CREATE VIEW transitions AS SELECT *, stamp_ns AS logged_ns FROM given")
+        if conditions is None:
+            named = connection.sql("SELECT DISTINCT unnest(conditions) FROM transitions").fetchall()
+            known = shipped()
+            conditions = [
+                known.get(name) or Condition(name, "post", "false") for (name,) in sorted(named)
+            ]
+
+        def task_json(task_hash: str) -> str:
+            if task is None:
+                return ""
+            if task.hash != task_hash:
+                raise StoreError(f"its rows are of task {task_hash}, the task given is {task.hash}")
+            return msgspec.json.encode(task).decode()
+
+        yield Source(connection, "table in memory", -1, task_json, tuple(conditions))
+
+
+def build_panel(
+    transitions: pa.Table | Store,
+    mixture: Mixture,
+    out: str | Path,
+    *,
+    task: Task | None = None,
+    conditions: Sequence[Condition] | None = None,
+    force: bool = False,
+    advance: Callable[[int], None] = lambda rows: None,
+) -> Panel:
+    """Plan, pack and open a panel.
+
+    Args:
+        transitions: a store, or a table with the columns of `ingest.schema.transition_schema`.
+        mixture: what to take, in which shares.
+        out: the panel's directory, which must not exist yet.
+        task: for a table, the task its rows were made by.
+        conditions: for a table, the conditions that labelled it.
+        force: replace a panel that is already at `out`.
+        advance: called with the number of source rows read, as packing goes on.
+
+    Raises:
+        ConfigError, MixtureError, StoreError: see `plan_panel`.
+        PanelError: `out` is there already.
+    """
+    with open_source(transitions, mixture, task=task, conditions=conditions) as source:
+        plan = plan_panel(source.connection, mixture, source.conditions, source.others)
+        return write_panel(source, plan, out, force=force, advance=advance)
+
+
+def write_panel(
+    source: Source,
+    plan: Plan,
+    out: str | Path,
+    *,
+    force: bool = False,
+    advance: Callable[[int], None] = lambda rows: None,
+) -> Panel:
+    """Pack a plan's rows into `out`; an interruption leaves nothing there.
+
+    Raises PanelError when something is at `out` that may not be replaced, or a row cannot be
+    packed.
+    """
+    out = Path(out)
+    _check_free(out, force)
+    with _building(out) as partial, _enough_memory():
+        scratch = partial / "scratch"
+        scratch.mkdir()
+        task_json = source.task_json(plan.task_hash)
+        steps = Steps(
+            scratch,
+            source.connection,
+            len(plan.stratum),
+            chance=_chance(task_json),
+            cut_at_off_policy=plan.mixture.cut_at_off_policy,
+        )
+        packer = Packer(source.connection, plan, steps, scratch)
+        size = packer.write_rows(partial / ROWS, advance)
+        packer.write_meta(partial / META, partial / HELD_OUT)
+        identity = panel_id(source, plan, packer.digest())
+        shutil.rmtree(scratch)
+        header = _header(source, plan, identity, task_json, size, partial)
+        (partial / HEADER).write_bytes(seal(header))
+        for name in (HEADER, *header.files):
+            _finish(partial / name)
+        _put(partial, out, force)
+    return Panel.open(out)
+
+
+@contextmanager
+def _enough_memory() -> Iterator[None]:
+    """What DuckDB, or Arrow for it, says when it has too little. Raises PanelError."""
+    try:
+        yield
+    except (duckdb.OutOfMemoryException, OSError) as error:
+        if isinstance(error, OSError) and "Out of Memory" not in str(error):
+            raise
+        raise PanelError(
+            f"DuckDB may hold too little in memory: {str(error).splitlines()[0]}",
+            remedy="give it more with `restock mix --memory-limit`, or Store(memory_limit=…)",
+        ) from error
+
+
+def _address(store: str) -> str:
+    """Where a trace finds a store, whatever folder it begins in."""
+    place = Location.of(store)
+    return str(place if place.folder is None else place.folder.resolve())
+
+
+def _check_free(out: Path, force: bool) -> None:
+    is_panel = (out / HEADER).is_file()
+    if out.exists() and not (force and is_panel):
+        raise PanelError(
+            "already there",
+            where=str(out),
+            remedy="choose another --out" + ("; --force replaces a panel" if is_panel else ""),
+        )
+
+
+@contextmanager
+def _building(out: Path) -> Iterator[Path]:
+    """A folder beside `out` that no other builder has; what is left of it at the end goes away.
+
+    Those of builders that were killed go away first.
+    """
+    out.parent.mkdir(parents=True, exist_ok=True)
+    mine = f".{out.name}.building~"
+    for left in out.parent.iterdir():
+        host, _, process = left.name.removeprefix(mine).rpartition("~")[0].rpartition("~")
+        ours = left.name.startswith(mine) and host == platform.node() and process.isdigit()
+        if ours and not _alive(int(process)):
+            shutil.rmtree(left, ignore_errors=True)
+    partial = Path(tempfile.mkdtemp("", f"{mine}{platform.node()}~{os.getpid()}~", out.parent))
+    try:
+        yield partial
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True
+
+
+def _finish(path: Path) -> None:
+    """Flush a file to the disk, and take the right to write away: a panel never changes."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+    path.chmod(0o444)
+
+
+def _put(partial: Path, out: Path, force: bool) -> None:
+    """Give the finished panel its name, which takes one step, or two where it replaces another."""
+    partial.chmod(0o755)  # what mkdtemp makes is for its owner alone
+    old = partial.with_name(partial.name + "-old")
+    if force and (out / HEADER).is_file():
+        with contextlib.suppress(FileNotFoundError):  # taken away meanwhile
+            out.rename(old)
+    try:
+        partial.rename(out)
+    except OSError as error:
+        if not out.exists():
+            if old.exists():
+                old.rename(out)
+            raise
+        raise PanelError(
+            "another builder was faster", where=str(out), remedy="use the panel that is there"
+        ) from error
+    finally:
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def _chance(task_json: str) -> float:
+    """How probable each action is to one who chooses blindly; 0 where the task is not known."""
+    if not task_json:
+        return 0.0
+    return 1.0 / len(msgspec.json.decode(task_json, type=Task).actions)
+
+
+def panel_id(source: Source, plan: Plan, digest: str) -> str:
+    """What names a panel: store versions, mixture, task, rows (by `digest`), packing code."""
+    versions = [source.version, *(store.version for store in source.others)]
+    named = [packing_code(), versions, plan.mixture, plan.task_hash, digest]
+    return hashlib.blake2b(msgspec.json.encode(named), digest_size=8).hexdigest()
+
+
+def _header(
+    source: Source,
+    plan: Plan,
+    identity: str,
+    task_json: str,
+    observation_size: int,
+    partial: Path,
+) -> Header:
+    by_priority = sorted(source.conditions, key=lambda c: (c.priority, c.name))
+    return Header(
+        id=identity,
+        store=source.name,
+        store_version=source.version,
+        task_hash=plan.task_hash,
+        task_json=task_json,
+        labels_version=labels_version(source.conditions),
+        observation_size=observation_size,
+        rows=len(plan.panel_rows),
+        discount=plan.mixture.discount,
+        n_step=plan.mixture.n_step,
+        packing_version=PACKING_VERSION,
+        packing_code=packing_code(),
+        restock_version=__version__,
+        newest_ns=plan.newest_ns,
+        logs_share=plan.logs_share,
+        conditions=[*(c.name for c in by_priority), NOMINAL],
+        left_out=plan.left_out,
+        effective_rows=plan.effective_rows,
+        strata=[
+            Stratum(name=line.stratum, **{k: v for k, v in asdict(line).items() if k != "stratum"})
+            for line in plan.strata
+        ],
+        mixture=plan.mixture,
+        others=[msgspec.structs.replace(o, path=_address(o.path)) for o in plan.others],
+        ratios=list(plan.ratios),
+        files={name: FileRecord.of(partial / name) for name in (ROWS, META, HELD_OUT)},
+    )

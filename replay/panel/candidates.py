@@ -1,0 +1,142 @@
+"""The rows a mixture may choose from: what DuckDB says of each transition, as columns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+
+from restock.errors import ConfigError, MixtureError, StoreError
+from restock.replay.mixture.mixture import Mixture
+from restock.replay.mixture.packed_row import Bools, Ints
+from restock.replay.panel.scratch import ORDER
+from restock.replay.panel.strata import Stratum
+
+META_COLUMNS = (
+    *("transition_id", "recording_id", "episode_id", "step_index", "stamp_ns", "logged_ns"),
+    *("condition", "zone", "behaviour_policy", "behaviour_version", "action_probability"),
+    *("action", "reward", "terminated", "truncated", "perturbation"),
+)
+# Of which rows from before they were kept have none.
+_LATER = ("perturbation",)
+_TEXT = (
+    *("recording_id", "episode_id", "condition", "zone", "behaviour_policy", "behaviour_version"),
+    "perturbation",
+)
+_CODED = pa.dictionary(pa.int32(), pa.string())
+BATCH_ROWS = 65_536  # read at a time
+# Of a view of several stores, which one a row is from (`replay.stores`).
+STORE_COLUMN = "mixture_store"
+
+
+def meta_columns(connection: duckdb.DuckDBPyConnection) -> str:
+    """META_COLUMNS of the connection's `transitions`, for a SELECT."""
+    has = connection.sql("FROM transitions LIMIT 0").columns
+    return ", ".join(
+        f"NULL::VARCHAR AS {name}" if name in _LATER and name not in has else name
+        for name in META_COLUMNS
+    )
+
+
+def read_candidates(
+    connection: duckdb.DuckDBPyConnection,
+    mixture: Mixture,
+    strata: Sequence[Stratum],
+    *,
+    several_stores: bool = False,
+) -> pa.Table:
+    """Every row of the connection's `transitions`, by recording, episode and step.
+
+    META_COLUMNS, `task_hash`, `labelled`, and one boolean for each predicate of the mixture:
+    `admitted`, `unsafe`, `stratum_0`, `state_0` (of the row's state alone) …; text columns come
+    as dictionaries; `store` (int) says which store a row is from.
+
+    Raises:
+        ConfigError: a predicate that does not run; names it.
+        StoreError: transitions that cannot be read.
+    """
+    predicates = {"admitted": ("`where`", mixture.where or "true")}
+    unsafe = mixture.safety.unsafe if mixture.safety else "false"
+    predicates["unsafe"] = ("safety.unsafe", unsafe)
+    for index, stratum in enumerate(strata):
+        predicates[f"stratum_{index}"] = (f"stratum {stratum.name!r}", stratum.predicate)
+        state = stratum.state_predicate or stratum.predicate
+        predicates[f"state_{index}"] = (f"stratum {stratum.name!r}", state)
+    tests = ", ".join(
+        f"coalesce(({sql}\n)::BOOLEAN, false) AS {name}" for name, (_, sql) in predicates.items()
+    )
+    store = STORE_COLUMN if several_stores else "0"
+    query = (
+        f"SELECT {meta_columns(connection)}, task_hash, ({store})::INTEGER AS store,"
+        " coalesce(condition, '') <> '' AND conditions IS NOT NULL AS labelled,"
+        f" {tests} FROM transitions {ORDER}"
+    )
+    try:
+        # Text becomes codes batch by batch: whole columns of it would be most of the memory.
+        reader = connection.sql(query).to_arrow_reader(BATCH_ROWS)
+        table = pa.Table.from_batches([_encoded(batch) for batch in reader], _schema(reader.schema))
+    except duckdb.Error as error:
+        _blame(connection, predicates)
+        raise StoreError(f"its transitions cannot be read: {error}") from error
+    return table.unify_dictionaries().combine_chunks()
+
+
+def _schema(schema: pa.Schema) -> pa.Schema:
+    for name in _TEXT:
+        place = schema.get_field_index(name)
+        schema = schema.set(place, schema.field(place).with_type(_CODED))
+    return schema
+
+
+def _encoded(batch: pa.RecordBatch) -> pa.RecordBatch:
+    schema = _schema(batch.schema)
+    columns = [
+        column.cast(pa.string()).dictionary_encode() if field.name in _TEXT else column
+        for column, field in zip(batch.columns, schema, strict=True)
+    ]
+    return pa.RecordBatch.from_arrays(columns, schema=schema)
+
+
+def _blame(connection: duckdb.DuckDBPyConnection, predicates: dict[str, tuple[str, str]]) -> None:
+    """Each predicate by itself, to say which does not run."""
+    for place, sql in predicates.values():
+        try:
+            connection.sql(f"SELECT ({sql}\n)::BOOLEAN FROM transitions LIMIT 0")
+        except duckdb.Error as cause:
+            raise ConfigError(
+                f"its SQL does not run over `transitions`: {str(cause).splitlines()[0]}",
+                where=f"mixture, {place}",
+            ) from cause
+
+
+def one_task(table: pa.Table) -> str:
+    """The task of all rows that the mixture admits.
+
+    Raises:
+        MixtureError: it admits none.
+        StoreError: they are of several tasks.
+    """
+    admitted = table.filter(table["admitted"])
+    hashes = sorted(admitted["task_hash"].unique().to_pylist())
+    if not hashes:
+        raise MixtureError("the mixture's `where` admits no transition")
+    if len(hashes) > 1:
+        raise StoreError(
+            f"it holds transitions of {len(hashes)} tasks ({', '.join(hashes)}):"
+            " their observations, actions and rewards do not mean the same",
+            remedy="""choose one in the mixture, e.g. where = "task_hash = '"""
+            + f"""{hashes[0]}'", or ingest into one store per task""",
+        )
+    return str(hashes[0])
+
+
+def codes(table: pa.Table, name: str) -> Ints:
+    """Dictionary codes of a text column, (N,); -1 for null."""
+    column = table[name].combine_chunks()
+    return np.asarray(column.indices.fill_null(-1).to_numpy(), np.int64)
+
+
+def bools(table: pa.Table, name: str) -> Bools:
+    return np.asarray(table[name].to_numpy(), np.bool_)

@@ -1,0 +1,189 @@
+"""Which rows are no part of a panel, and why: every one is counted under its reason."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from restock.errors import MixtureError
+from restock.replay.mixture.mixture import HeldOut, Mixture
+from restock.replay.mixture.packed_row import Bools, Ints
+from restock.replay.mixture.splitmix import GOLDEN, splitmix64
+from restock.replay.panel.candidates import bools, codes
+from restock.replay.panel.strata import NO_STRATUM, Stratum
+
+DAY_NS = 86_400 * 10**9
+
+
+@dataclass
+class LeftOut:
+    """Rows (N,) that are left out, each under the first reason that applied to it."""
+
+    gone: Bools
+    reasons: dict[str, int] = field(default_factory=dict)
+
+    def add(self, reason: str, rows: Bools) -> None:
+        new = int((rows & ~self.gone).sum())
+        if new:
+            self.reasons[reason] = self.reasons.get(reason, 0) + new
+        self.gone |= rows
+
+
+def leave_out(table: pa.Table, mixture: Mixture, held_out: Bools) -> LeftOut:
+    """What no stratum gets, whatever it asks for. `table` is of `read_candidates`.
+
+    Raises:
+        MixtureError: rows without a label, where the mixture does not say what to do with them.
+    """
+    out = LeftOut(np.zeros(len(table), np.bool_))
+    out.add("refused by the mixture's `where`", ~bools(table, "admitted"))
+    if mixture.safety is not None:
+        unsafe = bools(table, "unsafe")
+        if mixture.safety.leave_out == "episodes":
+            episode = codes(table, "episode_id")
+            unsafe = np.isin(episode, np.unique(episode[unsafe]))
+        out.add("unsafe", unsafe)
+    logged = table["logged_ns"].to_numpy()
+    if mixture.max_age_days is not None:
+        out.add("too old", logged < int(logged.max()) - int(mixture.max_age_days * DAY_NS))
+    if mixture.max_versions_behind is not None:
+        behind = versions_behind(table)
+        out.add("of an old version of its policy", behind > mixture.max_versions_behind)
+    out.add("held out", held_out)
+    bare = ~bools(table, "labelled") & ~out.gone
+    if bare.any() and mixture.unlabelled == "refuse":
+        raise MixtureError(
+            f"{int(bare.sum())} rows have no coverage label: nobody knows what is on that shelf",
+            remedy='`restock label` the store, or set unlabelled = "drop" (or "nominal")',
+        )
+    if mixture.unlabelled == "drop":
+        out.add("without a coverage label", bare)
+    return out
+
+
+def leave_out_of_strata(
+    table: pa.Table,
+    mixture: Mixture,
+    strata: list[Stratum],
+    stratum: NDArray[np.int16],
+    out: LeftOut,
+) -> None:
+    """Rows of no stratum, and those beyond a cap on one episode's or recording's rows.
+
+    Raises:
+        MixtureError: rows of no stratum, where the mixture refuses them.
+    """
+    unlisted = (stratum == NO_STRATUM) & ~out.gone
+    if unlisted.any() and mixture.unlisted == "refuse":
+        seen = sorted(set(table["condition"].to_numpy(zero_copy_only=False)[unlisted]))
+        raise MixtureError(
+            f"{int(unlisted.sum())} rows belong to no stratum (conditions: {', '.join(seen)})",
+            remedy='list a stratum for them, add [each_condition], or set unlisted = "drop"',
+        )
+    out.add("in no stratum", unlisted)
+    for column, name in (("episode_id", "episode"), ("recording_id", "recording")):
+        caps = np.array([_cap(s, mixture, f"max_rows_per_{name}") for s in strata], np.int64)
+        if (caps < len(table)).any():
+            over = beyond_cap(table, column, stratum, caps, out.gone, mixture.seed)
+            out.add(
+                f"beyond the cap of rows an {name}"
+                if name == "episode"
+                else f"beyond the cap of rows a {name}",
+                over,
+            )
+
+
+def _cap(stratum: Stratum, mixture: Mixture, name: str) -> int:
+    own, common = getattr(stratum.rule, name), getattr(mixture, name)
+    cap = own if own is not None else common
+    return np.iinfo(np.int64).max if cap is None else int(cap)
+
+
+def beyond_cap(
+    table: pa.Table,
+    column: str,
+    stratum: NDArray[np.int16],
+    caps: Ints,
+    gone: Bools,
+    seed: int,
+) -> Bools:
+    """Rows (N,) that are too many of their stratum and episode (or recording).
+
+    Which stay depends on their ids and the seed alone, as `row_number() OVER (PARTITION BY stratum,
+    episode ORDER BY hash(transition_id, seed))` would choose.
+    """
+    rows = np.flatnonzero(~gone & (stratum != NO_STRATUM))
+    order_of = scramble(table["transition_id"].to_numpy()[rows], seed)
+    group = stratum[rows].astype(np.int64) * (len(table) + 1) + codes(table, column)[rows]
+    order = np.lexsort((order_of, group))
+    sorted_group = group[order]
+    first = np.flatnonzero(np.append(True, sorted_group[1:] != sorted_group[:-1]))
+    place = np.arange(len(rows)) - np.repeat(first, np.diff(np.append(first, len(rows))))
+    over = np.zeros(len(table), np.bool_)
+    over[rows[order]] = place >= caps[stratum[rows[order]]]
+    return over
+
+
+def versions_behind(table: pa.Table) -> Ints:
+    """How many newer versions of a row's behaviour policy the table has, (N,).
+
+    Versions of a policy are in order of when each was first logged. A row without a version is of
+    the version "" of its policy.
+    """
+    policy, version = codes(table, "behaviour_policy"), codes(table, "behaviour_version")
+    pair = (policy + 1) * (version.max(initial=0) + 2) + version + 1
+    pairs, row_pair = np.unique(pair, return_inverse=True)
+    first = np.full(len(pairs), np.iinfo(np.int64).max)
+    np.minimum.at(first, row_pair, table["logged_ns"].to_numpy())
+    of_policy = pairs // (version.max(initial=0) + 2)
+    behind = np.array(
+        [np.sum((of_policy == of_policy[i]) & (first > first[i])) for i in range(len(pairs))],
+        np.int64,
+    )
+    return behind[row_pair]
+
+
+def hold_out(table: pa.Table, rule: HeldOut, seed: int) -> Bools:
+    """Which rows are held out, (N,): whole episodes, whole recordings, or the latest episodes.
+
+    Raises:
+        MixtureError: the rule would hold out everything, or there is only one group to split.
+    """
+    if rule.by == "none" or rule.share == 0:
+        return np.zeros(len(table), np.bool_)
+    column = "recording_id" if rule.by == "recording" else "episode_id"
+    code = codes(table, column)
+    names = table[column].combine_chunks().dictionary.to_pylist()
+    rows = np.bincount(code, minlength=len(names))
+    if rule.by == "time":
+        newest = np.zeros(len(names), np.int64)
+        np.maximum.at(newest, code, table["logged_ns"].to_numpy())
+        order = np.argsort(-newest, kind="stable")
+    else:
+        order = np.argsort([_hash(name, seed) for name in names], kind="stable")
+    order = order[rows[order] > 0]
+    if len(order) < 2:
+        raise MixtureError(
+            f"one {rule.by if rule.by == 'recording' else 'episode'} cannot be split"
+            " into a panel and held-out data",
+            remedy='ingest more, or set [held_out] by = "none" in a mixture of your own',
+        )
+    wanted = rule.share * len(table)
+    # At least one group, never all, and no more than needed.
+    count = int(np.searchsorted(np.cumsum(rows[order]), wanted)) + 1
+    chosen = order[: min(count, len(order) - 1)]
+    return np.isin(code, chosen)
+
+
+def _hash(name: str, seed: int) -> int:
+    digest = hashlib.blake2b(f"{seed}/{name}".encode(), digest_size=7).digest()
+    return int.from_bytes(digest, "big")
+
+
+def scramble(ids: Ints, seed: int) -> NDArray[np.uint64]:
+    """A fixed mixing of ids: the same on every machine, whatever the order."""
+    return splitmix64(ids.astype(np.uint64) + np.uint64((seed * GOLDEN + 1) % 2**64))

@@ -1,0 +1,257 @@
+"""Packing: a plan's rows into one file of float32 rows, with metadata beside, in bounded memory.
+
+Whatever the size of the store, memory holds the plan and a batch: what must be known of every row
+lies on disk (`scratch`), rows are written through a memory map. Observations are read in the order
+in which the files have them and put where they belong, because sorting rows this wide would spill
+all of them to disk first.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from restock.errors import PanelError
+from restock.replay.mixture.mixture import Mixture
+from restock.replay.mixture.packed_row import Ints, row_columns, row_width
+from restock.replay.panel.candidates import meta_columns
+from restock.replay.panel.plan import Plan
+from restock.replay.panel.scratch import BATCH_ROWS, ORDER, STRETCH, Steps
+from restock.replay.panel.strata import NO_STRATUM
+
+ROW_GROUP_ROWS = 65_536
+BATCH_BYTES = 4 << 20  # of observations, in memory at a time
+FINITE = (
+    'where = "isfinite(list_sum(observation::FLOAT[]) + list_sum(next_observation::FLOAT[])'
+    ' + reward)"'
+)
+_TEXT = pa.dictionary(pa.int32(), pa.string())
+_HELD_OUT = ("transition_id", "recording_id", "episode_id", "step_index", "logged_ns", "condition")
+
+
+def packing_code() -> str:
+    """A hash of the code that packs rows: part of a panel's id, 12 hex digits."""
+    digest = hashlib.blake2b(digest_size=6)
+    for name in ("mixture/packed_row.py", "mixture/n_step.py", "panel/pack.py", "panel/scratch.py"):
+        digest.update((files("restock.replay") / name).read_bytes())
+    return digest.hexdigest()
+
+
+class Packer:
+    """Packs one plan. `steps` are those of the source, in the order of the plan."""
+
+    def __init__(
+        self, connection: duckdb.DuckDBPyConnection, plan: Plan, steps: Steps, scratch: Path
+    ) -> None:
+        self.connection, self.plan, self.steps = connection, plan, steps
+        self.mixture: Mixture = plan.mixture
+        count = len(plan.weight)
+        # Of each packed row: its place in the source, and that of the last step of its return.
+        self.chosen: Ints = np.memmap(scratch / "chosen", np.int64, "w+", shape=(count,))
+        self.last: Ints = np.memmap(scratch / "last", np.int64, "w+", shape=(count,))
+        at = 0
+        for begin, end, rows in self._stretches():
+            horizon = steps.horizon(begin, end, self.mixture.n_step)[rows]
+            self.chosen[at : at + len(rows)] = begin + rows
+            self.last[at : at + len(rows)] = begin + rows + horizon - 1
+            at += len(rows)
+
+    def _stretches(self) -> Iterator[tuple[int, int, Ints]]:
+        """Stretches of the source, and which of their rows are packed."""
+        for begin in range(0, self.steps.rows, STRETCH):
+            end = min(begin + STRETCH, self.steps.rows)
+            yield begin, end, np.flatnonzero(self.plan.stratum[begin:end] != NO_STRATUM)
+
+    def digest(self) -> str:
+        """Names the rows: ids, strata, horizons, weights."""
+        digests = [hashlib.blake2b(digest_size=8) for _ in range(4)]
+        at = 0
+        for begin, _, rows in self._stretches():
+            mine = slice(at, at + len(rows))
+            for digest, values in zip(
+                digests,
+                (
+                    self.steps.ids[self.chosen[mine]],
+                    self.plan.stratum[begin + rows],
+                    self.last[mine] - self.chosen[mine],
+                    self.plan.weight[mine],
+                ),
+                strict=True,
+            ):
+                digest.update(np.ascontiguousarray(values).tobytes())
+            at += len(rows)
+        return hashlib.blake2b(b"".join(d.digest() for d in digests), digest_size=8).hexdigest()
+
+    def write_rows(self, path: Path, advance: Callable[[int], None]) -> int:
+        """Write the packed rows; returns the observation size.
+
+        Raises PanelError where an observation or reward is not finite, or of another size.
+        """
+        of_task = f"FROM transitions WHERE task_hash = '{self.plan.task_hash}'"
+        first = self.connection.sql(f"SELECT len(observation) {of_task} LIMIT 1").fetchall()
+        size = int(first[0][0])
+        at_a_time = max(BATCH_BYTES // (8 * size), 1)
+        names = "transition_id, recording_id, action, terminated, observation, next_observation"
+        query = f"SELECT {names} {of_task}"
+        shape = (len(self.chosen), row_width(size))
+        rows = np.memmap(path, np.dtype("<f4"), "w+", shape=shape)
+        places = self.steps.places()
+        filled = 0
+        # Rows may come as the threads that read them finish: each knows where it belongs.
+        self.connection.execute("SET preserve_insertion_order = false")
+        try:
+            for batch in self.connection.sql(query).to_arrow_reader(at_a_time):
+                place = places.of(batch.column("transition_id").to_numpy())
+                filled += self._write(rows, size, batch, place)
+                advance(len(batch))
+        finally:
+            self.connection.execute("RESET preserve_insertion_order")
+        if filled != 2 * len(self.chosen):
+            raise PanelError("the source changed while it was read", where=str(path.parent))
+        rows.flush()
+        return size
+
+    def _write(
+        self, rows: NDArray[np.float32], size: int, batch: pa.RecordBatch, place: Ints
+    ) -> int:
+        """Put a batch's values where they belong; returns how many halves of rows were filled."""
+        part = row_columns(size)
+        target = np.searchsorted(self.chosen, place)
+        mine = np.flatnonzero(_at(self.chosen, target) == place)
+        target = target[mine]
+        observation = _matrix(batch.column("observation"), size)[mine]
+        following = _matrix(batch.column("next_observation"), size)
+        rows[target, part["observation"]] = observation
+        horizon = self.last[target] - place[mine] + 1
+        returns = np.zeros(len(mine))
+        for ahead in range(int(horizon.max(initial=0))):
+            reach = np.flatnonzero(horizon > ahead)
+            reward = self.steps.reward[place[mine[reach]] + ahead]
+            returns[reach] += self.mixture.discount**ahead * reward
+        rows[target, part["action"]] = batch.column("action").to_numpy()[mine, None]
+        rows[target, part["reward"]] = returns[:, None]
+        # Returns that end with a row of this batch take its next observation.
+        first, behind = (np.searchsorted(self.last, place, side) for side in ("left", "right"))
+        source = np.repeat(np.arange(len(place)), behind - first)
+        ends = np.arange(len(source)) + np.repeat(first - _starts(behind - first), behind - first)
+        rows[ends, part["next_observation"]] = following[source]
+        going_on = ~np.asarray(batch.column("terminated").to_numpy(zero_copy_only=False), np.bool_)
+        spanned = self.last[ends] - self.chosen[ends] + 1
+        rows[ends, part["discount"]] = (self.mixture.discount**spanned * going_on[source])[:, None]
+        fine = np.isfinite(observation).all(axis=1) & np.isfinite(returns)
+        if not fine.all() or not np.isfinite(following[source]).all():
+            raise PanelError(
+                "an observation or a reward is NaN or infinite, which no network survives",
+                where=f"recording {batch.column('recording_id')[0].as_py()}",
+                remedy=f"`restock audit` names them; a mixture leaves them out with {FINITE}",
+            )
+        return len(target) + len(ends)
+
+    def write_meta(self, meta: Path, held_out: Path) -> None:
+        """Write what stands beside the rows, and the rows that are held out, in the same order."""
+        names = pa.array([line.stratum for line in self.plan.strata], pa.string())
+        to_go = None
+        if self.mixture.return_to_go:
+            to_go = self.steps.returns_to_go(self.mixture.discount)
+        columns = meta_columns(self.connection)
+        reader = self.connection.sql(f"SELECT {columns} FROM transitions {ORDER}").to_arrow_reader(
+            BATCH_ROWS
+        )
+        begin = at = 0
+        with _Table(meta) as kept, _Table(held_out) as left:
+            for batch in reader:
+                end = begin + len(batch)
+                ids = batch.column("transition_id").to_numpy()
+                if not np.array_equal(ids, self.steps.ids[begin:end]):
+                    raise PanelError("the source changed while it was read", where=str(meta.parent))
+                table = _encoded(pa.Table.from_batches([batch]))
+                held = table.select(_HELD_OUT).filter(pa.array(self.plan.held_out[begin:end]))
+                split_by = pa.repeat(self.mixture.held_out.by, len(held))  # for the audit `leakage`
+                left.write(held.append_column("split_by", split_by))
+                code = self.plan.stratum[begin:end]
+                rows = np.flatnonzero(code != NO_STRATUM)
+                table, code = table.take(pa.array(rows)), code[rows]
+                mine = slice(at, at + len(rows))
+                beside: dict[str, Any] = {
+                    "stratum": pa.DictionaryArray.from_arrays(pa.array(code, pa.int32()), names),
+                    "stratum_code": pa.array(code),
+                    "horizon": pa.array((self.last[mine] - self.chosen[mine] + 1).astype(np.int16)),
+                    "weight": pa.array(self.plan.weight[mine]),
+                    **{name: pa.array(v[mine]) for name, v in self.plan.beside.items()},
+                }
+                if to_go is not None:
+                    beside["return_to_go"] = pa.array(to_go[0][begin:end][rows])
+                    beside["return_to_go_whole"] = pa.array(to_go[1][begin:end][rows])
+                for name, values in beside.items():
+                    table = table.append_column(name, values)
+                kept.write(table)
+                begin, at = end, at + len(rows)
+
+
+class _Table:
+    """A Parquet file, written a row group at a time."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._waiting: list[pa.Table] = []
+        self._writer: pq.ParquetWriter | None = None
+
+    def __enter__(self) -> _Table:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._flush()
+        if self._writer is not None:
+            self._writer.close()
+
+    def write(self, table: pa.Table) -> None:
+        self._waiting.append(table)
+        if sum(map(len, self._waiting)) >= ROW_GROUP_ROWS:
+            self._flush()
+
+    def _flush(self) -> None:
+        if self._waiting:
+            table, self._waiting = pa.concat_tables(self._waiting), []
+            if self._writer is None:
+                self._writer = pq.ParquetWriter(self._path, table.schema, compression="zstd")
+            self._writer.write_table(table.unify_dictionaries())
+
+
+def _encoded(table: pa.Table) -> pa.Table:
+    """Text as dictionaries: there are few distinct values, and readers keep them as codes."""
+    for place, field in enumerate(table.schema):
+        if pa.types.is_string(field.type) or pa.types.is_large_string(field.type):
+            column = table.column(place).cast(_TEXT)
+            table = table.set_column(place, field.with_type(_TEXT), column)
+    return table
+
+
+def _matrix(column: pa.Array, size: int) -> NDArray[np.float32]:
+    """A list column (n lists of `size` floats) as (n, size)."""
+    flat = column.flatten().to_numpy(zero_copy_only=False)
+    if flat.size != len(column) * size:
+        raise PanelError(f"observations are not all of {size} entries; `restock audit` names them")
+    matrix: NDArray[np.float32] = flat.reshape(len(column), size)
+    return matrix
+
+
+def _at(values: Ints, place: Ints) -> Ints:
+    """values[place], and -1 beyond the end."""
+    if not len(values):
+        return np.full(len(place), -1)
+    found: Ints = np.where(place < len(values), values[np.minimum(place, len(values) - 1)], -1)
+    return found
+
+
+def _starts(counts: Ints) -> Ints:
+    """Where each of consecutive groups of these sizes begins."""
+    return np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)

@@ -1,0 +1,236 @@
+"""The panel: the pinned, memory-mapped set of transitions a run samples from.
+
+A directory that never changes once it is there:
+
+    panel.json       what it was made from, its strata, sizes and checksums
+    rows.f32         packed float32 rows, little-endian, as `replay.layout` says
+    meta.parquet     one row beside each packed row: ids, condition, behaviour policy, weight, …
+    held_out.parquet the transitions that were kept out, by whole episodes
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from restock.errors import PanelError
+from restock.ingest.task.task import Task
+from restock.replay.mixture.mixture import Mixture, Within
+from restock.replay.mixture.packed_row import F32, PACKING_VERSION, Ints, row_columns, row_width
+from restock.replay.panel.density_ratio import RatioFit
+from restock.replay.panel.seal import AGAIN, FileRecord, packed_by, unseal
+from restock.replay.panel.stores import PinnedStore
+from restock.replay.sampling.sampler import QuotaSampler
+
+HEADER, ROWS, META, HELD_OUT = "panel.json", "rows.f32", "meta.parquet", "held_out.parquet"
+
+
+class Stratum(msgspec.Struct, frozen=True):
+    """A stratum of a panel: what it wanted, what it got, what its rows must bear."""
+
+    name: str
+    source: str  # logs, or the name of another store
+    timing: str
+    correction: str
+    within: Within
+    rows: int
+    episodes: int
+    natural_share: float
+    wanted_share: float
+    share: float  # of the logs' part of a batch; shares of a panel sum to 1
+    replays_per_row: float  # expected over the mixture's planned updates
+    effective_episodes: float
+    effective_rows: float  # rows drawn equally often that its weighted draw is worth
+    largest_weight: float
+    effective_share: float  # after weights
+    note: str
+
+
+class Header(msgspec.Struct, frozen=True):
+    """panel.json."""
+
+    id: str
+    store: str  # its absolute path
+    store_version: int  # of the store's Delta table; -1 for a table in memory
+    task_hash: str
+    task_json: str  # "" where the source did not say
+    labels_version: str
+    observation_size: int
+    rows: int
+    discount: float
+    n_step: int
+    packing_version: int
+    packing_code: str  # a hash of the code that packed it
+    restock_version: str
+    newest_ns: int  # when its newest row was logged: ages of rows are against it, from logged_ns
+    logs_share: float  # of a batch
+    conditions: list[str]  # by priority, nominal last
+    left_out: dict[str, int]  # rows of the source that are not in the panel, by reason
+    effective_rows: float  # rows drawn equally often that the weighted draw is worth
+    strata: list[Stratum]
+    mixture: Mixture
+    others: list[PinnedStore]  # stores besides the first
+    ratios: list[RatioFit]  # how well density ratios were estimated, where a correction uses them
+    files: dict[str, FileRecord]
+
+
+class Panel:
+    """A panel on disk, open for reading. Use `Panel.open(path)`.
+
+    `rows` (n, W) float32 is memory-mapped and read-only; `columns` says where each part of a row
+    is; `meta` (n rows) stands beside it.
+    """
+
+    def __init__(self, path: Path, header: Header, rows: NDArray[np.float32]) -> None:
+        self.path, self.header, self.rows = path, header, rows
+        self.columns = row_columns(header.observation_size)
+        self._meta: pa.Table | None = None
+
+    @classmethod
+    def open(cls, path: str | Path, *, verify: bool = False) -> Panel:
+        """Open a panel; sizes are checked always, checksums with `verify`.
+
+        Raises:
+            PanelError: no panel, a damaged one, or one packed by another version.
+        """
+        path = Path(path)
+        if not (path / HEADER).is_file():
+            raise PanelError(
+                "not a panel" if path.exists() else "no such panel",
+                where=str(path),
+                remedy="`restock mix STORE --mixture coverage --out PANEL` makes one",
+            )
+        content = (path / HEADER).read_bytes()
+        if (version := packed_by(content)) not in (PACKING_VERSION, None):
+            raise PanelError(
+                f"packed by version {version} of the packing, this is {PACKING_VERSION}",
+                where=str(path),
+                remedy=AGAIN,
+            )
+        header = unseal(content, Header, path / HEADER)
+        for name, record in header.files.items():
+            record.check(path / name, verify=verify)
+        shape = (header.rows, row_width(header.observation_size))
+        if header.files[ROWS].bytes != 4 * shape[0] * shape[1]:
+            raise PanelError(
+                f"{header.files[ROWS].bytes} bytes are not {shape[0]} rows of {shape[1]} float32",
+                where=str(path / ROWS),
+                remedy=AGAIN,
+            )
+        return cls(path, header, np.memmap(path / ROWS, np.dtype("<f4"), "r", shape=shape))
+
+    def __len__(self) -> int:
+        return self.header.rows
+
+    def __repr__(self) -> str:
+        strata = ", ".join(f"{s.name} {s.share:.0%} of {s.rows}" for s in self.strata)
+        return f"<Panel {self.id}: {len(self)} rows x {self.rows.shape[1]} float32; {strata}>"
+
+    @property
+    def id(self) -> str:
+        return self.header.id
+
+    @property
+    def store_version(self) -> int:
+        return self.header.store_version
+
+    @property
+    def task_hash(self) -> str:
+        return self.header.task_hash
+
+    @property
+    def task(self) -> Task:
+        """The task that made these rows. Raises PanelError where the source did not say."""
+        if not self.header.task_json:
+            raise PanelError("it does not carry its task", where=str(self.path))
+        return msgspec.json.decode(self.header.task_json, type=Task)
+
+    @property
+    def observation_size(self) -> int:
+        return self.header.observation_size
+
+    @property
+    def discount(self) -> float:
+        return self.header.discount
+
+    @property
+    def n_step(self) -> int:
+        return self.header.n_step
+
+    @property
+    def strata(self) -> list[Stratum]:
+        return self.header.strata
+
+    @property
+    def meta(self) -> pa.Table:
+        """Beside each packed row (n,): transition_id, recording_id, episode_id, step_index,
+        stamp_ns, logged_ns, condition, zone, behaviour_policy, behaviour_version,
+        action_probability, action, reward (of one step), terminated, truncated, perturbation,
+        stratum, stratum_code (its place in `strata`), horizon, weight; where the mixture says so,
+        return_to_go and return_to_go_whole (it ran to a termination); and what adaptive shares
+        need (state_code, probability_of_…)."""
+        if self._meta is None:
+            self._meta = pq.read_table(self.path / META).unify_dictionaries()
+        return self._meta
+
+    def meta_column(self, name: str) -> NDArray[Any]:
+        """One column of `meta` (n,), without reading the others."""
+        if self._meta is not None:
+            return np.asarray(self._meta[name].to_numpy())
+        return np.asarray(pq.read_table(self.path / META, columns=[name])[name].to_numpy())
+
+    @property
+    def stratum_code(self) -> NDArray[np.int16]:
+        """The place of each row's stratum in `strata`, (n,)."""
+        return np.asarray(self.meta_column("stratum_code"), np.int16)
+
+    @property
+    def weights(self) -> F32:
+        """Importance weight of each row, (n,), of mean 1 over what the quotas draw."""
+        return np.asarray(self.meta_column("weight"), np.float32)
+
+    @property
+    def return_to_go(self) -> F32:
+        """Discounted rewards to the end of each row's episode, (n,).
+
+        Raises PanelError where the mixture did not ask for it.
+        """
+        if not self.header.mixture.return_to_go:
+            raise PanelError(
+                "it carries no return-to-go",
+                where=str(self.path),
+                remedy="say `return_to_go = true` in the mixture and mix again",
+            )
+        return np.asarray(self.meta_column("return_to_go"), np.float32)
+
+    def stratum_rows(self) -> list[Ints]:
+        """The row numbers of each stratum, in order of `strata`."""
+        code = self.stratum_code
+        return [np.flatnonzero(code == index) for index in range(len(self.strata))]
+
+    def sampler(
+        self, batch_size: int, rng: np.random.Generator, *, replacement: bool = False
+    ) -> QuotaSampler:
+        """Draws batches of row numbers by the panel's quotas; see `QuotaSampler`."""
+        return QuotaSampler(
+            self.stratum_rows(),
+            [stratum.share for stratum in self.strata],
+            batch_size,
+            rng,
+            weights=self.weights,
+            replacement=replacement,
+        )
+
+    def tensor(self) -> Any:
+        """The packed rows as a memory-mapped torch tensor (n, W): gather with `index_select`."""
+        import torch
+
+        return torch.from_file(
+            str(self.path / ROWS), shared=False, size=self.rows.size, dtype=torch.float32
+        ).view(self.rows.shape)

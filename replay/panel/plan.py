@@ -1,0 +1,212 @@
+"""From a mixture and a store to the rows of a panel: which, in which stratum, with which weight.
+
+DuckDB says what each row is; everything that must come out the same on every machine and version
+(the draws, the held-out episodes) is done here on transition ids, with hashes of our own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from restock.errors import MixtureError, StoreError
+from restock.ingest.task.conditions import NOMINAL, Condition
+from restock.replay.mixture.mixture import Mixture
+from restock.replay.mixture.packed_row import F32, Bools, Ints
+from restock.replay.mixture.schedules import mean_over
+from restock.replay.panel.candidates import META_COLUMNS, bools, codes, one_task, read_candidates
+from restock.replay.panel.density_ratio import RatioFit
+from restock.replay.panel.exclusions import LeftOut, hold_out, leave_out, leave_out_of_strata
+from restock.replay.panel.source_plan import SourcePlan, SourceRows, StratumPlan, plan_source
+from restock.replay.panel.stores import PinnedStore
+from restock.replay.panel.strata import NO_STRATUM, Stratum, assign, resolve_strata
+from restock.replay.panel.weights import effective_count
+
+LOGS = "logs"  # the name of the first store's part
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A mixture worked out against a store. Row arrays are over the store's rows, in order."""
+
+    mixture: Mixture
+    rows: pa.Table  # META_COLUMNS of every row of the store, by recording, episode, step
+    task_hash: str
+    stratum: NDArray[np.int16]  # (N,) of each row; -1 where it is not in the panel
+    weight: F32  # (n,) of the panel's rows
+    beside: dict[str, NDArray[Any]]  # (n,) each: what new shares need for new weights
+    held_out: Bools  # (N,)
+    strata: tuple[StratumPlan, ...]
+    logs_share: float  # of a batch, all stores together; the mean over a schedule
+    logs_share_wanted: float  # the same, had all strata rows enough
+    left_out: dict[str, int]  # rows not in the panel, by reason
+    effective_rows: float  # rows drawn equally often that the weighted draw is worth
+    newest_ns: int  # when the newest row was logged
+    others: tuple[PinnedStore, ...] = ()  # besides the first store
+    ratios: tuple[RatioFit, ...] = ()  # where a correction is by density ratio
+
+    @property
+    def panel_rows(self) -> Ints:
+        """Which of the store's rows are in the panel, (n,)."""
+        return np.flatnonzero(self.stratum != NO_STRATUM)
+
+
+def plan_panel(
+    connection: duckdb.DuckDBPyConnection,
+    mixture: Mixture,
+    conditions: Sequence[Condition],
+    others: Sequence[PinnedStore] = (),
+) -> Plan:
+    """Work a mixture out over the connection's `transitions`.
+
+    `others` are the mixture's other stores, where the view holds their rows too (`replay.stores`).
+
+    Raises:
+        ConfigError: a predicate that does not run.
+        MixtureError: too few rows where the mixture refuses that; rows outside every stratum.
+        StoreError: no rows, rows of several tasks, or ids that are not unique.
+    """
+    wanted = [store.name for store in mixture.sources.stores]
+    if wanted != [store.name for store in others]:
+        raise MixtureError(
+            f"it draws from other stores too ({', '.join(wanted)})",
+            remedy="`restock mix STORE --mixture FILE` opens them; from Python, `all_stores`",
+        )
+    strata = resolve_strata(mixture, conditions)
+    table = read_candidates(connection, mixture, strata, several_stores=bool(others))
+    if not len(table):
+        raise StoreError("it holds no transitions", remedy="`restock ingest` recordings first")
+    task_hash = one_task(table)
+    ids = table["transition_id"].to_numpy()
+    if len(np.unique(ids)) != len(ids):
+        raise StoreError(
+            f"{len(ids) - len(np.unique(ids))} transition ids occur twice",
+            remedy="`restock audit` names them; ingest those recordings again",
+        )
+    member, state = (
+        np.stack([bools(table, f"{kind}_{i}") for i in range(len(strata))], axis=1)
+        for kind in ("stratum", "state")
+    )
+    if mixture.unlabelled == "nominal":
+        for index, named in enumerate(strata):
+            if named.name == NOMINAL and named.rule.where is None:
+                member[:, index] |= ~bools(table, "labelled")
+                state[:, index] |= ~bools(table, "labelled")
+    stratum, state_code = assign(member, strata), assign(state, strata, only_pre=True)
+    held_out = hold_out(table, mixture.held_out, mixture.seed)
+    out = leave_out(table, mixture, held_out)
+    for other in others:
+        if other.repeated_rows:
+            out.reasons[f"of {other.name!r}, in a store before it too"] = other.repeated_rows
+    leave_out_of_strata(table, mixture, strata, stratum, out)
+    stratum[out.gone] = NO_STRATUM
+    given = _sources(mixture, table, stratum, state_code)
+    worked_out = [plan_source(connection, mixture, strata, source) for source in given]
+    return _joined(mixture, strata, table, task_hash, held_out, out, given, worked_out, others)
+
+
+def _sources(
+    mixture: Mixture, table: pa.Table, stratum: NDArray[np.int16], state_code: NDArray[np.int16]
+) -> list[SourceRows]:
+    """What each store may give, with its share of a batch as a run begins."""
+    store, episode = table["store"].to_numpy(), codes(table, "episode_id")
+    ids, action = table["transition_id"].to_numpy(), table["action"].to_numpy()
+    found = []
+    for number, (name, part) in enumerate(mixture.sources.parts.items()):
+        at = np.flatnonzero((stratum != NO_STRATUM) & (store == number))
+        found.append(
+            SourceRows(
+                name,
+                mean_over(part, 0, mixture.sources.last_bend),
+                at,
+                stratum[at],
+                state_code[at],
+                ids[at],
+                action[at].astype(np.int64),
+                episode[at],
+            )
+        )
+    return found
+
+
+def _joined(
+    mixture: Mixture,
+    strata: Sequence[Stratum],
+    table: pa.Table,
+    task_hash: str,
+    held_out: Bools,
+    out: LeftOut,
+    given: Sequence[SourceRows],
+    worked_out: Sequence[SourcePlan],
+    others: Sequence[PinnedStore],
+) -> Plan:
+    """All sources as one plan: the strata of source k are k * S and on."""
+    size = len(strata)
+    code = np.full(len(table), NO_STRATUM, np.int16)
+    state = np.full(len(table), NO_STRATUM, np.int16)
+    weight = np.zeros(len(table), np.float32)
+    outcome: dict[str, F32] = {}
+    filled = np.array([s.part * p.drawn for s, p in zip(given, worked_out, strict=True)])
+    part_of_logs = filled / filled.sum()
+    lines: list[StratumPlan] = []
+    never = 0
+    for number, (source, plan) in enumerate(zip(given, worked_out, strict=True)):
+        at = source.at[plan.kept]
+        never += len(source.at) - len(at)
+        code[at] = source.code[plan.kept] + number * size
+        state[at], weight[at] = source.state_code[plan.kept], plan.weight
+        estimated = (
+            [] if plan.outcome is None else np.flatnonzero(plan.outcome.any(axis=0)).tolist()
+        )
+        for index in estimated:
+            column = outcome.setdefault(
+                outcome_column(strata[index].name), np.zeros(len(table), np.float32)
+            )
+            column[at] = plan.outcome[:, index] if plan.outcome is not None else 0
+        of_logs = float(part_of_logs[number])
+        lines += [
+            replace(
+                line,
+                stratum=line.stratum if source.name == LOGS else f"{source.name}/{line.stratum}",
+                wanted_share=line.wanted_share * of_logs,
+                share=line.share * of_logs,
+                effective_share=line.effective_share * of_logs,
+            )
+            for line in plan.lines
+        ]
+    # Rows of a stratum that is never drawn are no part of the panel.
+    left_out = out.reasons | ({"in a stratum of share 0": never} if never else {})
+    chosen = np.flatnonzero(code != NO_STRATUM)
+    rows = np.array([line.rows for line in lines])
+    drawn = (np.array([line.share for line in lines]) / np.maximum(rows, 1))[code[chosen]]
+    return Plan(
+        mixture=mixture,
+        rows=table.select(META_COLUMNS),
+        task_hash=task_hash,
+        stratum=code,
+        weight=weight[chosen],
+        beside={"state_code": state[chosen]} | {k: v[chosen] for k, v in outcome.items()},
+        held_out=held_out,
+        strata=tuple(lines),
+        logs_share=float(filled.sum()),
+        logs_share_wanted=sum(source.part for source in given),
+        left_out=left_out,
+        effective_rows=effective_count(drawn * weight[chosen]),
+        newest_ns=int(table["logged_ns"].to_numpy().max()),
+        others=tuple(others),
+        ratios=tuple(plan.fit for plan in worked_out if plan.fit is not None),
+    )
+
+
+def outcome_column(stratum: str) -> str:
+    """The column of a panel's metadata with P(stratum | state, action)."""
+    return f"probability_of_{stratum}"
+
+
+__all__ = ["META_COLUMNS", "Plan", "StratumPlan", "outcome_column", "plan_panel"]

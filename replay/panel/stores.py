@@ -1,0 +1,107 @@
+"""Several stores as one: the transitions of a mixture's other stores beside those of the first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import duckdb
+import msgspec
+
+from restock.errors import StoreError
+from restock.replay.mixture.mixture import Mixture
+from restock.replay.mixture.sources import OtherStore
+from restock.replay.panel.candidates import STORE_COLUMN
+from restock.replay.store.store import Store, parquet_view
+
+
+class PinnedStore(msgspec.Struct, frozen=True):
+    """Another store of a panel, at the version that was taken."""
+
+    name: str
+    path: str  # as it was found
+    version: int
+    repeated_rows: int  # of recordings that a store before it has too: taken from that one
+
+
+@dataclass(frozen=True)
+class AllStores:
+    """One connection over all the stores of a mixture; its view `transitions` holds their rows."""
+
+    connection: duckdb.DuckDBPyConnection
+    others: tuple[PinnedStore, ...]
+
+
+@contextmanager
+def all_stores(first: Store, mixture: Mixture, folder: Path | None = None) -> Iterator[AllStores]:
+    """The first store with the mixture's others beside it, each at its pinned version.
+
+    A relative path is looked up in `folder` (that of the mixture's file), else where one stands.
+    The first store's own views stay as they are.
+
+    Raises:
+        StoreError: one of them cannot be opened, has no such version, or no rows.
+    """
+    if not mixture.sources.stores:
+        yield AllStores(first.connection, ())
+        return
+    with ExitStack() as opened:
+        others = [
+            (wanted, opened.enter_context(_open(wanted, folder)))
+            for wanted in mixture.sources.stores
+        ]
+        connection = opened.enter_context(duckdb.connect())
+        repeated_rows = _attach(connection, [first, *(store for _, store in others)])
+        pinned = tuple(
+            PinnedStore(wanted.name, str(store.path), store.version, repeated)
+            for (wanted, store), repeated in zip(others, repeated_rows, strict=True)
+        )
+        yield AllStores(connection, pinned)
+
+
+def _open(wanted: OtherStore, folder: Path | None) -> Store:
+    path: str | Path = wanted.path
+    if "://" not in wanted.path:
+        path = Path(wanted.path).expanduser()
+        if not path.is_absolute() and folder is not None:
+            path = folder / path
+    try:
+        return Store(path, version=wanted.version)
+    except StoreError as error:
+        raise StoreError(
+            f"the mixture's store {wanted.name!r}: {error.what}",
+            where=error.where,
+            remedy=error.remedy,
+        ) from error
+
+
+def _attach(connection: duckdb.DuckDBPyConnection, stores: Sequence[Store]) -> list[int]:
+    """Make the view; returns how many rows of each other store are in one before it."""
+    parts, repeated = [], []
+    for number, store in enumerate(stores):
+        schema = f'"store_{number}"'
+        connection.execute(f"CREATE SCHEMA {schema}")
+        for table in ("stored_transitions", "stored_recordings"):
+            if not store.files[table]:
+                raise StoreError("it holds no transitions", where=str(store.path))
+            connection.execute(parquet_view(table, store.files[table], schema=f"store_{number}"))
+        connection.execute(
+            f"CREATE TABLE {schema}.mine AS SELECT DISTINCT recording_id"
+            f" FROM {schema}.stored_transitions"
+        )
+        before = " UNION ALL ".join(f'FROM "store_{i}".mine' for i in range(number))
+        known = f"recording_id IN ({before})" if before else "false"
+        if number:
+            count = f"SELECT count(*) FROM {schema}.stored_transitions WHERE {known}"
+            repeated.append(int(connection.sql(count).fetchall()[0][0]))
+        parts.append(
+            f"SELECT {number} AS {STORE_COLUMN}, * EXCLUDE (clock_offset_ns),"
+            " stamp_ns + coalesce(clock_offset_ns, 0) AS logged_ns"
+            f" FROM {schema}.stored_transitions"
+            f" JOIN (SELECT ingest_id, clock_offset_ns FROM {schema}.stored_recordings)"
+            f" USING (ingest_id) WHERE NOT ({known})"
+        )
+    connection.execute("CREATE VIEW transitions AS " + " UNION ALL BY NAME ".join(parts))
+    return repeated

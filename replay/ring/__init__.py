@@ -1,0 +1,1 @@
+"""The newest experience, in a ring with reserves."""

@@ -1,0 +1,306 @@
+"""The diet of a run: which share of a batch each stratum gets now, and what each has had.
+
+A panel's shares are a plan for the mixture's `[planned]` draws. A run knows how much it will draw,
+at which environment step, and what its critic errs on: the diet works the mixture out for that run,
+follows its schedules and its [adaptive] rule, and counts what is drawn, so that no stratum gives
+more than its rows may give under `max_replays_per_row`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.errors import MixtureError
+from restock.replay.mixture.mixture import Mixture, Shortfall, StratumRule
+from restock.replay.mixture.packed_row import F64, Ints
+from restock.replay.mixture.schedules import knots, mean_over, value_at
+from restock.replay.mixture.shares import wanted_shares, within_limits
+from restock.replay.mixture.sources import Sources
+from restock.replay.sampling.adaptive import GroupDro
+
+REFRESH_BATCHES = 64  # shares with a schedule are worked out anew after so many
+
+
+@dataclass(frozen=True)
+class PlannedDraws:
+    """How many rows a run will draw: offline, and online over a span of environment steps."""
+
+    offline: float = 0.0  # all from logs
+    online: float = 0.0  # from logs and fresh rows
+    begin_env_steps: int = 0
+    end_env_steps: int = 0
+
+
+@dataclass(frozen=True)
+class FedStratum:
+    """A stratum of a panel, as a diet needs it."""
+
+    name: str
+    source: str
+    rule: StratumRule
+    rows: int  # in the panel; 0 where it is never drawn
+    episodes: int
+
+
+@dataclass
+class _Source:
+    """The strata of one source, and what it is planned to give."""
+
+    name: str
+    strata: slice
+    rules: list[StratumRule]
+    rows: Ints
+    caps: F64
+    offline: float  # planned draws
+    online: float
+    got: F64  # shares of its strata now
+    dro: GroupDro | None = None
+
+
+class Diet:
+    """Shares in force and draws so far, over the strata of a panel, (S,).
+
+    Args:
+        mixture: of the panel.
+        strata: of the panel, source by source.
+        planned: what the run will draw.
+        logs_share: a share of an online batch, in place of the mixture's.
+
+    `shares` (S,) are of the logged part of a batch and sum to 1, `logs_share` is that part of an
+    online batch, `drawn` (S,) what was drawn of each stratum.
+
+    Raises:
+        MixtureError: rows that cannot bear the offline phase, or a shortfall the mixture refuses.
+    """
+
+    def __init__(
+        self,
+        mixture: Mixture,
+        strata: Sequence[FedStratum],
+        planned: PlannedDraws,
+        *,
+        logs_share: float | None = None,
+    ) -> None:
+        self.mixture, self.strata, self.planned = mixture, list(strata), planned
+        self._share_given = logs_share
+        self.drawn: Ints = np.zeros(len(strata), np.int64)
+        self.batches = self.learnt = 0  # drawn, and learnt from
+        self.env_steps = 0.0
+        self.shares: F64 = np.zeros(len(strata))
+        self.logs_share = 0.0
+        self.sources = [self._source(name) for name in mixture.sources.parts]
+        shares = [stratum.rule.share for stratum in strata]
+        portions = [p for p in shares if not isinstance(p, str)]
+        portions += mixture.sources.parts.values()
+        self._moves = any(knots(portion) for portion in portions)
+        self._work_out(mixture.shortfall)
+        self.planned_shares = self.shares.copy()
+        if mixture.adaptive is not None:
+            for source in self.sources:
+                floors = np.array([rule.floor for rule in source.rules])
+                if source.got.sum() > 0:
+                    source.dro = GroupDro(mixture.adaptive, source.got, floors, source.caps)
+            self._work_out("redistribute")
+
+    @classmethod
+    def fixed(
+        cls, names: Sequence[str], rows: Sequence[int], shares: F64, logs_share: float
+    ) -> Diet:
+        """Shares that are simply given, and stay."""
+        rules = tuple(
+            StratumRule(name=name, share=float(share))
+            for name, share in zip(names, shares, strict=True)
+        )
+        mixture = Mixture(strata=rules, sources=Sources(logs=1.0))
+        fed = [FedStratum(r.name, "logs", r, n, 1) for r, n in zip(rules, rows, strict=True)]
+        return cls(mixture, fed, PlannedDraws(), logs_share=logs_share)
+
+    def _source(self, name: str) -> _Source:
+        places = [i for i, stratum in enumerate(self.strata) if stratum.source == name]
+        mine = slice(places[0], places[-1] + 1)
+        strata = self.strata[mine]
+        sources, planned = self.mixture.sources, self.planned
+        parts = self.parts_at(0)
+        span = (planned.begin_env_steps, planned.end_env_steps)
+        mean = self._scaled({n: mean_over(part, *span) for n, part in sources.parts.items()})
+        return _Source(
+            name,
+            mine,
+            [stratum.rule for stratum in strata],
+            np.array([stratum.rows for stratum in strata], np.int64),
+            np.array([self._cap_of(stratum.rule) for stratum in strata]),
+            planned.offline * parts[name] / max(sum(parts.values()), 1e-12),
+            planned.online * mean[name],
+            np.zeros(len(strata)),
+        )
+
+    def _cap_of(self, rule: StratumRule) -> float:
+        adaptive = self.mixture.adaptive
+        return rule.cap if adaptive is None else min(rule.cap, adaptive.ceiling)
+
+    def parts_at(self, env_steps: float) -> dict[str, float]:
+        """The share of an online batch each source is to have, before its rows are looked at."""
+        sources = self.mixture.sources
+        return self._scaled({n: value_at(part, env_steps) for n, part in sources.parts.items()})
+
+    def _scaled(self, parts: dict[str, float]) -> dict[str, float]:
+        if self._share_given is None:
+            return parts
+        total = max(sum(parts.values()), 1e-12)
+        return {name: part * self._share_given / total for name, part in parts.items()}
+
+    @property
+    def max_replays(self) -> int | None:
+        """The most draws of a row."""
+        cap = self.mixture.max_replays_per_row
+        return None if cap is None else int(cap)
+
+    def at(self, env_steps: float) -> bool:
+        """Before a batch is drawn: move to its moment. True where the shares changed."""
+        if not self._moves or self.batches % REFRESH_BATCHES:
+            return False
+        self.env_steps = env_steps
+        return self._work_out("redistribute")
+
+    def count(self, stratum: NDArray[Any]) -> None:
+        """A batch was drawn, its logged rows from these strata (n,)."""
+        self.batches += 1
+        self.drawn += np.bincount(stratum, minlength=len(self.drawn))
+
+    def give_up(self) -> bool:
+        """A stratum's rows were drawn as often as they may be. True where the shares changed."""
+        return self._work_out("redistribute")
+
+    def observe(self, stratum: NDArray[Any], td_abs: NDArray[Any]) -> bool:
+        """A batch was learnt from: |TD error| (n,) of its rows of these strata (n,).
+
+        True where the shares changed.
+        """
+        rule = self.mixture.adaptive
+        if rule is None:
+            return False
+        self.learnt += 1
+        stepping = self.learnt > rule.after_updates and self.learnt % rule.every_updates == 0
+        for source in self.sources:
+            if source.dro is not None:
+                mine = (stratum >= source.strata.start) & (stratum < source.strata.stop)
+                source.dro.observe(stratum[mine] - source.strata.start, td_abs[mine])
+                if stepping:
+                    source.dro.step()
+        return self._work_out("redistribute") if stepping else False
+
+    def _work_out(self, shortfall: Shortfall) -> bool:
+        """Shares for this moment, within what the rows can still bear."""
+        if self.mixture.shortfall == "shrink":
+            shortfall = "shrink"
+        parts, shares, logs_share = self.parts_at(self.env_steps), np.zeros(len(self.strata)), 0.0
+        for source in self.sources:
+            source.got, filled, online_filled = self._plan(source, shortfall)
+            part = value_at(self.mixture.sources.parts[source.name], self.env_steps)
+            shares[source.strata] = source.got * part * filled
+            logs_share += parts[source.name] * online_filled
+        total = shares.sum()
+        shares = shares / total if total > 0 else self.shares
+        changed = logs_share != self.logs_share or not np.array_equal(shares, self.shares)
+        self.shares, self.logs_share = shares, logs_share
+        return changed
+
+    def _plan(self, source: _Source, shortfall: Shortfall) -> tuple[F64, float, float]:
+        """A source's shares, and how much it can fill of its draws to come, and of online ones."""
+        wanted = (
+            wanted_shares(source.rules, source.rows, self.env_steps)
+            if source.dro is None
+            else source.dro.shares
+        )
+        drawn = self.drawn[source.strata]
+        ahead = max(source.offline + source.online - float(drawn.sum()), 1.0)
+        limit = np.where(source.rows > 0, 1.0, 0.0)
+        if self.max_replays is not None:
+            left = np.maximum(self.max_replays * source.rows - drawn, 0)
+            limit = np.minimum(limit, left / ahead)
+        if np.minimum(wanted, limit).sum() <= 0:
+            return np.zeros(len(wanted)), 0.0, 0.0
+
+        def complaints() -> str:
+            return "; ".join(
+                f"{rule.name} wants {wanted[i]:.1%} of {ahead:,.0f} draws, its"
+                f" {source.rows[i]:,} rows can bear {limit[i]:.1%}"
+                for i, rule in enumerate(source.rules)
+                if wanted[i] > limit[i] + 1e-12
+            )
+
+        plan = within_limits(wanted, limit, source.caps, shortfall, complaints)
+        offline = max(source.offline - float(drawn.sum()), 0.0)
+        fill = plan.scale * ahead
+        if fill < offline - 1e-6 and not drawn.any():
+            raise MixtureError(
+                f"the offline phase draws {offline:,.0f} rows of {source.name}, which its"
+                f" {source.rows.sum():,} rows cannot bear at {self.max_replays} draws each",
+                remedy="lower schedule.offline_updates, raise max_replays_per_row, or ingest more",
+            )
+        online = ahead - offline
+        filled = plan.scale if online <= 0 else min(max(fill - offline, 0.0) / online, 1.0)
+        return plan.got, plan.scale, filled
+
+    def describe(self) -> list[dict[str, Any]]:
+        """A row a stratum, for people and for a run's table `shares`."""
+        limit = self.max_replays
+        rows = []
+        for i, (stratum, share) in enumerate(zip(self.strata, self.shares.tolist(), strict=True)):
+            rows.append(
+                {
+                    "source": stratum.source,
+                    "stratum": stratum.name,
+                    "share": share,
+                    "planned_share": float(self.planned_shares[i]),
+                    "logs_share": self.logs_share,
+                    "rows": stratum.rows,
+                    "drawn_rows": int(self.drawn[i]),
+                    "replays_per_row": float(self.drawn[i] / max(stratum.rows, 1)),
+                    "max_replays_per_row": limit,
+                    "exhausted": limit is not None
+                    and stratum.rows > 0
+                    and int(self.drawn[i]) >= limit * stratum.rows,
+                }
+            )
+        return rows
+
+    def state_dict(self) -> dict[str, Any]:
+        """Arrays and JSON values, for a checkpoint."""
+        return {
+            "planned": asdict(self.planned),
+            "drawn": self.drawn.copy(),
+            "batches": self.batches,
+            "learnt": self.learnt,
+            "env_steps": self.env_steps,
+            "shares": self.shares.copy(),
+            "logs_share": self.logs_share,
+            "dro": [s.dro.state_dict() if s.dro is not None else None for s in self.sources],
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Puts the diet where `state_dict` found it; a budget that was extended is planned anew.
+
+        Raises:
+            MixtureError: the state is of other strata.
+        """
+        if len(state["drawn"]) != len(self.drawn) or len(state["dro"]) != len(self.sources):
+            raise MixtureError(
+                "the saved diet is of other strata",
+                remedy="resume with the panel and the settings the run began with",
+            )
+        self.drawn = np.array(state["drawn"], np.int64)
+        self.batches, self.learnt = int(state["batches"]), int(state["learnt"])
+        self.env_steps = float(state["env_steps"])
+        for source, saved in zip(self.sources, state["dro"], strict=True):
+            if source.dro is not None and saved is not None:
+                source.dro.load_state_dict(saved)
+        self.shares = np.array(state["shares"], np.float64)
+        self.logs_share = float(state["logs_share"])
+        if state["planned"] != asdict(self.planned):
+            self._work_out("redistribute")

@@ -1,0 +1,1 @@
+"""A store, open for reading: views, queries, audits."""

@@ -1,0 +1,268 @@
+"""Audits: queries that return offending rows, one a file, with a severity and advice.
+
+The header of an audit's file says what it is:
+
+    -- severity: error | warning | info
+    -- advice: what to do about the rows it returns
+    -- doc: what the rows are
+    -- needs: run | panel          (only where it looks at one; run.TABLE: that must have TABLE)
+
+`$name` in the query is a threshold, from `audits.toml` or a file of the user's.
+
+`python -m restock.replay.store.audit docs/audit.md` writes the table of the page anew.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Any, Literal, cast
+from xml.etree import ElementTree
+
+import duckdb
+
+from restock.errors import ConfigError
+from restock.replay.store.query import interruptible, values
+
+Severity = Literal["error", "warning", "info"]
+Status = Literal["pass", "fail", "warn", "info", "skipped"]
+Thresholds = Mapping[str, Mapping[str, float | str]]
+
+SAMPLE_ROWS = 10
+BEGIN = "<!-- audits: written by `python -m restock.replay.store.audit docs/audit.md` -->"
+END = "<!-- end of audits -->"
+_OFFENDED: dict[Severity, Status] = {"error": "fail", "warning": "warn", "info": "info"}
+
+
+@dataclass(frozen=True)
+class Audit:
+    """One query and what it says of itself."""
+
+    name: str
+    severity: Severity
+    advice: str
+    doc: str
+    needs: str | None  # "run", "panel" or a table of one: "run.fed_episodes"
+    sql: str
+
+    @property
+    def place(self) -> str | None:
+        """What it looks at beside the store: "run", "panel" or None."""
+        return self.needs.split(".")[0] if self.needs else None
+
+    @property
+    def parameters(self) -> set[str]:
+        """The thresholds that the query uses."""
+        return set(re.findall(r"\$([a-z_]+)", self.sql))
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one audit found."""
+
+    audit: Audit
+    status: Status
+    rows: int  # offending rows
+    columns: list[str]
+    sample: list[dict[str, Any]]  # the first of them
+    thresholds: Mapping[str, float | str]
+
+
+def shipped_audits() -> list[Audit]:
+    """The audits that come with Restock, by name."""
+    return _load((files("restock.replay.store") / "audits").iterdir(), "restock")
+
+
+def load_audits(folder: str | Path | None = None) -> list[Audit]:
+    """The shipped audits and those of a folder; one of the same name takes a shipped one's place.
+
+    Raises ConfigError for a folder without audits, or a file whose header is not as it must be.
+    """
+    found = {audit.name: audit for audit in shipped_audits()}
+    if folder is not None:
+        path = Path(folder)
+        if not path.is_dir() or not list(path.glob("*.sql")):
+            raise ConfigError("no audits (*.sql) in it", where=str(path))
+        found |= {audit.name: audit for audit in _load(path.iterdir(), str(path))}
+    return [found[name] for name in sorted(found)]
+
+
+def load_thresholds(file: str | Path | None = None) -> dict[str, dict[str, float | str]]:
+    """The shipped thresholds, with those of a file in their place.
+
+    Raises ConfigError for a file that is no TOML or holds anything but tables of values.
+    """
+    shipped = (files("restock.replay.store") / "audits.toml").read_text(encoding="utf-8")
+    found: dict[str, dict[str, float | str]] = tomllib.loads(shipped)
+    if file is None:
+        return found
+    try:
+        given = tomllib.loads(Path(file).read_text(encoding="utf-8"))
+    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot be read: {error}", where=str(file)) from error
+    for name, table in given.items():
+        if not isinstance(table, dict):
+            raise ConfigError(
+                f"{name!r} is no table", where=str(file), remedy="write [audit] tables of values"
+            )
+        found[name] = {**found.get(name, {}), **table}
+    return found
+
+
+def run_audits(
+    connection: duckdb.DuckDBPyConnection,
+    audits: Sequence[Audit],
+    thresholds: Thresholds,
+    *,
+    beside: Iterable[str] = (),
+) -> list[Finding]:
+    """Run audits over a connection with a store's views, worst findings first.
+
+    `beside` names the schemas that are there: "run", "panel". Audits that need another, or a table
+    that an older run does not have, are skipped.
+
+    Raises:
+        ConfigError: an audit does not run, a threshold is missing, or one is given that no audit
+            uses.
+    """
+    _check_thresholds(audits, thresholds)
+    there = set(beside)
+    there |= {f"{schema}.{table}" for schema, table in _tables(connection) if schema in there}
+    findings = [
+        _run(connection, audit, thresholds.get(audit.name, {}))
+        if audit.needs is None or audit.needs in there
+        else Finding(audit, "skipped", 0, [], [], {})
+        for audit in audits
+    ]
+    order = ["fail", "warn", "info", "pass", "skipped"]
+    return sorted(findings, key=lambda finding: (order.index(finding.status), finding.audit.name))
+
+
+def _tables(connection: duckdb.DuckDBPyConnection) -> list[tuple[str, str]]:
+    """Schema and name of every table and view."""
+    query = "SELECT table_schema, table_name FROM information_schema.tables"
+    found: list[tuple[str, str]] = connection.sql(query).fetchall()
+    return found
+
+
+def junit_xml(findings: Sequence[Finding], suite: str) -> str:
+    """The findings as JUnit XML: failed audits fail, skipped ones are skipped."""
+    suite = _printable(suite)
+    root = ElementTree.Element(
+        "testsuite",
+        name=suite,
+        tests=str(len(findings)),
+        failures=str(sum(finding.status == "fail" for finding in findings)),
+        errors="0",
+        skipped=str(sum(finding.status == "skipped" for finding in findings)),
+    )
+    for finding in findings:
+        case = ElementTree.SubElement(root, "testcase", classname=suite, name=finding.audit.name)
+        lines = [f"{finding.rows} rows. {finding.audit.advice}", *map(str, finding.sample)]
+        text = _printable("\n".join(lines))
+        if finding.status == "fail":
+            ElementTree.SubElement(case, "failure", message=finding.audit.doc).text = text
+        elif finding.status == "skipped":
+            ElementTree.SubElement(case, "skipped", message=f"needs a {finding.audit.needs}")
+        elif finding.rows:
+            ElementTree.SubElement(case, "system-out").text = text
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _printable(text: str) -> str:
+    """Text without the characters that XML 1.0 cannot hold, not even escaped."""
+    return re.sub("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", text)
+
+
+def _run(
+    connection: duckdb.DuckDBPyConnection, audit: Audit, thresholds: Mapping[str, float | str]
+) -> Finding:
+    where = f"audit {audit.name!r}"
+    if missing := sorted(audit.parameters - thresholds.keys()):
+        raise ConfigError(
+            f"no threshold {', '.join(missing)}",
+            where=where,
+            remedy=f"put it under [{audit.name}] in a file and give it with --thresholds",
+        )
+
+    def run() -> tuple[list[str], list[tuple[Any, ...]]]:
+        relation = connection.sql(audit.sql, params=dict(thresholds) or None)
+        return relation.columns, values(relation)
+
+    try:
+        columns, found = interruptible(connection, run)
+    except duckdb.Error as error:
+        raise ConfigError(f"its SQL does not run: {error}", where=where) from error
+    sample = [dict(zip(columns, row, strict=True)) for row in found[:SAMPLE_ROWS]]
+    status: Status = _OFFENDED[audit.severity] if found else "pass"
+    return Finding(audit, status, len(found), columns, sample, thresholds)
+
+
+def _check_thresholds(audits: Sequence[Audit], thresholds: Thresholds) -> None:
+    used = {audit.name: audit.parameters for audit in audits}
+    for name, table in thresholds.items():
+        if name not in used:
+            raise ConfigError(
+                f"no audit named {name!r}", where="thresholds", remedy=f"there is {', '.join(used)}"
+            )
+        if unknown := sorted(table.keys() - used[name]):
+            raise ConfigError(
+                f"{name}.{unknown[0]} is no threshold of this audit",
+                where="thresholds",
+                remedy=f"it has {', '.join(sorted(used[name])) or 'none'}",
+            )
+
+
+def _load(entries: Iterable[Traversable], where: str) -> list[Audit]:
+    found = sorted((e for e in entries if e.name.endswith(".sql")), key=lambda entry: entry.name)
+    return [
+        _parse(entry.name.removesuffix(".sql"), entry.read_text(encoding="utf-8"), where)
+        for entry in found
+    ]
+
+
+def _parse(name: str, text: str, where: str) -> Audit:
+    header = dict(re.findall(r"^-- (severity|advice|doc|needs): (.+)$", text, re.MULTILINE))
+    for key in ("severity", "advice", "doc"):
+        if key not in header:
+            raise ConfigError(f"its header has no `-- {key}: …`", where=f"{where}/{name}.sql")
+    if header["severity"] not in _OFFENDED:
+        raise ConfigError(
+            f"severity {header['severity']!r} is none of error, warning, info",
+            where=f"{where}/{name}.sql",
+        )
+    return Audit(
+        name=name,
+        severity=cast(Severity, header["severity"]),
+        advice=header["advice"],
+        doc=header["doc"],
+        needs=header.get("needs"),
+        sql=text,
+    )
+
+
+def rewrite(text: str) -> str:
+    """A page with the table between its two markers written anew."""
+    thresholds = load_thresholds()
+    lines = ["| audit | severity | finds | thresholds |", "| --- | --- | --- | --- |"]
+    for audit in shipped_audits():
+        table = thresholds.get(audit.name, {})
+        given = ", ".join(f"{name} = {value}" for name, value in table.items())
+        doc = audit.doc + (f" Needs `--{audit.place}`." if audit.needs else "")
+        lines.append(
+            f"| {audit.name} | {audit.severity} | {doc} | {given} |".replace("|  |", "| |")
+        )
+    before, rest = text.split(BEGIN, 1)
+    return f"{before}{BEGIN}\n\n" + "\n".join(lines) + f"\n\n{END}{rest.split(END, 1)[1]}"
+
+
+if __name__ == "__main__":
+    page = Path(sys.argv[1])
+    page.write_text(rewrite(page.read_text(encoding="utf-8")), encoding="utf-8")

@@ -1,0 +1,142 @@
+"""What each column of each view means: the view `columns`, and the tables in docs/sql.md.
+
+`python -m restock.replay.store.column_docs docs/sql.md` writes the tables of the page anew.
+"""
+
+from __future__ import annotations
+
+import sys
+import tomllib
+from importlib.resources import files
+from pathlib import Path
+
+import duckdb
+import pyarrow as pa
+
+from restock.ingest.task.schema import (
+    COLUMNS,
+    RECORDING_COLUMNS,
+    recording_schema,
+    transition_schema,
+)
+
+BEGIN = "<!-- columns: written by `python -m restock.replay.store.column_docs docs/sql.md` -->"
+END = "<!-- end of columns -->"
+
+# A name's ending -> its unit. Longer endings first.
+UNITS = (
+    ("_mps2", "m/s²"),
+    ("_mps", "m/s"),
+    ("_radps", "rad/s"),
+    ("_rad", "rad"),
+    ("_days", "days"),
+    ("_ns", "ns"),
+    ("_s", "s"),
+    ("_m", "m"),
+    ("_share", "1"),
+    ("_fraction", "1"),
+)
+
+
+def view_docs() -> dict[str, str]:
+    """What each view is, by name."""
+    return {name: table["doc"] for name, table in _read().items() if name != "shared"}
+
+
+def column_docs() -> dict[tuple[str, str], str]:
+    """(view, column) -> meaning, as far as they are named there; see `meaning` for the rest."""
+    found = {
+        (view, column): text
+        for view, table in _read().items()
+        for column, text in table.items()
+        if column != "doc"
+    }
+    found |= {("transitions", column.name): column.meaning for column in COLUMNS}
+    found |= {("recordings", column.name): column.meaning for column in RECORDING_COLUMNS}
+    return found
+
+
+def unit(column: str) -> str:
+    """A column's unit, from its name's ending; "" for none."""
+    return next((unit for ending, unit in UNITS if column.endswith(ending)), "")
+
+
+def install_columns(connection: duckdb.DuckDBPyConnection) -> None:
+    """Create the view `columns` over the views that are there."""
+    docs, own_units = column_docs(), {}
+    for name, own_unit, meaning, topic, path in _custom(connection):
+        docs["transitions", name] = meaning or f"{path} of {topic}"
+        own_units["transitions", name] = own_unit
+    there = connection.sql(
+        "SELECT table_name, column_name, data_type FROM duckdb_columns()"
+        " WHERE NOT internal AND table_name NOT LIKE 'stored_%' ORDER BY table_name, column_index"
+    ).fetchall()
+    order = list(view_docs())
+    there = [(view, column, kind) for view, column, kind in there if view in order]
+    own = [("columns", name, "VARCHAR") for name in ("view", "column", "type", "unit", "meaning")]
+    rows = [
+        {
+            "view": view,
+            "column": column,
+            "type": kind,
+            "unit": own_units.get((view, column)) or unit(column),
+            "meaning": docs.get((view, column)) or docs.get(("shared", column)),
+        }
+        for view, column, kind in sorted(there, key=lambda row: order.index(row[0])) + own
+    ]
+    names = ("view", "column", "type", "unit", "meaning")
+    schema = pa.schema([pa.field(name, pa.string()) for name in names])
+    connection.register("columns", pa.Table.from_pylist(rows, schema=schema))
+
+
+def _custom(connection: duckdb.DuckDBPyConnection) -> list[tuple[str, ...]]:
+    """Custom signals of the store's profiles: name, unit, meaning, topic and path."""
+    has = connection.sql(
+        "SELECT 1 FROM duckdb_columns() WHERE table_name = 'recordings' AND column_name = 'signals'"
+    ).fetchall()
+    if not has:
+        return []
+    return connection.sql(
+        "SELECT DISTINCT ON (s.name) s.name, s.unit, s.meaning, s.topic, s.path"
+        " FROM (SELECT ingested_at, unnest(signals) AS s FROM recordings) ORDER BY ingested_at DESC"
+    ).fetchall()
+
+
+def markdown() -> str:
+    """The tables of docs/sql.md: every view and column."""
+    from restock.replay.store.query import install
+
+    with duckdb.connect() as connection:
+        connection.register("stored_transitions", transition_schema(2).empty_table())
+        connection.register("stored_recordings", recording_schema().empty_table())
+        install(connection, "FLOAT[]")
+        rows = connection.sql("FROM columns").fetchall()
+    parts = []
+    for view, doc in view_docs().items():
+        parts.append(f"### {view}\n\n{doc[0].upper() + doc[1:]}.\n")
+        parts.append("| column | type | unit | meaning |\n| --- | --- | --- | --- |")
+        for of_view, column, kind, of_unit, meaning in rows:
+            if of_view == view:
+                kind = "STRUCT(…)[]" if kind.startswith("STRUCT") else kind
+                kind = "FLOAT[D]" if column.endswith("observation") else kind
+                line = f"| {column} | {kind} | {of_unit} | {meaning} |"
+                parts.append(line.replace("|  |", "| |").replace("<", "&lt;"))
+        parts.append("")
+    return "\n".join(parts)
+
+
+def rewrite(text: str) -> str:
+    """A page with the tables between its two markers written anew."""
+    before, rest = text.split(BEGIN, 1)
+    return f"{before}{BEGIN}\n\n{markdown()}\n{END}{rest.split(END, 1)[1]}"
+
+
+def _read() -> dict[str, dict[str, str]]:
+    text = (files("restock.replay.store") / "columns.toml").read_text(encoding="utf-8")
+    tables: dict[str, dict[str, str]] = tomllib.loads(text)
+    return tables
+
+
+if __name__ == "__main__":
+    page = Path(sys.argv[1])
+    page.write_text(rewrite(page.read_text(encoding="utf-8")), encoding="utf-8")

@@ -1,0 +1,82 @@
+"""The views of a store for any DuckDB: an init file, or a database file of views."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import duckdb
+
+from restock.errors import StoreError
+from restock.replay.store.query import definitions
+from restock.replay.store.store import Store, parquet_view
+
+# Written by any newer DuckDB, a file of this version is read by DuckDB 1.4 and later.
+STORAGE_VERSION = "v1.4.0"
+
+
+def init_script(store: Store) -> str:
+    """SQL that makes the store's views and macros: `duckdb -init FILE`.
+
+    Paths are absolute, and of the version that is open: write it anew after an ingest.
+    """
+    columns = ", ".join(
+        "(" + ", ".join(_literal(value) for value in row) + ")"
+        for row in store.sql("FROM columns").fetchall()
+    )
+    return "\n".join(
+        [
+            f"-- {store.path}, version {store.version}",
+            *(
+                parquet_view(view, [Path(file).absolute() for file in files]) + ";"
+                for view, files in store.files.items()
+            ),
+            definitions(store.observation_type),
+            f"CREATE OR REPLACE VIEW columns AS FROM (VALUES {columns})"
+            ' AS columns ("view", "column", "type", "unit", "meaning");',
+            "",
+        ]
+    )
+
+
+def export_views(store: Store, out: str | Path) -> Path:
+    """Write `out`: an init file (.sql), or a database of views (.duckdb).
+
+    Raises StoreError for another ending, a file that is there already, or an empty store.
+    """
+    out = Path(out)
+    if out.suffix not in (".sql", ".duckdb"):
+        raise StoreError(f"no export to {out.suffix or 'a file without an ending'}", where=str(out),
+                         remedy="name it .sql (for `duckdb -init`) or .duckdb")  # fmt: skip
+    if out.exists():
+        raise StoreError(
+            "already there", where=str(out), remedy="choose another name, or remove it"
+        )
+    if store.path.folder is None:
+        raise StoreError(
+            "views of a store on S3 cannot be had by other DuckDBs",
+            where=str(store.path),
+            remedy="ask it with `restock sql`, or from Python with restock.open()",
+        )
+    if not all(store.files.values()):
+        raise StoreError("it holds no recordings to look at", where=str(store.path))
+    partial = out.with_name(f".{out.name}.partial")
+    partial.unlink(missing_ok=True)
+    try:
+        if out.suffix == ".sql":
+            partial.write_text(init_script(store), encoding="utf-8")
+        else:
+            with duckdb.connect() as connection:
+                quoted = str(partial).replace("'", "''")
+                connection.execute(
+                    f"ATTACH '{quoted}' AS views (STORAGE_VERSION '{STORAGE_VERSION}'); USE views"
+                )
+                connection.execute(init_script(store))
+                connection.execute("USE memory; DETACH views")
+        partial.rename(out)
+    finally:
+        partial.unlink(missing_ok=True)
+    return out
+
+
+def _literal(value: object) -> str:
+    return "NULL" if value is None else "'" + str(value).replace("'", "''") + "'"

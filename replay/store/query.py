@@ -1,0 +1,120 @@
+"""Queries: the views and macros of a connection, read-only, with errors worth reading."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from importlib.resources import files
+from typing import Any, TypeVar
+
+import duckdb
+
+from restock.errors import QueryError
+from restock.replay.store.column_docs import install_columns
+
+T = TypeVar("T")
+
+# Statements that leave files as they are; CREATE makes tables and macros in memory.
+_ALLOWED = {"SELECT", "EXPLAIN", "CREATE", "DROP", "SET", "VARIABLE_SET", "PRAGMA", "CALL"}
+
+
+def install(connection: duckdb.DuckDBPyConnection, observation_type: str) -> None:
+    """Create the views and macros over `stored_transitions` and `stored_recordings`."""
+    connection.execute(definitions(observation_type))
+    install_columns(connection)
+
+
+def definitions(observation_type: str = "FLOAT[]") -> str:
+    """views.sql and macros.sql, with the type that observations are cast to."""
+    folder = files("restock.replay.store")
+    views = (folder / "views.sql").read_text(encoding="utf-8")
+    macros = (folder / "macros.sql").read_text(encoding="utf-8")
+    return views.replace("::FLOAT[] ", f"::{observation_type} ") + "\n" + macros
+
+
+def query(
+    connection: duckdb.DuckDBPyConnection, text: str, *, where: str
+) -> duckdb.DuckDBPyRelation:
+    """Run one query (the last of several statements).
+
+    Raises:
+        QueryError: DuckDB refused it, it is no query, or it would write.
+    """
+    try:
+        statements = connection.extract_statements(text)
+    except duckdb.Error as error:
+        raise QueryError(_message(error), where=where) from error
+    if not statements:
+        raise QueryError("the query is empty", where=where, remedy='try "FROM coverage"')
+    for statement in statements:
+        if statement.type.name not in _ALLOWED:
+            raise QueryError(
+                f"{statement.type.name} is refused: queries are read-only",
+                where=where,
+                remedy="print with --csv or --json and redirect, or use .to_arrow_table()",
+            )
+    try:
+        for statement in statements[:-1]:
+            connection.execute(statement).fetchall()
+        relation = connection.sql(statements[-1].query)
+    except duckdb.Error as error:
+        raise QueryError(_message(error), where=where, remedy=_hint(error)) from error
+    if relation is None:
+        raise QueryError(
+            "the last statement gives no rows", where=where, remedy="end with a SELECT or FROM"
+        )
+    return relation
+
+
+def fetch(
+    connection: duckdb.DuckDBPyConnection, text: str, *, where: str
+) -> tuple[list[str], list[tuple[Any, ...]]]:
+    """Column names and rows of one query; Ctrl-C stops it.
+
+    Raises:
+        QueryError: as `query` does, also for what goes wrong while it runs.
+        KeyboardInterrupt: the query was stopped.
+    """
+
+    def run() -> tuple[list[str], list[tuple[Any, ...]]]:
+        relation = query(connection, text, where=where)
+        try:
+            return relation.columns, values(relation)
+        except duckdb.Error as error:
+            raise QueryError(_message(error), where=where, remedy=_hint(error)) from error
+
+    return interruptible(connection, run)
+
+
+def values(relation: duckdb.DuckDBPyRelation) -> list[tuple[Any, ...]]:
+    """The rows of a relation; times with a zone as text in UTC."""
+    columns = [
+        f"timezone('UTC', #{place})::VARCHAR || 'Z' AS \"{name}\""
+        if str(kind) == "TIMESTAMP WITH TIME ZONE"
+        else f"#{place}"
+        for place, (name, kind) in enumerate(
+            zip(relation.columns, relation.types, strict=True), start=1
+        )
+    ]
+    return relation.project(", ".join(columns)).fetchall()
+
+
+def interruptible(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -> T:
+    """Run a job on a thread of its own: DuckDB does not look for Ctrl-C while it works."""
+    with ThreadPoolExecutor(1) as pool:
+        done = pool.submit(job)
+        try:
+            return done.result()
+        except KeyboardInterrupt:
+            connection.interrupt()
+            raise
+
+
+def _message(error: duckdb.Error) -> str:
+    return str(error).strip()
+
+
+def _hint(error: duckdb.Error) -> str | None:
+    if isinstance(error, duckdb.CatalogException | duckdb.BinderException):
+        return '`restock sql PATH "FROM columns"` lists every view and column'
+    return None

@@ -1,0 +1,244 @@
+"""A store, open for reading: DuckDB over the Parquet of one version of its Delta tables.
+
+The views of `views.sql` and the macros of `macros.sql` are there; queries are read-only. DuckDB
+reads a folder's files itself; those on S3 it reads through Arrow, which skips the columns and row
+groups that a query does not ask for.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from urllib.parse import unquote
+
+import duckdb
+import msgspec
+import pyarrow as pa
+import pyarrow.dataset
+from deltalake import DeltaTable
+
+from restock.errors import StoreError
+from restock.ingest.store.location import Location
+from restock.ingest.store.writer import OWN_PATH, RECORDINGS, TRANSITIONS
+from restock.ingest.task.conditions import Condition
+from restock.ingest.task.task import Task
+from restock.replay.store.query import install, query
+
+
+class Store:
+    """A store at one version. Close it, or use it as a context manager.
+
+    Args:
+        path: the store's directory, or `s3://bucket/prefix`.
+        version: of its transitions table; default the newest.
+        memory_limit: what DuckDB may hold in memory, e.g. "4GB"; default DuckDB's own (80 %).
+
+    `version` is of the transitions table, `files` the Parquet files of each table.
+
+    Raises:
+        StoreError: nothing there, not a store, no such version, or it cannot be reached.
+    """
+
+    def __init__(
+        self,
+        path: str | Path | Location,
+        *,
+        version: int | None = None,
+        memory_limit: str | None = None,
+    ) -> None:
+        self.path = Location.of(path)
+        _expect(self.path)
+        transitions = self.path.open_table(TRANSITIONS, version)
+        recordings = self.path.open_table(RECORDINGS)
+        self.version: int = transitions.version()
+        self._spill = tempfile.TemporaryDirectory(prefix="restock-")
+        self.connection = duckdb.connect(
+            config={"temp_directory": self._spill.name, "autoinstall_known_extensions": False}
+        )
+        if memory_limit is not None:
+            self._set_memory(memory_limit)
+        rows = _paths(transitions)
+        manifests = _manifests(self.path, recordings, rows)
+        self.files = {
+            "stored_recordings": self._present(RECORDINGS, recordings, manifests, hold=True),
+            "stored_transitions": self._present(TRANSITIONS, transitions, rows),
+        }
+        self._tasks = self._read_tasks()
+        self.observation_type = self._observation_type()
+        install(self.connection, self.observation_type)
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<Store {self.path} version {self.version}>"
+
+    def close(self) -> None:
+        """Close the connection and remove its temporary files."""
+        self.connection.close()
+        self._spill.cleanup()
+
+    def sql(self, text: str) -> duckdb.DuckDBPyRelation:
+        """The result of a query: `.to_arrow_table()`, `.df()`, `.pl()`, `.fetchall()`.
+
+        Raises QueryError with DuckDB's message, or where the query would write.
+        """
+        return query(self.connection, text, where=str(self.path))
+
+    def conditions(self) -> tuple[Condition, ...]:
+        """The conditions that labelled the store's rows, of the newest ingest.
+
+        Only what the table keeps of them: name, timing, priority and SQL.
+        """
+        found = self.connection.sql(
+            "SELECT conditions_json FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1"
+        ).fetchall()
+        if not found:
+            return ()
+        return tuple(msgspec.json.decode(found[0][0], type=list[Condition], strict=False))
+
+    def task_json(self, task_hash: str | None = None) -> str:
+        """The task of the store's rows as JSON.
+
+        Raises StoreError where the rows are of several tasks and none, or no such, is named.
+        """
+        if task_hash is None and len(self._tasks) == 1:
+            return next(iter(self._tasks.values()))
+        if task_hash is not None and task_hash in self._tasks:
+            return self._tasks[task_hash]
+        raise StoreError(
+            "it holds no recording"
+            if not self._tasks
+            else f"it holds transitions of the tasks {', '.join(sorted(self._tasks))}"
+            + (f", not of {task_hash}" if task_hash else ""),
+            where=str(self.path),
+            remedy="ingest recordings" if not self._tasks else "name one of them",
+        )
+
+    def task(self, task_hash: str | None = None) -> Task:
+        """The task of the store's rows. Raises StoreError as `task_json` does."""
+        return msgspec.json.decode(self.task_json(task_hash), type=Task)
+
+    def _read_tasks(self) -> dict[str, str]:
+        rows = self.connection.sql(
+            "SELECT DISTINCT task_hash, task_json FROM stored_recordings"
+            " WHERE ingest_id IN (SELECT ingest_id FROM stored_transitions) ORDER BY ALL"
+        ).fetchall()
+        return dict(rows)
+
+    def _observation_type(self) -> str:
+        """Fixed-size where all tasks agree on the size: DuckDB reads Delta's lists as FLOAT[]."""
+        sizes = {
+            msgspec.json.decode(text, type=Task).observation_size for text in self._tasks.values()
+        }
+        return f"FLOAT[{sizes.pop()}]" if len(sizes) == 1 else "FLOAT[]"
+
+    def _present(
+        self, name: str, table: DeltaTable, paths: Sequence[str], *, hold: bool = False
+    ) -> list[str]:
+        """A view `stored_…` of a table's files; returns their full paths.
+
+        What lies on S3 is read at each query, or once, to be held in memory.
+        """
+        view, schema = f"stored_{name}", pa.schema(table.schema().to_arrow())
+        files = [f"{self.path.table(name)}/{path}" for path in paths]
+        if not files:
+            self.connection.register(view, schema.empty_table())
+        elif self.path.folder is not None:
+            read_parquet(self.connection, view, files)
+        else:
+            parquet = pa.dataset.ParquetFileFormat(
+                default_fragment_scan_options=pa.dataset.ParquetFragmentScanOptions(pre_buffer=True)
+            )
+            remote = pa.dataset.FileSystemDataset(
+                [parquet.make_fragment(f"{name}/{path}", self.path.files) for path in paths],
+                schema,
+                parquet,
+                self.path.files,
+            )
+            with self.path.explained():
+                self.connection.register(view, remote.to_table() if hold else remote)
+        return files
+
+    def _set_memory(self, limit: str) -> None:
+        try:
+            self.connection.execute(f"SET memory_limit = '{limit}'")
+        except duckdb.Error as error:
+            raise StoreError(
+                f"no memory limit {limit!r}", remedy='write it like "4GB" or "512MB"'
+            ) from error
+
+
+def is_store(path: str | Path | Location) -> bool:
+    """Whether there is a store at `path`. Raises StoreError where the place cannot be reached."""
+    place = Location.of(path)
+    return all(place.has_table(name) for name in (TRANSITIONS, RECORDINGS))
+
+
+def _expect(place: Location) -> None:
+    if is_store(place):
+        return
+    raise StoreError(
+        "not a store" if place.folder is not None and place.folder.exists() else "no such store",
+        where=str(place),
+        remedy=f"`restock ingest RECORDINGS --store {place}` makes one",
+    )
+
+
+def _paths(table: DeltaTable) -> list[str]:
+    """The table's files, by their paths in it."""
+    paths = table.get_add_actions(flatten=True)["path"].to_pylist()
+    return [unquote(str(path)) for path in paths]
+
+
+def _manifests(place: Location, recordings: DeltaTable, rows: Sequence[str]) -> list[str]:
+    """The files of the manifests, those of an older version's rows included.
+
+    A manifest is taken out of `recordings` when its rows are replaced. Who reads the rows as they
+    were before, by version or because the writer was between two commits, finds it by its name.
+    """
+    active = _paths(recordings)
+    gone = sorted(set(filter(OWN_PATH.fullmatch, rows)) - set(active))
+    found = place.files.get_file_info([f"{RECORDINGS}/{path}" for path in gone])
+    return active + [path for path, info in zip(gone, found, strict=True) if info.is_file]
+
+
+@contextmanager
+def passed_in(connection: duckdb.DuckDBPyConnection, **tables: pa.Table) -> Iterator[None]:
+    """Tables that the connection's SQL sees by their names, for as long as the block runs."""
+    for name, table in tables.items():
+        connection.register(name, table)
+    try:
+        yield
+    finally:
+        for name in tables:
+            connection.unregister(name)
+
+
+def read_parquet(
+    connection: duckdb.DuckDBPyConnection,
+    view: str,
+    files: Sequence[str | os.PathLike[str]],
+    *,
+    schema: str = "main",
+) -> None:
+    """A view over Parquet files; columns that only some have are null in the others."""
+    connection.execute(parquet_view(view, files, schema=schema))
+
+
+def parquet_view(
+    view: str, files: Sequence[str | os.PathLike[str]], *, schema: str | None = None
+) -> str:
+    """The statement that makes such a view."""
+    quoted = ", ".join("'" + str(file).replace("'", "''") + "'" for file in files)
+    name = f'"{schema}"."{view}"' if schema else f'"{view}"'
+    return (
+        f"CREATE OR REPLACE VIEW {name} AS"
+        f" SELECT * FROM read_parquet([{quoted}], union_by_name = true)"
+    )

@@ -1,0 +1,1 @@
+"""From a sampled row back to the messages it was made from."""

@@ -1,0 +1,263 @@
+"""Where a row of a store came from: its ingest, its recording, and the messages it was made of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import msgspec
+import numpy as np
+
+from restock.errors import ConfigError, StoreError
+from restock.ingest.profile.profile import Profile, load_profile
+from restock.ingest.steps.messages_at_tick import HeldMessage, held_messages
+from restock.ingest.task.schema import STEP_BITS
+from restock.ingest.task.task import Task, reward_parts
+from restock.replay.store.store import Store, is_store
+
+# Where in log time the messages of a tick lie: it takes a while until the next ones come, and
+# some take longer than others to be received.
+WINDOW_S = (-1.0, 0.1)
+_RELABELLED = ("condition", "conditions", "labels_version", "profile_hash", "ingest_id", "reward")
+_LEFT_OUT = ("task_json", "conditions_json", "topics", "label_scores")  # of a manifest: long
+
+
+@dataclass(frozen=True)
+class Source:
+    """A store to look in, at a version (None: the newest)."""
+
+    path: str
+    version: int | None = None
+
+
+@dataclass
+class Origin:
+    """All that is known of a stored row. What is not known is None or empty; `notes` say why."""
+
+    transition: dict[str, Any]  # the row as it lies in the store
+    store: dict[str, Any]
+    moment: dict[str, Any]  # when it was, by stamp and by log time
+    reward_parts: dict[str, float] | None = None  # what each event of the step was worth
+    recording: dict[str, Any] | None = None  # the manifest of the ingest that wrote the row
+    topics: list[dict[str, Any]] = field(default_factory=list)  # that the profile reads
+    messages: list[HeldMessage] = field(default_factory=list)  # held at that tick
+    notes: list[str] = field(default_factory=list)
+
+
+def find_origin(
+    sources: Sequence[Source],
+    transition: int,
+    *,
+    recording: Path | None = None,
+    profile: str | None = None,
+) -> Origin:
+    """Look a transition up in the stores, first to last.
+
+    Args:
+        sources: the stores.
+        transition: its id.
+        recording: the recording, to read the messages held at that tick.
+        profile: the profile that read it, where it is not a shipped one.
+
+    Raises:
+        StoreError: a store is not there, or none has the row.
+        RecordingError: the recording given is not the one the row is of.
+    """
+    for source in sources:
+        if not is_store(source.path):
+            raise StoreError(
+                "the store is not there (any more)",
+                where=source.path,
+                remedy="say with --store where it is now",
+            )
+        origin = _look_up(source, transition)
+        if origin is not None:
+            _interpret(origin, recording, profile)
+            return origin
+    raise StoreError(
+        f"no transition {transition} in it",
+        where=", ".join(source.path for source in sources),
+        remedy="its recording was taken out, or ingested anew with other steps: `restock sql STORE"
+        ' "FROM recordings"` lists what is there; `--store` names another store',
+    )
+
+
+def _look_up(source: Source, transition: int) -> Origin | None:
+    """The row at that version, or as it is now where that version can no longer be read."""
+    now = _read(Source(source.path), transition)
+    if source.version is None:
+        return now
+    then = _read(source, transition)
+    if then is None and now is not None:
+        now.notes.append(
+            f"version {source.version} of the store cannot be read any more: this is the row of"
+            f" version {now.store['version']}"
+        )
+        return now
+    if then is not None:
+        then.store["newest_version"] = now.store["version"] if now else None
+        then.notes += _changes(then.transition, now)
+    return then
+
+
+def _read(source: Source, transition: int) -> Origin | None:
+    """A row with what stands around it; None where that version, or its files, are gone."""
+    try:
+        with Store(source.path, version=source.version) as store:
+            rows = rows_of(store.connection, sql_file("trace.sql"), {"id": transition})
+            if not rows:
+                return None
+            row = rows[0]
+            named = {"ingest": row["ingest_id"], "recording": row["recording_id"]}
+            manifests = rows_of(store.connection, sql_file("trace_manifest.sql"), named)
+            around = {"episode": row["episode_id"], "step": row["step_index"]}
+            near = {
+                r["step_index"]: r
+                for r in rows_of(store.connection, sql_file("trace_around.sql"), around)
+            }
+            version = store.version
+    except (duckdb.IOException, StoreError):
+        if source.version is None:
+            raise
+        return None
+    manifest = manifests[0] if manifests else None
+    origin = Origin(
+        transition=row,
+        store={"path": source.path, "version": version},
+        moment=_moment(row, manifest),
+        recording=manifest,
+    )
+    if manifest is None:
+        origin.notes.append("no manifest of its recording is left: see the row's own provenance")
+        return origin
+    if manifest["ingest_id"] != row["ingest_id"]:
+        origin.notes.append("the manifest is of a later ingest of the same recording")
+    origin.reward_parts = _reward_parts(row, near, manifest["task_json"])
+    return origin
+
+
+def rows_of(
+    connection: duckdb.DuckDBPyConnection, sql: str, parameters: Mapping[str, Any]
+) -> list[dict[str, Any]]:
+    """The rows that a query gives, by column."""
+    relation = connection.sql(sql, params=dict(parameters))
+    return [dict(zip(relation.columns, row, strict=True)) for row in relation.fetchall()]
+
+
+def _changes(row: Mapping[str, Any], now: Origin | None) -> list[str]:
+    """What became of a row since."""
+    if now is None:
+        return ["the newest version of the store has this row no more"]
+    changed = [name for name in _RELABELLED if row.get(name) != now.transition.get(name)]
+    if not changed:
+        return []
+    said = ", ".join(f"{name} {row.get(name)} -> {now.transition.get(name)}" for name in changed)
+    return [f"ingested or labelled anew since (version {now.store['version']}): {said}"]
+
+
+def _interpret(origin: Origin, recording: Path | None, name: str | None) -> None:
+    """What the profile says of the recording: which topics were read, and what they held."""
+    manifest, row = origin.recording, origin.transition
+    if manifest is None:
+        return
+    topics = manifest["topics"] or []
+    profile = _profile(origin, manifest, name)
+    if profile is not None:
+        fills: dict[str, list[str]] = {}
+        for input_name, source in profile.inputs.items():
+            fills.setdefault(source.topic, []).append(input_name)
+        topics = [t | {"fills": fills[t["topic"]]} for t in topics if t["topic"] in fills]
+    origin.topics = topics
+    origin.recording = {key: value for key, value in manifest.items() if key not in _LEFT_OUT}
+    if recording is not None and profile is not None:
+        origin.messages = held_messages(
+            recording,
+            profile,
+            recording_id=row["recording_id"],
+            tick=origin.moment["tick"],
+            stamp_ns=origin.moment["stamp_ns"],
+        )
+
+
+def _moment(row: Mapping[str, Any], manifest: Mapping[str, Any] | None) -> dict[str, Any]:
+    """When a row was: its stamp, by log time, and the window its messages lie in."""
+    stamp = int(row["stamp_ns"])
+    offset = (manifest or {}).get("clock_offset_ns") or 0
+    logged = stamp + int(offset)
+    return {
+        "stamp_ns": stamp,
+        "tick": int(row["transition_id"]) & ((1 << STEP_BITS) - 1),
+        "log_time_ns": logged,
+        "log_time": _utc(logged),
+        "window_ns": [logged + round(edge * 1e9) for edge in WINDOW_S],
+        "clock_jumps": (manifest or {}).get("clock_jumps"),
+    }
+
+
+def _utc(stamp_ns: int) -> str:
+    try:
+        return datetime.fromtimestamp(stamp_ns / 1e9, UTC).isoformat(timespec="milliseconds")
+    except (OverflowError, OSError, ValueError):
+        return ""
+
+
+def _reward_parts(
+    row: Mapping[str, Any], near: Mapping[int, Mapping[str, Any]], task_json: str
+) -> dict[str, float] | None:
+    """What the events of a step were worth; None at an episode's last step, whose end is no row."""
+    after = near.get(row["step_index"] + 1)
+    if after is None:
+        return None
+    task = msgspec.json.decode(task_json, type=Task)
+    before = near.get(row["step_index"] - 1)
+    previous = before["action"] if before is not None else 0
+
+    def columns(signals: Mapping[str, Any]) -> dict[str, Any]:
+        return {
+            name: np.array([value])
+            for name, value in signals.items()
+            if isinstance(value, bool | int | float)
+        }
+
+    parts = reward_parts(
+        task,
+        columns(row),
+        columns(after),
+        np.array([row["progress_m"]], np.float64),
+        np.array([row["action"]]),
+        np.array([previous]),
+    )
+    return {name: float(value[0]) + 0.0 for name, value in parts.items()}  # never -0
+
+
+def _profile(origin: Origin, manifest: Mapping[str, Any], given: str | None) -> Profile | None:
+    """The profile that read the recording: the one given, or the shipped one of that name."""
+    name = given or manifest["profile"]
+    try:
+        profile = load_profile(name)
+    except ConfigError:
+        if given is not None:
+            raise
+        origin.notes.append(
+            f"profile {name!r} does not come with Restock: give its file with --profile to see"
+            " which topics were read"
+        )
+        return None
+    if profile.hash != manifest["profile_hash"]:
+        origin.notes.append(
+            f"profile {name!r} is now {profile.hash}, the recording was read by"
+            f" {manifest['profile_hash']}: topics and ages may differ"
+        )
+    return profile
+
+
+@cache
+def sql_file(name: str) -> str:
+    """A query of this folder."""
+    return (files("restock.replay.trace") / name).read_text(encoding="utf-8")

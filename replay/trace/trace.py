@@ -1,0 +1,211 @@
+"""Where a sampled row came from: audit row, panel, store, recording, messages.
+
+A run, a panel and a store each name the next one down, so a trace can begin at any of them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import numpy as np
+
+from restock.errors import PanelError, RunError, StoreError
+from restock.replay.panel.panel import HEADER, Panel
+from restock.replay.places import RUN_CONFIG
+from restock.replay.store.store import is_store
+from restock.replay.trace.origin import Origin, Source, find_origin, rows_of, sql_file
+
+
+@dataclass
+class Trace:
+    """All that is known of one sampled row. What does not apply is None; `notes` say why."""
+
+    audit: dict[str, Any] | None = None  # the row as it was sampled
+    episode: dict[str, Any] | None = None  # of a fresh row: how it can be laid out again
+    panel: dict[str, Any] | None = None
+    origin: Origin | None = None  # in a store
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Where:
+    """Places that are not where they were, and what a trace may use."""
+
+    store: str | None = None
+    panel: Path | None = None
+    recording: Path | None = None
+    profile: str | None = None
+
+
+def trace(place: str | Path, row: str, where: Where | None = None) -> Trace:
+    """Follow one row of a run, a panel or a store down to its messages.
+
+    Args:
+        place: a run (`row` is STEP/ROW: gradient step and row of the batch), a panel (`row` is a
+            row number) or a store (`row` is a transition id).
+        row: which row.
+        where: places that were moved, and the recording whose messages to read.
+
+    Raises:
+        RunError, PanelError, StoreError: no such place or row, or the next place down is not
+            where it was.
+        RecordingError: the recording given is not the one the row is of.
+    """
+    path, where = Path(place), where or Where()
+    found = Trace()
+    if (path / RUN_CONFIG).is_file():
+        _of_run(found, path, row, where)
+    elif (path / HEADER).is_file():
+        _of_panel(found, Panel.open(path), _number(row, path, "row number of the panel"), where)
+    elif is_store(str(place)):
+        number = _number(row, path, "transition id")
+        found.origin = _origin([Source(str(place))], number, where)
+    else:
+        raise StoreError(
+            "neither a run, a panel nor a store" if path.exists() else "nothing is there",
+            where=str(path),
+        )
+    return found
+
+
+def audited_rows(run: str | Path, limit: int = 20) -> list[dict[str, Any]]:
+    """The audited rows of a run with the largest TD errors, each with its name for `trace`."""
+    if not (Path(run) / RUN_CONFIG).is_file():
+        raise RunError(
+            "is no run: only of a run can rows be listed",
+            where=str(run),
+            remedy="name the ROW: a row number of a panel, a transition id of a store",
+        )
+    table = _audit_table(Path(run))
+    with duckdb.connect() as connection:
+        return rows_of(connection, sql_file("trace_rows.sql"), {"file": table, "limit": limit})
+
+
+def _of_run(found: Trace, run: Path, row: str, where: Where) -> None:
+    document = json.loads((run / RUN_CONFIG).read_text(encoding="utf-8"))
+    found.audit = audit = _audit_row(run, row)
+    if audit["source"] == "fresh":
+        _of_twin(found, run, document, audit)
+        return
+    fed = document.get("panel") or {}
+    panel_path = where.panel or Path(fed.get("path", ""))
+    if not (panel_path / HEADER).is_file():
+        raise PanelError(
+            "the panel that the run was fed is not there",
+            where=str(panel_path),
+            remedy="say with --panel where it is now",
+        )
+    panel = Panel.open(panel_path)
+    if panel.id != fed.get("id"):
+        raise PanelError(
+            f"is panel {panel.id}, the run was fed {fed.get('id')}",
+            where=str(panel_path),
+            remedy="say with --panel where that one is",
+        )
+    number = audit.get("panel_row")
+    if number is None:  # a run from before audit rows had it
+        ids = panel.meta_column("transition_id")
+        number = int(np.flatnonzero(ids == audit["transition_id"])[0])
+    _of_panel(found, panel, int(number), where)
+
+
+def _of_panel(found: Trace, panel: Panel, number: int, where: Where) -> None:
+    if not 0 <= number < len(panel):
+        raise PanelError(f"has rows 0 to {len(panel) - 1}, not {number}", where=str(panel.path))
+    meta = panel.meta.slice(number, 1).to_pylist()[0]
+    packed = np.array(panel.rows[number])
+    found.panel = {"path": str(panel.path), "id": panel.id, "row": number, **meta}
+    if found.audit is not None:
+        digest = hashlib.blake2b(packed.tobytes(), digest_size=8).hexdigest()
+        found.panel["same_bytes_as_sampled"] = digest == found.audit["row_hash"]
+        if not found.panel["same_bytes_as_sampled"]:
+            found.notes.append("the row in the panel is not the one that was sampled")
+    header = panel.header
+    if header.store_version < 0:
+        found.notes.append(
+            "the panel was made from a table in memory: there is no store to look in"
+        )
+        return
+    sources = [Source(where.store or header.store, header.store_version)]
+    sources += [Source(other.path, other.version) for other in header.others]
+    found.origin = _origin(sources, int(meta["transition_id"]), where)
+    stored = np.float32(found.origin.transition["observation"])
+    same = np.array_equal(packed[panel.columns["observation"]], stored)
+    found.panel["same_observation_as_stored"] = same
+    if not same:
+        found.notes.append("the observation in the store is not the one that was packed")
+
+
+def _origin(sources: list[Source], transition: int, where: Where) -> Origin:
+    return find_origin(sources, transition, recording=where.recording, profile=where.profile)
+
+
+def _of_twin(
+    found: Trace, run: Path, document: Mapping[str, Any], audit: Mapping[str, Any]
+) -> None:
+    """A fresh row: its episode of the twin, and how that is laid out again."""
+    query = "FROM read_parquet($file) WHERE episode = $episode"
+    asked = {"file": str(run / "episodes.parquet"), "episode": int(audit["episode"])}
+    with duckdb.connect() as connection:
+        rows = rows_of(connection, query, asked)
+    found.episode = {"run_seed": document.get("seeds", {}).get("run")}
+    if not rows:
+        found.notes.append(
+            "its episode had not ended when the run stopped, or its tables end before"
+        )
+        return
+    found.episode |= rows[0]
+    if found.episode.get("episode_seed") is not None:
+        found.episode["spec"] = {
+            "condition": found.episode["true_condition"],
+            "seed": found.episode["episode_seed"],
+        }
+        found.notes.append(
+            "the twin lays the episode out again from its spec; the actions taken are not kept"
+        )
+        if found.episode["perturbation"] != "nominal":
+            found.notes.append(
+                f"its perturbation {found.episode['perturbation']!r} is part of what lays it out"
+            )
+
+
+def _audit_row(run: Path, row: str) -> dict[str, Any]:
+    table = _audit_table(run)
+    step, _, place = row.partition("/")
+    if not (step.isdigit() and place.isdigit()):
+        raise RunError(
+            f"{row!r} names no audit row",
+            where=str(run),
+            remedy="write STEP/ROW, a gradient step and a row of its batch, e.g. 1200/17;"
+            f" `restock trace {run}` lists some",
+        )
+    query = "FROM read_parquet($file) WHERE gradient_step = $step AND batch_row = $place"
+    asked = {"file": table, "step": int(step), "place": int(place)}
+    with duckdb.connect() as connection:
+        rows = rows_of(connection, query, asked)
+    if not rows:
+        raise RunError(
+            f"the batch of gradient step {step} was not audited, or has no row {place}",
+            where=str(run),
+            remedy=f"`restock trace {run}` lists audited rows; record.audit_share says how many",
+        )
+    return rows[0]
+
+
+def _audit_table(run: Path) -> str:
+    table = run / "audit.parquet"
+    if not table.is_file():
+        raise RunError("it has no audit.parquet", where=str(run), remedy="was it trained at all?")
+    return str(table)
+
+
+def _number(row: str, where: Path, what: str) -> int:
+    if not row.isdigit():
+        raise StoreError(f"{row!r} is no {what}", where=str(where))
+    return int(row)

@@ -1,0 +1,78 @@
+"""State that a checkpoint keeps, declared by name: what is saved is what is restored.
+
+A class names its attributes in `STATE`; each is an array, a number, a string, None, a list or dict
+of those, a generator, a torch module, or another object with `state_dict` and `load_state_dict`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+
+
+class Stateful:
+    """Saves and restores what `STATE` names.
+
+    `restored` is for what follows from the state and is not part of it.
+    """
+
+    STATE: ClassVar[tuple[str, ...]] = ()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Arrays and JSON values, by the names in `STATE` (without a leading underscore)."""
+        return {_key(name): saved(getattr(self, name)) for name in self.STATE}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Puts everything where `state_dict` found it."""
+        for name in self.STATE:
+            setattr(self, name, restored(getattr(self, name), state[_key(name)]))
+        self.restored()
+
+    def restored(self) -> None:
+        """Called after `load_state_dict`."""
+
+
+def saved(value: Any) -> Any:
+    """A value as arrays and JSON values, sharing no memory with it."""
+    if isinstance(value, np.random.Generator):
+        return value.bit_generator.state
+    if hasattr(value, "state_dict"):
+        return dict(value.state_dict())
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, Mapping):
+        return {name: saved(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [saved(item) for item in value]
+    return value
+
+
+def restored(current: Any, state: Any) -> Any:
+    """What `state` says, of the kind that `current` is: objects are changed in place."""
+    if isinstance(current, np.random.Generator):
+        current.bit_generator.state = state
+        return current
+    if hasattr(current, "load_state_dict"):
+        current.load_state_dict(state)
+        return current
+    if isinstance(current, np.ndarray):
+        return np.array(state, current.dtype)
+    if isinstance(current, dict) and current.keys() == state.keys():
+        return {name: restored(item, state[name]) for name, item in current.items()}
+    if isinstance(current, list | tuple) and len(current) == len(state):
+        pairs = zip(current, state, strict=True)
+        return type(current)(restored(item, one) for item, one in pairs)
+    if isinstance(current, bool | int | float) and state is not None:
+        return type(current)(state)
+    return saved(state)
+
+
+def _key(name: str) -> str:
+    return name.removeprefix("_")
+
+
+__all__ = ["Stateful", "restored", "saved"]

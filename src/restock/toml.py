@@ -1,0 +1,233 @@
+"""TOML in and out: typed structs with ranges, and errors that name the key and its value.
+
+A range stands in the type (`Annotated[float, Meta(ge=0, lt=1)]`): it is checked when a file is
+read, when a `Checked` struct is made in Python, and it goes into a JSON Schema. What concerns
+several fields stays in a struct's own `check`.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import re
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+from msgspec import inspect
+
+from restock.errors import ConfigError
+
+T = TypeVar("T")
+
+
+class Checked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A struct whose ranges also hold for values given in Python.
+
+    Raises:
+        ValueError: a value outside the range of its type, or refused by `check`.
+    """
+
+    def check(self) -> None:
+        """Raises ValueError where values do not go together."""
+
+    def __post_init__(self) -> None:
+        for name, kind in _ranges(type(self)).items():
+            _check(name, kind, getattr(self, name))
+        self.check()
+
+
+def read_toml(path: Path, *, remedy: str | None = "check the path") -> dict[str, Any]:
+    """The values of a TOML file.
+
+    Raises:
+        ConfigError: the file cannot be read, or is not TOML in UTF-8.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        what = f"cannot be read: {error.strerror}"
+        raise ConfigError(what, where=str(path), remedy=remedy) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"is not TOML: {error}", where=str(path)) from error
+
+
+def typed(
+    document: Mapping[str, Any],
+    kind: type[T],
+    *,
+    where: str,
+    remedy: str | None = None,
+    renamed: Mapping[str, str] | None = None,
+    prefix: str = "",
+) -> T:
+    """Plain values as a typed struct.
+
+    Args:
+        renamed: keys of earlier versions, dotted, each with the name that it has now.
+        prefix: what stands before each key in errors, dotted.
+
+    Raises:
+        ConfigError: an unknown, missing or renamed key, or a value that does not fit; names it.
+    """
+    for old, new in (renamed or {}).items():
+        if _has(document, old.split(".")):
+            raise ConfigError(
+                f"unknown key `{_join(prefix, old)}`",
+                where=where,
+                remedy=f"it is now called `{_join(prefix, new)}`: rename it",
+            )
+    try:
+        return msgspec.convert(document, kind)
+    except msgspec.ValidationError as error:
+        what = _in_words(str(error), document, kind, prefix)
+        raise ConfigError(what, where=where, remedy=remedy) from error
+
+
+def toml_value(value: Any) -> str:
+    """A string, number, boolean, list or mapping (its keys bare) as TOML on one line."""
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key} = {toml_value(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(toml_value, value)) + "]"
+    if isinstance(value, float):
+        return repr(float(value))  # JSON has no inf and nan
+    # JSON would escape what is beyond 16 bits in two halves, and leave DEL as it is.
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+@functools.cache
+def _ranges(kind: type) -> dict[str, inspect.Type]:
+    """The fields of a struct whose type has a range, or holds items that have one."""
+    info = inspect.type_info(kind)
+    assert isinstance(info, inspect.StructType)
+    return {f.name: f.type for f in info.fields if _ranged(f.type)}
+
+
+def _ranged(kind: inspect.Type) -> bool:
+    if isinstance(kind, inspect.UnionType):
+        return any(map(_ranged, kind.types))
+    item = _item(kind)
+    return bool(_bounds(kind)) or (item is not None and _ranged(item))
+
+
+def _item(kind: inspect.Type) -> inspect.Type | None:
+    if isinstance(kind, inspect.DictType):
+        return kind.value_type
+    if isinstance(kind, inspect.VarTupleType | inspect.ListType):
+        return kind.item_type
+    return None
+
+
+def _check(name: str, kind: inspect.Type, value: Any) -> None:
+    if value is None:
+        return
+    if isinstance(kind, inspect.UnionType):
+        fitting = [k for k in kind.types if _bounds(k) and isinstance(value, int | float)]
+        fitting += [k for k in kind.types if _item(k) and not isinstance(value, int | float | str)]
+        for option in fitting:
+            _check(name, option, value)
+        return
+    item = _item(kind)
+    if item is not None:
+        items = value.items() if isinstance(value, Mapping) else enumerate(value)
+        for place, one in items:
+            _check(f"{name}.{place}" if isinstance(place, str) else f"{name}[{place}]", item, one)
+        return
+    bounds = _bounds(kind)
+    if bounds and not _inside(value, bounds):
+        raise ValueError(f"{name} must be {_range_in_words(bounds)}, got {value}")
+
+
+def _bounds(kind: inspect.Type) -> dict[str, float]:
+    found = {name: getattr(kind, name, None) for name in ("ge", "gt", "le", "lt")}
+    return {name: bound for name, bound in found.items() if bound is not None}
+
+
+def _inside(value: float, bounds: Mapping[str, float]) -> bool:
+    return (
+        value >= bounds.get("ge", value)
+        and value <= bounds.get("le", value)
+        and ("gt" not in bounds or value > bounds["gt"])
+        and ("lt" not in bounds or value < bounds["lt"])
+    )
+
+
+def _range_in_words(bounds: Mapping[str, float]) -> str:
+    """`in [0, 1)`, `at least 1`, `above 0`, `at most 1`, `below 1`."""
+    low, high = bounds.get("ge", bounds.get("gt")), bounds.get("le", bounds.get("lt"))
+    if low is not None and high is not None:
+        left, right = "[" if "ge" in bounds else "(", "]" if "le" in bounds else ")"
+        return f"in {left}{low:g}, {high:g}{right}"
+    if low is not None:
+        return f"{'at least' if 'ge' in bounds else 'above'} {low:g}"
+    return f"{'at most' if 'le' in bounds else 'below'} {high:g}"
+
+
+def _in_words(message: str, document: Any, kind: Any, prefix: str) -> str:
+    """msgspec's message with the key as TOML writes it, and the range of the type in words."""
+    what, _, path = message.partition(" - at `$")
+    path = path.rstrip("`")
+    for pattern, word in (("contains unknown", "unknown"), ("missing required", "missing")):
+        if found := re.fullmatch(rf"Object {pattern} field `(.*)`", what):
+            return f"{word} key `{_join(prefix, path, found[1])}`"
+    key = _join(prefix, path)
+    if re.fullmatch(r"Expected `\w+` [<>]=? .*", what):
+        place = _walk(inspect.type_info(kind), document, path)
+        if place is not None:
+            bounds, value, key = *place[:2], _join(prefix, place[2])
+            return f"{key} must be {_range_in_words(bounds)}, got {value}"
+    if re.match(r"Expected `|Invalid ", what) or not path:
+        return f"`{key}`: {what}" if key else what
+    # A check of a struct's own names its fields: `loss.margin …` where the struct is at `loss`.
+    return what if what.startswith((key, "`")) or " " not in what else f"{key}.{what}"
+
+
+def _walk(kind: inspect.Type, value: Any, path: str) -> tuple[dict[str, float], Any, str] | None:
+    """Bounds, value and key of what a message's path leads to; `[...]` is any item of a map."""
+    if isinstance(kind, inspect.UnionType):
+        for option in kind.types:
+            if found := _walk(option, value, path):
+                return found
+        return None
+    if not path:
+        bounds = _bounds(kind)
+        return (bounds, value, "") if bounds and not _inside(value, bounds) else None
+    step, rest = re.fullmatch(r"(\.\w[\w-]*|\[\d+\]|\[\.\.\.\])(.*)", path, re.S).groups()  # type: ignore[union-attr]
+    if isinstance(kind, inspect.StructType | inspect.TypedDictType | inspect.DataclassType):
+        fields = {field.encode_name: field.type for field in kind.fields}
+        name = step[1:]
+        found = _walk(fields[name], value[name], rest) if name in fields else None
+        return found and (found[0], found[1], _join(name, found[2]))
+    item = _item(kind)
+    if item is None or not isinstance(value, Mapping | list | tuple):
+        return None
+    if step == "[...]":
+        for name, one in value.items() if isinstance(value, Mapping) else ():
+            if isinstance(one, int | float | Mapping | list) and (found := _walk(item, one, rest)):
+                return found[0], found[1], _join(str(name), found[2])
+        return None
+    found = _walk(item, value[int(step[1:-1])], rest)
+    return found and (found[0], found[1], _join(step, found[2]))
+
+
+def _has(document: Any, keys: list[str]) -> bool:
+    for key in keys:
+        if not isinstance(document, Mapping) or key not in document:
+            return False
+        document = document[key]
+    return True
+
+
+def _join(*parts: str) -> str:
+    """Keys with dots between them; an index stands by itself: `a.b[0].c`."""
+    text = ""
+    for part in parts:
+        part = part.lstrip(".")
+        text += part if not text or not part or part.startswith("[") else f".{part}"
+    return text
+
+
+__all__ = ["Checked", "read_toml", "toml_value", "typed"]

@@ -1,0 +1,108 @@
+"""The front door: help that teaches, one clear message for what is wrong, the right exit code."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+from support.paths import ROOT
+
+from restock import cli
+from restock.cli.output import print_table
+from restock.errors import ExitCode, RecordingError
+
+
+def restock(*args: str, **kwargs: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "restock", *args]
+    return subprocess.run(command, capture_output=True, text=True, **kwargs)  # type: ignore[call-overload]
+
+
+def test_help_lists_every_verb_and_the_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["--help"]) == 0
+    out = capsys.readouterr().out
+    assert all(f"  {verb}" in out for verb in cli.VERBS)
+    assert "130 interrupted" in out
+
+
+@pytest.mark.parametrize("verb", cli.VERBS)
+def test_every_verb_explains_itself(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([verb, "--help"]) == 0
+    out = capsys.readouterr().out
+    assert f"restock {verb}" in out
+    assert len(out.split()) > 40
+
+
+@pytest.mark.parametrize("verb", cli.VERBS)
+def test_every_verb_is_in_the_readme_and_in_the_docs(verb: str) -> None:
+    assert f"restock {verb}" in (ROOT / "README.md").read_text(encoding="utf-8")
+    pages = "".join(p.read_text(encoding="utf-8") for p in (ROOT / "docs").glob("*.md"))
+    assert f"restock {verb}" in pages
+
+
+def test_an_unknown_verb_suggests_the_near_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["inget"]) == ExitCode.USAGE
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "no verb named 'inget'" in captured.err
+    assert "restock ingest" in captured.err
+
+
+def test_a_wrong_flag_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["info", "--jsn", "x.mcap"]) == ExitCode.USAGE
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "--jsn" in captured.err
+    assert "Traceback" not in captured.err
+
+
+def test_no_arguments_is_a_usage_error() -> None:
+    assert cli.main([]) == ExitCode.USAGE
+
+
+def test_an_interrupt_exits_130(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(args: list[str]) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "_dispatch", interrupted)
+    assert cli.main(["info"]) == ExitCode.INTERRUPTED
+
+
+def test_an_error_says_what_where_and_what_to_do() -> None:
+    error = RecordingError("is empty", where="a.mcap", remedy="record it again")
+    assert str(error) == "a.mcap: is empty\n  record it again"
+    assert error.exit_code == ExitCode.USAGE
+
+
+def test_the_version_is_printed() -> None:
+    done = restock("--version")
+    assert done.returncode == 0
+    assert done.stdout.startswith("restock 0.")
+
+
+def test_a_reader_that_goes_away_is_no_error() -> None:
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    with os.fdopen(write_end, "wb") as gone:
+        command = [sys.executable, "-m", "restock", "--help"]
+        done = subprocess.run(command, stdout=gone, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 0
+    assert done.stderr == ""
+
+
+def test_starting_up_loads_none_of_the_heavy_libraries() -> None:
+    probe = (
+        "import sys, restock.cli; restock.cli.main(['--help']);"
+        "print(sorted({'torch', 'mujoco', 'duckdb', 'pyarrow', 'altair'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True)
+    assert done.stdout.strip().endswith("[]")
+
+
+def test_a_title_wider_than_its_table_stays_on_one_line(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    title = "success [bold] against the baseline, " + "paired by episode, " * 20
+    print_table([{"a": 1}], title=title)
+    assert capsys.readouterr().out.splitlines()[0] == title.rstrip()

@@ -1,0 +1,371 @@
+"""The report: one page that opens offline, says what the run's tables say, and trusts no name."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from dataclasses import asdict
+from html.parser import HTMLParser
+from itertools import pairwise
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from support.stores import TASK
+
+from restock import cli
+from restock.clustered import Estimate
+from restock.errors import RunError
+from restock.replay.mixture.mixture import parse_mixture
+from restock.replay.panel.build import build_panel
+from restock.replay.store.store import Store
+from restock.report import build_report
+from restock.report.facts import gather
+from restock.report.feed import flattery
+from restock.train.run.run import Run
+from restock.train.run.run_tables import EVAL_EPISODES, TABLES
+from restock.train.twin.calibration.gap import Gap
+from restock.train.twin.calibration.gap_files import write_gap
+from restock.train.twin.calibration.trust import Limits, Verdict
+
+HOSTILE = "<script>alert(1)</script>"
+
+
+def filled(table: str, **values: object) -> dict[str, object]:
+    """A row of a run's table; what is not given is a plain value of the column's type."""
+    row: dict[str, object] = {}
+    for field in TABLES[table]:
+        if pa.types.is_boolean(field.type):
+            row[field.name] = False
+        elif pa.types.is_floating(field.type):
+            row[field.name] = 0.5
+        elif pa.types.is_integer(field.type):
+            row[field.name] = 1
+        elif pa.types.is_list(field.type) or pa.types.is_map(field.type):
+            row[field.name] = []
+        else:
+            row[field.name] = "x"
+    return row | values
+
+
+@pytest.fixture(scope="module")
+def run(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run directory as training and `restock eval` leave it, over the synthetic store."""
+    root = tmp_path_factory.mktemp("reported")
+    mixture = parse_mixture("[each_condition]\nshare = 'natural'\n[held_out]\nby = 'none'\n")
+    with Store(store_path) as store:
+        panel = build_panel(store, mixture, root / "panel", task=TASK)
+    config = {"target": {"rule": "hard", "every": 500}, "replay": {"ring_capacity": 4096}}
+    document = {"config": config, "panel": {"path": str(root / "panel"), "id": panel.id}}
+    made = Run.create(root / "run", document)
+    steps = (500, 1000)
+    made.append(
+        "progress",
+        [filled("progress", gradient_steps=n, env_steps=4 * n, phase="online") for n in steps],
+    )
+    made.append(
+        "strata",
+        [
+            filled("strata", gradient_steps=n, source=source, stratum=name, drawn_rows=rows)
+            for n in steps
+            for source in ("logs", "fresh")
+            for name, rows in (("nominal", 90), (HOSTILE, 10))
+        ],
+    )
+    judged = {"fqe": {"refused": None}, "wdr": {"value": None, "refused": HOSTILE}}
+    made.append(
+        "off_policy",
+        [
+            filled("off_policy", condition=condition, estimator=name, **values)
+            for condition in ("all", "nominal")
+            for name, values in judged.items()
+        ],
+    )
+    made.append("ages", [filled("ages", source="logs", unit="days", bucket=b) for b in (-1, 0, 3)])
+    made.append("policies", [filled("policies", source="logs", behaviour_policy="planner")])
+    made.append("probe", [filled("probe", gradient_steps=n, condition="nominal") for n in steps])
+    made.append(
+        "evaluations",
+        [
+            filled(
+                "evaluations",
+                env_steps=4 * n,
+                gradient_steps=n,
+                condition="nominal",
+                block="none",
+                success=n == 500,
+                best=n == 500,
+            )
+            for n in steps
+        ],
+    )
+    made.flush()
+    episodes = [
+        {
+            "policy": policy,
+            "perturbation": "none",
+            "condition": condition,
+            "block": "none",
+            "episode_seed": seed,
+            "success": seed % 10 < wins,
+            "bumps": 0,
+            "time_s": 10.0,
+            "return": 1.0,
+            "end_x_m": 1.0,
+            "end_y_m": 2.0,
+            "failure": None if seed % 10 < wins else "stuck",
+        }
+        for policy, condition, wins in (
+            ("agent", "nominal", 9),
+            ("agent", "wheel_slip", 2),
+            ("planner", "nominal", 10),
+            ("planner", "wheel_slip", 10),
+        )
+        for seed in range(20)
+    ]
+    (made.path / "eval").mkdir()
+    table = pa.Table.from_pylist(episodes, schema=EVAL_EPISODES)
+    pq.write_table(table, made.path / "eval" / "episodes.parquet")
+    return made.path
+
+
+def test_the_replay_card_answers_every_question(run: Path, capsys) -> None:
+    assert cli.main(["report", str(run), "--card", "--json"]) == 0
+    card = json.loads(capsys.readouterr().out)
+    assert card["capacity"]["ring_rows"] == 4096
+    assert card["capacity"]["panel_rows"] > 0
+    assert card["target"] == {"rule": "hard", "every": 500}
+    assert card["sampling"]["logs"].startswith("quotas by stratum")
+    assert card["ages"][0]["p50"] == "below 2"
+    assert {row["stratum"] for row in card["strata"]} == {"nominal", HOSTILE}
+    assert card["behaviour_policies"][0]["behaviour_policy"] == "planner"
+    assert [(row["estimator"], row["value"]) for row in card["off_policy"]] == [
+        ("fqe", 0.5),
+        ("wdr", None),
+    ]
+    assert "flatters most" in card["imbalance"]
+    assert json.loads((run / "replay_card.json").read_text()) == card
+
+
+def test_the_replay_card_is_one_page_of_markdown_that_trusts_no_name(run: Path, capsys) -> None:
+    assert cli.main(["report", str(run), "--card"]) == 0
+    page = capsys.readouterr().out
+    assert (run / "replay_card.md").read_text() == page
+    assert len(page.splitlines()) < 60
+    assert "<script" not in page
+    for words in ("Capacity", "Sampling rule", "Target rule", "Corrections", "Age of the sampled"):
+        assert words in page
+    lines = page.splitlines()
+    for before, line in pairwise(lines):  # every table has one width
+        if before.startswith("|") and line.startswith("|"):
+            assert before.replace("\\|", "").count("|") == line.replace("\\|", "").count("|")
+
+
+class Outline(HTMLParser):
+    """Tags, and everything that a browser would fetch."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.fetched: list[str] = []
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        for name, value in attributes:
+            if name in ("src", "href", "xlink:href", "srcset", "data") and value:
+                self.fetched.append(value)
+
+
+@pytest.fixture(scope="module")
+def html(run: Path) -> str:
+    return build_report(run).read_text(encoding="utf-8")
+
+
+def outline(html: str) -> Outline:
+    parser = Outline()
+    parser.feed(html)
+    return parser
+
+
+def test_the_page_fetches_nothing(html: str) -> None:
+    page = outline(html)
+    assert [url for url in page.fetched if not url.startswith(("#", "data:"))] == []
+    assert "script" not in page.tags
+    assert "@import" not in html
+    assert "url(http" not in html
+
+
+def test_a_hostile_name_is_text_and_no_markup(html: str) -> None:
+    assert "alert(1)" in html  # it is shown …
+    assert HOSTILE not in html  # … as text
+
+
+def test_the_headline_is_what_the_episodes_say(html: str) -> None:
+    heading = re.search(r"<h1>(.*?)</h1>", html, re.DOTALL)
+    assert heading is not None
+    assert "Success 55% on average over 2 kinds of episode" in heading[1]
+    assert "20% in the hardest, wheel slip" in heading[1]
+
+
+def test_a_clear_loss_to_the_planner_is_said(html: str) -> None:
+    assert "Worse than the planner in wheel slip: 20% against 100%" in html
+    assert "Worse than the planner in nominal" not in html  # the intervals overlap
+
+
+def test_every_section_has_its_figures(html: str) -> None:
+    for section, figures in (
+        ("success", 1),
+        ("fed", 3),
+        ("learning", 2),
+        ("critic", 2),
+        ("map", 2),
+    ):
+        part = html.split(f'<section id="{section}">')[1].split("</section>")[0]
+        assert part.count("<svg") == figures, section
+
+
+def test_estimates_from_logs_are_on_the_page_with_what_was_refused(html: str) -> None:
+    part = html.split('<section id="learning">')[1].split("</section>")[0]
+    assert "Judged on held-out logs" in part
+    assert "0.50 [0.50, 0.50]" in part
+    assert "refused: &lt;script&gt;" in part
+
+
+def test_a_measured_gap_is_a_section(run: Path, tmp_path: Path) -> None:
+    position = {"condition": "nominal", "horizon_s": 3.0, "quantity": "position", "unit": "m"}
+    position |= {"source": "nominal", "segments": 40, "episodes": 9}
+    position |= {f"{q}{end}": 0.5 for q in ("median", "p90") for end in ("", "_low", "_high")}
+    far = Estimate(0.5, 0.4, 0.6)
+    gap = Gap(
+        about={"limits": asdict(Limits()), "store_version": 7, "twins": {"nominal": {}}},
+        paths=[position],
+        observations=[],
+        rewards=[],
+        verdicts=(Verdict("nominal", "untrusted", ("it is far off",), 40, 9, far, far),),
+        not_done=(f"No {HOSTILE} was compared.",),
+    )
+    copy = shutil.copytree(run, tmp_path / "run")
+    write_gap(gap, copy / "gap")
+    page = build_report(copy).read_text(encoding="utf-8")
+    part = page.split('<section id="twin-gap">')[1].split("</section>")[0]
+    for words in (
+        *("Do not trust the twin in: nominal.", "it is far off", "0.50 m [0.40, 0.60]"),
+        *("nominal twin", "measured at version 7", "No &lt;script&gt;alert(1)&lt;/script&gt; was"),
+    ):
+        assert words in part, words
+    assert part.count("<svg") == 1
+    (copy / "gap" / "gap.json").write_text("{}")
+    page = build_report(copy).read_text(encoding="utf-8")
+    assert '<section id="twin-gap">' not in page
+    assert "no gap that can be read" in page
+
+
+def test_drawn_shares_are_over_the_whole_run(run: Path) -> None:
+    fed = {(r["source"], r["stratum"]): r for r in gather(run).fed}
+    assert fed["logs", "nominal"]["drawn_rows"] == 180
+    assert fed["logs", "nominal"]["drawn_share"] == pytest.approx(0.9)
+    assert fed["fresh", HOSTILE]["drawn_share"] == pytest.approx(0.1)
+
+
+def test_shares_after_weights_count_intervals_by_what_was_drawn_in_them(tmp_path: Path) -> None:
+    made = Run.create(tmp_path / "run", {"config": {}})
+    made.append("progress", [filled("progress", phase="online")])
+    made.append(
+        "strata",
+        [
+            # A stratum that only the first, small interval held.
+            filled("strata", gradient_steps=1, stratum="a", drawn_rows=50, effective_share=0.5),
+            filled("strata", gradient_steps=1, stratum="b", drawn_rows=50, effective_share=0.5),
+            filled("strata", gradient_steps=2, stratum="a", drawn_rows=900, effective_share=1.0),
+        ],
+    )
+    made.flush()
+    fed = {row["stratum"]: row["effective_share"] for row in gather(made.path).fed}
+    assert fed == pytest.approx({"a": 0.95, "b": 0.05})
+
+
+def test_the_kept_evaluation_is_the_best_and_not_the_last(run: Path) -> None:
+    kept = gather(run).kept
+    assert kept is not None
+    assert (kept["env_steps"], kept["success"]) == (2000, 1.0)
+
+
+def test_the_imbalance_that_flatters_is_named(run: Path) -> None:
+    facts = gather(run)
+    facts.logged = [
+        {"condition": "nominal", "share": 0.1, "episodes": 1},
+        {"condition": "wheel_slip", "share": 0.9, "episodes": 9},
+    ]
+    # Half of the evaluation is nominal, which is easier, but a tenth of what was logged.
+    assert "success would be 27% instead of 55%" in flattery(facts)
+    assert "flatters most is nominal" in flattery(facts)
+
+
+def test_a_young_run_without_evaluation_still_has_a_page(tmp_path: Path) -> None:
+    made = Run.create(tmp_path / "run", {"config": {"target": {"rule": "polyak", "tau": 0.005}}})
+    made.append("progress", [filled("progress", phase="offline")])
+    made.flush()
+    html = build_report(made.path).read_text(encoding="utf-8")
+    assert "trained, not yet evaluated" in html
+    assert "had no panel" in html
+
+
+def _on_floors(run: Path, path: Path, layouts: str, ended_on: str) -> str:
+    """The page of the run as if it had driven on other floors, its evaluation on `ended_on`."""
+    shutil.copytree(run, path)
+    document = json.loads((path / "config.json").read_text())
+    document["config"]["env"] = {"layouts": layouts}
+    (path / "config.json").write_text(json.dumps(document))
+    file = path / "eval" / "episodes.parquet"
+    table = pq.read_table(file)
+    column = pa.array([ended_on] * len(table))
+    pq.write_table(table.set_column(table.column_names.index("layout"), "layout", column), file)
+    return build_report(path).read_text(encoding="utf-8")
+
+
+def test_the_floor_that_is_drawn_is_the_runs_own(run: Path, tmp_path: Path) -> None:
+    hall = tmp_path / "hall.toml"
+    hall.write_text("width_m = 20.0\ndepth_m = 5.0\nracks = [[1.0, 2.0, 8.0, 3.0]]\n")
+    page = _on_floors(run, tmp_path / "a", str(hall), "hall.toml")
+    assert 'width="800" height="200"' in page
+    assert "run drives on, hall.toml" in page
+    assert "18 failed clean episodes there" in page
+    page = _on_floors(run, tmp_path / "b", str(hall), "default")
+    assert "0 failed clean episodes there" in page
+
+
+@pytest.mark.parametrize(
+    ("layouts", "said"),
+    [
+        ("generated:train:3", "drives on 3 floors"),
+        ("gone.toml", "gone.toml: cannot be read"),
+    ],
+)
+def test_a_floor_that_is_not_drawn_is_said(
+    run: Path, tmp_path: Path, layouts: str, said: str
+) -> None:
+    page = _on_floors(run, tmp_path / "a", layouts, "default")
+    assert said in page
+    assert "Where did it happen?" not in page
+
+
+def test_a_run_without_an_update_is_refused(tmp_path: Path) -> None:
+    Run.create(tmp_path / "run", {"config": {}})
+    with pytest.raises(RunError, match="no update to report on"):
+        build_report(tmp_path / "run")
+
+
+def test_the_verb_prints_where_the_page_is(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "deep" / "page.html"
+    assert cli.main(["report", str(run), "--out", str(out), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said == {"report": str(out), "bytes": out.stat().st_size}
+
+
+def test_what_is_no_run_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["report", str(tmp_path / "nothing")]) == 2
+    assert "is not a run directory" in capsys.readouterr().err

@@ -1,0 +1,136 @@
+"""One clock, causal holds with maximum ages, and clocks that jump."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.driven_robot import START_NS, columns
+
+from restock.errors import RecordingError
+from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.profile.profile import Clock
+from restock.ingest.steps.align import NS, Samples, align, ticks_of
+
+stamps = st.lists(st.integers(0, 10_000), max_size=30).map(sorted)
+
+
+@given(stamps, stamps, st.one_of(st.none(), st.integers(0, 3000)))
+def test_a_hold_takes_the_latest_sample_at_or_before_the_tick(samples, ticks, max_age_ns):
+    held = Samples(np.array(samples, np.int64), np.arange(len(samples))).hold(
+        np.array(ticks, np.int64), None if max_age_ns is None else max_age_ns / NS
+    )
+    for index, tick in enumerate(ticks):
+        before = [row for row, stamp in enumerate(samples) if stamp <= tick]
+        assert held.known[index] == bool(before)
+        if before:
+            assert held.row[index] == before[-1]
+            assert held.age_ns[index] == tick - samples[before[-1]]
+            in_time = max_age_ns is None or held.age_ns[index] <= max_age_ns
+            assert held.fresh[index] == in_time
+
+
+@given(stamps, stamps, st.integers(1, 5000))
+def test_later_samples_change_no_earlier_tick(samples, ticks, later_by):
+    tick_ns = np.array(ticks, np.int64)
+    end = max([*ticks, *samples, 0])
+    more = [*samples, end + later_by]
+    now = Samples(np.array(samples, np.int64), np.arange(len(samples))).hold(tick_ns, 1e-6)
+    then = Samples(np.array(more, np.int64), np.arange(len(more))).hold(tick_ns, 1e-6)
+    assert np.array_equal(now.row * now.known, then.row * then.known)
+    assert np.array_equal(now.fresh, then.fresh)
+
+
+def test_topics_without_a_header_are_put_on_the_header_clock():
+    sim_offset = 1_701_217_691_789_000_000
+    time = np.arange(0, 5, 0.1)
+    stamp = np.rint(time * 1e9).astype(np.int64)
+    scan = TopicColumns(stamp + sim_offset, stamp + sim_offset, {"header.stamp": stamp})
+    late = 30_000_000  # a topic that is always 30 ms late does not set the offset
+    pose = TopicColumns(stamp + sim_offset + late, stamp, {"header.stamp": stamp})
+    command = TopicColumns(stamp + sim_offset + 7, stamp, {})
+    segments, report = align({"/scan": scan, "/pose": pose, "/cmd": command}, Clock())
+    assert len(segments) == 1
+    assert report.offset_ns == sim_offset
+    assert np.array_equal(segments[0].topics["/cmd"].stamp_ns, stamp + 7)
+    assert np.array_equal(segments[0].topics["/pose"].stamp_ns, stamp)
+
+
+def test_log_time_out_of_order_is_sorted_and_the_last_of_equal_stamps_wins():
+    stamp = np.array([10, 30, 20, 20], np.int64)
+    topic = TopicColumns(stamp, stamp, {})
+    segments, _ = align({"/t": topic}, Clock(alignment="log_time"))
+    samples = segments[0].topics["/t"]
+    assert samples.stamp_ns.tolist() == [10, 20, 20, 30]
+    assert samples.hold(np.array([25]), None).row.tolist() == [3]
+
+
+def test_a_clock_that_jumps_back_starts_a_segment_and_no_hold_crosses_it():
+    log = START_NS + np.arange(100, dtype=np.int64) * NS // 10
+    stamp = np.concatenate([np.arange(50), np.arange(50)]).astype(np.int64) * NS // 10
+    odom = TopicColumns(log, log, {"header.stamp": stamp})
+    slow = TopicColumns(log[::20] + 5, log[::20], {"header.stamp": stamp[::20]})
+    goal = TopicColumns(log[:1], log[:1], {"header.stamp": stamp[:1]})
+    topics = {"/odom": odom, "/slow": slow, "/goal": goal}
+    segments, report = align(topics, Clock(), frozenset({"/goal"}))
+    assert report.jumps == 1
+    assert [len(s.topics["/odom"].row) for s in segments] == [50, 50]
+    first_tick = segments[1].topics["/odom"].stamp_ns[:1]
+    assert first_tick.tolist() == [0]
+    assert not segments[1].topics["/slow"].hold(first_tick, None).known[0]  # not the old one's
+    assert segments[1].topics["/goal"].hold(first_tick, None).known[0]  # latched: still holds
+    # Headerless topics are mapped by their own segment's offset.
+    assert segments[1].offset_ns - segments[0].offset_ns == 5 * NS
+
+
+def test_one_bad_stamp_is_left_out_and_counted_and_is_no_jump():
+    time = np.arange(0, 5, 0.1)
+    topic = columns(time, {})
+    topic.fields["header.stamp"][20] = 0
+    segments, report = align({"/odom": topic}, Clock())
+    assert (len(segments), report.jumps, report.off_clock) == (1, 0, {"/odom": 1})
+    assert 20 not in segments[0].topics["/odom"].row
+
+
+def test_a_latched_message_older_than_the_recording_is_put_at_its_log_time():
+    odom, goal = columns(np.arange(0, 5, 0.1), {}), columns(np.array([0.0]), {})
+    goal.fields["header.stamp"][0] -= 600 * NS
+    segments, report = align({"/odom": odom, "/goal": goal}, Clock(), frozenset({"/goal"}))
+    assert report.restamped == {"/goal": 1}
+    assert segments[0].topics["/goal"].stamp_ns.tolist() == [START_NS]
+
+
+def test_no_header_at_all_asks_for_the_log_time():
+    time = np.array([1, 2], np.int64)
+    with pytest.raises(RecordingError, match='alignment = "log_time"'):
+        align({"/cmd": TopicColumns(time, time, {})}, Clock())
+
+
+def test_ticks_at_a_fixed_rate_start_at_the_first_command():
+    command = Samples(np.array([5, 6], np.int64) * NS, np.arange(2))
+    ticks, between = ticks_of(command, Clock(steps="rate"), 0.5, 7 * NS)
+    assert (ticks / NS).tolist() == [5, 5.5, 6, 6.5, 7]
+    assert between == 0
+
+
+def test_ticks_at_commands_are_no_closer_than_three_quarters_of_a_period():
+    command = Samples(np.array([0, 10, 151, 200, 310], np.int64) * 10**6, np.arange(5))
+    ticks, between = ticks_of(command, Clock(steps="command"), 0.2, 0)
+    assert (ticks // 10**6).tolist() == [0, 151, 310]
+    assert between == 2
+
+
+@given(st.integers(-(10**12), 10**12))
+def test_the_offset_between_clocks_does_not_matter(offset_ns):
+    """Sim time or wall time: the same ticks see the same messages."""
+    base = columns(np.arange(0, 3, 0.1), {})
+    command = columns(np.arange(0, 3, 0.2), {}, stamped=False)
+    shifted = {
+        name: TopicColumns(topic.log_time_ns + offset_ns, topic.publish_time_ns, topic.fields)
+        for name, topic in {"/odom": base, "/cmd": command}.items()
+    }
+    segments, _ = align(shifted, Clock())
+    expected, _ = align({"/odom": base, "/cmd": command}, Clock())
+    for name in shifted:
+        assert np.array_equal(segments[0].topics[name].stamp_ns, expected[0].topics[name].stamp_ns)

@@ -1,0 +1,329 @@
+"""The columnar decoder gives what rosbags gives, for any definition, in either byte order."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from support.bag_samples import STORE
+from support.paths import SHARED
+
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.decoding.cdr import ColumnDecoder
+from restock.ingest.decoding.channel import Channel
+from restock.ingest.decoding.columns import Batch, Ragged, equal
+from restock.ingest.decoding.definitions import RosType, message_type
+from restock.ingest.decoding.field_paths import CannotDecode, Leaf
+from restock.ingest.decoding.row_by_row import RowDecoder
+
+PRIMITIVES = [
+    *("bool", "byte", "char", "int8", "uint8", "int16", "uint16", "int32", "uint32"),
+    *("int64", "uint64", "float32", "float64"),
+]
+REPEATS = ["", "", "", "[]", "[]", "[<=5]", "[3]", "[1]"]
+
+
+def batch(payloads: list[bytes], lead: int = 3) -> Batch:
+    """Payloads at odd places of one buffer, as in a chunk."""
+    padded = [b"\xaa" * lead + payload for payload in payloads]
+    whole = Batch.of(padded, np.arange(len(payloads)), np.arange(len(payloads)))
+    return Batch(whole.buffer, whole.start + lead, whole.stop, whole.log_time_ns, whole.log_time_ns)
+
+
+def agree(message: RosType, payloads: list[bytes], *, ros1: bool = False) -> None:
+    leaves = message.leaves()
+    given_batch = batch(payloads)
+    ours = ColumnDecoder(message, leaves, ros1=ros1).decode(given_batch)
+    theirs = RowDecoder(message, leaves, ros1=ros1).decode(given_batch)
+    assert ours.bad == theirs.bad == {}
+    assert np.array_equal(ours.rows, theirs.rows)
+    assert ours.fields.keys() == theirs.fields.keys()
+    for path, column in theirs.fields.items():
+        assert equal(ours.fields[path], column), path
+    for leaf in leaves:  # and each on its own, so that the others are stepped over
+        alone = ColumnDecoder(message, [leaf], ros1=ros1).decode(given_batch)
+        assert equal(alone.fields[leaf.path], theirs.fields[leaf.path]), leaf.path
+
+
+# -- generated definitions ------------------------------------------------------------------
+
+
+@st.composite
+def definitions(draw: st.DrawFn, *, ros1: bool = False) -> str:
+    """A message definition with the messages it is made of, as a recording carries it."""
+    bounds = "[]" if ros1 else "[<=5]"  # ROS 1 knows none
+    repeats = [bounds if repeat == "[<=5]" else repeat for repeat in REPEATS]
+    others = ["time", "duration"] if ros1 else ["string<=8", "builtin_interfaces/Time"]
+    count = draw(st.integers(1, 4))
+    texts = []
+    for number in range(count):
+        inner = [f"pkg/T{other}" for other in range(number + 1, count)]
+        kinds = [*PRIMITIVES, "string", *others, *inner * 3]
+        fields = draw(
+            st.lists(st.tuples(st.sampled_from(kinds), st.sampled_from(repeats)), max_size=6)
+        )
+        lines = [f"{kind}{repeat} f{place}" for place, (kind, repeat) in enumerate(fields)]
+        texts.append("\n".join(lines) or "# nothing in it")
+    rule = "\n" + "=" * 80 + "\nMSG: "
+    time = "int32 sec\nuint32 nanosec"
+    family = [f"pkg/T{number}\n{text}" for number, text in enumerate(texts)][1:]
+    return rule.join([texts[0], *family, *([] if ros1 else [f"builtin_interfaces/Time\n{time}"])])
+
+
+class Maker:
+    """Random messages of a definition: varied lengths, or all alike."""
+
+    def __init__(self, store: Any, rng: np.random.Generator, longest: int) -> None:
+        self.store, self.rng, self.longest = store, rng, longest
+
+    def message(self, name: str) -> Any:
+        values = [self.value(description) for _, description in self.store.fielddefs[name][1]]
+        return self.store.types[name](*values)
+
+    def value(self, description: Any) -> Any:
+        node, rest = int(description[0]), description[1]
+        if node == 1:
+            return self.base(rest[0])
+        if node == 2:
+            return self.message(rest)
+        (inner, what), bound = rest
+        length = bound if node == 3 else int(self.rng.integers(0, (bound or self.longest) + 1))
+        if inner == 1 and what[0] != "string":
+            return np.array([self.base(what[0]) for _ in range(length)], self.dtype(what[0]))
+        return [self.value((inner, what)) for _ in range(length)]
+
+    def dtype(self, base: str) -> Any:
+        return {"byte": np.int8, "char": np.uint8, "bool": np.bool_}.get(base) or np.dtype(base)
+
+    def base(self, base: str) -> Any:
+        if base == "string":
+            letters = self.rng.integers(0, 4, self.rng.integers(0, 6)).tolist()
+            return "".join("aé\U0001f916 "[letter] for letter in letters)
+        if base == "bool":
+            return bool(self.rng.integers(2))
+        if base.startswith("float"):
+            special = [0.0, -1.5, np.inf, -np.inf, np.nan, 1e-30, 3.25]
+            return float(np.dtype(base).type(special[self.rng.integers(7)]))
+        info = np.iinfo(self.dtype(base))
+        return int(self.rng.integers(info.min, info.max, dtype=self.dtype(base), endpoint=True))
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@given(
+    text=definitions(),
+    seed=st.integers(0, 2**32),
+    rows=st.integers(1, 12),
+    longest=st.sampled_from([0, 1, 3, 9]),
+    little=st.booleans(),
+    alike=st.booleans(),
+)
+def test_any_definition_decodes_as_rosbags_does(
+    text: str, seed: int, rows: int, longest: int, little: bool, alike: bool
+) -> None:
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(text, "pkg/msg/T0"))
+    message = message_type(
+        Channel(1, "/t", "pkg/msg/T0", "cdr", "ros2msg", text.encode()), "humble"
+    )
+    maker = Maker(store, np.random.default_rng(seed), longest)
+    made = [maker.message("pkg/msg/T0") for _ in range(1 if alike else rows)]
+    payloads = [
+        bytes(store.serialize_cdr(one, "pkg/msg/T0", little_endian=little)) for one in made
+    ] * (rows if alike else 1)
+    agree(message, payloads)
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
+@given(
+    text=definitions(ros1=True),
+    seed=st.integers(0, 2**32),
+    rows=st.integers(1, 12),
+    longest=st.sampled_from([0, 1, 3, 9]),
+    alike=st.booleans(),
+)
+def test_any_ros1_definition_decodes_as_rosbags_does(
+    text: str, seed: int, rows: int, longest: int, alike: bool
+) -> None:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg(text, "pkg/msg/T0"))
+    channel = Channel(1, "/t", "pkg/T0", "ros1", "ros1msg", text.encode())
+    maker = Maker(store, np.random.default_rng(seed), longest)
+    made = [maker.message("pkg/msg/T0") for _ in range(1 if alike else rows)]
+    payloads = [bytes(store.serialize_ros1(one, "pkg/msg/T0")) for one in made]
+    agree(message_type(channel, "humble"), payloads * (rows if alike else 1), ros1=True)
+
+
+def test_both_byte_orders_in_one_batch() -> None:
+    message = message_type(Channel(1, "/t", "nav_msgs/msg/Path", "cdr"), "humble")
+    types = STORE.types
+    payloads = []
+    for row in range(9):
+        stamp = types["builtin_interfaces/msg/Time"](row, 5)
+        header = types["std_msgs/msg/Header"](stamp, "f" * row)
+        pose = types["geometry_msgs/msg/Pose"](
+            types["geometry_msgs/msg/Point"](1.0 * row, 2.0, 3.0),
+            types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+        )
+        poses = [types["geometry_msgs/msg/PoseStamped"](header, pose) for _ in range(row)]
+        path = types["nav_msgs/msg/Path"](header, poses)
+        little = row % 2 == 0
+        payloads.append(bytes(STORE.serialize_cdr(path, "nav_msgs/msg/Path", little_endian=little)))
+    agree(message, payloads)
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
+@pytest.mark.parametrize(
+    "name",
+    [
+        "every-common-type/test_bag_mcap",
+        "every-common-type/test_bag_sqlite3",
+        "turtlebot3-sim-humble",
+        "turtlebot3-sim-sparse-cmd",
+        "jazzy-mcap-backsteps",
+        "nav2-file-zstd",
+        "rosbag2-tests/mcap/cdr_test",
+        "rosbag2-services/only_topics.mcap",
+        "ros1/husky_robot_localization.bag",
+    ],
+)
+def test_other_peoples_messages_decode_as_rosbags_does(name: str) -> None:
+    with open_recording(SHARED / name) as recording:
+        for topic, info in recording.topics.items():
+            if info.skipped:
+                continue
+            (stream, *_) = recording._streams[topic]
+            message = message_type(stream.channel, "humble")
+            for _, found in stream.storage.batches([stream.channel.id]):
+                few = slice(None, 40)
+                part = Batch(
+                    found.buffer, found.start[few], found.stop[few], *[found.log_time_ns[few]] * 2
+                )
+                ros1 = info.encoding == "ros1"
+                leaves = message.leaves()
+                ours = ColumnDecoder(message, leaves, ros1=ros1).decode(part)
+                theirs = RowDecoder(message, leaves, ros1=ros1).decode(part)
+                assert len(ours.rows) == len(part)
+                for path, column in theirs.fields.items():
+                    assert equal(ours.fields[path], column), (topic, path)
+                break
+
+
+# -- golden bytes ---------------------------------------------------------------------------
+
+
+def one(kind: str, definition: str = "") -> RosType:
+    form = "ros2msg" if definition else ""
+    return message_type(Channel(1, "/t", kind, "cdr", form, definition.encode()), "humble")
+
+
+def leaf(message: RosType, path: str) -> Leaf:
+    return message.leaf(path)
+
+
+def test_alignment_is_relative_to_the_byte_after_the_header() -> None:
+    message = one("pkg/msg/T", "uint8 a\nfloat64 b\nuint8 c\nuint16 d")
+    payload = bytes.fromhex("00010000 07 00000000000000 000000000000f83f 09 00 3412")
+    found = ColumnDecoder(message, message.leaves()).decode(batch([payload])).fields
+    assert [column[0] for column in found.values()] == [7, 1.5, 9, 0x1234]
+
+
+def test_an_empty_sequence_takes_no_padding() -> None:
+    message = one("pkg/msg/T", "float64[] a\nuint8 b")
+    empty = bytes.fromhex("00010000 00000000 07")
+    full = bytes.fromhex("00010000 01000000 00000000 000000000000f03f 08")
+    found = ColumnDecoder(message, message.leaves()).decode(batch([empty, full])).fields
+    assert found["b"].tolist() == [7, 8]
+    assert isinstance(found["a"], Ragged)
+    assert [row.tolist() for row in (found["a"][0], found["a"][1])] == [[], [1.0]]
+
+
+def test_a_message_without_fields_carries_one_byte() -> None:
+    message = one("std_msgs/msg/Empty")
+    assert message.leaves() == []
+    found = ColumnDecoder(message, []).decode(batch([bytes.fromhex("0001000000")] * 3))
+    assert len(found.rows) == 3
+    assert not found.bad
+
+
+def test_xcdr2_and_parameter_lists_are_refused_by_name() -> None:
+    message = one("std_msgs/msg/Bool")
+    good, xcdr2 = bytes.fromhex("0001000001"), bytes.fromhex("0007000001")
+    found = ColumnDecoder(message, message.leaves()).decode(
+        batch([good, xcdr2, xcdr2, b"\0\3\0\0"])
+    )
+    assert found.rows.tolist() == [0]
+    assert found.bad == {
+        "serialised as XCDR2, 00 07: not read": 2,
+        "serialised as a parameter list (PL_CDR), 00 03: not read": 1,
+    }
+
+
+def test_mis_sized_messages_are_counted_and_the_others_kept() -> None:
+    message = one("std_msgs/msg/String")
+    rows = [bytes(STORE.serialize_cdr(STORE.types[message.name](t), message.name)) for t in "abc"]
+    rows[1:1] = [rows[0][:-1], rows[0] + b"\0\0\0\0", b"\0\1", b"\0\1\0\0\xff\xff\xff\xff"]
+    found = ColumnDecoder(message, message.leaves()).decode(batch(rows))
+    assert found.fields["data"].tolist() == ["a", "b", "c"]
+    assert found.rows.tolist() == [0, 5, 6]
+    assert found.bad == {
+        "mis-sized: it ends before its last field": 2,
+        "mis-sized: bytes are left after its last field": 1,
+        "mis-sized: shorter than its header": 1,
+    }
+
+
+def test_a_text_that_is_none_is_counted() -> None:
+    message = one("std_msgs/msg/String")
+    rows = [
+        bytes.fromhex("00010000 02000000 ff00"),
+        bytes.fromhex("00010000 02000000 6161"),
+        bytes.fromhex("00010000 02000000 6100"),
+    ]
+    found = ColumnDecoder(message, message.leaves()).decode(batch(rows))
+    assert found.fields["data"].tolist() == ["a"]
+    assert found.bad == {
+        "a text that is not UTF-8": 1,
+        "a text without its terminating zero": 1,
+    }
+
+
+def test_a_count_that_cannot_be_is_refused_before_anything_is_allocated() -> None:
+    rule = "=" * 80
+    point = "MSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z"
+    message = one("pkg/msg/T", f"geometry_msgs/Point[] p\n{rule}\n{point}")
+    rows = [bytes.fromhex("00010000 ffffffff") + bytes(28)]
+    found = ColumnDecoder(message, message.leaves()).decode(batch(rows))
+    assert not len(found.rows)
+    assert sum(found.bad.values()) == 1
+
+
+@pytest.mark.parametrize(
+    ("definition", "says"),
+    [
+        ("wstring name", "wstring"),
+        ("pkg/Missing inner", "not defined"),
+        ("uint8[0] none", "array of 0"),
+        ("uint8[99999999] much", "array of 99,999,999"),
+        ("pkg/T again", "nests deeper"),
+        ("=this is no definition", "cannot be parsed"),
+    ],
+)
+def test_what_cannot_be_decoded_is_named(definition: str, says: str) -> None:
+    with pytest.raises(CannotDecode, match=says):
+        one("pkg/msg/T", definition)
+
+
+def test_rows_that_are_wrong_in_many_ways_still_all_get_counted() -> None:
+    message = one("diagnostic_msgs/msg/DiagnosticArray")
+    rng = np.random.default_rng(3)
+    rows = [
+        b"\0\1\0\0" + rng.integers(0, 3, rng.integers(0, 90)).astype(np.uint8).tobytes()
+        for _ in range(400)
+    ]
+    found = ColumnDecoder(message, message.leaves()).decode(batch(rows))
+    assert len(found.rows) + sum(found.bad.values()) == 400
+    assert found.bad

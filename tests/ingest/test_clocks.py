@@ -1,0 +1,146 @@
+"""Clocks compared: offset, jumps, backsteps, repeated and zero stamps, by hand and as shown."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.driven_robot import Drive, write_bag
+from support.paths import SHARED
+
+from restock.cli import main
+from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.steps.align import NS
+from restock.ingest.steps.clocks import STAMP, odd, topic_clock
+
+
+def topic(stamps: list[int], logs: list[int] | None = None) -> TopicColumns:
+    stamp = np.array(stamps, np.int64)
+    log = stamp + 5 if logs is None else np.array(logs, np.int64)
+    return TopicColumns(log, log - 2, {STAMP: stamp})
+
+
+def test_a_clock_without_a_fault():
+    found = topic_clock("/t", topic([NS, 2 * NS, 3 * NS]), 1.0)
+    assert (found.messages, found.offset_ns, found.spread_ns) == (3, 5, 0)
+    assert found.publish_offset_ns == 2
+    assert (found.jumps, found.backsteps, found.duplicates, found.zero_stamps) == (0, 0, 0, 0)
+    assert odd(found.as_row()) == ""
+
+
+def test_each_fault_is_counted():
+    logs = [NS * n for n in range(1, 9)]
+    stamps = [NS, 2 * NS, 2 * NS, 2 * NS, 0, 0, 4 * NS, 3 * NS]
+    found = topic_clock("/t", topic(stamps, logs), 100.0)
+    # Of three alike two repeat one; a zero stamp goes back, and so does the last one.
+    assert (found.backsteps, found.duplicates, found.zero_stamps) == (2, 2, 2)
+    assert odd(found.as_row()) == (
+        "2 backsteps, 2 repeated stamps, 2 zero stamps, spread over 4.9 s"
+    )
+
+
+def test_a_clock_that_is_set_jumps_and_one_bad_stamp_is_no_jump():
+    logs = [NS * n for n in range(1, 41)]
+    stamps = [log - (0 if log <= 20 * NS else 30 * NS) for log in logs]
+    assert topic_clock("/t", topic(stamps, logs), 1.0).jumps == 1
+    once = [*logs[:10], logs[10] - 30 * NS, *logs[11:]]
+    assert topic_clock("/t", topic(once, logs), 1.0).jumps == 0
+
+
+def test_what_has_no_header_has_only_its_sending_to_compare():
+    log = np.array([10, 20, 30], np.int64)
+    found = topic_clock("/t", TopicColumns(log, log - 7, {}), 1.0)
+    assert (found.messages, found.publish_offset_ns, found.offset_ns) == (3, 7, None)
+    assert found.as_row()["stamped"] is False
+    none = topic_clock("/t", TopicColumns(log[:0], log[:0], {STAMP: log[:0]}), 1.0)
+    assert (none.messages, none.publish_offset_ns, none.offset_ns) == (0, None, None)
+
+
+def test_a_clock_that_never_ran():
+    found = topic_clock("/t", topic([0, 0, 0], [1, 2, 3]), 1.0)
+    assert (found.zero_stamps, found.duplicates, found.jumps) == (3, 0, 0)
+
+
+@given(st.lists(st.integers(0, 20), min_size=1, max_size=30), st.integers(-(10**18), 10**18))
+def test_counts_are_those_of_python(stamps, offset):
+    logs = [stamp + offset for stamp in stamps]
+    found = topic_clock("/t", topic(stamps, logs), 1.0)
+    assert found.backsteps == sum(b < a for a, b in itertools.pairwise(stamps))
+    told = [stamp for stamp in stamps if stamp]
+    assert found.duplicates == len(told) - len(set(told))
+    assert found.zero_stamps == len(stamps) - len(told)
+
+
+class Odd(Drive):
+    """Odometry that repeats a stamp, steps back once and says zero once."""
+
+    def topics(self) -> dict[str, TopicColumns]:
+        found = super().topics()
+        stamp = found["/odom"].fields[STAMP]
+        stamp[10] = stamp[9]
+        stamp[20] = stamp[19] - 1
+        stamp[30] = 0
+        return found
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_bag(Odd(), tmp_path_factory.mktemp("clocks") / "bag")
+
+
+def test_the_manifest_keeps_them_and_ingest_shows_them(bag, tmp_path, capsys):
+    store = tmp_path / "store"
+    assert main(["ingest", str(bag), "--store", str(store)]) == 0
+    shown = capsys.readouterr().out
+    line = next(line for line in shown.splitlines() if line.strip().startswith("/odom"))
+    # 19 -> 20 and 29 -> 30 go back; and the zero stamp is off the clock, so it is left out.
+    assert "2 backsteps, 1 repeated stamps, 1 zero stamps, 1 left out" in line
+    assert "0.002" in line
+    question = "SELECT unnest(clocks, recursive := true) FROM recordings"
+    assert main(["sql", str(store), question, "--json"]) == 0
+    rows = {row["topic"]: row for row in json.loads(capsys.readouterr().out)}
+    odom = rows["/odom"]
+    assert (odom["messages"], odom["offset_ns"], odom["stamped"]) == (300, 2_000_000, True)
+    assert (odom["backsteps"], odom["duplicates"], odom["zero_stamps"]) == (2, 1, 1)
+    assert (odom["off_clock"], odom["restamped"], odom["log_backsteps"]) == (1, 0, 0)
+    assert rows["/cmd_vel"]["stamped"] is False
+    assert rows["/cmd_vel"]["offset_ns"] is None
+
+
+def test_info_compares_clocks_when_asked(bag, capsys):
+    assert main(["info", str(bag), "--json"]) == 0
+    plain = json.loads(capsys.readouterr().out)["recordings"][0]["topics"]
+    assert "clock" not in plain["/odom"]
+    assert main(["info", str(bag), "--clocks", "--json"]) == 0
+    clock = json.loads(capsys.readouterr().out)["recordings"][0]["topics"]["/odom"]["clock"]
+    assert (clock["zero_stamps"], clock["duplicates"], clock["backsteps"]) == (1, 1, 2)
+    assert main(["info", str(bag), "--clocks"]) == 0
+    assert "1 zero stamps" in capsys.readouterr().out
+
+
+def test_messages_logged_out_of_order_are_counted(tmp_path, capsys):
+    from support.bag_samples import write_mcap
+
+    # Its messages step back in log time once; see bag_samples.
+    assert main(["info", str(write_mcap(tmp_path / "a.mcap")), "--clocks", "--json"]) == 0
+    topics = json.loads(capsys.readouterr().out)["recordings"][0]["topics"]
+    assert topics["/odom"]["clock"]["log_backsteps"] == 1
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
+@pytest.mark.parametrize(
+    ("bag", "offset_s"),
+    [("turtlebot3-sim-humble", 1_701_217_691.8), ("turtlebot3-sim-sparse-cmd", 1_670_256_022.8)],
+)
+def test_simulation_time_of_others_recordings(bag, offset_s, capsys):
+    assert main(["info", str(SHARED / bag), "--clocks", "--json"]) == 0
+    topics = json.loads(capsys.readouterr().out)["recordings"][0]["topics"]
+    for name in ("/odom", "/imu", "/joint_states"):
+        clock = topics[name]["clock"]
+        assert clock["offset_ns"] * 1e-9 == pytest.approx(offset_s, abs=0.1)
+        assert (clock["jumps"], clock["backsteps"], clock["zero_stamps"]) == (0, 0, 0)

@@ -1,0 +1,293 @@
+"""Conditions: what they say of a step, and that `pre` ones never look at what comes after."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from restock.errors import ConfigError
+from restock.ingest.task.conditions import Condition, label, labels_version, primary, shipped
+from restock.ingest.task.label_scores import score
+from restock.ingest.task.schema import SIGNAL_COLUMNS
+
+SHIPPED = list(shipped().values())
+
+
+def steps(count: int, episodes: list[int] | None = None, **signals: object) -> pa.Table:
+    """Steps of a robot that drives at .5 m/s with nothing near, but for these signals."""
+    usual = {
+        "stamp_ns": np.arange(count) * 200_000_000,
+        "pose_stamp_ns": np.arange(count) * 200_000_000,
+        "wheel_speed_mps": np.full(count, 0.5),
+        "localised_speed_mps": np.full(count, 0.5),
+        "clearance_m": np.full(count, 2.0),
+        "clearance_ahead_m": np.full(count, 2.0),
+        "bumped": np.zeros(count, np.bool_),
+        "command_speed_mps": np.full(count, 0.5),
+        "waypoint_near_x_m": np.ones(count),
+        "waypoint_far_x_m": np.full(count, 2.2),
+    } | signals
+    of = np.zeros(count, np.int32) if episodes is None else np.array(episodes, np.int32)
+    columns = {
+        column.name: pa.array(usual.get(column.name, np.zeros(count))).cast(column.type, safe=False)
+        for column in SIGNAL_COLUMNS
+    }
+    step = np.concatenate([np.arange((of == e).sum()) for e in np.unique(of)])
+    return pa.table({"episode_index": of, "step_index": step, **columns})
+
+
+def given_to(table: pa.Table, name: str) -> list[int]:
+    return np.flatnonzero(label(table, [shipped()[name]])[name]).tolist()
+
+
+def changed(value: float, usual: float, count: int, at: slice) -> np.ndarray:
+    column = np.full(count, usual)
+    column[at] = value
+    return column
+
+
+def test_nothing_is_labelled_where_nothing_happens():
+    labels = label(steps(20), SHIPPED)
+    assert set(labels) == {"recovery", "near_collision", "wheel_slip", "blocked_aisle"}
+    assert not any(given.any() for given in labels.values())
+    assert primary(labels, SHIPPED) == ["nominal"] * 20
+
+
+def test_wheels_that_turn_faster_than_the_robot_goes_slip():
+    table = steps(20, wheel_speed_mps=changed(1.2, 0.5, 20, slice(8, 12)))
+    found = given_to(table, "wheel_slip")
+    assert set(range(8, 12)) <= set(found) <= set(range(7, 13))
+
+
+def test_a_spin_that_the_gyroscope_does_not_feel_is_slip():
+    table = steps(20, wheel_yaw_rate_radps=changed(1.0, 0.0, 20, slice(8, 12)))
+    assert {8, 9, 10} <= set(given_to(table, "wheel_slip")) <= set(range(7, 13))
+
+
+def test_a_bump_makes_the_step_before_it_a_near_collision():
+    bumped = np.zeros(20, np.bool_)
+    bumped[9] = True
+    assert given_to(steps(20, bumped=bumped), "near_collision") == [8]
+
+
+def test_an_obstacle_in_the_way_is_a_blocked_aisle_only_when_it_stays():
+    passing = steps(20, clearance_ahead_m=changed(0.5, 2.0, 20, slice(8, 9)))
+    assert given_to(passing, "blocked_aisle") == []
+    standing = steps(30, clearance_ahead_m=changed(0.5, 2.0, 30, slice(8, 25)))
+    found = given_to(standing, "blocked_aisle")
+    assert found
+    assert set(found) <= set(range(8, 30))
+
+
+def test_recovery_lasts_until_there_is_room_again():
+    table = steps(30, clearance_m=np.array([2.0] * 10 + [0.1] * 3 + [0.2] * 4 + [0.5] * 13))
+    found = given_to(table, "recovery")
+    assert set(range(11, 16)) <= set(found)
+    assert found[0] >= 10
+    assert found[-1] <= 17
+    assert found == list(range(found[0], found[-1] + 1))
+
+
+values = st.floats(-2, 4, width=32)
+
+
+@st.composite
+def tables(draw: st.DrawFn) -> pa.Table:
+    count = draw(st.integers(2, 14))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    return steps(
+        count,
+        wheel_speed_mps=rng.uniform(-1, 2, count),
+        localised_speed_mps=rng.uniform(-1, 2, count),
+        wheel_yaw_rate_radps=rng.uniform(-1, 1, count),
+        gyro_yaw_rate_radps=rng.uniform(-1, 1, count),
+        clearance_m=rng.choice([0.05, 0.2, 0.5, 2.0], count),
+        clearance_ahead_m=rng.choice([0.3, 0.9, 1.4, 3.0], count),
+        bumped=rng.random(count) < 0.2,
+        goal_distance_m=rng.uniform(0, 9, count),
+        route_remaining_m=rng.uniform(0, 9, count),
+        pose_x_m=rng.uniform(0, 9, count),
+        pose_y_m=rng.uniform(0, 9, count),
+        command_speed_mps=rng.uniform(-1, 1, count),
+    )
+
+
+@settings(max_examples=30, deadline=None)
+@given(tables(), st.data())
+def test_a_pre_condition_does_not_change_when_the_future_does(table, data):
+    """Steps after t are exchanged for others: the labels of the steps up to t stay."""
+    until = data.draw(st.integers(0, len(table) - 1))
+    other = data.draw(tables())
+    future = other.slice(0, max(len(other) - 1, 1))
+    shift = pa.array(np.arange(len(future), dtype=np.int64) + until + 1)
+    future = future.set_column(
+        future.column_names.index("step_index"), "step_index", shift
+    ).set_column(
+        future.column_names.index("stamp_ns"),
+        "stamp_ns",
+        pa.array((np.arange(len(future)) + until + 1) * 200_000_000),
+    )
+    altered = pa.concat_tables([table.slice(0, until + 1), future], promote_options="default")
+    for condition in SHIPPED:
+        if condition.timing == "pre":
+            before = label(table, [condition])[condition.name][: until + 1]
+            after = label(altered, [condition])[condition.name][: until + 1]
+            assert np.array_equal(before, after), condition.name
+
+
+@settings(max_examples=15, deadline=None)
+@given(tables(), tables())
+def test_episodes_do_not_see_each_other(first, second):
+    index = first.column_names.index("episode_index")
+    other = second.set_column(index, "episode_index", pa.array(np.ones(len(second), np.int32)))
+    both = label(pa.concat_tables([first, other]), SHIPPED)
+    alone = label(first, SHIPPED)
+    for name, given_ in alone.items():
+        assert np.array_equal(both[name][: len(first)], given_), name
+
+
+def test_labels_are_in_the_order_of_the_rows():
+    table = steps(6, bumped=np.array([False, False, True, False, False, False]))
+    shuffled = table.take([5, 1, 0, 3, 2, 4])
+    found = label(shuffled, [shipped()["near_collision"]])["near_collision"]
+    assert np.flatnonzero(found).tolist() == [1]
+
+
+def test_the_post_conditions_look_ahead_and_say_so():
+    assert {c.name: c.timing for c in SHIPPED} == {
+        "blocked_aisle": "pre",
+        "near_collision": "post",
+        "recovery": "pre",
+        "wheel_slip": "post",
+    }
+
+
+def test_every_shipped_condition_is_explained():
+    for condition in SHIPPED:
+        assert len(condition.doc) > 20, condition.name
+        assert "timing:" not in condition.sql
+    folder = files("restock.ingest.task") / "conditions"
+    assert sorted(c.name + ".sql" for c in SHIPPED) == sorted(e.name for e in folder.iterdir())
+
+
+def test_the_lowest_priority_number_names_the_row():
+    low, high = Condition("a", "pre", "true", priority=1), Condition("b", "pre", "true")
+    labels = label(steps(2), [high, low])
+    assert primary(labels, [high, low]) == ["a", "a"]
+
+
+def test_a_condition_that_does_not_run_is_named():
+    good, bad = Condition("good", "pre", "true"), Condition("bad", "pre", "clearance_mm < 1")
+    with pytest.raises(ConfigError) as error:
+        label(steps(3), [good, bad])
+    assert "condition 'bad'" in str(error.value)
+    assert "clearance_m" in str(error.value)
+
+
+REFUSED = {
+    "(SELECT count(*) FROM read_text('/etc/passwd')) > 0": "it holds a query",
+    "EXISTS (FROM duckdb_settings())": "it holds a query",
+    "clearance_m > (SELECT avg(clearance_m) FROM steps)": "it holds a query",
+    "read_text('/etc/passwd') IS NULL": "does not run over the steps",
+    "getenv('HOME') = 'x'": "does not run over the steps",
+    "current_setting('home_directory') = 'x'": "looks outside the steps",
+    "user = 'x'": "looks outside the steps",
+    "current_date > '2026-01-01'": "looks outside the steps",
+    "random() < 0.5": "looks outside the steps",
+    "sleep_ms(100000) IS NULL": "looks outside the steps",
+    "length(repeat('x', 4000000000)) > 1": "may grow without bound",
+    "len(range(3000000000)) > 1": "may grow without bound",
+    "pg_get_viewdef('x') = 'x'": "looks outside the steps",
+    "ATTACH 'x.db'": "does not run over the steps",
+    "COPY steps TO 'x.csv'": "syntax error",
+    "true); ATTACH 'x.db'; SELECT (true": "SELECT",
+    "true; COPY steps TO 'x.csv'": "syntax error",
+    "true) AS x, (SELECT 1": "more than one expression",
+    "true), (false": "more than one expression",
+    "true) FROM steps WHERE (true": "syntax error",
+    "true) UNION ALL SELECT (true": "more than one expression",
+    "true /*": "comment",
+    "COLUMNS(*) > 1": "it holds *",
+    "$1": "it holds a parameter",
+    "max(clearance_m) OVER () > 1": "sees other episodes",
+    "lead(bumped) OVER episode": 'say timing = "post"',
+    "max(bumped) OVER (episode ROWS BETWEEN 1 PRECEDING AND 1 FOLLOWING)": "at CURRENT ROW",
+    "lag(bumped, -1) OVER episode": "lag by a plain number",
+    "max(bumped) OVER (PARTITION BY episode_index)": "write OVER episode",
+    "max(bumped) OVER (PARTITION BY episode_index ORDER BY step_index DESC)": "write OVER episode",
+    "percent_rank() OVER episode > 0.5": 'say timing = "post"',
+}
+
+
+@pytest.mark.parametrize("sql", REFUSED)
+def test_what_a_stranger_might_write_in_a_condition(sql, tmp_path, monkeypatch):
+    """No files, no other tables, no settings, no clock, no chance, no look ahead under `pre`."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match="condition 'x'") as error:
+        label(steps(3), [Condition("x", "pre", sql)])
+    assert REFUSED[sql] in str(error.value)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "sql",
+    [
+        "count(*) OVER episode > 2",
+        "lag(clearance_m, 2) OVER episode > 1 AND list_max([clearance_m, 1.5]) > 1",
+        "avg(clearance_m) FILTER (NOT bumped) OVER (episode ROWS 5 PRECEDING) > 1",
+        "rank() OVER episode = 1 OR clearance_m BETWEEN 1 AND 2 OR nullif(clearance_m, 2) IS NULL",
+        "list_filter([clearance_m], lambda x: x > 1)[1] > 1",
+    ],
+)
+def test_what_a_condition_may_say(sql):
+    assert label(steps(3), [Condition("x", "pre", sql)])["x"].any()
+
+
+def test_a_condition_sees_no_variable_of_the_program():
+    secret = pa.table({"z": [1]})
+    assert len(secret) == 1
+    with pytest.raises(ConfigError, match="it holds a query"):
+        label(steps(3), [Condition("x", "pre", "(SELECT z FROM secret) = 1")])
+
+
+@pytest.mark.parametrize("name", ['a" FROM steps; --', "nominal", "", "a b", "1a"])
+def test_a_condition_has_a_plain_name(name):
+    with pytest.raises(ValueError, match="letters, digits and _"):
+        Condition(name, "pre", "true")
+
+
+def test_a_condition_that_is_no_boolean_is_named():
+    with pytest.raises(ConfigError, match="not a boolean"):
+        label(steps(3), [Condition("number", "pre", "clearance_m")])
+
+
+def test_null_is_false():
+    found = label(steps(3), [Condition("n", "post", "lead(bumped) OVER episode")])["n"]
+    assert found.tolist() == [False, False, False]
+
+
+def test_the_version_names_what_the_conditions_say():
+    one = Condition("a", "pre", "true")
+    assert labels_version([one]) == labels_version([one])
+    assert labels_version([one]) != labels_version([Condition("a", "post", "true")])
+    assert labels_version([one, SHIPPED[0]]) == labels_version([SHIPPED[0], one])
+
+
+def test_scores_by_hand():
+    given_ = {"slip": np.array([True, True, False, False, True, False])}
+    truth = ["slip", "nominal", "slip, blocked", "nominal", None, "slip"]
+    (one,) = score(given_, truth)
+    assert (one.labelled, one.support, one.known) == (2, 3, 5)
+    assert one.precision == pytest.approx(1 / 2)
+    assert one.recall == pytest.approx(1 / 3)
+    assert one.shortfall == (
+        "precision 0.30 short of 0.8, recall 0.47 short of 0.8; true in 60.0% of steps"
+    )
+    assert score(given_, [None] * 6) == []
+    never = score({"slip": np.zeros(2, np.bool_)}, ["nominal", "nominal"])
+    assert never == []

@@ -1,0 +1,351 @@
+"""Custom signals: from any field to a column of the table, and into conditions and queries."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from support.driven_robot import Drive, columns
+from support.paths import ROOT
+from support.ragged import nested, ragged
+
+from restock.cli import main
+from restock.errors import ConfigError, RecordingError, StoreError
+from restock.ingest.decoding.columns import FieldColumn, TopicColumns
+from restock.ingest.profile.custom_signal import refuse_other_signals
+from restock.ingest.profile.profile import parse_profile
+from restock.ingest.steps.steps import Steps, steps_of
+
+TEXT = (ROOT / "ingest" / "profile" / "profiles" / "warehouse_amr.toml").read_text()
+SAMPLE = ROOT / "sample_logs" / "amr_tuesday"
+
+
+def signal(name: str, path: str, *more: str, topic: str = "/x", kind: str = "x/msg/X") -> str:
+    lines = [f"[signals.{name}]", f'topic = "{topic}"', f'type = "{kind}"', f"path = '{path}'"]
+    return "\n".join([*lines, *more, *(['unit = "1"'] if "unit" not in str(more) else [])]) + "\n"
+
+
+def with_signals(*tables: str) -> str:
+    return TEXT + "\n" + "\n".join(tables)
+
+
+def steps_with(
+    table: str, fields: dict[str, FieldColumn], times: list[float] | None = None
+) -> Steps:
+    """A drive of six seconds with messages of /x at these times (default: each second)."""
+    at = np.arange(0.0, 6.0) if times is None else np.array(times)
+    topics = Drive().topics() | {"/x": columns(at, fields)}
+    return steps_of(parse_profile(with_signals(table), where="p"), topics)
+
+
+def column(table: str, fields: dict[str, FieldColumn], times: list[float] | None = None) -> list:
+    return steps_with(table, fields, times).custom.table["s"].to_pylist()
+
+
+def test_a_value_is_held_from_when_it_was_measured_and_no_longer_than_its_age():
+    fields = {"v": np.array([10.0, 20.0])}
+    held = column(signal("s", "v", "max_age_s = 1.0"), fields, [0.5, 3.0])
+    # Ticks are every .2 s from .005 s on.
+    assert held[:3] == [None] * 3
+    assert held[3:8] == [10.0] * 5
+    assert held[8:15] == [None] * 7
+    assert held[15:20] == [20.0] * 5
+    assert held[20:] == [None] * 10
+
+
+def test_without_an_age_it_is_latched():
+    held = column(signal("s", "v"), {"v": np.array([10.0])}, [0.5])
+    assert held == [None] * 3 + [10.0] * 27
+
+
+def test_messages_that_lack_the_element_are_no_samples():
+    """Diagnostics come from many nodes: each message holds the statuses of one."""
+    fields = {
+        "status[].name": ragged([["battery"], ["lidar"], ["battery", "lidar"], [], [], []]),
+        "status[].values[].key": nested([[["v"]], [["v"]], [["v"], ["v"]], [], [], []]),
+        "status[].values[].value": nested([[["24"]], [["1"]], [["23.5"], ["2"]], [], [], []]),
+    }
+    path = "status[name=battery].values[key=v].value"
+    held = column(signal("s", path), fields)
+    assert held[1:10] == [24.0] * 9  # through the lidar's message
+    assert held[11:] == [23.5] * 19
+
+
+def test_an_empty_list_is_a_value_and_a_number_that_is_none_is_null():
+    ranges = ragged([[1.0, np.inf, 3.0, 4.0], [], [np.nan] * 3, [2.0], [2.0], [2.0]])
+    lists = column(signal("s", "ranges[::2]"), {"ranges": ranges})
+    assert [lists[i] for i in (1, 6, 11, 16)] == [[1.0, 3.0], [], [None, None], [2.0]]
+    nearest = column(signal("s", "ranges[]", 'reduce = "min"'), {"ranges": ranges})
+    assert [nearest[i] for i in (1, 6, 11, 16)] == [1.0, None, None, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("how", "want"), [("min", 1.0), ("max", 4.0), ("mean", 2.5), ("sum", 5.0), ("count", 3.0)]
+)
+def test_reductions_are_of_the_finite_elements(how, want):
+    ranges = ragged([[4.0, np.inf, 1.0]])
+    assert column(signal("s", "r[]", f'reduce = "{how}"'), {"r": ranges}, [0.0])[5] == want
+
+
+def test_scale_and_offset():
+    """Fahrenheit, say."""
+    table = signal("s", "v", "scale = 1.8", "offset = 32", 'unit = "°F"')
+    assert column(table, {"v": np.array([100.0])}, [0.0])[5] == 212.0
+
+
+def test_bools_enums_and_texts_as_numbers():
+    assert column(signal("s", "b"), {"b": np.array([True])}, [0.0])[5] == 1.0
+    mode = signal("s", "m", "values = { 3 = 30, 4 = 40 }")
+    assert column(mode, {"m": np.array([4], np.uint8)}, [0.0])[5] == 40.0
+    text = signal("s", "t", "values = { Auto = 1, manual = 2 }")
+    assert column(text, {"t": np.array(["auto"], object)}, [0.0])[5] == 1.0
+    flag = signal("s", "b", "values = { true = -1, false = 1 }")
+    assert column(flag, {"b": np.array([True])}, [0.0])[5] == -1.0
+
+
+def test_texts_that_are_no_number_are_counted_and_shown():
+    said = np.array(["24.5", "n/a", "n/a"], object)
+    steps = steps_with(signal("s", "t"), {"t": said}, [0.0, 1.0, 2.0])
+    assert steps.custom.table["s"].to_pylist()[:12] == [24.5] * 5 + [None] * 7
+    assert steps.notes == ["signals.s: 2 of 3 messages say what is no number to it, such as 'n/a'"]
+    (row,) = steps.custom.rows()
+    assert (row["messages"], row["found"], row["unread"], row["steps"]) == (3, 1, 2, 5)
+
+
+def test_a_quaternion_becomes_its_yaw():
+    half = 0.3 / 2
+    turn = {"x": 0.0, "y": 0.0, "z": np.sin(half), "w": np.cos(half)}
+    fields = {f"pose.orientation.{axis}": np.array([value]) for axis, value in turn.items()}
+    table = signal("s", "pose.orientation", 'reduce = "yaw"', 'unit = "rad"')
+    assert column(table, fields, [0.0])[5] == pytest.approx(0.3)
+
+
+def test_lists_survive_the_table_where_some_are_null(tmp_path):
+    ranges = ragged([[1.0, 2.0], [], [3.0]])
+    table = signal("s", "ranges[]", "max_age_s = 0.5")
+    steps = steps_with(table, {"ranges": ranges}, [0.5, 2.0, 4.0])
+    pq.write_table(steps.custom.table, tmp_path / "t.parquet")
+    read = pq.read_table(tmp_path / "t.parquet")["s"].to_pylist()
+    assert read == steps.custom.table["s"].to_pylist()
+    assert [read[i] for i in (0, 3, 7, 10, 14, 20, 25)] == [
+        None, [1.0, 2.0], None, [], None, [3.0], None,
+    ]  # fmt: skip
+
+
+def test_a_topic_that_is_not_there_gives_nulls_and_is_said():
+    from restock.ingest.steps.sources import stand_ins
+
+    profile = parse_profile(with_signals(signal("s", "v"), signal("l", "v[]")), where="p")
+    topics = Drive().topics()
+    steps = steps_of(profile, topics)
+    assert steps.custom.table["s"].null_count == steps.custom.table["l"].null_count == len(steps)
+    assert stand_ins(profile, topics)["signals.s"] == "null: no message of /x"
+
+
+def test_the_future_is_not_seen():
+    fields = {"v": np.arange(6.0)}
+    whole = column(signal("s", "v"), fields)
+    cut = column(signal("s", "v"), {"v": np.arange(3.0)}, [0.0, 1.0, 2.0])
+    assert whole[:15] == cut[:15]
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        (signal("clearance_m", "v"), "`signals.clearance_m`: Restock has a column of that name"),
+        (signal("logged_ns", "v"), "`signals.logged_ns`: Restock has a column of that name"),
+        (signal("select", "v"), "`signals.select`: SQL has a word of that name"),
+        (signal("Speed", "v"), "`signals.Speed`: a name has small letters"),
+        (signal("s", "a..b"), "`signals.s`: path 'a..b' cannot be read at '.b'"),
+        (signal("s", "a[].b[]"), "`signals.s`: path 'a[].b[]' gives lists of lists"),
+        (signal("s", "a", 'reduce = "min"'), "there is nothing to reduce"),
+        (signal("s", "a[]", 'reduce = "yaw"'), "takes one quaternion"),
+        (signal("s", "a[]", 'reduce = "median"'), "`signals.s.reduce`: Invalid enum value"),
+        (signal("s", "a", "max_age_s = 0"), "max_age_s must be above 0"),
+        (signal("s", "a", "unit = ''"), 'unit is empty: say "1"'),
+        (signal("s", "a", "units = 'm'"), "unknown key `signals.s.units`"),
+        (signal("s", "a", "values = { a = 'b' }"), "`signals.s.values[...]`: Expected `float`"),
+        ('[signals.s]\ntopic = "/x"\n', "missing key `signals.s."),
+        ("[signals]\ns = 3\n", "`signals.s`: Expected `object`"),
+    ],
+)
+def test_what_a_signal_may_not_say(table, said):
+    with pytest.raises(ConfigError) as error:
+        parse_profile(with_signals(table), where="mine.toml")
+    assert said in str(error.value)
+    assert str(error.value).startswith("mine.toml: ")
+
+
+def test_a_value_that_is_no_number_names_the_key():
+    with pytest.raises(RecordingError, match=r"`signals\.s\.path`: 'a' of /x gives an array"):
+        steps_with(signal("s", "a"), {"a": np.zeros((1, 3))}, [0.0])
+
+
+def check(profile: Path, capsys: pytest.CaptureFixture[str]) -> dict:
+    code = main(["profile", "check", str(profile), str(SAMPLE), "--json"])
+    said = json.loads(capsys.readouterr().out)
+    assert code == (2 if said["problems"] else 0)
+    return said
+
+
+def test_check_says_what_the_topic_offers_instead(tmp_path, capsys):
+    profile = tmp_path / "p.toml"
+    joints = {"topic": "/joint_states", "kind": "sensor_msgs/msg/JointState"}
+    profile.write_text(
+        with_signals(
+            signal("a", "velocty[left_wheel_joint]", **joints),
+            signal("b", "header.stmp", **joints),
+            signal("c", "velocity", **joints),
+            signal("d", "data", topic="/bumper", kind="std_msgs/msg/Float64"),
+            signal("e", "data", topic="/bumpr", kind="std_msgs/msg/Bool"),
+        )
+    )
+    said = check(profile, capsys)
+    assert said["outcome"] is None
+    assert said["problems"] == [
+        "/bumper holds std_msgs/msg/Bool, not std_msgs/msg/Float64 (signals.d)",
+        "`signals.a.path`: /joint_states: no field 'velocty': did you mean 'velocity'?",
+        "`signals.b.path`: /joint_states: no field 'header.stmp': did you mean 'header.stamp' or"
+        " 'header.frame_id'?",
+        "`signals.c.path`: /joint_states: velocity repeats: write velocity[0] for one element,"
+        " velocity[] for a list of all",
+    ]
+    (row,) = [row for row in said["inputs"] if row["input"] == "signals.e"]
+    assert (row["messages"], row[""]) == (0, "did you mean /bumper?")
+
+
+OWN = [
+    signal("left_radps", "velocity[left_wheel_joint]", "max_age_s = 1.5", 'unit = "rad/s"',
+           topic="/joint_states", kind="sensor_msgs/msg/JointState"),
+    signal("beams_m", "ranges[::45]", "max_age_s = 0.5", 'unit = "m"', 'doc = "some beams"',
+           topic="/scan", kind="sensor_msgs/msg/LaserScan"),
+    signal("battery_v", "status[name=battery].values[key=voltage].value", 'unit = "V"',
+           topic="/diagnostics", kind="diagnostic_msgs/msg/DiagnosticArray"),
+]  # fmt: skip
+FAST = """
+[[condition]]
+name = "fast_wheel"
+timing = "pre"
+priority = 1
+sql = "left_radps > {} AND len(beams_m) = 2 AND battery_v > 20"
+"""
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The sample bag with custom signals, and a condition on them."""
+    folder = tmp_path_factory.mktemp("custom")
+    (folder / "p.toml").write_text(with_signals(*OWN, FAST.format(5)))
+    command = ["ingest", str(SAMPLE), "--store", str(folder / "store")]
+    assert main([*command, "--profile", str(folder / "p.toml")]) == 0
+    return folder / "store"
+
+
+def ask(store: Path, question: str, capsys: pytest.CaptureFixture[str]) -> list[dict]:
+    capsys.readouterr()
+    assert main(["sql", str(store), question, "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_they_are_columns_of_the_table_with_units(store, capsys):
+    (row,) = ask(
+        store,
+        "SELECT count(*) AS rows, count(left_radps) AS left, count(beams_m) AS beams,"
+        " min(len(beams_m)) AS fewest, min(battery_v) AS battery,"
+        " corr(left_radps, wheel_speed_mps) AS follows FROM transitions",
+        capsys,
+    )
+    assert row["rows"] == row["beams"] == 740
+    assert 600 < row["left"] <= 740  # at 1 Hz: unknown at some ticks after a pause
+    assert row["fewest"] == 2
+    assert 20 < row["battery"] < 30
+    assert row["follows"] > 0.5
+    docs = ask(store, "FROM columns WHERE view = 'transitions'", capsys)
+    said = {doc["column"]: (doc["type"], doc["unit"], doc["meaning"]) for doc in docs}
+    assert said["left_radps"] == ("DOUBLE", "rad/s", "velocity[left_wheel_joint] of /joint_states")
+    assert said["beams_m"] == ("FLOAT[]", "m", "some beams")
+    (file,) = (store / "transitions").glob("*/*.parquet")
+    field = pq.read_schema(file).field("left_radps")
+    assert field.metadata[b"unit"] == b"rad/s"
+    rows = ask(store, "SELECT unnest(signals, recursive := true) FROM recordings", capsys)
+    said = [(row["name"], row["unit"], row["type"], row["messages"]) for row in rows]
+    assert said == [
+        ("left_radps", "rad/s", "number", 156),
+        ("beams_m", "m", "list", 750),
+        ("battery_v", "V", "number", 36),
+    ]
+
+
+def test_conditions_use_them_and_label_runs_changed_ones_anew(store, tmp_path, capsys):
+    """Stored signals are enough: no recording is read, and the audit names the old labels."""
+    by_hand = "SELECT count(*) AS n FROM transitions WHERE left_radps > {} AND battery_v > 20"
+    labelled = "SELECT count(*) AS n FROM transitions WHERE condition = 'fast_wheel'"
+    (before,), (five,) = ask(store, labelled, capsys), ask(store, by_hand.format(5), capsys)
+    assert before == five
+    assert before["n"] > 0
+    changed = tmp_path / "changed.toml"
+    changed.write_text(with_signals(*OWN, FAST.format(7)))
+    assert main(["label", str(store), "--profile", str(changed)]) == 0
+    (after,), (seven,) = ask(store, labelled, capsys), ask(store, by_hand.format(7), capsys)
+    assert after == seven
+    assert 0 < after["n"] < before["n"]
+    (versions,) = ask(store, "SELECT count(DISTINCT labels_version) AS n FROM transitions", capsys)
+    assert versions["n"] == 1
+
+
+def test_a_condition_on_a_signal_that_is_not_stored_asks_for_an_ingest(store, tmp_path, capsys):
+    more = signal("imu_z", "linear_acceleration.z", topic="/imu", kind="sensor_msgs/msg/Imu")
+    own = '[[condition]]\nname = "heavy"\ntiming = "pre"\nsql = "imu_z > 9"\n'
+    profile = tmp_path / "p.toml"
+    profile.write_text(with_signals(*OWN, more, own))
+    assert main(["label", str(store), "--profile", str(profile)]) == 2
+    said = capsys.readouterr().err
+    assert "condition 'heavy'" in said
+    assert "imu_z" in said
+    assert "ingest the recordings again" in said
+
+
+def test_another_meaning_of_a_stores_column_is_refused(store, tmp_path, capsys):
+    other = OWN[0].replace('"rad/s"', '"rpm"')
+    profile = tmp_path / "p.toml"
+    profile.write_text(with_signals(other))
+    command = ["ingest", str(SAMPLE), "--store", str(store), "--profile", str(profile)]
+    assert main(command) == 2
+    said = capsys.readouterr().err
+    assert "its column `left_radps` is a number in rad/s, and `signals.left_radps`" in said
+    assert "rename the signal" in said
+    assert ask(store, "SELECT count(*) AS n FROM transitions", capsys) == [{"n": 740}]
+
+
+def test_refusing_looks_at_type_and_unit_alone():
+    from deltalake import Schema
+
+    field = parse_profile(with_signals(OWN[0]), where="p").signals["left_radps"].field("a")
+    import pyarrow as pa
+
+    schema = pa.schema([field])
+    have = {one.name: one for one in Schema.from_arrow(schema).fields}
+    refuse_other_signals(have, schema, "store")
+    listed = pa.schema([field.with_type(pa.list_(pa.float32()))])
+    with pytest.raises(StoreError, match="is a number in rad/s"):
+        refuse_other_signals(have, listed, "store")
+
+
+def test_whole_messages_are_never_kept(monkeypatch):
+    """What a reader hands over holds the signal's values, not the ranges that they are from."""
+    from restock.ingest.containers.open_recording import open_recording
+    from restock.ingest.steps.needs import reductions, wanted_fields
+
+    profile = parse_profile(with_signals(*OWN), where="p")
+    with open_recording(SAMPLE) as recording:
+        there = [topic for topic in profile.topics if topic in recording.topics]
+        leaves = {topic: recording.fields(topic) for topic in there}
+        wanted = wanted_fields(profile, recording.topics, leaves)
+        read: dict[str, TopicColumns] = recording.read(
+            wanted, reductions(profile, recording.topics)
+        )
+    assert "ranges" not in read["/scan"].fields
+    assert "signal beams_m" in read["/scan"].fields

@@ -1,0 +1,553 @@
+"""MCAP's other message encodings: JSON, protobuf and ROS 1 become columns as CDR does."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from contextlib import ExitStack
+from importlib.resources import files
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from deltalake import DeltaTable
+from google.protobuf import duration_pb2, timestamp_pb2
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
+from google.protobuf.descriptor_pb2 import FileDescriptorSet as Files
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message_factory import GetMessageClass
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from mcap_protobuf.schema import build_file_descriptor_set
+from rosbags.typesys import Stores, get_typestore
+from support.paths import ROOT
+
+from restock.cli import main
+from restock.errors import RecordingError
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.decoding.channel import Channel
+from restock.ingest.decoding.columns import Ragged
+from restock.ingest.decoding.definitions import RosType, message_type
+from restock.ingest.decoding.field_paths import CannotDecode
+from restock.ingest.decoding.json_messages import JsonType
+from restock.ingest.decoding.protobuf_messages import protobuf_type
+from restock.ingest.pipeline import ingest
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.store.writer import StoreWriter
+
+START_NS = 1_700_000_000_000_000_000
+Topic = tuple[str, str, str, str, bytes, Sequence[bytes]]  # topic, encoding, type, format, …
+
+
+def write(path: Path, *topics: Topic) -> Path:
+    """An MCAP file of these topics, a message a millisecond."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for topic, encoding, kind, form, definition, payloads in topics:
+            schema = writer.register_schema(kind, form, definition) if form else 0
+            channel = writer.register_channel(topic, encoding, schema)
+            for row, payload in enumerate(payloads):
+                stamp = START_NS + row * 1_000_000
+                writer.add_message(channel, stamp, payload, stamp)
+        writer.finish()
+    return path
+
+
+# -- JSON ---------------------------------------------------------------------------------------
+
+VECTOR = {"type": "object", "properties": {axis: {"type": "number"} for axis in "xyz"}}
+TIME = {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
+SCHEMA = {
+    "title": "Pose",
+    "type": "object",
+    "properties": {
+        "timestamp": TIME,
+        "frame_id": {"type": "string"},
+        "position": {"$ref": "#/$defs/vector"},
+        "count": {"type": ["integer", "null"]},
+        "valid": {"type": "boolean"},
+        "ranges": {"type": "array", "items": {"type": "number"}},
+        "points": {"type": "array", "items": {"type": "object", "properties": {"p": VECTOR}}},
+        "stamps": {"type": "array", "items": TIME},
+    },
+    "$defs": {"vector": VECTOR},
+}
+LEAVES = [
+    *("timestamp", "frame_id", "position.x", "position.y", "position.z", "count", "valid"),
+    *("ranges", "points[].p.x", "points[].p.y", "points[].p.z", "stamps"),
+]
+
+
+def pose(row: int) -> dict[str, Any]:
+    vector = {"x": row + 0.5, "y": row, "z": -1.0}
+    return {
+        "timestamp": {"sec": 1_700_000_000 + row, "nsec": 5},
+        "frame_id": f"map {row}",
+        "position": vector,
+        "count": row,
+        "valid": row % 2 == 0,
+        "ranges": [1.5, None, 3][:row],
+        "points": [{"p": vector}] * row,
+        "stamps": [{"sec": 1, "nsec": row}] * row,
+    }
+
+
+@pytest.mark.parametrize("schema", [json.dumps(SCHEMA).encode(), b""], ids=["schema", "none"])
+def test_json_with_and_without_a_schema(schema: bytes, tmp_path: Path) -> None:
+    payloads = [json.dumps(pose(row)).encode() for row in range(4)]
+    form = "jsonschema" if schema else ""
+    path = write(tmp_path / "j.mcap", ("/pose", "json", "Pose", form, schema, payloads))
+    with open_recording(path) as recording:
+        assert recording.topics["/pose"].skipped is None
+        assert recording.topics["/pose"].definition == ("embedded" if schema else "inferred")
+        assert recording.leaves("/pose") == LEAVES
+        columns = recording.read({"/pose": LEAVES})["/pose"].fields
+        assert not recording.losses
+    assert columns["timestamp"].tolist() == [  # type: ignore[union-attr]
+        (1_700_000_000 + row) * 10**9 + 5 for row in range(4)
+    ]
+    assert columns["position.y"].dtype == np.float64  # type: ignore[union-attr]
+    assert columns["position.x"].tolist() == [0.5, 1.5, 2.5, 3.5]  # type: ignore[union-attr]
+    assert columns["frame_id"][2] == "map 2"
+    assert columns["valid"].tolist() == [True, False, True, False]  # type: ignore[union-attr]
+    ranges = columns["ranges"]
+    assert isinstance(ranges, Ragged)
+    assert np.array_equal(np.asarray(ranges[3]), [1.5, np.nan, 3.0], equal_nan=True)
+    points, stamps = columns["points[].p.x"], columns["stamps"]
+    assert np.asarray(points[2]).tolist() == [2.5, 2.5]
+    assert np.asarray(stamps[3]).tolist() == [10**9 + 3] * 3
+
+
+def test_json_that_does_not_decode_is_counted_by_reason(tmp_path: Path) -> None:
+    good = json.dumps({"x": 1.5, "stamp": {"sec": 1, "nanosec": 2}}).encode()
+    bad = {
+        b"{": "not JSON",
+        b'{"x": 1.5}': "without 'stamp'",
+        b'{"x": "1.5", "stamp": {"sec": 1, "nanosec": 2}}': "x is no float64",
+        b'{"x": 1.5, "stamp": {"sec": 1.5, "nanosec": 2}}': "a time that is none",
+        b'{"x": 1, "stamp": {"sec": 9999999999999999999, "nanosec": 2}}': "stamp is beyond any",
+        b"[1]": "JSON that is no object",
+        b'{"x":' * 100_000: "JSON that nests too deeply",
+        b"\xff": "not JSON",
+        b"": "not JSON",
+        b"1" * 5000: "not JSON",
+        b'{"x": %s, "stamp": {"sec": 1, "nanosec": 2}}' % (b"9" * 400): "not JSON",
+    }
+    payloads = [good, *bad, b'{"x": NaN, "stamp": {"sec": 1, "nanosec": 3}}']
+    path = write(tmp_path / "j.mcap", ("/t", "json", "", "", b"", payloads))
+    with open_recording(path) as recording:
+        columns = recording.read({"/t": ["x", "stamp"]})["/t"]
+        account = recording.accounts["/t"]
+    assert columns.fields["stamp"].tolist() == [10**9 + 2, 10**9 + 3]  # type: ignore[union-attr]
+    assert account.decoded == 2
+    assert account.expected == account.read == len(payloads)
+    assert sum(account.reasons.values()) == len(bad)
+    for says in bad.values():
+        assert any(reason.startswith(says) for reason in account.reasons), (says, account.reasons)
+
+
+def test_json_keeps_integers_that_float64_cannot_hold(tmp_path: Path) -> None:
+    payloads = [b'{"big": %d, "small": 3}' % (START_NS + row) for row in range(3)]
+    path = write(tmp_path / "j.mcap", ("/t", "json", "", "", b"", payloads))
+    with open_recording(path) as recording:
+        fields = recording.read({"/t": ["big", "small"]})["/t"].fields
+    assert fields["big"].tolist() == [START_NS, START_NS + 1, START_NS + 2]  # type: ignore[union-attr]
+    assert fields["small"].dtype == np.float64  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("schema", "leaves"),
+    [
+        (b'{"type": "object", "properties": {"a": {"$ref": "#"}, "x": {"type": "number"}}}', 1),
+        (b'{"$ref": "#"}', 0),
+        (b"[]", 0),
+        (b'{"properties": 7}', 0),
+    ],
+)
+def test_json_schemas_that_say_little_or_never_end(schema: bytes, leaves: int) -> None:
+    kind = JsonType("T", "embedded", schema, lambda: [])
+    assert len(kind.leaves()) == leaves
+
+
+@pytest.mark.parametrize("schema", [b"{", b"[" * 100_000, b'{"a": \xff}', b" " * (5 << 20)])
+def test_json_schemas_that_are_none(schema: bytes) -> None:
+    with pytest.raises(CannotDecode, match="its definition"):
+        JsonType("T", "embedded", schema, lambda: []).leaves()
+
+
+def test_json_of_very_many_fields_is_refused() -> None:
+    wide = json.dumps({str(number): 1 for number in range(30_000)}).encode()
+    with pytest.raises(CannotDecode, match="more than 20,000 fields"):
+        JsonType("T", "inferred", b"", lambda: [wide]).leaves()
+
+
+def test_json_paths_that_are_none(tmp_path: Path) -> None:
+    payload = b'{"a.b": 1, "x": {"y": 1}, "none": null, "grid": [[1]]}'
+    path = write(tmp_path / "j.mcap", ("/t", "json", "", "", b"", [payload]))
+    with open_recording(path) as recording:
+        assert recording.leaves("/t") == ["x.y"]
+        with pytest.raises(RecordingError, match="no value at 'x'"):
+            recording.read({"/t": ["x"]})
+        with pytest.raises(RecordingError, match="no value at 'grid'"):
+            recording.read({"/t": ["grid"]})
+
+
+# -- protobuf -----------------------------------------------------------------------------------
+
+F = FieldDescriptorProto
+
+
+def scan_files() -> Files:
+    """A Scan message with all kinds of fields, as a recorder would embed it."""
+    file = FileDescriptorProto(name="scan.proto", package="lab", syntax="proto3")
+    file.dependency.extend(["google/protobuf/timestamp.proto", "google/protobuf/duration.proto"])
+    scan = file.message_type.add(name="Scan")
+    point = file.message_type.add(name="Point")
+    entry = scan.nested_type.add(name="TagsEntry")
+    entry.options.map_entry = True
+    file.enum_type.add(name="Mode").value.add(name="OFF", number=0)
+    file.enum_type[0].value.add(name="ON", number=1)
+    rows: list[tuple[Any, str, int, bool, str]] = [
+        (scan, "timestamp", F.TYPE_MESSAGE, False, ".google.protobuf.Timestamp"),
+        (scan, "frame_id", F.TYPE_STRING, False, ""),
+        (scan, "ranges", F.TYPE_DOUBLE, True, ""),
+        (scan, "points", F.TYPE_MESSAGE, True, ".lab.Point"),
+        (scan, "mode", F.TYPE_ENUM, False, ".lab.Mode"),
+        (scan, "data", F.TYPE_BYTES, False, ""),
+        (scan, "tags", F.TYPE_MESSAGE, True, ".lab.Scan.TagsEntry"),
+        (scan, "took", F.TYPE_MESSAGE, False, ".google.protobuf.Duration"),
+        (scan, "inner", F.TYPE_MESSAGE, False, ".lab.Scan"),
+        (scan, "count", F.TYPE_UINT64, False, ""),
+        (point, "x", F.TYPE_FLOAT, False, ""),
+        (point, "names", F.TYPE_STRING, True, ""),
+        (entry, "key", F.TYPE_STRING, False, ""),
+        (entry, "value", F.TYPE_INT32, False, ""),
+    ]
+    for message, name, kind, many, of in rows:
+        message.field.add(
+            name=name,
+            number=len(message.field) + 1,
+            type=kind,
+            label=F.LABEL_REPEATED if many else F.LABEL_OPTIONAL,
+            type_name=of or None,
+        )
+    files = build_file_descriptor_set(timestamp_pb2.Timestamp)
+    files.MergeFrom(build_file_descriptor_set(duration_pb2.Duration))
+    files.file.insert(0, file)  # before what it depends on: the order is not promised
+    return files
+
+
+def scan_class() -> Any:
+    pool = DescriptorPool()
+    files = scan_files().file
+    for file in (*files[1:], files[0]):
+        pool.Add(file)
+    return GetMessageClass(pool.FindMessageTypeByName("lab.Scan"))
+
+
+def scan(row: int) -> bytes:
+    made = scan_class()()
+    made.timestamp.seconds, made.timestamp.nanos = 1_700_000_000, row
+    made.frame_id = "läser"
+    made.ranges.extend([0.5] * row)
+    for name in range(row):
+        made.points.add(x=name + 0.25, names=["a"] * name)
+    made.mode = row % 2
+    made.data = bytes(range(row))
+    made.tags["b"], made.tags["a"] = row, -row
+    made.took.seconds, made.took.nanos = -1, -500_000_000
+    made.inner.count = 2**63 + row
+    return bytes(made.SerializeToString())
+
+
+def protobuf(payloads: Sequence[bytes]) -> Topic:
+    definition = scan_files().SerializeToString()
+    return "/scan", "protobuf", "lab.Scan", "protobuf", definition, payloads
+
+
+def test_protobuf(tmp_path: Path) -> None:
+    path = write(tmp_path / "p.mcap", protobuf([scan(row) for row in range(4)]))
+    with open_recording(path) as recording:
+        leaves = recording.leaves("/scan")
+        assert leaves == [
+            *("timestamp", "frame_id", "ranges", "points[].x", "points[].names", "mode", "data"),
+            *("tags[].key", "tags[].value", "took", "count"),
+        ]
+        wanted = [*leaves, "timestamp.nanos", "inner.count"]
+        columns: dict[str, Any] = dict(recording.read({"/scan": wanted})["/scan"].fields)
+        assert not recording.losses
+    assert columns["timestamp"].tolist() == [START_NS + row for row in range(4)]
+    assert columns["timestamp.nanos"].tolist() == [0, 1, 2, 3]
+    assert columns["took"].tolist() == [-1_500_000_000] * 4
+    assert set(columns["frame_id"]) == {"läser"}
+    assert columns["ranges"][3].tolist() == [0.5] * 3
+    assert columns["points[].x"][2].tolist() == [0.25, 1.25]
+    assert columns["points[].x"].values.dtype == np.float32
+    assert [list(names) for names in (columns["points[].names"][2][n] for n in (0, 1))] == [
+        [],
+        ["a"],
+    ]
+    assert columns["mode"].tolist() == [0, 1, 0, 1]
+    assert columns["data"][3].tolist() == [0, 1, 2]
+    assert list(columns["tags[].key"][1]) == ["a", "b"]
+    assert columns["tags[].value"][1].tolist() == [-1, 1]
+    assert columns["count"].dtype == np.uint64
+    assert columns["inner.count"].tolist() == [2**63 + row for row in range(4)]
+
+
+def test_protobuf_that_does_not_parse_is_counted(tmp_path: Path) -> None:
+    beyond = scan_class()()
+    beyond.timestamp.seconds = 2**62
+    payloads = [scan(1), b"\xff\xff", scan(2)[:-1], bytes(beyond.SerializeToString()), scan(3)]
+    path = write(tmp_path / "p.mcap", protobuf(payloads))
+    with open_recording(path) as recording:
+        columns = recording.read({"/scan": ["timestamp", "mode"]})["/scan"]
+        account = recording.accounts["/scan"]
+    assert len(columns) == 2
+    assert account.reasons == {
+        "not a protobuf message of its type": 2,
+        "timestamp is beyond any date": 1,
+    }
+
+
+def broken(change: Any) -> bytes:
+    files = scan_files()
+    change(files)
+    return bytes(files.SerializeToString())
+
+
+@pytest.mark.parametrize(
+    ("definition", "says"),
+    [
+        (b"\xff\xff", "cannot be parsed"),
+        (b"", "does not define lab.Scan"),
+        (broken(lambda files: files.file.pop(1)), "cannot be parsed"),
+        (broken(lambda files: files.file[1].dependency.append("scan.proto")), "cannot be parsed"),
+        (broken(lambda files: files.file[0].message_type.pop(0)), "does not define lab.Scan"),
+        (broken(lambda files: files.file[0].message_type[0].field.pop()), None),
+        (bytes(5 << 20), "has 5,242,880 bytes"),
+    ],
+)
+def test_protobuf_definitions_that_are_none(definition: bytes, says: str | None) -> None:
+    if says is None:
+        assert protobuf_type("lab.Scan", definition).leaves()
+        return
+    with pytest.raises(CannotDecode, match=says):
+        protobuf_type("lab.Scan", definition)
+
+
+def test_a_protobuf_definition_that_unfolds_without_end_is_refused() -> None:
+    files = Files()
+    file = files.file.add(name="a.proto", package="a", syntax="proto3")
+    for depth in range(22):
+        message = file.message_type.add(name=f"T{depth}")
+        for side in range(2):
+            kind = F.TYPE_MESSAGE if depth < 21 else F.TYPE_BOOL
+            of = f".a.T{depth + 1}" if depth < 21 else None
+            message.field.add(name=f"f{side}", number=side + 1, type=kind, type_name=of, label=1)
+    with pytest.raises(CannotDecode, match="more than 20,000 fields"):
+        protobuf_type("a.T0", files.SerializeToString())
+
+
+# -- ROS 1 in MCAP, and what is not read --------------------------------------------------------
+
+
+def test_ros1_messages_in_mcap(tmp_path: Path) -> None:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    kind = "geometry_msgs/msg/PointStamped"
+    definition, _ = store.generate_msgdef(kind, ros_version=1)
+    make = store.types
+    payloads = []
+    for row in range(3):
+        time = make["builtin_interfaces/msg/Time"](row, 7)
+        header = make["std_msgs/msg/Header"](row, time, "map")
+        point = make["geometry_msgs/msg/Point"](row * 1.5, 0.0, 0.0)
+        payloads.append(bytes(store.serialize_ros1(make[kind](header, point), kind)))
+    name = "geometry_msgs/PointStamped"
+    path = write(
+        tmp_path / "r.mcap", ("/p", "ros1", name, "ros1msg", definition.encode(), payloads)
+    )
+    with open_recording(path) as recording:
+        assert recording.leaves("/p") == [
+            *("header.seq", "header.stamp", "header.frame_id", "point.x", "point.y", "point.z")
+        ]
+        columns = recording.read({"/p": ["header.stamp", "point.x"]})["/p"]
+    assert columns.fields["header.stamp"].tolist() == [7, 10**9 + 7, 2 * 10**9 + 7]  # type: ignore[union-attr]
+    assert columns.fields["point.x"].tolist() == [0.0, 1.5, 3.0]  # type: ignore[union-attr]
+
+
+def test_info_names_every_encoding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write(
+        tmp_path / "all.mcap",
+        protobuf([scan(1)]),
+        ("/j", "json", "", "", b"", [b'{"x": 1}']),
+        ("/c", "cbor", "Some", "", b"", [b"\xa0"]),
+        ("/p", "protobuf", "lab.Other", "protobuf", scan_files().SerializeToString(), [b""]),
+    )
+    assert main(["info", str(path), "--json"]) == 0
+    topics = json.loads(capsys.readouterr().out)["recordings"][0]["topics"]
+    assert {name: topic["skipped"] for name, topic in topics.items()} == {
+        "/scan": None,
+        "/j": None,
+        "/c": "messages encoded as 'cbor' are not read",
+        "/p": "its definition does not define lab.Other",
+    }
+    assert topics["/scan"]["type"] == "lab.Scan"
+    assert topics["/j"]["definition"] == "inferred"
+
+
+# -- the same drive in every encoding -----------------------------------------------------------
+
+SAMPLE = ROOT / "sample_logs" / "amr_monday.mcap"
+SCALARS = {
+    **dict.fromkeys(("int8", "int16", "int32"), F.TYPE_INT32),
+    **dict.fromkeys(("uint8", "byte", "char", "uint16", "uint32"), F.TYPE_UINT32),
+    **{"int64": F.TYPE_INT64, "uint64": F.TYPE_UINT64, "bool": F.TYPE_BOOL},
+    **{"float32": F.TYPE_FLOAT, "float64": F.TYPE_DOUBLE, "string": F.TYPE_STRING},
+}
+
+
+def proto_name(kind: str) -> str:
+    if kind == "builtin_interfaces/msg/Time":
+        return ".google.protobuf.Timestamp"
+    if kind == "builtin_interfaces/msg/Duration":
+        return ".google.protobuf.Duration"
+    return ".ros." + kind.replace("/", "_")
+
+
+def as_descriptor(kind: RosType) -> Files:
+    """A ROS type as protobuf would define it."""
+    found = build_file_descriptor_set(timestamp_pb2.Timestamp)
+    found.MergeFrom(build_file_descriptor_set(duration_pb2.Duration))
+    file = found.file.add(name="ros.proto", package="ros", syntax="proto3")
+    file.dependency.extend(["google/protobuf/timestamp.proto", "google/protobuf/duration.proto"])
+    wanted, done = [kind.name], set(kind.times)
+    while wanted:
+        name = wanted.pop()
+        if name in done:
+            continue
+        done.add(name)
+        message = file.message_type.add(name=name.replace("/", "_"))
+        for number, field in enumerate(kind.fields_of(name), 1):
+            message.field.add(
+                name=field.name,
+                number=number,
+                label=F.LABEL_REPEATED if field.many else F.LABEL_OPTIONAL,
+                type=SCALARS[field.base] if field.base else F.TYPE_MESSAGE,
+                type_name=proto_name(field.message) if field.message else None,
+            )
+            wanted += [field.message] if field.message else []
+    return found
+
+
+def plain(value: Any) -> Any:
+    """A message of rosbags as JSON's kinds of values."""
+    if hasattr(value, "__msgtype__"):
+        # Constants are fields of rosbags' classes, too.
+        names = [name for name in value.__dataclass_fields__ if name.islower()]
+        names.remove("__msgtype__")
+        return {name: plain(getattr(value, name)) for name in names}
+    if isinstance(value, np.ndarray | list):
+        return [plain(item) for item in (value.tolist() if hasattr(value, "tolist") else value)]
+    return value
+
+
+def fill(message: Any, values: dict[str, Any]) -> Any:
+    """The same values in a protobuf message."""
+    for name, value in values.items():
+        if isinstance(value, dict) and value.keys() == {"sec", "nanosec"}:
+            part = getattr(message, name)
+            part.seconds, part.nanos = value["sec"], value["nanosec"]
+            part.SetInParent()
+        elif isinstance(value, dict):
+            fill(getattr(message, name), value)
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            for item in value:
+                fill(getattr(message, name).add(), item)
+        elif isinstance(value, list):
+            getattr(message, name).extend(value)
+        else:
+            setattr(message, name, value)
+    return message
+
+
+def copies(folder: Path, count: int) -> dict[str, Path]:
+    """The first messages of a sample recording as they are, in JSON and in protobuf."""
+    paths = {encoding: folder / f"{encoding}.mcap" for encoding in ("cdr", "json", "protobuf")}
+    with ExitStack() as stack:
+        writers = {
+            name: Writer(stack.enter_context(path.open("wb"))) for name, path in paths.items()
+        }
+        for writer in writers.values():
+            writer.start()
+        channels: dict[tuple[str, int], int] = {}
+        kinds: dict[int, tuple[Any, Any]] = {}
+        reader = make_reader(stack.enter_context(SAMPLE.open("rb")))
+        for schema, channel, message in islice(reader.iter_messages(log_time_order=False), count):
+            assert schema is not None
+            if channel.id not in kinds:
+                form = (channel.topic, schema.name, "cdr", "ros2msg", schema.data)
+                kind = message_type(Channel(1, *form), "humble")
+                store = get_typestore(Stores.EMPTY)
+                store.register({name: kind.raw[name] for name in family(kind)})
+                described = as_descriptor(kind).SerializeToString()
+                name = proto_name(kind.name)[1:]
+                kinds[channel.id] = store, protobuf_type(name, described)
+                forms = {
+                    "cdr": (schema.name, "ros2msg", schema.data),
+                    "json": (schema.name, "jsonschema", b'{"type": "object"}'),
+                    "protobuf": (name, "protobuf", described),
+                }
+                for encoding, writer in writers.items():
+                    channels[encoding, channel.id] = writer.register_channel(
+                        channel.topic, encoding, writer.register_schema(*forms[encoding])
+                    )
+            store, proto = kinds[channel.id]
+            values = plain(store.deserialize_cdr(message.data, schema.name))
+            payloads = {
+                "cdr": message.data,
+                "json": json.dumps(values).encode(),
+                "protobuf": fill(proto.message_class(), values).SerializeToString(),
+            }
+            for encoding, writer in writers.items():
+                number = channels[encoding, channel.id]
+                writer.add_message(number, message.log_time, payloads[encoding], message.log_time)
+        for writer in writers.values():
+            writer.finish()
+    return paths
+
+
+def family(kind: RosType) -> set[str]:
+    wanted, found = [kind.name], set[str]()
+    while wanted:
+        name = wanted.pop()
+        if name not in found:
+            found.add(name)
+            wanted += [field.message for field in kind.fields_of(name) if field.message]
+    return found
+
+
+def test_the_same_drive_in_every_encoding(tmp_path: Path) -> None:
+    profile, ingest_files = load_profile("warehouse_amr"), files("restock.ingest.profile")
+    tables: dict[str, pa.Table] = {}
+    for encoding, path in copies(tmp_path, 4000).items():
+        using = profile
+        if encoding == "protobuf":  # whose types have other names
+            text = (ingest_files / "profiles" / "warehouse_amr.toml").read_text("utf-8")
+            kinds = [source.type for _, source in profile.inputs.items()]
+            for kind in sorted(set(kinds), key=len, reverse=True):
+                text = text.replace(f'"{kind}"', f'"{proto_name(kind)[1:]}"')
+            (tmp_path / "proto.toml").write_text(text)
+            using = load_profile(str(tmp_path / "proto.toml"))
+        store = StoreWriter(tmp_path / encoding)
+        outcome = ingest(path, using, store=store)
+        assert not outcome.losses
+        tables[encoding] = DeltaTable(str(tmp_path / encoding / "transitions")).to_pyarrow_table()
+        assert outcome.manifest["transitions"] > 300
+    for encoding in ("json", "protobuf"):
+        for name in ("observation", "action", "reward", "condition", "stamp_ns"):
+            assert tables[encoding][name].equals(tables["cdr"][name]), (encoding, name)

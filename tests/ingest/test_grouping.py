@@ -1,0 +1,210 @@
+"""How a recording is cut into groups while it is read changes nothing of what comes out."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType, Writer
+from support.bag_samples import write_bag, write_mcap
+from support.driven_robot import Drive
+from support.driven_robot import write_bag as write_drive
+
+from restock.ingest.containers import mcap_file, sqlite_file
+from restock.ingest.containers import topic_reading as reading
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.decoding import growing_columns as growing
+from restock.ingest.decoding.columns import Ragged, TopicColumns, equal, offsets_of
+from restock.ingest.decoding.growing_columns import GrowingColumn
+from restock.ingest.pipeline import ingest
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.steps.episodes import split
+from restock.ingest.steps.steps import steps_of
+from restock.ingest.store import episode_rows
+from restock.ingest.store.transitions import Provenance, recording_table
+
+WHOLE = 1 << 40
+PROFILE = load_profile("warehouse_amr")
+PROVENANCE = Provenance("0123456789abcdef", "feedc0de", "logs/run.mcap", "1.2.3")
+
+
+def cut_by(patch: pytest.MonkeyPatch, size: int, rows: int) -> None:
+    """Groups of `size` bytes, batches of `rows` messages put together."""
+    patch.setattr(mcap_file, "GROUP_BYTES", size)
+    patch.setattr(sqlite_file, "BYTES_PER_BATCH", size)
+    patch.setattr(reading, "SMALL_ROWS", rows)
+    patch.setattr(reading, "TOGETHER_ROWS", rows)
+    patch.setattr(growing, "AHEAD_BYTES", size)
+
+
+def read(path: Path, size: int, rows: int, *, salvage: bool) -> dict[str, Any]:
+    with pytest.MonkeyPatch.context() as patch:
+        cut_by(patch, size, rows)
+        with open_recording(path, salvage=salvage) as recording:
+            columns = recording.read({topic: recording.leaves(topic) for topic in recording.topics})
+            return {
+                "columns": columns,
+                "accounts": recording.accounts,
+                "losses": recording.losses,
+                "integrity": recording.integrity,
+            }
+
+
+def same(left: dict[str, TopicColumns], right: dict[str, TopicColumns]) -> None:
+    assert left.keys() == right.keys()
+    for topic, columns in left.items():
+        other = right[topic]
+        assert np.array_equal(columns.log_time_ns, other.log_time_ns), topic
+        assert np.array_equal(columns.publish_time_ns, other.publish_time_ns), topic
+        assert columns.fields.keys() == other.fields.keys()
+        for path, column in columns.fields.items():
+            assert equal(column, other.fields[path]), (topic, path)
+
+
+def shuffled(source: Path, target: Path, chunk_size: int, seed: int, **options: Any) -> Path:
+    """The same messages out of order, as several recorders' buffers leave them."""
+    with source.open("rb") as file, target.open("wb") as sink:
+        found = list(make_reader(file).iter_messages(log_time_order=False))
+        random.Random(seed).shuffle(found)
+        writer = Writer(sink, chunk_size=chunk_size, **options)
+        writer.start(profile="ros2")
+        channels: dict[int, int] = {}
+        for schema, channel, message in found:
+            if channel.id not in channels:
+                assert schema is not None
+                kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, kind
+                )
+            stamp = message.log_time
+            writer.add_message(channels[channel.id], stamp, message.data, publish_time=stamp + 7)
+        writer.finish()
+    return target
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_mcap(tmp_path_factory.mktemp("mcap") / "run.mcap", count=25)
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    chunk_size=st.integers(500, 30_000),
+    size=st.sampled_from([1, 5_000, 50_000]),
+    rows=st.integers(1, 30),
+    seed=st.integers(0, 99),
+    chunked=st.booleans(),
+    compression=st.sampled_from(list(CompressionType)),
+    index=st.sampled_from([IndexType.ALL, IndexType.NONE]),
+    whole=st.one_of(st.none(), st.floats(0.3, 0.99)),
+)
+def test_any_grouping_of_an_mcap_gives_the_same_columns(
+    tmp_path_factory: pytest.TempPathFactory,
+    sample: Path,
+    chunk_size: int,
+    size: int,
+    rows: int,
+    seed: int,
+    chunked: bool,
+    compression: CompressionType,
+    index: IndexType,
+    whole: float | None,
+) -> None:
+    path = shuffled(
+        sample,
+        tmp_path_factory.mktemp("shuffled") / "run.mcap",
+        chunk_size,
+        seed,
+        use_chunking=chunked,
+        compression=compression,
+        index_types=index,
+    )
+    if whole is not None:
+        path.write_bytes(path.read_bytes()[: int(path.stat().st_size * whole)])
+    expected = read(path, WHOLE, 1, salvage=whole is not None)
+    found = read(path, size, rows, salvage=whole is not None)
+    same(expected.pop("columns"), found.pop("columns"))
+    assert expected == found
+
+
+@pytest.mark.parametrize("size", [1, 3000, 40_000])
+def test_any_batches_of_a_sqlite_bag_give_the_same_columns(size: int, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "run", count=60)
+    expected = read(bag, WHOLE, 1, salvage=False)
+    for salvage in (False, True):
+        found = read(bag, size, 7, salvage=salvage)
+        same(expected["columns"], found["columns"])
+        assert expected["accounts"] == found["accounts"]
+
+
+class Kept:
+    """A store that only keeps what is written."""
+
+    def write(self, manifest: Any, rows: Any) -> int:
+        self.manifest, self.rows = manifest, rows
+        return 1
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_any_grouping_gives_the_same_table(storage: str, tmp_path: Path) -> None:
+    goals = [(0.0, 3.0, 1.0), (3.2, 11.0, 1.0), (9.0, 20.0, 1.0)]
+    drive = Drive(duration_s=15.0, goals=goals, truth="nominal")
+    bag = write_drive(drive, tmp_path / "drive", storage=storage)
+    tables = []
+    for size, rows, group in ((WHOLE, 1, WHOLE), (1, 3, 1), (2000, 50, 20)):
+        store: Any = Kept()
+        with pytest.MonkeyPatch.context() as patch:
+            cut_by(patch, size, rows)
+            patch.setattr(episode_rows, "GROUP_ROWS", group)
+            ingest(bag, PROFILE, store=store, force=True)
+        tables.append(store.rows.drop_columns(["ingest_id"]))
+    assert len(tables[0]) > 50
+    for other in tables[1:]:
+        assert tables[0].equals(other, check_metadata=True)
+
+
+@pytest.mark.parametrize("group", [1, 7, 25])
+def test_rows_do_not_depend_on_which_episodes_come_together(
+    group: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drive = Drive(duration_s=20.0, goals=[(0.0, 3.0, 1.0), (4.2, 6.0, 1.0), (9.0, 20.0, 1.0)])
+    steps = steps_of(PROFILE, drive.topics())
+    episodes = split(PROFILE.task, steps)
+    assert len(episodes.episodes) > 2
+    whole, every = recording_table(PROFILE, steps, episodes, PROVENANCE)
+    monkeypatch.setattr(episode_rows, "GROUP_ROWS", group)
+    table, rows = recording_table(PROFILE, steps, episodes, PROVENANCE)
+    assert table.equals(whole, check_metadata=True)
+    assert np.array_equal(rows.tick, every.tick)
+    assert rows.labels.keys() == every.labels.keys()
+    for name, holds in every.labels.items():
+        assert np.array_equal(rows.labels[name], holds), name
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    parts=st.lists(st.lists(st.lists(st.integers(0, 9), max_size=4), max_size=5), max_size=6),
+    expected=st.integers(0, 40),
+)
+def test_a_column_that_grows_is_its_parts_one_after_the_other(
+    parts: list[list[list[int]]], expected: int
+) -> None:
+    def column(rows: list[list[int]]) -> Ragged:
+        flat = np.array([value for row in rows for value in row], np.int32)
+        return Ragged(flat, offsets_of(np.array([len(row) for row in rows], np.int64)))
+
+    nested = GrowingColumn(column([]))
+    plain = GrowingColumn(np.zeros((0, 2), np.float32))
+    for part in parts:
+        nested.add(column(part), expected)
+        plain.add(np.array([(len(row), sum(row)) for row in part]).reshape(-1, 2), expected)
+    rows = [row for part in parts for row in part]
+    assert equal(nested.column(), column(rows))
+    flat = np.array([(len(row), sum(row)) for row in rows], np.float32).reshape(-1, 2)
+    assert equal(plain.column(), flat)

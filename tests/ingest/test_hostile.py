@@ -1,0 +1,427 @@
+"""Hostile files: a clear refusal or a counted loss; no crash, no hang, no memory without bound."""
+
+from __future__ import annotations
+
+import io
+import json
+import resource
+import sqlite3
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import pytest
+import zstandard
+from mcap.writer import CompressionType, Writer
+from support.bag_samples import write_bag, write_mcap
+
+from restock.cli import main
+from restock.errors import RecordingError, visible
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.decoding.channel import Channel
+from restock.ingest.decoding.definitions import message_type
+from restock.ingest.decoding.field_paths import CannotDecode
+
+# -- sqlite: programs in place of tables ----------------------------------------------------------
+
+
+def bag_with(folder: Path, script: str) -> Path:
+    """A bag's file after an SQL script."""
+    file = next(write_bag(folder / "run", 2).glob("*.db3"))
+    base = sqlite3.connect(file)
+    base.executescript(script)
+    base.close()
+    return file
+
+
+@pytest.mark.parametrize(
+    ("script", "says"),
+    [
+        (
+            "ALTER TABLE messages RENAME TO m; CREATE VIEW messages AS WITH RECURSIVE n(id) AS"
+            " (SELECT 1 UNION ALL SELECT id + 1 FROM n) SELECT id, 1 AS topic_id,"
+            " id AS timestamp, zeroblob(1000000) AS data FROM n",
+            "messages is no plain table",
+        ),
+        (
+            "ALTER TABLE topics RENAME TO t; CREATE VIEW topics AS SELECT * FROM t",
+            "topics is no plain table",
+        ),
+        (
+            "DROP TABLE messages; CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id INTEGER,"
+            " timestamp INTEGER, data BLOB AS (zeroblob(900000000)));"
+            "INSERT INTO messages (topic_id, timestamp) VALUES (1, 1)",
+            "messages has computed columns",
+        ),
+        ("DROP TABLE messages", "no such table"),
+        ("ALTER TABLE messages RENAME COLUMN data TO datum", "no such column"),
+    ],
+)
+def test_sqlite_files_that_are_programs_are_refused(script: str, says: str, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=says):
+        open_recording(bag_with(tmp_path, script))
+
+
+def test_sqlite_values_of_the_wrong_kind_are_counted(tmp_path: Path) -> None:
+    file = bag_with(
+        tmp_path,
+        "UPDATE messages SET timestamp = 'noon' WHERE id = 1;"
+        "UPDATE messages SET timestamp = 1.5 WHERE id = 2;"
+        "UPDATE messages SET data = CAST(x'ff' AS TEXT) WHERE id = 3;"
+        "UPDATE messages SET data = '' WHERE id = 4;"
+        "UPDATE messages SET data = 17 WHERE id = 5;",
+    )
+    with open_recording(file) as recording:
+        recording.read({topic: recording.leaves(topic) for topic in recording.topics})
+        assert sum(account.decoded for account in recording.accounts.values()) == 14 - 5
+        assert sum(account.lost for account in recording.accounts.values()) == 5
+        assert recording.span_ns is not None
+
+
+def test_a_sqlite_tree_that_multiplies_its_pages_is_interrupted(tmp_path: Path) -> None:
+    """Interior pages whose every child is the same page: a few kB that hold 10^14 rows."""
+    file = tmp_path / "loop.db3"
+    base = sqlite3.connect(file)
+    base.executescript(
+        "PRAGMA page_size = 512;"
+        "CREATE TABLE topics (id INTEGER PRIMARY KEY, name, type, serialization_format);"
+        "CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id, timestamp, data);"
+        "INSERT INTO topics VALUES (1, '/t', 'std_msgs/msg/Bool', 'cdr')"
+    )
+    base.executemany(
+        "INSERT INTO messages VALUES (?, 1, 5, x'0001000001')", [(n,) for n in range(5000)]
+    )
+    base.commit()
+    (root,) = base.execute("SELECT rootpage FROM sqlite_master WHERE name = 'messages'").fetchone()
+    base.close()
+    content = bytearray(file.read_bytes())
+
+    def pointers(page: int) -> list[int]:
+        """Where an interior page keeps the numbers of its children."""
+        at = (page - 1) * 512
+        assert content[at] == 5
+        count = int.from_bytes(content[at + 3 : at + 5], "big")
+        cells = [
+            int.from_bytes(content[at + 12 + 2 * n : at + 14 + 2 * n], "big") for n in range(count)
+        ]
+        return [at + 8, *(at + cell for cell in cells)]
+
+    first = int.from_bytes(content[pointers(root)[1] : pointers(root)[1] + 4], "big")
+    page = bytes(content[(first - 1) * 512 : first * 512])
+    pages = len(content) // 512
+    for level in range(7):  # a chain of pages: each child of one is the next
+        content += page
+        for at in pointers(pages + 1 + level):
+            child = first if level == 6 else pages + 2 + level
+            content[at : at + 4] = child.to_bytes(4, "big")
+    for at in pointers(root):
+        content[at : at + 4] = (pages + 1).to_bytes(4, "big")
+    content[28:32] = (len(content) // 512).to_bytes(4, "big")
+    file.write_bytes(content)
+    with pytest.raises(RecordingError, match=r"interrupted|malformed"):
+        open_recording(file)
+
+
+# -- memory and time: in a process that may have little -------------------------------------------
+
+LITTLE_MB = 700  # imports alone take some 300 of address space
+
+
+def limited(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run Python where no more than LITTLE_MB can be allocated, for at most a minute."""
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (LITTLE_MB << 20, LITTLE_MB << 20))
+
+    return subprocess.run(
+        [sys.executable, *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+        preexec_fn=limit,
+        env={"PATH": "/usr/bin:/bin", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+    )
+
+
+def record(opcode: int, content: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(content)) + content
+
+
+def chunk(compression: bytes, stored: bytes, size: int) -> bytes:
+    head = struct.pack("<QQQI", 1, 1, size, 0) + struct.pack("<I", len(compression)) + compression
+    return record(6, head + struct.pack("<Q", len(stored)) + stored)
+
+
+def mcap_of(*records: bytes) -> bytes:
+    magic = b"\x89MCAP0\r\n"
+    end = record(0x0F, bytes(4)) + record(2, bytes(20)) + magic
+    return magic + record(1, bytes(8)) + b"".join(records) + end
+
+
+def one_topic(
+    kind: str, definition: bytes, payload: bytes, form: str = "ros2msg", encoding: str = "cdr"
+) -> bytes:
+    out = io.BytesIO()
+    writer = Writer(out, compression=CompressionType.NONE)
+    writer.start()
+    schema = writer.register_schema(kind, form, definition)
+    channel = writer.register_channel("/t", encoding, schema)
+    writer.add_message(channel, 1, payload, 1)
+    writer.finish()
+    return out.getvalue()
+
+
+def family(*types: str) -> bytes:
+    rule = "\n" + "=" * 80 + "\nMSG: "
+    return rule.join(types).encode()
+
+
+@cache
+def bomb() -> bytes:
+    """Two thousand million zeros."""
+    pack = zstandard.ZstdCompressor().compressobj(size=2000 << 20)
+    zeros = bytes(1 << 20)
+    return b"".join(pack.compress(zeros) for _ in range(2000)) + pack.flush()
+
+
+DEEP = family("pkg/T1 a", *(f"pkg/T{n}\npkg/T{n + 1} a" for n in range(1, 500)), "pkg/T500\nbool a")
+WIDE = (
+    family(
+        "pkg/T1 a\npkg/T1 b", *(f"pkg/T{n}\npkg/T{n + 1} a\npkg/T{n + 1} b" for n in range(1, 23))
+    ).replace(b"T23", b"T1x")
+    + b"\n"
+    + b"=" * 80
+    + b"\nMSG: pkg/T1x\nbool a"
+)
+
+
+def sequence_of_sequences(depth: int) -> bytes:
+    """Each level repeats the next: with counts of four thousand million at every one."""
+    levels = (f"pkg/T{n}\npkg/T{n + 1}[] a" for n in range(1, depth))
+    return family("pkg/T1[] a", *levels, f"pkg/T{depth}\nuint8[] a")
+
+
+HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
+    "a zstd file that is a bomb": (bomb, "refused"),
+    "a chunk that is a zstd bomb": (
+        lambda: mcap_of(chunk(b"zstd", bomb(), 2000 << 20)),
+        "that claim to hold",
+    ),
+    "a chunk that claims little and holds much": (
+        lambda: mcap_of(chunk(b"zstd", bomb(), 100)),
+        "more than it claims",
+    ),
+    "a chunk that claims 2^63": (lambda: mcap_of(chunk(b"lz4", b"x", 1 << 63)), "claim to hold"),
+    "a record of 2^63 bytes": (
+        lambda: mcap_of(struct.pack("<BQ", 6, 1 << 63)),
+        "more than there are",
+    ),
+    "zstd messages that are bombs": (
+        lambda: one_topic("pkg/msg/T", b"uint8[] a", bomb()[: 1 << 16]),
+        "",
+    ),
+    "a zstd message that claims 2^62": (
+        lambda: one_topic("pkg/msg/T", b"uint8[] a", b"\x28\xb5\x2f\xfd\xe0" + b"\x3f" * 99),
+        "",
+    ),
+    "a definition 500 messages deep": (
+        lambda: one_topic("pkg/msg/T", DEEP, bytes(9)),
+        "nests deeper than",
+    ),
+    "a definition that doubles 23 times": (
+        lambda: one_topic("pkg/msg/T", WIDE, bytes(9)),
+        "more than 20,000 fields",
+    ),
+    "an array of 2^31": (
+        lambda: one_topic("pkg/msg/T", b"float64[2147483648] a", bytes(9)),
+        "an array of 2,147,483,648",
+    ),
+    "arrays of arrays": (
+        lambda: one_topic(
+            "pkg/msg/T",
+            family(
+                "pkg/A[1000000] a",
+                "pkg/A\npkg/B[1000000] b",
+                "pkg/B\nfloat64[1000000] c",
+            ),
+            b"\0\1\0\0" + bytes(64),
+        ),
+        "",
+    ),
+    "counts of 2^32 within each other": (
+        lambda: one_topic("pkg/msg/T", sequence_of_sequences(20), b"\0\1\0\0" + b"\xff" * 4000),
+        "",
+    ),
+    "empty elements by the thousand million": (
+        lambda: one_topic(
+            "pkg/msg/T",
+            family("pkg/E[] a", "pkg/E\n# nothing"),
+            b"\0\1\0\0\xff\xff\xff\x7f" + bytes(64),
+        ),
+        "",
+    ),
+    "JSON 100,000 deep": (
+        lambda: one_topic("T", b"{}", b'{"a":' * 100_000, "jsonschema", "json"),
+        "",
+    ),
+    "JSON of brackets": (
+        lambda: one_topic("T", b"{}", b'{"a":[' + b"[]," * 300_000 + b"0]}", "jsonschema", "json"),
+        "",
+    ),
+    "a protobuf definition of noise": (
+        lambda: one_topic("p.T", b"\x0a\xff\xff\xff\x0f" * 99, b"", "protobuf", "protobuf"),
+        "cannot be parsed",
+    ),
+    "metadata without end": (
+        lambda: b"\x89MCAP0\r\n" + record(0x0C, bytes(8)) * 100_000,
+        "its footer is missing",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_little_memory_is_enough_for_hostile_files(name: str, tmp_path: Path) -> None:
+    make, says = HOSTILE[name]
+    path = tmp_path / "run.mcap"
+    path.write_bytes(make())
+    shown = limited("-m", "restock", "info", str(path), "--json")
+    assert "Traceback" not in shown.stderr, shown.stderr
+    assert shown.returncode in (0, 2, 3)
+    assert says in shown.stdout + shown.stderr
+    if shown.returncode == 0:
+        reading = limited("-c", READ, str(path))
+        assert reading.returncode == 0, reading.stderr
+        assert int(reading.stdout) == 1  # counted, whatever it was
+
+
+READ = """
+import sys
+from restock.ingest.containers.open_recording import open_recording
+with open_recording(sys.argv[1]) as recording:
+    recording.read({topic: recording.leaves(topic) for topic in recording.topics})
+    print(sum(a.decoded + sum(a.reasons.values()) for a in recording.accounts.values()))
+"""
+
+
+IDL = "module pkg {{ module msg {{ {} struct T {{ {} double x; }}; }}; }};"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        IDL.format("const uint8 N = " + "(" * 9 + "1" + ")" * 9 + ";", ""),
+        IDL.format("", "sequence<" * 20 + "double" + ">" * 20 + " y;"),
+        IDL.format('const string S = "' + "\\\\" * 99_999, ""),
+        "/*" * 99_999 + "(",
+    ],
+)
+def test_idl_that_would_take_its_parser_hours_is_refused(text: str) -> None:
+    channel = Channel(1, "/t", "pkg/msg/T", "cdr", "ros2idl", text.encode())
+    with pytest.raises(CannotDecode, match=r"nests brackets|cannot be parsed"):
+        message_type(channel, "humble")
+
+
+def test_brackets_in_annotations_and_comments_are_no_hindrance() -> None:
+    text = '@verbatim (language="comment", text="(a (b")  double y;  // sequence<(<<<<'
+    channel = Channel(1, "/t", "pkg/msg/T", "cdr", "ros2idl", IDL.format("", text + "\n").encode())
+    assert [leaf.path for leaf in message_type(channel, "humble").leaves()] == ["y", "x"]
+
+
+# -- metadata.yaml ------------------------------------------------------------------------------
+
+
+LAUGHS = "\n".join(
+    f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" if n else "a0: &a0 [lol]" for n in range(30)
+)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        LAUGHS + "\nrosbag2_bagfile_information: {relative_file_paths: [*a29], version: *a29}",
+        LAUGHS + "\nrosbag2_bagfile_information: {topics_with_message_count: *a29}",
+        "rosbag2_bagfile_information: {topics_with_message_count: [{topic_metadata:"
+        " {name: [1], serialization_format: [cdr]}, message_count: {}}]}",
+        "rosbag2_bagfile_information: {relative_file_paths: 7, topics_with_message_count: 7}",
+        "rosbag2_bagfile_information: {relative_file_paths: ['', '..', '/', 'a\\0b', null]}",
+        "rosbag2_bagfile_information: " + "[" * 300,
+        "rosbag2_bagfile_information: !!python/object:os.system {}",
+        "rosbag2_bagfile_information: !!timestamp 2001-99-99",
+        "? [1]\n: 2",
+        "{" * 100 + "\x1b[2J",
+        "\xff",
+    ],
+)
+def test_metadata_of_any_kind_leaves_the_files_as_they_are(text: str, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "run", 2)
+    (bag / "metadata.yaml").write_text(text, encoding="latin-1")
+    with open_recording(bag) as recording:
+        assert recording.messages == 14
+        assert all("\x1b" not in note for note in recording.notes)
+
+
+# -- the terminal ---------------------------------------------------------------------------
+
+EVIL = "/t\x1b[2J\x07\n/other\u202egpj.\x9b31m"
+
+
+def test_no_control_character_of_a_file_reaches_the_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "evil.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema(EVIL, "ros2msg", f"pkg/{EVIL} a".encode())
+        channel = writer.register_channel(EVIL, "cdr", schema)
+        other = writer.register_channel(EVIL + "2", EVIL, 0)
+        for number in (channel, other):
+            writer.add_message(number, 1, b"", 1)
+        writer.add_attachment(1, 1, EVIL, EVIL, b"")
+        writer.add_metadata(EVIL, {})
+        writer.finish()
+    bag = write_bag(tmp_path / "run", 2)
+    text = (bag / "metadata.yaml").read_text()
+    escaped = json.dumps(EVIL)
+    text = text.replace("name: /bumper", f"name: {escaped}").replace("run.db3", "gone\\e[2J.db3")
+    (bag / "metadata.yaml").write_text(text)
+    with sqlite3.connect(next(bag.glob("*.db3"))) as base:
+        base.execute("UPDATE topics SET type = ? WHERE name = '/odom'", (EVIL,))
+    base.close()
+    odd = write_mcap(tmp_path / "a\x1b[2Jb.mcap", 2)
+    assert main(["info", str(path), str(bag), str(odd), str(tmp_path / "no\x1b[2J")]) == 2
+    assert main(["info", str(odd.rename(tmp_path / "b\x1b[2J.mcap")), "--json"]) == 0
+    printed = capsys.readouterr()
+    for text in (printed.out, printed.err):
+        assert r"\x1b[2J" in text
+        assert all(letter.isprintable() or letter == "\n" for letter in text)
+    assert any(
+        line.startswith(r" /t\x1b[2J\x07\n/other\u202e") for line in printed.out.splitlines()
+    )
+
+
+def test_visible_text_stays_as_it_is() -> None:
+    assert visible("/odom läuft 🤖") == "/odom läuft 🤖"
+    assert visible("a\nb\tc", keep="\n") == "a\nb\\tc"
+
+
+def test_zstd_messages_are_inflated_a_few_at_a_time(tmp_path: Path) -> None:
+    """Ninety messages of 8 MiB in a few kB, in a process that could not hold them all."""
+    packed = zstandard.ZstdCompressor().compress(
+        b"\0\1\0\0" + (8 << 20).to_bytes(4, "little") + bytes(8 << 20)
+    )
+    with (tmp_path / "run.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("pkg/msg/T", "ros2msg", b"uint8[] a")
+        channel = writer.register_channel("/t", "cdr", schema)
+        for row in range(90):
+            writer.add_message(channel, row, packed, row)
+        writer.finish()
+    code = READ.replace("recording.leaves(topic)", "[]")
+    done = limited("-c", code, str(tmp_path / "run.mcap"))
+    assert (done.returncode, done.stdout) == (0, "90\n"), done.stderr

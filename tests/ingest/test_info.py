@@ -1,0 +1,98 @@
+"""`restock info`: right counts for every recording, and one clear message for what is none."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from support.bag_samples import TOPICS, write_bag, write_mcap
+from support.paths import SHARED
+
+from restock.cli import main
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("logs")
+    write_mcap(folder / "one.mcap")
+    write_bag(folder / "bag")
+    return folder
+
+
+def test_json_names_every_recording_and_topic(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["info", str(folder), "--json"]) == 0
+    printed = capsys.readouterr()
+    recordings = json.loads(printed.out)["recordings"]
+    assert [entry["path"] for entry in recordings] == [
+        str(folder / "bag"),
+        str(folder / "one.mcap"),
+    ]
+    assert [entry["format"] for entry in recordings] == ["rosbag2-sqlite3", "mcap"]
+    for entry in recordings:
+        assert entry["messages"] == 140
+        assert entry["start"] == "2023-11-14T22:13:20Z"
+        assert entry["duration_s"] == pytest.approx(0.950000006)
+        assert {name: topic["type"] for name, topic in entry["topics"].items()} == TOPICS
+        for topic in entry["topics"].values():
+            assert topic["messages"] == 20
+            assert topic["rate_hz"] == pytest.approx(20 / 0.95, rel=1e-3)
+            assert topic["skipped"] is None
+
+
+def test_a_table_for_people(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", str(folder / "one.mcap")]) == 0
+    text = capsys.readouterr().out
+    assert "140 messages" in text
+    assert "nav_msgs/msg/Odometry" in text
+
+
+def test_one_bad_recording_does_not_hide_the_others(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty = tmp_path / "empty.mcap"
+    empty.touch()
+    assert main(["info", str(empty), str(folder / "one.mcap"), "--json"]) == 2
+    printed = capsys.readouterr()
+    assert len(json.loads(printed.out)["recordings"]) == 1
+    assert printed.err.startswith(f"restock: {empty}: an empty file")
+    assert "Traceback" not in printed.err
+
+
+def test_a_cut_file_needs_salvage(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cut = tmp_path / "cut.mcap"
+    whole = (folder / "one.mcap").read_bytes()
+    cut.write_bytes(whole[: len(whole) // 2])
+    assert main(["info", str(cut), "--json"]) == 2
+    assert "--salvage" in capsys.readouterr().err
+    assert main(["info", str(cut), "--json", "--salvage"]) == 3
+    entry = json.loads(capsys.readouterr().out)["recordings"][0]
+    assert 20 < entry["messages"] < 140
+    assert "cut short" in entry["damage"][0]
+
+
+def test_no_path_and_no_such_path(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["info"]) == 2
+    assert "no path given" in capsys.readouterr().err
+    assert main(["info", str(tmp_path / "nothing")]) == 2
+    assert "no such file" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
+def test_topics_that_cannot_be_decoded_are_still_counted(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    bag = SHARED / "turtlebot3-sim-humble"
+    refused = SHARED / "rosbag2-tests" / "mcap" / "wrong_rmw_test"
+    assert main(["info", str(bag), str(refused), "--json"]) == 2
+    printed = capsys.readouterr()
+    (entry,) = json.loads(printed.out)["recordings"]
+    assert entry["messages"] == 9432
+    metrics = entry["topics"]["/performance_metrics"]
+    assert metrics["messages"] == 142
+    assert "gazebo_msgs/msg/PerformanceMetrics" in metrics["skipped"]
+    assert "wrong_format" in printed.err

@@ -1,0 +1,186 @@
+"""`restock label`: changed conditions over stored signals, in one commit."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from deltalake import DeltaTable
+from support.driven_robot import Drive, write_bag
+from support.paths import ROOT
+
+from restock.cli import main
+from restock.errors import StoreError
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.relabel import relabel
+from restock.ingest.store.writer import StoreWriter
+from restock.ingest.task.conditions import Condition, label, labels_version
+from restock.replay.store.store import Store
+
+TEXT = (ROOT / "ingest" / "profile" / "profiles" / "warehouse_amr.toml").read_text()
+# Looks ahead: at the last transition of an episode, at a step that is no row of the store.
+SOON = '\n[[condition]]\nname = "soon"\ntiming = "post"\npriority = 1\nsql = "{}"\n'
+HALF_WAY = "lead(pose_x_m) OVER episode > 2.55"
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    """Two recordings, one of which reaches its goal, read by a profile with a condition `soon`."""
+    profile = tmp_path / "amr.toml"
+    profile.write_text(TEXT + SOON.format(HALF_WAY))
+    for name, goal in (("a", 3.0), ("b", 11.0)):
+        write_bag(Drive(goals=[(0.0, goal, 1.0)], truth="soon"), tmp_path / name)
+    path = tmp_path / "store"
+    bags = [str(tmp_path / name) for name in "ab"]
+    assert main(["ingest", *bags, "--store", str(path), "--profile", str(profile)]) == 0
+    return path
+
+
+def rows(path: Path, columns: str = "*") -> list[tuple]:
+    with Store(path) as opened:
+        query = f"SELECT {columns} FROM transitions ORDER BY transition_id"
+        return opened.sql(query).fetchall()
+
+
+def test_the_same_conditions_over_the_store_give_the_same_labels(store, capsys):
+    """Also at the last transition of each episode, which looks at a step that is no row."""
+    before = rows(store, "condition, conditions")
+    assert any(name == "soon" for name, _ in before)
+    found = {}
+    profile = load_profile(store.parent / "amr.toml")
+    # One more condition that never holds: another version, the same labels otherwise.
+    conditions = [*profile.conditions, Condition("never", "pre", "false")]
+    outcomes, version = relabel(StoreWriter(store), lambda name: conditions)
+    found = {outcome.source_file: outcome.changed for outcome in outcomes}
+    assert set(found.values()) == {0}
+    assert version is not None
+    assert rows(store, "condition, conditions") == before
+    assert {v for (v,) in rows(store, "labels_version")} == {labels_version(conditions)}
+
+
+def test_changed_conditions_change_labels_and_nothing_else(store, tmp_path, capsys):
+    others = "* EXCLUDE (condition, conditions, labels_version, ingest_id)"
+    before = rows(store, others)
+    changed = tmp_path / "changed.toml"
+    changed.write_text(TEXT + SOON.format("lead(pose_x_m) OVER episode > 1.95"))
+    files = len(DeltaTable(str(store / "transitions")).file_uris())
+    version = DeltaTable(str(store / "transitions")).version()
+    capsys.readouterr()
+    assert main(["label", str(store), "--profile", str(changed), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["version"] == version + 1  # one commit for both recordings
+    assert [row["changed"] for row in said["recordings"]] == [6, 6]
+    assert len(DeltaTable(str(store / "transitions")).file_uris()) == files
+    assert rows(store, others) == before
+    for row in said["recordings"]:
+        assert row["named"]["soon"] == row["named_before"]["soon"] + 6
+        (soon,) = [score for score in row["label_scores"] if score["condition"] == "soon"]
+        assert soon["labelled"] == row["named"]["soon"]
+    with Store(store) as opened:
+        assert "1.95" in next(c.sql for c in opened.conditions() if c.name == "soon")
+        assert opened.sql("SELECT count(*) FROM recordings").fetchall() == [(2,)]
+    assert main(["label", str(store), "--profile", str(changed), "--json"]) == 0
+    again = json.loads(capsys.readouterr().out)
+    assert again["version"] is None
+    assert [row["changed"] for row in again["recordings"]] == [0, 0]
+
+
+def test_an_ingest_after_a_relabel_finds_it_unchanged(store, tmp_path, capsys):
+    """By the same profile: its rows and labels are what they would be."""
+    shipped = tmp_path / "shipped.toml"
+    shipped.write_text(TEXT)
+    profile = str(tmp_path / "amr.toml")
+    assert main(["label", str(store), "--profile", str(shipped)]) == 0
+    assert main(["label", str(store), "--profile", profile]) == 0
+    capsys.readouterr()
+    command = ["ingest", str(tmp_path / "a"), "--store", str(store), "--profile", profile]
+    assert main([*command, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["recordings"][0]["status"] == "unchanged"
+
+
+def test_a_dry_run_says_what_would_change_and_writes_nothing(store, tmp_path, capsys):
+    shipped = tmp_path / "shipped.toml"
+    shipped.write_text(TEXT)
+    before = sorted(store.rglob("*"))
+    assert main(["label", str(store), "--profile", str(shipped), "--dry-run"]) == 0
+    assert "soon" in capsys.readouterr().out
+    assert sorted(store.rglob("*")) == before
+
+
+def test_a_recording_that_was_ingested_meanwhile_is_left_alone(store, tmp_path):
+    writer = StoreWriter(store)
+
+    def conditions_of(name: str) -> list[Condition]:
+        return [Condition("always", "pre", "true")]
+
+    original = writer.rows
+
+    def rows_and_a_rival(recording_id: str, ingest_id: str):
+        found = original(recording_id, ingest_id)
+        bag, profile = str(tmp_path / "a"), str(tmp_path / "amr.toml")
+        command = ["ingest", bag, "--store", str(store), "--profile", profile, "--force"]
+        assert main(command) == 0
+        return found
+
+    writer.rows = rows_and_a_rival  # type: ignore[method-assign]
+    with pytest.raises(StoreError, match="ingested anew meanwhile"):
+        relabel(writer, conditions_of)
+    assert {name for (name,) in rows(store, "condition")} == {"nominal", "soon"}
+
+
+def test_rows_without_their_episodes_ends_are_refused(store):
+    writer = StoreWriter(store)
+    original = writer.rows
+    writer.rows = lambda *key: original(*key).replace_schema_metadata(None)  # type: ignore[method-assign]
+    with pytest.raises(StoreError, match="without the ends of their episodes"):
+        relabel(writer, lambda name: [Condition("always", "pre", "true")])
+
+
+def test_wrong_usage(store, tmp_path, capsys):
+    assert main(["label", str(tmp_path / "none")]) == 2
+    assert "no store, or an empty one" in capsys.readouterr().err
+    bad = tmp_path / "bad.toml"
+    bad.write_text(TEXT + SOON.format("lead(pose_x_mm) OVER episode > 2"))
+    assert main(["label", str(store), "--profile", str(bad)]) == 2
+    assert "`condition[0].sql` ('soon'): its SQL does not run" in capsys.readouterr().err
+
+
+def test_the_ends_are_kept_with_the_rows(store):
+    from restock.ingest.store.episode_rows import episode_ends
+
+    writer = StoreWriter(store)
+    for row in writer.live().to_pylist():
+        ends = episode_ends(writer.rows(row["recording_id"], row["ingest_id"]))
+        assert ends is not None
+        assert len(ends) == row["episodes"] == 1
+        last = ends["pose_x_m"][0].as_py()
+        assert last == pytest.approx(2.6 if row["transitions"] == 16 else 3.9, abs=0.01)
+        assert not label(ends, [Condition("x", "pre", "bumped")])["x"].any()
+
+
+def stale(store: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """The recordings whose labels or profile the audit calls stale."""
+    capsys.readouterr()
+    main(["audit", str(store), "--json"])
+    audits = json.loads(capsys.readouterr().out)["audits"]
+    (one,) = [audit for audit in audits if audit["audit"] == "stale_labels"]
+    return [Path(row["source_file"]).name for row in one["sample"]]
+
+
+def test_the_audit_names_stale_labels_until_they_are_run_anew(store, tmp_path, capsys):
+    """End to end: a changed condition, one recording ingested by it, the other one labelled."""
+    profile = tmp_path / "amr.toml"
+    assert stale(store, capsys) == []
+    profile.write_text(TEXT + SOON.format("lead(pose_x_m) OVER episode > 1.95"))
+    bag = str(tmp_path / "b")
+    assert main(["ingest", bag, "--store", str(store), "--profile", str(profile)]) == 0
+    assert stale(store, capsys) == ["a"]
+    assert main(["label", str(store), "--profile", str(profile)]) == 0
+    assert stale(store, capsys) == []
+    bags = [str(tmp_path / name) for name in "ab"]
+    command = ["ingest", *bags, "--store", str(store), "--profile", str(profile), "--json"]
+    capsys.readouterr()
+    assert main(command) == 0
+    said = json.loads(capsys.readouterr().out)["recordings"]
+    assert [one["status"] for one in said] == ["unchanged", "unchanged"]

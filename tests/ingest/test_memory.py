@@ -1,0 +1,115 @@
+"""Memory goes with what a profile keeps of a recording, not with the recording's bytes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zstandard
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as BagWriter
+from rosbags.typesys import Stores, get_typestore
+from support.driven_robot import Drive
+from support.driven_robot import write_bag as write_drive
+
+IMAGE_BYTES = 400_000
+FEW, MANY = 10, 250  # images
+ALLOWED_MB = 24  # of growth, where the larger recording holds 96 MB more
+
+# Ingests each recording in turn, and says the peak of this process' memory after each.
+MEASURE = """
+import json, re, sys
+from restock.ingest.pipeline import ingest
+from restock.ingest.profile.profile import load_profile
+profile, peaks = load_profile("warehouse_amr"), []
+for path in sys.argv[1:]:
+    outcome = ingest(path, profile, store=None)
+    with open("/proc/self/status") as file:  # ru_maxrss would count the parent's memory, too
+        peak = int(re.search(r"VmHWM:\\s+(\\d+) kB", file.read())[1]) / 1024
+    peaks.append((outcome.manifest["transitions"], peak))
+print(json.dumps(peaks))
+"""
+
+
+def with_images(drive: Path, target: Path, images: int, storage: str) -> Path:
+    """The drive with images among its messages."""
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    rng = np.random.default_rng(1)
+    plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
+    with (
+        AnyReader([drive]) as reader,
+        BagWriter(target, version=9, storage_plugin=plugin) as writer,
+    ):
+        names = {c.topic: c.msgtype for c in reader.connections}
+        connections = {
+            topic: writer.add_connection(topic, name, typestore=types)
+            for topic, name in names.items()
+        }
+        camera = writer.add_connection("/camera", "sensor_msgs/msg/Image", typestore=types)
+        lines = list(reader.messages())
+        every = max(len(lines) // images, 1)
+        left = images
+        for number, (connection, stamp, data) in enumerate(lines):
+            writer.write(connections[connection.topic], stamp, data)
+            while left and (number % every == 0 or number == len(lines) - 1):
+                writer.write(camera, stamp, rng.bytes(IMAGE_BYTES))
+                left -= 1
+                if number < len(lines) - 1:
+                    break
+    return target
+
+
+def unchunked(bag: Path) -> Path:
+    """The messages of an MCAP bag outside any chunk, without a data section CRC."""
+    target = bag.with_suffix(".mcap")
+    with next(bag.glob("*.mcap")).open("rb") as file, target.open("wb") as sink:
+        writer = Writer(sink, use_chunking=False, compression=CompressionType.NONE)
+        writer.start(profile="ros2")
+        channels: dict[int, int] = {}
+        for schema, channel, message in make_reader(file).iter_messages():
+            assert schema is not None
+            if channel.id not in channels:
+                kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, "cdr", kind)
+            writer.add_message(channels[channel.id], message.log_time, message.data, 0)
+        writer.finish()
+    return target
+
+
+def packed(bag: Path) -> Path:
+    """The bag with its storage file compressed as a whole, as rosbag2's file mode does."""
+    for file in bag.glob("*.mcap"):
+        with file.open("rb") as source, file.with_name(file.name + ".zstd").open("wb") as sink:
+            zstandard.ZstdCompressor(level=1).copy_stream(source, sink)
+        file.unlink()
+    return bag
+
+
+def recording(kind: str, drive: Path, folder: Path, images: int) -> Path:
+    bag = with_images(drive, folder / "run", images, "sqlite3" if kind == "sqlite3" else "mcap")
+    if kind == "not chunked":
+        return unchunked(bag)
+    return packed(bag) if kind == "zstd file" else bag
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="no /proc to read peaks from")
+@pytest.mark.parametrize("kind", ["mcap", "not chunked", "zstd file", "sqlite3"])
+def test_memory_does_not_grow_with_the_bytes_of_a_recording(kind: str, tmp_path: Path) -> None:
+    drive = write_drive(Drive(), tmp_path / "drive")
+    paths = []
+    for name, images in (("small", FEW), ("large", MANY)):
+        (tmp_path / name).mkdir()
+        paths.append(recording(kind, drive, tmp_path / name, images))
+    done = subprocess.run(
+        [sys.executable, "-c", MEASURE, *map(str, paths)], capture_output=True, check=True
+    )
+    (few, before), (many, after) = json.loads(done.stdout)
+    assert few == many > 20
+    assert after - before < ALLOWED_MB

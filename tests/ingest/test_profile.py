@@ -1,0 +1,260 @@
+"""Profiles: what ships, what a stranger's file may get wrong, and where each error points."""
+
+from __future__ import annotations
+
+import json
+from importlib.resources import files
+
+import numpy as np
+import pytest
+
+from restock.cli import main
+from restock.errors import ConfigError
+from restock.ingest.profile.profile import load_profile, parse_profile, shipped_profiles
+
+TEXT = (files("restock.ingest.profile") / "profiles" / "warehouse_amr.toml").read_text("utf-8")
+
+
+def test_the_shipped_profiles_load():
+    assert shipped_profiles() == ["turtlebot3", "warehouse_amr"]
+    for name in shipped_profiles():
+        profile = load_profile(name)
+        assert profile.name == name
+        assert {c.name for c in profile.conditions} >= {"wheel_slip", "blocked_aisle"}
+
+
+def test_the_hash_names_all_that_a_profile_says_but_its_conditions():
+    assert parse_profile(TEXT, where="a").hash == load_profile("warehouse_amr").hash
+    changed = parse_profile(TEXT.replace("max_gap_s = 0.5", "max_gap_s = 0.6"), where="a")
+    assert changed.hash != load_profile("warehouse_amr").hash
+    assert changed.task.hash == load_profile("warehouse_amr").task.hash
+    fewer = parse_profile(TEXT.replace('"recovery", ', ""), where="a")
+    assert fewer.hash == load_profile("warehouse_amr").hash
+    assert fewer.labels_version != load_profile("warehouse_amr").labels_version
+
+
+def test_zones_are_looked_up_in_order():
+    profile = load_profile("warehouse_amr")
+    first = profile.zones[0]
+    x = np.array([(first.box_m[0] + first.box_m[2]) / 2, -5.0])
+    y = np.array([(first.box_m[1] + first.box_m[3]) / 2, -5.0])
+    assert profile.zone_of(x, y) == [first.name, "elsewhere"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("sectors = 36", "sectrs = 36", "unknown key `task.sectrs`"),
+        ("length_m = 0.70", "length = 0.7", "unknown key `task.body.length`"),
+        ("[clock]", "[klock]", "unknown key `klock`"),
+        ('topic = "/scan"', "topic = 3", "`inputs.scan.topic`: Expected `str`, got `int`"),
+        ("sectors = 36", "sectors = 3", "sectors must be even and at least 4, got 3"),
+        ("  [0.0, 0.0],", "  [0.1, 0.0],", "actions must start with the stop action [0, 0]"),
+        ('"recovery"', '"recvery"', "no condition named 'recvery'"),
+        ('"recovery"', '"recovery", "recovery"', "recovery given twice"),
+        (
+            '{ x_m = "pose.pose',
+            '{ x = "pose.pose',
+            "`inputs.pose.fields`: unknown 'x', missing 'x_m'",
+        ),
+        ("[inputs.goal]", "[inputs.gaol]", "unknown key `inputs.gaol`"),
+        ('name = "warehouse_amr"', "", "missing key `name`"),
+        ('goal = "route"', 'goal = "rout"', "`task.goal`: Invalid enum value 'rout'"),
+        ("[task]", "[task", "is not TOML"),
+    ],
+)
+def test_an_error_names_the_file_and_the_key(old, new, said):
+    assert old in TEXT
+    with pytest.raises(ConfigError) as error:
+        parse_profile(TEXT.replace(old, new, 1), where="mine.toml")
+    assert said in str(error.value)
+    assert str(error.value).startswith("mine.toml: ")
+
+
+def test_what_nothing_can_stand_in_for_is_not_optional():
+    text = TEXT.replace("[inputs.wheels]", "[inputs.wheels]\noptional = true")
+    with pytest.raises(ConfigError, match="nothing can stand in for wheels"):
+        parse_profile(text, where="mine.toml")
+
+
+def test_a_route_needs_a_goal_and_a_plan():
+    start, end = TEXT.index("[inputs.plan]"), TEXT.index("[inputs.bumper]")
+    with pytest.raises(ConfigError, match=r"`inputs\.plan` is missing"):
+        parse_profile(TEXT[:start] + TEXT[end:], where="mine.toml")
+
+
+def test_a_condition_of_ones_own():
+    own = '\n[[condition]]\nname = "dark"\ntiming = "pre"\nsql = "clearance_m < 1"\npriority = 5\n'
+    profile = parse_profile(TEXT + own, where="mine.toml")
+    assert profile.conditions[-1].name == "dark"
+    assert profile.labels_version != load_profile("warehouse_amr").labels_version
+
+
+def test_a_name_that_is_nearly_one(tmp_path):
+    with pytest.raises(ConfigError, match="did you mean 'turtlebot3'"):
+        load_profile("turtlebot")
+    with pytest.raises(ConfigError, match="shipped are: turtlebot3, warehouse_amr"):
+        load_profile(tmp_path / "none.toml")
+
+
+def test_a_file_that_is_not_text(tmp_path):
+    file = tmp_path / "p.toml"
+    file.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError, match="cannot be read as UTF-8"):
+        load_profile(file)
+
+
+def test_what_stands_in_is_said():
+    assert load_profile("warehouse_amr").fallbacks == {}
+    assert set(load_profile("turtlebot3").fallbacks) == {
+        "bumper", "behaviour_policy", "true_condition", "perturbation", "goal", "plan",
+    }  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def bag(tmp_path_factory):
+    """A bag of a robot with a navigation stack."""
+    from support.driven_robot import Drive, write_bag
+
+    return write_bag(Drive(), tmp_path_factory.mktemp("bag") / "drive")
+
+
+def test_a_proposed_profile_reads_the_recording_it_was_proposed_from(bag, tmp_path, capsys):
+    file = tmp_path / "mine.toml"
+    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
+    assert capsys.readouterr().out == ""
+    profile = load_profile(file)
+    assert profile.name == "mine"
+    shipped = load_profile("warehouse_amr")
+    for name, source in profile.inputs.items():
+        wanted = getattr(shipped.inputs, name)
+        assert (source.topic, source.type) == (wanted.topic, wanted.type), name
+        assert source.fields == wanted.fields, name
+    assert profile.task.goal == "route"
+    assert profile.task.control_period_s == 0.2
+    assert profile.clock.steps == "command"
+    assert (0.4, 0.0) in profile.task.actions  # what the robot was told
+    assert main(["profile", "check", str(file), str(bag), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["problems"] == []
+    assert said["outcome"]["transitions"] == 29
+    assert {one["input"] for one in said["inputs"]} >= {"command", "pose", "scan", "plan"}
+
+
+def test_a_proposal_says_what_no_topic_fills(tmp_path, capsys):
+    from support.driven_robot import Drive, write_bag
+
+    class Blind(Drive):
+        def topics(self):
+            topics = super().topics()
+            del topics["/odom"], topics["/plan"], topics["/imu"]
+            return topics
+
+    bag = write_bag(Blind(), tmp_path / "bag")
+    assert main(["profile", "new", str(bag)]) == 0
+    out, err = capsys.readouterr()
+    assert "MISSING, and required" in out
+    assert 'goal = "none"' in out
+    assert "# [inputs.imu]  # no topic seen; instead: gyro yaw rate taken from the wheels" in out
+    assert "no topic of nav_msgs/msg/Odometry." in out
+    assert "no topic for wheels" in err
+    assert main(["profile", "new", str(bag), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["missing"] == ["wheels"]
+
+
+def test_checking_a_profile_that_does_not_fit(bag, tmp_path, capsys):
+    file = tmp_path / "p.toml"
+    file.write_text(TEXT.replace('"/scan"', '"/front"').replace('"/odom"', '"/imu"'))
+    assert main(["profile", "check", str(file), str(bag)]) == 2
+    out, err = capsys.readouterr()
+    assert "no topic /front (scan)" in err
+    assert "/imu holds sensor_msgs/msg/Imu, not nav_msgs/msg/Odometry (wheels)" in err
+    assert "/amcl_pose" in out
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["new"], "takes 1 path, got 0"),
+        (["check", "warehouse_amr"], "takes 2 paths, got 1"),
+        (["new", "nowhere.mcap"], "nowhere.mcap"),
+        (["check", "warehouse", "nowhere.mcap"], "did you mean 'warehouse_amr'"),
+    ],
+)
+def test_wrong_usage_of_profile(args, said, capsys):
+    assert main(["profile", *args]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_profile_is_never_overwritten(bag, tmp_path, capsys):
+    file = tmp_path / "mine.toml"
+    file.write_text("mine")
+    assert main(["profile", "new", str(bag), "--out", str(file)]) == 2
+    assert file.read_text() == "mine"
+
+
+OWN = '\n[[condition]]\nfile = "{}"\n'
+TIGHT = "-- There is little room.\n-- timing: pre\n-- priority: 44\nclearance_m < 0.3\n"
+
+
+def test_a_condition_may_lie_in_a_file_beside_the_profile(tmp_path):
+    (tmp_path / "tight.sql").write_text(TIGHT)
+    file = tmp_path / "p.toml"
+    file.write_text(TEXT + OWN.format("tight.sql"))
+    found = load_profile(file).own_conditions[0]
+    assert (found.name, found.timing, found.priority) == ("tight", "pre", 44)
+    assert (found.sql, found.doc) == ("clearance_m < 0.3", "There is little room.")
+    before = load_profile(file)
+    (tmp_path / "tight.sql").write_text(TIGHT.replace("0.3", "0.4"))
+    assert load_profile(file).hash == before.hash
+    assert load_profile(file).labels_version != before.labels_version
+    file.write_text(TEXT + OWN.format("tight.sql") + 'name = "narrow"\npriority = 3\n')
+    found = load_profile(file).own_conditions[0]
+    assert (found.name, found.priority) == ("narrow", 3)
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ('file = "../tight.sql"', "`condition[0].file` leads out of the profile's folder"),
+        ('file = "/etc/passwd.sql"', "`condition[0].file` leads out of the profile's folder"),
+        ('file = "link.sql"', "`condition[0].file` leads out of the profile's folder"),
+        ('file = "none.sql"', "`condition[0].file` cannot be read: none.sql"),
+        ('file = "p.toml"', "`condition[0].file` must name a .sql file"),
+        ('file = "big.sql"', "`condition[0].file` is larger than 100,000 bytes"),
+        ('file = "tight.sql"\nsql = "true"', "`condition[0].file` stands beside `sql`"),
+        ('file = "bare.sql"', "missing key `condition[0].timing`"),
+    ],
+)
+def test_a_file_of_a_condition_stays_beside_the_profile(entry, said, tmp_path):
+    folder = tmp_path / "profiles"
+    folder.mkdir()
+    (tmp_path / "tight.sql").write_text(TIGHT)
+    (folder / "link.sql").symlink_to(tmp_path / "tight.sql")
+    (folder / "tight.sql").write_text(TIGHT)
+    (folder / "bare.sql").write_text("true")
+    (folder / "big.sql").write_text("-- " + "x" * 100_000)
+    file = folder / "p.toml"
+    file.write_text(TEXT + f"\n[[condition]]\n{entry}\n")
+    with pytest.raises(ConfigError) as error:
+        load_profile(file)
+    assert said in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("sql", "said"),
+    [
+        ("clearance_mm < 1", 'Referenced column "clearance_mm" not found'),
+        ("clearance_m", "its SQL gives float, not a boolean"),
+        ("clearance_m <", "its SQL cannot be read: syntax error"),
+        ("lead(bumped) OVER episode", 'timing is "pre", but lead() may look at later steps'),
+        ("(SELECT content FROM read_text('/etc/passwd')) = ''", "it holds a query"),
+        ("getenv('HOME') = ''", "does not exist"),
+    ],
+)
+def test_a_condition_that_does_not_bind_is_refused_with_its_key(sql, said):
+    own = f'\n[[condition]]\nname = "x"\ntiming = "pre"\nsql = """{sql}"""\n'
+    with pytest.raises(ConfigError) as error:
+        parse_profile(TEXT + own, where="mine.toml")
+    assert str(error.value).startswith("mine.toml: `condition[0].sql` ('x'): ")
+    assert said in str(error.value)

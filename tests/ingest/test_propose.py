@@ -1,0 +1,161 @@
+"""Proposed profiles: they load, check clean, and so do all the custom signals they offer."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from support.bag_samples import write_bag as write_sample_bag
+from support.driven_robot import Drive, write_bag
+from support.paths import ROOT, SHARED
+
+from restock.cli import main
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.profile.profile import load_profile, parse_profile
+from restock.ingest.propose.propose import propose
+
+SAMPLES = ROOT / "sample_logs"
+ROBOTS = {  # of others -> transitions of the proposal
+    "turtlebot3-sim-humble": 138,
+    "turtlebot3-sim-sparse-cmd": 9,
+    "ros1/husky_robot_localization.bag": 3951,
+}
+
+
+def with_all_signals(toml: str) -> str:
+    """The proposal with every commented-out custom signal taken in."""
+    lines, inside = [], False
+    for line in toml.splitlines():
+        inside = line.startswith("# [signals.") or (inside and line.startswith("# "))
+        lines.append(line.removeprefix("# ") if inside else line)
+    return "\n".join(lines)
+
+
+def check(profile: Path, recording: Path, capsys: pytest.CaptureFixture[str]) -> dict:
+    assert main(["profile", "check", str(profile), str(recording), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["problems"] == []
+    return said["outcome"]
+
+
+def proposed(recording: Path, folder: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+    file = folder / "proposed.toml"
+    assert main(["profile", "new", str(recording), "--out", str(file)]) == 0
+    assert capsys.readouterr().err == ""
+    return file
+
+
+def test_of_the_sample_bag_and_with_all_its_signals(tmp_path, capsys):
+    recording = SAMPLES / "amr_tuesday"
+    file = proposed(recording, tmp_path, capsys)
+    assert check(file, recording, capsys)["transitions"] == 740
+    text = file.read_text()
+    count = len(re.findall(r"^# \[signals\.", text, re.M))
+    assert count >= 8
+    file.write_text(with_all_signals(text))
+    outcome = check(file, recording, capsys)
+    assert outcome["transitions"] == 740
+    assert len(outcome["signals"]) == count
+    for signal in outcome["signals"]:
+        assert signal["steps"] > 0, signal["name"]
+        assert signal["unread"] == 0, signal["name"]
+    names = {signal["name"]: signal["unit"] for signal in outcome["signals"]}
+    assert names["diagnostics_battery_voltage_v"] == "V"
+    assert names["joint_states_velocity_left_wheel_joint_radps"] == "rad/s"
+    assert not any("ground_truth" in name for name in names)  # no robot knows it
+
+
+def test_it_says_rates_roles_clock_lidar_and_frames(capsys):
+    with open_recording(SAMPLES / "amr_tuesday") as recording:
+        text = propose(recording, "amr").toml
+    assert re.search(r"^# /odom +nav_msgs/msg/Odometry +\d+\.\d Hz  wheels$", text, re.M)
+    assert 'alignment = "header.stamp"  # log time is 0.002 s ahead of it' in text
+    assert "range_min_m = 0.05" in text
+    assert "# [frames]  # instead of inputs.pose, from /tf: map -> odom -> base_link" in text
+    assert parse_profile(text, where="p").frames is None
+    taken = re.sub(r"^# (\[frames\]|fixed|base|max_age_s = 0.5)", r"\1", text, flags=re.M)
+    assert parse_profile(taken, where="p").frames is not None
+
+
+def test_without_a_pose_topic_the_pose_is_from_transforms(tmp_path, capsys):
+    """A recording of the sample's topics but for /amcl_pose."""
+    with open_recording(SAMPLES / "amr_tuesday") as recording:
+        del recording.topics["/amcl_pose"]
+        text = propose(recording, "amr").toml
+    assert "# [inputs.pose]  # from transforms, by [frames]" in text
+    profile = parse_profile(text, where="p")
+    assert profile.inputs.pose is None
+    assert profile.frames is not None
+    assert (profile.frames.fixed, profile.frames.base) == ("map", "base_link")
+    file = tmp_path / "p.toml"
+    file.write_text(text)
+    assert check(file, SAMPLES / "amr_tuesday", capsys)["transitions"] > 600
+
+
+def test_without_commands_what_the_robot_did_stands_for_them(tmp_path, capsys):
+    class Uncommanded(Drive):
+        def topics(self):
+            topics = super().topics()
+            del topics["/cmd_vel"], topics["/scan"]
+            return topics
+
+    bag = write_bag(Uncommanded(), tmp_path / "bag")
+    file = proposed(bag, tmp_path, capsys)
+    assert "# No command was recorded: what the robot did stands" in file.read_text()
+    profile = load_profile(file)
+    assert profile.inputs.command.topic == "/odom"
+    outcome = check(file, bag, capsys)
+    assert outcome["transitions"] > 20
+    stand_ins = {item["input"] for item in outcome["stand_ins"]}
+    assert stand_ins == {"scan", "true_condition", "perturbation"}
+
+
+def test_every_type_of_a_bag_without_a_robot_is_gone_through(tmp_path, capsys):
+    bag = write_sample_bag(tmp_path / "bag")
+    assert main(["profile", "new", str(bag), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["missing"] == []
+    assert said["signals"] == len(re.findall(r"^# \[signals\.", said["toml"], re.M)) > 4
+    parse_profile(with_all_signals(said["toml"]), where="p")
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
+@pytest.mark.parametrize("name", ROBOTS)
+def test_of_others_robots_and_with_all_its_signals(name, tmp_path, capsys):
+    recording = SHARED / name
+    file = proposed(recording, tmp_path, capsys)
+    assert check(file, recording, capsys)["transitions"] == ROBOTS[name]
+    file.write_text(with_all_signals(file.read_text()))
+    outcome = check(file, recording, capsys)
+    assert outcome["transitions"] == ROBOTS[name]
+    assert len(outcome["signals"]) > 4
+    assert all(signal["found"] for signal in outcome["signals"])
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
+@pytest.mark.parametrize(
+    ("name", "missing"),
+    [
+        ("jazzy-mcap-backsteps", ["command", "wheels", "pose"]),
+        ("nav2-file-zstd", ["wheels", "pose"]),
+    ],
+)
+def test_what_others_recordings_lack_is_named(name, missing, tmp_path, capsys):
+    file = tmp_path / "p.toml"
+    assert main(["profile", "new", str(SHARED / name), "--out", str(file)]) == 0
+    said = capsys.readouterr().err
+    assert [word for word in ("command", "wheels", "pose") if f"no topic for {word}" in said] == (
+        missing
+    )
+    assert main(["profile", "check", str(file), str(SHARED / name)]) == 2
+    assert f"missing key `inputs.{missing[0]}`" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
+@pytest.mark.parametrize("kind", ["test_bag_mcap", "test_bag_sqlite3"])
+def test_every_common_type_can_be_gone_through(kind, capsys):
+    assert main(["profile", "new", str(SHARED / "every-common-type" / kind), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    parse_profile(with_all_signals(said["toml"]), where="p")

@@ -1,0 +1,548 @@
+"""Readers: every container gives the same columns, and nothing goes missing unsaid."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zstandard
+from mcap.writer import CompressionType, IndexType, Writer
+from ruamel.yaml import YAML
+from support.bag_samples import START_NS, TOPICS, messages, write_bag, write_mcap
+from support.paths import SHARED
+
+from restock.errors import RecordingError
+from restock.ingest.containers.open_recording import (
+    Recording,
+    TopicColumns,
+    open_recording,
+    recordings_in,
+)
+from restock.ingest.decoding.columns import Ragged, equal
+from restock.ingest.describe import describe
+
+
+def everything(recording: Recording) -> dict[str, TopicColumns]:
+    return recording.read({topic: recording.leaves(topic) for topic in recording.topics})
+
+
+def same(left: dict[str, TopicColumns], right: dict[str, TopicColumns]) -> None:
+    assert left.keys() == right.keys()
+    for topic, columns in left.items():
+        other = right[topic]
+        assert np.array_equal(columns.log_time_ns, other.log_time_ns), topic
+        assert columns.fields.keys() == other.fields.keys()
+        for path, column in columns.fields.items():
+            assert equal(column, other.fields[path]), (topic, path)
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_bag(tmp_path_factory.mktemp("bag") / "run")
+
+
+@pytest.fixture(scope="module")
+def mcap(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_mcap(tmp_path_factory.mktemp("mcap") / "run.mcap")
+
+
+# -- the conformance test: the same recording in every container gives the same columns ------
+
+CONTAINERS = {
+    "mcap, lz4": lambda d: write_mcap(d / "r.mcap", compression=CompressionType.LZ4),
+    "mcap, not compressed": lambda d: write_mcap(d / "r.mcap", compression=CompressionType.NONE),
+    "mcap, not chunked": lambda d: write_mcap(d / "r.mcap", use_chunking=False),
+    "mcap, one chunk": lambda d: write_mcap(d / "r.mcap", chunk_size=1 << 20),
+    "mcap, no message index": lambda d: write_mcap(d / "r.mcap", index_types=IndexType.NONE),
+    "mcap, nothing repeated in the summary": lambda d: write_mcap(
+        d / "r.mcap", repeat_channels=False, repeat_schemas=False, use_statistics=False
+    ),
+    "mcap, no statistics": lambda d: write_mcap(d / "r.mcap", use_statistics=False),
+    "sqlite3 bag": lambda d: write_bag(d / "run"),
+    "mcap bag": lambda d: write_bag(d / "run", storage="mcap"),
+    "sqlite3 file without its folder": lambda d: next(write_bag(d / "run").glob("*.db3")),
+    "sqlite3 bag, zstd file": lambda d: compress_files(write_bag(d / "run")),
+    "mcap bag, zstd file": lambda d: compress_files(write_bag(d / "run", storage="mcap")),
+    "sqlite3 bag, zstd messages": lambda d: compress_messages(write_bag(d / "run")),
+    "mcap bag, zstd messages": lambda d: write_mcap(d / "r.mcap", packed=True),
+    "sqlite3 bag without metadata": lambda d: without_metadata(write_bag(d / "run")),
+    "sqlite3 bag in three files": lambda d: split_sqlite(write_bag(d / "run")),
+    **{
+        f"metadata version {version}": lambda d, version=version: with_metadata(
+            write_bag(d / "run"), version
+        )
+        for version in range(1, 10)
+    },
+}
+
+
+def compress_files(bag: Path) -> Path:
+    for file in [*bag.glob("*.db3"), *bag.glob("*.mcap")]:
+        packed = zstandard.ZstdCompressor().compress(file.read_bytes())
+        file.with_name(file.name + ".zstd").write_bytes(packed)
+        file.unlink()
+    return bag
+
+
+def compress_messages(bag: Path) -> Path:
+    with sqlite3.connect(next(bag.glob("*.db3"))) as base:
+        rows = base.execute("SELECT id, data FROM messages").fetchall()
+        pack = zstandard.ZstdCompressor().compress
+        base.executemany(
+            "UPDATE messages SET data = ? WHERE id = ?", [(pack(data), id) for id, data in rows]
+        )
+    base.close()
+    return bag
+
+
+def without_metadata(bag: Path) -> Path:
+    (bag / "metadata.yaml").unlink()
+    file = next(bag.glob("*.db3"))
+    file.rename(bag / f"{bag.name}_0.db3")
+    return bag
+
+
+def split_sqlite(bag: Path) -> Path:
+    """The bag's messages in three files; the second holds the earliest."""
+    file = next(bag.glob("*.db3"))
+    for part in range(3):
+        copy = shutil.copy(file, bag / f"run_{part}.db3")
+        with sqlite3.connect(copy) as base:
+            base.execute("DELETE FROM messages WHERE (id + 1) % 3 != ?", (part,))
+        base.close()
+    file.unlink()
+    (bag / "metadata.yaml").unlink()
+    return bag
+
+
+def with_metadata(bag: Path, version: int) -> Path:
+    """The bag with a metadata.yaml as rosbag2 wrote it at that version."""
+    file = next(bag.glob("*.db3")).name
+    qos: object = "- history: 1\n  depth: 10\n"
+    about = {
+        "version": version,
+        "storage_identifier": "sqlite3",
+        # The first versions wrote the path from where the recorder was started.
+        "relative_file_paths": [f"run/{file}" if version < 3 else file],
+        "duration": {"nanoseconds": 950_000_006},
+        "starting_time": {"nanoseconds_since_epoch": START_NS + 3_000_000},
+        "message_count": 140,
+        "topics_with_message_count": [
+            {
+                "topic_metadata": {
+                    "name": topic,
+                    "type": kind,
+                    "serialization_format": "cdr",
+                    **({"offered_qos_profiles": qos if version < 9 else []} if version > 3 else {}),
+                    **({"type_description_hash": "RIHS01_0"} if version > 6 else {}),
+                },
+                "message_count": 20,
+            }
+            for topic, kind in TOPICS.items()
+        ],
+        **({"compression_format": "", "compression_mode": ""} if version > 2 else {}),
+        **({"files": [{"path": file, "message_count": 140}]} if version > 4 else {}),
+        **({"custom_data": None} if version > 5 else {}),
+        **({"ros_distro": "rosbags"} if version > 7 else {}),
+    }
+    with (bag / "metadata.yaml").open("w") as out:
+        YAML(typ="safe").dump({"rosbag2_bagfile_information": about}, out)
+    return bag
+
+
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_every_container_gives_the_same_columns(container: str, mcap: Path, tmp_path: Path) -> None:
+    with (
+        open_recording(mcap) as reference,
+        open_recording(CONTAINERS[container](tmp_path)) as other,
+    ):
+        expected, found = everything(reference), everything(other)
+        assert not other.losses
+        assert not [note for note in other.notes if "no metadata" not in note]
+        assert {name: topic.type for name, topic in other.topics.items()} == TOPICS
+        same(expected, found)
+        for topic, account in other.accounts.items():
+            assert account.expected == account.read == account.decoded == 20, topic
+
+
+def test_columns_hold_what_was_written(bag: Path) -> None:
+    with open_recording(bag) as recording:
+        columns = recording.read(
+            {
+                "/odom": ["header.stamp", "twist.twist.linear.x", "pose.covariance"],
+                "/scan": ["ranges", "header.frame_id"],
+                "/joint_states": ["name[]", "velocity"],
+                "/plan": ["poses[].pose.position.x", "poses[].header.frame_id"],
+                "/bumper": ["data"],
+                "/diagnostics": ["status[].level", "status[].values[].value"],
+            }
+        )
+    written: dict[str, list[tuple[int, object]]] = {topic: [] for topic in TOPICS}
+    for topic, log, message in messages():
+        written[topic].append((log, message))
+    for rows in written.values():
+        rows.sort(key=lambda row: row[0])
+
+    odom = columns["/odom"]
+    assert odom.log_time_ns.tolist() == [log for log, _ in written["/odom"]]
+    assert (np.diff(odom.log_time_ns) >= 0).all()
+    assert odom.fields["header.stamp"].dtype == np.int64
+    assert set(odom.fields["header.stamp"]) == {START_NS + n * 50_000_000 for n in range(20)}
+    speed = [message.twist.twist.linear.x for _, message in written["/odom"]]
+    assert odom.fields["twist.twist.linear.x"].tolist() == speed
+    assert odom.fields["pose.covariance"].shape == (20, 36)
+
+    ranges = columns["/scan"].fields["ranges"]
+    assert isinstance(ranges, Ragged)
+    for row, (_, message) in enumerate(written["/scan"]):
+        assert np.array_equal(ranges[row], message.ranges)
+    assert set(columns["/scan"].fields["header.frame_id"]) == {"lidar"}
+    assert columns["/joint_states"].fields["name[]"][3].tolist() == ["left", "right wheel"]
+    x = columns["/plan"].fields["poses[].pose.position.x"]
+    assert x.lengths.tolist() == [len(message.poses) for _, message in written["/plan"]]
+    assert columns["/bumper"].fields["data"].dtype == np.bool_
+    levels = columns["/diagnostics"].fields["status[].values[].value"]
+    for row, (_, message) in enumerate(written["/diagnostics"]):
+        assert [list(item) for item in (levels[row][n] for n in range(len(levels[row])))] == [
+            [pair.value for pair in status.values] for status in message.status
+        ]
+
+
+def test_the_id_is_of_the_content(bag: Path, mcap: Path, tmp_path: Path) -> None:
+    moved = shutil.copytree(bag, tmp_path / "elsewhere")
+    with open_recording(bag) as here, open_recording(moved) as there, open_recording(mcap) as other:
+        assert here.recording_id == there.recording_id
+        assert len(here.recording_id) == 16
+        assert other.recording_id != here.recording_id
+
+
+def test_split_files_are_one_recording(tmp_path: Path) -> None:
+    bag = tmp_path / "split"
+    bag.mkdir()
+    for part in range(3):
+        shutil.copy(write_mcap(tmp_path / "part.mcap", 5), bag / f"split_{part}.mcap")
+    assert recordings_in(tmp_path / "split") == [bag]
+    with open_recording(bag) as recording:
+        assert recording.topics["/odom"].expected == 15
+        assert len(recording.read({"/odom": ["header.stamp"]})["/odom"]) == 15
+
+
+def test_finding_recordings(tmp_path: Path) -> None:
+    (tmp_path / "many" / "a").mkdir(parents=True)
+    (tmp_path / "empty").mkdir()
+    write_bag(tmp_path / "many" / "a" / "run", 2)
+    write_mcap(tmp_path / "many" / "one.mcap", 2)
+    write_mcap(tmp_path / "many" / "two.mcap", 2)
+    (tmp_path / "many" / "notes.txt").write_text("not a recording")
+    names = [path.name for path in recordings_in(tmp_path / "many")]
+    assert names == ["run", "one.mcap", "two.mcap"]
+    assert len(recordings_in(tmp_path / "many" / "*.mcap")) == 2
+    with pytest.raises(RecordingError, match="no such file"):
+        recordings_in(tmp_path / "nothing")
+    with pytest.raises(RecordingError, match="no recording in this folder"):
+        recordings_in(tmp_path / "empty")
+
+
+# -- bad input ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"", "an empty file"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0", "Git LFS pointer"),
+        (b"<html>not found</html>", "not a recording"),
+        (b"SQLite format 3\x00", "cut short"),
+        (b"\x89MCAP0\r\n", "cut short"),
+        (b"#ROSBAG V2.0\n", "cannot be read"),
+        (b"\x28\xb5\x2f\xfd\x00", "cut short"),
+    ],
+)
+def test_what_is_no_recording_is_named(content: bytes, says: str, tmp_path: Path) -> None:
+    file = tmp_path / "run.mcap"
+    file.write_bytes(content)
+    with pytest.raises(RecordingError, match=says) as caught:
+        open_recording(file)
+    assert caught.value.where is not None
+
+
+def test_a_sqlite_file_that_is_no_bag(tmp_path: Path) -> None:
+    with sqlite3.connect(tmp_path / "other.db3") as base:
+        base.execute("CREATE TABLE something (x)")
+    base.close()
+    with pytest.raises(RecordingError, match="not a rosbag2 recording"):
+        open_recording(tmp_path / "other.db3")
+
+
+def test_a_missing_file_topic_field_and_type_store(mcap: Path, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="no such file"):
+        open_recording(tmp_path / "none.mcap")
+    with pytest.raises(RecordingError, match="no type store named 'hamble'"):
+        open_recording(mcap, typestore="hamble")
+    with open_recording(mcap) as recording:
+        with pytest.raises(RecordingError, match="no topic named '/odm'"):
+            recording.read({"/odm": ["x"]})
+        with pytest.raises(RecordingError, match=r"no value at 'twist\.twist\.linear\.w'"):
+            recording.read({"/odom": ["twist.twist.linear.w"]})
+        with pytest.raises(RecordingError, match="it is a message"):
+            recording.read({"/odom": ["pose.pose"]})
+        with pytest.raises(RecordingError, match=r"write poses\[\]"):
+            recording.read({"/plan": ["poses.pose.position.x"]})
+
+
+def test_a_cut_mcap_is_refused_and_salvaged(mcap: Path, tmp_path: Path) -> None:
+    whole = mcap.read_bytes()
+    for share in (0.3, 0.6, 0.9):
+        cut = tmp_path / "cut.mcap"
+        cut.write_bytes(whole[: int(len(whole) * share)])
+        with pytest.raises(RecordingError, match="cut short"):
+            open_recording(cut)
+        with open_recording(cut, salvage=True) as recording, open_recording(mcap) as full:
+            found = everything(recording)
+            expected = everything(full)
+            assert recording.integrity == "damaged"
+            assert "cut short" in recording.losses[0].reason
+            got = sum(len(columns) for columns in found.values())
+            assert got > 0.6 * share * 140
+            # What came is what is in the whole file, from the start of each topic.
+            for topic, columns in found.items():
+                times = set(expected[topic].log_time_ns.tolist())
+                assert set(columns.log_time_ns.tolist()) <= times
+
+
+def test_a_cut_sqlite_bag_is_refused_and_salvaged(tmp_path: Path) -> None:
+    file = next(write_bag(tmp_path / "run", 300).glob("*.db3"))
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) * 6 // 10])
+    with pytest.raises(RecordingError, match="cut short"):
+        open_recording(file)
+    with open_recording(file, salvage=True) as recording:
+        found = everything(recording)
+        assert 0.3 * 2100 < sum(len(columns) for columns in found.values()) < 2100
+        assert recording.losses
+
+
+def test_a_bad_chunk_loses_only_itself(mcap: Path, tmp_path: Path) -> None:
+    from restock.ingest.containers.mcap_file import McapFile
+
+    chunks = McapFile(mcap)._contents.chunks
+    assert len(chunks) > 3
+    damaged = bytearray(mcap.read_bytes())
+    damaged[(chunks[1].start + chunks[1].stop) // 2] ^= 0xFF
+    (tmp_path / "bad.mcap").write_bytes(damaged)
+    with open_recording(tmp_path / "bad.mcap") as recording:
+        found = everything(recording)
+        lost = sum(chunks[1].counts().values())
+        assert sum(len(columns) for columns in found.values()) == 140 - lost
+        assert recording.losses[0].messages == lost
+        assert recording.integrity == "damaged"
+        assert sum(account.lost for account in recording.accounts.values()) == lost
+
+
+def test_integrity_is_what_checksums_vouch_for(mcap: Path, bag: Path, tmp_path: Path) -> None:
+    unchecked = write_mcap(tmp_path / "no_crc.mcap", enable_crcs=False)
+    for path, integrity in ((mcap, "verified"), (unchecked, "unverified"), (bag, "unverified")):
+        with open_recording(path) as recording:
+            everything(recording)
+            assert recording.integrity == integrity
+
+
+def test_rows_in_a_wal_file_are_seen(tmp_path: Path) -> None:
+    file = next(write_bag(tmp_path / "run").glob("*.db3"))
+    base = sqlite3.connect(file)
+    base.execute("PRAGMA journal_mode = WAL")
+    base.execute("PRAGMA wal_autocheckpoint = 0")
+    base.execute(
+        "INSERT INTO messages (topic_id, timestamp, data)"
+        " SELECT topic_id, timestamp + 1, data FROM messages"
+    )
+    base.commit()
+    kept = {
+        item.name: item.read_bytes() for item in file.parent.iterdir() if "shm" not in item.name
+    }
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    for name, content in kept.items():
+        (copy / name).write_bytes(content)
+    base.close()
+    with open_recording(copy) as recording:
+        assert recording.messages == 280
+        assert sum(len(columns) for columns in everything(recording).values()) == 280
+        assert any("-wal" in note for note in recording.notes)
+    assert {item.name: item.read_bytes() for item in copy.iterdir()} == kept
+
+
+def test_metadata_is_not_believed(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "run")
+    metadata = bag / "metadata.yaml"
+    text = metadata.read_text()
+    outside = write_bag(tmp_path / "secret") / "secret.db3"
+    metadata.write_text(text.replace("run.db3", str(outside)))
+    with open_recording(bag) as recording:
+        assert [file.parent for file in recording.files] == [bag]
+        assert any("secret.db3, which is not there" in loss.reason for loss in recording.losses)
+    metadata.write_text(text.replace("message_count: 20", "message_count: 21"))
+    with open_recording(bag) as recording:
+        assert any("counts 21 messages on /odom" in note for note in recording.notes)
+        assert recording.topics["/odom"].expected == 20
+    metadata.write_text("a: [unclosed")
+    with open_recording(bag) as recording:
+        assert recording.messages == 140
+
+
+def test_statistics_that_count_more_than_there_is(tmp_path: Path) -> None:
+    from restock.ingest.containers.mcap_records import Op, walk
+
+    file = write_mcap(tmp_path / "run.mcap")
+    content = bytearray(file.read_bytes())
+    for opcode, start, stop in walk(content, 8, len(content)):
+        if opcode == Op.STATISTICS:  # the last channel's count is the last field
+            content[stop - 8 : stop] = (25).to_bytes(8, "little")
+            total = int.from_bytes(content[start : start + 8], "little")
+            content[start : start + 8] = (total + 5).to_bytes(8, "little")
+        if opcode == Op.FOOTER:
+            break
+    file.write_bytes(content)
+    with open_recording(file) as recording:
+        everything(recording)
+        lost = [account for account in recording.accounts.values() if account.lost]
+        assert [account.lost for account in lost] == [5]
+        assert recording.losses[0].reason == "counted by the container, but not in it"
+
+
+def test_an_unknown_type_skips_its_topic_by_name(tmp_path: Path) -> None:
+    file = next(write_bag(tmp_path / "run").glob("*.db3"))
+    with sqlite3.connect(file) as base:
+        base.execute("UPDATE topics SET type = 'gazebo_msgs/msg/Performance' WHERE name = '/odom'")
+    base.close()
+    with open_recording(file) as recording:
+        assert "gazebo_msgs/msg/Performance" in str(recording.topics["/odom"].skipped)
+        found = recording.read({"/odom": ["x"], "/bumper": ["data"]})
+        assert list(found) == ["/bumper"]
+        assert recording.accounts["/odom"].expected == recording.accounts["/odom"].lost == 20
+        assert [loss.topic for loss in recording.losses] == ["/odom"]
+
+
+def test_absurd_log_times_are_counted_by_name(tmp_path: Path) -> None:
+    for name, stamps in (
+        ("run.mcap", {3: 2**64 - 1, 5: 2**63, 7: 2**63 - 1}),
+        ("run.db3", {3: -1, 5: -(2**63), 7: 2**63 - 1}),
+    ):
+        file = tmp_path / name
+        if name.endswith("mcap"):
+            with file.open("wb") as out:
+                writer = Writer(out)
+                writer.start()
+                schema = writer.register_schema("std_msgs/msg/Bool", "ros2msg", b"bool data")
+                channel = writer.register_channel("/t", "cdr", schema)
+                for row in range(10):
+                    stamp = stamps.get(row, START_NS)
+                    writer.add_message(channel, stamp, b"\0\1\0\0\1", 2**64 - 1)
+                writer.finish()
+        else:
+            with sqlite3.connect(file) as base:
+                base.executescript(
+                    "CREATE TABLE topics"
+                    " (id INTEGER PRIMARY KEY, name, type, serialization_format);"
+                    "CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id, timestamp, data);"
+                    "INSERT INTO topics VALUES (1, '/t', 'std_msgs/msg/Bool', 'cdr')"
+                )
+                base.executemany(
+                    "INSERT INTO messages (topic_id, timestamp, data) VALUES (1, ?, x'0001000001')",
+                    [(stamps.get(row, START_NS),) for row in range(10)],
+                )
+            base.close()
+        with open_recording(file) as recording:
+            columns = recording.read({"/t": ["data"]})["/t"]
+            assert columns.log_time_ns.tolist() == [START_NS] * 7
+            assert (columns.publish_time_ns > 0).all()
+            reasons = recording.accounts["/t"].reasons
+            assert reasons == {"logged at an absurd time, before 1970 or after 2262": 3}
+        assert any("absurd stamps" in note for note in describe(file)["notes"])
+
+
+# -- recordings that other people made ------------------------------------------------------
+
+needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
+
+COUNTS = {
+    "turtlebot3-sim-humble": 9432,
+    "turtlebot3-sim-sparse-cmd": 7811,
+    "jazzy-mcap-backsteps": 6578,
+    "nav2-file-zstd": 693,
+    "every-common-type/test_bag_mcap": 188,
+    "every-common-type/test_bag_sqlite3": 188,
+    "rosbag2-resources/mcap/talker": 20,
+    "rosbag2-resources/mcap/convert_a": 150,
+    "rosbag2-resources/mcap/convert_b": 75,
+    "rosbag2-resources/mcap/wbag": 6074,
+    "rosbag2-resources/mcap/reindex_test_bags/multiple_files": 1324 + 1324 + 529,
+    "rosbag2-resources/sqlite3/talker": 20,
+    "rosbag2-resources/sqlite3/convert_a": 150,
+    "rosbag2-resources/sqlite3/convert_b": 75,
+    "rosbag2-resources/sqlite3/wbag": 6074,
+    "rosbag2-resources/sqlite3/reindex_test_bags/multiple_files": 1324 + 1324 + 529,
+    "rosbag2-zstd-modes/message_compression": 380 + 360 + 360 + 27,
+    "rosbag2-zstd-modes/file_compression": 249 + 242 + 240 + 44,
+    "rosbag2-tests/mcap/cdr_test": 7,
+    "rosbag2-tests/sqlite3/cdr_test": 7,
+    "rosbag2-services/topics_and_services.db3": 13,
+    "rosbag2-services/topics_and_services.mcap": 13,
+    "rosbag2-services/only_topics.mcap": 7,
+    "rosbag2-services/only_services.mcap": 12,
+    "ros1/husky_robot_localization.bag": 16806,
+}
+
+
+@needs_shared
+@pytest.mark.parametrize("name", COUNTS)
+def test_other_peoples_recordings_are_counted_and_read(name: str) -> None:
+    with open_recording(SHARED / name) as recording:
+        assert recording.messages == COUNTS[name]
+        found = everything(recording)
+        for topic, account in recording.accounts.items():
+            info = recording.topics[topic]
+            assert account.expected == info.expected
+            assert account.decoded + sum(account.reasons.values()) == account.expected
+            if info.skipped is None:
+                assert len(found[topic]) == account.decoded
+                assert account.read == account.expected
+
+
+@needs_shared
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_bag_that_is_not_cdr_is_refused_by_name(storage: str) -> None:
+    with pytest.raises(RecordingError, match="'wrong_format', and only CDR is read"):
+        open_recording(SHARED / "rosbag2-tests" / storage / "wrong_rmw_test")
+
+
+@needs_shared
+def test_the_same_data_as_sqlite_and_as_mcap() -> None:
+    folder = SHARED / "every-common-type"
+    with (
+        open_recording(folder / "test_bag_mcap") as left,
+        open_recording(folder / "test_bag_sqlite3") as right,
+    ):
+        one, other = everything(left), everything(right)
+        assert one.keys() == other.keys()
+        assert len(one) == 94
+        for topic, columns in one.items():
+            for path, column in columns.fields.items():
+                if "stamp" not in path:  # the two were generated one after the other
+                    assert equal(column, other[topic].fields[path]), (topic, path)
+
+
+@needs_shared
+def test_counts_per_topic_of_a_turtlebot() -> None:
+    with open_recording(SHARED / "turtlebot3-sim-humble") as recording:
+        counts = {name: topic.expected for name, topic in recording.topics.items()}
+        assert counts["/odom"] == 826
+        assert counts["/cmd_vel"] == counts["/scan"] == 140
+        assert (counts["/imu"], counts["/tf"], counts["/clock"]) == (5636, 1376, 282)
+        columns = recording.read({"/odom": ["header.stamp"], "/scan": ["ranges"]})
+        offset_s = (columns["/odom"].log_time_ns - columns["/odom"].fields["header.stamp"]) * 1e-9
+        assert np.allclose(offset_s, 1_701_217_691.8, atol=0.5)
+        assert np.isinf(columns["/scan"].fields["ranges"].values).any()

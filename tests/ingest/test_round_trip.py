@@ -1,0 +1,276 @@
+"""One contract, two sources: a recording is ingested to the very steps that the twin saw.
+
+Row by row, for both formats, for scripted and learned drivers, on slip, blocks and traffic, with
+sensor noise and latency. Nothing may differ but by what a real robot's messages lose too:
+
+| what | is off by at most | because |
+| --- | --- | --- |
+| action, episode, step, terminated, truncated, behaviour policy | 0 | |
+| gyro_yaw_rate, slip_yaw_rate | 2^-11 rad/s | the gyroscope's resolution is 2^-10 rad/s |
+| accel_x | 2^-9 / 5 | the accelerometer's is 2^-8 m/s2; the entry is a fifth of it |
+| localised_speed, lateral_speed, slip_speed | 1e-5 m/s | two poses in single precision, over .2 s |
+| other scalars | 2e-6 | poses and odometry in single precision, headings as quaternions |
+| clearance_* | 2^-10 m, in metres | the lidar's resolution is 2^-9 m, and float32 |
+| closing_* | 1e-6 of the difference of the stored clearances | it is their difference |
+| reward | 1e-5 | the same; but where a clearance lies within the lidar's resolution of the
+threshold of tightness, that cost may be on either side |
+| action_probability | 1e-4 | it is published with four digits |
+
+A range within the lidar's resolution of the end of what counts (`range_max_m`) may count as free
+on one side alone: those entries, and no others, may differ by more, and they must be few.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from numpy.typing import NDArray
+from rosbags.highlevel import AnyReader
+from support.kept_run import kept_run
+
+from restock.ingest.pipeline import ingest
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.store.writer import StoreWriter
+from restock.replay.store.store import Store
+from restock.train.twin.physics.perturbation import Perturbation, Schedule
+from restock.train.twin.recording.bag_writer import Format
+from restock.train.twin.recording.crew import FleetCrew
+from restock.train.twin.recording.drivers import HANDOVER
+from restock.train.twin.recording.fleet import Driven, Fleet
+from restock.train.twin.recording.missions import Mission, schedule
+from restock.train.twin.recording.publish import ACCEL_LSB_MPS2, GYRO_LSB_RADPS, LIDAR_LSB_M
+from restock.train.twin.recording.recorder import HARDWARE, NOISELESS, Plan, load_policy, record
+from restock.train.twin.recording.robot_topics import TOPICS
+
+TASK = load_profile("warehouse_amr").task
+EQUAL = {"nominal": 1.0, "wheel_slip": 1.0, "blocked_aisle": 1.0, "near_collision": 1.0}
+MISSIONS = 5
+ROUGH = Schedule(
+    name="rough",
+    ranges={"latency_s": (0.1, 0.2), "lidar_dropout": (0.02, 0.1), "friction_scale": (0.5, 1.0)},
+    base=Perturbation(
+        payload_kg=40.0,
+        wheel_radius_scale=0.97,
+        lidar_noise_m=0.03,
+        localisation_noise_m=0.01,
+        localisation_drift_m=0.05,
+        encoder_noise_radps=0.1,
+        gyro_noise_radps=0.02,
+        gyro_bias_radps=0.03,
+        accel_noise_mps2=0.2,
+        accel_bias_mps2=0.1,
+        encoder_bias_radps=0.05,
+        lidar_period_s=0.4,
+        localisation_period_s=0.4,
+    ),
+)
+SINGLE = 2e-6  # what single precision leaves of poses on this floor
+SCALARS = {
+    "gyro_yaw_rate": GYRO_LSB_RADPS / 2,
+    "slip_yaw_rate": GYRO_LSB_RADPS / 2,
+    "accel_x": ACCEL_LSB_MPS2 / 2 / 5,
+    "localised_speed": 1e-5,
+    "lateral_speed": 1e-5,
+    "slip_speed": 1e-5,
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """One way to record."""
+
+    hardware: Perturbation | Schedule
+    format: Format = "mcap"
+    policy: str = HANDOVER
+    epsilon: float | None = None
+
+
+CASES = {
+    "noiseless mcap": Case(NOISELESS),
+    "stand-in rosbag2": Case(HARDWARE, "rosbag2"),
+    "a run, perturbed, mcap": Case(ROUGH, "mcap", "run:", 0.25),
+    "a run, stand-in, rosbag2": Case(HARDWARE, "rosbag2", "run:", 0.0),
+}
+
+
+@dataclass
+class Trip:
+    """A recording's way: driven, written, ingested."""
+
+    case: Case
+    folder: Path
+    plan: Plan = field(init=False)
+    driven: list[Driven] = field(init=False)
+    rows: pa.Table = field(init=False)
+
+    def __post_init__(self) -> None:
+        case, policy = self.case, self.case.policy
+        if policy == "run:":
+            policy += str(kept_run(self.folder / "learner"))
+        self.plan = Plan(
+            format=case.format,
+            missions=MISSIONS,
+            seed=7,
+            conditions=EQUAL,
+            policy=policy,
+            epsilon=case.epsilon,
+            hardware=case.hardware,
+        )
+        self.path = self.folder / ("log.mcap" if case.format == "mcap" else "log")
+        self.summary = record(self.path, self.plan)
+        # The same missions once more: the twin is deterministic, and nothing of it is on disk.
+        fleet = Fleet(case.hardware, scan_hz=self.plan.rates.scan)
+        guest = load_policy(self.plan)
+        crew = FleetCrew(fleet.env.num_envs, seed=7, epsilon=case.epsilon, guest=guest)
+        self.missions = list(islice(_missions(self.plan, guest), MISSIONS))
+        self.driven = list(fleet.drive(iter(self.missions), crew))
+        store = self.folder / "store"
+        self.outcome = ingest(self.path, load_profile("warehouse_amr"), store=StoreWriter(store))
+        query = "FROM transitions ORDER BY episode_index, step_index"
+        self.rows = Store(store).sql(query).to_arrow_table()
+
+    def saw(self, of: str, last: int | None = None, first: int = 0) -> NDArray[Any]:
+        return np.concatenate([np.asarray(getattr(d, of))[first:last] for d in self.driven])
+
+    def signal(self, name: str) -> NDArray[Any]:
+        return np.concatenate([d.drive.signals[name][1:] for d in self.driven])
+
+    def row(self, name: str) -> NDArray[Any]:
+        column = self.rows[name].to_numpy()
+        return np.stack(column) if column.dtype == object and len(column) else column
+
+    @property
+    def steps(self) -> list[int]:
+        return [len(driven.action) for driven in self.driven]
+
+
+def _missions(plan: Plan, guest: Any) -> Any:
+    driver, version = (plan.policy, "1") if guest is None else (guest.name, guest.version)
+    return schedule(plan.seed, plan.conditions, driver, plan.hardware, version=version)
+
+
+@pytest.fixture(scope="module", params=CASES.values(), ids=list(CASES))
+def trip(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Trip:
+    return Trip(request.param, tmp_path_factory.mktemp("trip"))
+
+
+def test_every_step_is_there_in_its_episode_and_no_other(trip: Trip) -> None:
+    assert trip.outcome.losses == []
+    assert trip.rows.num_rows == sum(trip.steps)
+    episode = [index for index, steps in enumerate(trip.steps) for _ in range(steps)]
+    assert trip.rows["episode_index"].to_pylist() == episode
+    step = [step for steps in trip.steps for step in range(steps)]
+    assert trip.rows["step_index"].to_pylist() == step
+    assert set(trip.summary.missions) == set(EQUAL)
+
+
+def test_episodes_end_as_they_did(trip: Trip) -> None:
+    last = np.cumsum(trip.steps) - 1
+    reached = last[[driven.terminated for driven in trip.driven]]
+    assert np.flatnonzero(trip.row("terminated")).tolist() == reached.tolist()
+    cut = last[[not driven.terminated for driven in trip.driven]]
+    assert np.flatnonzero(trip.row("truncated")).tolist() == cut.tolist()
+
+
+def test_observations_are_what_the_twin_saw(trip: Trip) -> None:
+    names = TASK.observation_names
+    place = {name: index for index, name in enumerate(names)}
+    near = [place[name] for name in names if name.startswith("clearance_")]
+    closing = [place[name] for name in names if name.startswith("closing_")]
+    others = [name for name in names if not name.startswith(("clearance_", "closing_"))]
+    for column, seen in (
+        ("observation", trip.saw("observation", last=-1)),
+        ("next_observation", trip.saw("observation", first=1)),
+    ):
+        stored = trip.row(column)
+        for name in others:
+            error = np.abs(stored[:, place[name]] - seen[:, place[name]])
+            assert error.max() <= SCALARS.get(name, SINGLE) + SINGLE, (column, name)
+        # The entries are roots of metres within the range that counts.
+        metres = np.abs(stored[:, near] ** 2 - seen[:, near] ** 2) * TASK.range_max_m
+        off = metres > LIDAR_LSB_M / 2 + 1e-5
+        assert (np.maximum(stored[:, near], seen[:, near])[off] == 1.0).all(), column
+        assert off.mean() < 1e-3, column
+    now, after = trip.row("observation"), trip.row("next_observation")
+    change = after[:, near] - now[:, near]
+    np.testing.assert_allclose(after[:, closing], change, atol=1e-6)
+    first = trip.row("step_index") == 0
+    assert not now[first][:, closing].any()
+
+
+def test_a_next_observation_is_the_observation_of_the_next_row(trip: Trip) -> None:
+    same = np.diff(trip.row("episode_index")) == 0
+    now, after = trip.row("observation"), trip.row("next_observation")
+    np.testing.assert_array_equal(after[:-1][same], now[1:][same])
+
+
+def test_actions_and_rewards_are_what_the_twin_gave(trip: Trip) -> None:
+    assert trip.row("action").tolist() == trip.saw("action").tolist()
+    clearance = trip.signal("clearance_m")
+    on_edge = np.abs(clearance - TASK.rewards.tight_clearance_m) < LIDAR_LSB_M
+    error = np.abs(trip.row("reward") - trip.saw("reward"))
+    assert error[~on_edge].max() < 1e-5
+    assert error.max() <= abs(TASK.rewards.tight) + 1e-5
+    assert on_edge.mean() < 0.05
+
+
+def test_who_drove_and_what_was_true_come_through(trip: Trip) -> None:
+    drives = [driven.drive for driven in trip.driven]
+    who = [entry for drive in drives for entry in drive.policy]
+    assert trip.rows["behaviour_policy"].to_pylist() == [name for name, _, _ in who]
+    assert trip.rows["behaviour_version"].to_pylist() == [version for _, version, _ in who]
+    assert trip.row("action_probability") == pytest.approx([p for _, _, p in who], abs=1e-4)
+    truth = [name for drive in drives for name in drive.true_condition]
+    assert trip.rows["true_condition"].to_pylist() == truth
+    assert len(set(truth)) > 2
+    parameters = [_parameters(driven.mission) for driven in trip.driven]
+    assert trip.rows["perturbation"].to_pylist() == [
+        item.name for item, steps in zip(parameters, trip.steps, strict=True) for _ in range(steps)
+    ]
+    firsts = np.cumsum([0, *trip.steps[:-1]])
+    for first, item in zip(firsts.tolist(), parameters, strict=True):
+        assert dict(trip.rows["perturbation_values"][first].as_py()) == item.changed()
+    if trip.case.policy == HANDOVER:
+        assert len({name for name, _, _ in who}) > 1  # the operator took over somewhere
+    else:
+        assert {(name, version) for name, version, _ in who} == {("dqn", "learner@7")}
+        greedy = 1 - trip.plan.epsilon + trip.plan.epsilon / len(TASK.actions)
+        chances = {greedy, trip.plan.epsilon / len(TASK.actions)} - {0.0}
+        assert {round(p, 5) for _, _, p in who} == {round(p, 5) for p in chances}
+
+
+def test_missions_come_in_their_order_each_with_its_driver(trip: Trip) -> None:
+    assert [driven.mission for driven in trip.driven] == trip.missions
+    if trip.case.policy == HANDOVER:
+        assert len(set(trip.steps)) > 1  # they did not end in order
+    for driven in trip.driven:
+        drivers = {(name, version) for name, version, _ in driven.drive.policy}
+        assert (driven.mission.driver, driven.mission.version) in drivers
+        assert drivers <= {(driven.mission.driver, driven.mission.version), ("operator", "1")}
+        assert driven.drive.plans[0][1][-1] == pytest.approx(driven.drive.goal_m)
+    if isinstance(trip.case.hardware, Schedule):
+        drawn = {_parameters(mission).latency_s for mission in trip.missions}
+        assert len(drawn) == MISSIONS
+
+
+def _parameters(mission: Mission) -> Perturbation:
+    assert mission.spec.perturbation is not None
+    return mission.spec.perturbation
+
+
+def test_the_summary_counts_what_is_in_the_file(trip: Trip) -> None:
+    summary = trip.summary.describe()
+    with AnyReader([trip.path]) as reader:
+        assert summary["topics"] == {c.topic: c.msgcount for c in reader.connections}
+        assert set(summary["topics"]) == {topic.name for topic in TOPICS}
+        assert summary["messages"] == reader.message_count
+    assert summary["minutes"] == pytest.approx(sum(trip.steps) * 0.2 / 60, abs=1e-3)
+    assert Counter(trip.summary.missions).total() == MISSIONS
+    assert sum(summary["policy_steps"].values()) == trip.rows.num_rows

@@ -1,0 +1,136 @@
+"""Damaged MCAP files: what can be proven to be there is read, what is lost is said in bytes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from mcap.writer import CompressionType
+from support.bag_samples import write_mcap
+
+from restock.cli import main
+from restock.errors import RecordingError
+from restock.ingest.containers.mcap_file import McapFile
+from restock.ingest.containers.mcap_records import MAGIC, Op, walk
+from restock.ingest.containers.open_recording import open_recording
+
+COUNT = 140
+
+
+def chunks_of(path: Path) -> list[tuple[int, int]]:
+    """Where each chunk's record and its index records are."""
+    content = path.read_bytes()
+    found: list[tuple[int, int]] = []
+    for opcode, at, stop in walk(content, len(MAGIC), len(content) - len(MAGIC)):
+        if opcode == Op.CHUNK:
+            found.append((at - 9, stop))
+        elif opcode == Op.MESSAGE_INDEX:
+            found[-1] = (found[-1][0], stop)
+    return found
+
+
+def read(path: Path) -> tuple[int, list[str], int]:
+    """Messages decoded, what was lost, and how many messages that was said to be."""
+    with open_recording(path, salvage=True) as recording:
+        recording.read({topic: recording.leaves(topic) for topic in recording.topics})
+        accounts = recording.accounts.values()
+        decoded = sum(account.decoded for account in accounts)
+        assert recording.integrity == "damaged"
+        return (
+            decoded,
+            [loss.reason for loss in recording.losses],
+            sum(account.lost for account in accounts),
+        )
+
+
+def damaged(path: Path, at: int, content: bytes, *, drop_end: int = 0) -> Path:
+    whole = bytearray(path.read_bytes())
+    whole[at : at + len(content)] = content
+    path.write_bytes(whole[: len(whole) - drop_end])
+    with pytest.raises(RecordingError, match="cut short or damaged at byte"):
+        open_recording(path)
+    return path
+
+
+HUGE = (1 << 60).to_bytes(8, "little")
+
+
+@pytest.mark.parametrize("compression", list(CompressionType), ids=lambda c: c.name)
+def test_by_the_chunk_index(compression: CompressionType, tmp_path: Path) -> None:
+    """The length of the third chunk's record is damaged, and nothing else."""
+    path = write_mcap(tmp_path / "run.mcap", compression=compression)
+    third = chunks_of(path)[2][0]
+    decoded, losses, lost = read(damaged(path, third + 1, HUGE))
+    assert decoded == COUNT
+    assert lost == 0
+    assert losses[0].startswith(f"cut short or damaged at byte {third:,}")
+
+
+def test_a_chunk_that_is_gone_is_counted(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "run.mcap", use_statistics=True)
+    third = chunks_of(path)[2][0]
+    held = sum(McapFile(path)._contents.chunks[2].counts().values())
+    decoded, losses, lost = read(damaged(path, third, b"\x05" + HUGE + b"\xff" * 60))
+    assert decoded == COUNT - held
+    assert lost == held
+    assert any(f"chunk at byte {third:,} is lost" in loss for loss in losses)
+
+
+def test_a_wrong_length_that_leads_astray(tmp_path: Path) -> None:
+    """The third chunk says that it ends within the fifth: the fourth is found all the same."""
+    path = write_mcap(tmp_path / "run.mcap")
+    places = chunks_of(path)
+    third, fifth = places[2][0], places[4][0]
+    length = (fifth + 500 - third).to_bytes(8, "little")
+    decoded, _, lost = read(damaged(path, third + 1, length))
+    assert decoded == COUNT
+    assert lost == 0
+
+
+@pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])
+def test_without_a_summary_chunks_show_themselves(
+    compression: CompressionType, tmp_path: Path
+) -> None:
+    path = write_mcap(tmp_path / "run.mcap", compression=compression)
+    places = chunks_of(path)
+    held = sum(McapFile(path)._contents.chunks[2].counts().values())
+    wreck = b"\x05" + HUGE + b"\xff" * 60
+    decoded, losses, _ = read(damaged(path, places[2][0], wreck, drop_end=50))
+    assert decoded == COUNT - held
+    lost = places[3][0] - places[2][0]
+    assert any(loss.startswith(f"{lost:,} bytes from byte {places[2][0]:,} on") for loss in losses)
+
+
+def test_twice_damaged_without_a_summary(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "run.mcap", chunk_size=2048)
+    places = chunks_of(path)
+    chunks = McapFile(path)._contents.chunks
+    held = sum(sum(chunks[at].counts().values()) for at in (2, 5))
+    wreck = b"\x05" + HUGE + b"\xff" * 60
+    damaged(path, places[5][0], wreck)
+    decoded, losses, _ = read(damaged(path, places[2][0], wreck, drop_end=50))
+    assert decoded == COUNT - held
+    assert sum("bytes from byte" in loss for loss in losses) == 3  # and what is left at the end
+
+
+def test_a_chunk_that_only_looks_like_one(tmp_path: Path) -> None:
+    """Bytes that name a compression within a message are no chunk."""
+    path = write_mcap(tmp_path / "run.mcap", compression=CompressionType.NONE, use_chunking=False)
+    fake = b"\x06" + bytes(36) + b"\x04\x00\x00\x00zstd" + HUGE
+    content = path.read_bytes()
+    records = list(walk(content, len(MAGIC), len(content) - len(MAGIC)))
+    at = [start - 9 for opcode, start, _ in records if opcode == Op.MESSAGE][70]
+    decoded, losses, _ = read(damaged(path, at, b"\x05" + HUGE + fake, drop_end=50))
+    assert decoded == 70
+    assert any("bytes from byte" in loss for loss in losses)
+
+
+def test_info_shows_what_was_lost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_mcap(tmp_path / "run.mcap")
+    third = chunks_of(path)[2][0]
+    damaged(path, third + 1, HUGE)
+    assert main(["info", str(path)]) == 2
+    assert main(["info", str(path), "--salvage"]) == 3
+    printed = capsys.readouterr()
+    assert "140 messages" in printed.out
+    assert f"damaged at byte {third:,}" in printed.err

@@ -1,0 +1,78 @@
+"""Lidar scans to clearance per sector."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from restock.ingest.task.scan import Body, SectorMap, outline_reach
+
+BODY = Body(length_m=0.7, width_m=0.5)
+POINT = Body(length_m=1e-9, width_m=1e-9)
+CIRCLE = np.linspace(-np.pi, np.pi, 360, endpoint=False)
+
+
+def test_sectors_go_counter_clockwise_from_straight_behind():
+    sectors = SectorMap.build(CIRCLE, 4, POINT)
+    ranges = np.full((1, 360), 3.0)
+    ranges[0, 180 + 45] = 1.0  # 45 degrees to the left of straight ahead
+    assert sectors.clearance(ranges, 0.05, 4.0)[0] == pytest.approx([3, 3, 1, 3])
+
+
+def test_clearance_is_what_lies_beyond_the_outline():
+    reach = outline_reach(np.array([0.0, np.pi / 2, np.pi, -np.pi / 2]), BODY)
+    assert reach == pytest.approx([0.35, 0.25, 0.35, 0.25])
+    ahead = Body(length_m=0.7, width_m=0.5, lidar_x_m=0.2)
+    assert outline_reach(np.array([0.0, np.pi]), ahead) == pytest.approx([0.15, 0.55])
+    corner = np.arctan2(0.25, 0.35)
+    assert outline_reach(np.array([corner]), BODY) == pytest.approx([np.hypot(0.35, 0.25)])
+
+
+def test_a_lidar_that_looks_backward():
+    turned = Body(length_m=1e-9, width_m=1e-9, lidar_yaw_rad=np.pi)
+    ranges = np.full((1, 360), 3.0)
+    ranges[0, 180] = 1.0  # its zero bearing, which is the robot's back
+    sectors = SectorMap.build(CIRCLE, 4, turned).clearance(ranges, 0.05, 4.0)[0]
+    assert sectors.argmin() in (0, 3)
+
+
+@pytest.mark.parametrize("nothing", [np.inf, np.nan, 0.0, 0.049, 4.1, -1.0])
+def test_no_valid_return_counts_as_free(nothing):
+    sectors = SectorMap.build(CIRCLE, 36, BODY)
+    assert (sectors.clearance(np.full((2, 360), nothing), 0.05, 4.0) == 4.0).all()
+
+
+def test_a_sector_without_beams_is_free():
+    front = np.linspace(-0.5, 0.5, 20)
+    clearance = SectorMap.build(front, 36, BODY).clearance(np.full((1, 20), 1.0), 0.05, 4.0)[0]
+    assert clearance[0] == 4.0
+    assert clearance[17:19].max() < 1.0
+
+
+@given(
+    st.integers(2, 40).map(lambda half: 2 * half),
+    st.lists(st.floats(0.05, 4.0), min_size=1, max_size=50),
+    st.floats(-3, 3),
+)
+def test_the_smallest_clearance_is_that_of_some_beam(sectors, ranges, first):
+    bearings = first + np.arange(len(ranges)) * 0.1
+    sector_map = SectorMap.build(bearings, sectors, POINT)
+    clearance = sector_map.clearance(np.array([ranges]), 0.05, 4.0)[0]
+    assert clearance.min() == pytest.approx(min(ranges), abs=1e-6)
+    assert len(clearance) == sectors
+    # Each beam's sector is at most as free as the beam.
+    sector = ((bearings + np.pi) % (2 * np.pi) * (sectors / (2 * np.pi))).astype(int)
+    for beam, range_m in zip(np.minimum(sector, sectors - 1), ranges, strict=True):
+        assert clearance[beam] <= range_m + 1e-9
+
+
+@given(st.floats(-7, 7), st.floats(0.1, 2), st.floats(0.1, 2), st.floats(-0.04, 0.04))
+def test_the_reach_ends_on_the_outline(bearing, length, width, lidar_x):
+    body = Body(length_m=length, width_m=width, lidar_x_m=lidar_x)
+    reach = outline_reach(np.array([bearing]), body)[0]
+    x, y = lidar_x + reach * np.cos(bearing), reach * np.sin(bearing)
+    on_end = abs(abs(x) - length / 2) < 1e-6 and abs(y) <= width / 2 + 1e-6
+    on_side = abs(abs(y) - width / 2) < 1e-6 and abs(x) <= length / 2 + 1e-6
+    assert on_end or on_side

@@ -1,0 +1,164 @@
+"""Signal paths: what they find in columns, and what they say where there is no such field."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.ragged import nested, ragged
+
+from restock.ingest.decoding.columns import FieldColumn
+from restock.ingest.decoding.definitions import distro_types
+from restock.ingest.decoding.field_paths import Leaf
+from restock.ingest.profile.signal_paths import PathProblem, SignalPath
+
+
+def found(path: str, columns: dict[str, FieldColumn], end: str | None = None) -> list[list]:
+    """What a path finds, message by message."""
+    read = SignalPath.read(path)
+    got = read.find(columns, end)
+    count = len(next(iter(columns.values())))
+    return [got.values[got.message == row].tolist() for row in range(count)]
+
+
+JOINTS = {
+    "name": ragged([["left", "right"], ["right", "left"], ["arm"], []]),
+    "velocity": ragged([[1.0, 2.0], [3.0, 4.0], [5.0], []]),
+}
+STATUS = {
+    "status[].name": ragged([["battery", "lidar"], ["lidar"], []]),
+    "status[].level": ragged([[0, 1], [2], []]),
+    "status[].values[].key": nested([[["v", "i"], ["n"]], [["n", "v"]], []]),
+    "status[].values[].value": nested([[["24", "1"], ["7"]], [["8", "9"]], []]),
+}
+
+
+def test_a_plain_field_and_elements_of_a_list():
+    assert found("voltage", {"voltage": np.array([1.0, 2.0])}) == [[1.0], [2.0]]
+    ranges = {"ranges": ragged([[1, 2, 3, 4, 5], [6], []])}
+    assert found("ranges[0]", ranges) == [[1], [6], []]
+    assert found("ranges[-1]", ranges) == [[5], [6], []]
+    assert found("ranges[4]", ranges) == [[5], [], []]
+    assert found("ranges[]", ranges) == [[1, 2, 3, 4, 5], [6], []]
+    assert found("ranges[::2]", ranges) == [[1, 3, 5], [6], []]
+    assert found("ranges[1:-1]", ranges) == [[2, 3, 4], [], []]
+    assert found("ranges[-2:]", ranges) == [[4, 5], [6], []]
+
+
+def test_elements_of_a_fixed_array():
+    columns = {"covariance": np.arange(12.0).reshape(3, 4)}
+    assert found("covariance[3]", columns) == [[3], [7], [11]]
+    assert found("covariance[::3]", columns) == [[0, 3], [4, 7], [8, 11]]
+
+
+def test_an_element_by_the_name_beside_it():
+    assert found("velocity[left]", JOINTS) == [[1.0], [4.0], [], []]
+    assert found("velocity[arm]", JOINTS) == [[], [], [5.0], []]
+
+
+def test_names_without_values_beside_them_find_nothing():
+    columns = JOINTS | {"velocity": ragged([[], [3.0], [], []])}
+    assert found("velocity[left]", columns) == [[], [], [], []]
+    assert found("velocity[right]", columns) == [[], [3.0], [], []]
+
+
+def test_an_element_by_what_a_field_of_it_says():
+    path = "status[name=battery].values[key=v].value"
+    assert found(path, STATUS) == [["24"], [], []]
+    assert found("status[name=lidar].values[key=v].value", STATUS) == [[], ["9"], []]
+    assert found("status[name=lidar].level", STATUS) == [[1], [2], []]
+    assert found("status[level=2].name", STATUS) == [[], ["lidar"], []]
+    assert found("status[0].values[-1].value", STATUS) == [["1"], ["9"], []]
+    assert found("status[].values[].value", STATUS) == [["24", "1", "7"], ["8", "9"], []]
+    assert found("status[].values[key=n].value", STATUS) == [["7"], ["8"], []]
+
+
+def test_of_two_elements_that_say_so_the_first_counts():
+    columns = {"s[].k": ragged([["a", "a"]]), "s[].v": ragged([[1, 2]])}
+    assert found("s[k=a].v", columns) == [[1]]
+
+
+@given(
+    st.lists(st.lists(st.integers(-9, 9), max_size=6), min_size=1, max_size=5),
+    st.one_of(st.none(), st.integers(-7, 7)),
+    st.one_of(st.none(), st.integers(-7, 7)),
+    st.integers(1, 4),
+)
+def test_slices_are_pythons(rows, start, stop, step):
+    text = f"x[{'' if start is None else start}:{'' if stop is None else stop}:{step}]"
+    assert found(text, {"x": ragged(rows)}) == [row[start:stop:step] for row in rows]
+
+
+@given(st.lists(st.lists(st.integers(-9, 9), max_size=6), min_size=1, max_size=5))
+def test_an_index_is_pythons(rows):
+    for index in range(-7, 7):
+        want = [[row[index]] if -len(row) <= index < len(row) else [] for row in rows]
+        assert found(f"x[{index}]", {"x": ragged(rows)}) == want
+
+
+@pytest.mark.parametrize(
+    ("path", "said"),
+    [
+        ("", "ends without a field"),
+        ("a.", "ends without a field"),
+        ("a..b", "cannot be read at '.b'"),
+        ("a[0", "cannot be read"),
+        ("a[0][1]", "cannot be read"),
+        ("1a", "cannot be read"),
+        ("a b", "cannot be read"),
+        ("a[::0]", "a step of 0"),
+    ],
+)
+def test_what_is_no_path(path, said):
+    with pytest.raises(PathProblem) as problem:
+        SignalPath.read(path)
+    assert said in str(problem.value)
+
+
+def leaves(kind: str) -> list[Leaf]:
+    from restock.ingest.decoding.definitions import RosType
+
+    return RosType(kind, "humble", distro_types("humble")).leaves()
+
+
+@pytest.mark.parametrize(
+    ("kind", "path", "said"),
+    [
+        ("sensor_msgs/msg/BatteryState", "voltge", "did you mean 'voltage'"),
+        ("sensor_msgs/msg/BatteryState", "voltage[0]", "voltage does not repeat"),
+        ("sensor_msgs/msg/LaserScan", "ranges", "ranges repeats: write ranges[0]"),
+        ("sensor_msgs/msg/LaserScan", "header.seq", "no field 'header.seq'"),
+        ("nav_msgs/msg/Odometry", "pose.covariance", "covariance repeats"),
+        ("nav_msgs/msg/Odometry", "pose.pose", "no field 'pose.pose'"),
+        ("sensor_msgs/msg/LaserScan", "ranges[front]", "no field 'name'"),
+        ("diagnostic_msgs/msg/DiagnosticArray", "status.level", "status repeats"),
+        ("diagnostic_msgs/msg/DiagnosticArray", "status[nam=x].level", "'status[].name'"),
+        ("diagnostic_msgs/msg/DiagnosticArray", "status[0].values[0].valu", "].value'"),
+    ],
+)
+def test_a_path_that_a_type_does_not_have(kind, path, said):
+    with pytest.raises(PathProblem) as problem:
+        SignalPath.read(path).check(leaves(kind))
+    assert said in str(problem.value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "path", "wanted", "kinds"),
+    [
+        ("sensor_msgs/msg/BatteryState", "voltage", ["voltage"], ["float32"]),
+        ("sensor_msgs/msg/LaserScan", "ranges[::4]", ["ranges"], ["float32"]),
+        ("nav_msgs/msg/Odometry", "pose.covariance[35]", ["pose.covariance"], ["float64"]),
+        ("sensor_msgs/msg/JointState", "velocity[left]", ["velocity", "name"], ["float64"]),
+        (
+            "diagnostic_msgs/msg/DiagnosticArray",
+            "status[name=a].values[key=b].value",
+            ["status[].values[].value", "status[].name", "status[].values[].key"],
+            ["string"],
+        ),
+    ],
+)
+def test_what_a_path_reads(kind, path, wanted, kinds):
+    read = SignalPath.read(path)
+    assert read.check(leaves(kind)) == kinds
+    assert read.wanted() == wanted

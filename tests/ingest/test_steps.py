@@ -1,0 +1,218 @@
+"""Topics to steps: what each tick sees, and why a tick cannot be used."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.driven_robot import (
+    FREE_M,
+    PERIOD_S,
+    SPEED_MPS,
+    START_NS,
+    Drive,
+    columns,
+    scans,
+    without,
+)
+
+from restock.ingest.profile.profile import Clock, load_profile
+from restock.ingest.steps.filling import parse_policy
+from restock.ingest.steps.steps import steps_of
+
+PROFILE = load_profile("warehouse_amr")
+
+
+def test_every_signal_of_a_straight_drive():
+    steps = steps_of(PROFILE, Drive().topics())
+    assert len(steps) == 30
+    assert set(steps.problem) == set(steps.route_problem) == {""}
+    now = steps.signals
+    at_s = (now["stamp_ns"] - START_NS) * 1e-9
+    assert at_s == pytest.approx(0.005 + np.arange(30) * PERIOD_S, abs=1e-6)
+    assert now["pose_x_m"] == pytest.approx(1 + SPEED_MPS * np.arange(30) * PERIOD_S)
+    assert now["pose_y_m"] == pytest.approx(np.ones(30))
+    assert now["localised_speed_mps"] == pytest.approx(np.full(30, SPEED_MPS))
+    assert now["goal_distance_m"] == pytest.approx(11 - now["pose_x_m"])
+    assert now["route_remaining_m"] == pytest.approx(11 - now["pose_x_m"])
+    assert now["waypoint_near_x_m"] == pytest.approx(np.ones(30))
+    assert now["waypoint_far_x_m"] == pytest.approx(np.full(30, 2.2))
+    front = PROFILE.task.body.length_m / 2 - PROFILE.task.body.lidar_x_m
+    assert now["clearance_ahead_m"] == pytest.approx(np.full(30, FREE_M - front), abs=0.02)
+    assert set(steps.action) == {1}  # .4 m/s straight ahead
+    assert steps.residual == pytest.approx(np.zeros(30))
+    assert set(steps.policy) == {"planner"}
+    assert steps.follows.tolist() == [False] + [True] * 29
+
+
+def test_nothing_of_a_step_comes_from_later_messages():
+    """Cut the recording after any tick: the steps up to it stay what they were."""
+    topics = Drive().topics()
+    whole = steps_of(PROFILE, topics)
+    for tick in (3, 11, 20):
+        end = whole.signals["stamp_ns"][tick] + 2_000_000  # the latency of the tick's command
+        cut = {name: without(topic, topic.log_time_ns <= end) for name, topic in topics.items()}
+        part = steps_of(PROFILE, cut)
+        assert len(part) == tick + 1
+        for name, column in part.signals.items():
+            assert np.array_equal(column, whole.signals[name][: tick + 1]), name
+
+
+def test_a_stale_input_makes_the_tick_unusable_by_name():
+    topics = Drive().topics()
+    quiet = (topics["/scan"].log_time_ns - START_NS) * 1e-9
+    topics["/scan"] = without(topics["/scan"], (quiet < 2) | (quiet > 3.5))
+    steps = steps_of(PROFILE, topics)
+    stale = [index for index, problem in enumerate(steps.problem) if problem == "scan: stale"]
+    at_s = (steps.signals["stamp_ns"][stale] - START_NS) * 1e-9
+    assert at_s.min() > 1.9 + 0.5  # the last scan before, and its maximum age
+    assert at_s.max() < 3.5
+    assert len(stale) == 6
+    assert not steps.follows[stale[0]]
+    assert not steps.follows[stale[-1] + 1]
+
+
+def test_what_was_never_received_is_said_so():
+    topics = Drive().topics()
+    late = (topics["/imu"].log_time_ns - START_NS) * 1e-9
+    topics["/imu"] = without(topics["/imu"], late > 1)
+    steps = steps_of(PROFILE, topics)
+    assert steps.problem[:5] == ["imu: not yet received"] * 5
+    assert steps.problem[6] == ""
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e300])
+def test_a_number_that_is_none_makes_the_tick_unusable(bad):
+    topics = Drive().topics()
+    topics["/odom"].fields["twist.twist.linear.x"][100:110] = bad
+    steps = steps_of(PROFILE, topics)
+    assert steps.problem.count("wheels: not finite") == 1  # the tick at 2.005 s
+    assert np.isfinite(steps.signals["wheel_speed_mps"]).all()
+
+
+def test_scans_of_inf_and_nan_and_changing_geometry():
+    drive = Drive()
+    topics = drive.topics()
+    tenth = np.arange(0, 6, 0.1)
+    ranges = np.full((60, 72), 3.0)
+    ranges[:30, ::2] = np.inf
+    ranges[:30, 1::4] = np.nan
+    topics["/scan"] = columns(tenth, scans(ranges))
+    topics["/scan"].fields["angle_min"][30:] = 0.0  # as some drivers: forward first
+    steps = steps_of(PROFILE, topics)
+    assert set(steps.problem) == {""}
+    clearance = steps.signals["sector_clearance_m"]
+    assert np.isfinite(clearance).all()
+    assert clearance.max() == PROFILE.task.range_max_m  # sectors with nothing but inf and NaN
+    assert clearance[-1].max() < 3.0
+
+
+def test_a_plan_for_another_goal_is_not_followed():
+    drive = Drive(goals=[(0.0, 11.0, 1.0), (2.0, 11.0, 9.0)])
+    topics = drive.topics()
+    topics["/plan"] = without(topics["/plan"], np.array([True, False]))  # no plan for the second
+    steps = steps_of(PROFILE, topics)
+    assert steps.route_problem[9] == ""
+    assert set(steps.route_problem[10:]) == {"plan: for another goal"}
+    assert set(steps.problem) == {""}
+    assert steps.routing.goal[10] == -1
+
+
+def test_the_same_goal_again_is_no_new_goal():
+    drive = Drive(goals=[(0.0, 11.0, 1.0), (2.0, 11.0, 1.0), (4.0, 11.0, 1.005)])
+    steps = steps_of(PROFILE, drive.topics())
+    assert set(steps.routing.goal) == {0}
+
+
+def test_a_bump_between_two_ticks_is_not_missed():
+    topics = Drive().topics()
+    time = np.arange(0, 6, 0.02)
+    pressed = np.zeros(len(time), np.bool_)
+    pressed[103] = True  # at 2.06 s for 20 ms
+    topics["/bumper"] = columns(time, {"data": pressed}, stamped=False)
+    bumped = steps_of(PROFILE, topics).signals["bumped"]
+    assert np.flatnonzero(bumped).tolist() == [11]  # the tick at 2.205 s
+
+
+def test_a_handover_is_on_the_tick_it_takes_force():
+    text = '{"policy": "operator", "version": "2", "probability": 0.5}'
+    drive = Drive(policies=[(0.0, "planner"), (2.0, text)])
+    steps = steps_of(PROFILE, drive.topics())
+    assert steps.policy[:10] == ["planner"] * 10
+    assert steps.policy[10:] == ["operator"] * 20
+    assert steps.policy_version[9:11] == [None, "2"]
+    assert steps.probability[9:11] == [None, 0.5]
+
+
+def test_policies_are_json_or_a_bare_name():
+    assert parse_policy('{"policy": "dqn", "version": 3}') == ("dqn", "3", None)
+    assert parse_policy(" planner ") == ("planner", None, None)
+    assert parse_policy("") == ("unknown", None, None)
+    assert parse_policy("3") == ("3", None, None)
+
+
+def test_a_robot_that_was_carried_does_not_drive_on():
+    topics = Drive().topics()
+    topics["/amcl_pose"].fields["pose.pose.position.x"][30:] += 3.0
+    steps = steps_of(PROFILE, topics)
+    assert [cut for cut in steps.cut if cut] == ["start of the recording", "pose jump"]
+    # No speed is made up across the jump.
+    assert steps.signals["localised_speed_mps"] == pytest.approx(np.full(30, SPEED_MPS))
+
+
+def test_at_a_fixed_rate_the_action_is_the_one_in_force_for_most_of_the_interval():
+    import msgspec
+
+    profile = msgspec.structs.replace(PROFILE, clock=Clock(steps="rate"))
+    topics = Drive().topics()
+    # Commands every .2 s that drift 4 ms a tick against the ticks, alternating.
+    count = 25
+    topics["/cmd_vel"] = columns(
+        0.005 + np.arange(count) * 0.204,
+        {"linear.x": np.where(np.arange(count) % 2, 1.0, 0.4), "angular.z": np.zeros(count)},
+        stamped=False,
+    )
+    steps = steps_of(profile, topics)
+    assert steps.action[:20].tolist() == [1, 2] * 10
+
+
+def test_without_imu_and_goal_the_stand_ins_are_used():
+    profile = load_profile("turtlebot3")
+    odom = Drive().topics()
+    time = np.arange(0, 6, 0.02)
+    from support.driven_robot import pose
+
+    topics = {
+        "/cmd_vel": odom["/cmd_vel"],
+        "/scan": odom["/scan"],
+        "/imu": odom["/imu"],
+        "/odom": columns(
+            time,
+            {
+                **pose("pose.pose", 1 + SPEED_MPS * time, 1.0),
+                "twist.twist.linear.x": np.full(len(time), SPEED_MPS),
+                "twist.twist.angular.z": np.zeros(len(time)),
+            },
+        ),
+    }
+    steps = steps_of(profile, topics)
+    assert set(steps.problem) == set(steps.route_problem) == {""}
+    assert not steps.signals["bumped"].any()
+    assert set(steps.policy) == {"unknown"}
+    assert (steps.signals["goal_distance_m"] == 0).all()
+    assert (steps.routing.goal == -1).all()
+
+
+def test_an_optional_topic_without_messages_is_replaced_like_one_that_is_not_there():
+    import msgspec
+
+    from restock.ingest.steps.sources import stand_ins
+
+    topics = Drive().topics()
+    empty = without(topics["/bumper"], np.zeros(60, np.bool_))
+    bumper = msgspec.structs.replace(PROFILE.inputs.bumper, optional=True)
+    inputs = msgspec.structs.replace(PROFILE.inputs, bumper=bumper)
+    profile = msgspec.structs.replace(PROFILE, inputs=inputs)
+    steps = steps_of(profile, topics | {"/bumper": empty})
+    assert set(steps.problem) == {""}
+    assert "bumper" in stand_ins(profile, topics | {"/bumper": empty})
+    assert "bumper" not in stand_ins(profile, topics)

@@ -1,0 +1,299 @@
+"""The store's writer: whole or not at all, replaced in one commit, whoever else is writing."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+from deltalake import DeltaTable
+from deltalake.exceptions import CommitFailedError
+from support.stores import one, shown
+
+from restock.errors import StoreError
+from restock.ingest.store.location import Location
+from restock.ingest.store.writer import RECORDINGS, TRANSITIONS, StoreWriter
+from restock.replay.store.store import Store
+
+
+def test_what_is_written_is_read(tmp_path):
+    manifest, rows = one(1)
+    version = StoreWriter(tmp_path / "s").write(manifest, rows)
+    with Store(tmp_path / "s") as store:
+        assert store.version == version
+        found = store.sql("FROM transitions ORDER BY transition_id").to_arrow_table()
+    assert found["transition_id"].equals(rows["transition_id"])
+    assert found["observation"].to_pylist() == rows["observation"].to_pylist()
+
+
+def test_a_recording_written_again_replaces_its_rows_and_no_others(tmp_path):
+    writer = StoreWriter(tmp_path / "s")
+    writer.write(*one(1, "a"))
+    writer.write(*one(2, "b"))
+    writer.write(*one(1, "c", seed=9))
+    first, second = one(1, "c", seed=9)[1], one(2, "b")[1]
+    assert shown(tmp_path / "s") == {
+        first["ingest_id"][0].as_py(): len(first),
+        second["ingest_id"][0].as_py(): len(second),
+    }
+    assert sorted(writer.live()["ingest_id"].to_pylist()) == sorted(shown(tmp_path / "s"))
+
+
+def test_the_old_rows_can_still_be_read_at_the_old_version(tmp_path):
+    writer = StoreWriter(tmp_path / "s")
+    version = writer.write(*one(1, "a"))
+    writer.write(*one(1, "b"))
+    files = DeltaTable(str(tmp_path / "s" / "transitions"), version=version).file_uris()
+    assert pq.read_table(files[0].removeprefix("file://")).to_pylist() == one(1, "a")[1].to_pylist()
+
+
+def test_an_old_version_keeps_its_manifests(tmp_path):
+    """They are taken out of `recordings` when the rows are replaced, and found by their names."""
+    writer = StoreWriter(tmp_path / "s")
+    version = writer.write(*one(1, "a"))
+    writer.write(*one(1, "b"))
+    with Store(tmp_path / "s", version=version) as store:
+        assert store.sql("SELECT DISTINCT ingest_id FROM transitions").fetchall() == [
+            ("0000000000000001-a",)
+        ]
+        assert store.sql("SELECT ingest_id FROM recordings").fetchall() == [("0000000000000001-a",)]
+
+
+def test_a_reader_between_a_replacing_writers_commits_sees_the_recording(tmp_path, monkeypatch):
+    """It opens the rows as they were, and their manifest is gone when it looks."""
+    path = tmp_path / "s"
+    StoreWriter(path).write(*one(1, "a"))
+    open_table = Location.open_table
+
+    def overtaken(self, name, *rest):
+        if name == RECORDINGS:
+            monkeypatch.undo()
+            StoreWriter(path).write(*one(1, "b"))
+        return open_table(self, name, *rest)
+
+    monkeypatch.setattr(Location, "open_table", overtaken)
+    assert shown(path) == {"0000000000000001-a": len(one(1, "a")[1])}
+
+
+def test_a_manifest_without_transitions_shows_nothing_and_is_cleared_away(tmp_path, monkeypatch):
+    """A kill between the two commits."""
+    writer = StoreWriter(tmp_path / "s")
+    writer.write(*one(1, "a"))
+    commit = StoreWriter._commit
+
+    def killed(self, name, *rest):
+        if name == "transitions":
+            raise KeyboardInterrupt
+        return commit(self, name, *rest)
+
+    monkeypatch.setattr(StoreWriter, "_commit", killed)
+    with pytest.raises(KeyboardInterrupt):
+        writer.write(*one(1, "b"))
+    monkeypatch.undo()
+    assert list(shown(tmp_path / "s")) == ["0000000000000001-a"]
+    writer.write(*one(1, "c"))
+    assert list(shown(tmp_path / "s")) == ["0000000000000001-c"]
+
+    def manifests() -> list[str]:
+        kept = DeltaTable(str(tmp_path / "s" / RECORDINGS)).get_add_actions(flatten=True)["path"]
+        return sorted(Path(path).stem[-1] for path in kept.to_pylist())
+
+    # Another writer may still be about to commit what joins nothing, so only age removes it.
+    writer.clean()
+    assert manifests() == ["b", "c"]
+    assert writer.clean(retention_hours=0) != []
+    assert manifests() == ["c"]
+    assert writer.clean(retention_hours=0) == []
+    assert list(shown(tmp_path / "s")) == ["0000000000000001-c"]
+
+
+def test_orphans_are_cleaned_after_the_retention_window_only(tmp_path):
+    writer = StoreWriter(tmp_path / "s")
+    writer.write(*one(1))
+    orphan = tmp_path / "s" / "transitions" / "00000000000000ff" / "x.parquet"
+    orphan.parent.mkdir()
+    orphan.write_bytes(b"left by a killed writer")
+    assert writer.clean() == []
+    assert orphan.exists()
+    old = time.time() - 8 * 24 * 3600
+    os.utime(orphan, (old, old))
+    version = DeltaTable(str(tmp_path / "s" / "transitions")).version()
+    assert writer.clean() == ["transitions/00000000000000ff/x.parquet"]
+    assert writer.clean() == []
+    assert not orphan.exists()
+    assert len(shown(tmp_path / "s")) == 1
+    assert DeltaTable(str(tmp_path / "s" / "transitions")).version() == version
+
+
+def _write(path: Path, recording: int, ingest: str) -> None:
+    StoreWriter(path).write(*one(recording, ingest))
+
+
+def test_writers_at_the_same_time_lose_nothing_and_double_nothing(tmp_path):
+    path = tmp_path / "s"
+    context = multiprocessing.get_context("spawn")
+    # Two writers of the same recording among them: one replaces the other.
+    jobs = [(1, "a"), (1, "b"), (2, "a"), (3, "a")]
+    processes = [context.Process(target=_write, args=(path, *job)) for job in jobs]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+    assert [process.exitcode for process in processes] == [0] * len(jobs)
+    found = shown(path)
+    assert sorted(ingest.split("-")[0][-1] for ingest in found) == ["1", "2", "3"]
+    for ingest, count in found.items():
+        recording, name = ingest.split("-")
+        assert count == len(one(int(recording, 16), name)[1])
+
+
+def test_columns_that_two_writers_add_at_once_are_added_once(tmp_path, monkeypatch):
+    path, (manifest, rows) = tmp_path / "s", one(1)
+    StoreWriter(path).write(manifest, rows.drop_columns(["zone"]))
+    open_table = Location.open_table
+
+    def overtaken(self, name, *rest):
+        table = open_table(self, name, *rest)
+        if name == TRANSITIONS:
+            monkeypatch.undo()
+            StoreWriter(path).write(*one(2))
+        return table
+
+    monkeypatch.setattr(Location, "open_table", overtaken)
+    StoreWriter(path).write(*one(3))
+    assert len(shown(path)) == 3
+
+
+def test_a_commit_whose_answer_was_lost_is_not_done_twice(tmp_path, monkeypatch):
+    transact = StoreWriter._transact
+
+    def lost(self, *args):
+        transact(self, *args)
+        monkeypatch.setattr(StoreWriter, "_transact", transact)
+        raise CommitFailedError("the answer was lost")
+
+    writer = StoreWriter(tmp_path / "s")
+    writer.write(*one(1, "a"))
+    monkeypatch.setattr(StoreWriter, "_transact", lost)
+    writer.write(*one(1, "b"))
+    assert shown(tmp_path / "s") == {"0000000000000001-b": len(one(1, "b")[1])}
+    assert DeltaTable(str(tmp_path / "s" / RECORDINGS)).count() == 1
+
+
+def test_an_interrupt_before_the_first_commit_leaves_no_file(tmp_path):
+    writer = StoreWriter(tmp_path / "s")
+    writer.write(*one(1))
+    before = sorted((tmp_path / "s").rglob("*.parquet"))
+
+    def interrupted():
+        yield one(2)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        writer.write_all(interrupted())
+    assert sorted((tmp_path / "s").rglob("*.parquet")) == before
+
+
+class _Overtaken(StoreWriter):
+    """A writer between whose two commits another one writes."""
+
+    def __init__(self, path: Path, meanwhile: Callable[[], object]) -> None:
+        super().__init__(path)
+        self.meanwhile = meanwhile
+
+    def _commit(self, name, added, instead_of):
+        if name == TRANSITIONS:
+            self.meanwhile()
+        return super()._commit(name, added, instead_of)
+
+
+def test_a_writer_overtaken_by_another_of_the_same_recording_loses_nothing(tmp_path):
+    path = tmp_path / "s"
+    _Overtaken(path, lambda: StoreWriter(path).write(*one(1, "b"))).write(*one(1, "a"))
+    assert shown(path) == {"0000000000000001-a": len(one(1, "a")[1])}
+    manifests = DeltaTable(str(path / RECORDINGS)).file_uris()
+    assert [Path(uri).stem for uri in manifests] == ["0000000000000001-a"]
+
+
+def _write_for_ever(path: Path) -> None:
+    for turn in range(1000):
+        StoreWriter(path).write(*one(1, f"{turn}", seed=turn))
+
+
+@pytest.mark.parametrize("after_s", [0.05, 0.13, 0.21])
+def test_a_killed_writer_leaves_the_last_whole_commit(tmp_path, after_s):
+    path = tmp_path / "s"
+    StoreWriter(path).write(*one(1, "first"))
+    process = multiprocessing.get_context("fork").Process(target=_write_for_ever, args=(path,))
+    process.start()
+    time.sleep(after_s)
+    assert process.pid is not None
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    (ingest, count), *others = shown(path).items()
+    assert not others
+    name = ingest.split("-")[1]
+    seed = 0 if name == "first" else int(name)
+    assert count == len(one(1, name, seed=seed)[1])
+    StoreWriter(path).write(*one(1, "last"))
+    assert list(shown(path)) == ["0000000000000001-last"]
+
+
+def test_new_columns_are_added_and_old_rows_hold_null(tmp_path):
+    path, (manifest, rows) = tmp_path / "s", one(1)
+    StoreWriter(path).write(manifest, rows.drop_columns(["zone"]))
+    StoreWriter(path).write(*one(2))
+    with Store(path) as store:
+        found = store.sql(
+            "SELECT recording_id[-1:] AS r, count(zone) > 0 FROM stored_transitions"
+            " GROUP BY ALL ORDER BY ALL"
+        ).fetchall()
+    assert found == [("1", False), ("2", True)]
+
+
+def test_a_file_in_the_way_is_said_so(tmp_path):
+    (tmp_path / "s").write_text("hello")
+    with pytest.raises(StoreError, match="is a file, not a store"):
+        StoreWriter(tmp_path / "s").write(*one(1))
+
+
+@pytest.mark.parametrize(
+    ("place", "said"),
+    [
+        ("gs://bucket/store", "cannot lie on gs:"),
+        ("some%20where/store", "percent sign"),
+    ],
+)
+def test_places_that_cannot_hold_a_store_are_refused(place, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(StoreError, match=said):
+        StoreWriter(place)
+    with pytest.raises(StoreError, match=said):
+        Store(place)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_files_of_other_tools_are_refused_by_name(tmp_path):
+    path = tmp_path / "s"
+    StoreWriter(path).write(*one(1))
+    DeltaTable(str(path / "transitions")).optimize.compact()
+    StoreWriter(path).write(*one(2))
+    DeltaTable(str(path / "transitions")).optimize.compact()
+    with pytest.raises(StoreError, match="did not write"):
+        StoreWriter(path).write(*one(3))
+
+
+def test_floats_are_split_by_byte_and_compressed(tmp_path):
+    manifest, rows = one(1)
+    StoreWriter(tmp_path / "s").write(manifest, rows)
+    (file,) = (tmp_path / "s" / "transitions").glob("*/*.parquet")
+    group = pq.ParquetFile(file).metadata.row_group(0)
+    columns = {group.column(i).path_in_schema: group.column(i) for i in range(group.num_columns)}
+    assert {column.compression for column in columns.values()} == {"ZSTD"}
+    assert "BYTE_STREAM_SPLIT" in columns["observation.list.element"].encodings
+    assert "BYTE_STREAM_SPLIT" in columns["pose_x_m"].encodings

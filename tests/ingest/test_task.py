@@ -1,0 +1,218 @@
+"""The task: observation, action, reward, termination. By hand, and by what must always hold."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.scan import Body
+from restock.ingest.task.signals import SIGNALS, localised_velocity, wrap_angle
+from restock.ingest.task.task import (
+    Rewards,
+    Task,
+    clearance_ahead,
+    nearest_action,
+    observe,
+    reached_goal,
+    reward,
+    terminated,
+)
+
+TASK = Task(
+    body=Body(length_m=0.7, width_m=0.5),
+    actions=((0.0, 0.0), (0.5, 0.0), (1.0, 0.0), (0.0, 1.0), (0.0, -1.0)),
+    sectors=4,
+)
+
+
+def signals(count: int = 1, **values: object) -> dict[str, np.ndarray]:
+    """Signals of a robot that stands still with room all round, but for these."""
+    usual: dict[str, np.ndarray] = {}
+    for signal in SIGNALS:
+        shape = (count, TASK.sectors) if signal.per_sector else (count,)
+        usual[signal.name] = np.zeros(shape, signal.dtype)
+    usual["sector_clearance_m"] += 4.0
+    for name in ("clearance_m", "clearance_ahead_m", "goal_distance_m", "waypoint_near_x_m"):
+        usual[name] += 4.0
+    for name, value in values.items():
+        usual[name] = np.broadcast_to(value, usual[name].shape).astype(usual[name].dtype)
+    return usual
+
+
+def entry(observation: np.ndarray, name: str) -> float:
+    return float(observation[0, TASK.observation_names.index(name)])
+
+
+def test_the_observation_by_hand():
+    now = signals(
+        waypoint_near_x_m=1.0,
+        waypoint_near_y_m=1.0,
+        waypoint_far_x_m=0.0,
+        waypoint_far_y_m=-2.0,
+        route_remaining_m=5.0,
+        wheel_speed_mps=0.8,
+        localised_speed_mps=0.3,
+        wheel_yaw_rate_radps=0.5,
+        gyro_yaw_rate_radps=0.1,
+        localised_lateral_mps=-0.2,
+        accel_x_mps2=2.5,
+        sector_clearance_m=np.array([[4.0, 1.0, 0.25, 9.0]]),
+    )
+    before = signals(sector_clearance_m=np.array([[4.0, 4.0, 0.25, 4.0]]))
+    found = observe(TASK, now, before, np.array([2]))
+    assert found.shape == (1, TASK.observation_size)
+    assert found.dtype == np.float32
+    half = np.sqrt(0.5)
+    assert found[0, :5] == pytest.approx([half, half, -1.0, 0.0, 0.5], abs=1e-6)
+    assert found[0, 5:12] == pytest.approx([0.8, 0.1, 0.3, 0.5, 0.4, -0.2, 0.5], abs=1e-6)
+    assert found[0, 12:17].tolist() == [0, 0, 1, 0, 0]
+    assert found[0, 17:21] == pytest.approx([1.0, 0.5, 0.25, 1.0])
+    assert found[0, 21:25] == pytest.approx([0.0, -0.5, 0.0, 0.0])
+
+
+def test_the_names_are_those_of_the_entries():
+    assert len(TASK.observation_names) == TASK.observation_size == len(set(TASK.observation_names))
+    found = observe(TASK, signals(wheel_speed_mps=0.7), signals(), np.array([3]))
+    assert entry(found, "wheel_speed") == pytest.approx(0.7)
+    assert entry(found, "previous_action_3") == 1
+    assert entry(found, "clearance_-135deg") == 1
+    for task in (load_profile("warehouse_amr").task, load_profile("turtlebot3").task):
+        assert len(set(task.observation_names)) == task.observation_size
+
+
+def test_without_a_goal_the_route_is_not_observed():
+    task = msgspec.structs.replace(TASK, goal="none")
+    found = observe(task, signals(route_remaining_m=7.0), signals(), np.array([0]))
+    assert (found[0, :5] == 0).all()
+    assert not reached_goal(task, signals(goal_distance_m=0.0)).any()
+
+
+def test_the_nearest_action_and_how_far_it_is():
+    speed = np.array([0.0, 0.6, 2.0, 0.1, 0.25, np.float64(0.0)])
+    yaw = np.array([0.0, 0.0, 0.0, -0.7, 0.0, 1.0])
+    action, residual = nearest_action(TASK, speed, yaw)
+    assert action.tolist() == [0, 1, 2, 4, 0, 3]  # .25 lies between stop and .5: the first wins
+    assert residual == pytest.approx([0, 0.1, 1.0, np.hypot(0.1, 0.3), 0.25, 0])
+
+
+@given(st.integers(0, 4))
+def test_every_action_is_its_own_nearest(index):
+    speed, yaw = TASK.actions[index]
+    action, residual = nearest_action(TASK, np.array([speed]), np.array([yaw]))
+    assert (action[0], residual[0]) == (index, 0)
+
+
+@pytest.mark.parametrize(
+    ("values", "progress", "actions", "expected"),
+    [
+        ({}, 0.0, (0, 0), -0.02),
+        ({}, 0.2, (1, 1), 0.18),
+        ({}, 7.0, (1, 1), 0.98),  # progress is clipped
+        ({}, -7.0, (1, 1), -1.02),
+        ({}, 0.0, (1, 0), -0.03),
+        ({"clearance_m": 0.1}, 0.0, (0, 0), -0.07),
+        ({"bumped": True}, 0.0, (0, 0), -1.02),
+        ({"goal_distance_m": 0.4}, 0.0, (0, 0), 4.98),
+        ({"wheel_speed_mps": 0.7, "localised_speed_mps": 0.7}, 0.0, (0, 0), -0.07),  # 3.5 m/s2
+        ({"wheel_speed_mps": 0.5, "localised_speed_mps": 0.0}, 0.0, (0, 0), -0.05),  # slip .5
+    ],
+)
+def test_the_reward_by_hand(values, progress, actions, expected):
+    task = msgspec.structs.replace(TASK, rewards=Rewards(
+        progress_per_m=1.0, step=-0.02, action_change=-0.01, tight=-0.05, tight_clearance_m=0.15,
+        harsh=-0.05, harsh_mps2=3.0, slip_per_mps=-0.1, goal=5.0, bump=-1.0,
+    ))  # fmt: skip
+    found = reward(
+        task,
+        signals(),
+        signals(**values),
+        np.array([progress]),
+        np.array([actions[0]]),
+        np.array([actions[1]]),
+    )
+    assert found.dtype == np.float32
+    assert found[0] == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_bump_terminates_only_where_the_task_says_so():
+    after = signals(bumped=True)
+    assert not terminated(TASK, after).any()
+    assert terminated(msgspec.structs.replace(TASK, bump_terminates=True), after).all()
+    assert terminated(TASK, signals(goal_distance_m=0.3)).all()
+
+
+def test_the_clearance_ahead_is_of_the_sectors_toward_the_waypoint():
+    sectors = np.array([[1.0, 2.0, 3.0, 4.0, 0.5, 9.0, 9.0, 9.0]])
+    task = msgspec.structs.replace(TASK, sectors=8)
+    # Straight ahead, slightly left: sector 4, and its neighbours 3 and 5.
+    assert clearance_ahead(task, sectors, np.array([1.0]), np.array([0.1])) == pytest.approx([0.5])
+    # Straight behind on the right: sector 0, and round the seam 7 and 1.
+    assert clearance_ahead(task, sectors, np.array([-1.0]), np.array([-0.1])) == pytest.approx(
+        [1.0]
+    )
+
+
+def test_localised_velocity_of_a_turn_in_place_is_nothing():
+    before = signals(pose_yaw_rad=0.0, pose_stamp_ns=0)
+    now = signals(pose_yaw_rad=0.3, pose_stamp_ns=200_000_000)
+    forward, lateral = localised_velocity(now, before)
+    assert (forward[0], lateral[0]) == (0, 0)
+
+
+def test_localised_velocity_is_in_the_body_frame():
+    half_pi = np.pi / 2
+    before = signals(pose_yaw_rad=half_pi, pose_stamp_ns=0)
+    now = signals(pose_yaw_rad=half_pi, pose_stamp_ns=200_000_000, pose_y_m=0.1, pose_x_m=0.02)
+    forward, lateral = localised_velocity(now, before)
+    assert forward == pytest.approx([0.5])
+    assert lateral == pytest.approx([-0.1])  # +x is to the right of a robot that looks along +y
+
+
+def test_without_a_new_pose_the_wheels_are_believed():
+    now = signals(wheel_speed_mps=0.7, pose_stamp_ns=5, pose_x_m=1.0)
+    forward, lateral = localised_velocity(now, signals(pose_stamp_ns=5))
+    assert (forward[0], lateral[0]) == (pytest.approx(0.7), 0)
+
+
+@given(st.floats(-100, 100))
+def test_angles_wrap(angle):
+    wrapped = wrap_angle(np.array([angle]))[0]
+    assert -np.pi <= wrapped <= np.pi
+    assert np.cos(wrapped) == pytest.approx(np.cos(angle), abs=1e-9)
+    assert np.sin(wrapped) == pytest.approx(np.sin(angle), abs=1e-9)
+
+
+rows = arrays(np.float64, (6,), elements=st.floats(-5, 5))
+
+
+@given(rows, rows, arrays(np.float64, (6, 4), elements=st.floats(0, 6)))
+def test_every_row_stands_alone(speed, waypoint, clearance):
+    """Vectorised over steps or environments: no row's observation depends on another's."""
+    now = signals(6, wheel_speed_mps=speed, waypoint_near_y_m=waypoint)
+    now["sector_clearance_m"] = clearance
+    action = np.arange(6) % 5
+    together = observe(TASK, now, signals(6), action)
+    for index in range(6):
+        alone = {name: column[index : index + 1] for name, column in now.items()}
+        one = observe(TASK, alone, signals(1), action[index : index + 1])
+        assert np.array_equal(one[0], together[index])
+    assert np.isfinite(together).all()
+
+
+def test_the_hash_names_every_parameter():
+    assert TASK.hash == msgspec.json.decode(msgspec.json.encode(TASK), type=Task).hash
+    assert msgspec.structs.replace(TASK, near_m=1.1).hash != TASK.hash
+    harsher = msgspec.structs.replace(TASK.rewards, bump=-2.0)
+    assert msgspec.structs.replace(TASK, rewards=harsher).hash != TASK.hash
+
+
+def test_actions_have_names_for_people():
+    assert TASK.action_names == ["stop", "drive 0.5", "drive 1", "turn left 1", "turn right 1"]
+    names = load_profile("warehouse_amr").task.action_names
+    assert len(set(names)) == len(names)
+    assert names[0] == "stop"

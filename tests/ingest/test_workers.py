@@ -1,0 +1,199 @@
+"""Several workers: the same results, whoever of them dies, and no half-written store."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from support.driven_robot import Drive, write_bag
+
+from restock.cli import main
+from restock.ingest.batch import Job, ingest_all
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.workers import side_by_side
+from restock.replay.store.store import Store, is_store
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of recordings."""
+    folder = tmp_path_factory.mktemp("bags")
+    for number in range(5):
+        write_bag(Drive(duration_s=3.0 + number, truth="nominal"), folder / f"drive{number}")
+    return folder
+
+
+def _length(path: Path) -> int:
+    if path.name == "slow":
+        time.sleep(0.3)
+    if path.name.startswith("killed"):
+        os.kill(os.getpid(), signal.SIGKILL)
+    if path.name == "gone":
+        os._exit(7)
+    return len(path.name)
+
+
+def test_each_path_once_in_order_whoever_dies() -> None:
+    names = ["slow", "a", "killed1", "bb", "ccc", "gone", "dddd", "killed2"]
+    found = side_by_side(_length, [Path(name) for name in names], 2, died=lambda path, code: code)
+    assert list(found) == [4, 1, -9, 2, 3, 7, 4, -9]
+
+
+def test_a_caller_that_stops_early_stops_the_work() -> None:
+    found = side_by_side(_length, [Path("a"), *[Path("slow")] * 50], 2, died=lambda *_: -1)
+    assert next(found) == 1
+    found.close()
+    assert multiprocessing.active_children() == []
+
+
+class _Broken(Job):
+    """A job that fails in another way for each recording."""
+
+    def run(self, path):
+        if path.name == "drive1":
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().run(path)
+
+
+def test_a_killed_worker_costs_its_recording_only(bags, tmp_path):
+    job = _Broken(load_profile("warehouse_amr"), tmp_path / "s")
+    paths = sorted(bags.iterdir())
+    results = dict(ingest_all(paths, job, workers=2))
+    assert list(results) == paths
+    error = results.pop(bags / "drive1")
+    assert "drive1: the process that read it was killed (SIGKILL)" in str(error)
+    assert {result.status for result in results.values()} == {"written"}
+    with Store(tmp_path / "s") as store:
+        assert store.sql("SELECT count(*) FROM recordings").fetchall() == [(4,)]
+
+
+def test_the_command_names_it_and_exits_3(bags, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("restock.ingest.batch.Job", _Broken)
+    code = main(["ingest", str(bags), "--store", str(tmp_path / "s"), "--workers", "2", "--json"])
+    out, err = capsys.readouterr()
+    said = {Path(one["path"]).name: one["status"] for one in json.loads(out)["recordings"]}
+    assert code == 3
+    assert said.pop("drive1") == "failed"
+    assert list(said.values()) == ["written"] * 4
+    assert "drive1: the process that read it was killed (SIGKILL)" in err
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (MemoryError(), "memory ran out\n  with fewer --workers"),
+        (KeyError("x"), "a defect of Restock: KeyError: 'x' (test_workers.py, line "),
+    ],
+)
+def test_what_nobody_foresaw_costs_its_recording_only(bags, tmp_path, monkeypatch, error, said):
+    from restock.ingest import batch
+
+    ingest = batch.ingest
+
+    def failing(path, *args, **kwargs):
+        if path.name == "drive1":
+            raise error
+        return ingest(path, *args, **kwargs)
+
+    monkeypatch.setattr(batch, "ingest", failing)
+    job = Job(load_profile("warehouse_amr"), tmp_path / "s")
+    results = dict(ingest_all(sorted(bags.iterdir()), job))
+    assert said in str(results.pop(bags / "drive1"))
+    assert {result.status for result in results.values()} == {"written"}
+
+
+def command(bags: Path, store: Path, *more: str) -> list[str]:
+    return [
+        sys.executable, "-m", "restock", "ingest", str(bags), "--store", str(store), "--json", *more
+    ]  # fmt: skip
+
+
+def _alive(pid: int) -> bool:
+    stat = Path(f"/proc/{pid}/stat")
+    return stat.exists() and stat.read_text().rsplit(")", 1)[1].split()[0] != "Z"
+
+
+def descendants(pid: int) -> list[int]:
+    """A process's children, and theirs."""
+    found: list[int] = []
+    for task in Path(f"/proc/{pid}/task").glob("*/children"):
+        for child in map(int, task.read_text().split()):
+            found += [child, *descendants(child)]
+    return found
+
+
+def begun(process: subprocess.Popen[str], store: Path) -> None:
+    """Wait until the first recording is there."""
+    while not is_store(store):
+        assert process.poll() is None
+        time.sleep(0.01)
+
+
+def rows(store: Path) -> dict[str, int]:
+    """source -> transitions, as a reader sees them."""
+    with Store(store) as opened:
+        found = opened.sql(
+            "SELECT recordings.source_file[-6:], recordings.transitions, count(*)"
+            " FROM transitions JOIN recordings USING (ingest_id) GROUP BY ALL"
+        ).fetchall()
+    assert all(said == there for _, said, there in found)
+    assert len({name for name, _, _ in found}) == len(found)
+    return {name: there for name, _, there in found}
+
+
+needs_proc = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs Linux' /proc")
+
+
+@needs_proc
+@pytest.mark.parametrize(("workers", "after_s"), [("1", 0.0), ("2", 0.0), ("2", 0.06)])
+def test_a_kill_of_the_whole_command_leaves_whole_recordings(bags, tmp_path, workers, after_s):
+    store = tmp_path / "s"
+    process = subprocess.Popen(
+        command(bags, store, "--workers", workers), text=True, start_new_session=True
+    )
+    begun(process, store)
+    time.sleep(after_s)
+    children = descendants(process.pid)
+    process.kill()
+    process.wait()
+    while any(map(_alive, children)):  # the workers end by themselves
+        time.sleep(0.01)
+    before = rows(store)
+    done = subprocess.run(
+        command(bags, store, "--workers", workers), capture_output=True, text=True
+    )
+    assert done.returncode == 0
+    said = {Path(one["path"]).name: one for one in json.loads(done.stdout)["recordings"]}
+    assert len(said) == 5
+    assert {name: one["transitions"] for name, one in said.items()} == rows(store)
+    unchanged = {name for name, one in said.items() if one["status"] == "unchanged"}
+    assert unchanged == set(before)
+
+
+@needs_proc
+def test_ctrl_c_ends_with_130_and_leaves_nothing_running(bags, tmp_path):
+    store = tmp_path / "s"
+    process = subprocess.Popen(
+        command(bags, store, "--workers", "2"),
+        text=True,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
+    begun(process, store)
+    children = descendants(process.pid)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all of them
+    _, err = process.communicate()
+    assert (process.returncode, err) == (
+        130,
+        "restock: interrupted; nothing is left half-written\n",
+    )
+    while any(map(_alive, children)):
+        time.sleep(0.01)
+    rows(store)

@@ -1,0 +1,534 @@
+"""Each audit finds the fault planted for it, and nothing in data without it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from xml.etree import ElementTree
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from support.paths import ROOT
+from support.stores import TASK, manifest, recording_transitions, write_store
+
+from restock import cli
+from restock.errors import ConfigError
+from restock.replay.mixture.mixture import parse_mixture
+from restock.replay.panel.build import build_panel
+from restock.replay.places import open_place
+from restock.replay.store.audit import (
+    Audit,
+    Finding,
+    junit_xml,
+    load_audits,
+    load_thresholds,
+    rewrite,
+    run_audits,
+    shipped_audits,
+)
+from restock.replay.store.query import install
+from restock.replay.store.store import Store
+
+AUDITS = {audit.name: audit for audit in shipped_audits()}
+Tables = tuple[pa.Table, pa.Table]  # transitions, recordings
+
+
+def replaced(table: pa.Table, name: str, values: object) -> pa.Table:
+    place = table.schema.get_field_index(name)
+    field = table.schema.field(place)
+    if not isinstance(values, pa.Array):
+        values = pa.array(values, field.type)
+    return table.set_column(place, pa.field(name, values.type), values)
+
+
+@pytest.fixture(scope="module")
+def clean() -> Tables:
+    """Enough recent data of every condition that only the two logs' infos have anything to say."""
+    tables = [recording_transitions(index, episodes=120) for index in (1, 2)]
+    recordings = pa.concat_tables([manifest(table) for table in tables])
+    table = pa.concat_tables(tables)
+    recent = int(datetime.now(UTC).timestamp()) * 10**9
+    table = replaced(table, "stamp_ns", table["stamp_ns"].to_numpy() % 10**13 + recent - 10**14)
+    return table, recordings
+
+
+def found(tables: Tables, name: str, **thresholds: float) -> Finding:
+    with duckdb.connect() as connection:
+        connection.register("stored_transitions", tables[0])
+        connection.register("stored_recordings", tables[1])
+        install(connection, "FLOAT[]")
+        chosen = {name: load_thresholds().get(name, {}) | thresholds}
+        (finding,) = run_audits(connection, [AUDITS[name]], chosen)
+    return finding
+
+
+Plant = Callable[[pa.Table, pa.Table], Tables]
+
+
+def rows_where(table: pa.Table, name: str, value: object) -> np.ndarray:
+    return np.array([entry == value for entry in table[name].to_pylist()])
+
+
+def no_slip(table: pa.Table, recordings: pa.Table) -> Tables:
+    return table.filter(pa.array(~rows_where(table, "condition", "wheel_slip"))), recordings
+
+
+def slip_of_one_episode(table: pa.Table, recordings: pa.Table) -> Tables:
+    slip = rows_where(table, "condition", "wheel_slip")
+    one = table.filter(pa.array(slip))["episode_id"][0].as_py()
+    return table.filter(pa.array(~slip | rows_where(table, "episode_id", one))), recordings
+
+
+def never_back(table: pa.Table, recordings: pa.Table) -> Tables:
+    gone = rows_where(table, "condition", "recovery") & rows_where(table, "action", 4)
+    return table.filter(pa.array(~gone)), recordings
+
+
+def never_slipped_in_the_twin(table: pa.Table, recordings: pa.Table) -> Tables:
+    slip = rows_where(table, "condition", "wheel_slip")
+    return replaced(table, "perturbation", np.where(slip, None, "wet").tolist()), recordings
+
+
+def old_slip(table: pa.Table, recordings: pa.Table) -> Tables:
+    stamps = table["stamp_ns"].to_numpy().copy()
+    stamps[rows_where(table, "condition", "wheel_slip")] -= 400 * 86400 * 10**9
+    return replaced(table, "stamp_ns", stamps), recordings
+
+
+def only_planner_slips(table: pa.Table, recordings: pa.Table) -> Tables:
+    policy = np.array(table["behaviour_policy"].to_pylist())
+    policy[rows_where(table, "condition", "wheel_slip")] = "planner"
+    return replaced(table, "behaviour_policy", policy), recordings
+
+
+def null_reward(table: pa.Table, recordings: pa.Table) -> Tables:
+    reward = table["reward"].to_pylist()
+    reward[17] = None
+    return replaced(table, "reward", reward), recordings
+
+
+def nan_observation(table: pa.Table, recordings: pa.Table) -> Tables:
+    observation = table["observation"].to_pylist()
+    observation[5] = [float("nan"), *observation[5][1:]]
+    observation[6] = [*observation[6][:-1], float("inf")]
+    return replaced(table, "observation", observation), recordings
+
+
+def twice(table: pa.Table, recordings: pa.Table) -> Tables:
+    return pa.concat_tables([table, table.slice(3, 2)]), recordings
+
+
+def bag_and_a_part_of_it(table: pa.Table, recordings: pa.Table) -> Tables:
+    part = table.filter(pa.array(rows_where(table, "recording_id", f"{1:016x}"))).slice(20, 60)
+    part = replaced(part, "recording_id", [f"{9:016x}"] * len(part))
+    part = replaced(part, "source_file", ["logs/part.mcap"] * len(part))
+    part = replaced(part, "transition_id", (np.int64(9) << 25) + np.arange(len(part)))
+    return pa.concat_tables([table, part.cast(table.schema)]), recordings
+
+
+def two_tasks(table: pa.Table, recordings: pa.Table) -> Tables:
+    hashes = np.where(rows_where(table, "episode_index", 0), "0" * 12, TASK.hash)
+    return replaced(table, "task_hash", hashes), recordings
+
+
+def old_labels(table: pa.Table, recordings: pa.Table) -> Tables:
+    old = [datetime(2026, 1, 1, tzinfo=UTC), datetime(2025, 1, 1, tzinfo=UTC)]
+    recordings = replaced(recordings, "ingested_at", old)
+    versions = [recordings["labels_version"][0].as_py(), "000000000000"]
+    return table, replaced(recordings, "labels_version", versions)
+
+
+def poor_labels(table: pa.Table, recordings: pa.Table) -> Tables:
+    score = {"condition": "wheel_slip", "precision": 0.5, "recall": 0.9, "labelled": 50}
+    scores = [[score | {"support": 30}], []]
+    return table, replaced(recordings, "label_scores", scores)
+
+
+def failures(table: pa.Table, recordings: pa.Table) -> Tables:
+    # Episodes with a slip end in failure: cut instead of terminated.
+    failed = set(
+        table.filter(pa.array(rows_where(table, "condition", "wheel_slip")))[
+            "episode_id"
+        ].to_pylist()
+    )
+    fails = np.array([episode in failed for episode in table["episode_id"].to_pylist()])
+    over = table["terminated"].to_numpy()
+    table = replaced(table, "terminated", over & ~fails)
+    # Others all arrive, so that only this condition is one of failures.
+    return table, recordings
+
+
+def bumping_operator(table: pa.Table, recordings: pa.Table) -> Tables:
+    operator = rows_where(table, "behaviour_policy", "operator")
+    bumped = operator & (np.arange(len(table)) % 10 == 0)
+    return replaced(table, "bumped", bumped), recordings
+
+
+def many_drops(table: pa.Table, recordings: pa.Table) -> Tables:
+    drops = [[{"reason": "stale scan", "count": 2000}], []]
+    return table, replaced(recordings, "drops", drops)
+
+
+def far_operator(table: pa.Table, recordings: pa.Table) -> Tables:
+    operator = rows_where(table, "behaviour_policy", "operator")
+    return replaced(table, "action_residual", np.where(operator, 0.4, 0.0)), recordings
+
+
+def drifting_clearance(table: pa.Table, recordings: pa.Table) -> Tables:
+    clearance = table["clearance_m"].to_numpy().copy()
+    clearance[rows_where(table, "recording_id", f"{2:016x}")] += 5
+    return replaced(table, "clearance_m", clearance.astype(np.float32)), recordings
+
+
+def picky_operator(table: pa.Table, recordings: pa.Table) -> Tables:
+    """The operator drives only nominal episodes; in nominal ones all arrive, in others half."""
+    episode = np.array(table["episode_id"].to_pylist())
+    names = np.unique(episode)
+    number = np.searchsorted(names, episode)
+    slips = number % 3 == 0
+    table = replaced(table, "true_condition", np.where(slips, "wheel_slip", "nominal"))
+    operator = (number % 3 == 1) & (number % 2 == 0)
+    table = replaced(table, "behaviour_policy", np.where(operator, "operator", "planner"))
+    last = np.append(episode[1:] != episode[:-1], True)
+    arrives = last & (~slips | (number % 2 == 0))
+    table = replaced(table, "terminated", arrives)
+    table = replaced(table, "truncated", last & ~arrives)
+    return replaced(table, "reward", np.where(arrives, 5.0, -0.1).astype(np.float32)), recordings
+
+
+def mostly_easy_operator(table: pa.Table, recordings: pa.Table) -> Tables:
+    """As picky, but it drove one in ten of its episodes on a slippery floor, and failed there."""
+    table, recordings = picky_operator(table, recordings)
+    policy = np.array(table["behaviour_policy"].to_pylist())
+    number = np.array([int(name.split("/")[1]) for name in table["episode_id"].to_pylist()])
+    slips = rows_where(table, "true_condition", "wheel_slip")
+    return replaced(
+        table, "behaviour_policy", np.where(slips & (number % 30 == 3), "operator", policy)
+    ), recordings
+
+
+PLANTS: list[tuple[str, Plant, int, dict[str, object]]] = [
+    ("rare_condition", no_slip, 1, {"condition": "wheel_slip", "rows": 0}),
+    ("few_effective_episodes", slip_of_one_episode, 1, {"condition": "wheel_slip", "episodes": 1}),
+    ("missing_cells", never_back, 1, {"condition": "recovery", "action": 4, "rows": 0}),
+    ("thin_perturbation", never_slipped_in_the_twin, 1, {"condition": "wheel_slip", "rows": 0}),
+    ("stale_data", old_slip, 1, {"condition": "wheel_slip"}),
+    ("single_behaviour_policy", only_planner_slips, 1, {"condition": "wheel_slip"}),
+    ("null_values", null_reward, 1, {"transition_id": (1 << 25) + 17}),
+    ("non_finite_values", nan_observation, 2, {"transition_id": (1 << 25) + 5}),
+    ("duplicate_transitions", twice, 2, {"copies": 2}),
+    ("several_tasks", two_tasks, 2, {"task_hash": TASK.hash}),
+    ("stale_labels", old_labels, 1, {"recording_id": f"{2:016x}"}),
+    ("label_quality", poor_labels, 1, {"condition": "wheel_slip", "precision": 0.5}),
+    ("stratum_of_failures", failures, 1, {"condition": "wheel_slip", "success_share": 0.0}),
+    ("unsafe_data", bumping_operator, 1, {"behaviour_policy": "operator"}),
+    ("dropped_ticks", many_drops, 1, {"dropped": 2000}),
+    ("far_actions", far_operator, 1, {"behaviour_policy": "operator", "far_share": 1.0}),
+    ("repeated_steps", bag_and_a_part_of_it, 1, {"same_as_file": "logs/part.mcap", "rows": 60}),
+    ("observation_drift", drifting_clearance, 2, {"signal": "clearance_m"}),
+    ("flattering_policy", picky_operator, 1, {"behaviour_policy": "operator"}),
+    ("flattering_policy", mostly_easy_operator, 1, {"behaviour_policy": "operator"}),
+]
+
+
+# Labels of the stand-in data fall at random, so that failures of one condition touch all others.
+STRICTER: dict[str, dict[str, float]] = {
+    "stratum_of_failures": {"min_success_share": 0.01},
+    "thin_perturbation": {"min_rows": 1},  # there is little of the stand-in data
+}
+
+
+@pytest.mark.parametrize(("name", "plant", "rows", "first"), PLANTS, ids=[p[0] for p in PLANTS])
+def test_each_audit_finds_its_planted_fault_and_nothing_else(
+    clean: Tables, name: str, plant: Plant, rows: int, first: dict[str, object]
+) -> None:
+    if name not in ("far_actions",):  # the random residuals of the stand-in data are far
+        assert found(clean, name).status == "pass"
+    finding = found(plant(*clean), name, **STRICTER.get(name, {}))
+    assert finding.rows == rows
+    expected = {"error": "fail", "warning": "warn", "info": "info"}[AUDITS[name].severity]
+    assert finding.status == expected
+    assert first.items() <= finding.sample[0].items()
+
+
+def test_every_shipped_audit_of_a_store_has_a_planted_fault() -> None:
+    alone = {name for name, audit in AUDITS.items() if audit.needs is None}
+    # The stand-in data itself has no action probabilities.
+    assert {name for name, *_ in PLANTS} | {"no_action_probability"} == alone
+
+
+def test_missing_action_probabilities_are_said(clean: Tables) -> None:
+    finding = found(clean, "no_action_probability")
+    assert finding.status == "info"
+    assert {row["behaviour_policy"] for row in finding.sample} == {"planner", "operator"}
+
+
+def test_an_evaluation_full_of_easy_episodes_flatters(tmp_path: Path) -> None:
+    # The logs are about nominal and blocked episodes in equal parts; the evaluation is nine parts
+    # nominal, where the policy succeeds. Only the last evaluation counts.
+    table = recording_transitions(1, episodes=40)
+    truth = np.where(table["episode_index"].to_numpy() % 2 == 0, "nominal", "blocked_aisle")
+    evaluations = [
+        {"env_steps": steps, "condition": condition, "success": condition == "nominal"}
+        for steps in (100, 200)
+        for condition in ["nominal"] * (9 if steps == 200 else 1) + ["blocked_aisle"]
+    ]
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "config.json").write_text("{}")
+    store = write_store(tmp_path / "store", [replaced(table, "true_condition", truth)])
+    name = "flattering_evaluation"
+    thresholds = {name: load_thresholds()[name]}
+    pq.write_table(pa.Table.from_pylist(evaluations), run / "evaluations.parquet")
+    with open_place(store, beside={"run": run}) as connection:
+        (finding,) = run_audits(connection, [AUDITS[name]], thresholds, beside=["run"])
+        assert finding.rows == 1
+        assert finding.sample[0] == {
+            "condition": "nominal",
+            "share": 0.9,
+            "share_in_logs": 0.5,
+            "success_share": 1.0,
+        }
+        assert run_audits(connection, [AUDITS[name]], thresholds)[0].status == "skipped"
+    # Where the policy does as well everywhere, more of one condition flatters nobody.
+    everywhere = [row | {"success": True} for row in evaluations]
+    pq.write_table(pa.Table.from_pylist(everywhere), run / "evaluations.parquet")
+    with open_place(store, beside={"run": run}) as connection:
+        assert run_audits(connection, [AUDITS[name]], thresholds, beside=["run"])[0].rows == 0
+
+
+@pytest.fixture(scope="module")
+def panels(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A panel of the store for each way of holding out."""
+    folder, made = tmp_path_factory.mktemp("panels"), {}
+    with Store(store_path) as store:
+        for by in ("episode", "recording", "time"):
+            text = f"held_out = {{by = '{by}'}}\nplanned = {{updates = 50}}"
+            mixture = parse_mixture(f"{text}\n[each_condition]\nshare = 'equal'")
+            made[by] = build_panel(store, mixture, folder / by).path
+    return made
+
+
+def beside_panel(store: Path, panel: Path, name: str, spoil: str = "SELECT 1") -> Finding:
+    """What an audit finds of a panel whose held-out list was spoilt."""
+    chosen = {name: load_thresholds()[name]} if AUDITS[name].parameters else {}
+    with open_place(store, beside={"panel": panel}) as connection:
+        connection.execute(spoil).fetchall()
+        return run_audits(connection, [AUDITS[name]], chosen, beside=["panel"])[0]
+
+
+def test_strata_that_the_panel_flatters_are_named(
+    store_path: Path, panels: dict[str, Path]
+) -> None:
+    finding = beside_panel(store_path, panels["episode"], "flattering_panel")
+    boosted = {row["stratum"] for row in finding.sample}
+    assert boosted == {"wheel_slip", "blocked_aisle", "near_collision", "recovery"}
+
+
+LEAKS = {
+    "episode": ("episode", "the same episode", "SELECT * FROM panel.rows LIMIT 1"),
+    "recording": (
+        "recording",
+        "a recording that is held out",
+        "SELECT * REPLACE ('elsewhere' AS episode_id) FROM panel.rows LIMIT 1",
+    ),
+    "time": (
+        "time",
+        "later than what is held out",
+        "SELECT * REPLACE ('elsewhere' AS episode_id) FROM panel.rows ORDER BY logged_ns LIMIT 1",
+    ),
+}
+
+
+@pytest.mark.parametrize(("by", "leak", "spoilt"), LEAKS.values(), ids=LEAKS)
+def test_what_leaks_from_held_out_data_is_found(
+    store_path: Path, panels: dict[str, Path], by: str, leak: str, spoilt: str
+) -> None:
+    assert beside_panel(store_path, panels[by], "leakage").status == "pass"
+    spoil = f"CREATE OR REPLACE VIEW panel.held_out AS SELECT *, '{by}' AS split_by FROM ({spoilt})"
+    finding = beside_panel(store_path, panels[by], "leakage", spoil)
+    assert finding.status == "fail"
+    assert leak in {row["leak"] for row in finding.sample}
+
+
+def test_a_copy_of_a_held_out_step_is_a_leak(tmp_path: Path) -> None:
+    one = recording_transitions(1)
+    copy = replaced(one, "recording_id", [f"{7:016x}"] * len(one))
+    episodes = [f"{7:016x}/{index}" for index in one["episode_index"].to_pylist()]
+    copy = replaced(copy, "episode_id", episodes)
+    copy = replaced(copy, "transition_id", (np.int64(7) << 25) + np.arange(len(one)))
+    copy = replaced(copy, "ingest_id", ["copy"] * len(one))
+    path = write_store(tmp_path / "store", [one, copy])
+    mixture = parse_mixture("[each_condition]\n[held_out]\nby = 'recording'\nshare = 0.4")
+    with Store(path) as store:
+        panel = build_panel(store, mixture, tmp_path / "p")
+    finding = beside_panel(path, panel.path, "leakage")
+    assert {row["leak"] for row in finding.sample} == {"the same step under another id"}
+    assert finding.rows == len(one["episode_id"].unique())
+
+
+def test_strata_of_few_episodes_are_found_in_a_panel_and_in_a_run(
+    store_path: Path, panels: dict[str, Path], tmp_path: Path
+) -> None:
+    assert beside_panel(store_path, panels["episode"], "few_panel_episodes").status == "pass"
+    spoil = "UPDATE panel.strata SET effective_episodes = 2.5 WHERE name = 'wheel_slip'"
+    finding = beside_panel(store_path, panels["episode"], "few_panel_episodes", spoil)
+    assert [row["stratum"] for row in finding.sample] == ["wheel_slip"]
+
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "config.json").write_text("{}")
+    pq.write_table(pa.table({"condition": ["nominal"]}), run / "evaluations.parquet")
+    name = "few_drawn_episodes"
+    chosen = {name: load_thresholds()[name]}
+    with open_place(store_path, beside={"run": run}) as connection:  # from before there was one
+        (older,) = run_audits(connection, [AUDITS[name]], chosen, beside=["run"])
+    assert older.status == "skipped"
+    drawn = [("nominal", f"a/{index}", 10) for index in range(20)]
+    drawn += [("wheel_slip", "a/0", 500), ("wheel_slip", "a/1", 3), ("wheel_slip", "a/2", 3)]
+    rows = [
+        {"source": "logs", "stratum": stratum, "episode": episode, "drawn_rows": count}
+        for stratum, episode, count in drawn
+    ]
+    pq.write_table(pa.Table.from_pylist(rows), run / "fed_episodes.parquet")
+    with open_place(store_path, beside={"run": run}) as connection:
+        (finding,) = run_audits(connection, [AUDITS[name]], chosen, beside=["run"])
+    assert [(row["stratum"], row["episodes"]) for row in finding.sample] == [("wheel_slip", 3)]
+    assert finding.sample[0]["effective_episodes"] == pytest.approx(1.02, abs=0.01)
+
+
+def test_ones_own_audits_and_thresholds(tmp_path: Path, clean: Tables) -> None:
+    (tmp_path / "slow.sql").write_text(
+        "-- severity: error\n-- advice: Drive on.\n-- doc: Slow steps.\n"
+        "SELECT transition_id FROM transitions WHERE command_speed_mps < $least LIMIT 3"
+    )
+    (tmp_path / "rare_condition.sql").write_text(
+        "-- severity: info\n-- advice: None.\n-- doc: Nothing.\nSELECT 1 WHERE false"
+    )
+    audits = {audit.name: audit for audit in load_audits(tmp_path)}
+    assert audits["rare_condition"].severity == "info"
+    assert audits.keys() == AUDITS.keys() | {"slow"}
+    (tmp_path / "mine.toml").write_text("[slow]\nleast = 0.5\n[stale_data]\nmax_age_days = 7")
+    thresholds = load_thresholds(tmp_path / "mine.toml")
+    assert thresholds["stale_data"] == {"max_age_days": 7}
+    with duckdb.connect() as connection:
+        connection.register("stored_transitions", clean[0])
+        connection.register("stored_recordings", clean[1])
+        install(connection, "FLOAT[]")
+        (finding,) = run_audits(connection, [audits["slow"]], {"slow": thresholds["slow"]})
+        assert (finding.status, finding.rows) == ("fail", 3)
+        with pytest.raises(ConfigError, match="no threshold least"):
+            run_audits(connection, [audits["slow"]], {})
+        with pytest.raises(ConfigError, match=r"slow\.most is no threshold"):
+            run_audits(connection, [audits["slow"]], {"slow": {"least": 1, "most": 2}})
+        with pytest.raises(ConfigError, match="no audit named 'sloow'"):
+            run_audits(connection, [audits["slow"]], {"sloow": {"least": 1}})
+        broken = Audit("broken", "error", "", "", None, "SELECT nothing FROM transitions")
+        with pytest.raises(ConfigError, match=r"broken.*does not run"):
+            run_audits(connection, [broken], {})
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("-- severity: error\n-- doc: x\nSELECT 1", "no `-- advice"),
+        ("-- severity: bad\n-- advice: x\n-- doc: x\nSELECT 1", "severity 'bad'"),
+    ],
+)
+def test_an_audit_without_a_whole_header_is_refused(
+    tmp_path: Path, text: str, message: str
+) -> None:
+    (tmp_path / "mine.sql").write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        load_audits(tmp_path)
+
+
+def test_wrong_files_of_audits_and_thresholds_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no audits"):
+        load_audits(tmp_path)
+    (tmp_path / "t.toml").write_text("rare_condition = 3")
+    with pytest.raises(ConfigError, match="no table"):
+        load_thresholds(tmp_path / "t.toml")
+    (tmp_path / "t.toml").write_text("[rare")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_thresholds(tmp_path / "t.toml")
+
+
+def test_thresholds_are_those_the_audits_use() -> None:
+    shipped = load_thresholds()
+    assert {name: set(table) for name, table in shipped.items()} == {
+        name: audit.parameters for name, audit in AUDITS.items() if audit.parameters
+    }
+
+
+def test_the_verb_fails_on_an_error_and_passes_without(
+    store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    junit = tmp_path / "audit.xml"
+    assert cli.main(["audit", str(store_path), "--json", "--junit", str(junit)]) == 1
+    document = json.loads(capsys.readouterr().out)
+    assert document["failed"] == 1
+    assert [a["audit"] for a in document["audits"] if a["status"] == "fail"] == ["rare_condition"]
+    root = ElementTree.fromstring(junit.read_text())
+    failed = [case.get("name") for case in root if case.find("failure") is not None]
+    assert failed == ["rare_condition"]
+    assert root.get("tests") == str(len(AUDITS))
+    easy = tmp_path / "easy.toml"
+    easy.write_text("[rare_condition]\nmin_rows = 1\nmin_episodes = 1")
+    assert cli.main(["audit", str(store_path), "--thresholds", str(easy)]) == 0
+    out = capsys.readouterr().out
+    assert "stale_data" in out
+    assert "skipped" in out
+    assert cli.main(["audit", str(store_path), "--thresholds", str(easy), "--strict"]) == 1
+
+
+def test_the_verb_refuses_what_is_no_store(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["audit", str(tmp_path)]) == 2
+    assert "not a store" in capsys.readouterr().err
+
+
+def test_the_verb_refuses_a_run_that_is_none_and_a_file_it_cannot_write(
+    store_path: Path, panels: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = str(store_path)
+    assert cli.main(["audit", store, "--run", str(panels["time"])]) == 2
+    assert "is not a run directory" in capsys.readouterr().err
+    assert cli.main(["audit", store, "--junit", str(tmp_path / "nowhere" / "x.xml")]) == 2
+    assert "cannot be written" in capsys.readouterr().err
+
+
+def test_junit_is_as_its_readers_expect() -> None:
+    """The rules of junit-10.xsd that concern us: names of elements, attributes, and the counts."""
+    rows = [{"source_file": "a\x00b\x1b[31m\ud800<&>", "rows": 3}]
+    findings = [
+        Finding(AUDITS["rare_condition"], "fail", 3, ["rows"], rows, {}),
+        Finding(AUDITS["stale_data"], "warn", 1, ["rows"], rows, {}),
+        Finding(AUDITS["several_tasks"], "pass", 0, [], [], {}),
+        Finding(AUDITS["leakage"], "skipped", 0, [], [], {}),
+    ]
+    text = junit_xml(findings, "audit \x07 store")
+    root = ElementTree.fromstring(text.encode("utf-8"))  # what XML cannot hold is not in it
+    assert root.tag == "testsuite"
+    assert root.keys() == ["name", "tests", "failures", "errors", "skipped"]
+    assert [root.get(name) for name in ("tests", "failures", "errors", "skipped")] == list("4101")
+    for case in root:
+        assert case.tag == "testcase"
+        assert {"name", "classname"} == set(case.keys())
+        assert {child.tag for child in case} <= {"failure", "skipped", "system-out"}
+    failure = root[0].find("failure")
+    assert failure is not None
+    assert "<&>" in str(failure.text)
+    assert root[1].find("failure") is None
+    assert root[3].find("skipped") is not None
+
+
+def test_the_page_lists_every_audit_as_it_is() -> None:
+    page = (ROOT / "docs" / "audit.md").read_text(encoding="utf-8")
+    assert rewrite(page) == page, "run: python -m restock.replay.store.audit docs/audit.md"

@@ -1,0 +1,146 @@
+"""The density ratio where it is known: outcomes stay as they are, states stay boosted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from numpy.typing import NDArray
+from support.stores import CONDITIONS, TASK
+
+from restock.replay.mixture.mixture import CorrectionRule, StratumRule, parse_mixture
+from restock.replay.panel.build import build_panel, open_source
+from restock.replay.panel.density_ratio import OutcomeModel, density_ratio
+from restock.replay.panel.plan import plan_panel
+from restock.replay.panel.strata import Stratum
+from restock.replay.panel.weights import effective_count, importance_weights
+
+COUNT = 30_000
+
+
+def slippery(seed: int = 0) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Features (n, 4), the true chance of a slip (n,), and whether it slipped (n,)."""
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(COUNT, 4))
+    chance = 1 / (1 + np.exp(-(-3.0 + 1.2 * x[:, 0] - 0.8 * x[:, 1])))
+    return x, chance, rng.random(COUNT) < chance
+
+
+def strata(correction: str) -> list[Stratum]:
+    return [
+        Stratum(StratumRule(name="slip"), "true", None, 1, "post", correction),  # type: ignore[arg-type]
+        Stratum(StratumRule(name="nominal"), "true", None, 9, "pre", "none"),
+    ]
+
+
+def test_the_estimate_is_the_true_ratio() -> None:
+    x, chance, slipped = slippery()
+    share = 0.5
+    boost = np.array([share / slipped.mean(), (1 - share) / (1 - slipped.mean())])
+    truth = (chance * boost[0] + (1 - chance) * boost[1]) / boost[1]
+    model = OutcomeModel(x, slipped.astype(np.int64), 2)
+    estimated = model.probability(x)[:, 1].astype(np.float32)
+    outcome = np.stack([estimated, np.zeros(COUNT, np.float32)], axis=1)
+    ratio = density_ratio(outcome, boost, np.full(COUNT, boost[1]), clip=1e9)
+    error = np.abs(np.log(ratio) - np.log(truth))
+    assert error.mean() < 0.05
+    assert np.quantile(error, 0.99) < 0.15
+    clipped = density_ratio(outcome, boost, np.full(COUNT, boost[1]), clip=2.0)
+    np.testing.assert_allclose(clipped, np.minimum(ratio, 2.0))
+
+
+def test_a_fit_on_a_part_of_the_common_outcome_stands_for_all_of_it() -> None:
+    x, chance, slipped = slippery()
+    rng = np.random.default_rng(1)
+    kept = slipped | (rng.random(COUNT) < 0.2)
+    weight = np.where(slipped, 1.0, 5.0)[kept]
+    model = OutcomeModel(x[kept], slipped[kept].astype(np.int64), 2, weight)
+    assert np.abs(model.probability(x)[:, 1] - chance).mean() < 0.02
+
+
+@pytest.mark.parametrize("estimate", ["true", "useless"])
+def test_outcomes_stay_as_they_are_however_good_the_fit(estimate: str) -> None:
+    """P(slip | state) after weights is what it was, in every part of the state space."""
+    _, chance, slipped = slippery()
+    code = np.where(slipped, 0, 1).astype(np.int16)
+    state = np.ones(COUNT, np.int16)
+    shares = np.array([0.5, 0.5])
+    guess = chance if estimate == "true" else np.full(COUNT, slipped.mean())
+    outcome = np.stack([guess, np.zeros(COUNT)], axis=1).astype(np.float32)
+    rule = CorrectionRule(clip=50.0)
+    weight = importance_weights(code, state, strata("density_ratio"), shares, rule, outcome)
+    drawn = (shares / np.bincount(code))[code]
+    assert (drawn * weight).sum() == pytest.approx(1, rel=1e-4)
+    risk = np.digitize(chance, [0.02, 0.05, 0.1, 0.3])
+    for part in range(5):
+        mine = risk == part
+        after = (drawn * weight)[mine & slipped].sum() / (drawn * weight)[mine].sum()
+        # Within a part the ratio varies, and with it where in the part the rows lie.
+        assert after == pytest.approx(slipped[mine].mean(), rel=0.12)
+    # Uncorrected, slips are far too frequent.
+    raw = drawn[(risk == 2) & slipped].sum() / drawn[risk == 2].sum()
+    assert raw > 4 * slipped[risk == 2].mean()
+
+
+def test_risky_states_stay_boosted_where_full_correction_takes_the_boost_away() -> None:
+    _, chance, slipped = slippery()
+    code = np.where(slipped, 0, 1).astype(np.int16)
+    state, shares = np.ones(COUNT, np.int16), np.array([0.5, 0.5])
+    outcome = np.stack([chance, np.zeros(COUNT)], axis=1).astype(np.float32)
+    drawn = (shares / np.bincount(code))[code]
+    risky = chance > 0.3
+
+    def of_risky(correction: str, given: NDArray[np.float32] | None = None) -> float:
+        rule = CorrectionRule(clip=50.0)
+        weight = importance_weights(code, state, strata(correction), shares, rule, given)
+        return float((drawn * weight)[risky].sum())
+
+    natural = risky.mean()
+    assert of_risky("full") == pytest.approx(natural, rel=0.01)
+    assert of_risky("density_ratio", outcome) == pytest.approx(drawn[risky].sum(), rel=0.05)
+    assert drawn[risky].sum() > 2.5 * natural
+    # What that costs: between the natural sample of full correction and the uncorrected one.
+    worth = {
+        name: effective_count(
+            drawn
+            * importance_weights(
+                code, state, strata(name), shares, CorrectionRule(clip=50.0), given
+            )
+        )
+        for name, given in (("none", None), ("density_ratio", outcome), ("full", None))
+    }
+    assert worth["full"] == pytest.approx(COUNT, rel=1e-3)
+    assert worth["none"] < worth["density_ratio"] < worth["full"]
+
+
+TEXT = """
+[correction]
+post = "density_ratio"
+[each_condition]
+share = "equal"
+"""
+
+
+def test_a_plan_estimates_the_ratio_and_the_panel_keeps_what_new_shares_need(
+    transitions: pa.Table, tmp_path: object
+) -> None:
+    mixture = parse_mixture(TEXT)
+    with open_source(transitions, mixture, task=TASK, conditions=CONDITIONS) as source:
+        plan = plan_panel(source.connection, mixture, source.conditions)
+    (fit,) = plan.ratios
+    assert set(fit.strata) == {s.stratum for s in plan.strata if s.timing == "post"}
+    assert fit.base_log_loss > 0
+    assert fit.rows > 100
+    share = np.array([line.share for line in plan.strata])
+    rows = np.array([line.rows for line in plan.strata])
+    code = plan.stratum[plan.panel_rows]
+    assert ((share / rows)[code] * plan.weight).sum() == pytest.approx(1, rel=1e-4)
+    panel = build_panel(transitions, mixture, f"{tmp_path}/panel", task=TASK, conditions=CONDITIONS)
+    for name in fit.strata:
+        chance = panel.meta[f"probability_of_{name}"].to_numpy()
+        assert ((chance >= 0) & (chance <= 1)).all()
+        # The labels of these rows are drawn by chance: what the features say of them is the mean.
+        assert chance.mean() == pytest.approx(
+            (panel.meta["stratum"].to_pylist()).count(name) / len(panel), abs=0.02
+        )
+    assert panel.header.ratios == [fit]

@@ -1,0 +1,471 @@
+"""Exports: trajectories put back together, each format read back, by the real library where it is.
+
+Not every library can live in one environment (d3rlpy pins an old Gymnasium, lerobot a torch with
+CUDA), so those two are read with the Python that RESTOCK_NEIGHBOURS_PYTHON names, else with that of
+`.venv-neighbours` where there is one, else with this one.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from support.stores import TASK, recording_transitions, write_store
+
+from restock import cli
+from restock.errors import ExitCode, PanelError, QueryError, StoreError
+from restock.replay.export.dataset import FORMATS, export_dataset
+from restock.replay.export.selection import open_selection
+from restock.replay.export.trajectory import Counts, Trajectory, trajectories
+from restock.replay.mixture.mixture import parse_mixture
+from restock.replay.panel.build import build_panel
+from restock.replay.panel.panel import Panel
+
+TESTS = Path(__file__).parent
+SLIP = "FROM transitions WHERE condition = 'wheel_slip'"
+
+
+def of(path: Path, **arguments: Any) -> tuple[list[Trajectory], Counts]:
+    counts = Counts()
+    with open_selection(path, **arguments) as selection:
+        found = trajectories(
+            selection.batches, continuous=selection.continuous, counts=counts, where="here"
+        )
+        return list(found), counts
+
+
+def ordered(transitions: pa.Table) -> pa.Table:
+    keys = ("recording_id", "episode_index", "step_index")
+    return transitions.sort_by([(key, "ascending") for key in keys])
+
+
+def matrix(column: pa.ChunkedArray) -> np.ndarray:
+    return np.array(column.to_pylist(), np.float32)
+
+
+def panel_of(store: Path, out: Path, n_step: int, where: str = "") -> Panel:
+    from restock.replay.store.store import Store
+
+    mixture = parse_mixture(
+        f'n_step = {n_step}\n{where}[each_condition]\nshare = "natural"\n[held_out]\nby = "none"\n'
+    )
+    with Store(store) as opened:
+        return build_panel(opened, mixture, out)
+
+
+def test_whole_episodes_come_back_in_order_with_their_final_observation(
+    store_path: Path, transitions: pa.Table
+) -> None:
+    found, counts = of(store_path)
+    rows = ordered(transitions)
+    assert counts.rows == counts.transitions == len(rows)
+    assert counts.cut == 0
+    assert counts.terminated == int(np.sum(rows["terminated"].to_numpy()))
+    assert counts.truncated == int(np.sum(rows["truncated"].to_numpy()))
+    observations = np.concatenate([t.observations[:-1] for t in found])
+    after = np.concatenate([t.observations[1:] for t in found])
+    np.testing.assert_array_equal(observations, matrix(rows["observation"]))
+    np.testing.assert_array_equal(after, matrix(rows["next_observation"]))
+    for name, column in (("rewards", "reward"), ("actions", "action")):
+        joined = np.concatenate([getattr(t, name) for t in found])
+        np.testing.assert_array_equal(joined, rows[column].to_numpy())
+    ids = np.concatenate([t.carried["transition_id"] for t in found])
+    np.testing.assert_array_equal(ids, rows["transition_id"].to_numpy())
+    assert [t.terminated for t in found] == [
+        end for end, cut in zip(rows["terminated"].to_pylist(), rows["truncated"].to_pylist(),
+                                strict=True) if end or cut
+    ]  # fmt: skip
+
+
+def test_an_episode_is_cut_where_a_query_leaves_rows_out(
+    store_path: Path, transitions: pa.Table
+) -> None:
+    found, counts = of(store_path, query=SLIP)
+    slipping = {
+        row["transition_id"]: row
+        for row in transitions.to_pylist()
+        if row["condition"] == "wheel_slip"
+    }
+    assert counts.transitions == len(slipping)
+    assert counts.cut > 0
+    for t in found:
+        ids = t.carried["transition_id"].tolist()
+        assert ids == list(range(ids[0], ids[0] + len(t)))  # steps on end
+        np.testing.assert_array_equal(t.observations[-1], slipping[ids[-1]]["next_observation"])
+        last = slipping[ids[-1]]
+        assert t.terminated == last["terminated"]
+        assert t.cut == (not last["terminated"] and not last["truncated"])
+
+
+def test_small_batches_give_the_same_trajectories(
+    store_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, _ = of(store_path)
+    monkeypatch.setattr("restock.replay.export.selection.BATCH_ROWS", 7)
+    with open_selection(store_path) as selection:
+        pieces = [
+            piece.slice(start, 7)
+            for piece in selection.batches
+            for start in range(0, len(piece), 7)
+        ]
+    some = list(trajectories(iter(pieces), continuous=False, counts=Counts(), where="here"))
+    assert len(some) == len(whole)
+    for one, other in zip(some, whole, strict=True):
+        assert (one.episode_id, one.first_step) == (other.episode_id, other.first_step)
+        np.testing.assert_array_equal(one.observations, other.observations)
+
+
+def test_a_step_whose_next_observation_is_not_the_next_steps_is_an_end() -> None:
+    rows = recording_transitions(1, episodes=1)
+    broken = rows["next_observation"].to_pylist()
+    broken[3][0] += 1.0
+    place = rows.column_names.index("next_observation")
+    rows = rows.set_column(
+        place, rows.field(place), pa.array(broken, rows.schema.field(place).type)
+    )
+    counts = Counts()
+    found = list(
+        trajectories(iter(rows.to_batches()), continuous=False, counts=counts, where="here")
+    )
+    assert [len(t) for t in found] == [4, len(rows) - 4]
+    assert [t.cut for t in found] == [True, False]
+
+
+def test_a_panel_of_n_steps_gives_back_single_steps(store_path: Path, tmp_path: Path) -> None:
+    one = panel_of(store_path, tmp_path / "one", 1)
+    three = panel_of(store_path, tmp_path / "three", 3)
+    single, counts = of(one.path)
+    several, counts_too = of(three.path)
+    assert counts.transitions == counts_too.transitions == len(one)
+    for left, right in zip(single, several, strict=True):
+        np.testing.assert_array_equal(left.observations, right.observations)
+        np.testing.assert_array_equal(left.rewards, right.rewards)
+        assert left.terminated == right.terminated
+
+
+def test_a_panel_with_holes_leaves_out_and_counts_what_it_cannot_tell(
+    store_path: Path, tmp_path: Path
+) -> None:
+    holes = panel_of(store_path, tmp_path / "holes", 3, 'where = "step_index % 5 <> 4"\n')
+    found, counts = of(holes.path)
+    whole, _ = of(store_path)
+    by_id = {
+        identity: (t, at)
+        for t in whole
+        for at, identity in enumerate(t.carried["transition_id"].tolist())
+    }
+    for t in found:
+        origin, at = by_id[int(t.carried["transition_id"][0])]
+        expected = origin.observations[at : at + len(t) + 1]
+        np.testing.assert_array_equal(t.observations, expected)
+    assert counts.transitions + sum(counts.left_out.values()) == counts.rows == len(holes)
+
+
+@pytest.mark.parametrize("to", sorted(FORMATS))
+def test_every_format_says_where_it_is_from_and_leaves_no_trace_of_a_failure(
+    to: str, store_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if FORMATS[to][1]:
+        pytest.importorskip(FORMATS[to][1])
+    out = tmp_path / f"out{FORMATS[to][2]}"
+
+    def broken(self: Trajectory) -> bool:
+        raise RuntimeError("the disk is full")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Trajectory, "truncated", property(broken))
+        patched.setattr(Trajectory, "__len__", broken)
+        with pytest.raises(RuntimeError, match="disk is full"):
+            export_dataset(store_path, to, out)
+    assert not list(tmp_path.iterdir())
+    document = export_dataset(store_path, to, out, query=SLIP)
+    assert [path.name for path in tmp_path.iterdir()] == [out.name]
+    assert document["provenance"]["query"] == SLIP
+    assert document["provenance"]["task_hash"] == TASK.hash
+    assert provenance_in(to, out)["counts"] == {
+        name: document[name] for name in Counts().describe()
+    }
+    with pytest.raises(StoreError, match="already there"):
+        export_dataset(store_path, to, out)
+
+
+def provenance_in(to: str, out: Path) -> Any:
+    """What the data set itself says."""
+    text: Callable[[], Any] = {
+        "parquet": lambda: pq.read_metadata(out).metadata[b"restock"],
+        "npz": lambda: np.load(out)["restock"].item(),
+        "lerobot": lambda: (out / "meta/restock.json").read_text(),
+        "minari": lambda: json.loads((out / "metadata.json").read_text())["restock"],
+        "d3rlpy": lambda: __import__("h5py").File(out)["restock"].attrs["provenance"],
+    }[to]
+    return json.loads(text())
+
+
+def test_parquet_reads_back(store_path: Path, tmp_path: Path, transitions: pa.Table) -> None:
+    export_dataset(store_path, "parquet", tmp_path / "a.parquet")
+    table, rows = pq.read_table(tmp_path / "a.parquet"), ordered(transitions)
+    for name in ("observation", "next_observation"):
+        np.testing.assert_array_equal(matrix(table[name]), matrix(rows[name]))
+    for name in ("action", "reward", "terminated", "truncated", "transition_id", "condition"):
+        assert table[name].to_pylist() == rows[name].to_pylist()
+
+
+def test_npz_reads_back_without_pickles(
+    store_path: Path, tmp_path: Path, transitions: pa.Table
+) -> None:
+    export_dataset(store_path, "npz", tmp_path / "a.npz", continuous=True)
+    arrays, rows = np.load(tmp_path / "a.npz", allow_pickle=False), ordered(transitions)
+    np.testing.assert_array_equal(arrays["observations"], matrix(rows["observation"]))
+    np.testing.assert_array_equal(arrays["actions"][:, 0], rows["command_speed_mps"].to_numpy())
+    np.testing.assert_array_equal(arrays["actions"][:, 1], rows["command_yaw_rate_radps"])
+    np.testing.assert_array_equal(arrays["terminals"], rows["terminated"].to_numpy())
+    np.testing.assert_array_equal(arrays["timeouts"], rows["truncated"].to_numpy())
+    assert arrays["condition"].tolist() == rows["condition"].to_pylist()
+
+
+@pytest.mark.parametrize("continuous", [False, True])
+def test_minari_reads_its_data_set(store_path: Path, tmp_path: Path, continuous: bool) -> None:
+    minari = pytest.importorskip("minari")
+    export_dataset(store_path, "minari", tmp_path / "logs", continuous=continuous)
+    dataset = minari.MinariDataset(tmp_path / "logs")
+    expected, counts = of(store_path, continuous=continuous)
+    assert dataset.total_steps == counts.transitions
+    space = dataset.action_space
+    assert isinstance(space, gymnasium.spaces.Box if continuous else gymnasium.spaces.Discrete)
+    for episode, t in zip(dataset.iterate_episodes(), expected, strict=True):
+        np.testing.assert_array_equal(episode.observations, t.observations)
+        np.testing.assert_array_equal(episode.actions, t.actions)
+        np.testing.assert_array_equal(episode.rewards, t.rewards)
+        assert episode.terminations[-1] == t.terminated
+        assert episode.truncations[-1] == t.truncated
+        assert not (episode.terminations | episode.truncations)[:-1].any()
+        assert all(action in space for action in episode.actions)
+        ids = episode.infos["transition_id"]
+        assert ids.tolist() == [*t.carried["transition_id"].tolist(), -1]
+
+
+def test_minari_makes_the_twin_again_for_logs_of_its_task(tmp_path: Path) -> None:
+    minari = pytest.importorskip("minari")
+    from restock.ingest.profile.profile import load_profile
+
+    task = load_profile("warehouse_amr").task
+    store = write_store(tmp_path / "s", [recording_transitions(1, task=task)], task=task)
+    registered = gymnasium.spec("restock/Warehouse-v0").kwargs.copy()
+    export_dataset(store, "minari", tmp_path / "logs", continuous=True)
+    env = minari.MinariDataset(tmp_path / "logs").recover_environment()
+    assert env.observation_space.shape == (task.observation_size,)
+    assert isinstance(env.action_space, gymnasium.spaces.Box)
+    assert gymnasium.spec("restock/Warehouse-v0").kwargs == registered
+
+
+def read_with(library: str, path: Path) -> Any:
+    """What the real library finds, in a Python that has it; the test is skipped where none has."""
+    apart = TESTS.parent / ".venv-neighbours" / "bin" / "python"
+    python = os.environ.get("RESTOCK_NEIGHBOURS_PYTHON") or str(
+        apart if apart.exists() else sys.executable
+    )
+    probe = f"import importlib.util as u; raise SystemExit(u.find_spec('{library}') is None)"
+    if subprocess.run([python, "-c", probe], check=False).returncode:
+        pytest.skip(f"{python} has no {library}")
+    done = subprocess.run(
+        [python, str(TESTS / f"read_with_{library}.py"), str(path)],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=path.parent,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize("continuous", [False, True])
+def test_d3rlpy_reads_its_data_set_and_trains_on_it(
+    store_path: Path, tmp_path: Path, continuous: bool
+) -> None:
+    pytest.importorskip("h5py")
+    export_dataset(store_path, "d3rlpy", tmp_path / "a.h5", query=SLIP, continuous=continuous)
+    found = read_with("d3rlpy", tmp_path / "a.h5")
+    expected, counts = of(store_path, query=SLIP, continuous=continuous)
+    assert found["transitions"] == counts.transitions
+    assert found["discrete"] != continuous
+    assert found["trained"]
+    for episode, t in zip(found["episodes"], expected, strict=True):
+        assert episode["terminated"] == t.terminated
+        np.testing.assert_allclose(np.squeeze(episode["actions"], -1) if not continuous
+                                   else episode["actions"], t.actions, rtol=1e-6)  # fmt: skip
+        np.testing.assert_allclose(episode["rewards"], t.rewards, rtol=1e-6)
+        np.testing.assert_allclose(episode["first"], t.observations[:-1, 0], rtol=1e-6)
+        steps = slice(1, -1) if t.terminated else slice(1, None)  # there it gives zeros
+        expected_next = t.observations[steps, 0]
+        np.testing.assert_allclose(episode["next_first"][: len(expected_next)], expected_next)
+        assert episode["terminal"] == [0.0] * (len(t) - 1) + [float(t.terminated)]
+
+
+def test_lerobot_reads_its_data_set(
+    store_path: Path, tmp_path: Path, transitions: pa.Table
+) -> None:
+    export_dataset(store_path, "lerobot", tmp_path / "a")
+    found = read_with("lerobot", tmp_path / "a")
+    rows = ordered(transitions)
+    assert found["fps"] == 1 / TASK.control_period_s
+    for name, column in (
+        ("action", "action"),
+        ("terminated", "terminated"),
+        ("truncated", "truncated"),
+        ("transition_id", "transition_id"),
+        ("condition", "condition"),
+    ):
+        assert found[name] == rows[column].to_pylist()
+    np.testing.assert_allclose(found["reward"], rows["reward"].to_numpy(), rtol=1e-6)
+    np.testing.assert_allclose(found["mean_reward"], rows["reward"].to_numpy().mean(), rtol=1e-5)
+    for name, column in (("first", "observation"), ("next_first", "next_observation")):
+        np.testing.assert_allclose(found[name], matrix(rows[column])[:, 0], rtol=1e-6)
+    assert len(found["lengths"]) == found["episodes"]
+    begin = found["lengths"][0]
+    assert found["chunk"] == found["action"][begin : begin + 2]
+
+
+def test_lerobots_layout_is_complete_without_lerobot(
+    store_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("restock.replay.export.lerobot_v3.DATA_FILE_MB", 0.05)  # several files
+    monkeypatch.setattr("restock.replay.export.lerobot_v3.CHUNK_FILES", 2)
+    out = tmp_path / "a"
+    document = export_dataset(store_path, "lerobot", out)
+    info = json.loads((out / "meta/info.json").read_text())
+    assert info["codebase_version"] == "v3.0"
+    assert info["total_frames"] == document["transitions"]
+    episodes = pq.read_table(out / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert (out / "data/chunk-001/file-000.parquet").is_file()
+    for episode in episodes:
+        path = info["data_path"].format(
+            chunk_index=episode["data/chunk_index"], file_index=episode["data/file_index"]
+        )
+        frames = pq.read_table(
+            out / path, filters=[("episode_index", "==", episode["episode_index"])]
+        )
+        span = range(episode["dataset_from_index"], episode["dataset_to_index"])
+        assert frames["index"].to_pylist() == list(span)
+        assert set(frames.column_names) == set(info["features"])
+    stats = json.loads((out / "meta/stats.json").read_text())
+    reward = pq.ParquetDataset(out / "data").read()["next.reward"].to_numpy()
+    np.testing.assert_allclose(stats["next.reward"]["mean"], reward.mean(), rtol=1e-5)
+    np.testing.assert_allclose(stats["next.reward"]["std"], reward.std(), rtol=1e-5)
+    tasks = pq.read_table(out / "meta/tasks.parquet").to_pandas()
+    assert tasks.iloc[0].name.startswith("Drive along")
+
+
+def test_a_query_that_lacks_columns_is_refused_by_their_names(
+    store_path: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(QueryError, match="the query gives no next_observation, truncated"):
+        export_dataset(
+            store_path,
+            "npz",
+            tmp_path / "a.npz",
+            query="SELECT * EXCLUDE (next_observation, truncated) FROM transitions",
+        )
+    with pytest.raises(QueryError, match="gives no command_speed_mps"):
+        export_dataset(
+            store_path,
+            "npz",
+            tmp_path / "a.npz",
+            query="SELECT * EXCLUDE (command_speed_mps) FROM transitions;",
+            continuous=True,
+        )
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"to": "tfrecord"}, StoreError, "no format 'tfrecord'"),
+        ({"to": "npz", "out": "a.zip"}, StoreError, "a file that ends in .npz"),
+        ({"query": "FROM transitions WHERE false"}, StoreError, "gives no rows"),
+        ({"query": "FROM transitions UNION ALL FROM transitions"}, StoreError, "comes twice"),
+        ({"query": "COPY transitions TO 'a.csv'"}, QueryError, "read-only"),
+        ({"query": "FROM nowhere"}, QueryError, "nowhere"),
+        (
+            {"query": "SELECT * REPLACE (1.5 AS observation) FROM transitions"},
+            QueryError,
+            "its observation is a DECIMAL",
+        ),
+        (
+            {"query": "SELECT * REPLACE (observation[1:3] AS observation) FROM transitions"},
+            StoreError,
+            "observations have 3 entries, next observations 25",
+        ),
+        (
+            {
+                "query": "SELECT * REPLACE (observation[1:3] AS observation,"
+                " next_observation[1:3] AS next_observation) FROM transitions"
+            },
+            StoreError,
+            "observations have 3 entries, those of its task 25",
+        ),
+        (
+            {"query": "SELECT * REPLACE (NULL::FLOAT AS reward) FROM transitions"},
+            StoreError,
+            "rows have no reward",
+        ),
+        (
+            {"query": "SELECT * REPLACE (error('boom')::FLOAT AS reward) FROM transitions"},
+            QueryError,
+            "boom",
+        ),
+    ],
+)
+def test_what_cannot_be_exported_is_refused(
+    arguments: dict[str, Any],
+    error: type[Exception],
+    message: str,
+    store_path: Path,
+    tmp_path: Path,
+) -> None:
+    given = {"to": "npz", "out": "a.npz"} | arguments
+    out = tmp_path / given.pop("out")
+    with pytest.raises(error, match=message):
+        export_dataset(store_path, given.pop("to"), out, **given)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_panel_has_no_commands_but_its_store_has(store_path: Path, tmp_path: Path) -> None:
+    panel = panel_of(store_path, tmp_path / "panel", 1, "where = \"zone = 'cross'\"\n")
+    with pytest.raises(PanelError, match="keeps the index of the action"):
+        export_dataset(panel.path, "npz", tmp_path / "a.npz", continuous=True)
+    document = export_dataset(
+        store_path,
+        "npz",
+        tmp_path / "a.npz",
+        query="FROM transitions SEMI JOIN panel.rows USING (transition_id)",
+        panel=panel.path,
+        continuous=True,
+    )
+    assert document["transitions"] == len(panel)
+    assert document["provenance"]["panel"] == panel.id
+
+
+def test_the_verb_says_what_it_wrote(
+    store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "a.npz"
+    assert cli.main(["export", str(store_path), "--to", "npz", "--out", str(out), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["transitions"] == document["rows"] == len(np.load(out)["rewards"])
+    arguments = ["export", str(store_path), "--to", "npz", "--out", str(tmp_path / "b.npz")]
+    assert cli.main([*arguments, "--query", SLIP]) == 0
+    assert "cut where rows are missing" in capsys.readouterr().out
+    assert cli.main(arguments) == ExitCode.USAGE
+    captured = capsys.readouterr()
+    assert "already there" in captured.err
+    assert captured.out == ""

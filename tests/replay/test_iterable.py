@@ -1,0 +1,102 @@
+"""A panel through torch's DataLoader: the same batches whatever the workers, quotas exact."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from restock.errors import MixtureError
+from restock.replay.mixture.mixture import parse_mixture
+from restock.replay.panel.build import build_panel
+from restock.replay.panel.iterable import PanelDataset
+from restock.replay.panel.panel import Panel
+from restock.replay.store.store import Store
+
+MIXTURE = parse_mixture(
+    '[[strata]]\nname = "wheel_slip"\nshare = 0.25\n[[strata]]\nname = "near_collision"\n'
+    'share = 0.10\n[each_condition]\nshare = "natural"\n'
+)
+
+
+@pytest.fixture(scope="module")
+def panel(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Panel:
+    with Store(store_path) as store:
+        return build_panel(store, MIXTURE, tmp_path_factory.mktemp("iterable") / "panel")
+
+
+def batches(dataset: PanelDataset, workers: int) -> list[dict[str, torch.Tensor]]:
+    loader = DataLoader(
+        dataset,
+        batch_size=None,
+        num_workers=workers,
+        multiprocessing_context="fork" if workers else None,
+    )
+    return list(loader)
+
+
+def test_a_batch_is_the_panels_rows(panel: Panel) -> None:
+    (batch,) = batches(PanelDataset(panel.path, 32, batches=1, seed=0), 0)
+    packed = panel.rows[batch["row"].numpy()]
+    for name in ("observation", "next_observation"):
+        np.testing.assert_array_equal(batch[name], packed[:, panel.columns[name]])
+    for name in ("action", "reward", "discount"):
+        np.testing.assert_array_equal(batch[name], packed[:, panel.columns[name]][:, 0])
+    np.testing.assert_array_equal(batch["weight"], panel.weights[batch["row"].numpy()])
+    np.testing.assert_array_equal(batch["stratum"], panel.stratum_code[batch["row"].numpy()])
+    assert batch["action"].dtype == torch.int64
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_workers_change_nothing(panel: Panel, workers: int) -> None:
+    dataset = PanelDataset(panel, 40, batches=17, seed=5)
+    alone, shared = batches(dataset, 0), batches(dataset, workers)
+    assert len(alone) == len(shared) == 17
+    for one, other in zip(alone, shared, strict=True):
+        for name, values in one.items():
+            assert torch.equal(values, other[name])
+
+
+def test_quotas_are_exact_in_every_batch_and_no_row_repeats_before_its_turn(panel: Panel) -> None:
+    drawn = batches(PanelDataset(panel, 40, batches=30, seed=1), 2)
+    slip = next(i for i, stratum in enumerate(panel.strata) if stratum.name == "wheel_slip")
+    assert {int((batch["stratum"] == slip).sum()) for batch in drawn} == {10}
+    rows = torch.cat([batch["row"] for batch in drawn]).numpy()
+    times = np.bincount(rows, minlength=len(panel))
+    for members in panel.stratum_rows():
+        assert np.ptp(times[members]) <= 1
+
+
+def test_passes_are_repeated_or_renewed_by_epoch_and_seed(panel: Panel) -> None:
+    dataset = PanelDataset(panel, 40, batches=3, seed=1)
+    first = [batch["row"].tolist() for batch in batches(dataset, 0)]
+    assert [batch["row"].tolist() for batch in batches(dataset, 0)] == first
+    dataset.set_epoch(1)
+    assert [batch["row"].tolist() for batch in batches(dataset, 2)] != first
+    other = PanelDataset(panel, 40, batches=3, seed=2)
+    assert [batch["row"].tolist() for batch in batches(other, 0)] != first
+
+
+def test_an_endless_pass_goes_on(panel: Panel) -> None:
+    loader = DataLoader(PanelDataset(panel, 8, seed=0), batch_size=None)
+    seen = [batch for _, batch in zip(range(200), loader, strict=False)]
+    assert len(seen) == 200
+
+
+def test_a_worker_is_sent_the_path_not_the_rows(panel: Panel) -> None:
+    dataset = PanelDataset(panel, 8, batches=2, seed=0)
+    sent = pickle.dumps(dataset)
+    assert len(sent) < 2000
+    again = batches(pickle.loads(sent), 0)
+    assert torch.equal(again[1]["row"], batches(dataset, 0)[1]["row"])
+
+
+def test_sizes_below_one_are_refused(panel: Panel) -> None:
+    with pytest.raises(MixtureError, match="must be at least 1"):
+        PanelDataset(panel, 0, seed=0)
+    with pytest.raises(MixtureError, match="must be at least 1"):
+        PanelDataset(panel, 8, batches=0, seed=0)

@@ -1,0 +1,412 @@
+"""Mixtures: what a file may say, how shares come about, and the weights against their boost."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from support.paths import ROOT
+from support.stores import CONDITIONS, TASK
+
+from restock import cli
+from restock.errors import ConfigError, MixtureError
+from restock.ingest.task.conditions import Condition
+from restock.replay.mixture.mixture import (
+    Adaptive,
+    CorrectionRule,
+    EachCondition,
+    HeldOut,
+    Mixture,
+    PlannedUse,
+    Prioritised,
+    Safety,
+    StratumRule,
+    load_mixture,
+    parse_mixture,
+    shipped_mixtures,
+)
+from restock.replay.mixture.schedules import Cosine, Linear, Piecewise
+from restock.replay.mixture.shares import plan_shares, scaled_within, wanted_shares
+from restock.replay.mixture.sources import OtherStore, Sources
+from restock.replay.panel.build import build_panel, open_source
+from restock.replay.panel.plan import Plan, plan_panel
+from restock.replay.panel.strata import Stratum, assign, resolve_strata
+from restock.replay.panel.weights import effective_count, effective_shares, importance_weights
+
+EVERY = "[each_condition]\nshare = 'natural'\n"
+
+
+def planned(transitions: pa.Table, text: str) -> Plan:
+    with open_source(transitions, task=TASK, conditions=CONDITIONS) as source:
+        return plan_panel(source.connection, parse_mixture(text), source.conditions)
+
+
+def shares(plan: Plan) -> dict[str, float]:
+    return {line.stratum: line.share for line in plan.strata}
+
+
+@pytest.mark.parametrize("name", shipped_mixtures())
+def test_the_shipped_mixtures_load_and_fill(name: str, transitions: pa.Table) -> None:
+    mixture = load_mixture(name)
+    assert mixture.doc
+    with open_source(transitions, conditions=CONDITIONS) as source:
+        plan = plan_panel(source.connection, mixture, source.conditions)
+    assert sum(line.share for line in plan.strata) == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (EVERY + "sahre = 1", "sahre"),
+        (EVERY + "[sources]\nlogs = 0.7\nfresh = 0.4", "sum to 1"),
+        (
+            EVERY + "[sources]\nfresh = 0.5\nlogs = {schedule = 'linear', start = 0.9, end = 0.1,"
+            " to_env_steps = 10}",
+            "leave `fresh` out",
+        ),
+        (
+            EVERY + "[sources]\nlogs = {schedule = 'linear', start = 0.2, end = 0.9,"
+            " to_env_steps = 10}\n[[sources.stores]]\nname = 'b'\npath = 'b'\nshare = 0.5",
+            "sources sum to 1.4",
+        ),
+        (EVERY + "[sources]\nlogs = {schedule = 'step', start = 1}", "sources.logs.schedule"),
+        (EVERY + "[sources]\nlogs = {schedule = 'piecewise', points = [[9, 1], [2, 0]]}", "rising"),
+        (EVERY + "[adaptive]\nfloor = 0.7", "floor < ceiling"),
+        (
+            "[adaptive]\n[[strata]]\nname = 'a'\n"
+            "share = {schedule = 'linear', start = 0.1, end = 0.2, to_env_steps = 9}",
+            "both a schedule",
+        ),
+        (EVERY + "[safety]\nleave_out = 'rows'", "unsafe"),
+        ("max_rows_per_episode = 0\n" + EVERY, "max_rows_per_episode"),
+        ("within = 'rank'\n" + EVERY, "within"),
+        ("sampling = 'chunked'\nwithin = 'per'\n" + EVERY, "without_replacement"),
+        ("discount = 1.5\n" + EVERY, "discount"),
+        ("seed = 'x'\n" + EVERY, "seed"),
+        ("discount = 0.9", "no strata"),
+        ("[[strata]]\nname = 'a'\nshare = 0.7\n[[strata]]\nname = 'b'\nshare = 0.7", "sum to 1.4"),
+        ("[[strata]]\nname = 'a'\n[[strata]]\nname = 'a'", "named twice"),
+        ("[[strata]]\nname = 'a'\nshare = 'some'", "share"),
+        ("[[strata]]\nname = 'a'\nfloor = 0.5\ncap = 0.4", "floor <= cap"),
+        ("[[strata]]\nname = 'a'\nunit = 'mission'", "unit"),
+        ("[[strata]]\nname = 'a'\nmin_steps = 3", 'needs unit = "episode"'),
+        ("[each_condition]\nunit = 'episode'\nmin_steps = 0", "at least 1"),
+        ("shortfall = 'ignore'\n" + EVERY, "shortfall"),
+        ("not toml", "mixture"),
+    ],
+)
+def test_what_a_mixture_may_not_say_is_refused_with_its_place(text: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        parse_mixture(text)
+
+
+def test_an_unknown_key_is_named_with_its_path(tmp_path: Path) -> None:
+    (tmp_path / "m.toml").write_text("[[strata]]\nname = 'nominal'\nshair = 0.3\n")
+    with pytest.raises(ConfigError, match=r"(?s)m\.toml.*shair.*strata\[0\]|strata\[\.\.\.\]"):
+        load_mixture(tmp_path / "m.toml")
+    with pytest.raises(ConfigError, match="coverage, missions, uniform"):
+        load_mixture("coverag")
+
+
+def test_a_stratum_nobody_knows_is_refused(transitions: pa.Table) -> None:
+    with pytest.raises(ConfigError, match="wheel_slip"):
+        planned(transitions, "[[strata]]\nname = 'ice'\n")
+
+
+def test_wrong_sql_in_a_stratum_is_named(transitions: pa.Table) -> None:
+    with pytest.raises(ConfigError, match=r"stratum 'fast'.*speed"):
+        planned(transitions, "[[strata]]\nname = 'fast'\nwhere = 'speed > 1'\n")
+    with pytest.raises(ConfigError, match="`where`"):
+        planned(transitions, "where = 'speed > 1'\n" + EVERY)
+
+
+def test_given_natural_and_equal_shares() -> None:
+    def wanted(*given: object, **more: object) -> list[float]:
+        rules = [StratumRule(name=str(i), share=s) for i, s in enumerate(given)]  # type: ignore[arg-type]
+        counts = more.get("rows", [600, 300, 100])
+        return [round(float(share), 6) for share in wanted_shares(rules, np.array(counts))]
+
+    assert wanted(0.5, 0.3, 0.2) == [0.5, 0.3, 0.2]
+    assert wanted(0.4, "equal", "equal") == [0.4, 0.3, 0.3]
+    assert wanted(0.2, "natural", "natural") == [0.2, 0.6, 0.2]
+    assert wanted("natural", "natural", "natural") == [0.6, 0.3, 0.1]
+    # An equal part for each; the natural ones share theirs out by rows.
+    assert wanted("equal", "natural", "natural") == [0.333333, 0.5, 0.166667]
+    with pytest.raises(MixtureError, match=r"sum to 0\.9"):
+        wanted(0.5, 0.3, 0.1)
+
+
+def test_floors_and_caps_hold_and_the_others_take_the_rest() -> None:
+    rules = [
+        StratumRule(name="nominal", cap=0.5),
+        StratumRule(name="a", floor=0.2),
+        StratumRule(name="b"),
+    ]
+    got = wanted_shares(rules, np.array([9000, 100, 900]))
+    assert got.sum() == pytest.approx(1)
+    assert got[0] == pytest.approx(0.5)
+    assert got[1] == pytest.approx(0.2)
+    assert got[2] == pytest.approx(0.3)
+    with pytest.raises(MixtureError, match="no way to share out"):
+        wanted_shares([StratumRule(name="a", cap=0.3)], np.array([10]))
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.data())
+def test_scaling_keeps_within_bounds_and_sums_to_one(data: st.DataObject) -> None:
+    count = data.draw(st.integers(1, 8))
+    part = st.integers(0, 1000).map(lambda thousandths: thousandths / 1000)
+    base = np.array(data.draw(st.lists(part, min_size=count, max_size=count)))
+    low = np.array(data.draw(st.lists(part, min_size=count, max_size=count))) / count
+    high = np.minimum(low + np.array(data.draw(st.lists(part, min_size=count, max_size=count))), 1)
+    assume(low.sum() <= 1 - 1e-6 and high.sum() >= 1 + 1e-6 and base.sum() > 1e-3)
+    got = scaled_within(base, low, high)
+    assert got.sum() == pytest.approx(1)
+    assert (got >= low - 1e-6).all()
+    assert (got <= high + 1e-6).all()
+
+
+def test_replays_per_row_cap_a_small_stratum_and_the_surplus_goes_to_the_others() -> None:
+    # 1,000 updates x 100 rows x 1/2 = 50,000 draws; 100 rows x 50 replays = 5,000: a share of 0.1.
+    text = "max_replays_per_row = 50\n[planned]\nupdates = 1000\nbatch_size = 100\n" + EVERY
+    rules = [StratumRule(name="nominal", share=0.5), StratumRule(name="rare", share=0.5)]
+    rows, episodes = np.array([10_000, 100]), np.array([100, 10])
+    plan = plan_shares(parse_mixture(text), rules, rows, episodes, draws=50_000)
+    np.testing.assert_allclose(plan.got, [0.9, 0.1])
+    np.testing.assert_allclose(plan.wanted, [0.5, 0.5])
+    assert plan.notes == ("took the surplus", "short of rows")
+    assert plan.scale == 1.0
+    shrunk = plan_shares(
+        parse_mixture("shortfall = 'shrink'\n" + text), rules, rows, episodes, draws=50_000
+    )
+    assert shrunk.scale == pytest.approx(0.6)
+    np.testing.assert_allclose(shrunk.got, [0.5 / 0.6, 0.1 / 0.6])
+    with pytest.raises(MixtureError, match=r"rare wants 50\.0%, its 100 rows in 10 episodes"):
+        plan_shares(
+            parse_mixture("shortfall = 'refuse'\n" + text), rules, rows, episodes, draws=50_000
+        )
+    # Where nobody can take the surplus, it cannot come from the logs.
+    small = plan_shares(parse_mixture(text), rules, np.array([300, 100]), episodes, draws=50_000)
+    assert small.scale == pytest.approx(0.4)
+    np.testing.assert_allclose(small.got, [0.75, 0.25])
+
+
+def test_a_stratum_below_its_minimum_gets_nothing(transitions: pa.Table) -> None:
+    text = "[each_condition]\nshare = 'equal'\nmin_rows = 30\n[planned]\nupdates = 10\n"
+    plan = planned(transitions, text)
+    assert shares(plan)["near_collision"] == 0
+    assert sum(shares(plan).values()) == pytest.approx(1)
+    assert plan.left_out["in a stratum of share 0"] > 0
+    with pytest.raises(MixtureError, match="no stratum has rows"):
+        planned(transitions, text.replace("30", "30000"))
+
+
+def test_rows_of_no_stratum_are_refused_unless_dropped(transitions: pa.Table) -> None:
+    text = "[[strata]]\nname = 'nominal'\n[[strata]]\nname = 'wheel_slip'\n"
+    with pytest.raises(MixtureError, match=r"belong to no stratum .*recovery"):
+        planned(transitions, text)
+    plan = planned(transitions, "unlisted = 'drop'\n" + text)
+    assert plan.left_out["in no stratum"] > 0
+    assert sum(plan.left_out.values()) + len(plan.panel_rows) == len(transitions)
+
+
+def test_old_and_refused_rows_are_left_out_and_counted(transitions: pa.Table) -> None:
+    # The three recordings begin an hour apart.
+    text = "max_age_days = 0.05\nwhere = 'action <> 4'\n" + EVERY + "[held_out]\nby = 'none'\n"
+    plan = planned(transitions, text)
+    kept = plan.rows.take(pa.array(plan.panel_rows))
+    assert set(kept["recording_id"].to_pylist()) == {f"{2:016x}", f"{3:016x}"}
+    assert 4 not in kept["action"].to_pylist()
+    assert set(plan.left_out) == {"refused by the mixture's `where`", "too old"}
+    assert sum(plan.left_out.values()) + len(plan.panel_rows) == len(transitions)
+
+
+def test_priority_decides_overlap(transitions: pa.Table) -> None:
+    def count(priority: int) -> int:
+        plan = planned(
+            transitions,
+            "unlisted = 'drop'\n[held_out]\nby = 'none'\n[[strata]]\nname = 'fast'\n"
+            f"where = 'command_speed_mps > 0'\npriority = {priority}\n" + EVERY,
+        )
+        return next(line.rows for line in plan.strata if line.stratum == "fast")
+
+    fast = np.sum(transitions["command_speed_mps"].to_numpy() > 0)
+    assert count(1) == fast
+    assert count(2000) == 0
+    assert 0 < count(500) < fast  # before nominal, after every condition
+
+
+def strata_of(*timings: str, correction: str = "full") -> list[Stratum]:
+    return [
+        Stratum(
+            StratumRule(name=f"s{i}"),
+            "true",
+            None,
+            i,
+            timing,  # type: ignore[arg-type]
+            "none" if timing == "pre" else correction,  # type: ignore[arg-type]
+        )
+        for i, timing in enumerate(timings)
+    ]
+
+
+def test_strata_take_timing_priority_and_correction_from_conditions() -> None:
+    conditions = [Condition("slip", "post", "x", 30), Condition("blocked", "pre", "x", 40)]
+    mixture = parse_mixture("[correction]\npost = 'beta'\n" + EVERY)
+    found = {s.name: s for s in resolve_strata(mixture, conditions)}
+    assert [s.name for s in found.values()] == ["nominal", "slip", "blocked"]
+    assert (found["slip"].timing, found["slip"].correction) == ("post", "beta")
+    assert (found["blocked"].timing, found["blocked"].correction) == ("pre", "none")
+    assert found["slip"].priority == 30
+    where = parse_mixture("[[strata]]\nname = 'x'\nwhere = 'action = 1'\n")
+    assert resolve_strata(where, conditions)[0].timing == "post"  # the safe assumption
+
+
+def test_assignment_by_priority_and_by_state_alone() -> None:
+    strata = strata_of("post", "pre", "pre")
+    member = np.array([[1, 1, 0], [0, 1, 1], [0, 0, 1], [0, 0, 0]], np.bool_)
+    assert assign(member, strata).tolist() == [0, 1, 2, -1]
+    assert assign(member, strata, only_pre=True).tolist() == [1, 1, 2, -1]
+
+
+def test_full_correction_keeps_the_outcomes_of_a_state_as_they_were() -> None:
+    """States a and b; in each, one row in ten has the outcome that stratum 0 collects."""
+    rng = np.random.default_rng(0)
+    count = 20_000
+    in_b = np.arange(count) % 20 == 0  # state b is rare, and its stratum is boosted
+    outcome = rng.random(count) < 0.1
+    strata = strata_of("post", "pre", "pre")
+    member = np.stack([outcome, in_b, np.ones(count, np.bool_)], axis=1)
+    code = assign(member, strata)
+    state = assign(member, strata, only_pre=True)
+    given = np.array([0.5, 0.3, 0.2])
+    rule = CorrectionRule()
+    weights = importance_weights(code, state, strata, given, rule)
+    drawn = (given / np.bincount(code))[code] * weights  # expected weight of each row in a batch
+    assert drawn.sum() == pytest.approx(1, rel=1e-4)
+    for in_state in (in_b, ~in_b):
+        share = drawn[in_state & outcome].sum() / drawn[in_state].sum()
+        assert share == pytest.approx(outcome[in_state].mean(), rel=1e-4)
+    # The state that was boosted stays boosted.
+    assert drawn[in_b].sum() > 5 * in_b.mean()
+    after = effective_shares(code, weights, given)
+    assert after.sum() == pytest.approx(1)
+    assert after[0] == pytest.approx(drawn[outcome].sum(), rel=1e-4)
+    # Without correction the outcome is five times as frequent as it was.
+    raw = importance_weights(
+        code, state, strata_of("post", "pre", "pre", correction="none"), given, rule
+    )
+    np.testing.assert_allclose(raw, 1.0, rtol=1e-5)
+
+
+def test_the_state_of_a_slip_is_nominal_where_nothing_was_known_before(
+    transitions: pa.Table,
+) -> None:
+    """Its row is weighted to the density of nominal rows, boosted or not: P(s'|s, a) stays."""
+    plan = planned(transitions, "[[strata]]\nname = 'nominal'\nshare = 0.2\n" + EVERY)
+    names = [line.stratum for line in plan.strata]
+    slip, nominal = names.index("wheel_slip"), names.index("nominal")
+    chosen = plan.panel_rows
+    code, state = plan.stratum[chosen], plan.beside["state_code"]
+    labels = transitions.sort_by(
+        [("recording_id", "ascending"), ("episode_index", "ascending"), ("step_index", "ascending")]
+    )["conditions"].to_pylist()
+    only_slip = np.array([labels[row] == ["wheel_slip"] for row in chosen])
+    assert only_slip.any()
+    assert (state[only_slip] == nominal).all()
+    share = np.array([line.share for line in plan.strata])
+    density = (share / np.array([line.rows for line in plan.strata]))[code] * plan.weight
+    np.testing.assert_allclose(
+        density[only_slip & (code == slip)], density[code == nominal][0], rtol=1e-5
+    )
+
+
+def test_beta_and_clip_stand_between_none_and_full() -> None:
+    code = np.repeat(np.array([0, 1], np.int16), [100, 9900])
+    state = np.ones(10_000, np.int16)
+    given = np.array([0.5, 0.5])
+
+    def ratio(correction: str, **rule: float) -> float:
+        strata = strata_of("post", "pre", correction=correction)
+        weights = importance_weights(code, state, strata, given, CorrectionRule(**rule))
+        return float(weights[-1] / weights[0])
+
+    assert ratio("none") == pytest.approx(1)
+    assert ratio("full") == pytest.approx(99)  # boosted 50 times, the others 50/99 times
+    assert ratio("beta", beta=0.5) == pytest.approx(99**0.5, rel=1e-3)
+    assert ratio("clipped", clip=4.0) == pytest.approx(4)
+
+
+def test_effective_count() -> None:
+    assert effective_count(np.array([5, 5, 5])) == pytest.approx(3)
+    assert effective_count(np.array([100, 1, 1])) < 1.1
+    assert effective_count(np.array([])) == 0
+
+
+def test_the_plan_counts_replays(transitions: pa.Table) -> None:
+    plan = planned(
+        transitions,
+        "[planned]\nupdates = 100\nbatch_size = 64\n[sources]\nlogs = 0.25\nfresh = 0.75\n" + EVERY,
+    )
+    draws = sum(line.replays_per_row * line.rows for line in plan.strata)
+    assert draws == pytest.approx(100 * 64 * 0.25)
+    assert plan.effective_rows == pytest.approx(len(plan.panel_rows), rel=1e-3)
+
+
+def test_the_verb_explains_then_packs_and_never_overwrites(
+    store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "panel"
+    assert cli.main(["mix", str(store_path), "--out", str(out), "--dry-run"]) == 0
+    text = capsys.readouterr().out
+    assert "near_collision" in text
+    assert "nothing was written" in text
+    assert not out.exists()
+    assert cli.main(["mix", str(store_path), "--out", str(out), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert sum(line["share"] for line in document["strata"]) == pytest.approx(1)
+    assert document["store_version"] == 2
+    before = (out / "panel.json").read_bytes()
+    assert json.loads(before)["id"] == document["id"]
+    assert cli.main(["mix", str(store_path), "--out", str(out)]) == 2
+    assert "already there" in capsys.readouterr().err
+    assert (out / "panel.json").read_bytes() == before
+    assert cli.main(["mix", str(store_path)]) == 2
+    assert "no --out" in capsys.readouterr().err
+
+
+def test_the_same_store_and_mixture_give_the_same_bytes(
+    transitions: pa.Table, tmp_path: Path
+) -> None:
+    panels = [
+        build_panel(transitions, load_mixture("coverage"), tmp_path / name, task=TASK)
+        for name in "ab"
+    ]
+    for name in ("rows.f32", "meta.parquet", "held_out.parquet", "panel.json"):
+        contents = [(panel.path / name).read_bytes() for panel in panels]
+        assert contents[0] == contents[1], name
+
+
+def test_the_page_explains_every_key() -> None:
+    page = (ROOT / "docs" / "mixture.md").read_text(encoding="utf-8")
+    structs = (
+        *(Mixture, StratumRule, EachCondition, PlannedUse, HeldOut, Sources, CorrectionRule),
+        *(OtherStore, Safety, Prioritised, Adaptive, Linear, Cosine, Piecewise),
+    )
+    for struct in structs:
+        for field in msgspec.structs.fields(struct):
+            name = field.encode_name
+            forms = (
+                f"`{name}`",
+                f"`[{name}]`",
+                f"[[{name}]]`",
+                f"[[sources.{name}]]`",
+                f"{name} = ",
+            )
+            assert any(form in page for form in forms), name

@@ -1,0 +1,290 @@
+"""Which rows a mixture takes: safety, versions, caps an episode, labels, several stores; and its
+schema."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pytest
+from support.paths import ROOT
+from support.stores import CONDITIONS, TASK, recording_transitions, write_store
+
+from restock import cli
+from restock.errors import MixtureError, StoreError
+from restock.replay.mixture.mixture import load_mixture, parse_mixture, shipped_mixtures
+from restock.replay.mixture.mixture_schema import FILE, mixture_schema, shipped_schema
+from restock.replay.panel.build import build_panel, open_source
+from restock.replay.panel.panel import Panel
+from restock.replay.panel.plan import Plan, plan_panel
+from restock.replay.sampling.share_controller import PlannedDraws
+from restock.replay.store.store import Store
+from restock.train.feed.logged_sampler import diet_of
+
+EVERY = "[each_condition]\nshare = 'natural'\n"
+NO_HOLD = "[held_out]\nby = 'none'\n"
+
+
+def planned(transitions: pa.Table, text: str) -> Plan:
+    with open_source(transitions, task=TASK, conditions=CONDITIONS) as source:
+        return plan_panel(source.connection, parse_mixture(text), source.conditions)
+
+
+def taken(plan: Plan) -> pa.Table:
+    return plan.rows.take(pa.array(plan.panel_rows))
+
+
+def test_every_row_is_in_one_stratum_or_left_out_for_one_reason(transitions: pa.Table) -> None:
+    text = (
+        "max_rows_per_episode = 20\nmax_age_days = 0.05\nwhere = 'action <> 4'\n"
+        "[safety]\nunsafe = 'bumped'\n" + EVERY
+    )
+    plan = planned(transitions, text)
+    assert len(plan.left_out) == 5
+    assert sum(plan.left_out.values()) + len(plan.panel_rows) == len(transitions)
+    assert sum(line.rows for line in plan.strata) == len(plan.panel_rows)
+
+
+@pytest.mark.parametrize("min_steps", [1, 4])
+def test_a_stratum_of_episodes_has_all_rows_of_those_that_met_it(
+    transitions: pa.Table, min_steps: int
+) -> None:
+    plan = planned(
+        transitions,
+        NO_HOLD + f"[each_condition]\nunit = 'episode'\nmin_steps = {min_steps}\n",
+    )
+    assert len(plan.panel_rows) == len(transitions)  # nominal is what is left
+    rows = taken(plan)
+    names = [line.stratum for line in plan.strata]
+    stratum = dict(
+        zip(
+            rows["transition_id"].to_pylist(),
+            (names[code] for code in plan.stratum.tolist()),
+            strict=True,
+        )
+    )
+    order = sorted(CONDITIONS, key=lambda condition: (condition.priority, condition.name))
+    for episode in transitions["episode_id"].unique().to_pylist():
+        own = transitions.filter(pc.equal(transitions["episode_id"], episode))
+        held = own["conditions"].to_pylist()
+        met = [c.name for c in order if sum(c.name in row for row in held) >= min_steps]
+        of_rows = {stratum[row] for row in own["transition_id"].to_pylist()}
+        assert of_rows == {met[0] if met else "nominal"}
+    assert {line.correction for line in plan.strata} == {"none"}
+
+
+def test_unsafe_rows_go_alone_or_with_their_episode(transitions: pa.Table) -> None:
+    bumped = set(transitions.filter(transitions["bumped"])["transition_id"].to_pylist())
+    assert bumped
+    rows = planned(transitions, NO_HOLD + "[safety]\nunsafe = 'bumped'\n" + EVERY)
+    assert rows.left_out == {"unsafe": len(bumped)}
+    assert not bumped & set(taken(rows)["transition_id"].to_pylist())
+    whole = planned(
+        transitions, NO_HOLD + "[safety]\nunsafe = 'bumped'\nleave_out = 'episodes'\n" + EVERY
+    )
+    hit = set(transitions.filter(transitions["bumped"])["episode_id"].to_pylist())
+    assert not hit & set(taken(whole)["episode_id"].to_pylist())
+    assert whole.left_out["unsafe"] > len(bumped)
+    # A return may still span an unsafe step: what it cost is what is to be learnt.
+
+
+def test_old_versions_of_a_policy_are_left_out(transitions: pa.Table) -> None:
+    recording = np.array([int(name, 16) for name in transitions["recording_id"].to_pylist()])
+    policy = np.array(transitions["behaviour_policy"].to_pylist())
+    # The planner was changed twice, the operator has no version at all.
+    version = np.where(policy == "planner", np.char.add("v", recording.astype(str)), None)
+    place = transitions.schema.get_field_index("behaviour_version")
+    changed = transitions.set_column(
+        place, transitions.schema.field(place), pa.array(version.tolist(), pa.string())
+    )
+    newest = planned(changed, "max_versions_behind = 0\n" + NO_HOLD + EVERY)
+    kept = taken(newest)
+    assert set(kept["behaviour_version"].to_pylist()) == {"v3", None}
+    gone = int(((policy == "planner") & (recording < 3)).sum())
+    assert newest.left_out == {"of an old version of its policy": gone}
+    one_back = planned(changed, "max_versions_behind = 1\n" + NO_HOLD + EVERY)
+    assert set(taken(one_back)["behaviour_version"].to_pylist()) == {"v2", "v3", None}
+
+
+@pytest.mark.parametrize("name", ["episode", "recording"])
+def test_caps_an_episode_and_recording_hold_in_each_stratum(
+    transitions: pa.Table, name: str
+) -> None:
+    text = f"max_rows_per_{name} = 7\n" + NO_HOLD + EVERY
+    plan = planned(transitions, text)
+    rows = taken(plan)
+    groups = pa.table({"group": rows[f"{name}_id"], "code": plan.stratum[plan.panel_rows]})
+    assert (
+        pc.max(
+            groups.group_by(["group", "code"]).aggregate([([], "count_all")])["count_all"]
+        ).as_py()
+        == 7
+    )
+    (reason,) = plan.left_out
+    assert name in reason
+    # The same ones whatever the order of the rows; others with another seed.
+    again = planned(transitions.take(pa.array(np.arange(len(transitions))[::-1])), text)
+    assert taken(again)["transition_id"].to_pylist() == rows["transition_id"].to_pylist()
+    other = planned(transitions, "seed = 1\n" + text)
+    assert taken(other)["transition_id"].to_pylist() != rows["transition_id"].to_pylist()
+    # A stratum's own cap stands before the mixture's.
+    own = planned(
+        transitions,
+        text + f"[[strata]]\nname = 'nominal'\nmax_rows_per_{name} = 2\n",
+    )
+    line = next(line for line in own.strata if line.stratum == "nominal")
+    assert line.rows == 2 * line.episodes if name == "episode" else line.rows == 6
+
+
+def test_rows_without_a_label_are_refused_dropped_or_taken_for_nominal(
+    transitions: pa.Table,
+) -> None:
+    bare = np.arange(len(transitions)) < 50
+    table = transitions
+    for name in ("condition", "conditions"):
+        place = table.schema.get_field_index(name)
+        field = table.schema.field(place).with_nullable(True)
+        values = [
+            None if gone else v for gone, v in zip(bare, table[name].to_pylist(), strict=True)
+        ]
+        table = table.set_column(place, field, pa.array(values, field.type))
+    with pytest.raises(MixtureError, match=r"50 rows have no coverage label"):
+        planned(table, NO_HOLD + EVERY)
+    dropped = planned(table, "unlabelled = 'drop'\n" + NO_HOLD + EVERY)
+    assert dropped.left_out == {"without a coverage label": 50}
+    nominal = planned(table, "unlabelled = 'nominal'\n" + NO_HOLD + EVERY)
+    assert nominal.left_out == {}
+    rows = {line.stratum: line.rows for line in nominal.strata}
+    before = {line.stratum: line.rows for line in dropped.strata}
+    assert rows["nominal"] == before["nominal"] + 50
+
+
+OTHERS = """
+[sources]
+logs = 0.4
+[[sources.stores]]
+name = "twin"
+path = "other"
+version = 1
+share = 0.2
+[held_out]
+by = "none"
+"""
+
+
+@pytest.fixture
+def two_stores(tmp_path: Path, store_path: Path) -> Path:
+    """A folder with `other`: recordings 3 (which the first store has too), 7 and, later, 8."""
+    tables = [recording_transitions(index) for index in (3, 7, 8)]
+    write_store(tmp_path / "other", tables)
+    (tmp_path / "m.toml").write_text(OTHERS + EVERY)
+    return tmp_path
+
+
+def test_another_store_is_drawn_from_at_its_pinned_version(
+    two_stores: Path, store_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = two_stores / "panel"
+    arguments = ["mix", str(store_path), "--mixture", str(two_stores / "m.toml"), "--json"]
+    assert cli.main([*arguments, "--out", str(out)]) == 0
+    document = json.loads(capsys.readouterr().out)
+    (other,) = document["other_stores"]
+    assert (other["name"], other["version"]) == ("twin", 1)
+    repeated = len(recording_transitions(3))
+    assert document["left_out"] == {"of 'twin', in a store before it too": repeated}
+    panel = Panel.open(out)
+    assert panel.header.others[0].version == 1
+    recordings = set(panel.meta["recording_id"].to_pylist())
+    assert recordings == {f"{index:016x}" for index in (1, 2, 3, 7)}  # 8 came after version 1
+    of_twin = [stratum for stratum in panel.strata if stratum.source == "twin"]
+    assert of_twin[0].name == "twin/nominal"
+    assert sum(stratum.share for stratum in of_twin) == pytest.approx(1 / 3)
+    assert panel.header.logs_share == pytest.approx(0.6)
+    stratum = np.array(panel.meta["stratum"].to_pylist())
+    from_twin = np.char.startswith(stratum, "twin/")
+    assert from_twin.sum() == len(recording_transitions(7))
+    assert set(np.array(panel.meta["recording_id"].to_pylist())[from_twin]) == {f"{7:016x}"}
+    # Packed rows are the rows of their store.
+    truth = recording_transitions(7).select(["transition_id", "observation"]).to_pydict()
+    rows = panel.rows[from_twin][:, panel.columns["observation"]]
+    ids = panel.meta["transition_id"].to_numpy()[from_twin]
+    by_id = dict(zip(truth["transition_id"], truth["observation"], strict=True))
+    np.testing.assert_allclose(rows[:20], [by_id[i] for i in ids[:20].tolist()], rtol=1e-6)
+
+
+def test_a_run_draws_from_both_stores_by_their_schedules(
+    two_stores: Path, store_path: Path
+) -> None:
+    share = "{schedule = 'linear', start = 0.0, end = 0.4, to_env_steps = 1000}"
+    text = OTHERS.replace("share = 0.2", f"share = {share}").replace(
+        '"other"', f'"{two_stores}/other"'
+    )
+    every = "[adaptive]\nafter_updates = 0\nevery_updates = 1\nstep_size = 0.5\n" + EVERY
+    with Store(store_path) as store:
+        panel = build_panel(store, parse_mixture(text + every), two_stores / "p")
+    diet = diet_of(panel, PlannedDraws(640, 6400, 0, 1000), None)
+    twin = np.array([stratum.source == "twin" for stratum in panel.strata])
+    assert diet.shares[twin].sum() == 0
+    assert diet.logs_share == pytest.approx(0.4)
+    diet.at(500)
+    assert diet.logs_share == pytest.approx(0.6)
+    assert diet.shares[twin].sum() == pytest.approx(1 / 3)
+    # A stratum of the twin that errs takes from the twin's other strata, not from the logs.
+    worst = [stratum.name for stratum in panel.strata].index("twin/wheel_slip")
+    before = diet.shares.copy()
+    everyone = np.flatnonzero(before > 0)
+    diet.observe(everyone, np.where(everyone == worst, 5.0, 1.0))
+    assert diet.shares[worst] > before[worst]
+    assert diet.shares[twin].sum() == pytest.approx(1 / 3)
+
+
+def test_a_missing_other_store_is_named(store_path: Path, tmp_path: Path) -> None:
+    mixture = parse_mixture(OTHERS + EVERY)
+    with Store(store_path) as store:
+        with pytest.raises(StoreError, match=r"the mixture's store 'twin': no such store"):
+            build_panel(store, mixture, tmp_path / "panel")
+        with pytest.raises(MixtureError, match=r"draws from other stores too \(twin\)"):
+            plan_panel(store.connection, mixture, store.conditions())
+
+
+def test_the_schema_is_what_the_structs_say(capsys: pytest.CaptureFixture[str]) -> None:
+    remedy = "write it with `python -m restock.replay.mixture.mixture_schema`"
+    assert shipped_schema() == mixture_schema(), remedy
+    assert cli.main(["mix", "--schema"]) == 0
+    assert capsys.readouterr().out == shipped_schema()
+
+
+@pytest.mark.parametrize("name", shipped_mixtures())
+def test_shipped_mixtures_are_valid_by_the_schema(name: str) -> None:
+    folder = ROOT / "replay" / "mixture" / "mixtures"
+    text = (folder / f"{name}.toml").read_text(encoding="utf-8")
+    jsonschema.validate(tomllib.loads(text), json.loads(shipped_schema()))
+    load_mixture(name)
+    assert (folder / FILE).is_file()
+
+
+@pytest.mark.parametrize(
+    ("text", "ok"),
+    [
+        (OTHERS + EVERY, True),
+        ("[sources]\nlogs = {schedule = 'cosine', start = 1, end = 0.5, to_env_steps = 9}\n", True),
+        ("[[strata]]\nname = 'a'\nshare = 'equal'\nwithin = 'per'\n[adaptive]\n", True),
+        ("[[strata]]\nname = 'a'\nshare = 'half'\n", False),
+        ("[sources]\nlogs = {schedule = 'cosine', begin = 1}\n", False),
+        ("max_age = 3\n", False),
+        ("where = 3\n", False),
+    ],
+)
+def test_the_schema_accepts_and_refuses_as_the_reader_does(text: str, ok: bool) -> None:
+    schema = json.loads(shipped_schema())
+    if ok:
+        jsonschema.validate(tomllib.loads(text), schema)
+        parse_mixture(text if "strata" in text or "each" in text else text + EVERY)
+    else:
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(tomllib.loads(text), schema)

@@ -1,0 +1,483 @@
+"""Panels: rows equal to the store's, n-step returns, pinned, checked, all or nothing."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.stores import TASK, manifest, recording_transitions, write_store
+
+from restock import cli
+from restock.errors import MixtureError, PanelError, StoreError
+from restock.ingest.store.writer import StoreWriter
+from restock.ingest.task.task import Task
+from restock.replay.mixture.mixture import Mixture, load_mixture, parse_mixture
+from restock.replay.mixture.n_step import n_step_horizon, n_step_return
+from restock.replay.panel import build, pack, scratch
+from restock.replay.panel.build import build_panel
+from restock.replay.panel.panel import ROWS, Panel
+from restock.replay.store.store import Store
+
+
+def uniform(**changes: object) -> Mixture:
+    text = f"[each_condition]\nshare = 'natural'\n[held_out]\nby = '{changes.pop('by', 'none')}'\n"
+    top = "".join(f"{name} = {json.dumps(value)}\n" for name, value in changes.items())
+    return parse_mixture(top + text)
+
+
+def by_episode(table: pa.Table) -> dict[str, list[dict[str, object]]]:
+    rows: dict[str, list[dict[str, object]]] = {}
+    for row in table.sort_by(
+        [("episode_id", "ascending"), ("step_index", "ascending")]
+    ).to_pylist():
+        rows.setdefault(str(row["episode_id"]), []).append(row)
+    return rows
+
+
+@pytest.mark.parametrize("n_step", [1, 3, 7])
+def test_packed_rows_are_those_of_a_naive_reading_of_the_table(
+    transitions: pa.Table, tmp_path: Path, n_step: int
+) -> None:
+    # Shuffled, because a store's files come in any order; and with a step missing.
+    order = np.random.default_rng(0).permutation(len(transitions))
+    shuffled = transitions.take(pa.array(order)).filter(
+        pa.array(transitions["transition_id"].to_numpy()[order] != (2 << 25) + 40)
+    )
+    mixture = uniform(n_step=n_step, discount=0.9, return_to_go=True)
+    panel = build_panel(shuffled, mixture, tmp_path / "p", task=TASK)
+    assert len(panel) == len(transitions) - 1
+    episodes = by_episode(shuffled)
+    part = panel.columns
+    for packed, meta in zip(panel.rows, panel.meta.to_pylist(), strict=True):
+        episode = episodes[meta["episode_id"]]
+        at = next(i for i, r in enumerate(episode) if r["step_index"] == meta["step_index"])
+        span = episode[at : at + n_step]
+        for index in range(1, len(span)):
+            if span[index]["step_index"] != span[0]["step_index"] + index:
+                span = span[:index]
+                break
+        assert meta["transition_id"] == span[0]["transition_id"]
+        assert meta["horizon"] == len(span)
+        expected = sum(0.9**k * row["reward"] for k, row in enumerate(span))
+        np.testing.assert_allclose(packed[part["reward"]], expected, rtol=1e-5, atol=1e-5)
+        np.testing.assert_array_equal(packed[part["observation"]], span[0]["observation"])
+        np.testing.assert_array_equal(
+            packed[part["next_observation"]], span[-1]["next_observation"]
+        )
+        assert packed[part["action"]] == span[0]["action"]
+        np.testing.assert_allclose(
+            packed[part["discount"]], 0.9 ** len(span) * (not span[-1]["terminated"]), rtol=1e-6
+        )
+        to_go = [episode[at]]
+        while to_go[-1] is not episode[-1] and (
+            episode[at + len(to_go)]["step_index"] == span[0]["step_index"] + len(to_go)
+        ):
+            to_go.append(episode[at + len(to_go)])
+        expected = sum(0.9**k * row["reward"] for k, row in enumerate(to_go))
+        assert meta["return_to_go"] == pytest.approx(expected, abs=1e-4)
+        assert meta["return_to_go_whole"] == to_go[-1]["terminated"]
+
+
+def test_returns_stop_at_a_handover(tmp_path: Path) -> None:
+    table = recording_transitions(1, episodes=1)
+    policy = np.where(np.arange(len(table)) < 5, "planner", "operator")
+    place = table.schema.get_field_index("behaviour_policy")
+    table = table.set_column(place, table.schema.field(place), pa.array(policy))
+    panel = build_panel(table, uniform(n_step=4), tmp_path / "p")
+    assert panel.meta["horizon"].to_pylist()[:6] == [4, 4, 3, 2, 1, 4]
+    across = build_panel(table, uniform(n_step=4, cut_at_off_policy=False), tmp_path / "q")
+    assert across.meta["horizon"].to_pylist()[:6] == [4] * 6
+
+
+def test_returns_stop_before_an_action_less_likely_than_chance(tmp_path: Path) -> None:
+    table = recording_transitions(1, episodes=1)
+    # Five actions: chance is 0.2. The step that explored is the first of its own return.
+    probability = np.where(np.arange(len(table)) == 5, 0.1, 0.9).astype(np.float32)
+    probability[7] = 0.2
+    place = table.schema.get_field_index("action_probability")
+    table = table.set_column(place, table.schema.field(place), pa.array(probability))
+    panel = build_panel(table, uniform(n_step=4), tmp_path / "p", task=TASK)
+    assert panel.meta["horizon"].to_pylist()[:8] == [4, 4, 3, 2, 1, 4, 4, 4]
+    # Without the task nobody knows what chance is.
+    blind = build_panel(table, uniform(n_step=4), tmp_path / "q")
+    assert blind.meta["horizon"].to_pylist()[:8] == [4] * 8
+
+
+def test_a_return_to_go_that_was_cut_is_not_whole(tmp_path: Path) -> None:
+    table = recording_transitions(1, episodes=1)
+    last = len(table) - 1
+    for name, value in (("terminated", True), ("truncated", False)):
+        place = table.schema.get_field_index(name)
+        ended = pa.array(np.where(np.arange(len(table)) == last, value, False))
+        table = table.set_column(place, table.schema.field(place), ended)
+    policy = np.where(np.arange(len(table)) < 5, "planner", "operator")
+    place = table.schema.get_field_index("behaviour_policy")
+    table = table.set_column(place, table.schema.field(place), pa.array(policy))
+    panel = build_panel(table, uniform(return_to_go=True, discount=1.0), tmp_path / "p")
+    reward = table["reward"].to_numpy()
+    assert panel.return_to_go[0] == pytest.approx(float(reward[:5].sum()), abs=1e-4)
+    assert panel.return_to_go[5] == pytest.approx(float(reward[5:].sum()), abs=1e-4)
+    assert panel.meta["return_to_go_whole"].to_pylist() == [False] * 5 + [True] * (last - 4)
+    without = build_panel(table, uniform(), tmp_path / "q")
+    with pytest.raises(PanelError, match="no return-to-go"):
+        _ = without.return_to_go
+
+
+@pytest.mark.parametrize("whole_file", [True, False])
+def test_small_stretches_and_batches_pack_the_same_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole_file: bool
+) -> None:
+    tables = [recording_transitions(index, episodes=90) for index in (3, 1, 2)]
+    table = pa.concat_tables(tables)  # some 9,000 rows, more than DuckDB gives at a time
+    if not whole_file:
+        table = table.take(pa.array(np.random.default_rng(0).permutation(len(table))))
+    mixture = uniform(n_step=5, return_to_go=True, by="episode")
+    at_once = build_panel(table, mixture, tmp_path / "a", task=TASK)
+    for module, name, value in (
+        (scratch, "STRETCH", 64),
+        (pack, "STRETCH", 64),
+        (scratch, "BATCH_ROWS", 2048),
+        (pack, "BATCH_ROWS", 2048),
+        (pack, "BATCH_BYTES", 2048 * 8 * TASK.observation_size),
+        (pack, "ROW_GROUP_ROWS", 1000),
+    ):
+        monkeypatch.setattr(module, name, value)
+    by_parts = build_panel(table, mixture, tmp_path / "b", task=TASK)
+    np.testing.assert_array_equal(at_once.rows, by_parts.rows)
+    assert at_once.meta.to_pylist() == by_parts.meta.to_pylist()
+    assert at_once.id == by_parts.id
+    held = [pq.read_table(panel.path / "held_out.parquet") for panel in (at_once, by_parts)]
+    assert held[0].to_pylist() == held[1].to_pylist()
+
+
+def test_ids_that_no_ingest_gave_find_their_rows_too(transitions: pa.Table, tmp_path: Path) -> None:
+    # Ids of three recordings mixed: the runs of rising ids overlap.
+    place = transitions.schema.get_field_index("transition_id")
+    ids = np.random.default_rng(1).permutation(len(transitions)).astype(np.int64)
+    table = transitions.set_column(place, transitions.schema.field(place), pa.array(ids))
+    panel = build_panel(table, uniform(n_step=3), tmp_path / "p")
+    plain = build_panel(transitions, uniform(n_step=3), tmp_path / "q")
+    np.testing.assert_array_equal(panel.rows, plain.rows)
+
+
+def test_a_row_that_is_no_number_is_refused(transitions: pa.Table, tmp_path: Path) -> None:
+    rows = transitions["next_observation"].to_pylist()
+    rows[7] = [float("nan"), *rows[7][1:]]
+    place = transitions.schema.get_field_index("next_observation")
+    field = transitions.schema.field(place)
+    table = transitions.set_column(place, field, pa.array(rows, field.type))
+    with pytest.raises(PanelError, match="isfinite") as caught:
+        build_panel(table, uniform(), tmp_path / "p")
+    where = str(caught.value).split('where = "')[1].split('"')[0]
+    assert len(build_panel(table, uniform(where=where), tmp_path / "p")) == len(table) - 1
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    continues=st.lists(st.booleans(), min_size=1, max_size=40),
+    n_step=st.integers(1, 45),
+    discount=st.floats(0, 1),
+)
+def test_horizons_and_returns_follow_their_definition(
+    continues: list[bool], n_step: int, discount: float
+) -> None:
+    going_on = np.array([*continues[:-1], False])
+    reward = np.random.default_rng(0).normal(size=len(going_on)).astype(np.float32)
+    horizon = n_step_horizon(going_on, n_step)
+    returns = n_step_return(reward, horizon, discount)
+    for row in range(len(going_on)):
+        steps = 1
+        while steps < n_step and going_on[row + steps - 1]:
+            steps += 1
+        assert horizon[row] == steps
+        expected = sum(discount**k * float(reward[row + k]) for k in range(steps))
+        assert returns[row] == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_store_and_the_same_table_pack_the_same_rows(
+    transitions: pa.Table, store_path: Path, tmp_path: Path
+) -> None:
+    mixture = load_mixture("coverage")
+    from_table = build_panel(transitions, mixture, tmp_path / "a", task=TASK)
+    with Store(store_path) as store:
+        from_store = build_panel(store, mixture, tmp_path / "b")
+    np.testing.assert_array_equal(from_table.rows, from_store.rows)
+    assert from_table.meta.equals(from_store.meta)
+    assert from_store.task == TASK
+    assert from_store.task_hash == TASK.hash
+    assert from_store.store_version == 2
+
+
+def test_the_id_names_the_content(transitions: pa.Table, tmp_path: Path) -> None:
+    def made(name: str, **changes: object) -> str:
+        return build_panel(transitions, uniform(**changes), tmp_path / name).id
+
+    assert made("a") == made("b")
+    assert (
+        len(
+            {
+                made("c"),
+                made("d", n_step=2),
+                made("e", seed=1, by="episode"),
+                made("f", seed=2, by="episode"),
+            }
+        )
+        == 4
+    )
+
+
+def test_strata_are_those_of_the_labels_by_priority(transitions: pa.Table, tmp_path: Path) -> None:
+    panel = build_panel(transitions, uniform(), tmp_path / "p")
+    assert panel.meta["stratum"].to_pylist() == panel.meta["condition"].to_pylist()
+    for stratum, rows in zip(panel.strata, panel.stratum_rows(), strict=True):
+        assert stratum.rows == len(rows)
+    assert sum(stratum.share for stratum in panel.strata) == pytest.approx(1)
+
+
+def test_the_sampler_draws_by_the_panels_quotas(transitions: pa.Table, tmp_path: Path) -> None:
+    mixture = parse_mixture(
+        "[planned]\nupdates = 100\n[each_condition]\nshare = 'equal'\n[held_out]\nby = 'none'"
+    )
+    panel = build_panel(transitions, mixture, tmp_path / "p")
+    sampler = panel.sampler(50, np.random.default_rng(0))
+    rows, strata = sampler.draw()
+    assert np.bincount(strata).tolist() == [10] * 5
+    np.testing.assert_array_equal(panel.stratum_code[rows], strata)
+    # Full correction: the mean weight of what is drawn is 1.
+    weights = np.mean([sampler.weights[sampler.draw()[0]].mean() for _ in range(400)])
+    assert weights == pytest.approx(1, abs=0.05)
+
+
+@pytest.mark.parametrize("by", ["episode", "recording", "time"])
+def test_held_out_data_shares_no_episode_with_the_panel(
+    transitions: pa.Table, tmp_path: Path, by: str
+) -> None:
+    panel = build_panel(transitions, uniform(by=by), tmp_path / "p")
+    held = pq.read_table(panel.path / "held_out.parquet")
+    assert 0 < len(held) < 0.5 * len(transitions)
+    assert len(held) + len(panel) == len(transitions)
+    column = "recording_id" if by == "recording" else "episode_id"
+    assert not set(held[column].to_pylist()) & set(panel.meta[column].to_pylist())
+    if by == "time":
+        newest = max(panel.meta["stamp_ns"].to_pylist())
+        stamps = dict(
+            zip(
+                transitions["transition_id"].to_pylist(),
+                transitions["stamp_ns"].to_pylist(),
+                strict=True,
+            )
+        )
+        assert min(stamps[i] for i in held["transition_id"].to_pylist()) > newest
+
+
+def test_one_recording_cannot_be_held_out_by_recording(tmp_path: Path) -> None:
+    with pytest.raises(MixtureError, match="cannot be split"):
+        build_panel(recording_transitions(1), uniform(by="recording"), tmp_path / "p")
+
+
+def test_rows_of_two_tasks_are_refused_unless_one_is_chosen(tmp_path: Path) -> None:
+    other = Task(body=TASK.body, actions=TASK.actions, sectors=6)
+    path = write_store(tmp_path / "store", [recording_transitions(1)])
+    write_store(path, [recording_transitions(2, task=other)], task=other)
+    with Store(path) as store:
+        with pytest.raises(StoreError, match="2 tasks"):
+            build_panel(store, uniform(), tmp_path / "p")
+        mixture = uniform(where=f"task_hash = '{other.hash}'")
+        panel = build_panel(store, mixture, tmp_path / "p")
+    assert panel.task == other
+    assert panel.observation_size == other.observation_size
+
+
+def test_a_panel_that_is_there_is_kept_unless_forced(transitions: pa.Table, tmp_path: Path) -> None:
+    first = build_panel(transitions, uniform(), tmp_path / "p")
+    with pytest.raises(PanelError, match="already there"):
+        build_panel(transitions, uniform(n_step=3), tmp_path / "p")
+    assert Panel.open(tmp_path / "p").id == first.id
+    assert build_panel(transitions, uniform(n_step=3), tmp_path / "p", force=True).id != first.id
+    (tmp_path / "mine").mkdir()
+    with pytest.raises(PanelError, match="already there"):
+        build_panel(transitions, uniform(), tmp_path / "mine", force=True)
+
+
+def test_an_interruption_leaves_nothing(
+    transitions: pa.Table, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(build, "_header", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        build_panel(transitions, uniform(), tmp_path / "p")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_another_builder_of_the_same_panel_does_not_collide(
+    transitions: pa.Table, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_meta = pack.Packer.write_meta
+
+    def meanwhile(*args: Path) -> None:
+        monkeypatch.undo()
+        build_panel(transitions, uniform(), tmp_path / "p")
+        write_meta(*args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(pack.Packer, "write_meta", meanwhile)
+    with pytest.raises(PanelError, match="another builder was faster"):
+        build_panel(transitions, uniform(), tmp_path / "p")
+    assert [path.name for path in tmp_path.iterdir()] == ["p"]
+    Panel.open(tmp_path / "p", verify=True)
+
+
+def test_a_killed_build_leaves_nothing_in_the_way(transitions: pa.Table, tmp_path: Path) -> None:
+    table = tmp_path / "rows.parquet"
+    pq.write_table(transitions, table)
+    code = (
+        "import os, signal, sys, pyarrow.parquet as pq\n"
+        "from restock.replay import build, pack\n"
+        "from restock.replay.mixture.mixture import load_mixture\n"
+        "pack.Packer.write_meta = lambda *_: os.kill(os.getpid(), signal.SIGKILL)\n"
+        "build.build_panel(pq.read_table(sys.argv[1]), load_mixture('uniform'), sys.argv[2])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(table), str(tmp_path / "p")])
+    assert done.returncode == -signal.SIGKILL
+    assert not (tmp_path / "p").exists()
+    assert len(list(tmp_path.iterdir())) == 2  # the table, and what the build had begun
+    build_panel(transitions, uniform(), tmp_path / "p")
+    assert {path.name for path in tmp_path.iterdir()} == {"rows.parquet", "p"}
+
+
+def test_the_verb_checks_every_byte(
+    transitions: pa.Table, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    panel = build_panel(transitions, uniform(), tmp_path / "p")
+    assert cli.main(["mix", "--verify", str(panel.path)]) == 0
+    assert panel.id in capsys.readouterr().out
+    rows = panel.path / ROWS
+    rows.chmod(0o644)
+    content = bytearray(rows.read_bytes())
+    content[6000] ^= 1
+    rows.write_bytes(content)
+    assert cli.main(["mix", "--verify", str(panel.path)]) == 2
+    assert "changed or damaged" in capsys.readouterr().err
+
+
+def test_an_edited_header_is_refused(transitions: pa.Table, tmp_path: Path) -> None:
+    panel = build_panel(transitions, uniform(), tmp_path / "p")
+    header = panel.path / "panel.json"
+    header.chmod(0o644)
+    header.write_text(header.read_text().replace('"n_step": 1', '"n_step": 2'))
+    with pytest.raises(PanelError, match="changed after it was written"):
+        Panel.open(panel.path)
+
+
+def test_the_id_names_the_code_that_packed(
+    transitions: pa.Table, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = build_panel(transitions, uniform(), tmp_path / "a")
+    assert first.header.packing_code == pack.packing_code()
+    monkeypatch.setattr(build, "packing_code", lambda: "0" * 12)
+    assert build_panel(transitions, uniform(), tmp_path / "b").id != first.id
+
+
+def test_damage_is_found(transitions: pa.Table, tmp_path: Path) -> None:
+    panel = build_panel(transitions, uniform(), tmp_path / "p")
+    rows = panel.path / ROWS
+    Panel.open(panel.path, verify=True)
+    assert not rows.stat().st_mode & 0o222
+    rows.chmod(0o644)
+    content = bytearray(rows.read_bytes())
+    content[6000] ^= 1  # between two of the blocks that every opening looks at
+    rows.write_bytes(content)
+    Panel.open(panel.path)
+    with pytest.raises(PanelError, match="checksum"):
+        Panel.open(panel.path, verify=True)
+    content[-1] ^= 1
+    rows.write_bytes(content)
+    with pytest.raises(PanelError, match="checksum"):
+        Panel.open(panel.path)
+    rows.write_bytes(content[:-4])
+    with pytest.raises(PanelError, match="bytes, not the"):
+        Panel.open(panel.path)
+    rows.unlink()
+    with pytest.raises(PanelError, match="missing"):
+        Panel.open(panel.path)
+
+
+def test_what_is_no_panel_is_said_to_be_none(tmp_path: Path) -> None:
+    with pytest.raises(PanelError, match="no such panel"):
+        Panel.open(tmp_path / "nowhere")
+    with pytest.raises(PanelError, match="not a panel"):
+        Panel.open(tmp_path)
+    (tmp_path / "panel.json").write_text('{"id": 3}')
+    with pytest.raises(PanelError, match="header cannot be read"):
+        Panel.open(tmp_path)
+
+
+def test_the_tensor_is_the_rows(transitions: pa.Table, tmp_path: Path) -> None:
+    panel = build_panel(transitions, uniform(), tmp_path / "p")
+    np.testing.assert_array_equal(panel.tensor().numpy(), panel.rows)
+    with pytest.raises(ValueError, match="read-only"):
+        panel.rows[0, 0] = 1.0
+
+
+MEASURED = """
+import resource, sys
+from pathlib import Path
+from restock.replay.panel.build import build_panel
+from restock.replay.mixture.mixture import parse_mixture
+from restock.replay.store.store import Store
+
+text = "n_step = 3\\nreturn_to_go = true\\nheld_out = {by = 'none'}\\n[each_condition]"
+mixture = parse_mixture(text)
+with Store(sys.argv[1], memory_limit="110MB") as store:
+    store.sql("SET threads = 1")
+    status = Path("/proc/self/status").read_text().split("VmData:")[1].split()[0]
+    limit = int(status) * 1024 + int(sys.argv[3])
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
+    build_panel(store, mixture, sys.argv[2])
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="limits memory as Linux does")
+def test_a_store_several_times_the_memory_is_packed(tmp_path: Path) -> None:
+    task = Task(body=TASK.body, actions=TASK.actions, sectors=76)
+    limit = 340 << 20  # bytes more than the process has once its store is open
+    first = recording_transitions(1, episodes=1500, task=task)
+    recordings = []
+    for number in range(1, 17):
+        table = first.set_column(
+            0, first.schema.field(0), pa.array((np.int64(number) << 25) + np.arange(len(first)))
+        )
+        for name, values in (
+            ("recording_id", [f"{number:016x}"] * len(first)),
+            ("episode_id", [f"{number:016x}/{e}" for e in first["episode_index"].to_pylist()]),
+            ("ingest_id", [f"{number:016x}-a"] * len(first)),
+        ):
+            place = first.schema.get_field_index(name)
+            table = table.set_column(place, first.schema.field(place), pa.array(values))
+        recordings.append(table)
+    store = tmp_path / "store"
+    StoreWriter(store).write_all((manifest(table, task=task), table) for table in recordings)
+    command = [sys.executable, "-c", MEASURED, str(store), str(tmp_path / "p"), str(limit)]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr[-2000:]
+    panel = Panel.open(tmp_path / "p", verify=True)
+    assert panel.rows.nbytes > 3 * limit
+    order = np.random.default_rng(0).integers(len(panel), size=50)
+    ids = panel.meta_column("transition_id")
+    observation = first["observation"].combine_chunks()
+    for row in order:
+        expected = observation[int(ids[row]) & ((1 << 25) - 1)].as_py()
+        np.testing.assert_array_equal(panel.rows[row, panel.columns["observation"]], expected)

@@ -1,0 +1,280 @@
+"""The store's views: what they count, what they hide, and that every column is documented."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+import pytest
+from deltalake import write_deltalake
+from support.paths import ROOT
+from support.stores import TASK, manifest, recording_transitions, write_store
+
+import restock
+from restock.errors import QueryError, StoreError
+from restock.ingest.task.task import Task
+from restock.replay.store.column_docs import column_docs, rewrite, view_docs
+from restock.replay.store.store import Store, is_store
+
+
+@pytest.fixture(scope="module")
+def store(store_path: Path) -> Store:
+    return Store(store_path)
+
+
+def rows(store: Store, query: str) -> list[dict[str, object]]:
+    found: list[dict[str, object]] = store.sql(query).to_arrow_table().to_pylist()
+    return found
+
+
+def test_transitions_are_those_that_were_written(store: Store, transitions: pa.Table) -> None:
+    read = store.sql("FROM transitions ORDER BY transition_id").to_arrow_table()
+    expected = transitions.sort_by("transition_id")
+    assert read.column_names == [*expected.column_names, "logged_ns"]
+    for name in expected.column_names:
+        assert read[name].to_pylist() == expected[name].to_pylist(), name
+    assert pa.types.is_fixed_size_list(read.schema.field("observation").type)
+    assert store.version == 2
+    assert store.task() == TASK
+
+
+def test_a_store_opens_from_the_front_door(store_path: Path) -> None:
+    with restock.open(str(store_path)) as opened:
+        assert opened.sql("SELECT count(*) FROM recordings").fetchall() == [(3,)]
+
+
+def test_an_ingest_cut_before_its_transitions_is_in_no_view(tmp_path: Path) -> None:
+    path = write_store(tmp_path / "store", [recording_transitions(1)])
+    write_deltalake(str(path / "recordings"), manifest(recording_transitions(2)), mode="append")
+    with Store(path) as store:
+        assert store.sql("SELECT DISTINCT recording_id FROM recordings").fetchall() == [
+            (f"{1:016x}",)
+        ]
+
+
+def test_an_older_version_can_be_opened(store_path: Path, transitions: pa.Table) -> None:
+    with Store(store_path, version=0) as store:
+        assert store.sql("SELECT count(DISTINCT recording_id) FROM transitions").fetchall() == [
+            (1,)
+        ]
+        assert store.sql("SELECT count(*) FROM recordings").fetchall() == [(1,)]
+    with pytest.raises(StoreError, match="version 9"):
+        Store(store_path, version=9)
+
+
+def test_columns_that_older_rows_lack_are_null(tmp_path: Path) -> None:
+    path = write_store(tmp_path / "store", [recording_transitions(1)])
+    newer = recording_transitions(2)
+    newer = newer.append_column("payload_kg", pa.array(np.full(len(newer), 3.0)))
+    write_deltalake(str(path / "recordings"), manifest(newer), mode="append")
+    write_deltalake(str(path / "transitions"), newer, mode="append", schema_mode="merge")
+    with Store(path) as store:
+        found = store.sql(
+            "SELECT recording_id, any_value(payload_kg) FROM transitions GROUP BY ALL ORDER BY ALL"
+        ).fetchall()
+    assert found == [(f"{1:016x}", None), (f"{2:016x}", 3.0)]
+
+
+def test_episodes_are_those_of_a_naive_reading(store: Store, transitions: pa.Table) -> None:
+    by_episode: dict[str, list[dict[str, object]]] = {}
+    for row in transitions.to_pylist():
+        by_episode.setdefault(row["episode_id"], []).append(row)
+    found = rows(store, "FROM episodes")
+    assert len(found) == len(by_episode)
+    for episode in found:
+        steps = by_episode[str(episode["episode_id"])]
+        assert episode["steps"] == len(steps)
+        assert episode["missing_steps"] == 0
+        assert episode["return"] == pytest.approx(sum(s["reward"] for s in steps), abs=1e-4)
+        assert episode["duration_s"] == pytest.approx(0.2 * (len(steps) - 1))
+        assert episode["ended"] == ("terminated" if steps[-1]["terminated"] else "truncated")
+        reached = steps[-1]["terminated"] and steps[-1]["reward"] > TASK.rewards.goal / 2
+        assert episode["success"] == reached
+        assert episode["conditions"] == sorted({c for s in steps for c in s["conditions"]})
+        assert episode["bumped_steps"] == sum(s["bumped"] for s in steps)
+        assert episode["handovers"] == 0
+
+
+def test_a_handover_is_counted_and_a_missing_step_is_seen(tmp_path: Path) -> None:
+    table = recording_transitions(1, episodes=1)
+    policy = np.where(np.arange(len(table)) < 5, "planner", "operator")
+    place = table.schema.get_field_index("behaviour_policy")
+    table = table.set_column(place, table.schema.field(place), pa.array(policy))
+    table = pa.concat_tables([table.slice(0, 3), table.slice(4)])
+    with Store(write_store(tmp_path / "s", [table])) as store:
+        (episode,) = rows(store, "FROM episodes")
+    assert episode["handovers"] == 1
+    assert episode["missing_steps"] == 1
+    assert episode["first_policy"] == "planner"
+
+
+def test_without_a_goal_there_is_no_success(tmp_path: Path) -> None:
+    task = Task(body=TASK.body, actions=TASK.actions, sectors=4, goal="none")
+    path = write_store(tmp_path / "s", [recording_transitions(1, task=task)], task=task)
+    with Store(path) as store:
+        assert store.sql("SELECT DISTINCT success FROM episodes").fetchall() == [(None,)]
+        assert store.sql("SELECT DISTINCT success_share FROM coverage").fetchall() == [(None,)]
+
+
+def test_coverage_counts_every_row_once(store: Store, transitions: pa.Table) -> None:
+    found = rows(store, "FROM coverage")
+    assert sum(row["rows"] for row in found) == len(transitions)  # type: ignore[misc]
+    assert sum(row["share"] for row in found) == pytest.approx(1)  # type: ignore[misc]
+    by_condition = rows(store, "FROM coverage_by_condition")
+    expected = transitions["condition"].to_pylist()
+    assert {r["condition"]: r["rows"] for r in by_condition} == {
+        name: expected.count(name) for name in set(expected)
+    }
+    for row in by_condition:
+        assert 1 <= row["effective_episodes"] <= row["episodes"]  # type: ignore[operator]
+
+
+def test_a_condition_never_seen_has_a_line_and_empty_cells(tmp_path: Path) -> None:
+    table = recording_transitions(1)
+    keep = [name != "wheel_slip" for name in table["condition"].to_pylist()]
+    table = table.filter(pa.array(keep))
+    keep = [
+        not (name == "recovery" and action == 2)
+        for name, action in zip(
+            table["condition"].to_pylist(), table["action"].to_pylist(), strict=True
+        )
+    ]
+    with Store(write_store(tmp_path / "s", [table.filter(pa.array(keep))])) as store:
+        (slip,) = rows(store, "FROM coverage_by_condition WHERE condition = 'wheel_slip'")
+        assert (slip["rows"], slip["episodes"], slip["behaviour_policies"]) == (0, 0, [])
+        missing = {(row["condition"], row["action"]) for row in rows(store, "FROM missing_cells")}
+        assert {("wheel_slip", action) for action in range(5)} | {("recovery", 2)} <= missing
+        assert rows(store, "FROM cells_below(1)") == [
+            row | {"rows": 0} for row in rows(store, "FROM missing_cells")
+        ]
+
+
+def test_overlap_counts_pairs_both_ways(store: Store, transitions: pa.Table) -> None:
+    held = [set(conditions) for conditions in transitions["conditions"].to_pylist()]
+    for row in rows(store, "FROM label_overlap"):
+        both = sum({row["condition"], row["other"]} <= names for names in held)
+        one = sum(row["condition"] in names for names in held)
+        assert row["rows"] == both
+        assert row["share"] == pytest.approx(both / one)
+
+
+def test_near_duplicates_are_found(tmp_path: Path) -> None:
+    table = recording_transitions(1)
+    observation = table["observation"].to_pylist()
+    observation[9] = [value + 1e-7 for value in observation[4]]
+    action = table["action"].to_pylist()
+    action[9] = action[4]
+    for name, values in (("observation", observation), ("action", action)):
+        place = table.schema.get_field_index(name)
+        table = table.set_column(
+            place, table.schema.field(place), pa.array(values, table.schema.field(place).type)
+        )
+    with Store(write_store(tmp_path / "s", [table])) as store:
+        found = rows(store, "FROM near_duplicates(4)")
+    assert [row["copies"] for row in found] == [2]
+    assert found[0]["transition_id"] == (1 << 25) + 4
+
+
+def test_ages_are_against_the_moment_asked_for(store: Store, transitions: pa.Table) -> None:
+    newest = max(transitions["stamp_ns"].to_pylist())
+    day = "make_timestamp_ns(" + str(newest + 3 * 86400 * 10**9) + ")"
+    ages = rows(store, f"FROM ages_at({day})")
+    assert min(row["age_min_days"] for row in ages) == pytest.approx(3, abs=1e-3)  # type: ignore[type-var]
+
+
+def test_ages_are_by_log_time_where_stamps_are_a_simulators(tmp_path: Path) -> None:
+    table = recording_transitions(1)
+    place = table.schema.get_field_index("stamp_ns")
+    simulated = pa.array(np.arange(len(table)) * 200_000_000)
+    table = table.set_column(place, table.schema.field(place), simulated)
+    row = manifest(table)
+    place = row.schema.get_field_index("clock_offset_ns")
+    offset = pa.array([1_700_000_000 * 10**9])
+    row = row.set_column(place, row.schema.field(place), offset)
+    write_deltalake(str(tmp_path / "recordings"), row)
+    write_deltalake(str(tmp_path / "transitions"), table)
+    with Store(tmp_path) as store:
+        ((oldest,),) = store.sql("SELECT min(oldest)::VARCHAR FROM ages").fetchall()
+    assert oldest == "2023-11-14 22:13:20"
+
+
+def test_every_column_of_every_view_is_documented(store: Store) -> None:
+    undocumented = rows(store, "FROM columns WHERE meaning IS NULL OR meaning = ''")
+    assert undocumented == []
+    views = {
+        name
+        for (name,) in store.sql(
+            "SELECT view_name FROM duckdb_views() WHERE NOT internal"
+        ).fetchall()
+    } - {"stored_transitions", "stored_recordings"}
+    assert views == set(view_docs())
+    there = {(row["view"], row["column"]) for row in rows(store, "FROM columns")}
+    assert {key for key in column_docs() if key[0] != "shared"} <= there  # no doc of nothing
+
+
+def test_queries_are_read_only(store: Store, tmp_path: Path) -> None:
+    for text in (
+        f"COPY transitions TO '{tmp_path}/out.parquet'",
+        f"ATTACH '{tmp_path}/other.db'",
+        f"EXPORT DATABASE '{tmp_path}/out'",
+        "INSTALL httpfs",
+    ):
+        with pytest.raises(QueryError, match="read-only"):
+            store.sql(text)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("query", "message"),
+    [
+        ("FROM coverag", "Did you mean"),
+        ("SELECT nope FROM episodes", "nope"),
+        ("SELEC 1", "syntax error"),
+        ("", "empty"),
+    ],
+)
+def test_wrong_sql_says_what_duckdb_says(store: Store, query: str, message: str) -> None:
+    with pytest.raises(QueryError, match=message):
+        store.sql(query)
+
+
+def test_what_is_no_store_is_said_to_be_none(tmp_path: Path) -> None:
+    assert not is_store(tmp_path)
+    with pytest.raises(StoreError, match="not a store"):
+        Store(tmp_path)
+    with pytest.raises(StoreError, match="no such store"):
+        Store(tmp_path / "x")
+    with pytest.raises(StoreError, match="memory limit"):
+        Store(write_store(tmp_path / "s", [recording_transitions(1)]), memory_limit="lots")
+
+
+def test_a_memory_limit_is_kept(store_path: Path) -> None:
+    with Store(store_path, memory_limit="300MB") as store:
+        ((limit,),) = store.sql("SELECT current_setting('memory_limit')").fetchall()
+    assert limit.startswith("286")  # MiB
+
+
+def test_the_views_run_over_tables_in_memory_too(transitions: pa.Table) -> None:
+    """views.sql asks for two relations and nothing else."""
+    from restock.replay.store.query import definitions
+
+    with duckdb.connect() as connection:
+        connection.register("stored_transitions", transitions)
+        connection.register("stored_recordings", manifest(recording_transitions(1)))
+        connection.execute(definitions())
+        ((count,),) = connection.sql("SELECT count(*) FROM transitions").fetchall()
+    assert count == len(recording_transitions(1))
+
+
+def test_the_page_lists_every_column_as_it_is() -> None:
+    page = (ROOT / "docs" / "sql.md").read_text(encoding="utf-8")
+    assert rewrite(page) == page, "run: python -m restock.replay.store.column_docs docs/sql.md"
+
+
+def test_a_store_may_lie_in_a_folder_with_spaces_and_umlauts(tmp_path: Path) -> None:
+    path = write_store(tmp_path / "Läger 7 (neu)" / "my store", [recording_transitions(1)])
+    with Store(path) as store:
+        ((rows,),) = store.sql("SELECT count(*) FROM transitions").fetchall()
+    assert rows > 0

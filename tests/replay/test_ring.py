@@ -1,0 +1,345 @@
+"""The fresh ring: n-step rows against a naive oracle, eviction, labels, resume."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from restock.errors import MixtureError
+from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.sampler import Quotas
+
+SIZE = 3
+CONDITIONS = ("wheel_slip", "blocked_aisle", "nominal")
+
+
+@dataclass
+class Drive:
+    """Random steps of N environments with SAME_STEP autoreset, as the twin gives them."""
+
+    num_envs: int
+    seed: int
+    steps: list[dict[str, Any]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.rng = np.random.default_rng(self.seed)
+        self.observation = self.fresh()
+
+    def fresh(self) -> np.ndarray:
+        return self.rng.normal(size=(self.num_envs, SIZE)).astype(np.float32)
+
+    def step(self) -> dict[str, Any]:
+        ended = self.rng.random(self.num_envs) < 0.25
+        terminated = ended & (self.rng.random(self.num_envs) < 0.5)
+        after, after_reset = self.fresh(), self.fresh()
+        step = {
+            "observation": self.observation.copy(),
+            "action": self.rng.integers(0, 9, self.num_envs),
+            "reward": self.rng.normal(size=self.num_envs).astype(np.float32),
+            "terminated": terminated,
+            "truncated": ended & ~terminated,
+            "next_observation": after,
+        }
+        self.observation = np.where(ended[:, None], after_reset, after)
+        self.steps.append(step)
+        return step
+
+
+def oracle(steps: list[dict[str, Any]], discount: float, n_step: int) -> dict[tuple[int, int], Any]:
+    """(env, first step) -> the packed row, for every row that is complete."""
+    found = {}
+    for env in range(len(steps[0]["action"])):
+        for first in range(len(steps)):
+            total, horizon, complete, terminal = 0.0, 0, False, False
+            for step in steps[first : first + n_step]:
+                total += discount**horizon * float(step["reward"][env])
+                horizon += 1
+                terminal = bool(step["terminated"][env])
+                if terminal or step["truncated"][env]:
+                    complete = True
+                    break
+            if complete or horizon == n_step:
+                last = steps[first + horizon - 1]
+                found[env, first] = np.concatenate(
+                    [
+                        steps[first]["observation"][env],
+                        last["next_observation"][env],
+                        [steps[first]["action"][env], total, discount**horizon * (not terminal)],
+                    ]
+                )
+    return found
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    num_envs=st.integers(1, 4),
+    n_step=st.integers(1, 5),
+    steps=st.integers(1, 25),
+    seed=st.integers(0, 2**32),
+)
+def test_rows_are_those_of_a_naive_n_step_oracle(
+    num_envs: int, n_step: int, steps: int, seed: int
+) -> None:
+    ring = FreshRing(500, num_envs, SIZE, discount=0.9, n_step=n_step)
+    drive = Drive(num_envs, seed)
+    keys = []
+    for index in range(steps):
+        step = drive.step()
+        keys.append(ring.append(**step, env_step=index * num_envs, gradient_step=index // 4))
+    expected = oracle(drive.steps, 0.9, n_step)
+    assert len(ring) == len(expected)
+    # A row is found by its episode and its step in it.
+    began: dict[int, int] = {}
+    for index, row_keys in enumerate(keys):
+        for key in row_keys.tolist():
+            began.setdefault(key, index)
+    env_of = {key: env for row_keys in keys for env, key in enumerate(row_keys.tolist())}
+    for slot in range(len(ring)):
+        key = int(ring.meta["episode"][slot])
+        first = began[key] + int(ring.meta["episode_step"][slot])
+        np.testing.assert_allclose(
+            ring.rows[slot], expected.pop((env_of[key], first)), rtol=1e-5, atol=1e-5
+        )
+        assert ring.meta["env_step"][slot] == first * num_envs
+        assert ring.meta["gradient_step"][slot] == first // 4
+    assert not expected
+
+
+def test_known_values_of_termination_truncation_and_bootstrap() -> None:
+    ring = FreshRing(10, 2, 1, discount=0.5, n_step=3)
+    for index in range(2):  # environment 0 terminates after two steps, environment 1 is cut
+        ring.append(
+            observation=np.array([[index], [10 + index]]),
+            action=np.array([1, 2]),
+            reward=np.array([1.0, 2.0]),
+            terminated=np.array([index == 1, False]),
+            truncated=np.array([False, index == 1]),
+            next_observation=np.array([[index + 1], [11 + index]]),
+            env_step=index,
+            gradient_step=0,
+        )
+    part = {name: ring.rows[:4, place].ravel().tolist() for name, place in ring.columns.items()}
+    assert part["observation"] == [0.0, 10.0, 1.0, 11.0]
+    assert part["next_observation"] == [2.0, 12.0, 2.0, 12.0]
+    assert part["reward"] == [1.5, 3.0, 1.0, 2.0]
+    assert part["discount"] == [0.0, 0.25, 0.0, 0.5]  # truncation bootstraps, shortened
+    assert ring.meta["horizon"][:4].tolist() == [2, 2, 1, 1]
+
+
+def filled(
+    capacity: int = 40, steps: int = 60, seed: int = 0, n_step: int = 3
+) -> tuple[FreshRing, Drive]:
+    """A ring after some steps, ended episodes labelled by the parity of their step."""
+    ring = FreshRing(capacity, 2, SIZE, discount=0.9, n_step=n_step, conditions=CONDITIONS)
+    drive = Drive(2, seed)
+    advance(ring, drive, steps)
+    return ring, drive
+
+
+def advance(ring: FreshRing, drive: Drive, steps: int) -> None:
+    for _ in range(steps):
+        step = drive.step()
+        keys = ring.append(**step, env_step=len(drive.steps), gradient_step=0, policy_version=7)
+        for key in keys[step["terminated"] | step["truncated"]].tolist():
+            ring.set_labels(key, np.where(np.arange(500) % 2 == 0, 2, key % 2))
+
+
+def test_the_oldest_rows_go_first() -> None:
+    ring, drive = filled(capacity=20, steps=100)
+    kept = ring.meta["env_step"]
+    assert len(ring) == 20
+    assert ring.appended > 20
+    # 2 environments: rows of the last ten or so steps, n-step rows lag by up to two.
+    assert kept.min() >= len(drive.steps) - 14
+
+
+def test_labels_put_rows_in_their_strata_and_eviction_takes_them_out() -> None:
+    ring, _ = filled(capacity=30, steps=200)
+    ended = ring.ended_mask()
+    codes = ring.condition(np.arange(len(ring)))
+    assert (codes[ended] >= 0).all()
+    assert (codes[~ended] == -1).all()
+    expected = np.where(
+        ring.meta["episode_step"][ended] % 2 == 0, 2, ring.meta["episode"][ended] % 2
+    )
+    np.testing.assert_array_equal(codes[ended], expected)
+    for code in range(3):
+        assert sorted(ring.strata.members(code)) == np.flatnonzero(codes == code).tolist()
+
+
+def test_quotas_over_fresh_conditions_are_exact() -> None:
+    ring, _ = filled(capacity=200, steps=150)
+    quotas = Quotas([0.25, 0.25, 0.5], 16)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        slots, codes = ring.sample_strata(quotas, rng)
+        assert np.bincount(codes, minlength=3).tolist() == [4, 4, 8]
+        np.testing.assert_array_equal(ring.condition(slots), codes)
+
+
+def test_the_part_of_an_empty_stratum_is_drawn_from_all_rows() -> None:
+    ring = FreshRing(50, 2, SIZE, discount=0.9, conditions=CONDITIONS)
+    drive = Drive(2, 1)
+    for index in range(10):
+        ring.append(**drive.step(), env_step=index, gradient_step=0)
+    slots, codes = ring.sample_strata(Quotas([0.5, 0.25, 0.25], 8), np.random.default_rng(0))
+    assert len(slots) == 8
+    assert set(codes.tolist()) == {-1}
+
+
+def test_uniform_draws_cover_every_row() -> None:
+    ring, _ = filled(capacity=25, steps=100)
+    drawn = ring.sample(5000, np.random.default_rng(0))
+    counts = np.bincount(drawn, minlength=25)
+    assert counts.min() > 100
+    with pytest.raises(MixtureError, match="empty"):
+        FreshRing(5, 1, SIZE, discount=0.9).sample(4, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("steps", [9, 150])  # before and after the ring is full
+def test_a_restored_ring_goes_on_exactly(steps: int) -> None:
+    ring, drive = filled(capacity=60, steps=steps, seed=5)
+    state = ring.state_dict()
+    arrays = {name: value for name, value in state.items() if isinstance(value, np.ndarray)}
+    plain = json.loads(json.dumps({k: v for k, v in state.items() if k not in arrays}))
+    other = FreshRing(60, 2, SIZE, discount=0.9, n_step=3, conditions=CONDITIONS)
+    other.load_state_dict({**arrays, **plain})
+    began = len(drive.steps)
+    advance(ring, drive, 40)
+    for step in drive.steps[began:]:
+        keys = other.append(**step, env_step=began + 1, gradient_step=0, policy_version=7)
+        began += 1
+        for key in keys[step["terminated"] | step["truncated"]].tolist():
+            other.set_labels(key, np.where(np.arange(500) % 2 == 0, 2, key % 2))
+    for name, value in ring.state_dict().items():
+        np.testing.assert_array_equal(value, other.state_dict()[name], err_msg=name)
+    rngs = [np.random.default_rng(9), np.random.default_rng(9)]
+    quotas = [Quotas([0.2, 0.2, 0.6], 10), Quotas([0.2, 0.2, 0.6], 10)]
+    for _ in range(5):
+        mine, theirs = (
+            r.sample_strata(q, g) for r, q, g in zip((ring, other), quotas, rngs, strict=True)
+        )
+        np.testing.assert_array_equal(mine[0], theirs[0])
+
+
+def test_a_state_of_another_ring_is_refused() -> None:
+    ring, _ = filled()
+    other = FreshRing(41, 2, SIZE, discount=0.9, n_step=3, conditions=CONDITIONS)
+    with pytest.raises(MixtureError, match="another shape"):
+        other.load_state_dict(ring.state_dict())
+
+
+def test_wrong_labels_are_refused() -> None:
+    ring = FreshRing(50, 1, SIZE, discount=0.9, conditions=CONDITIONS)
+    drive = Drive(1, 0)
+    key = -1
+    for index in range(3):
+        step = drive.step() | {"terminated": np.array([index == 2]), "truncated": np.array([False])}
+        key = int(ring.append(**step, env_step=0, gradient_step=0)[0])
+    with pytest.raises(MixtureError, match="name no condition"):
+        ring.set_labels(key, np.array([0, 1, 3]))
+    with pytest.raises(MixtureError, match="2 labels"):
+        ring.set_labels(key, np.array([0, 1]))
+
+
+def test_a_ring_too_small_for_its_environments_is_refused() -> None:
+    with pytest.raises(MixtureError, match="at least 48 rows"):
+        FreshRing(47, 16, SIZE, discount=0.9, n_step=3)
+
+
+def reserving(
+    capacity: int = 60, seed: int = 0, num_envs: int = 2, **reserved: int
+) -> tuple[FreshRing, Drive]:
+    ring = FreshRing(
+        capacity,
+        num_envs,
+        SIZE,
+        discount=0.9,
+        n_step=3,
+        conditions=CONDITIONS,
+        reserved=reserved,
+    )
+    return ring, Drive(num_envs, seed)
+
+
+def label_rarely(ring: FreshRing, drive: Drive, steps: int) -> None:
+    """One episode in ten is of wheel slip, all others are nominal."""
+    for _ in range(steps):
+        step = drive.step()
+        keys = ring.append(**step, env_step=len(drive.steps), gradient_step=0)
+        for key in keys[step["terminated"] | step["truncated"]].tolist():
+            ring.set_labels(key, np.full(500, 0 if key % 10 == 0 else 2))
+
+
+def test_rare_rows_are_not_washed_out_where_they_are_reserved() -> None:
+    plain, drive = reserving(seed=3)
+    label_rarely(plain, drive, 1500)
+    kept, drive = reserving(seed=3, wheel_slip=25, blocked_aisle=10)
+    label_rarely(kept, drive, 1500)
+    assert plain.strata.counts[0] < 15
+    assert 25 <= kept.strata.counts[0] <= 60
+    # What is not used of a reserve is anybody's; nominal rows stay the newest there are.
+    assert kept.strata.counts[2] >= 20
+    newest = np.sort(kept.meta["env_step"][kept.strata.members(2)])[-10:]
+    assert newest.min() > len(drive.steps) - 40
+    # Of the rare ones, too, the oldest went first.
+    slips = kept.meta["env_step"][kept.strata.members(0)]
+    assert slips.min() > 100
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    capacity=st.integers(12, 80),
+    steps=st.integers(1, 120),
+    parts=st.tuples(st.integers(0, 4), st.integers(0, 4), st.integers(0, 4)),
+    seed=st.integers(0, 2**32),
+)
+def test_a_ring_with_reserves_stays_whole(
+    capacity: int, steps: int, parts: tuple[int, int, int], seed: int
+) -> None:
+    reserved = {
+        name: part * capacity // max(sum(parts), 1)
+        for name, part in zip(CONDITIONS, parts, strict=True)
+    }
+    ring, drive = reserving(capacity, seed=seed, **reserved)
+    advance(ring, drive, steps)
+    filled = len(ring)
+    assert filled == min(ring.appended, capacity)
+    codes = ring.condition(np.arange(filled))
+    for code in range(3):
+        assert sorted(ring.strata.members(code)) == np.flatnonzero(codes == code).tolist()
+    # Every row is a step of its own, and as it was when it was appended.
+    key = (ring.meta["episode"][:filled] << 20) + ring.meta["episode_step"][:filled]
+    assert len(np.unique(key)) == filled
+    expected = oracle(drive.steps, 0.9, 3)
+    at = {tuple(np.float32(row)): place for place, row in expected.items()}
+    for slot in range(filled):
+        _, first = at[tuple(ring.rows[slot])]
+        assert ring.meta["env_step"][slot] == first + 1
+
+
+def test_a_restored_ring_with_reserves_goes_on_exactly() -> None:
+    ring, drive = reserving(seed=5, wheel_slip=20)
+    label_rarely(ring, drive, 150)
+    other, _ = reserving(seed=5, wheel_slip=20)
+    other.load_state_dict(ring.state_dict())
+    for one in (ring, other):
+        label_rarely(one, Drive(2, 11), 200)
+    for name, value in ring.state_dict().items():
+        np.testing.assert_array_equal(value, other.state_dict()[name], err_msg=name)
+
+
+def test_what_cannot_be_reserved_is_refused() -> None:
+    with pytest.raises(MixtureError, match="cannot be reserved"):
+        reserving(60, wheel_slip=40, nominal=30)
+    with pytest.raises(MixtureError, match="cannot be reserved"):
+        reserving(60, unheard_of=1)
+    ring, _ = reserving(60, wheel_slip=40)
+    with pytest.raises(MixtureError, match="reserved"):
+        reserving(60, wheel_slip=20)[0].load_state_dict(ring.state_dict())

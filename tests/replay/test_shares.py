@@ -1,0 +1,203 @@
+"""Shares: they sum to one, floors and caps hold, rows bear no more than they can, rows are one
+stratum's; schedules and group DRO."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from restock.errors import MixtureError
+from restock.replay.mixture.mixture import Adaptive, StratumRule
+from restock.replay.mixture.schedules import Cosine, Linear, Piecewise, mean_over, value_at
+from restock.replay.mixture.shares import wanted_shares, within_limits
+from restock.replay.panel.strata import Stratum, assign
+from restock.replay.sampling.adaptive import GroupDro
+
+PARTS = st.integers(0, 1000).map(lambda thousandths: thousandths / 1000)
+
+
+@st.composite
+def rules(draw: st.DrawFn) -> list[StratumRule]:
+    found = []
+    for index in range(draw(st.integers(1, 7))):
+        low, high = sorted((draw(PARTS), draw(PARTS)))
+        bounded = draw(st.booleans())
+        found.append(
+            StratumRule(
+                name=f"s{index}",
+                share=draw(st.one_of(st.sampled_from(["natural", "equal"]), PARTS)),
+                floor=low / 2 if bounded else 0.0,
+                cap=max(high, low) if bounded else 1.0,
+            )
+        )
+    return found
+
+
+@settings(max_examples=300, deadline=None)
+@given(rules(), st.data())
+def test_wanted_shares_sum_to_one_within_floors_and_caps_or_are_refused(
+    given_rules: list[StratumRule], data: st.DataObject
+) -> None:
+    rows = np.array([data.draw(st.integers(0, 10_000)) for _ in given_rules])
+    fixed = sum(rule.share for rule in given_rules if isinstance(rule.share, float))
+    flexible = [rule for rule in given_rules if isinstance(rule.share, str)]
+    rest = 1 - fixed
+    low, high = sum(rule.floor for rule in flexible), sum(rule.cap for rule in flexible)
+    close = min(abs(rest - low), abs(high - rest), abs(rest)) < 1e-6
+    feasible = low <= rest + 1e-9 and (high >= rest - 1e-9 if flexible else abs(rest) < 1e-6)
+    if not feasible and not close:
+        with pytest.raises(MixtureError, match=r"sum to"):
+            wanted_shares(given_rules, rows)
+        return
+    try:
+        wanted = wanted_shares(given_rules, rows)
+    except MixtureError:
+        assert close
+        return
+    assert wanted.sum() == pytest.approx(1)
+    for rule, share in zip(given_rules, wanted, strict=True):
+        if isinstance(rule.share, str):
+            assert rule.floor - 1e-6 <= share <= rule.cap + 1e-6
+        else:
+            assert share == pytest.approx(rule.share, abs=1e-6)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.data())
+def test_no_stratum_gives_more_than_its_rows_can_bear(data: st.DataObject) -> None:
+    count = data.draw(st.integers(1, 7))
+    parts = [np.array([data.draw(PARTS) for _ in range(count)]) for _ in range(3)]
+    wanted, limit, caps = parts
+    if wanted.sum() == 0:
+        wanted = np.ones(count)
+    wanted = wanted / wanted.sum()
+    shortfall = data.draw(st.sampled_from(["redistribute", "shrink", "refuse"]))
+    short = (wanted > limit + 1e-8).any()
+    if short and (shortfall == "refuse" or np.minimum(wanted, limit).sum() <= 0):
+        with pytest.raises(MixtureError, match=r"who is short|no stratum has rows"):
+            within_limits(wanted, limit, caps, shortfall, lambda: "who is short")
+        return
+    plan = within_limits(wanted, limit, caps, shortfall, lambda: "who is short")
+    assert plan.got.sum() == pytest.approx(1)
+    assert 0 < plan.scale <= 1
+    assert (plan.got * plan.scale <= limit + 1e-6).all()
+    if (wanted <= limit + 1e-12).all():
+        np.testing.assert_allclose(plan.got, wanted)
+    if shortfall == "redistribute":
+        # No stratum was lifted above its cap, and nothing was left lying that could be given.
+        lifted = plan.got * plan.scale > wanted + 1e-6
+        assert (plan.got * plan.scale)[lifted] == pytest.approx(
+            np.minimum(plan.got * plan.scale, caps)[lifted], abs=1e-6
+        )
+        room = np.maximum(np.minimum(limit, caps) - plan.got * plan.scale, 0)
+        assert plan.scale == pytest.approx(1, abs=1e-6) or room.sum() < 1e-6
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.data())
+def test_priorities_part_the_rows(data: st.DataObject) -> None:
+    count, size = data.draw(st.integers(0, 30)), data.draw(st.integers(1, 5))
+    flags = data.draw(st.lists(st.booleans(), min_size=count * size, max_size=count * size))
+    member = np.array(flags, np.bool_).reshape(count, size)
+    priority = data.draw(st.lists(st.integers(0, 3), min_size=size, max_size=size))
+    strata = [
+        Stratum(StratumRule(name=f"s{i}"), "true", None, p, "pre", "none")
+        for i, p in enumerate(priority)
+    ]
+    code = assign(member, strata)
+    for row in range(count):
+        holds = [(priority[i], i) for i in range(size) if member[row, i]]
+        assert code[row] == (min(holds)[1] if holds else -1)
+
+
+def test_schedules_pass_through_their_points() -> None:
+    linear = Linear(start=0.8, end=0.2, from_env_steps=100, to_env_steps=300)
+    assert [linear.at(step) for step in (0, 100, 200, 300, 900)] == pytest.approx(
+        [0.8, 0.8, 0.5, 0.2, 0.2]
+    )
+    cosine = Cosine(start=1.0, end=0.0, to_env_steps=400)
+    assert cosine.at(100) == pytest.approx((1 + math.cos(math.pi / 4)) / 2)
+    assert cosine.at(200) == pytest.approx(0.5)
+    points = ((10, 0.5), (20, 1.0), (40, 0.0))
+    line, hold = Piecewise(points=points), Piecewise(points=points, between="hold")
+    assert [line.at(step) for step in (0, 10, 15, 20, 30, 50)] == pytest.approx(
+        [0.5, 0.5, 0.75, 1.0, 0.5, 0.0]
+    )
+    assert [hold.at(step) for step in (0, 15, 20, 39, 40)] == [0.5, 0.5, 1.0, 1.0, 0.0]
+    assert value_at(0.3, 7) == 0.3
+
+
+@pytest.mark.parametrize(
+    "portion",
+    [
+        0.25,
+        Linear(start=0.9, end=0.1, from_env_steps=50, to_env_steps=150),
+        Cosine(start=0.1, end=0.9, to_env_steps=120),
+        Piecewise(points=((0, 0.2), (30, 0.8), (31, 0.1)), between="hold"),
+    ],
+)
+def test_the_mean_of_a_schedule_is_the_mean_of_its_values(portion: object) -> None:
+    steps = (np.arange(200_000) + 0.5) / 1000
+    values = np.mean([value_at(portion, step) for step in steps])  # type: ignore[arg-type]
+    assert mean_over(portion, 0, 200) == pytest.approx(values, abs=2e-4)  # type: ignore[arg-type]
+
+
+def dro(shares: list[float], **rule: float) -> GroupDro:
+    size = len(shares)
+    return GroupDro(
+        Adaptive(**{"floor": 0.0, "ceiling": 1.0, **rule}),  # type: ignore[arg-type]
+        np.array(shares),
+        np.zeros(size),
+        np.ones(size),
+    )
+
+
+def test_a_step_of_group_dro_is_the_papers() -> None:
+    groups = dro([0.5, 0.3, 0.2], step_size=0.1)
+    groups.observe(np.array([0, 0, 1, 2]), np.array([1.0, 3.0, 1.0, 3.0]))
+    error = np.array([2.0, 1.0, 3.0])
+    expected = np.array([0.5, 0.3, 0.2]) * np.exp(0.1 * error / error.mean())
+    np.testing.assert_allclose(groups.step(), expected / expected.sum(), rtol=1e-9)
+    np.testing.assert_allclose(groups.td_abs, error)
+    # With nothing seen, nothing changes.
+    before = groups.shares.copy()
+    np.testing.assert_array_equal(groups.step(), before)
+
+
+def test_group_dro_feeds_the_worst_and_starves_none() -> None:
+    groups = dro([0.9, 0.1, 0.0], step_size=0.5, floor=0.05, ceiling=0.8)
+    for _ in range(100):
+        groups.observe(np.array([0, 1]), np.array([1.0, 4.0]))
+        groups.step()
+    np.testing.assert_allclose(groups.shares, [0.2, 0.8, 0.0], atol=1e-9)
+    for _ in range(200):
+        groups.observe(np.array([0, 1]), np.array([9.0, 1.0]))
+        groups.step()
+    np.testing.assert_allclose(groups.shares, [0.8, 0.2, 0.0], atol=1e-9)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.data())
+def test_adaptive_shares_stay_within_floor_and_ceiling(data: st.DataObject) -> None:
+    size = data.draw(st.integers(2, 6))
+    start = np.array([data.draw(st.integers(1, 100)) for _ in range(size)], float)
+    groups = dro((start / start.sum()).tolist(), step_size=1.0, floor=0.1 / size, ceiling=0.7)
+    for _ in range(data.draw(st.integers(1, 20))):
+        stratum = np.array(data.draw(st.lists(st.integers(0, size - 1), min_size=1, max_size=9)))
+        error = np.array([data.draw(st.integers(0, 1000)) / 10 for _ in stratum])
+        groups.observe(stratum, error)
+        shares = groups.step()
+        assert shares.sum() == pytest.approx(1)
+        assert (shares >= 0.1 / size - 1e-6).all()
+        assert (shares <= 0.7 + 1e-6).all()
+
+
+def test_floors_and_ceilings_that_cannot_hold_are_refused() -> None:
+    with pytest.raises(MixtureError, match=r"2 strata cannot share out 1 .* sum to 0\.8"):
+        dro([0.5, 0.5], ceiling=0.4)
+    with pytest.raises(MixtureError, match=r"floors that sum to 1\.2"):
+        dro([0.5, 0.5], floor=0.6)

@@ -1,0 +1,209 @@
+"""`restock sql`: tables, JSON and CSV; stdin; runs and panels; errors; Ctrl-C."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import duckdb
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from restock import cli
+from restock.replay.mixture.mixture import load_mixture
+from restock.replay.panel.build import build_panel
+from restock.replay.store.store import Store
+
+
+def out_of(capsys: pytest.CaptureFixture[str], *args: str, code: int = 0) -> str:
+    assert cli.main(["sql", *args]) == code
+    captured = capsys.readouterr()
+    return captured.out if code == 0 else captured.err
+
+
+@pytest.fixture
+def run_dir(tmp_path: Path) -> Path:
+    """A run directory as far as SQL looks at it."""
+    path = tmp_path / "run"
+    (path / "eval").mkdir(parents=True)
+    (path / "config.json").write_text("{}")
+    ids = [(1 << 25) + 3, (1 << 25) + 4, None]
+    audit = {"gradient_step": [1, 1, 2], "source": ["logs", "logs", "fresh"], "transition_id": ids}
+    pq.write_table(pa.table(audit), path / "audit.parquet")
+    pq.write_table(pa.table({"env_steps": [10], "loss": [0.5]}), path / "progress.parquet")
+    pq.write_table(pa.table({"policy": ["dqn"]}), path / "eval" / "episodes.parquet")
+    return path
+
+
+def test_json_is_a_list_of_row_objects(
+    store_path: Path, capsys: pytest.CaptureFixture[str], transitions: pa.Table
+) -> None:
+    query = "SELECT count(*) AS rows, ['a', 'b'] AS list, 0.0/0 AS nothing FROM transitions"
+    rows = json.loads(out_of(capsys, str(store_path), query, "--json"))
+    assert rows == [{"rows": len(transitions), "list": ["a", "b"], "nothing": None}]
+    assert json.loads(out_of(capsys, str(store_path), query + " WHERE false", "--json")) == [
+        {"rows": 0, "list": ["a", "b"], "nothing": None}
+    ]
+
+
+def test_times_with_a_zone_are_text_in_utc(
+    store_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    query = "SELECT ingested_at, ingested_at AS again FROM recordings LIMIT 1"
+    rows = json.loads(out_of(capsys, str(store_path), query, "--json"))
+    assert rows == [{"ingested_at": "2026-01-01 00:00:00Z", "again": "2026-01-01 00:00:00Z"}]
+
+
+def test_csv_has_a_header_even_without_rows(
+    store_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = out_of(capsys, str(store_path), "SELECT condition, rows FROM ages", "--csv")
+    found = list(csv.DictReader(io.StringIO(text)))
+    assert {row["condition"] for row in found} >= {"nominal", "wheel_slip"}
+    query = "SELECT condition, rows FROM ages WHERE false"
+    assert out_of(capsys, str(store_path), query, "--csv") == "condition,rows\n"
+
+
+def test_a_table_is_for_people(store_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = out_of(capsys, str(store_path), "FROM coverage_by_condition")
+    assert "behaviour_policies" in text
+    assert "operator, planner" in text
+
+
+def test_rows_too_wide_for_a_table_are_printed_one_below_the_other(
+    store_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = out_of(capsys, str(store_path), "FROM recordings ORDER BY recording_id LIMIT 2")
+    assert "row 2" in text
+    assert "conditions_json" in text
+
+
+def test_a_query_comes_from_stdin(
+    store_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO("SELECT 1 AS one;\nSELECT 2 AS two"))
+    assert json.loads(out_of(capsys, str(store_path), "-", "--json")) == [{"two": 2}]
+
+
+def test_a_run_is_queried_by_its_tables(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert json.loads(out_of(capsys, str(run_dir), "FROM progress", "--json")) == [
+        {"env_steps": 10, "loss": 0.5}
+    ]
+    assert "dqn" in out_of(capsys, str(run_dir), "FROM eval_episodes")
+    assert "gradient_step" in out_of(capsys, str(run_dir), "FROM columns")
+
+
+def test_what_was_sampled_joins_what_was_logged(
+    store_path: Path, run_dir: Path, capsys: pytest.CaptureFixture[str], transitions: pa.Table
+) -> None:
+    query = (
+        "SELECT transition_id, source_file FROM run.audit JOIN transitions USING (transition_id)"
+        " ORDER BY ALL"
+    )
+    rows = json.loads(out_of(capsys, str(store_path), query, "--run", str(run_dir), "--json"))
+    assert rows == [
+        {"transition_id": (1 << 25) + step, "source_file": "logs/1.mcap"} for step in (3, 4)
+    ]
+
+
+def test_a_panel_is_queried_by_its_tables(
+    store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Store(store_path) as store:
+        panel = build_panel(store, load_mixture("uniform"), tmp_path / "p")
+    query = "SELECT sum(rows) AS rows FROM strata"
+    assert json.loads(out_of(capsys, str(panel.path), query, "--json")) == [{"rows": len(panel)}]
+    query = "SELECT count(*) AS rows FROM panel.rows JOIN transitions USING (transition_id)"
+    beside = ["--panel", str(panel.path), "--json"]
+    assert json.loads(out_of(capsys, str(store_path), query, *beside)) == [{"rows": len(panel)}]
+
+
+@pytest.mark.parametrize(
+    ("query", "message"),
+    [("FROM coverag", "Did you mean"), ("SELECT 'a'::INT", "Could not convert")],
+)
+def test_wrong_sql_is_one_message_and_exit_2(
+    store_path: Path, capsys: pytest.CaptureFixture[str], query: str, message: str
+) -> None:
+    err = out_of(capsys, str(store_path), query, code=2)
+    assert message in err
+    assert "Traceback" not in err
+
+
+def test_wrong_places_are_refused(
+    tmp_path: Path, store_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "neither a store" in out_of(capsys, str(tmp_path), "SELECT 1", code=2)
+    assert "nothing is there" in out_of(capsys, str(tmp_path / "x"), "SELECT 1", code=2)
+    err = out_of(capsys, str(store_path), "SELECT 1", "--run", str(tmp_path), code=2)
+    assert "not a run" in err
+    err = out_of(capsys, str(store_path), "SELECT 1", "--json", "--csv", code=2)
+    assert "choose one" in err
+
+
+def test_without_a_query_there_is_a_prompt(
+    store_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lines = iter(["SELECT 41 + 1", "AS answer;", "FROM nope;", "SELECT 7 AS seven;"])
+
+    def answer(prompt: str) -> str:
+        try:
+            return next(lines)
+        except StopIteration:
+            raise EOFError from None
+
+    monkeypatch.setattr("builtins.input", answer)
+    monkeypatch.setattr(sys, "stdin", type("Terminal", (), {"isatty": lambda self: True})())
+    assert cli.main(["sql", str(store_path), "--csv"]) == 0
+    captured = capsys.readouterr()
+    assert captured.out == "answer\n42\nseven\n7\n"
+    assert "nope" in captured.err
+
+
+@pytest.mark.parametrize("name", ["views.sql", "views.duckdb"])
+def test_any_duckdb_sees_the_exported_views(
+    store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    out = tmp_path / name
+    assert cli.main(["sql", str(store_path), "--export", str(out)]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    with Store(store_path) as store:
+        questions = ["FROM coverage", "FROM episodes ORDER BY ALL", "FROM cells_below(9)"]
+        questions += ["FROM columns", "SELECT typeof(observation) FROM transitions LIMIT 1"]
+        expected = [store.sql(question).fetchall() for question in questions]
+    with duckdb.connect(str(out) if name.endswith("duckdb") else ":memory:") as other:
+        if name.endswith("sql"):
+            other.execute(out.read_text())
+        assert [other.sql(question).fetchall() for question in questions] == expected
+    assert cli.main(["sql", str(store_path), "--export", str(out)]) == 2
+    assert cli.main(["sql", str(store_path), "--export", str(tmp_path / "views.db")]) == 2
+    err = capsys.readouterr().err
+    assert "already there" in err
+    assert "no export to .db" in err
+
+
+def test_ctrl_c_stops_a_query_at_once(store_path: Path) -> None:
+    endless = "SELECT count(*) FROM range(100000000) a, range(100000000) b WHERE a.range % 7 = 3"
+    command = [sys.executable, "-m", "restock", "sql", str(store_path), endless]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    # The query runs once DuckDB burns time; a signal before that is handled as well.
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and _cpu_seconds(process.pid) < 2.0:
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "interrupted" in err
+
+
+def _cpu_seconds(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")

@@ -1,0 +1,311 @@
+"""A sampled row leads back to its panel, store, recording and messages, or says what is missing."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from deltalake import DeltaTable, write_deltalake
+from support.paths import ROOT
+from support.stores import TASK, manifest, recording_transitions, write_store
+
+from restock import cli
+from restock.errors import PanelError, RecordingError, RunError, StoreError
+from restock.ingest.pipeline import ingest
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.store.writer import StoreWriter
+from restock.replay.mixture.mixture import parse_mixture
+from restock.replay.panel.build import build_panel
+from restock.replay.panel.panel import Panel
+from restock.replay.places import open_place
+from restock.replay.store.audit import load_audits, load_thresholds, run_audits
+from restock.replay.store.store import Store
+from restock.replay.trace.trace import Where, audited_rows, trace
+
+RECORDING = ROOT / "sample_logs" / "amr_tuesday"
+MIXTURE = parse_mixture("n_step = 3\n[each_condition]\nshare = 'natural'\n[held_out]\nby = 'none'")
+
+
+@dataclass
+class Places:
+    """A recording's store, a panel of it, and a run that was fed the panel."""
+
+    store: Path
+    panel: Path
+    run: Path
+
+    def rows(self, query: str) -> list[dict[str, Any]]:
+        with Store(self.store) as store:
+            found: list[dict[str, Any]] = store.sql(query).to_arrow_table().to_pylist()
+        return found
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory: pytest.TempPathFactory) -> Places:
+    folder = tmp_path_factory.mktemp("trace")
+    ingest(RECORDING, load_profile("warehouse_amr"), store=StoreWriter(folder / "store"))
+    with Store(folder / "store") as store:
+        panel = build_panel(store, MIXTURE, folder / "panel")
+    write_run(folder / "run", panel)
+    return Places(folder / "store", folder / "panel", folder / "run")
+
+
+def write_run(path: Path, panel: Panel) -> None:
+    """What a run writes of one audited batch: three logged rows and a fresh one."""
+    path.mkdir()
+    fed = {"path": str(panel.path), "id": panel.id}
+    (path / "config.json").write_text(json.dumps({"panel": fed, "seeds": {"run": 5}}))
+    ids = panel.meta_column("transition_id")
+    logged = [
+        {
+            "gradient_step": 7,
+            "batch_row": place,
+            "source": "logs",
+            "transition_id": int(ids[row]),
+            "panel_row": row,
+            "td": float(place),
+            "row_hash": hashlib.blake2b(panel.rows[row].tobytes(), digest_size=8).hexdigest(),
+        }
+        for place, row in enumerate([3, 100, 400])
+    ]
+    fresh = {"gradient_step": 7, "batch_row": 3, "source": "fresh", "episode": "12"}
+    blank = dict.fromkeys(
+        (
+            "stratum",
+            "condition",
+            "behaviour_policy",
+            "age_days",
+            "age_env_steps",
+            "action",
+            "reward",
+        )
+    )
+    rows = [blank | {"q": 0.0, "td": 0.5, "episode": "x"} | row for row in [*logged, fresh]]
+    rows[3]["episode_step"] = 4
+    names = {name for row in rows for name in row}
+    pq.write_table(
+        pa.Table.from_pylist([dict.fromkeys(names) | row for row in rows]), path / "audit.parquet"
+    )
+    episode = {"episode": 12, "env": 2, "episode_seed": 99, "true_condition": "wheel_slip"}
+    pq.write_table(
+        pa.Table.from_pylist([episode | {"perturbation": "nominal"}]), path / "episodes.parquet"
+    )
+
+
+def test_an_audited_row_leads_to_the_messages_it_was_made_of(places: Places) -> None:
+    found = trace(places.run, "7/1", Where(recording=RECORDING))
+    assert found.panel is not None
+    assert found.panel["row"] == 100
+    assert found.panel["same_bytes_as_sampled"]
+    assert found.panel["same_observation_as_stored"]
+    assert found.origin is not None
+    assert found.notes == found.origin.notes == []
+    row = found.origin.transition
+    assert found.audit is not None
+    assert row["transition_id"] == found.audit["transition_id"]
+    assert found.origin.recording is not None
+    assert found.origin.recording["source_file"] == str(RECORDING)
+    assert found.origin.store["newest_version"] == found.origin.store["version"]
+    held = {message.input: message for message in found.origin.messages}
+    command = held["command"]
+    assert command.age_s == 0
+    assert command.stamp_ns == row["stamp_ns"]
+    assert command.fields["linear.x"] == pytest.approx(row["command_speed_mps"])
+    assert command.fields["angular.z"] == pytest.approx(row["command_yaw_rate_radps"])
+    assert held["pose"].fields["pose.pose.position.x"] == pytest.approx(row["pose_x_m"])
+    assert held["pose"].stamp_ns == row["pose_stamp_ns"]
+    assert held["wheels"].fields["twist.twist.linear.x"] == pytest.approx(row["wheel_speed_mps"])
+    # Nothing that made an observation is from after the tick, or older than the profile allows.
+    low, high = found.origin.moment["window_ns"]
+    assert low < held["scan"].log_time_ns <= high
+    for name in held.keys() - {"behaviour_policy", "true_condition"}:
+        assert held[name].age_s >= 0
+        assert held[name].max_age_s is None or held[name].age_s <= held[name].max_age_s
+    assert {name for topic in found.origin.topics for name in topic["fills"]} >= {"command", "scan"}
+
+
+def test_the_parts_of_a_reward_sum_to_it(places: Places) -> None:
+    steps = places.rows("FROM transitions ORDER BY transition_id")
+    whole = 0
+    for row in steps[::80]:
+        origin = trace(places.store, str(row["transition_id"])).origin
+        assert origin is not None
+        last = row["terminated"] or row["truncated"]
+        assert (origin.reward_parts is None) == last
+        if origin.reward_parts is not None:
+            whole += 1
+            assert sum(origin.reward_parts.values()) == pytest.approx(row["reward"], abs=2e-6)
+    assert whole > 5
+
+
+def test_every_row_of_the_recording_finds_its_tick(places: Places) -> None:
+    for row in places.rows("FROM transitions ORDER BY hash(transition_id) LIMIT 3"):
+        where = Where(recording=RECORDING)
+        origin = trace(places.store, str(row["transition_id"]), where).origin
+        assert origin is not None
+        imu = next(message for message in origin.messages if message.input == "imu")
+        assert imu.fields["angular_velocity.z"] == pytest.approx(row["gyro_yaw_rate_radps"])
+
+
+def test_a_fresh_row_leads_to_what_lays_its_episode_out_again(places: Places) -> None:
+    found = trace(places.run, "7/3")
+    assert found.origin is None
+    assert found.episode == {
+        "run_seed": 5,
+        "episode": 12,
+        "env": 2,
+        "episode_seed": 99,
+        "true_condition": "wheel_slip",
+        "perturbation": "nominal",
+        "spec": {"condition": "wheel_slip", "seed": 99},
+    }
+    assert found.audit is not None
+    assert found.audit["episode_step"] == 4
+
+
+def test_audited_rows_are_listed_by_their_error(places: Places) -> None:
+    assert [row["row"] for row in audited_rows(places.run, 3)] == ["7/2", "7/1", "7/3"]
+
+
+def test_rows_are_listed_of_runs_alone(places: Places, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["trace", str(places.panel)]) == 2
+    assert "name the ROW" in capsys.readouterr().err
+
+
+def test_a_row_of_the_panel_can_be_followed_too(places: Places) -> None:
+    found = trace(places.panel, "5")
+    assert found.panel is not None
+    assert found.origin is not None
+    assert found.panel["transition_id"] == found.origin.transition["transition_id"]
+    with pytest.raises(PanelError, match="has rows 0 to"):
+        trace(places.panel, "1000000")
+
+
+def test_what_is_not_there_is_said(places: Places, tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="names no audit row"):
+        trace(places.run, "12")
+    with pytest.raises(RunError, match="was not audited"):
+        trace(places.run, "8/0")
+    with pytest.raises(StoreError, match="no transition 5"):
+        trace(places.store, "5")
+    with pytest.raises(StoreError, match="is no transition id"):
+        trace(places.store, "seven")
+    with pytest.raises(StoreError, match="neither a run, a panel nor a store"):
+        trace(tmp_path, "1")
+    with pytest.raises(StoreError, match="nothing is there"):
+        trace(tmp_path / "nowhere", "1")
+
+
+def test_places_that_were_moved_are_asked_for_and_taken(places: Places, tmp_path: Path) -> None:
+    store, panel = tmp_path / "store", tmp_path / "panel"
+    shutil.copytree(places.store, store)
+    with Store(store) as opened:
+        build_panel(opened, MIXTURE, panel)
+    write_run(tmp_path / "run", Panel.open(panel))
+    store.rename(tmp_path / "elsewhere")
+    with pytest.raises(StoreError, match=r"--store"):
+        trace(tmp_path / "run", "7/0")
+    panel.rename(tmp_path / "moved")
+    with pytest.raises(PanelError, match=r"--panel"):
+        trace(tmp_path / "run", "7/0")
+    moved = Where(store=str(tmp_path / "elsewhere"), panel=tmp_path / "moved")
+    found = trace(tmp_path / "run", "7/0", moved)
+    assert found.origin is not None
+    assert found.origin.store["path"] == str(tmp_path / "elsewhere")
+    build_panel(recording_transitions(1), MIXTURE, tmp_path / "other", task=TASK)
+    with pytest.raises(PanelError, match="the run was fed"):
+        trace(tmp_path / "run", "7/0", Where(panel=tmp_path / "other"))
+
+
+def test_another_recording_is_refused(places: Places) -> None:
+    (row,) = places.rows("SELECT transition_id FROM transitions LIMIT 1")
+    other = RECORDING.with_name("amr_monday.mcap")
+    with pytest.raises(RecordingError, match="the row is of"):
+        trace(places.store, str(row["transition_id"]), Where(recording=other))
+
+
+def test_a_row_that_was_labelled_anew_since_says_so(tmp_path: Path) -> None:
+    before = recording_transitions(1)
+    writer = write_store(tmp_path / "store", [before, recording_transitions(2)])
+    with Store(writer) as store:
+        build_panel(store, MIXTURE, tmp_path / "panel")
+    later = recording_transitions(1, ingest="b")
+    place = later.schema.get_field_index("condition")
+    named = pa.array(np.where(np.arange(len(later)) == 0, "recovery", later["condition"]))
+    replace_recording(tmp_path / "store", later.set_column(place, later.schema.field(place), named))
+    found = trace(tmp_path / "panel", "0").origin
+    assert found is not None
+    assert found.transition["condition"] == before["condition"][0].as_py()
+    assert any("anew since" in note and "-> recovery" in note for note in found.notes)
+    replace_recording(tmp_path / "store", later.slice(1))
+    found = trace(tmp_path / "panel", "0").origin
+    assert found is not None
+    assert "the newest version of the store has this row no more" in found.notes
+
+
+def replace_recording(store: Path, rows: pa.Table) -> None:
+    """As an ingest does: the recording's old rows go in the commit that brings the new ones."""
+    write_deltalake(str(store / "recordings"), manifest(rows), mode="append")
+    table = DeltaTable(str(store / "transitions"))
+    predicate = f"recording_id = '{rows['recording_id'][0].as_py()}'"
+    write_deltalake(table, rows, mode="overwrite", predicate=predicate)
+
+
+def test_the_verb_prints_a_trace_and_its_document(
+    places: Places, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["trace", str(places.run)]) == 0
+    assert "7/2" in capsys.readouterr().out
+    arguments = ["trace", str(places.run), "7/2", "--recording", str(RECORDING)]
+    assert cli.main(arguments) == 0
+    out = capsys.readouterr().out
+    for said in ("as it was sampled", "its recording", "/cmd_vel", "same_bytes_as_sampled"):
+        assert said in out
+    assert cli.main([*arguments, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["messages"][0]["topic"] == "/cmd_vel"
+    assert document["transition"]["recording_id"] == document["recording"]["recording_id"]
+    assert document["notes"] == []
+    assert cli.main(["trace", str(places.run), "9/9"]) == 2
+    assert "was not audited" in capsys.readouterr().err
+
+
+def test_a_store_that_an_older_version_wrote_audits_mixes_and_traces(tmp_path: Path) -> None:
+    # Its manifests lack what was added since; a newer recording beside them brings a column more.
+    store = tmp_path / "store"
+    for number in (1, 2):
+        rows = recording_transitions(number)
+        old = manifest(rows).drop_columns(["clocks", "signals"])
+        write_deltalake(str(store / "recordings"), old, mode="append")
+        write_deltalake(str(store / "transitions"), rows, mode="append")
+
+    def works(expected: int) -> None:
+        with open_place(store) as connection:
+            findings = run_audits(connection, load_audits(), load_thresholds())
+            for (view,) in connection.sql('SELECT DISTINCT "view" FROM columns').fetchall():
+                connection.sql(f'FROM "{view}"').fetchall()
+        assert {f.audit.name for f in findings if f.status == "fail"} == {"rare_condition"}
+        panel = tmp_path / f"panel{expected}"
+        with Store(store) as opened:
+            assert len(build_panel(opened, MIXTURE, panel)) == expected
+        origin = trace(panel, "3").origin
+        assert origin is not None
+        assert origin.recording is not None
+        assert origin.recording.get("clocks") is None
+        assert origin.transition.get("payload_kg") is None
+
+    works(sum(len(recording_transitions(number)) for number in (1, 2)))
+    newer = recording_transitions(3)
+    carried = pa.array(np.full(len(newer), 3.0))
+    rows = newer.append_column("payload_kg", carried)
+    write_deltalake(str(store / "recordings"), manifest(newer), mode="append", schema_mode="merge")
+    write_deltalake(str(store / "transitions"), rows, mode="append", schema_mode="merge")
+    works(sum(len(recording_transitions(number)) for number in (1, 2, 3)))

@@ -1,0 +1,208 @@
+"""A robot that drives straight ahead at .5 m/s, as columns of topics and as a rosbag2: for tests
+whose right answers can be worked out by hand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, offsets_of
+
+SPEED_MPS = 0.5
+PERIOD_S = 0.2
+START_NS = 1_700_000_000 * 10**9
+LATENCY_NS = 2_000_000  # from header stamp to log time, of every topic
+BEAMS = 72
+FREE_M = 3.0
+GOAL = (11.0, 1.0)
+
+
+@dataclass
+class Drive:
+    """A drive of `duration_s` along y = 1 from x = 1; goals as (time, x, y)."""
+
+    duration_s: float = 6.0
+    goals: list[tuple[float, float, float]] = field(default_factory=lambda: [(0.0, *GOAL)])
+    policies: list[tuple[float, str]] = field(default_factory=lambda: [(0.0, "planner")])
+    truth: str | None = None
+
+    def x_at(self, time_s: NDArray[Any]) -> NDArray[Any]:
+        return 1.0 + SPEED_MPS * time_s
+
+    def topics(self) -> dict[str, TopicColumns]:
+        """What a reader would hand over for the profile `warehouse_amr`."""
+        fast = np.arange(0, self.duration_s, 0.02)
+        ticks = np.arange(0, self.duration_s, PERIOD_S)
+        tenth = np.arange(0, self.duration_s, 0.1)
+        goal_s = np.array([time for time, *_ in self.goals])
+        goal_xy = np.array([(x, y) for _, x, y in self.goals]).reshape(-1, 2)
+        starts = np.array([(self.x_at(time), 1.0) for time in goal_s]).reshape(-1, 2)
+        found = {
+            "/cmd_vel": columns(
+                ticks + 0.005,
+                {"linear.x": np.full(len(ticks), 0.4), "angular.z": np.zeros(len(ticks))},
+                stamped=False,
+            ),
+            "/amcl_pose": columns(tenth, pose("pose.pose", self.x_at(tenth), 1.0)),
+            "/odom": columns(
+                fast,
+                {
+                    "twist.twist.linear.x": np.full(len(fast), SPEED_MPS),
+                    "twist.twist.angular.z": np.zeros(len(fast)),
+                },
+            ),
+            "/imu": columns(
+                fast,
+                {
+                    "angular_velocity.z": np.zeros(len(fast)),
+                    "linear_acceleration.x": np.zeros(len(fast)),
+                },
+            ),
+            "/scan": columns(tenth, scans(np.full((len(tenth), BEAMS), FREE_M))),
+            "/goal_pose": columns(
+                goal_s, {"pose.position.x": goal_xy[:, 0], "pose.position.y": goal_xy[:, 1]}
+            ),
+            "/plan": columns(
+                goal_s,
+                {
+                    "poses[].pose.position.x": ragged([starts[:, 0], goal_xy[:, 0]]),
+                    "poses[].pose.position.y": ragged([starts[:, 1], goal_xy[:, 1]]),
+                },
+            ),
+            "/bumper": columns(tenth, {"data": np.zeros(len(tenth), np.bool_)}, stamped=False),
+            "/behaviour_policy": columns(
+                np.array([time for time, _ in self.policies]),
+                {"data": np.array([text for _, text in self.policies], object)},
+                stamped=False,
+            ),
+        }
+        if self.truth is not None:
+            found["/ground_truth/condition"] = columns(
+                ticks, {"data": np.full(len(ticks), self.truth, object)}, stamped=False
+            )
+        return found
+
+
+def columns(
+    time_s: NDArray[Any], fields: dict[str, FieldColumn], *, stamped: bool = True
+) -> TopicColumns:
+    """A topic whose messages were measured at these times."""
+    stamp = START_NS + np.rint(time_s * 1e9).astype(np.int64)
+    fields = dict(fields)
+    if stamped:
+        fields["header.stamp"] = stamp
+    return TopicColumns(stamp + LATENCY_NS, stamp + LATENCY_NS, fields)
+
+
+def pose(path: str, x: NDArray[Any], y: float) -> dict[str, FieldColumn]:
+    """Poses that look along x."""
+    zero, one = np.zeros(len(x)), np.ones(len(x))
+    quaternion = {f"{path}.orientation.{axis}": zero for axis in "xyz"}
+    return {
+        f"{path}.position.x": x,
+        f"{path}.position.y": np.full(len(x), y),
+        **quaternion,
+        f"{path}.orientation.w": one,
+    }
+
+
+def scans(ranges: NDArray[Any]) -> dict[str, FieldColumn]:
+    """Scans (N, B) over the full circle, from straight behind counter-clockwise."""
+    count, beams = ranges.shape
+    flat = np.asarray(ranges, np.float32).reshape(-1)
+    return {
+        "ranges": Ragged(flat, offsets_of(np.full(count, beams))),
+        "angle_min": np.full(count, -np.pi),
+        "angle_increment": np.full(count, 2 * np.pi / beams),
+    }
+
+
+def ragged(points: list[NDArray[Any]]) -> Ragged:
+    """Columns (N,) of the points of N polylines, one column a point."""
+    values = np.stack(points, axis=1)
+    return Ragged(values.reshape(-1), offsets_of(np.full(len(values), values.shape[1])))
+
+
+def without(topic: TopicColumns, keep: NDArray[np.bool_]) -> TopicColumns:
+    """Only some of a topic's messages."""
+    from restock.ingest.decoding.columns import take
+
+    rows = np.flatnonzero(keep)
+    return TopicColumns(
+        topic.log_time_ns[rows],
+        topic.publish_time_ns[rows],
+        {path: take(column, rows) for path, column in topic.fields.items()},
+    )
+
+
+def write_bag(drive: Drive, folder: Path, *, storage: str = "sqlite3") -> Path:
+    """The drive as a rosbag2 folder, `sqlite3` or `mcap`, written by rosbags."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    names = {
+        "/cmd_vel": "geometry_msgs/msg/Twist",
+        "/amcl_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
+        "/odom": "nav_msgs/msg/Odometry",
+        "/imu": "sensor_msgs/msg/Imu",
+        "/scan": "sensor_msgs/msg/LaserScan",
+        "/goal_pose": "geometry_msgs/msg/PoseStamped",
+        "/plan": "nav_msgs/msg/Path",
+        "/bumper": "std_msgs/msg/Bool",
+        "/behaviour_policy": "std_msgs/msg/String",
+        "/ground_truth/condition": "std_msgs/msg/String",
+    }
+    plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
+    with Writer(folder, version=9, storage_plugin=plugin) as writer:
+        lines = []
+        for topic, messages in drive.topics().items():
+            connection = writer.add_connection(topic, names[topic], typestore=types)
+            for row in range(len(messages)):
+                message = _blank(types, names[topic])
+                for path, column in messages.fields.items():
+                    _set(types, message, path, column[row])
+                data = types.serialize_cdr(message, names[topic])
+                lines.append((int(messages.log_time_ns[row]), connection, data))
+        for log_time_ns, connection, data in sorted(lines, key=lambda line: line[0]):
+            writer.write(connection, log_time_ns, data)
+    return folder
+
+
+def _blank(types: Any, name: str) -> Any:
+    """A message with every field zero or empty."""
+    from rosbags.interfaces import Nodetype
+
+    values: dict[str, Any] = {}
+    for key, (kind, detail) in types.fielddefs[name][1]:
+        if kind == Nodetype.NAME:
+            values[key] = _blank(types, detail)
+        elif kind == Nodetype.BASE:
+            values[key] = "" if detail[0] == "string" else False if detail[0] == "bool" else 0
+        elif kind == Nodetype.ARRAY:
+            values[key] = np.zeros(detail[1])
+        else:
+            primitive = detail[0][0] == Nodetype.BASE
+            values[key] = np.zeros(0, np.float32) if primitive else []
+    return types.types[name](**values)
+
+
+def _set(types: Any, message: Any, path: str, value: Any) -> None:
+    if path == "header.stamp":
+        stamp = types.types["builtin_interfaces/msg/Time"](*divmod(int(value), 10**9))
+        message.header.stamp = stamp
+        return
+    if path.startswith("poses[]"):
+        while len(message.poses) < len(value):
+            message.poses.append(_blank(types, "geometry_msgs/msg/PoseStamped"))
+        for item, part in zip(message.poses, value, strict=True):
+            _set(types, item, path.removeprefix("poses[]."), float(part))
+        return
+    *parents, last = path.split(".")
+    for parent in parents:
+        message = getattr(message, parent)
+    setattr(message, last, value.item() if isinstance(value, np.generic) else value)

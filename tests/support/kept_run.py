@@ -1,0 +1,52 @@
+"""A run that kept a policy, as `restock train` leaves it, without the training."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import torch
+
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.task import Task
+from restock.replay.panel.panel import Panel
+from restock.train.dqn import checkpoint
+from restock.train.dqn.config import NetworkConfig, TrainConfig
+from restock.train.dqn.network import Network, make_network
+from restock.train.run.run import Run, panel_document
+
+TASK = load_profile("warehouse_amr").task
+NETWORK = NetworkConfig()
+
+
+def kept_network(settings: NetworkConfig = NETWORK, task: Task = TASK) -> Network:
+    """What `kept_run` keeps: random weights, seed 0."""
+    generator = torch.Generator().manual_seed(0)
+    return make_network(settings, task.observation_size, len(task.actions), generator)
+
+
+def kept_run(
+    path: Path,
+    network: NetworkConfig = NETWORK,
+    panel: Panel | None = None,
+    profile: str = "warehouse_amr",
+) -> Path:
+    """That network as the best of gradient step 7, as if it had learnt from the panel."""
+    task = load_profile(profile).task
+    config = msgspec.structs.replace(TrainConfig(), network=network, profile=profile)
+    fed = None if panel is None else panel_document(panel)
+    made = Run.create(path, {"config": msgspec.to_builtins(config), "panel": fed})
+    made.best.parent.mkdir()
+    checkpoint.save(
+        made.best,
+        {
+            "network": dict(kept_network(network, task).state_dict()),
+            "observation_size": task.observation_size,
+            "actions": len(task.actions),
+            "task_hash": task.hash,
+            "env_steps": 0,
+            "gradient_steps": 7,
+            "score": {},
+        },
+    )
+    return path

@@ -1,0 +1,153 @@
+"""A small synthetic store of transitions, for tests that need one without a recording."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+from deltalake import write_deltalake
+
+from restock.ingest.task.conditions import labels_version, primary, shipped
+from restock.ingest.task.scan import Body
+from restock.ingest.task.schema import STEP_BITS, recording_schema, transition_schema
+from restock.ingest.task.task import Task
+from restock.replay.store.store import Store
+
+TASK = Task(
+    body=Body(length_m=0.7, width_m=0.5),
+    actions=((0.0, 0.0), (0.4, 0.0), (1.0, 0.0), (0.0, 1.2), (-0.4, 0.0)),
+    sectors=4,
+)
+CONDITIONS = [shipped()[name] for name in sorted(shipped())]
+LABEL_CHANCE = {"wheel_slip": 0.03, "blocked_aisle": 0.06, "near_collision": 0.02, "recovery": 0.03}
+START_NS = 1_700_000_000 * 10**9
+
+
+def recording_transitions(
+    recording: int, *, episodes: int = 12, seed: int = 0, task: Task = TASK, ingest: str = "a"
+) -> pa.Table:
+    """Random transitions of one recording, with the columns and meanings of `ingest.schema`."""
+    rng = np.random.default_rng([seed, recording])
+    lengths = rng.integers(8, 60, episodes)
+    rows, size = int(lengths.sum()), task.observation_size
+    episode = np.repeat(np.arange(episodes), lengths)
+    step = np.concatenate([np.arange(length) for length in lengths])
+    last = np.append(step[1:] == 0, True)
+    reached = rng.random(episodes) < 0.7
+    labels = {name: rng.random(rows) < chance for name, chance in LABEL_CHANCE.items()}
+    held = [[name for name in sorted(labels) if labels[name][row]] for row in range(rows)]
+    observation = rng.normal(size=(rows, size)).astype(np.float32)
+    after = np.where(last[:, None], rng.normal(size=(rows, size)), np.roll(observation, -1, 0))
+    recording_id = f"{recording:016x}"
+    values: dict[str, object] = {
+        "transition_id": (np.int64(recording) << STEP_BITS) + np.arange(rows),
+        "recording_id": [recording_id] * rows,
+        "episode_id": [f"{recording_id}/{index}" for index in episode],
+        "episode_index": episode,
+        "step_index": step,
+        "observation": list(observation),
+        "next_observation": list(after.astype(np.float32)),
+        "action": rng.integers(0, len(task.actions), rows),
+        "reward": rng.normal(size=rows) + 5.0 * (last & reached[episode]),
+        "terminated": last & reached[episode],
+        "truncated": last & ~reached[episode],
+        "condition": primary(labels, CONDITIONS),
+        "conditions": held,
+        "true_condition": [None] * rows,
+        "perturbation": np.where(np.arange(rows) % 3 > 0, "wet", None),
+        "perturbation_values": [[("friction_scale", 0.5)] if r % 3 else None for r in range(rows)],
+        "zone": rng.choice(["aisle_1", "aisle_2", "cross"], rows),
+        "behaviour_policy": np.where(rng.random(episodes)[episode] < 0.8, "planner", "operator"),
+        "behaviour_version": ["1"] * rows,
+        "action_probability": pa.nulls(rows, pa.float32()),
+        "stamp_ns": START_NS + recording * 3600 * 10**9 + np.arange(rows) * 200_000_000,
+        "goal_distance_m": np.where(last & reached[episode], 0.3, 4.0),
+        "bumped": labels["near_collision"] & (rng.random(rows) < 0.3),
+        "ingest_id": [f"{recording_id}-{ingest}"] * rows,
+        "source_file": [f"logs/{recording}.mcap"] * rows,
+        "profile_hash": ["0123456789ab"] * rows,
+        "task_hash": [task.hash] * rows,
+        "labels_version": [labels_version(CONDITIONS)] * rows,
+        "restock_version": ["0.1.0"] * rows,
+    }
+    schema = transition_schema(size)
+    arrays = [
+        pa.array(values[field.name], field.type)
+        if field.name in values
+        else pa.array(rng.normal(size=rows)).cast(field.type, safe=False)
+        for field in schema
+    ]
+    return pa.Table.from_arrays(arrays, schema=schema)
+
+
+def manifest(transitions: pa.Table, *, task: Task = TASK) -> pa.Table:
+    """The `recordings` row of one recording's transitions."""
+    first = transitions.slice(0, 1).to_pylist()[0]
+    conditions = [
+        {"name": c.name, "timing": c.timing, "priority": c.priority, "sql": c.sql}
+        for c in CONDITIONS
+    ]
+    row = {
+        "recording_id": first["recording_id"],
+        "ingest_id": first["ingest_id"],
+        "ingested_at": datetime(2026, 1, 1, tzinfo=UTC),
+        "source_file": first["source_file"],
+        "format": "mcap",
+        "duration_s": len(transitions) * 0.2,
+        "profile": "warehouse_amr",
+        "profile_hash": first["profile_hash"],
+        "task_hash": first["task_hash"],
+        "labels_version": first["labels_version"],
+        "restock_version": first["restock_version"],
+        "steps": len(transitions) + 12,
+        "episodes": len(transitions["episode_id"].unique()),
+        "transitions": len(transitions),
+        "drops": [{"reason": "stale scan", "count": 3}],
+        "topics": [
+            {"topic": "/odom", "type": "nav_msgs/msg/Odometry", "expected": 900, "decoded": 900}
+            | {"skipped": 0, "reason": ""}
+        ],
+        "label_scores": [
+            {"condition": "wheel_slip", "precision": 0.9, "recall": 0.8, "support": 40}
+            | {"labelled": 36}
+        ],
+        "task_json": msgspec.json.encode(task).decode(),
+        "conditions_json": msgspec.json.encode(conditions).decode(),
+    }
+    schema = recording_schema()
+    blank = {pa.string(): "", pa.int64(): 0, pa.int32(): 0, pa.float64(): 0.0}
+    row["ticks"] = row["steps"] + 3
+    row = {field.name: row.get(field.name, blank.get(field.type, [])) for field in schema}
+    return pa.Table.from_pylist([row], schema=schema)
+
+
+def write_store(path: Path, recordings: list[pa.Table], *, task: Task = TASK) -> Path:
+    """A store of these recordings, one commit each, the manifest row first."""
+    for transitions in recordings:
+        write_deltalake(str(path / "recordings"), manifest(transitions, task=task), mode="append")
+        write_deltalake(str(path / "transitions"), transitions, mode="append")
+    return path
+
+
+def one(recording: int, ingest: str = "a", seed: int = 0) -> tuple[pa.Table, pa.Table]:
+    """A recording's manifest row and transitions."""
+    rows = recording_transitions(recording, ingest=ingest, seed=seed)
+    row = manifest(rows).to_pylist()[0]
+    row["ingested_at"] = datetime(2026, 1, 1, tzinfo=UTC)
+    for field in recording_schema():
+        empty = [] if pa.types.is_list(field.type) else "" if pa.types.is_string(field.type) else 0
+        row.setdefault(field.name, empty)
+    return pa.Table.from_pylist([row], schema=recording_schema()), rows
+
+
+def shown(path: Path) -> dict[str, int]:
+    """recording_id/ingest_id -> rows, as a reader sees the store."""
+    with Store(path) as store:
+        found = store.sql(
+            "SELECT ingest_id, count(*) FROM transitions JOIN recordings USING (ingest_id)"
+            " GROUP BY ALL ORDER BY ALL"
+        ).fetchall()
+    return dict(found)

@@ -1,0 +1,119 @@
+"""Every variant of the learner on a problem with a known answer: a corridor, by value iteration.
+
+States 0 to 3, actions back and forward; the step out of state 3 ends with reward 1, each other
+costs 0.05. What the variants should come to differs: the optimal values, or the optimal policy.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from restock.train.dqn.config import TrainConfig, parse_config
+from restock.train.dqn.learner import Learner
+
+STATES, GAMMA = 4, 0.9
+
+
+def corridor() -> tuple[torch.Tensor, np.ndarray]:
+    """Packed rows (8, 11) of every state and action, and the optimal values (4, 2)."""
+    rows, q = [], np.zeros((STATES, 2))
+    following, reward, discount = (np.zeros((STATES, 2)) for _ in range(3))
+    for state in range(STATES):
+        for action, move in enumerate((-1, 1)):
+            out = state + move == STATES
+            following[state, action] = np.clip(state + move, 0, STATES - 1)
+            reward[state, action], discount[state, action] = (1.0, 0.0) if out else (-0.05, GAMMA)
+            now, after = np.eye(STATES)[[state, int(following[state, action])]]
+            rows.append([*now, *after, action, reward[state, action], discount[state, action]])
+    for _ in range(200):  # value iteration
+        q = reward + discount * q.max(axis=1)[following.astype(int)]
+    return torch.tensor(np.array(rows), dtype=torch.float32), q
+
+
+def config(**settings: object) -> TrainConfig:
+    document: dict[str, dict[str, object]] = {
+        "network": {"hidden": [32, 32]},
+        "loss": {"discount": GAMMA},
+        "target": {"rule": "polyak", "tau": 0.1},
+        "optimizer": {"learning_rate": 5e-3},
+    }
+    for path, value in settings.items():
+        section, key = path.split("__")
+        document[section][key] = value
+    return parse_config(document, where="test")
+
+
+def learnt(settings: TrainConfig, updates: int = 500, **given: object) -> np.ndarray:
+    """The values (4, 2) after learning from every row of the corridor."""
+    rows, _ = corridor()
+    learner = Learner(settings, STATES, 2)
+    for step in range(1, updates + 1):
+        learner.update(rows, **given)  # type: ignore[arg-type]
+        learner.target.after(step)
+    with torch.no_grad():
+        return learner.network(torch.eye(STATES)).numpy()
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"loss__double": False},
+        {"network__dueling": True},
+        {"network__quantiles": 8},
+        {"network__quantiles": 8, "network__dueling": True},
+        {"network__ensemble": 3},
+        {"network__ensemble": 2, "network__quantiles": 4},
+    ],
+    ids=str,
+)
+def test_values_agree_with_value_iteration(settings: dict[str, object]) -> None:
+    np.testing.assert_allclose(learnt(config(**settings)), corridor()[1], atol=0.06)
+
+
+def test_munchausen_finds_the_optimal_policy_with_a_wider_gap() -> None:
+    plain, q = learnt(config()), corridor()[1]
+    soft = learnt(config(loss__munchausen=0.9))
+    np.testing.assert_array_equal(soft.argmax(axis=1), q.argmax(axis=1))
+    # The paper's point: the gap between actions grows.
+    assert np.ptp(soft, axis=1).mean() > np.ptp(plain, axis=1).mean()
+
+
+def test_an_ensemble_believes_the_least_of_its_members() -> None:
+    rows, _ = corridor()
+    learner = Learner(config(network__ensemble=3, loss__double=False), STATES, 2)
+    target = learner._target(*_unpacked(rows))
+    each = [
+        rows[:, -2] + rows[:, -1] * member(rows[:, STATES : 2 * STATES]).amax(dim=1)
+        for member in learner.target_network.members
+    ]
+    assert torch.allclose(target, torch.stack(each).amin(dim=0))
+
+
+def _unpacked(rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    from restock.train.dqn.learner import unpack
+
+    return unpack(rows, STATES)
+
+
+def test_the_margin_makes_the_experts_action_the_best_even_where_it_is_not() -> None:
+    rows, _ = corridor()
+    backs = rows[:, 2 * STATES] == 0  # an expert who goes back
+    values = learnt(config(loss__margin=5.0), logged=len(rows), expert=backs)
+    assert (values.argmax(axis=1) == 0).all()
+    none = learnt(
+        config(loss__margin=5.0), logged=len(rows), expert=torch.zeros(8, dtype=torch.bool)
+    )
+    np.testing.assert_allclose(none, corridor()[1], atol=0.06)
+
+
+def test_calibration_keeps_values_up_to_what_the_logs_got() -> None:
+    rows, q = corridor()
+    to_go = torch.tensor(q.max(axis=1).repeat(2), dtype=torch.float32)
+    given = {"logged": len(rows), "conservative": 1.0}
+    held_down = learnt(config(), **given)
+    calibrated = learnt(config(), **given, return_to_go=to_go)
+    worst = np.abs(calibrated.max(axis=1) - q.max(axis=1)).max()
+    assert worst < np.abs(held_down.max(axis=1) - q.max(axis=1)).max()

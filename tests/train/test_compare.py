@@ -1,0 +1,263 @@
+"""`restock compare`: what may be compared, what is refused and why, and who did better."""
+
+from __future__ import annotations
+
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from restock.cli import main
+from restock.train.dqn.config import TrainConfig
+from restock.train.run.run import Run
+
+UPDATES, ENV_STEPS = 10_000, 40_000
+DOCUMENT: dict[str, Any] = {
+    "created_ns": 0,
+    "config": msgspec.to_builtins(TrainConfig()),
+    "panel": {
+        "path": "/panels/p",
+        "id": "abc",
+        "store": "store",
+        "store_version": 3,
+        "labels_version": "l1",
+        "strata": {"nominal": 0.7, "wheel_slip": 0.3},
+    },
+    "task_hash": "t",
+    "labels_version": "l1",
+    "versions": {"torch": "1"},
+}
+
+
+def document(seed: int = 0, **changes: Any) -> dict[str, Any]:
+    """A run's config.json, with `section__key=value` changed."""
+    whole = copy.deepcopy(DOCUMENT)
+    whole["config"]["seed"] = seed
+    for path, value in changes.items():
+        *sections, last = path.split("__")
+        place = whole
+        for section in sections:
+            place = place[section]
+        place[last] = value
+    return whole
+
+
+def make_run(
+    path: Path,
+    whole: dict[str, Any],
+    *,
+    slip_share: float = 0.3,
+    success: float = 0.5,
+    updates: int = UPDATES,
+    fresh_episodes: int = 4000,
+    first_episode_seed: int = 90_000,
+) -> Path:
+    """A finished run: half its rows from logs by quota, half fresh, each episode of one kind."""
+    seed = whole["config"]["seed"]
+    rng = np.random.default_rng([seed, round(1000 * success)])
+    run = Run.create(path, whole)
+    for part in range(1, 11):
+        clocks = {"env_steps": ENV_STEPS * part // 10, "gradient_steps": updates * part // 10}
+        for stratum, share in (("nominal", 1 - slip_share), ("wheel_slip", slip_share)):
+            run.append_columns(
+                "fed_episodes",
+                {
+                    **clocks,
+                    "source": "logs",
+                    "stratum": stratum,
+                    "episode": [f"a/{key}" for key in range(50)],
+                    "drawn_rows": round(1000 * share),
+                    "weight": 1000.0 * share,
+                },
+            )
+        count = fresh_episodes // 10
+        run.append_columns(
+            "fed_episodes",
+            {
+                **clocks,
+                "source": "fresh",
+                "stratum": np.where(rng.random(count) < 0.3, "wheel_slip", "nominal"),
+                "episode": (part * count + np.arange(count)).astype(str),
+                "drawn_rows": 50_000 // count,
+                "weight": 50_000.0 / count,
+            },
+        )
+        run.append_columns(
+            "progress",
+            {
+                **dict.fromkeys(run.table("progress").schema.names),
+                **clocks,
+                "phase": ["online"],
+            },
+        )
+    for condition, bonus in (("nominal", 0.2), ("wheel_slip", 0.0)):
+        won = rng.random(40) < success + bonus
+        run.append_columns(
+            "evaluations",
+            {
+                "env_steps": ENV_STEPS,
+                "gradient_steps": updates,
+                "condition": condition,
+                "block": "none",
+                "episode_seed": first_episode_seed + np.arange(40),
+                "success": won,
+                "bumps": 0,
+                "time_s": 10.0,
+                "return": won.astype(float),
+                "best": True,
+                "perturbation": "none",
+                "layout": None,
+                "perturbation_values": None,
+            },
+        )
+    run.flush()
+    return path
+
+
+def arm(tmp_path: Path, name: str, seeds: range, **given: Any) -> list[str]:
+    settings = {key: given.pop(key) for key in list(given) if "__" in key}
+    return [
+        str(make_run(tmp_path / f"{name}{seed}", document(seed, **settings), **given))
+        for seed in seeds
+    ]
+
+
+def compared(
+    capsys: pytest.CaptureFixture[str], first: list[str], second: list[str], *flags: str
+) -> tuple[int, dict[str, Any]]:
+    code = main(["compare", *first, "--against", *second, "--json", *flags])
+    return code, json.loads(capsys.readouterr().out)
+
+
+def test_algorithms_fed_alike_are_compared(tmp_path, capsys) -> None:
+    first = arm(tmp_path, "a", range(3), success=0.2)
+    second = arm(tmp_path, "b", range(3, 6), success=0.7, config__network__dueling=True)
+    code, found = compared(capsys, first, second)
+    assert (code, found["verdict"], found["outcomes_from"]) == (0, "comparable", "training")
+    assert [d["setting"] for d in found["differences"]] == ["config.network.dueling"]
+    slip = next(row for row in found["outcomes"] if row["condition"] == "wheel_slip")
+    assert (slip["episodes"], slip["runs"]) == (40, [3, 3])
+    assert slip["difference"] == pytest.approx(0.5, abs=0.12)
+    assert slip["difference_low"] > 0.3
+    assert slip["improvement"] > 0.7
+
+
+def test_no_difference_has_an_interval_around_zero(tmp_path, capsys) -> None:
+    first = arm(tmp_path, "a", range(3))
+    second = arm(tmp_path, "b", range(3, 6), config__network__dueling=True)
+    _, found = compared(capsys, first, second)
+    for row in found["outcomes"]:
+        assert row["difference_low"] < 0 < row["difference_high"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "setting"),
+    [
+        ({"panel__store_version": 4}, "panel.store_version"),
+        ({"config__evaluation__seed": 91_000}, "config.evaluation.seed"),
+        ({"config__target__tau": 0.1}, "config.target.tau"),
+        ({"config__replay__ring_capacity": 5_000}, "config.replay.ring_capacity"),
+        ({"task_hash": "u"}, "task_hash"),
+    ],
+)
+def test_what_the_treatment_does_not_name_may_not_differ(tmp_path, capsys, changes, setting):
+    first = arm(tmp_path, "a", range(3))
+    second = [
+        str(make_run(tmp_path / f"b{seed}", document(seed, **changes))) for seed in range(3, 6)
+    ]
+    code, found = compared(capsys, first, second)
+    assert (code, found["verdict"], found["refused"]) == (1, "incomparable", [setting])
+    assert found["outcomes"] == []
+
+
+def test_the_target_rule_is_compared_when_it_is_the_treatment(tmp_path, capsys) -> None:
+    first = arm(tmp_path, "a", range(3))
+    second = arm(tmp_path, "b", range(3, 6), config__target__tau=0.1)
+    assert compared(capsys, first, second, "--treatment", "target")[0] == 0
+    third = arm(tmp_path, "c", range(3), config__target__tau=0.1, config__optimizer__lr=1)
+    assert compared(capsys, first, third, "--treatment", "target")[0] == 1
+
+
+def test_another_feed_is_refused_unless_it_is_the_treatment(tmp_path, capsys) -> None:
+    first = arm(tmp_path, "a", range(3))
+    second = arm(tmp_path, "b", range(3, 6), slip_share=0.15)
+    code, found = compared(capsys, first, second)
+    assert (code, found["verdict"], found["refused"]) == (1, "incomparable", [])
+    failed = {
+        c["check"] if "check" in c else c["name"]
+        for c in found["checks"]
+        if c["verdict"] == "incomparable"
+    }
+    assert "share of logs/wheel_slip" in failed
+    code, found = compared(capsys, first, second, "--treatment", "mixture")
+    assert (code, found["verdict"]) == (0, "comparable")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"panel__store_version": 4},
+        {"panel__store": "another"},
+        {"config__evaluation__seed": 91_000},
+    ],
+)
+def test_even_mixtures_need_one_store_and_one_evaluation(tmp_path, capsys, changes) -> None:
+    first = arm(tmp_path, "a", range(1))
+    second = [str(make_run(tmp_path / "b", document(1, **changes), slip_share=0.2))]
+    code, found = compared(capsys, first, second, "--treatment", "mixture")
+    assert (code, found["refused"]) == (1, [next(iter(changes)).replace("__", ".")])
+
+
+def test_online_only_is_a_mixture_without_logs(tmp_path, capsys) -> None:
+    first = arm(tmp_path, "a", range(1))
+    second = [str(make_run(tmp_path / "b", document(1, panel=None)))]
+    code, found = compared(capsys, first, second, "--treatment", "mixture")
+    assert code == 0
+    assert [d["setting"] for d in found["differences"]] == ["panel.id"]
+
+
+def test_a_run_of_half_the_updates_is_refused(tmp_path, capsys) -> None:
+    first = arm(tmp_path, "a", range(1))
+    second = [str(make_run(tmp_path / "b", document(1), updates=UPDATES // 2))]
+    code, found = compared(capsys, first, second, "--treatment", "mixture")
+    assert (code, found["verdict"]) == (1, "incomparable")
+    (check,) = [c for c in found["checks"] if c["name"] == "updates"]
+    assert (check["value"], check["verdict"]) == (2.0, "incomparable")
+
+
+def test_few_episodes_are_inconclusive_and_more_seeds_are_asked_for(tmp_path, capsys) -> None:
+    few = {"fresh_episodes": 400}
+    first, second = arm(tmp_path, "a", range(2, 3), **few), arm(tmp_path, "b", range(3, 4), **few)
+    assert main(["compare", *first, *second]) == 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert "REFUSED, inconclusive: too few episodes" in said
+    assert "add seeds" in said
+
+
+def test_people_read_what_differs_and_why_it_is_refused(tmp_path, capsys) -> None:
+    first = arm(tmp_path, "a", range(1))
+    second = [str(make_run(tmp_path / "b", document(1, config__target__tau=0.1)))]
+    assert main(["compare", *first, *second]) == 1
+    shown = capsys.readouterr()
+    assert "config.target.tau" in shown.out
+    assert "not allowed" in shown.out
+    assert "which is not what --treatment algorithm compares" in " ".join(shown.err.split())
+
+
+def test_what_is_no_arm_is_refused_with_a_remedy(tmp_path, capsys) -> None:
+    first = arm(tmp_path, "a", range(3))
+    other = str(make_run(tmp_path / "o", document(9, config__target__tau=0.1)))
+    young = str(Run.create(tmp_path / "young", document(1)).path)
+    for words, said in (
+        ([*first], "needs two runs, got 3"),
+        ([first[0], other, "--against", first[1]], "differs from"),
+        ([first[0], first[0], "--against", first[1]], "is named twice"),
+        ([first[0], young], "has no record of the episodes it was fed"),
+        ([first[0], str(tmp_path)], "is not a run directory"),
+    ):
+        assert main(["compare", *words]) == 2
+        assert said in " ".join(capsys.readouterr().err.split())

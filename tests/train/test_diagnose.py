@@ -1,0 +1,199 @@
+"""`restock diagnose`: planted symptoms are named for what they are, and never forced."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from restock.cli import main
+from restock.train.comparison.confirm import swapped
+from restock.train.comparison.diagnose import diagnose
+from restock.train.dqn.config import TrainConfig, apply_overrides, parse_config
+from restock.train.run.run import Run
+
+CONDITIONS = ("nominal", "wheel_slip", "blocked_aisle", "near_collision", "recovery")
+SHARES = dict(zip(CONDITIONS, (0.6, 0.15, 0.1, 0.05, 0.1), strict=True))
+
+
+def make_run(
+    path: Path,
+    *,
+    windows: int = 4,
+    gap: float | Mapping[str, float] = 1.2,
+    lag: float = 0.05,
+    clock: float = 1.0,
+    q_abs_max: float = 10.0,
+    shares: Mapping[str, float] | None = None,
+    quota_met: float = 1.0,
+    agreement: Mapping[str, float] | None = None,
+    unexplained: Mapping[str, float] | None = None,
+    explained: float | None = 0.8,
+    strata: bool = True,  # named as the conditions are; else there is one of all rows
+    until: int | None = None,  # the window in which the symptoms end
+) -> Run:
+    """A run whose evaluations show these figures, as training writes them."""
+    run = Run.create(path, {"config": msgspec.to_builtins(TrainConfig()), "panel": None})
+    for window in range(1, windows + 1):
+        clocks = {"env_steps": 1000 * window, "gradient_steps": 500 * window}
+        ill = until is None or window <= until
+        for name in CONDITIONS:
+            share = (shares or SHARES).get(name, 0.0) if ill else SHARES[name]
+            here = gap.get(name, 1.2) if isinstance(gap, Mapping) else gap
+            replay_td = 0.2 if share else None
+            held_out = 0.2 * (here if ill else 1.2)
+            run.append(
+                "held_out",
+                [
+                    {
+                        **clocks,
+                        "condition": name,
+                        "rows": 200,
+                        "rows_met": round(SHARES[name] * 1000),
+                        "td_abs_mean": held_out,
+                        "td_online_abs_mean": held_out * (clock if ill else 1.0),
+                        "explained": explained,
+                        "q_abs_mean": 1.0,
+                        "q_lag": lag if ill else 0.05,
+                        "logs_agreement": (agreement or {}).get(name, 0.8),
+                        "logs_unexplained": (unexplained or {}).get(name, 0.45),
+                    }
+                ],
+            )
+            if share:
+                run.append(
+                    "conditions",
+                    [
+                        {
+                            **dict.fromkeys(run.table("conditions").schema.names),
+                            **clocks,
+                            "source": "logs",
+                            "condition": name,
+                            "drawn_rows": round(share * 10_000),
+                            "td_abs_mean": replay_td,
+                        }
+                    ],
+                )
+                run.append(
+                    "strata",
+                    [
+                        {
+                            **dict.fromkeys(run.table("strata").schema.names),
+                            **clocks,
+                            "source": "logs",
+                            "stratum": name if strata else "all",
+                            "quota_share": share / quota_met,
+                            "drawn_rows": round(share * 10_000),
+                            "td_abs_mean": replay_td,
+                        }
+                    ],
+                )
+        run.append(
+            "progress",
+            [
+                {
+                    **dict.fromkeys(run.table("progress").schema.names),
+                    **clocks,
+                    "updates": 500,
+                    "target_q_lag": lag if ill else 0.05,
+                    "q_abs_max": q_abs_max if ill else 10.0,
+                }
+            ],
+        )
+    run.append(
+        "audit",
+        [{**dict.fromkeys(run.table("audit").schema.names), "reward": -1.5}],
+    )
+    run.flush()
+    return run
+
+
+@pytest.mark.parametrize(
+    ("symptoms", "cause"),
+    [
+        ({}, "HEALTHY"),
+        ({"gap": {"blocked_aisle": 6.0}}, "BUFFER"),
+        ({"shares": {n: s for n, s in SHARES.items() if n != "blocked_aisle"}}, "BUFFER"),
+        ({"shares": {**SHARES, "blocked_aisle": 0.005}}, "BUFFER"),  # a tenth is met
+        ({"shares": {**SHARES, "blocked_aisle": 0.02}}, "HEALTHY"),
+        ({"agreement": {"blocked_aisle": 0.03}}, "BUFFER"),
+        ({"unexplained": {"blocked_aisle": 1.2}}, "BUFFER"),
+        ({"unexplained": dict.fromkeys(CONDITIONS, 1.2)}, "HEALTHY"),  # a noisy robot is no fault
+        ({"strata": False}, "HEALTHY"),
+        ({"strata": False, "gap": {"blocked_aisle": 6.0}}, "BUFFER"),
+        ({"lag": 0.9}, "TARGET"),
+        ({"lag": 0.0}, "TARGET"),  # no target network at all
+        ({"clock": 8.0}, "TARGET"),
+        ({"gap": 7.0}, "TARGET"),
+        ({"lag": 0.9, "gap": {"blocked_aisle": 6.0}}, "BOTH"),
+        ({"q_abs_max": 400.0}, "DIVERGENCE"),
+        ({"q_abs_max": float("inf")}, "DIVERGENCE"),
+        ({"explained": 0.01}, "DIVERGENCE"),
+        ({"explained": 0.01, "lag": 0.9}, "TARGET"),
+        ({"explained": None}, "HEALTHY"),  # a run from before it was kept
+        ({"windows": 2, "lag": 0.9}, "UNDETERMINED"),  # too few to agree
+        ({"until": 3, "lag": 0.9}, "UNDETERMINED"),  # gone in the last one
+        ({"until": 1, "lag": 0.9}, "HEALTHY"),  # a young critic's lag
+    ],
+)
+def test_symptoms_are_named(tmp_path: Path, symptoms: dict[str, Any], cause: str) -> None:
+    assert diagnose([make_run(tmp_path / "r", **symptoms)]).cause == cause
+
+
+def test_the_evidence_names_the_condition(tmp_path: Path) -> None:
+    found = diagnose([make_run(tmp_path / "r", gap={"blocked_aisle": 6.0})])
+    assert any(
+        line.startswith("blocked_aisle: held-out |TD| is 6.0 times") for line in found.evidence
+    )
+    assert "blocked_aisle" in found.experiment
+    assert not any("wheel_slip" in line for line in found.evidence)
+
+
+def test_most_seeds_must_agree(tmp_path: Path) -> None:
+    slow = [make_run(tmp_path / f"s{n}", lag=0.9) for n in range(2)]
+    well = [make_run(tmp_path / f"w{n}") for n in range(2)]
+    assert diagnose([*slow, well[0]]).cause == "TARGET"
+    assert diagnose([*slow, *well]).cause == "UNDETERMINED"
+
+
+def test_the_verb_says_what_it_saw(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    make_run(tmp_path / "r", gap={"blocked_aisle": 6.0})
+    assert main(["diagnose", str(tmp_path / "r")]) == 0
+    shown = capsys.readouterr().out
+    assert "BUFFER" in shown
+    assert "to confirm: train again with more or corrected rows of blocked_aisle" in shown
+    assert main(["diagnose", str(tmp_path / "r"), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert (document["cause"], document["confirmation"]) == ("BUFFER", None)
+    assert len(document["runs"][0]["windows"]) == 4
+
+
+def test_what_cannot_be_diagnosed_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    Run.create(tmp_path / "young", {"config": msgspec.to_builtins(TrainConfig())})
+    make_run(tmp_path / "well")
+    for words, said in (
+        ([str(tmp_path / "young")], "has no evaluation to diagnose"),
+        ([str(tmp_path)], "is not a run directory"),
+        ([], "needs a run"),
+        (
+            [str(tmp_path / "well"), "--confirm", str(tmp_path / "c")],
+            "is HEALTHY: there is nothing to confirm",
+        ),
+    ):
+        assert main(["diagnose", *words]) == 2
+        assert said in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "c").exists()
+
+
+@pytest.mark.parametrize("cause", ["BUFFER", "TARGET", "DIVERGENCE"])
+def test_the_experiment_swaps_one_clock(tmp_path: Path, cause: Any) -> None:
+    run = make_run(tmp_path / "r")
+    config = run.document["config"]
+    changed = parse_config(apply_overrides(config, swapped(run, cause)), where="test")
+    sections = {"BUFFER": {"replay", "env"}, "TARGET": {"target"}, "DIVERGENCE": {"optimizer"}}
+    before, after = config, msgspec.to_builtins(changed)
+    assert {key for key in before if before[key] != after[key]} <= sections[cause]

@@ -1,0 +1,325 @@
+"""The diet of a run: its own draws, schedules, adaptive shares, and the cap a row that holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+from support.stores import CONDITIONS, recording_transitions
+from support.toy_run import assert_same_run, config, run_to_end, session
+from support.toy_twin import TASK as TOY_TASK
+
+from restock.errors import MixtureError
+from restock.replay.mixture.mixture import Prioritised, parse_mixture
+from restock.replay.panel.build import build_panel
+from restock.replay.panel.panel import Panel
+from restock.replay.panel.strata import rules_of
+from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.share_controller import Diet, FedStratum, PlannedDraws
+from restock.replay.sampling.within_stratum import panel_sampler
+from restock.train.feed.batches import Batches, Logs
+from restock.train.feed.logged_sampler import LogDraws
+from restock.train.loop import TrainingInterrupted, train
+from restock.train.session import Session
+
+HALVES = "[[strata]]\nname = 'nominal'\nshare = 0.5\n[[strata]]\nname = 'rare'\nshare = 0.5\n"
+
+
+def diet(text: str, rows: list[int], planned: PlannedDraws, **more: Any) -> Diet:
+    mixture = parse_mixture(text)
+    names = [rule.name for rule in mixture.strata]
+    fed = [
+        FedStratum(name, "logs", rule, count, 9)
+        for name, rule, count in zip(names, rules_of(mixture, names), rows, strict=True)
+    ]
+    return Diet(mixture, fed, planned, **more)
+
+
+def test_the_cap_is_reckoned_with_the_runs_own_draws() -> None:
+    text = "max_replays_per_row = 50\n[planned]\nupdates = 1\n" + HALVES
+    # 100,000 online rows, half of them logs: 50,000; 100 rows x 50 are a tenth of that.
+    plan = diet(text, [10_000, 100], PlannedDraws(0, 100_000, 0, 1000))
+    np.testing.assert_allclose(plan.shares, [0.9, 0.1])
+    assert plan.logs_share == 0.5
+    # Twice the run: half the share.
+    plan = diet(text, [10_000, 100], PlannedDraws(0, 200_000, 0, 1000))
+    np.testing.assert_allclose(plan.shares, [0.95, 0.05])
+    # All rows together bear 20,000 of 60,000: 10,000 go to the offline phase, 10,000 of 50,000 on.
+    plan = diet(text, [300, 100], PlannedDraws(10_000, 100_000, 0, 1000))
+    np.testing.assert_allclose(plan.shares, [0.75, 0.25])
+    assert plan.logs_share == pytest.approx(0.1)
+    with pytest.raises(MixtureError, match=r"offline phase draws 30,000 rows of logs.*400 rows"):
+        diet(text, [300, 100], PlannedDraws(30_000, 100_000, 0, 1000))
+    with pytest.raises(MixtureError, match=r"rare wants 50\.0% of 50,000 draws, its 100 rows"):
+        diet("shortfall = 'refuse'\n" + text, [10_000, 100], PlannedDraws(0, 100_000, 0, 1000))
+    shrunk = diet("shortfall = 'shrink'\n" + text, [10_000, 100], PlannedDraws(0, 100_000, 0, 1))
+    np.testing.assert_allclose(shrunk.shares, [5 / 6, 1 / 6])
+    assert shrunk.logs_share == pytest.approx(0.3)
+
+
+def test_shares_follow_schedules_of_sources_and_strata() -> None:
+    text = (
+        "[sources]\nlogs = {schedule = 'linear', start = 0.8, end = 0.2, to_env_steps = 1000}\n"
+        "[[strata]]\nname = 'rare'\n"
+        "share = {schedule = 'piecewise', points = [[0, 0.5], [1000, 0]]}\n"
+        "[[strata]]\nname = 'nominal'\n"
+    )
+    plan = diet(text, [100, 1000], PlannedDraws(0, 1000, 0, 1000))
+    seen = []
+    for env_steps in (0, 250, 500, 1000, 5000):
+        plan.batches = 0  # due
+        plan.at(env_steps)
+        seen.append((plan.logs_share, *plan.shares))
+    expected = [(0.8, 0.5, 0.5), (0.65, 0.375, 0.625), (0.5, 0.25, 0.75), (0.2, 0, 1), (0.2, 0, 1)]
+    np.testing.assert_allclose(seen, expected, atol=1e-12)
+    # A share that is given for the run stands in place of the schedule's.
+    given = diet(text, [100, 1000], PlannedDraws(0, 1000, 0, 1000), logs_share=0.3)
+    given.at(700)
+    assert given.logs_share == pytest.approx(0.3)
+
+
+@pytest.fixture(scope="module")
+def table() -> pa.Table:
+    return pa.concat_tables([recording_transitions(index, task=TOY_TASK) for index in (1, 2, 3)])
+
+
+def panel(table: pa.Table, path: Path, text: str) -> Panel:
+    whole = "discount = 0.9\n" + text
+    return build_panel(table, parse_mixture(whole), path, task=TOY_TASK, conditions=CONDITIONS)
+
+
+def draws_of(panel: Panel, planned: PlannedDraws, batch_size: int = 64) -> LogDraws:
+    return LogDraws(Logs.of_panel(panel, planned), None, batch_size, 0)
+
+
+@pytest.mark.parametrize("within", ["without_replacement", "uniform", "per", "lap"])
+def test_no_row_is_drawn_more_often_than_it_may_be(
+    table: pa.Table, tmp_path: Path, within: str
+) -> None:
+    text = f"max_replays_per_row = 9\nwithin = '{within}'\n[each_condition]\nshare = 'equal'\n"
+    built = panel(table, tmp_path / "p", text)
+    draws = draws_of(built, PlannedDraws(offline=4_000))
+    rng = np.random.default_rng(0)
+    counted = np.zeros(len(built), np.int64)
+    drawn = 0
+    # The run goes on for longer than it said: the rows still bear no more.
+    while True:
+        batch = draws.draw(64)
+        np.add.at(counted, batch.rows, 1)
+        drawn += len(batch.rows)
+        np.testing.assert_array_equal(built.stratum_code[batch.rows], batch.strata)
+        assert counted.max() <= 9
+        if len(batch.rows) < 64:
+            break
+        draws.update(batch.rows, batch.strata, rng.random(64))
+    assert drawn == 9 * len(built)  # all of it was given before the end
+    np.testing.assert_array_equal(draws.replays, counted)
+    rows = draws.describe()
+    assert all(row["exhausted"] and row["replays_max"] == 9 for row in rows if row["rows"])
+    if within != "without_replacement":
+        assert sum(row["replaced_rows"] for row in rows) > 0
+    assert draws.draw(64).rows.size == 0
+
+
+def test_a_panel_read_in_chunks_gives_the_rows_it_names(table: pa.Table, tmp_path: Path) -> None:
+    text = "max_replays_per_row = 9\nsampling = 'chunked'\n[each_condition]\nshare = 'equal'\n"
+    built = panel(table, tmp_path / "p", text)
+    ring = FreshRing(64, 4, TOY_TASK.observation_size, discount=0.9)
+    logs = Logs.of_panel(built, PlannedDraws(offline=4_000))
+    parts = {"batch_size": 64, "logs_share": None, "seed": 0, "device": torch.device("cpu")}
+    batches = Batches(logs, ring, **parts)  # type: ignore[arg-type]
+    again = Batches(logs, ring, **parts)  # type: ignore[arg-type]
+    counted = np.zeros(len(built), np.int64)
+    for number in range(9 * len(built) // 64):
+        batch = batches.draw_offline()
+        np.testing.assert_array_equal(batch.rows.numpy(), built.rows[batch.log_rows])
+        np.add.at(counted, batch.log_rows, 1)
+        if number == 20:
+            again.load_state_dict(batches.state_dict())
+        elif number == 21:
+            np.testing.assert_array_equal(again.draw_offline().log_rows, batch.log_rows)
+    assert counted.max() <= 9
+    with pytest.raises(MixtureError, match="every row of the panel was drawn 9 times"):
+        batches.draw_offline()
+
+
+def test_the_surplus_of_a_stratum_that_is_used_up_goes_to_the_others(
+    table: pa.Table, tmp_path: Path
+) -> None:
+    text = "max_replays_per_row = 20\n[[strata]]\nname = 'near_collision'\nshare = 0.5\n"
+    built = panel(table, tmp_path / "p", text + "[each_condition]\n")
+    draws = draws_of(built, PlannedDraws(online=10))  # it says it will draw next to nothing
+    place = [stratum.name for stratum in built.strata].index("near_collision")
+    assert draws.diet.shares[place] == 0.5
+    limit = 20 * built.strata[place].rows
+    while draws.diet.drawn[place] < limit:
+        draws.draw(64)
+    assert draws.diet.shares[place] == 0
+    assert draws.diet.shares.sum() == pytest.approx(1)
+    before = draws.diet.drawn[place]
+    assert len(draws.draw(64).rows) == 64
+    assert draws.diet.drawn[place] == before == limit
+
+
+EVERYTHING = """
+max_replays_per_row = 40
+max_age_env_steps = 900
+[sources]
+logs = { schedule = "cosine", start = 0.75, end = 0.25, to_env_steps = 1200 }
+[correction]
+post = "density_ratio"
+[adaptive]
+step_size = 0.3
+every_updates = 7
+after_updates = 20
+ceiling = 0.9
+[[strata]]
+name = "nominal"
+share = 0.4
+[[strata]]
+name = "wheel_slip"
+within = "per"
+[[strata]]
+name = "recovery"
+within = "lap"
+[each_condition]
+share = "equal"
+within = "uniform"
+"""
+
+
+def test_draws_go_on_exactly_where_they_were_saved(table: pa.Table, tmp_path: Path) -> None:
+    built = panel(table, tmp_path / "p", EVERYTHING)
+    planned = PlannedDraws(640, 20_000, 0, 1200)
+
+    def some(draws: LogDraws, batches: int, seed: int) -> list[Any]:
+        rng = np.random.default_rng(seed)
+        found: list[Any] = []
+        for number in range(batches):
+            draws.move_to(number * 10)
+            count = max(round(64 * draws.diet.logs_share), 1)
+            batch = draws.draw(count)
+            draws.update(batch.rows, batch.strata, rng.random(len(batch.rows)) * (1 + batch.strata))
+            found.append((batch.rows, batch.strata, batch.weight, batch.quota.copy()))
+        return found
+
+    draws = draws_of(built, planned)
+    some(draws, 50, 1)
+    state = draws.state_dict()
+    going_on = some(draws, 90, 2)
+    assert len({tuple(quota) for *_, quota in going_on}) > 5  # shares did move
+    again = draws_of(built, planned)
+    again.load_state_dict(state)
+    for one, two in zip(going_on, some(again, 90, 2), strict=True):
+        for a, b in zip(one, two, strict=True):
+            np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(draws.replays, again.replays)
+
+
+def test_weights_follow_the_shares_in_force(table: pa.Table, tmp_path: Path) -> None:
+    """Full correction keeps P(outcome) what it was, however the shares move."""
+    text = EVERYTHING.replace("density_ratio", "full")
+    built = panel(table, tmp_path / "p", text)
+    draws = draws_of(built, PlannedDraws(0, 100_000, 0, 1200))
+    post = np.array([stratum.timing == "post" for stratum in built.strata])
+    rows = np.array([stratum.rows for stratum in built.strata])
+    for step in range(3):
+        shares = draws.diet.shares
+        weight = draws._own_weights(np.arange(len(built)))
+        assert weight is not None
+        mean = np.bincount(built.stratum_code, weight) / np.maximum(rows, 1)
+        assert (shares * mean).sum() == pytest.approx(1, rel=1e-4)
+        density = shares * mean / rows
+        nominal = [stratum.name for stratum in built.strata].index("nominal")
+        # Rows of the nominal state are drawn alike, whatever their outcome was.
+        state = built.meta["state_code"].to_numpy()
+        of_nominal = state == nominal
+        per_row = (shares / rows)[built.stratum_code] * weight
+        np.testing.assert_allclose(per_row[of_nominal], density[nominal], rtol=1e-4)
+        assert (post[built.stratum_code] & of_nominal).any()
+        for _ in range(80):
+            batch = draws.draw(64)
+            draws.update(batch.rows, batch.strata, 1.0 + 3 * (batch.strata == step + 1))
+
+
+def test_mixed_rules_keep_exact_quotas_and_their_own_ways() -> None:
+    members = [np.arange(0, 50), np.arange(50, 90), np.arange(90, 100)]
+    sampler = panel_sampler(
+        ["without_replacement", "per", "uniform"],
+        members,
+        np.array([0.5, 0.3, 0.2]),
+        30,
+        np.random.default_rng(0),
+        Prioritised(per_alpha=1.0),
+    )
+    counts = np.zeros(100, np.int64)
+    for _ in range(400):
+        rows, strata = sampler.draw()
+        assert np.bincount(strata, minlength=3).tolist() == [15, 9, 6]
+        np.add.at(counts, rows, 1)
+        sampler.update(rows, np.where(rows == 60, 10.0, 0.1))
+    assert np.ptp(counts[:50]) <= 1
+    assert counts[60] > 5 * np.median(counts[50:90])
+    weights = sampler.drawn_weights
+    assert weights is not None
+    assert (weights[:15] == 1).all()
+    assert (weights[24:] == 1).all()
+
+
+def toy_logs(built: Panel) -> Logs:
+    return Logs.of_panel(built, PlannedDraws(60 * 32, 350 * 32, 200, 1600))
+
+
+SETTINGS = config(replay={"logs_share": None}, schedule={"env_steps": 1600})
+
+
+@pytest.fixture(scope="module")
+def whole(table: pa.Table, tmp_path_factory: pytest.TempPathFactory) -> tuple[Session, Panel]:
+    """A run on everything at once."""
+    path = tmp_path_factory.mktemp("runs")
+    built = panel(table, path / "panel", EVERYTHING)
+    return run_to_end(path / "whole", SETTINGS, logs=toy_logs(built)), built
+
+
+def test_a_run_on_everything_at_once_resumes_bit_for_bit(
+    whole: tuple[Session, Panel], tmp_path: Path
+) -> None:
+    undisturbed, built = whole
+    asked = iter(range(150))
+    path = tmp_path / "cut"
+    live = session(path, SETTINGS, logs=toy_logs(built))
+    with pytest.raises(TrainingInterrupted):
+        train(live, stop=lambda: next(asked, None) is None)
+    live.close()
+    again = session(path, SETTINGS, logs=toy_logs(built), resume=True)
+    train(again)
+    again.close()
+    assert_same_run(undisturbed, again)
+
+
+def test_the_run_records_the_shares_in_force(whole: tuple[Session, Panel]) -> None:
+    live, built = whole
+    path, size = live.run.path, len(built.strata)
+    shares = pq.read_table(path / "shares.parquet").to_pylist()
+    assert len(shares) > 4 * size
+    for first in range(0, len(shares), size):
+        mine = shares[first : first + size]
+        assert sum(row["share"] for row in mine) == pytest.approx(1)
+        assert all(row["replays_max"] <= 40 for row in mine)
+    last = shares[-size:]
+    assert live.batches.diet is not None
+    np.testing.assert_allclose([row["share"] for row in last], live.batches.diet.shares)
+    assert [row["share"] for row in last] != [row["planned_share"] for row in last]
+    assert last[0]["logs_share"] < 0.4 < shares[0]["logs_share"]
+    # What was asked for is what was drawn.
+    strata = pq.read_table(path / "strata.parquet").to_pylist()
+    for row in strata:
+        if row["source"] == "logs" and row["phase"] == "online":
+            assert row["drawn_share"] == pytest.approx(row["quota_share"], abs=0.03)
+    ages = pq.read_table(path / "ages.parquet").to_pylist()
+    assert max(row["bucket"] for row in ages if row["unit"] == "env_steps") <= 9  # 2 ** 9 <= 900

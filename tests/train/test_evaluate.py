@@ -1,0 +1,110 @@
+"""Evaluation: the same episodes for everyone, in the order asked, whatever the number of envs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from support.toy_twin import CELLS, TASK, ToyTwin
+
+from restock.stats import wilson
+from restock.train.evaluation.evaluate import (
+    EpisodeResult,
+    Score,
+    cell_name,
+    fixed_episodes,
+    run_episodes,
+    score,
+    summary_rows,
+)
+from restock.train.twin.physics.episode import EpisodeSpec
+
+
+class Always:
+    """Takes one action, always."""
+
+    version = "1"
+
+    def __init__(self, action: int, name: str = "always") -> None:
+        self.action, self.name = action, name
+
+    def act(self, env: Any, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.full(len(observation), self.action), np.ones(len(observation), np.float32)
+
+
+def drive(env: ToyTwin, action: int, specs: list[EpisodeSpec]) -> list[EpisodeResult]:
+    return run_episodes(
+        env,
+        Always(action),
+        specs,
+        control_period_s=TASK.control_period_s,
+        time_limit_steps=TASK.time_limit_steps,
+    )
+
+
+SPECS = fixed_episodes(["nominal", "wheel_slip"], 7, 100)
+
+
+def test_results_are_in_the_order_of_the_episodes() -> None:
+    results = drive(ToyTwin(3), 1, SPECS)
+    assert [(r.condition, r.episode_seed) for r in results] == [
+        (spec.condition, spec.seed) for spec in SPECS
+    ]
+
+
+def test_results_do_not_depend_on_how_many_run_at_once() -> None:
+    alone = drive(ToyTwin(1), 1, SPECS)
+    assert alone == drive(ToyTwin(4), 1, SPECS) == drive(ToyTwin(64), 1, SPECS)
+    assert len({result.time_s for result in alone}) > 2  # slipping ones take longer, each its own
+
+
+def test_an_episode_is_counted_by_hand() -> None:
+    (result,) = drive(ToyTwin(2), 1, [EpisodeSpec("nominal", 5)])
+    assert result.success
+    assert result.failure is None
+    assert result.time_s == pytest.approx((CELLS - 1) * 0.2)
+    assert result.undiscounted_return == pytest.approx(1.0 - 0.05 * (CELLS - 2))
+    assert result.end_x_m == CELLS - 1
+    assert result.bumps == 0
+
+
+def test_a_contact_that_lasts_is_one_bump() -> None:
+    (result,) = drive(ToyTwin(1), 2, [EpisodeSpec("nominal", 5)])  # backs into the wall, 20 steps
+    assert result.bumps == 1
+    assert not result.success
+    assert result.failure == "stuck"
+    assert result.time_s == pytest.approx(TASK.time_limit_steps * 0.2)
+
+
+def test_score_weighs_conditions_the_same_and_breaks_ties_by_return() -> None:
+    def result(condition: str, success: bool, value: float) -> EpisodeResult:
+        return EpisodeResult(condition, "none", 0, success, 0, 1.0, value, 0.0, 0.0, None)
+
+    found = score(
+        [result("nominal", True, 2.0), result("nominal", True, 4.0), result("slip", False, -1.0)]
+    )
+    assert found == Score({"nominal": 1.0, "slip": 0.0}, 0.5, 1.0)
+    assert found.beats(None)
+    assert not found.beats(found)
+    assert Score({}, 0.5, 1.1).beats(found)
+    assert not Score({}, 0.4, 9.0).beats(found)
+
+
+def test_the_summary_tells_partial_and_full_blocks_apart() -> None:
+    def result(block: str, success: bool) -> EpisodeResult:
+        condition = "nominal" if block == "none" else "blocked_aisle"
+        return EpisodeResult(condition, block, 0, success, 1, 3.0, 2.0, 0.0, 0.0, None)
+
+    episodes = [result("full", True), result("partial", False), result("none", True)]
+    rows = summary_rows({("agent", "none"): [*episodes, result("partial", True)]})
+    assert [row["condition"] for row in rows] == [
+        "nominal",
+        "blocked_aisle (full)",
+        "blocked_aisle (partial)",
+    ]
+    partial = rows[2]
+    assert (partial["success"], partial["episodes"]) == (0.5, 2)
+    assert (partial["success_low"], partial["success_high"]) == wilson(1, 2)
+    assert partial["time_s"] == 3.0
+    assert cell_name("nominal", "none") == "nominal"

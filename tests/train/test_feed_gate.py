@@ -1,0 +1,126 @@
+"""The gate: what was fed alike passes, what was planted is found, and noise is called noise."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from restock.train.comparison.comparability import Check, Feed, Limits, check_feeds, worst
+
+CELLS = ["logs/nominal", "logs/wheel_slip", "logs/rare", "fresh/nominal", "fresh/wheel_slip"]
+LIMITS = Limits(resamples=300)
+
+
+def feed(
+    seed: int,
+    *,
+    logs: tuple[float, ...] = (0.7, 0.298, 0.002),
+    slip: float = 0.3,
+    fresh_episodes: int = 4000,
+    log_episodes: int = 200,
+    runs: int = 1,
+    weight: tuple[float, ...] = (1, 1, 1, 1, 1),
+) -> Feed:
+    """Half from logs in exact quotas, half fresh: each fresh episode has one condition."""
+    rng = np.random.default_rng(seed)
+    parts = []  # cell, tenth, episode, run, drawn
+    for number, part in np.ndindex(runs, 10):
+        for index, share in enumerate(logs):
+            keys = np.arange(log_episodes)
+            parts.append((np.full(log_episodes, index), part, keys, number, share / log_episodes))
+        count = fresh_episodes // 10
+        keys = 1_000_000 * (number + 1) + part * 100_000 + np.arange(count)
+        parts.append((3 + (rng.random(count) < slip), part, keys, number, 1 / count))
+    cell, tenth, episode, run, drawn = (
+        np.concatenate([np.broadcast_to(part[column], part[0].shape) for part in parts])
+        for column in range(5)
+    )
+    amounts = drawn * 5000
+    return Feed(CELLS, cell, tenth, episode, run, amounts, amounts * np.array(weight)[cell])
+
+
+def verdict(first: Feed, second: Feed) -> str:
+    return worst([c.verdict for c in check_feeds(first, second, LIMITS, np.random.default_rng(0))])
+
+
+def failing(first: Feed, second: Feed) -> list[Check]:
+    checks = check_feeds(first, second, LIMITS, np.random.default_rng(0))
+    return [check for check in checks if check.verdict == "incomparable"]
+
+
+def test_feeds_of_one_process_with_enough_episodes_are_comparable() -> None:
+    assert verdict(feed(1, runs=5), feed(2, runs=5)) == "comparable"
+
+
+def test_a_feed_against_itself_is_never_incomparable() -> None:
+    few = feed(1, fresh_episodes=100)
+    assert verdict(few, few) != "incomparable"
+
+
+def test_few_episodes_of_one_process_are_inconclusive_not_different() -> None:
+    # Many rows of few episodes: a test that counts rows would call nearly all of these different.
+    verdicts = [
+        verdict(feed(seed, fresh_episodes=150), feed(seed + 100, fresh_episodes=150))
+        for seed in range(12)
+    ]
+    assert verdicts.count("inconclusive") >= 10
+    assert "comparable" not in verdicts
+
+
+def test_the_rarest_stratum_halved_is_found_although_the_distance_is_tiny() -> None:
+    found = failing(feed(1, runs=5), feed(2, logs=(0.7, 0.299, 0.001), runs=5))
+    (raw,) = found
+    assert raw.name == "share of logs/rare"
+    assert raw.value == pytest.approx(2.0)
+    assert (raw.first, raw.second) == (pytest.approx(0.001), pytest.approx(0.0005))
+
+
+def test_another_mix_of_conditions_in_the_twin_is_found() -> None:
+    found = failing(feed(1), feed(2, slip=0.5))
+    assert "mix" in {check.name for check in found}
+    assert "share of fresh/wheel_slip" in {check.name for check in found}
+
+
+def test_weights_that_undo_a_boost_are_found_where_the_draws_agree() -> None:
+    found = failing(feed(1, runs=5), feed(2, runs=5, weight=(1, 0.2, 1, 1, 1)))
+    assert {check.name for check in found} >= {"mix after weights"}
+    assert not [check for check in found if "after weights" not in check.name]
+
+
+def test_a_stratum_fed_from_few_episodes_is_found() -> None:
+    found = failing(feed(1, runs=5), feed(2, runs=5, log_episodes=40))
+    assert {check.name for check in found} == {
+        f"episodes of logs/{name}" for name in ("nominal", "wheel_slip", "rare")
+    }
+
+
+def test_a_shift_within_the_run_that_the_whole_hides_is_found() -> None:
+    first, second = feed(1, runs=5), feed(2, runs=5)
+    amounts = second.drawn.copy()
+    for tenth, times in ((0, 1.5), (9, 0.5)):  # early more slip, late less
+        here = (second.tenth == tenth) & (second.cell == 1)
+        amounts[here] *= times
+    shifted = Feed(
+        CELLS, second.cell, second.tenth, second.episode, second.run, amounts, second.weight
+    )
+    parts = {check.part for check in failing(first, shifted) if check.name == "mix"}
+    assert parts == {"tenth 1", "tenth 10"}
+
+
+def test_rows_that_nobody_could_label_show_nothing() -> None:
+    first, second = feed(1, runs=5), feed(2, runs=5)
+    names = [name.replace("fresh/nominal", "fresh/unlabelled") for name in CELLS]
+    unknown = [dataclasses.replace(one, cells=names) for one in (first, second)]
+    assert verdict(first, second) == "comparable"
+    assert verdict(*unknown) == "inconclusive"
+
+
+def test_a_cell_that_only_one_was_fed_is_an_infinite_ratio() -> None:
+    (check, *_) = [
+        c
+        for c in failing(feed(1), feed(2, logs=(0.702, 0.298, 0.0)))
+        if c.name == "share of logs/rare"
+    ]
+    assert check.value == float("inf")

@@ -1,0 +1,241 @@
+"""What the twin gave goes into a store like a robot's log: once, whole, with its labels."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+import restock
+from restock.cli import main
+from restock.errors import RunError
+from restock.ingest.profile.profile import Profile, load_profile
+from restock.ingest.store.episode_rows import episode_ends
+from restock.ingest.store.writer import StoreWriter
+from restock.replay.mixture.mixture import load_mixture
+from restock.replay.panel.build import build_panel
+from restock.replay.ring.ring import FreshRing
+from restock.train.dqn import checkpoint
+from restock.train.feed.collector import Collector, ring_conditions
+from restock.train.feed.fresh_log import FreshLog, episode_files
+from restock.train.flush_fresh import flush
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.physics.perturbation import Schedule
+
+ENVS, LONGEST = 3, 25
+
+
+@dataclass
+class Collecting:
+    """The warehouse with short episodes, driven at random, and what went into the ring."""
+
+    folder: Path
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
+    steps: int = 0
+
+    def __post_init__(self) -> None:
+        shipped = load_profile("warehouse_amr")
+        task = msgspec.structs.replace(shipped.task, time_limit_steps=LONGEST)
+        self.profile: Profile = msgspec.structs.replace(shipped, task=task)
+        drawn = Schedule(ranges={"payload_kg": (10.0, 60.0)}, name="laden")
+        self.env = WarehouseVectorEnv(ENVS, seed=1, task=task, perturbation=drawn)
+        self.ring = FreshRing(
+            500,
+            ENVS,
+            task.observation_size,
+            discount=0.9,
+            conditions=ring_conditions(self.profile.conditions),
+        )
+        self.collector = Collector(self.env, self.ring, self.profile.conditions, task, None)
+        self.collector.reset(1)
+
+    def keep(self) -> FreshLog:
+        return self.collector.keep(self.folder / "fresh")
+
+    def drive(self, steps: int) -> None:
+        for _ in range(steps):
+            action = self.rng.integers(0, 9, ENVS)
+            probability = self.rng.uniform(0.1, 1.0, ENVS).astype(np.float32)
+            self.collector.start(action, probability)
+            self.collector.finish(
+                env_steps=self.steps * ENVS, gradient_steps=self.steps, acting_step=self.steps
+            )
+            self.steps += 1
+            self.collector.label(all_of_them=True)
+
+
+@pytest.fixture
+def collecting(tmp_path: Path) -> Collecting:
+    made = Collecting(tmp_path / "run")
+    made.keep()
+    made.drive(2 * LONGEST + 5)
+    return made
+
+
+def test_a_flushed_run_is_a_recording_like_any_other(
+    collecting: Collecting, tmp_path: Path
+) -> None:
+    done = flush(collecting.folder, StoreWriter(tmp_path / "store"), collecting.profile)
+    assert (done.status, done.episodes) == ("written", 2 * ENVS)
+    store = restock.open(tmp_path / "store")
+    (recording,) = store.sql("FROM recordings").to_arrow_table().to_pylist()
+    assert recording["format"] == "twin"
+    assert recording["ticks"] == recording["transitions"] + recording["episode_ends"]
+    rows = store.sql(
+        "FROM transitions JOIN recordings USING (recording_id) WHERE format = 'twin'"
+        " ORDER BY episode_index, step_index"
+    )
+    rows = rows.to_arrow_table().to_pylist()
+    assert len(rows) == done.transitions == 2 * ENVS * LONGEST
+    # The ring has the same steps (n_step is 1): by observation, action and reward.
+    ring, place = collecting.ring, {}
+    for slot in range(len(ring)):
+        place[ring.rows[slot, : ring.observation_size].tobytes()] = slot
+    labels = (*ring.conditions, None)
+    for row in rows:
+        slot = place[np.array(row["observation"], np.float32).tobytes()]
+        packed = ring.rows[slot]
+        assert row["action"] == packed[ring.columns["action"]][0]
+        assert row["reward"] == packed[ring.columns["reward"]][0]
+        assert (packed[ring.columns["discount"]][0] == 0) == row["terminated"]
+        np.testing.assert_array_equal(
+            np.array(row["next_observation"], np.float32), packed[ring.columns["next_observation"]]
+        )
+        assert row["step_index"] == ring.meta["episode_step"][slot]
+        assert row["condition"] == labels[ring.condition(np.array([slot]))[0]]
+        assert row["action_probability"] == ring.meta["action_probability"][slot]
+        assert row["behaviour_policy"] == "dqn"
+        began = ring.meta["policy_version"][slot] - row["step_index"]
+        assert row["behaviour_version"] == f"run@{began}"
+    assert {row["perturbation"] for row in rows} == {"laden"}
+    payloads = {row["episode_index"]: dict(row["perturbation_values"]) for row in rows}
+    assert {tuple(values) for values in payloads.values()} == {("payload_kg",)}
+    assert len({values["payload_kg"] for values in payloads.values()}) == 2 * ENVS
+    last = [row for row in rows if row["truncated"] or row["terminated"]]
+    assert [row["step_index"] for row in last] == [LONGEST - 1] * 2 * ENVS
+    stamps = np.array([row["stamp_ns"] for row in rows])
+    assert (np.diff(stamps) > 0).all()
+
+
+def test_a_panel_can_be_mixed_from_it(collecting: Collecting, tmp_path: Path) -> None:
+    flush(collecting.folder, StoreWriter(tmp_path / "store"), collecting.profile)
+    with restock.open(tmp_path / "store") as store:
+        panel = build_panel(store, load_mixture("uniform"), tmp_path / "panel")
+    assert len(panel) >= ENVS * LONGEST
+    assert panel.task == collecting.profile.task
+
+
+def test_the_ends_of_episodes_are_kept_for_labels_that_look_ahead(
+    collecting: Collecting, tmp_path: Path
+) -> None:
+    writer = StoreWriter(tmp_path / "store")
+    done = flush(collecting.folder, writer, collecting.profile)
+    (manifest,) = writer.live(done.recording_id).to_pylist()
+    ends = episode_ends(writer.rows(done.recording_id, manifest["ingest_id"]))
+    assert ends is not None
+    assert ends["step_index"].to_pylist() == [LONGEST] * 2 * ENVS
+
+
+def test_the_same_episodes_are_flushed_once(collecting: Collecting, tmp_path: Path) -> None:
+    writer = StoreWriter(tmp_path / "store")
+    first, again = (flush(collecting.folder, writer, collecting.profile) for _ in range(2))
+    assert (again.status, again.recording_id) == ("unchanged", first.recording_id)
+    collecting.drive(LONGEST)
+    more = flush(collecting.folder, writer, collecting.profile)
+    assert more.recording_id != first.recording_id
+    assert len(writer.live()) == 2
+
+
+def test_what_is_kept_goes_on_exactly_from_a_checkpoint(tmp_path: Path) -> None:
+    def state(made: Collecting) -> dict[str, Any]:
+        return {
+            "env": made.env.get_state(),
+            "ring": made.ring.state_dict(),
+            "collector": made.collector.state_dict(),
+        }
+
+    first = Collecting(tmp_path / "first" / "run")
+    first.keep()
+    first.drive(LONGEST + 9)
+    checkpoint.save(tmp_path / "checkpoint", state(first))
+    first.drive(30)
+
+    second = Collecting(tmp_path / "first" / "run")
+    second.rng = np.random.default_rng(0)
+    for _ in range(LONGEST + 9):
+        second.rng.integers(0, 9, ENVS), second.rng.uniform(0.1, 1.0, ENVS)
+    saved = checkpoint.load(tmp_path / "checkpoint")
+    second.env.set_state(saved["env"])
+    second.ring.load_state_dict(saved["ring"])
+    second.collector.load_state_dict(saved["collector"])
+    second.steps = LONGEST + 9
+    before = flush(first.folder, StoreWriter(tmp_path / "store"), first.profile)
+    second.keep()  # what was written after the checkpoint goes, and comes again
+    assert len(episode_files(second.folder / "fresh")) == 1
+    second.drive(30)
+    after = flush(second.folder, StoreWriter(tmp_path / "store"), second.profile)
+    assert (after.status, after.recording_id) == ("unchanged", before.recording_id)
+
+
+def test_a_step_that_blew_up_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = Collecting(tmp_path / "run")
+    log = made.keep()
+    made.drive(10)
+    simulation = made.env.simulation
+    drive = simulation.drive
+
+    def blow_up(command: Any) -> None:
+        drive(command)
+        simulation.blown_up = np.array([True, False, False])
+
+    with monkeypatch.context() as patch:
+        patch.setattr(simulation, "drive", blow_up)
+        made.drive(1)
+    made.drive(LONGEST)
+    assert log.dropped_steps == 1
+    writer = StoreWriter(tmp_path / "store")
+    done = flush(made.folder, writer, made.profile, log.dropped_steps)
+    (manifest,) = writer.live(done.recording_id).to_pylist()
+    assert manifest["drops"] == [{"reason": "physics blew up", "count": 1}]
+    assert manifest["ticks"] == manifest["transitions"] + manifest["episode_ends"] + 1
+    rows = restock.open(tmp_path / "store").sql(
+        "SELECT step_index, terminated FROM transitions WHERE truncated OR terminated"
+    )
+    assert {"step_index": 9, "terminated": False} in rows.to_arrow_table().to_pylist()
+
+
+def test_episodes_under_way_when_keeping_begins_are_left_out(tmp_path: Path) -> None:
+    made = Collecting(tmp_path / "run")
+    made.drive(5)
+    made.keep()
+    made.drive(LONGEST - 5)
+    with pytest.raises(RunError, match="no finished episode"):
+        flush(made.folder, StoreWriter(tmp_path / "store"), made.profile)
+    made.drive(LONGEST)
+    assert flush(made.folder, StoreWriter(tmp_path / "store"), made.profile).episodes == ENVS
+
+
+@pytest.mark.slow
+def test_train_flushes_to_a_store_and_flushing_again_changes_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = ["env.num_envs=4", "evaluation.episodes=1", "network.hidden=[16]"]
+    keys = [word for key in (*small, "record.tensorboard=false") for word in ("--set", key)]
+    run, store = str(tmp_path / "a"), str(tmp_path / "store")
+    new = ["train", "--out", run, "--env-steps", "1000", *keys]
+    assert main([*new, "--flush-fresh", store, "--json"]) == 0
+    flushed = json.loads(capsys.readouterr().out)["flushed"]
+    assert (flushed["status"], flushed["version"]) == ("written", 1)
+    assert flushed["episodes"] >= 4
+    assert main(["train", "--resume", run, "--flush-fresh", store, "--json"]) == 0
+    again = json.loads(capsys.readouterr().out)["flushed"]
+    assert again == flushed | {"status": "unchanged", "version": None}
+    query = "SELECT format, count(*) AS rows FROM transitions JOIN recordings USING (recording_id)"
+    assert main(["sql", store, f"{query} GROUP BY ALL", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found == [{"format": "twin", "rows": flushed["transitions"]}]

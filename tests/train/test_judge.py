@@ -1,0 +1,207 @@
+"""Judging a run on logs: only on episodes it did not learn from, and said where it cannot be."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+from support.kept_run import kept_network, kept_run
+from support.stores import recording_transitions, write_store
+
+from restock.cli import main
+from restock.errors import RunError
+from restock.ingest.profile.profile import load_profile
+from restock.replay.mixture.mixture import parse_mixture
+from restock.replay.panel.build import build_panel
+from restock.replay.panel.panel import Panel
+from restock.replay.store.store import Store
+from restock.train.dqn.config import NetworkConfig
+from restock.train.dqn.fitted_q import Fit, soft_greedy
+from restock.train.dqn.network import make_network
+from restock.train.evaluation.ope import Judging, judge
+from restock.train.evaluation.ope_dataset import Steps, find_evidence, read_steps
+
+TASK = load_profile("warehouse_amr").task
+MIXTURE = parse_mixture("[each_condition]\nshare = 'natural'\n[held_out]\nshare = 0.3\n")
+NETWORK = NetworkConfig(hidden=(16,))
+QUICK = Fit(iterations=2, updates=2, batch_size=32, hidden=(8,), cloning_updates=50)
+
+
+def chances(table: pa.Table, chance: float) -> pa.Table:
+    """The same rows with the action's probability logged."""
+    place = table.schema.get_field_index("action_probability")
+    column = pa.array(np.full(len(table), chance, np.float32))
+    return table.set_column(place, table.schema.field(place), column)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("judge") / "store"
+    tables = [chances(recording_transitions(1, task=TASK), 0.25)]
+    return write_store(path, [*tables, recording_transitions(2, task=TASK)], task=TASK)
+
+
+@pytest.fixture(scope="module")
+def panel(store: Path) -> Panel:
+    with Store(store) as opened:
+        return build_panel(opened, MIXTURE, store.parent / "panel")
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is fitted does not matter here: two updates will do."""
+    monkeypatch.setattr(judge, "__kwdefaults__", {**judge.__kwdefaults__, "fit": QUICK})
+
+
+def test_no_episode_is_both_fitted_on_and_judged_by(store: Path, panel: Panel) -> None:
+    fed = set(panel.meta["episode_id"].to_pylist())
+    held = set(pq.read_table(panel.path / "held_out.parquet")["episode_id"].to_pylist())
+    for logs in (None, str(store), str(panel.path)):
+        evidence = find_evidence(panel, TASK, logs)
+        assert len(evidence.held.condition) == len(held - fed)
+        assert len(evidence.model.condition) == len(fed)
+        rows = evidence.held.rows
+        seen = {tuple(row) for row in evidence.model.rows.observation[:, :3].tolist()}
+        assert not seen & {tuple(row) for row in rows.observation[:, :3].tolist()}
+    assert "left aside" in find_evidence(panel, TASK, str(store)).notes[0]
+
+
+def test_what_was_all_learnt_from_is_refused(store: Path, tmp_path: Path) -> None:
+    everything = parse_mixture("[each_condition]\nshare = 'natural'\n[held_out]\nby = 'none'\n")
+    with Store(store) as opened:
+        panel = build_panel(opened, everything, tmp_path / "p")
+    with pytest.raises(RunError, match="no episode that the run did not learn from"):
+        find_evidence(panel, TASK, str(store))
+    other = msgspec.structs.replace(TASK, time_limit_steps=3)
+    with pytest.raises(RunError, match="its rows are of task"):
+        find_evidence(panel, other, str(store))
+    with pytest.raises(RunError, match="learnt from no panel"):
+        find_evidence(None, TASK)
+
+
+def test_without_a_panel_half_the_episodes_are_judged_by(store: Path) -> None:
+    evidence = find_evidence(None, TASK, str(store))
+    assert len(evidence.held.condition) + len(evidence.model.condition) == 24
+    assert len(evidence.held.condition) > 3
+    assert "no panel" in evidence.notes[0]
+
+
+def test_success_is_arriving_before_any_contact(store: Path) -> None:
+    with Store(store) as opened:
+        ids = opened.sql("SELECT transition_id FROM transitions").fetchnumpy()["transition_id"]
+        steps = read_steps(opened.connection, np.asarray(ids, np.int64))
+        rows = opened.sql(
+            "SELECT episode_id, step_index, bumped, terminated FROM transitions"
+            " ORDER BY recording_id, episode_index, step_index"
+        ).fetchall()
+    expected, ends = [], []
+    for name in dict.fromkeys(row[0] for row in rows):
+        episode = [row for row in rows if row[0] == name]
+        # The contact of a step is what the bumper says at the next one.
+        bumps = [any_after[2] for any_after in episode[1:]] + [False]
+        until = bumps.index(True) if True in bumps else len(episode) - 1
+        arrived = episode[until][3] and not bumps[until]
+        expected.append([0.0] * until + [float(arrived)])
+        ends.append(bool(bumps[until] or episode[until][3]))
+    measured = steps.measured("success")
+    found = [
+        measured.rows.reward[measured.episode == index] for index in np.unique(measured.episode)
+    ]
+    assert [part.tolist() for part in found] == expected
+    last = np.flatnonzero(np.diff(measured.episode, append=-1))
+    assert measured.rows.terminated[last].tolist() == ends
+    assert measured.rows.terminated.sum() == sum(ends)
+
+
+def test_weights_are_of_logged_probabilities_and_of_cloned_ones_where_there_are_none(
+    panel: Panel,
+) -> None:
+    evidence = find_evidence(panel, TASK)
+    network = kept_network(NETWORK)
+    rows = judge(network, evidence, discount=0.97, fit=QUICK)
+    unknown = np.isnan(evidence.held.probability)
+    assert 0 < unknown.mean() < 1
+    assert {row["estimated_share"] for row in rows} == {unknown.mean()}
+    logged = _known(evidence.held)
+    rows = judge(
+        network, replace(evidence, held=logged), discount=0.97, measures=("return",), fit=QUICK
+    )
+    assert {row["estimated_share"] for row in rows} == {0.0}
+    whole = next(r for r in rows if (r["condition"], r["estimator"]) == ("all", "logged"))
+    first = np.flatnonzero(np.diff(logged.episode, prepend=-1))
+    power = np.arange(len(logged.rows)) - np.repeat(
+        first, np.diff(np.append(first, len(logged.rows)))
+    )
+    total = (logged.rows.reward * 0.97**power).sum() / len(first)
+    assert whole["value"] == pytest.approx(total, rel=1e-5)
+
+
+def _known(held: Steps) -> Steps:
+    return replace(held, probability=np.full(len(held.rows), 0.3))
+
+
+def test_soft_greedy_is_a_distribution_with_its_chance_on_the_best() -> None:
+    network = make_network(NETWORK, 4, 3, torch.Generator().manual_seed(1))
+    observation = np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)
+    chance = soft_greedy(network, observation, 0.3)
+    np.testing.assert_allclose(chance.sum(axis=1), 1, rtol=1e-6)
+    np.testing.assert_allclose(chance.max(axis=1), 0.8, rtol=1e-6)
+    with torch.no_grad():
+        best = network(torch.from_numpy(observation)).argmax(dim=1).numpy()
+    np.testing.assert_array_equal(chance.argmax(axis=1), best)
+
+
+def test_the_verb_judges_and_says_why_it_refuses(
+    store: Path, panel: Panel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = kept_run(tmp_path / "a", NETWORK, panel)
+    argv = ["eval", str(run), "--on-logs", "own"]
+    assert main([*argv, "--dry-run"]) == 0
+    assert not (run / "eval").exists()
+    capsys.readouterr()
+    assert main(argv) == 0
+    said = capsys.readouterr()
+    assert "refused" in said.out
+    assert "episodes, less than" in " ".join(said.err.split())
+    assert "are estimated (cloned) for" in " ".join(said.err.split())
+    assert main([*argv, "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["results"]
+    table = pq.read_table(run / "eval" / "off_policy.parquet").to_pylist()
+    assert [row["value"] for row in table] == [row["value"] for row in rows]
+    assert {row["gradient_steps"] for row in table} == {7}
+    assert {row["estimator"] for row in rows} == {"logged", "fqe", "pdwis", "wdr"}
+    for row in rows:
+        assert (row["value"] is None) == (row["refused"] is not None)
+    assert main(["sql", str(run), "SELECT count(*) AS n FROM eval_off_policy", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == [{"n": len(rows)}]
+    assert main(["eval", str(run), "--on-logs", str(tmp_path / "nowhere")]) == 2
+    assert main([*argv, "--epsilon", "2"]) == 2
+    assert "epsilon must be in [0, 1]" in capsys.readouterr().err
+
+
+def test_a_horizon_gives_an_answer_where_the_whole_was_refused(panel: Panel) -> None:
+    evidence = find_evidence(panel, TASK)
+    network = kept_network(NETWORK)
+    evidence = replace(evidence, held=_known(evidence.held))
+    how = Judging(epsilon=1.0, horizon=1)
+    rows = judge(network, evidence, discount=0.97, measures=("return",), how=how, fit=QUICK)
+    whole = {r["estimator"]: r["value"] for r in rows if r["condition"] == "all"}
+    assert all(value is not None for value in whole.values())
+
+
+def test_training_judges_before_it_drives(panel: Panel, tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    argv = ["train", "--panel", str(panel.path), "--out", str(path), "--env-steps", "0"]
+    small = ["schedule.offline_updates=3", "network.hidden=[8]", "evaluation.episodes=1"]
+    small += ["record.tensorboard=false", "evaluation.off_policy=true", "replay.batch_size=8"]
+    assert main([*argv, *(flag for value in small for flag in ("--set", value))]) == 0
+    rows = pq.read_table(path / "off_policy.parquet").to_pylist()
+    assert {row["measure"] for row in rows} == {"return", "success"}
+    assert {row["gradient_steps"] for row in rows} == {3}

@@ -1,0 +1,186 @@
+"""Stable-Baselines3's DQN and PPO as arms of a study: runs that are evaluated as any other."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow.compute as pc
+import pytest
+
+from restock.cli import main
+from restock.errors import ConfigError
+from restock.ingest.profile.profile import load_profile
+from restock.train.evaluation.eval_run import load_agent
+from restock.train.libraries.library_arm import LibraryArm, dqn_arguments, resolve, train_library
+from restock.train.run.run import Run
+from restock.train.study.study import load_study
+
+TASK = load_profile("warehouse_amr").task
+SETTINGS = (
+    "network.hidden=[16]",
+    "env.num_envs=2",
+    "schedule.env_steps=160",
+    "schedule.warmup_env_steps=40",
+    "schedule.updates_per_env_step=0.5",
+    "replay.batch_size=16",
+    "evaluation.every_env_steps=1000",
+    "evaluation.episodes=1",
+    "record.every_updates=20",
+)
+
+
+def trained(out: Path, library: str, **arguments: object) -> Run:
+    pytest.importorskip("stable_baselines3")
+    train_library(LibraryArm(str(out), library, SETTINGS, dict(arguments)))  # type: ignore[arg-type]
+    return Run.open(out)
+
+
+def test_dqn_leaves_a_run_that_says_what_it_was_fed(tmp_path: Path) -> None:
+    run = trained(tmp_path / "dqn", "sb3-dqn")
+    known = run.document["library"]
+    assert known["algorithm"] == "sb3-dqn"
+    assert known["arguments"]["buffer_size"] == run.document["config"]["replay"]["ring_capacity"]
+    assert known["arguments"]["gamma"] == run.document["config"]["loss"]["discount"]
+    updates = run.table("progress")["gradient_steps"][-1].as_py()
+    assert updates == 60  # (160 - 40) environment steps, one update every second one
+    fed = run.table("fed_episodes")
+    assert pc.sum(fed["drawn_rows"]).as_py() == updates * 16
+    assert set(fed["source"].to_pylist()) == {"fresh"}
+    evaluated = run.table("evaluations")
+    assert len(evaluated) == 4  # one episode of each kind
+    assert json.loads((tmp_path / "dqn" / "library.json").read_text())["env_steps"] == 160
+
+
+def test_what_is_kept_acts_as_the_library_does(tmp_path: Path, monkeypatch) -> None:
+    pytest.importorskip("stable_baselines3")
+    from restock.train.libraries import sb3_drive
+
+    models: dict[str, object] = {}
+    for name in ("DQN", "PPO"):
+        made = getattr(sb3_drive, name)
+        monkeypatch.setattr(
+            sb3_drive,
+            name,
+            lambda *a, _made=made, _n=name, **k: models.setdefault(_n, _made(*a, **k)),
+        )
+    observations = np.random.default_rng(0).normal(size=(64, TASK.observation_size))
+    observations = observations.astype(np.float32)
+    for library, name, own in (
+        ("sb3-dqn", "DQN", {}),
+        ("sb3-ppo", "PPO", {"n_steps": 40, "batch_size": 20, "n_epochs": 2}),
+    ):
+        run = trained(tmp_path / name, library, **own)
+        theirs, _ = models[name].predict(observations, deterministic=True)  # type: ignore[attr-defined]
+        ours, _ = load_agent(run).act(None, observations)
+        assert ours.tolist() == theirs.tolist()
+
+
+def test_ppo_was_fed_every_step_of_its_rollouts_some_epochs_long(tmp_path: Path) -> None:
+    run = trained(tmp_path / "ppo", "sb3-ppo", n_steps=30, batch_size=20, n_epochs=3)
+    assert run.document["target"] == {"rule": "none"}
+    assert run.document["library"]["replay"].startswith("none")
+    last = run.table("progress").slice(run.table("progress").num_rows - 1)
+    # 160 steps are two rollouts of 2 x 30, and 40 steps that were not learnt from.
+    assert last["env_steps"][0].as_py() == 160
+    assert last["gradient_steps"][0].as_py() == 2 * 3 * 3
+    assert pc.sum(run.table("fed_episodes")["drawn_rows"]).as_py() == 2 * 60 * 3
+
+
+def test_the_clocks_of_dqn_are_the_configs() -> None:
+    given = dqn_arguments(resolve((*SETTINGS, 'target={rule = "hard", every = 100}'), "sb3-dqn"))
+    assert (given["train_freq"], given["gradient_steps"]) == (1, 1)
+    assert (given["target_update_interval"], given["tau"]) == (200, 1.0)
+    sets = ("env.num_envs=16", "schedule.updates_per_env_step=0.125")
+    given = dqn_arguments(resolve((*sets, 'target={rule = "polyak", tau = 0.01}'), "sb3-dqn"))
+    assert (given["train_freq"], given["gradient_steps"]) == (1, 2)
+    assert given["target_update_interval"] == 16
+    assert given["tau"] == pytest.approx(1 - 0.99**2)
+    given = dqn_arguments(
+        resolve(("env.num_envs=2", "schedule.updates_per_env_step=0.1"), "sb3-dqn")
+    )
+    assert (given["train_freq"], given["gradient_steps"]) == (5, 1)
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("network.dueling=true", "has no network"),
+        ("loss.munchausen=0.9", "has no loss.munchausen"),
+        ("guard.margin=0.1", "has no guard.margin"),
+        ("guide.env_steps=100", "has no guide.env_steps"),
+    ],
+)
+def test_settings_without_a_counterpart_are_refused(setting: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        resolve((setting,), "sb3-dqn")
+
+
+def test_without_the_library_it_says_what_to_install(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    with pytest.raises(ConfigError, match="pip install stable-baselines3"):
+        train_library(LibraryArm(str(tmp_path / "x"), "sb3-dqn"))
+    assert not (tmp_path / "x").exists()
+
+
+def test_arguments_that_the_library_does_not_know_are_its_to_refuse(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"did not take its arguments: .*wings"):
+        trained(tmp_path / "x", "sb3-dqn", wings=2)
+
+
+@pytest.mark.parametrize(
+    ("arm", "said"),
+    [
+        ('library = "sb3-sac"', "sb3-sac"),
+        ('library = "sb3-dqn"\nmixture = "uniform"', "learns from no logs here"),
+        ("arguments = { n_steps = 3 }", "no library to take them"),
+    ],
+)
+def test_arms_that_cannot_be_are_refused(tmp_path: Path, arm: str, said: str) -> None:
+    (tmp_path / "s.toml").write_text(
+        f'store = "s"\n[[arms]]\nname = "a"\n{arm}\n[[arms]]\nname = "b"'
+    )
+    with pytest.raises(ConfigError, match=said):
+        load_study(tmp_path / "s.toml")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["processes", "ray"])
+def test_a_study_of_methods_ends_in_one_comparison(tmp_path: Path, capsys, engine: str) -> None:
+    pytest.importorskip("stable_baselines3")
+    if engine == "ray":
+        pytest.importorskip("ray")
+    settings = "\n".join((*SETTINGS, "record.tensorboard = false"))
+    (tmp_path / "s.toml").write_text(f"""
+treatment = "method"
+seeds = [0]
+[settings]
+{settings}
+[evaluation]
+episodes = 1
+[[arms]]
+name = "restock"
+[[arms]]
+name = "dqn"
+library = "sb3-dqn"
+[[arms]]
+name = "ppo"
+library = "sb3-ppo"
+arguments = {{ n_steps = 40, batch_size = 20, n_epochs = 2 }}
+""")
+    out = tmp_path / "out"
+    argv = ["study", str(tmp_path / "s.toml"), "--out", str(out), "--engine", engine, "--json"]
+    argv += ["--workers", "2"]
+    assert main(argv) == 0
+    found = json.loads(capsys.readouterr().out)
+    dqn, ppo = found["comparisons"]
+    assert dqn["verdict"] == ppo["verdict"] == "comparable"
+    assert {row["condition"] for row in ppo["outcomes"]} >= {"nominal", "wheel_slip"}
+    page = (out / "study.md").read_text()
+    assert "Not held: replay (library.replay); the target rule (library.target)" in page
+    made = {path: path.stat().st_mtime_ns for path in out.glob("runs/*/*.parquet")}
+    main(argv)
+    assert "3 of 3 runs are there already" in capsys.readouterr().err
+    assert {path: path.stat().st_mtime_ns for path in made} == made

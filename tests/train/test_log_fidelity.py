@@ -1,0 +1,77 @@
+"""Logged rows with wrong labels, or that do not belong together, are told from good ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from restock.train.feed.log_fidelity import LogFidelity, discriminant
+from restock.train.feed.probe import Probe
+
+SIZE, ROWS = 12, 200
+CONDITIONS = ["nominal", "wheel_slip", "blocked_aisle"]
+
+
+def rows(rng: np.random.Generator, level: float) -> NDArray[np.float32]:
+    """Packed rows of a linear system that is driven at some level, (ROWS, 2 SIZE + 3)."""
+    observation = rng.normal(level * np.linspace(0, 1, SIZE), 0.3, (ROWS, SIZE))
+    action = rng.integers(0, 4, ROWS)
+    following = 0.9 * observation + 0.2 * action[:, None] + rng.normal(0, 0.05, (ROWS, SIZE))
+    rest = np.stack([action, rng.normal(size=ROWS), np.full(ROWS, 0.97)], axis=1)
+    return np.concatenate([observation, following, rest], axis=1).astype(np.float32)
+
+
+def probe(parts: list[NDArray[np.float32]]) -> Probe:
+    bounds = np.cumsum([0, *map(len, parts)]).tolist()
+    packed = torch.from_numpy(np.concatenate(parts))
+    return Probe(packed, CONDITIONS[: len(parts)], bounds, "logs", "")
+
+
+def levels(seed: int) -> list[NDArray[np.float32]]:
+    rng = np.random.default_rng(seed)
+    return [rows(rng, level) for level in (0.0, 2.0, -2.0)]
+
+
+def test_good_rows_look_like_their_condition_and_follow() -> None:
+    logs = LogFidelity(probe(levels(0)), SIZE)
+    assert all(share > 0.9 for share in logs.agreement(probe(levels(1))).values())
+    assert all(rest < 0.2 for rest in logs.unexplained.values())
+    assert set(logs.unexplained) == set(CONDITIONS)
+
+
+def test_wrong_labels_are_not_confirmed() -> None:
+    nominal, slip, blocked = levels(0)
+    logs = LogFidelity(probe([np.concatenate([nominal[:100], blocked]), slip, nominal[100:]]), SIZE)
+    found = logs.agreement(probe(levels(1)))
+    assert found["blocked_aisle"] < 0.1
+    assert found["wheel_slip"] > 0.9
+
+
+def test_next_observations_of_other_rows_do_not_follow() -> None:
+    nominal, slip, blocked = levels(0)
+    blocked[:, SIZE : 2 * SIZE] = np.random.default_rng(2).permutation(blocked[:, SIZE : 2 * SIZE])
+    found = LogFidelity(probe([nominal, slip, blocked]), SIZE).unexplained
+    assert found["blocked_aisle"] > 0.9
+    assert found["blocked_aisle"] > 3 * max(found["nominal"], found["wheel_slip"])
+
+
+def test_conditions_of_few_rows_are_not_judged() -> None:
+    nominal, slip, blocked = levels(0)
+    logs = LogFidelity(probe([nominal, slip, blocked[:5]]), SIZE)
+    assert set(logs.unexplained) == {"nominal", "wheel_slip"}
+    assert set(logs.agreement(probe(levels(1)))) == {"nominal", "wheel_slip"}
+    assert logs.agreement(probe([nominal])) == {}
+
+
+def test_the_discriminant_takes_covariance_into_account() -> None:
+    """Two classes that differ along a direction of little spread, beside one of much."""
+    rng = np.random.default_rng(0)
+    spread = np.array([[3.0, 0.0], [2.9, 1.0]])  # the second follows the first but for a little
+    first, second = (
+        rng.normal(size=(500, 2)) @ spread.T + np.array([0.0, offset]) for offset in (-2.0, 2.0)
+    )
+    said = discriminant([first[:250], second[:250]], np.concatenate([first[250:], second[250:]]))
+    assert min((said[:250] == 0).mean(), (said[250:] == 1).mean()) > 0.93
+    by_height = np.concatenate([first[250:], second[250:]])[:, 1] > 0
+    assert by_height[250:].mean() < 0.85  # what the nearer mean would say

@@ -1,0 +1,496 @@
+"""The training loop on a corridor: it learns, repeats itself, resumes bit for bit, and says what
+the critic was fed."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+from support.toy_run import SMALL, assert_same_run, config, logs, run_to_end, session
+from support.toy_twin import CELLS, TASK
+
+from restock.errors import ConfigError, RunError
+from restock.ingest.task.conditions import Condition
+from restock.train.dqn import checkpoint
+from restock.train.dqn.config import TrainConfig, parse_config
+from restock.train.dqn.learner import Learner
+from restock.train.feed.batches import Logs
+from restock.train.feed.log_terms import LogTerms
+from restock.train.loop import TrainingInterrupted, train
+from restock.train.run.kept_checkpoints import earlier, go_back
+from restock.train.session import Session
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Session:
+    return run_to_end(tmp_path_factory.mktemp("runs") / "undisturbed", config())
+
+
+def test_the_corridor_is_solved_online_without_logs(tmp_path: Path) -> None:
+    live = run_to_end(tmp_path / "a", config(schedule={"env_steps": 6000}), logs=None)
+    assert live.best is not None
+    assert live.best.success == {"nominal": 1.0, "wheel_slip": 1.0}
+    # Forward is the best action of every cell, and the value of the last cell before the goal 1.
+    cells = np.zeros((CELLS - 1, TASK.observation_size), np.float32)
+    cells[np.arange(CELLS - 1), np.arange(CELLS - 1)] = 1
+    assert live.learner.greedy(cells).tolist() == [1] * (CELLS - 1)
+    assert live.learner.gradient_steps > 1000
+
+
+def test_offline_learning_alone_agrees_with_value_iteration(tmp_path: Path) -> None:
+    """Rows of a corridor that never slips: Q of the logged actions is known in closed form."""
+    shelf = logs(600)
+    keep = shelf.condition.codes == shelf.condition.names.index("nominal")
+    live = session(
+        tmp_path / "a",
+        config(schedule={"offline_updates": 3000, "env_steps": 0}),
+        logs=one_stratum(shelf, stratum_rows=[np.flatnonzero(keep)], shares=np.ones(1)),
+    )
+    train(live)
+    live.close()
+    value = np.zeros(CELLS)  # of the state; the last cell is terminal
+    for cell in range(CELLS - 2, -1, -1):
+        value[cell] = 1.0 if cell == CELLS - 2 else -0.05 + 0.9 * value[cell + 1]
+    cells = torch.zeros(CELLS - 1, TASK.observation_size)
+    cells[torch.arange(CELLS - 1), torch.arange(CELLS - 1)] = 1
+    q = live.learner.network(cells).detach().numpy()
+    back = np.array([-0.05 + 0.9 * value[max(cell - 1, 0)] for cell in range(CELLS - 1)])
+    stop = -0.05 + 0.9 * value[: CELLS - 1]
+    np.testing.assert_allclose(q, np.stack([stop, value[: CELLS - 1], back], axis=1), atol=0.04)
+
+
+def one_stratum(shelf: Logs, **changes: Any) -> Logs:
+    """The same logs with one stratum of other rows."""
+    return dataclasses.replace(shelf, strata=["nominal"], timings=["pre"], **changes)
+
+
+def test_the_same_seed_gives_the_same_run(undisturbed: Session, tmp_path: Path) -> None:
+    assert_same_run(undisturbed, run_to_end(tmp_path / "again", config()))
+
+
+def test_simulating_on_another_thread_changes_nothing(undisturbed: Session, tmp_path: Path) -> None:
+    assert_same_run(undisturbed, run_to_end(tmp_path / "alone", config(env={"overlap": False})))
+
+
+@pytest.mark.parametrize("calls", [20, 61, 150, 333])
+def test_interrupted_and_resumed_is_bit_exact(
+    undisturbed: Session, tmp_path: Path, calls: int
+) -> None:
+    asked = iter(range(calls))
+    path = tmp_path / "a"
+    live = session(path, config())
+    with pytest.raises(TrainingInterrupted, match="restock train --resume"):
+        train(live, stop=lambda: next(asked, None) is None)
+    live.close()
+
+    again = session(path, config(), resume=True)
+    train(again)
+    again.close()
+    assert_same_run(undisturbed, again)
+
+
+def test_killed_after_a_checkpoint_and_resumed_is_bit_exact(
+    undisturbed: Session, tmp_path: Path
+) -> None:
+    class Killed(Exception):
+        pass
+
+    path = tmp_path / "a"
+    live = session(path, config())
+    rows = iter(range(6))
+
+    def kill(event: str, values: dict[str, Any]) -> None:
+        if event == "progress" and next(rows, None) is None:
+            raise Killed
+
+    with pytest.raises(Killed):
+        train(live, notify=kill)
+    live.close()
+    assert 0 < checkpoint.load(live.run.latest)["clock"]["env_steps"] < live.clock.env_steps
+    again = session(path, config(), resume=True)
+    train(again)
+    again.close()
+    assert_same_run(undisturbed, again)
+
+
+def test_an_earlier_checkpoint_leads_to_the_same_end(undisturbed: Session, tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    live = run_to_end(path, config())
+    kept = earlier(live.run.latest)
+    steps = live.config.record.checkpoint_every_env_steps
+    end = live.clock.env_steps
+    assert list(kept) == [(end - 1) // steps * steps - steps, (end - 1) // steps * steps]
+    with pytest.raises(RunError, match="no earlier checkpoint was taken after 7 env"):
+        go_back(live.run.latest, 7)
+    live.run.latest.write_bytes(b"half a file")
+    with pytest.raises(RunError, match=f"go back to an earlier one: --from-env-steps {max(kept)}"):
+        session(path, config(), resume=True)
+    go_back(live.run.latest, min(kept))
+    assert earlier(live.run.latest) == {}
+    again = session(path, config(), resume=True)
+    assert again.clock.env_steps == min(kept)
+    train(again)
+    again.close()
+    assert_same_run(undisturbed, again)
+
+
+def test_one_checkpoint_is_kept_where_one_is_asked_for(tmp_path: Path) -> None:
+    live = run_to_end(tmp_path / "run", config(record={"keep_checkpoints": 1}))
+    assert earlier(live.run.latest) == {}
+
+
+GUIDED = {"guide": {"env_steps": 1000, "horizon_steps": 5}}
+
+
+def test_the_logs_behaviour_drives_first_and_hands_over(tmp_path: Path) -> None:
+    live = run_to_end(tmp_path / "run", config(**GUIDED))
+    meta = {name: values[: len(live.ring)] for name, values in live.ring.meta.items()}
+    cloned = meta["behaviour_policy"] == live.ring.behaviour_policies.index("cloned")
+    early = meta["env_step"] < 500
+    assert cloned[early].mean() > cloned[~early].mean() > 0
+    assert not cloned[meta["env_step"] >= 1000].any()
+    assert meta["episode_step"][cloned].max() < 5  # then the learner drives to the end
+    forward = live.ring.rows[: len(live.ring), -3] == 1  # as it is in 7 of 10 logged steps
+    assert forward[cloned].mean() == pytest.approx(0.7, abs=0.15)
+    chance = meta["action_probability"][cloned]
+    assert chance[forward[cloned]].mean() > 0.5 > chance[~forward[cloned]].mean() > 0
+    fed = pq.read_table(tmp_path / "run" / "policies.parquet").to_pylist()
+    assert {"dqn", "cloned"} <= {r["behaviour_policy"] for r in fed if r["source"] == "fresh"}
+
+
+def test_a_guided_run_resumes_bit_exact(tmp_path: Path) -> None:
+    whole = run_to_end(tmp_path / "whole", config(**GUIDED))
+    path = Path(shutil.copytree(whole.run.path, tmp_path / "cut"))
+    latest = path / "checkpoints" / "latest.safetensors"
+    go_back(latest, min(earlier(latest)))
+    again = session(path, config(**GUIDED), resume=True)
+    assert 0 < again.clock.env_steps < 1000  # while it still drives
+    train(again)
+    again.close()
+    assert_same_run(whole, again)
+
+
+def test_a_guide_needs_logs(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="about the logs' behaviour, and there are none"):
+        session(tmp_path / "run", config(**GUIDED), logs=None)
+
+
+def test_half_of_each_online_batch_is_from_logs_by_quota(undisturbed: Session) -> None:
+    strata = pq.read_table(undisturbed.run.path / "strata.parquet").to_pylist()
+    offline = [row for row in strata if row["phase"] == "offline"]
+    assert {row["source"] for row in offline} == {"logs"}
+    online = [row for row in strata if row["phase"] == "online"]
+    for clock in {row["gradient_steps"] for row in online}:
+        here = [row for row in online if row["gradient_steps"] == clock]
+        drawn = {
+            source: sum(row["drawn_rows"] for row in here if row["source"] == source)
+            for source in ("logs", "fresh")
+        }
+        assert drawn["logs"] == drawn["fresh"] > 0
+        slip = next(r for r in here if r["source"] == "logs" and r["stratum"] == "wheel_slip")
+        assert slip["drawn_share"] == pytest.approx(0.25, abs=1e-3)
+        assert slip["quota_share"] == 0.25
+        assert slip["timing"] == "post"
+
+
+def test_every_drawn_row_is_counted(undisturbed: Session) -> None:
+    path = undisturbed.run.path
+    steps = undisturbed.learner.gradient_steps
+    drawn = pq.read_table(path / "strata.parquet")
+    assert sum(drawn["drawn_rows"].to_pylist()) == steps * 32
+    last = {(row["source"], row["stratum"]): row["total_drawn_rows"] for row in drawn.to_pylist()}
+    assert sum(last.values()) == steps * 32
+    assert sum(pq.read_table(path / "policies.parquet")["rows"].to_pylist()) == steps * 32
+    by_condition = pq.read_table(path / "conditions.parquet").to_pylist()
+    assert sum(row["drawn_rows"] for row in by_condition) == steps * 32
+    own = {(r["gradient_steps"], r["source"], r["stratum"]): r for r in drawn.to_pylist()}
+    for row in by_condition:  # the strata of this panel are conditions
+        stratum = own[row["gradient_steps"], row["source"], row["condition"]]
+        for name in ("phase", "drawn_rows", "drawn_share", "effective_share", "td_abs_mean"):
+            assert row[name] == pytest.approx(stratum[name]), name
+    fed = pq.read_table(path / "fed_episodes.parquet").to_pylist()
+    assert sum(row["drawn_rows"] for row in fed) == steps * 32
+    assert {row["episode"] for row in fed if row["source"] == "logs"} == {"a/0"}
+    assert len({row["episode"] for row in fed if row["source"] == "fresh"}) > 50
+    ages = pq.read_table(path / "ages.parquet").to_pylist()
+    by_unit = {
+        unit: sum(r["count"] for r in ages if r["unit"] == unit) for unit in ("days", "env_steps")
+    }
+    assert sum(by_unit.values()) == steps * 32
+    assert sum(pq.read_table(path / "progress.parquet")["updates"].to_pylist()) == steps
+
+
+def test_the_critic_is_measured_on_steps_that_no_replay_has(undisturbed: Session) -> None:
+    path = undisturbed.run.path
+    evaluated = set(pq.read_table(path / "evaluations.parquet")["gradient_steps"].to_pylist())
+    measured = pq.read_table(path / "held_out.parquet").to_pylist()
+    assert {row["gradient_steps"] for row in measured} == evaluated
+    assert {row["condition"] for row in measured} >= {"nominal", "wheel_slip"}
+    last = [row for row in measured if row["gradient_steps"] == max(evaluated)]
+    first = [row for row in measured if row["gradient_steps"] == min(evaluated)]
+    assert all(row["rows"] > 0 and row["td_abs_mean"] > 0 for row in measured)
+    mean = [sum(row["td_abs_mean"] for row in rows) / len(rows) for rows in (first, last)]
+    assert mean[1] < mean[0]  # it learnt
+
+
+def test_audit_rows_hold_what_the_row_was(undisturbed: Session) -> None:
+    audit = pq.read_table(undisturbed.run.path / "audit.parquet").to_pylist()
+    batches = {row["gradient_step"] for row in audit}
+    assert len(audit) == 32 * len(batches)
+    assert 0.05 < len(batches) / undisturbed.learner.gradient_steps < 0.2
+    shelf = logs()
+    for row in audit:
+        assert row["last_target_sync"] == row["gradient_step"] - 1  # Polyak: after every update
+        if row["source"] == "logs":
+            packed = shelf.rows[row["transition_id"] - 1000]
+            assert row["action"] == int(packed[-3])
+            assert row["reward"] == pytest.approx(float(packed[-2]))
+            assert row["behaviour_policy"] in ("planner", "operator")
+            stamp = shelf.stamp_ns[row["transition_id"] - 1000] / 86_400e9
+            assert row["age_days"] == pytest.approx(10 - stamp)
+        else:
+            assert row["behaviour_policy"] == "dqn"
+            assert row["age_env_steps"] >= 0
+            assert row["perturbation"] == "worn"
+            assert dict(row["perturbation_values"]) == {"gain": 0.9}
+            assert row["age_gradient_steps"] >= 0
+            assert row["ring_slot"] is not None
+
+
+def test_finished_episodes_are_labelled_in_the_ring(undisturbed: Session) -> None:
+    episodes = pq.read_table(undisturbed.run.path / "episodes.parquet").to_pylist()
+    slipping = [row for row in episodes if row["true_condition"] == "wheel_slip"]
+    assert slipping
+    assert not any("wheel_slip" in r["conditions"] for r in episodes if r not in slipping)
+    assert sum("wheel_slip" in row["conditions"] for row in slipping) > 0.8 * len(slipping)
+    ring = undisturbed.ring
+    names = ring.conditions
+    slip_rows = ring.rows[: len(ring)][
+        ring.condition(np.arange(len(ring))) == names.index("wheel_slip")
+    ]
+    # Only a forward command can slip, and a slipping robot is where it was.
+    assert len(slip_rows)
+    assert set(slip_rows[:, -3].tolist()) == {1.0}
+
+
+def test_the_run_says_its_target_rule_and_lag(undisturbed: Session, tmp_path: Path) -> None:
+    progress = pq.read_table(undisturbed.run.path / "progress.parquet").to_pylist()
+    learning = [row for row in progress if row["updates"]]
+    assert {row["target_rule"] for row in learning} == {"polyak tau 0.05"}
+    assert all(row["target_param_distance"] > 0 and row["target_q_lag"] > 0 for row in learning)
+    assert {row["steps_since_sync"] for row in learning} == {0}
+    probe = pq.read_table(undisturbed.run.path / "probe.parquet").to_pylist()
+    assert {row["condition"] for row in probe} == {"nominal", "wheel_slip"}
+    assert len({row["probe_hash"] for row in probe}) == 1
+
+    hard = run_to_end(tmp_path / "hard", config(target={"rule": "hard", "every": 25}))
+    rows = pq.read_table(hard.run.path / "progress.parquet").to_pylist()
+    full = [row for row in rows if row["updates"] == 50]
+    # Every interval ends on a sync, where the distance is 0: what is logged is from just before.
+    assert {row["target_sampled"] for row in full} == {"before_sync"}
+    assert all(row["target_param_distance"] > 0 and row["target_q_lag"] > 0 for row in full)
+    assert {row["steps_since_sync"] for row in full} == {0}
+
+
+def test_the_best_checkpoint_is_by_evaluation_not_the_last(undisturbed: Session) -> None:
+    best = checkpoint.load(undisturbed.run.best)
+    rows = pq.read_table(undisturbed.run.path / "evaluations.parquet").to_pylist()
+    marked = {row["env_steps"] for row in rows if row["best"]}
+    assert best["env_steps"] == max(marked)
+    means = {
+        step: np.mean([row["success"] for row in rows if row["env_steps"] == step])
+        for step in {row["env_steps"] for row in rows}
+    }
+    assert means[best["env_steps"]] == max(means.values())
+    assert {row["episode_seed"] for row in rows} == {90_000, 90_001, 90_002}
+
+
+def test_warmup_collects_without_learning(tmp_path: Path) -> None:
+    live = run_to_end(
+        tmp_path / "a", config(schedule={"env_steps": 400, "warmup_env_steps": 400}), logs=None
+    )
+    assert live.learner.gradient_steps == 0
+    assert len(live.ring) > 300
+
+
+def test_updates_keep_the_asked_ratio(undisturbed: Session) -> None:
+    clock = undisturbed.clock
+    assert clock.online_from == 200
+    assert clock.online_updates == int((clock.env_steps - 200) * 0.25)
+    assert undisturbed.learner.gradient_steps == 60 + clock.online_updates
+
+
+def test_a_learner_fits_a_batch_it_sees_again_and_again() -> None:
+    learner = Learner(config(), TASK.observation_size, 3)
+    rows = logs().rows[:32].clone()
+    rows[:, -1] = 0  # terminal: the target is the reward
+    for _ in range(400):
+        loss = learner.update(rows)
+    assert float(loss.td.abs().max()) < 0.9
+    expected = rows[:, -2]
+    td, q, _ = learner.td_error(rows)
+    chosen = q.gather(1, rows[:, -3:-2].long()).squeeze(1)
+    assert torch.allclose(td, chosen - expected, atol=1e-5)
+
+
+def test_the_policy_that_is_kept_is_an_average_of_the_weights() -> None:
+    rows = logs().rows[:32].clone()
+    for rate in (1.0, 0.25):
+        learner = Learner(config(evaluation={"averaging": rate}), TASK.observation_size, 3)
+        seen = []
+        for _ in range(6):
+            learner.update(rows)
+            seen.append(learner.network.advantage.bias.detach().clone())
+        # The mean of the first four, then a quarter of the way to each further one.
+        expected = seen[-1]
+        if rate == 0.25:
+            expected = torch.stack(seen[:4]).mean(dim=0)
+            for weights in seen[4:]:
+                expected = expected + 0.25 * (weights - expected)
+        assert torch.allclose(learner.policy_network.advantage.bias, expected, atol=1e-6)
+
+
+def test_the_conservative_term_lowers_what_the_logs_never_did(tmp_path: Path) -> None:
+    """Offline on rows that only drive forward: without it, "back" is worth what chance says."""
+    shelf = logs(400)
+    forward = np.flatnonzero(shelf.rows[:, -3].numpy() == 1)
+    shelf = one_stratum(shelf, stratum_rows=[forward], shares=np.ones(1))
+    cells = torch.zeros(CELLS - 1, TASK.observation_size)
+    cells[torch.arange(CELLS - 1), torch.arange(CELLS - 1)] = 1
+    gaps = []
+    for weight in (0.0, 0.5):
+        live = session(
+            tmp_path / str(weight),
+            config(
+                loss={"conservative": weight}, schedule={"offline_updates": 600, "env_steps": 0}
+            ),
+            logs=shelf,
+        )
+        train(live)
+        live.close()
+        q = live.learner.network(cells).detach()
+        gaps.append(float((q[:, 1] - q[:, [0, 2]].amax(dim=1)).min()))
+    assert gaps[1] > max(gaps[0], 0) + 0.2
+    assert q.argmax(dim=1).tolist() == [1] * (CELLS - 1)
+
+
+def spoilt(live: Session, at: int) -> Any:
+    """A `stop` that makes the policy useless once, at an environment step: it stands still."""
+
+    def stop() -> bool:
+        if live.clock.env_steps >= at and not getattr(stop, "done", False):
+            stop.done = True  # type: ignore[attr-defined]
+            for network in (live.learner.network, live.learner.policy_network):
+                with torch.no_grad():
+                    network.advantage.weight.zero_()
+                    network.advantage.bias.copy_(torch.tensor([50.0, -50.0, -50.0]))
+        return False
+
+    return stop
+
+
+@pytest.mark.parametrize("action", ["stop", "rollback"])
+def test_the_guard_does_not_let_a_condition_be_unlearnt(tmp_path: Path, action: str) -> None:
+    settings = config(
+        guard={"margin": 0.5, "action": action, "conditions": ["nominal"]},
+        schedule={**SMALL["schedule"], "env_steps": 4000},
+    )
+    live = session(tmp_path / "r", settings)
+    said: list[dict[str, Any]] = []
+    outcome = train(
+        live,
+        stop=spoilt(live, at=2340),
+        notify=lambda event, values: said.append(values) if event == "guard" else None,
+    )
+    live.close()
+    assert said
+    assert said[0]["action"] == action
+    rows = pq.read_table(live.run.path / "guard.parquet").to_pylist()
+    assert {row["condition"] for row in rows} == {"nominal"}
+    assert all(row["best"] - row["now"] >= 0.5 for row in rows)
+    assert outcome.best is not None
+    if action == "stop":
+        assert outcome.stopped
+        assert outcome.env_steps < settings.schedule.env_steps
+    else:
+        assert outcome.rollbacks >= 1
+        assert outcome.env_steps == settings.schedule.env_steps
+        assert outcome.last is not None
+        assert outcome.last.success["nominal"] > 0.5  # it recovered
+
+
+def test_without_a_margin_the_guard_is_off(undisturbed: Session) -> None:
+    assert pq.read_table(undisturbed.run.path / "guard.parquet").num_rows == 0
+
+
+def test_the_margin_is_for_rows_of_the_named_policy_and_strata() -> None:
+    shelf = logs()
+    operator = shelf.behaviour_policy.codes == shelf.behaviour_policy.names.index("operator")
+    slips = np.isin(np.arange(len(shelf)), shelf.stratum_rows[1])
+    terms = {
+        strata: LogTerms.of(
+            config(loss={"margin": 1.0, "margin_strata": list(strata)}).loss,
+            shelf,
+            torch.device("cpu"),
+        )
+        for strata in ((), ("wheel_slip",))
+    }
+    for strata, chosen in (((), operator), (("wheel_slip",), operator & slips)):
+        expert, to_go = terms[strata].rows(np.arange(len(shelf)))
+        assert expert is not None
+        assert to_go is None
+        np.testing.assert_array_equal(expert.numpy(), chosen)
+
+
+@pytest.mark.parametrize(
+    ("loss", "message"),
+    [
+        ({"margin": 1.0, "margin_policies": ["nobody"]}, "have no 'nobody'"),
+        ({"margin": 1.0, "margin_strata": ["ice"]}, "have no 'ice'"),
+        ({"calibrated": True}, "needs logs from a panel"),
+    ],
+)
+def test_terms_that_the_logs_cannot_serve_are_refused(
+    tmp_path: Path, loss: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        session(tmp_path / "r", config(loss=loss))
+
+
+def test_a_run_with_every_term_resumes_bit_exactly(tmp_path: Path) -> None:
+    settings = config(
+        loss={"margin": 0.5, "conservative": 0.1},
+        network={"hidden": [16], "quantiles": 4, "ensemble": 2},
+        schedule={**SMALL["schedule"], "env_steps": 800},
+    )
+    whole = run_to_end(tmp_path / "whole", settings)
+    first = session(tmp_path / "cut", settings)
+    steps = iter(range(10_000))
+    with pytest.raises(TrainingInterrupted):
+        train(first, stop=lambda: next(steps) > 150)
+    first.close()
+    second = session(tmp_path / "cut", settings, resume=True)
+    train(second)
+    second.close()
+    assert_same_run(whole, second)
+
+
+def test_a_condition_that_cannot_run_is_refused_before_the_first_step(tmp_path: Path) -> None:
+    broken = Condition("wet", "pre", "humidity > 3")
+    with pytest.raises(ConfigError, match="condition 'wet'"):
+        session(tmp_path / "a", config(), conditions=[broken])
+
+
+def test_the_config_refuses_unknown_keys_with_their_path() -> None:
+    with pytest.raises(ConfigError, match=r"unknown field `taw`.*target"):
+        parse_config({"target": {"rule": "polyak", "taw": 1}}, where="x.toml")
+    with pytest.raises(ConfigError, match=r"logs_share must be in \[0, 1\], got 2"):
+        parse_config({"replay": {"logs_share": 2.0}}, where="x.toml")
+    assert msgspec.to_builtins(TrainConfig())["target"] == {"rule": "polyak", "tau": 0.005}

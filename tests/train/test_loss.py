@@ -1,0 +1,133 @@
+"""The loss against hand arithmetic."""
+
+from __future__ import annotations
+
+import pytest
+from torch import tensor
+
+from restock.train.dqn.loss import (
+    conservative_penalty,
+    dqn_loss,
+    huber,
+    margin_penalty,
+    munchausen_target,
+    quantile_loss,
+    quantile_target,
+    td_target,
+)
+
+
+def test_td_target_by_hand() -> None:
+    # r = 1, gamma = 0.9, max_a Q_target(s') = 4 -> 1 + 0.9 * 4 = 4.6; terminal: the reward alone.
+    target = td_target(
+        reward=tensor([1.0, 1.0]),
+        discount=tensor([0.9, 0.0]),
+        next_target_q=tensor([[2.0, 4.0], [2.0, 4.0]]),
+    )
+    assert target.tolist() == pytest.approx([4.6, 1.0])
+
+
+def test_double_dqn_selects_with_the_online_and_evaluates_with_the_target_network() -> None:
+    online = tensor([[9.0, 1.0]])  # prefers action 0
+    slow = tensor([[2.0, 4.0]])  # values it 2, though its own best is worth 4
+    reward, discount = tensor([1.0]), tensor([0.5])
+    assert td_target(reward, discount, slow, online).tolist() == [2.0]  # 1 + 0.5 * 2
+    assert td_target(reward, discount, slow).tolist() == [3.0]  # 1 + 0.5 * 4
+
+
+def test_huber_is_quadratic_then_linear() -> None:
+    error = tensor([0.0, 0.5, -1.0, 3.0, -3.0])
+    assert huber(error).tolist() == pytest.approx([0.0, 0.125, 0.5, 2.5, 2.5])
+    assert huber(tensor([3.0]), delta=2.0).tolist() == pytest.approx([4.0])  # 2 * (3 - 1)
+
+
+def test_huber_bounds_the_gradient() -> None:
+    error = tensor([0.3, 5.0, -50.0], requires_grad=True)
+    huber(error).sum().backward()
+    assert error.grad is not None
+    assert error.grad.tolist() == pytest.approx([0.3, 1.0, -1.0])
+
+
+def test_loss_by_hand() -> None:
+    q = tensor([[1.0, 2.0], [3.0, 0.0]], requires_grad=True)
+    loss = dqn_loss(q, tensor([1, 0]), tensor([1.5, 0.0]))
+    # td = 2 - 1.5 = 0.5 and 3 - 0 = 3; huber 0.125 and 2.5; mean 1.3125
+    assert loss.td.tolist() == [0.5, 3.0]
+    assert loss.q.tolist() == [2.0, 3.0]
+    assert loss.value.item() == pytest.approx(1.3125)
+    loss.value.backward()
+    assert q.grad is not None
+    # Half of each error's clipped slope, and only at the actions taken.
+    assert q.grad.tolist() == [[0.0, 0.25], [0.5, 0.0]]
+
+
+def test_importance_weights_scale_each_row() -> None:
+    q = tensor([[1.0, 2.0], [3.0, 0.0]])
+    loss = dqn_loss(q, tensor([1, 0]), tensor([1.5, 0.0]), weight=tensor([2.0, 0.0]))
+    assert float(loss.value) == pytest.approx(0.125)  # (2 * 0.125 + 0 * 2.5) / 2
+
+
+def test_conservative_penalty_by_hand() -> None:
+    q = tensor([[0.0, 0.0], [1.0, 3.0]])
+    # log 2 - 0 = 0.6931; log(e + e^3) - 3 = 0.1269
+    assert float(conservative_penalty(q, tensor([0, 1]))) == pytest.approx(0.4100, abs=1e-4)
+
+
+def test_munchausen_by_hand() -> None:
+    # Equal values at s: log pi = log 1/2, times 0.5 is -0.3466; floored at -0.3. At s' they are
+    # equal too: sum pi (q - t log pi) = 2 + 0.5 * log 2 = 2.3466.
+    target = munchausen_target(
+        reward=tensor([1.0]),
+        discount=tensor([0.9]),
+        action=tensor([0]),
+        target_q=tensor([[3.0, 3.0]]),
+        next_target_q=tensor([[2.0, 2.0]]),
+        scale=0.9,
+        temperature=0.5,
+        floor=-0.3,
+    )
+    assert target.tolist() == pytest.approx([1 - 0.9 * 0.3 + 0.9 * 2.346574], abs=1e-5)
+
+
+def test_quantile_loss_by_hand() -> None:
+    # Quantiles 0 and 2 (levels 1/4, 3/4) against the one target 1: u = 1 and -1, huber 1/2 each;
+    # |1/4 - 0| / 2 + |3/4 - 1| / 2 = 0.25.
+    loss = quantile_loss(tensor([[[0.0, 2.0], [9.0, 9.0]]]), tensor([0]), tensor([[1.0]]))
+    assert loss.value.item() == pytest.approx(0.25)
+    assert loss.q.tolist() == [1.0]
+    assert loss.td.tolist() == [0.0]
+
+
+def test_quantiles_at_the_true_ones_have_no_gradient() -> None:
+    quantiles = tensor([[[0.0, 1.0]]], requires_grad=True)
+    quantile_loss(quantiles, tensor([0]), tensor([[0.0, 0.0, 1.0, 1.0]])).value.backward()
+    assert quantiles.grad is not None
+    assert quantiles.grad.abs().max().item() < 0.13  # huber's curvature, no more
+
+
+def test_quantile_target_takes_the_best_action_of_the_least_member() -> None:
+    first = tensor([[[0.0, 2.0], [5.0, 7.0]]])  # means 1 and 6
+    second = tensor([[[3.0, 5.0], [1.0, 3.0]]])  # means 4 and 2
+    reward, discount = tensor([1.0]), tensor([0.5])
+    # The least means are 1 and 2: action 1, of the second member.
+    target = quantile_target(reward, discount, [first, second])
+    assert target.tolist() == [[1.5, 2.5]]
+    chosen = quantile_target(reward, discount, [first, second], tensor([[9.0, 0.0]]))
+    assert chosen.tolist() == [[1.0, 2.0]]
+
+
+def test_margin_by_hand() -> None:
+    q = tensor([[1.0, 0.5], [1.0, 0.5], [2.0, 0.0]])
+    # Expert 1 in rows 0 and 1: max(1 + 0.8, 0.5) - 0.5 = 1.3; in row 2 expert 0: max(2, 0.8) - 2.
+    every = margin_penalty(q, tensor([1, 1, 0]), tensor([True, True, True]), 0.8)
+    assert every.item() == pytest.approx(2.6 / 3)
+    one = margin_penalty(q, tensor([1, 1, 0]), tensor([True, False, True]), 0.8)
+    assert one.item() == pytest.approx(1.3 / 3)
+
+
+def test_calibration_stops_the_conservative_term_at_the_return() -> None:
+    q = tensor([[0.0, 1.0]], requires_grad=True)
+    conservative_penalty(q, tensor([1]), tensor([5.0])).backward()
+    assert q.grad is not None
+    # Both values are below what the logs got: nothing is pushed down, the logged one still up.
+    assert q.grad.tolist() == [[0.0, -1.0]]

@@ -1,0 +1,95 @@
+"""Neighbours train in the twin unchanged: every example under docs/examples is run, shortened."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from support.paths import ROOT
+from support.stores import recording_transitions, write_store
+
+from restock.ingest.profile.profile import load_profile
+from restock.replay.mixture.mixture import parse_mixture
+from restock.replay.panel.build import build_panel
+from restock.replay.store.store import Store
+
+EXAMPLES = ROOT / "docs" / "examples"
+NEEDS = {
+    "sb3_dqn": "stable_baselines3",
+    "sb3_sac": "stable_baselines3",
+    "sb3_mixture": "stable_baselines3",
+    "tianshou_dqn": "tianshou",
+    "cleanrl_dqn": "torch",
+}
+
+
+def example(name: str) -> Any:
+    """An example's module; the test is skipped where its library is not installed."""
+    pytest.importorskip(NEEDS[name])
+    torch.set_num_threads(1)
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def panel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    task = load_profile("warehouse_amr").task
+    folder = tmp_path_factory.mktemp("neighbours")
+    store = write_store(folder / "store", [recording_transitions(1, task=task)], task=task)
+    mixture = parse_mixture('[each_condition]\nshare = "natural"\n')
+    with Store(store) as opened:
+        return build_panel(opened, mixture, folder / "panel").path
+
+
+def test_every_example_is_run_and_explained() -> None:
+    # ros2_policy is no trainer: tests/test_live.py runs it.
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == {*NEEDS, "ros2_policy"}
+    page = (EXAMPLES.parent / "neighbours.md").read_text(encoding="utf-8")
+    assert all(f"examples/{name}.py" in page for name in NEEDS)
+
+
+def test_stable_baselines3_dqn() -> None:
+    done = example("sb3_dqn").main(steps=320, num_envs=2)
+    assert done["env_steps"] == 320
+    assert done["updates"] >= 25
+    assert isinstance(done["success"], bool)
+
+
+def test_stable_baselines3_sac_on_the_continuous_face() -> None:
+    done = example("sb3_sac").main(steps=200, num_envs=2)
+    assert done["env_steps"] == 200
+    assert done["updates"] >= 15
+    speed, yaw_rate = done["command"]
+    assert -0.4 <= speed <= 1.0
+    assert -1.2 <= yaw_rate <= 1.2
+
+
+def test_stable_baselines3_with_a_mixture(panel: Path, tmp_path: Path) -> None:
+    done = example("sb3_mixture").main(str(panel), str(tmp_path / "run"), updates=20, steps=200)
+    assert done["env_steps"] >= 200
+    assert done["updates"] > 20
+    assert (tmp_path / "run" / "strata.parquet").is_file()
+
+
+@pytest.mark.parametrize("mixed", [False, True])
+def test_tianshous_collectors_and_dqn(panel: Path, tmp_path: Path, mixed: bool) -> None:
+    given = {"panel": str(panel), "run": str(tmp_path / "run")} if mixed else {}
+    done = example("tianshou_dqn").main(steps=96, num_envs=2, **given)
+    assert done["env_steps"] >= 96
+    assert done["update_steps"] >= 10
+    assert (tmp_path / "run" / "strata.parquet").is_file() == mixed
+
+
+def test_a_single_file_dqn_on_the_native_vector_environment() -> None:
+    done = example("cleanrl_dqn").main(steps=2400, num_envs=8, target_network_frequency=50)
+    assert done["env_steps"] == 2400
+    assert done["updates"] >= 400
+    assert done["episodes"] >= 8
+    assert done["loss"] >= 0

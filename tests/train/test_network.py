@@ -1,0 +1,65 @@
+"""The Q network: shapes, LayerNorm, dueling, seeded initialisation."""
+
+from __future__ import annotations
+
+import torch
+
+from restock.train.dqn.network import QNetwork, clone
+
+
+def seeded(seed: int = 0, **options: object) -> QNetwork:
+    return QNetwork(5, 3, hidden=(8, 8), generator=torch.Generator().manual_seed(seed), **options)  # type: ignore[arg-type]
+
+
+def test_it_maps_observations_to_a_value_per_action() -> None:
+    assert seeded()(torch.zeros(4, 5)).shape == (4, 3)
+
+
+def test_the_seed_decides_the_weights_whatever_the_global_state() -> None:
+    torch.manual_seed(1)
+    first = seeded(7).state_dict()
+    torch.manual_seed(2)
+    second = seeded(7).state_dict()
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    assert not torch.equal(first["advantage.weight"], seeded(8).state_dict()["advantage.weight"])
+
+
+def test_layer_norm_makes_features_independent_of_the_scale_of_a_layers_output() -> None:
+    network = seeded()
+    observation = torch.randn(6, 5, generator=torch.Generator().manual_seed(0))
+    before = network(observation)
+    with torch.no_grad():
+        network.body[0].weight.mul_(100)
+        network.body[0].bias.mul_(100)
+    assert torch.allclose(network(observation), before, atol=1e-3)
+
+    plain = seeded(layer_norm=False)
+    before = plain(observation)
+    with torch.no_grad():
+        plain.body[0].weight.mul_(100)
+        plain.body[0].bias.mul_(100)
+    assert not torch.allclose(plain(observation), before, atol=1e-3)
+
+
+def test_layer_norm_bounds_values_far_from_the_data() -> None:
+    network = seeded()
+    direction = torch.ones(1, 5)
+    near, far = network(direction * 1e2), network(direction * 1e6)
+    assert float((near - far).detach().abs().max()) < 0.1
+
+
+def test_dueling_advantages_average_to_zero() -> None:
+    network = seeded(dueling=True)
+    observation = torch.randn(6, 5, generator=torch.Generator().manual_seed(0))
+    assert network.value is not None
+    value = network.value(network.body(observation)).squeeze(1)
+    assert torch.allclose(network(observation).mean(dim=1), value, atol=1e-6)
+
+
+def test_a_clone_is_apart_and_takes_no_gradients() -> None:
+    network = seeded()
+    copied = clone(network)
+    with torch.no_grad():
+        network.advantage.bias.add_(1.0)
+    assert not torch.equal(network.advantage.bias, copied.advantage.bias)
+    assert not any(parameter.requires_grad for parameter in copied.parameters())

@@ -1,0 +1,247 @@
+"""Off-policy evaluation against a finite MDP whose value is known: solved as a linear system."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from restock.train.dqn.fitted_q import Fit, Rows, cloned_behaviour, fitted_q, values
+from restock.train.evaluation.ope_estimators import (
+    Gate,
+    Logged,
+    doubly_robust,
+    effective_episodes,
+    estimate,
+    observed,
+    once,
+    per_decision,
+)
+
+STATES, ACTIONS, STEPS, DISCOUNT = 5, 2, 30, 0.9
+
+
+class Chain:
+    """States 0 … 4 in a row, the last one absorbs: action 1 goes on with chance 0.8, action 0
+    stays; each step costs 0.1, and arriving pays 1."""
+
+    def __init__(self) -> None:
+        self.move = np.zeros((STATES, ACTIONS, STATES))  # P(s' | s, a)
+        self.reward = np.zeros((STATES, ACTIONS, STATES))
+        for state in range(STATES - 1):
+            self.move[state, 0, state] = 1.0
+            self.move[state, 1, state + 1], self.move[state, 1, state] = 0.8, 0.2
+            self.reward[state] = -0.1
+        self.reward[STATES - 2, 1, STATES - 1] = 1.0
+        self.move[STATES - 1, :, STATES - 1] = 1.0
+
+    def q(self, policy: np.ndarray) -> np.ndarray:
+        """Q of a policy (S, A) for STEPS steps at most is that of the infinite horizon, but for
+        0.9^30 of it: the exact one, by (I - gamma P) Q = R."""
+        reward = (self.move * self.reward).sum(axis=2).reshape(-1)
+        onward = np.einsum("sat,tb->satb", self.move, policy).reshape(STATES * ACTIONS, -1)
+        solved = np.linalg.solve(np.eye(STATES * ACTIONS) - DISCOUNT * onward, reward)
+        return solved.reshape(STATES, ACTIONS)
+
+    def drive(
+        self, policy: np.ndarray, episodes: int, rng: np.random.Generator
+    ) -> tuple[np.ndarray, ...]:
+        """States (n, T), actions, rewards, next states and whether there was still a step."""
+        state = np.zeros(episodes, np.int64)
+        found: list[tuple[np.ndarray, ...]] = []
+        for _ in range(STEPS):
+            action = (rng.random(episodes) < policy[state, 1]).astype(np.int64)
+            onward = self.move[state, action].cumsum(axis=1)
+            following = (rng.random(episodes)[:, None] > onward).sum(axis=1)
+            alive = state != STATES - 1
+            found.append((state, action, self.reward[state, action, following], following, alive))
+            state = following
+        return tuple(np.stack(column, axis=1) for column in zip(*found, strict=True))
+
+
+CHAIN = Chain()
+BEHAVIOUR = np.tile([0.4, 0.6], (STATES, 1))
+TARGET = np.tile([0.2, 0.8], (STATES, 1))
+TRUTH = float((TARGET[0] * CHAIN.q(TARGET)[0]).sum())
+
+
+def logged(episodes: int, seed: int, q: np.ndarray, policy: np.ndarray = TARGET) -> Logged:
+    state, action, reward, following, alive = CHAIN.drive(
+        BEHAVIOUR, episodes, np.random.default_rng(seed)
+    )
+    value = (policy * q).sum(axis=1)
+    value[-1] = 0.0
+    ratio = np.where(alive, policy[state, action] / BEHAVIOUR[state, action], 1.0)
+    return Logged(
+        ratio,
+        np.where(alive, reward, 0.0),
+        np.where(alive, q[state, action], 0.0),
+        np.where(alive, value[following], 0.0),
+        value[state[:, 0]],
+        DISCOUNT,
+    )
+
+
+NO_MODEL = np.zeros((STATES, ACTIONS))
+
+
+def repeated(estimator, q: np.ndarray, *, weighted: bool, episodes: int = 50) -> np.ndarray:
+    """The estimator over 300 data sets."""
+    return np.array(
+        [
+            estimator(logged(episodes, seed, q), once(episodes), weighted=weighted)[0]
+            for seed in range(300)
+        ]
+    )
+
+
+def test_the_exact_value_is_that_of_driving_it() -> None:
+    state, _, reward, _, alive = CHAIN.drive(TARGET, 20_000, np.random.default_rng(9))
+    driven = (np.where(alive, reward, 0.0) @ DISCOUNT ** np.arange(STEPS)).mean()
+    assert driven == pytest.approx(TRUTH, abs=0.01)
+    assert state.shape == (20_000, STEPS)
+
+
+@pytest.mark.parametrize("model", ["none", "wrong", "right"])
+@pytest.mark.parametrize("estimator", [per_decision, doubly_robust], ids=["is", "dr"])
+def test_without_normalising_the_estimators_are_unbiased(estimator, model: str) -> None:
+    """Whatever the model: five standard errors of the mean over 300 data sets."""
+    q = {"none": NO_MODEL, "wrong": 0.5 * CHAIN.q(TARGET) + 0.2, "right": CHAIN.q(TARGET)}[model]
+    q = np.where(np.arange(STATES)[:, None] == STATES - 1, 0.0, q)
+    found = repeated(estimator, q, weighted=False)
+    assert abs(found.mean() - TRUTH) < 5 * found.std() / np.sqrt(len(found)) + 0.005
+
+
+def test_normalised_weights_are_consistent() -> None:
+    """More episodes, less error; and little of it with many."""
+    few, many = (
+        np.sqrt(np.mean((repeated(per_decision, NO_MODEL, weighted=True, episodes=n) - TRUTH) ** 2))
+        for n in (10, 250)
+    )
+    assert many < few / 2
+    for estimator in (per_decision, doubly_robust):
+        found = estimator(logged(20_000, 1, NO_MODEL), once(20_000))[0]
+        assert found == pytest.approx(TRUTH, abs=0.02)
+
+
+def test_doubly_robust_varies_less_than_importance_sampling_when_the_model_is_right() -> None:
+    sampling = repeated(per_decision, CHAIN.q(TARGET), weighted=True).std()
+    robust = repeated(doubly_robust, CHAIN.q(TARGET), weighted=True).std()
+    assert robust < 0.6 * sampling
+
+
+def test_doubly_robust_mends_a_wrong_model_and_the_model_alone_stays_wrong() -> None:
+    wrong = np.where(np.arange(STATES)[:, None] == STATES - 1, 0.0, CHAIN.q(TARGET) + 0.5)
+    answers = {e.estimator: e for e in _estimates(logged(4000, 2, wrong))}
+    assert answers["fqe"].value == pytest.approx(TRUTH + 0.5, abs=1e-6)
+    assert answers["wdr"].value == pytest.approx(TRUTH, abs=0.05)
+
+
+def test_intervals_hold_the_truth_about_as_often_as_they_say() -> None:
+    inside = {"pdwis": 0, "wdr": 0}
+    for seed in range(100):
+        for answer in _estimates(logged(120, seed, NO_MODEL), resamples=300):
+            if answer.estimator in inside:
+                assert answer.low is not None
+                assert answer.high is not None
+                inside[answer.estimator] += answer.low <= TRUTH <= answer.high
+    assert min(inside.values()) >= 85
+
+
+def test_weights_of_the_same_policy_are_all_one() -> None:
+    same = logged(40, 3, CHAIN.q(BEHAVIOUR), BEHAVIOUR)
+    np.testing.assert_allclose(effective_episodes(same.ratio), 40.0)
+    plain = observed(same, once(40))
+    np.testing.assert_allclose(per_decision(same, once(40)), plain)
+    assert Gate().refusal(same) is None
+
+
+def test_the_gate_refuses_a_policy_far_away_and_says_how_far_they_agree() -> None:
+    far = np.tile([0.97, 0.03], (STATES, 1))
+    away = logged(60, 4, CHAIN.q(far), far)
+    answers = {e.estimator: e for e in _estimates(away)}
+    assert answers["fqe"].value is not None
+    for name in ("pdwis", "wdr"):
+        assert answers[name].value is None
+        assert "of 60 episodes, less than 12.0" in str(answers[name].refused)
+    reach = Gate().measure(away)[1]
+    assert 0 < reach < STEPS
+    again = {e.estimator: e for e in _estimates(away, horizon=reach)}
+    assert again["pdwis"].value is not None
+
+
+def test_a_deterministic_policy_that_no_episode_followed_is_refused_and_not_divided_by() -> None:
+    stay = np.tile([1.0, 0.0], (STATES, 1))
+    away = logged(30, 5, NO_MODEL, stay)
+    assert effective_episodes(away.ratio)[-1] == 0.0
+    assert all(np.isfinite(e.value) for e in _estimates(away) if e.value is not None)
+
+
+def test_a_horizon_cuts_the_rewards_of_one_and_not_of_the_other() -> None:
+    """Doubly robust takes the model's word for the rest; with the right model that is right."""
+    near = logged(4000, 6, CHAIN.q(TARGET)).until(3)
+    assert per_decision(near, once(4000))[0] < TRUTH - 0.1
+    assert doubly_robust(near, once(4000))[0] == pytest.approx(TRUTH, abs=0.02)
+
+
+def test_weights_do_not_overflow() -> None:
+    wild = logged(10, 7, NO_MODEL)
+    wild = replace(wild, ratio=np.where(wild.ratio != 1, 1e12, 1.0))
+    assert np.isfinite(per_decision(wild, once(10))).all()
+
+
+TABULAR = Fit(iterations=40, updates=20, batch_size=512, hidden=(), layer_norm=False)
+TABULAR = replace(TABULAR, learning_rate=0.03)
+
+
+def rows(episodes: int, seed: int) -> tuple[Rows, np.ndarray]:
+    """Transitions with one-hot observations, and their next states."""
+    state, action, reward, following, alive = CHAIN.drive(
+        BEHAVIOUR, episodes, np.random.default_rng(seed)
+    )
+    state, action, reward, following = (
+        column[alive] for column in (state, action, reward, following)
+    )
+    one_hot = np.eye(STATES, dtype=np.float32)
+    return Rows(
+        one_hot[state],
+        action,
+        reward.astype(np.float32),
+        one_hot[following],
+        following == STATES - 1,
+    ), following
+
+
+def test_fitted_q_finds_the_exact_values() -> None:
+    seen, following = rows(600, 8)
+    policy = TARGET.astype(np.float32)
+    network = fitted_q(seen, policy[following], discount=DISCOUNT, fit=TABULAR)
+    found = values(network, np.eye(STATES, dtype=np.float32))
+    np.testing.assert_allclose(found[:-1], CHAIN.q(TARGET)[:-1], atol=0.06)
+
+
+def test_fitted_q_is_the_same_again_for_the_same_seed() -> None:
+    seen, following = rows(50, 8)
+    short = replace(TABULAR, iterations=3)
+    policy = TARGET.astype(np.float32)[following]
+    first, second, other = (
+        values(fitted_q(seen, policy, discount=DISCOUNT, fit=short, seed=seed), seen.observation)
+        for seed in (1, 1, 2)
+    )
+    np.testing.assert_array_equal(first, second)
+    assert not np.array_equal(first, other)
+
+
+def test_cloning_finds_the_behaviour() -> None:
+    seen, _ = rows(600, 10)
+    network = cloned_behaviour(
+        seen.observation, seen.action, ACTIONS, fit=replace(TABULAR, cloning_updates=400)
+    )
+    logits = values(network, np.eye(STATES, dtype=np.float32)[:-1])
+    chance = np.exp(logits) / np.exp(logits).sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(chance, BEHAVIOUR[:-1], atol=0.05)
+
+
+def _estimates(of: Logged, *, resamples: int = 200, horizon: int | None = None):
+    return estimate(of, rng=np.random.default_rng(0), resamples=resamples, horizon=horizon)

@@ -1,0 +1,131 @@
+"""Policies as ONNX: the values of PyTorch, usable without it, refused where they do not fit."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+from support.kept_run import kept_run
+
+from restock.cli import main
+from restock.errors import ConfigError
+from restock.ingest.profile.profile import load_profile
+from restock.train.dqn.config import NetworkConfig
+from restock.train.dqn.network import make_network
+from restock.train.evaluation.onnx_policy import OnnxPolicy, to_onnx
+
+onnx = pytest.importorskip("onnx")
+runtime = pytest.importorskip("onnxruntime")
+TASK = load_profile("warehouse_amr").task
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"layer_norm": False},
+        {"dueling": True},
+        {"quantiles": 5},
+        {"quantiles": 5, "dueling": True},
+        {"ensemble": 3},
+        {"ensemble": 2, "quantiles": 4, "dueling": True},
+    ],
+    ids=str,
+)
+def test_values_are_those_of_torch(settings: dict[str, object]) -> None:
+    config = msgspec.convert({"hidden": [32, 24], **settings}, NetworkConfig)
+    network = make_network(config, 11, 5, torch.Generator().manual_seed(3))
+    session = runtime.InferenceSession(to_onnx(network).SerializeToString())
+    observation = np.random.default_rng(0).normal(size=(64, 11)).astype(np.float32)
+    values, action = session.run(["values", "action"], {"observation": observation})
+    with torch.no_grad():
+        expected = network(torch.from_numpy(observation)).numpy()
+    np.testing.assert_allclose(values, expected, atol=1e-5)
+    np.testing.assert_array_equal(action, expected.argmax(axis=1))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that kept a policy."""
+    return kept_run(tmp_path_factory.mktemp("runs") / "a")
+
+
+def test_the_file_says_how_to_use_it(run: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "p.onnx"
+    assert main(["export", str(run), "--to", "onnx", "--out", str(out), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    session = runtime.InferenceSession(str(out))
+    meta = session.get_modelmeta().custom_metadata_map
+    assert json.loads(meta["actions"]) == [list(action) for action in TASK.actions]
+    assert json.loads(meta["observation"]) == TASK.observation_names
+    assert meta["task_hash"] == said["task_hash"] == TASK.hash
+    assert msgspec.json.decode(meta["task"], type=type(TASK)) == TASK
+    assert meta["version"] == "a@7"
+
+
+def test_eval_drives_it_like_the_agent_it_is(run: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "p.onnx"
+    assert main(["export", str(run), "--to", "onnx", "--out", str(out)]) == 0
+    capsys.readouterr()
+    policies = f"agent,onnx:{out},run:{run}"
+    argv = ["eval", str(run), "--episodes", "1", "--perturbations", "none", "--json"]
+    assert main([*argv, "--policies", policies]) == 0
+    rows = json.loads(capsys.readouterr().out)["results"]
+    by = {
+        policy: [
+            (r["condition"], r["success"], r["bumps_per_episode"], r["return"])
+            for r in rows
+            if r["policy"] == policy
+        ]
+        for policy in ("agent", f"onnx:{out}", f"run:{run}")
+    }
+    assert by["agent"] == by[f"run:{run}"]
+    assert [row[:3] for row in by["agent"]] == [row[:3] for row in by[f"onnx:{out}"]]
+
+
+def test_what_is_no_policy_of_this_task_is_refused(run: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "p.onnx"
+    argv = ["export", str(run), "--to", "onnx", "--out", str(out)]
+    assert main(argv) == 0
+    assert main(argv) == 2  # there already
+    assert "is there already" in capsys.readouterr().err
+    (tmp_path / "text.onnx").write_text("hello")
+    other = make_network(NetworkConfig(hidden=(4,)), 3, 2)
+    (tmp_path / "other.onnx").write_bytes(to_onnx(other).SerializeToString())
+    for name, said in (
+        ("missing.onnx", "no such file"),
+        ("text.onnx", "is not an ONNX model"),
+        ("other.onnx", r"the task's observation is \(N, "),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            OnnxPolicy(tmp_path / name, TASK)
+    changed = msgspec.structs.replace(TASK, time_limit_steps=7)
+    with pytest.raises(ConfigError, match="was made for task"):
+        OnnxPolicy(out, changed)
+    assert main(["eval", str(run), "--policies", f"onnx:{tmp_path / 'text.onnx'}"]) == 2
+    assert not (run / "eval").exists() or not list((run / "eval").glob("*.tmp"))
+
+
+def test_eval_takes_a_perturbation_from_a_file(run: Path, tmp_path: Path, capsys) -> None:
+    wet = tmp_path / "wet.toml"
+    wet.write_text('name = "wet"\nfriction_scale = 0.5\n')
+    argv = ["eval", str(run), "--dry-run", "--json", "--perturbations"]
+    assert main([*argv, f"none,{wet}"]) == 0
+    said = json.loads(capsys.readouterr().out)["perturbations"]
+    assert {name: table["friction_scale"] for name, table in said.items()} == {
+        "none": 1.0,
+        str(wet): 0.5,
+    }
+    for text, why in (
+        ("[ranges]\ngain = [0.9, 1.0]\n", "is a schedule"),
+        ("timestep_s = 0.005\n", "holds for a timestep of 0.005 s"),
+        ("grip = 1.0\n", "grip"),
+    ):
+        wet.write_text(text)
+        assert main([*argv, str(wet)]) == 2
+        assert why in capsys.readouterr().err.replace("\n", " ")
+    assert main([*argv, str(tmp_path / "none.toml")]) == 2

@@ -1,0 +1,114 @@
+"""The run directory: readable at any moment, never half-written, continued where it was."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import duckdb
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from restock.errors import RunError
+from restock.train.run.run import Run
+from restock.train.run.run_tables import TABLES
+
+
+def policies(step: int, rows: int) -> dict[str, object]:
+    return {
+        "env_steps": step,
+        "gradient_steps": 0,
+        "source": "logs",
+        "behaviour_policy": "planner",
+        "rows": rows,
+    }
+
+
+def test_a_new_run_has_every_table_before_any_row(tmp_path: Path) -> None:
+    run = Run.create(tmp_path / "a", {"seed": 3})
+    assert json.loads((run.path / "config.json").read_text())["seed"] == 3
+    for name, schema in TABLES.items():
+        assert pq.read_schema(run.path / f"{name}.parquet").names == schema.names
+    assert not [item for item in run.path.iterdir() if item.name.startswith(".")]
+
+
+def test_rows_are_readable_by_others_after_a_flush(tmp_path: Path) -> None:
+    run = Run.create(tmp_path / "a", {})
+    run.append("policies", [policies(1, 10), policies(2, 20)])
+    run.append_columns(
+        "policies",
+        {**policies(3, 0), "rows": np.array([30, 40]), "behaviour_policy": ["planner", None]},
+    )
+    run.flush()
+    total = duckdb.sql(f"SELECT sum(rows) FROM '{run.path}/policies.parquet'").fetchall()
+    assert total == [(100,)]
+
+
+def test_a_long_table_waits_until_it_has_grown(tmp_path: Path) -> None:
+    run = Run.create(tmp_path / "a", {})
+
+    def on_disk() -> int:
+        return pq.read_metadata(run.path / "policies.parquet").num_rows
+
+    def add(count: int) -> None:
+        run.append_columns("policies", {**policies(1, 0), "rows": np.zeros(count)})
+
+    add(5000)
+    run.flush(everything=False)
+    add(100)
+    run.flush(everything=False)
+    assert on_disk() == 5000
+    add(300)
+    run.flush(everything=False)
+    assert on_disk() == 5400
+    add(1)
+    run.flush()
+    assert on_disk() == 5401
+
+
+def test_a_row_with_a_missing_or_unknown_column_is_refused(tmp_path: Path) -> None:
+    run = Run.create(tmp_path / "a", {})
+    with pytest.raises(KeyError, match="row_count"):
+        run.append("policies", [{**policies(1, 1), "row_count": 1}])
+    with pytest.raises(KeyError, match="source"):
+        run.append_columns("policies", {"rows": [1]})
+
+
+def test_reopening_truncates_to_the_checkpoint(tmp_path: Path) -> None:
+    run = Run.create(tmp_path / "a", {})
+    run.append("policies", [policies(1, 10)])
+    counts = run.row_counts()
+    run.append("policies", [policies(2, 20)])
+    run.flush()  # and here the run is killed
+
+    again = Run.open(tmp_path / "a")
+    again.truncate(counts)
+    again.append("policies", [policies(2, 21)])
+    again.flush()
+    assert pq.read_table(run.path / "policies.parquet")["rows"].to_pylist() == [10, 21]
+
+
+def test_a_table_shorter_than_the_checkpoint_is_an_error(tmp_path: Path) -> None:
+    run = Run.create(tmp_path / "a", {})
+    with pytest.raises(RunError, match=r"audit.parquet: has 0 rows, the checkpoint .* after 5"):
+        run.truncate({"audit": 5})
+
+
+def test_an_existing_directory_is_refused_with_a_remedy(tmp_path: Path) -> None:
+    Run.create(tmp_path / "a", {})
+    with pytest.raises(RunError, match=r"is there already\n.*--resume"):
+        Run.create(tmp_path / "a", {})
+    (tmp_path / "empty").mkdir()
+    Run.create(tmp_path / "empty", {})  # an empty directory is free
+
+
+def test_a_directory_that_is_no_run_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"no config\.json"):
+        Run.open(tmp_path)
+    (tmp_path / "config.json").write_text('{"format": "restock-run/999"}')
+    with pytest.raises(RunError, match="restock-run/999"):
+        Run.open(tmp_path)
+    (tmp_path / "config.json").write_text("{")
+    with pytest.raises(RunError, match="cannot be read"):
+        Run.open(tmp_path)

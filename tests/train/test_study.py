@@ -1,0 +1,186 @@
+"""`restock study`: every arm with every seed, once; what is there is not done again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from restock.cli import main
+from restock.errors import ConfigError
+from restock.train.comparison.arms import Difference
+from restock.train.comparison.compare import Comparison
+from restock.train.study import study_run
+from restock.train.study.study import Plan, load_study
+
+SMALL = """
+treatment = "algorithm"
+seeds = [0]
+[settings]
+network.hidden = [16]
+schedule.env_steps = 400
+schedule.warmup_env_steps = 150
+schedule.updates_per_env_step = 0.1
+evaluation.every_env_steps = 400
+evaluation.episodes = 1
+record.tensorboard = false
+[evaluation]
+episodes = 1
+[[arms]]
+name = "plain"
+[[arms]]
+name = "dueling"
+settings = { network.dueling = true }
+"""
+
+
+@pytest.mark.slow
+def test_a_study_runs_every_arm_once_and_ends_in_a_comparison(tmp_path: Path, capsys) -> None:
+    (tmp_path / "s.toml").write_text(SMALL)
+    out = tmp_path / "out"
+    argv = ["study", str(tmp_path / "s.toml"), "--out", str(out), "--workers", "2", "--json"]
+    # So short a run shows too few episodes for the gate: refused, and said so.
+    assert main(argv) == 1
+    found = json.loads(capsys.readouterr().out)
+    (comparison,) = found["comparisons"]
+    assert (comparison["arm"], comparison["baseline"]) == ("dueling", "plain")
+    assert comparison["verdict"] in ("inconclusive", "incomparable")
+    assert [d["setting"] for d in comparison["differences"]] == ["config.network.dueling"]
+    assert "Not compared" in (out / "study.md").read_text()
+    made = {path: path.stat().st_mtime_ns for path in out.glob("runs/*/*.parquet")}
+    assert len({path.parent.name for path in made}) == 2
+    main(argv)
+    assert "2 of 2 runs are there already" in capsys.readouterr().err
+    assert {path: path.stat().st_mtime_ns for path in made} == made
+    # The same directory, another question.
+    (tmp_path / "s.toml").write_text(SMALL.replace("400", "500", 1))
+    assert main(argv) == 2
+    assert "made for other settings" in capsys.readouterr().err
+
+
+def test_a_run_that_fails_says_where_its_words_are(tmp_path: Path, capsys) -> None:
+    text = SMALL.replace("[settings]", "[settings]\nnetwork.hiden = [3]")
+    (tmp_path / "s.toml").write_text(text)
+    assert main(["study", str(tmp_path / "s.toml"), "--out", str(tmp_path / "o")]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "plain-0.log: `restock train` failed with exit code 2" in said
+    assert "hiden" in said
+
+
+def test_the_plan_is_shown_before_anything_is_run(tmp_path: Path, capsys) -> None:
+    (tmp_path / "s.toml").write_text(SMALL.replace("[0]", "[0, 7]"))
+    argv = ["study", str(tmp_path / "s.toml"), "--out", str(tmp_path / "o"), "--dry-run", "--json"]
+    assert main(argv) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert [Path(row["run"]).name for row in rows] == [
+        *("plain-0", "dueling-0"),
+        *("plain-7", "dueling-7"),
+    ]
+    assert "network.dueling=true" in rows[1]["settings"]
+    assert not (tmp_path / "o").exists()
+
+
+def test_an_arm_may_have_a_baseline_and_a_treatment_of_its_own(tmp_path: Path, capsys) -> None:
+    # coverage against uniform as mixtures; the same mixture with a margin, as an algorithm.
+    (tmp_path / "s.toml").write_text("""
+treatment = "mixture"
+baseline = "uniform"
+seeds = [0]
+[[arms]]
+name = "margin"
+treatment = "algorithm"
+baseline = "coverage"
+[[arms]]
+name = "uniform"
+[[arms]]
+name = "coverage"
+[[arms]]
+name = "method"
+treatment = "method"
+""")
+    argv = ["study", str(tmp_path / "s.toml"), "--out", str(tmp_path / "o"), "--dry-run", "--json"]
+    assert main(argv) == 0
+    assert [row["against"] for row in json.loads(capsys.readouterr().out)] == [
+        *("coverage (algorithm)", None),
+        *("uniform (mixture)", "uniform (method)"),
+    ]
+
+
+def test_each_comparison_is_judged_by_its_own_treatment(
+    tmp_path: Path, capsys, monkeypatch
+) -> None:
+    arm = '\n[[arms]]\nname = "again"\nbaseline = "dueling"\ntreatment = "method"'
+    (tmp_path / "s.toml").write_text(SMALL + arm)
+    out = tmp_path / "out"
+    plan = Plan(load_study(tmp_path / "s.toml"), tmp_path, out)
+    for job in plan.jobs:  # all were trained and evaluated before
+        job.path.mkdir(parents=True)
+        job.done.write_text(plan.fingerprint(job))
+    dueling = Difference("config.network.dueling", "algorithm", False, True)
+    own = [Difference(f"library.arguments.{n}", "algorithm", None, 1) for n in ("gamma", "tau")]
+
+    def judged(first, second, *, treatment):
+        asked.append((first[0].name, second[0].name, treatment))
+        if treatment == "algorithm":
+            return Comparison(treatment, "incomparable", [dueling], [dueling], [], [], None, [])
+        return Comparison(treatment, "comparable", [dueling, *own], [], [], [], "evaluation", [])
+
+    asked: list[tuple[str, str, str]] = []
+    monkeypatch.setattr(study_run, "compare", judged)
+    assert main(["study", str(tmp_path / "s.toml"), "--out", str(out), "--json"]) == 1
+    assert asked == [("plain-0", "dueling-0", "algorithm"), ("dueling-0", "again-0", "method")]
+    first, second = json.loads(capsys.readouterr().out)["comparisons"]
+    assert (first["arm"], first["baseline"], first["treatment"]) == (
+        "dueling",
+        "plain",
+        "algorithm",
+    )
+    assert (second["arm"], second["baseline"], second["treatment"]) == (
+        *("again", "dueling"),
+        "method",
+    )
+    page = (out / "study.md").read_text()
+    assert 'they differ in config.network.dueling, which treatment = "algorithm"' in page
+    assert "## again against dueling" in page
+    assert "Not held: the algorithm (config.network.dueling, library.arguments)." in page
+
+
+def test_panels_of_mixtures_are_the_studys_own(tmp_path: Path) -> None:
+    arms = '[[arms]]\nname = "a"\nmixture = "uniform"\n[[arms]]\nname = "b"\npanel = "p"\n'
+    (tmp_path / "s.toml").write_text(f'store = "../s"\n{arms}')
+    plan = Plan(load_study(tmp_path / "s.toml"), tmp_path, tmp_path / "o")
+    a, b = plan.study.arms
+    assert plan.panel(a) == tmp_path / "o" / "panels" / "a"
+    assert plan.panel(b) == tmp_path / "p"
+    assert plan.study.base is a
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("arms = []", "arms must be two or more"),
+        ('[[arms]]\nname = "a"\n[[arms]]\nname = "a"', "each with its own name"),
+        ('[[arms]]\nname = "../a"\n[[arms]]\nname = "b"', "must be letters"),
+        ('[[arms]]\nname = "a"\nmixture = "u"\n[[arms]]\nname = "b"', "and the study no store"),
+        ('baseline = "c"\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "is none of the arms"),
+        (
+            '[[arms]]\nname = "a"\n[[arms]]\nname = "b"\nbaseline = "c"',
+            "'c' is none of the arms",
+        ),
+        ('[[arms]]\nname = "a"\n[[arms]]\nname = "b"\nbaseline = "b"', "'b' is its own baseline"),
+        (
+            '[[arms]]\nname = "a"\ntreatment = "method"\n[[arms]]\nname = "b"',
+            "'a' is the study's baseline, and is compared with no other",
+        ),
+        ('[[arms]]\nname = "a"\n[[arms]]\nname = "b"\ntreatment = "luck"', "Invalid enum value"),
+        ('seeds = [1, 1]\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "each once"),
+        ('[settings]\nseed = 3\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "must not set seed"),
+        ('worker = 2\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "unknown field `worker`"),
+        ("arms = [", "is not TOML"),
+    ],
+)
+def test_what_is_no_study_is_refused(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "s.toml").write_text(text)
+    with pytest.raises(ConfigError, match=said):
+        load_study(tmp_path / "s.toml")

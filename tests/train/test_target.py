@@ -1,0 +1,94 @@
+"""Target updates, and the two clocks example: online and target estimate over four updates."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import nn
+
+from restock.train.dqn.target import Hard, Polyak, TargetUpdate, describe, value_lag
+
+
+class One(nn.Module):
+    """An estimate of one number."""
+
+    def __init__(self, value: float) -> None:
+        super().__init__()
+        self.value = nn.Parameter(torch.tensor([value], dtype=torch.float64))
+
+
+def test_the_two_clocks() -> None:
+    """One state with a self-loop: reward 1, discount 0.5, learning rate 0.5, hard sync at three.
+
+    The online estimate moves half-way to `1 + 0.5 * target` at every update. The target stands at
+    0 for the first three updates, so the online estimate closes on 1, not on the true value 2;
+    only after the sync does it learn from what it learnt.
+    """
+    online, target = One(0.0), One(0.0)
+    clock = TargetUpdate(Hard(every=3), online.parameters(), target.parameters())
+    history = []
+    for step in range(1, 5):
+        with torch.no_grad():
+            goal = 1.0 + 0.5 * target.value
+            online.value += 0.5 * (goal - online.value)
+        moved = clock.after(step)
+        history.append((float(online.value), float(target.value), moved, clock.last_sync))
+    assert history == [
+        (0.5, 0.0, False, 0),
+        (0.75, 0.0, False, 0),
+        (0.875, 0.875, True, 3),
+        (1.15625, 0.875, False, 3),  # 0.875 + 0.5 * (1 + 0.5 * 0.875 - 0.875)
+    ]
+
+
+def test_polyak_by_hand() -> None:
+    online, target = One(1.0), One(0.0)
+    clock = TargetUpdate(Polyak(tau=0.1), online.parameters(), target.parameters())
+    values = []
+    for step in range(1, 4):
+        assert clock.after(step)
+        values.append(float(target.value))
+    assert values == pytest.approx([0.1, 0.19, 0.271])  # 1 - 0.9**n
+    assert clock.last_sync == 3
+
+
+def test_tau_of_one_is_a_hard_sync_of_every_update() -> None:
+    torch.manual_seed(0)
+    online = nn.Linear(4, 3)
+    slow, hard = nn.Linear(4, 3), nn.Linear(4, 3)
+    TargetUpdate(Polyak(tau=1.0), online.parameters(), slow.parameters()).after(1)
+    TargetUpdate(Hard(every=1), online.parameters(), hard.parameters()).after(1)
+    for a, b in zip(slow.parameters(), hard.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_distance_is_relative_to_the_online_parameters() -> None:
+    online, target = One(4.0), One(3.0)
+    clock = TargetUpdate(Hard(every=2), online.parameters(), target.parameters())
+    assert clock.distance() == pytest.approx(0.25)
+    clock.after(2)
+    assert clock.distance() == 0.0
+
+
+def test_value_lag_by_hand() -> None:
+    q, slow = torch.tensor([[1.0, -3.0]]), torch.tensor([[0.0, -2.0]])
+    assert value_lag(q, slow) == pytest.approx(1.0 / 2.0)
+
+
+def test_a_rule_says_its_effective_lag() -> None:
+    assert describe(Polyak(tau=0.005)) == {
+        "rule": "polyak",
+        "tau": 0.005,
+        "effective_lag_updates": 200.0,
+    }
+    assert describe(Hard(every=1000))["effective_lag_updates"] == 500
+
+
+@pytest.mark.parametrize("tau", [0.0, -1.0, 1.5, math.nan])
+def test_impossible_rules_are_refused(tau: float) -> None:
+    with pytest.raises(ValueError, match="tau must be in"):
+        Polyak(tau=tau)
+    with pytest.raises(ValueError, match="every must be at least 1"):
+        Hard(every=0)

@@ -1,0 +1,288 @@
+"""`restock train` and `restock eval` in the real twin: small runs, and every refusal."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+from support.paths import ROOT
+from support.stores import recording_transitions
+
+from restock.cli import main
+from restock.ingest.profile.profile import load_profile
+from restock.replay.mixture.mixture import parse_mixture
+from restock.replay.panel.build import build_panel
+from restock.train.dqn import checkpoint
+from restock.train.dqn.config import TrainConfig
+
+TINY = [
+    *("--set", "env.num_envs=4", "--set", "schedule.warmup_env_steps=100"),
+    *("--set", "schedule.offline_updates=30", "--set", "network.hidden=[32, 32]"),
+    *("--set", "evaluation.episodes=1", "--set", "record.every_updates=20"),
+    *("--set", "record.tensorboard=false", "--set", "replay.batch_size=32"),
+    *("--set", "record.audit_share=0.2"),
+]
+
+
+MIXTURE = parse_mixture("[each_condition]\nshare = 'natural'\n[held_out]\nby = 'none'\n")
+
+
+@pytest.fixture(scope="module")
+def panel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A panel of random rows of the twin's task."""
+    task = load_profile("warehouse_amr").task
+    path = tmp_path_factory.mktemp("panels") / "panel"
+    rows = recording_transitions(1, episodes=40, task=task)
+    build_panel(rows, MIXTURE, path, task=task)
+    return path
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory, panel: Path) -> Path:
+    """A small run on that panel."""
+    path = tmp_path_factory.mktemp("runs") / "a"
+    argv = ["train", "--panel", str(panel), "--out", str(path), "--env-steps", "400", *TINY]
+    assert main(argv) == 0
+    return path
+
+
+def test_a_run_says_what_it_was_made_from(trained: Path, panel: Path) -> None:
+    document = json.loads((trained / "config.json").read_text())
+    header = json.loads((panel / "panel.json").read_text())
+    assert document["panel"]["id"] == header["id"]
+    assert document["panel"]["store"] == header["store"]  # by which `restock compare` knows it
+    assert document["task_hash"] == load_profile("warehouse_amr").task.hash
+    assert document["target"] == {"rule": "polyak", "tau": 0.005, "effective_lag_updates": 200.0}
+    assert document["seeds"]["run"] == 0
+    assert set(document["versions"]) >= {"restock", "torch", "mujoco", "python"}
+    # The mixture is worked out for this run's own draws: half of a batch is from logs.
+    assert document["panel"]["logs_share"] == 0.5
+    assert sum(document["panel"]["strata"].values()) == pytest.approx(1)
+    assert document["config"]["epsilon"]["start"] == 0.2  # it has learnt to drive offline
+
+
+def test_offline_then_online_batches_are_half_from_the_panel(trained: Path) -> None:
+    progress = pq.read_table(trained / "progress.parquet").to_pylist()
+    assert list(dict.fromkeys(row["phase"] for row in progress)) == ["offline", "warmup", "online"]
+    shares = {row["phase"]: row["logs_share"] for row in progress if row["updates"]}
+    assert shares == {"offline": 1.0, "online": 0.5}
+    audit = pq.read_table(trained / "audit.parquet").to_pylist()
+    assert {row["behaviour_policy"] for row in audit} >= {"planner", "dqn"}
+
+
+def test_finished_episodes_of_the_twin_are_labelled(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    # Random driving for longer than an episode, so that several end.
+    argv = ["train", "--out", str(path), "--env-steps", "2400", *TINY]
+    assert main([*argv, "--set", "schedule.warmup_env_steps=2400", "--set", "env.num_envs=8"]) == 0
+    document = json.loads((path / "config.json").read_text())
+    assert document["panel"] is None
+    assert document["config"]["epsilon"]["start"] == 1.0
+    episodes = pq.read_table(path / "episodes.parquet").to_pylist()
+    assert len(episodes) >= 8
+    found = {name for row in episodes for name in row["conditions"]}
+    assert found <= {condition.name for condition in load_profile("warehouse_amr").conditions}
+    assert "near_collision" in found  # random driving bumps into racks
+    assert all((row["bumps"] == 0) or not row["success"] for row in episodes)
+
+
+def test_resuming_in_the_twin_is_bit_exact(tmp_path: Path, panel: Path) -> None:
+    base = ["train", "--panel", str(panel), *TINY]
+    assert main([*base, "--out", str(tmp_path / "whole"), "--env-steps", "400"]) == 0
+    assert main([*base, "--out", str(tmp_path / "parts"), "--env-steps", "240"]) == 0
+    # A run whose budget is raised goes on; only its closing evaluation at 240 is extra.
+    assert main(["train", "--resume", str(tmp_path / "parts"), "--env-steps", "400"]) == 0
+    whole = checkpoint.load(tmp_path / "whole" / "checkpoints" / "latest.safetensors")
+    parts = checkpoint.load(tmp_path / "parts" / "checkpoints" / "latest.safetensors")
+    for name, value in whole["learner"]["network"].items():
+        assert torch.equal(value, parts["learner"]["network"][name]), name
+    np.testing.assert_array_equal(whole["ring"]["rows"], parts["ring"]["rows"])
+    assert whole["exploration"] == parts["exploration"]
+
+
+def test_ctrl_c_writes_a_checkpoint_and_says_how_to_go_on(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    command = [sys.executable, "-m", "restock", "train", "--out", str(path), *TINY]
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"}
+    )
+    try:
+        deadline = time.monotonic() + 120
+        progress = path / "progress.parquet"
+        while time.monotonic() < deadline and process.poll() is None:
+            if progress.exists() and pq.read_metadata(progress).num_rows > 1:
+                break
+            time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        _, complaint = process.communicate(timeout=120)
+    finally:
+        process.kill()
+    assert process.returncode == 130, complaint
+    assert "restock train --resume" in complaint
+    assert "Traceback" not in complaint
+    stopped = checkpoint.load(path / "checkpoints" / "latest.safetensors")["clock"]["env_steps"]
+    assert stopped > 0
+    assert main(["train", "--resume", str(path), "--env-steps", str(stopped + 40)]) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rows", [3, 6, 9])
+def test_a_run_killed_at_any_instant_goes_on_bit_exactly(tmp_path: Path, rows: int) -> None:
+    settings = [*TINY, "--env-steps", "800", "--set", "record.checkpoint_every_env_steps=120"]
+    assert main(["train", "--out", str(tmp_path / "whole"), *settings]) == 0
+    path = tmp_path / "killed"
+    command = [sys.executable, "-m", "restock", "train", "--out", str(path), *settings]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+        progress = path / "progress.parquet"
+        while process.poll() is None:
+            written = pq.read_metadata(progress).num_rows if progress.exists() else 0
+            if written >= rows and (path / "checkpoints" / "latest.safetensors").exists():
+                break
+            time.sleep(0.01)
+        process.kill()  # SIGKILL
+    for table in path.glob("*.parquet"):
+        pq.read_table(table)  # readable, each of them
+    assert main(["train", "--resume", str(path)]) == 0
+    whole, killed = (
+        checkpoint.load(tmp_path / name / "checkpoints" / "latest.safetensors")
+        for name in ("whole", "killed")
+    )
+    for name, value in whole["learner"]["network"].items():
+        assert torch.equal(value, killed["learner"]["network"][name]), name
+    np.testing.assert_array_equal(whole["ring"]["rows"], killed["ring"]["rows"])
+    for name in ("strata", "audit", "evaluations", "episodes"):
+        one, two = (
+            pq.read_table(tmp_path / run / f"{name}.parquet") for run in ("whole", "killed")
+        )
+        assert one.equals(two), name
+
+
+def test_eval_drives_everyone_through_the_same_episodes(
+    trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = ["eval", str(trained), "--episodes", "2", "--perturbations", "none,latency"]
+    assert main([*argv, "--policies", "agent,planner", "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert (
+        shown["perturbations"]["latency"]["latency_s"] > shown["perturbations"]["none"]["latency_s"]
+    )
+    rows = pq.read_table(trained / "eval" / "episodes.parquet").to_pylist()
+    seeds = {
+        (policy, perturbation): [
+            (row["condition"], row["episode_seed"], row["block"])
+            for row in rows
+            if (row["policy"], row["perturbation"]) == (policy, perturbation)
+        ]
+        for policy in ("agent", "planner")
+        for perturbation in ("none", "latency")
+    }
+    first = seeds["agent", "none"]
+    assert len(first) == 8
+    assert all(episodes == first for episodes in seeds.values())
+    assert all((row["failure"] is None) == row["success"] for row in rows)
+    for row in shown["results"]:
+        assert 0 <= row["success_low"] <= row["success"] <= row["success_high"] <= 1
+    nominal = [r for r in rows if r["policy"] == "planner" and r["condition"] == "nominal"]
+    assert any(row["success"] for row in nominal)
+
+
+@pytest.mark.parametrize(
+    ("argv", "complaint"),
+    [
+        (["train"], "give --out RUN"),
+        (["train", "--out", "{new}", "--set", "loss.gamma=1"], "unknown field `gamma`"),
+        (["train", "--out", "{new}", "--set", "nonsense"], "'nonsense' is not key=value"),
+        (["train", "--out", "{new}", "--config", "{missing}"], "cannot be read"),
+        (["train", "--out", "{new}", "--device", "cuda"], "sees no CUDA device"),
+        (["train", "--out", "{new}", "--panel", "{missing}"], "no such panel"),
+        (["train", "--out", "{trained}"], "is there already"),
+        (["train", "--resume", "{missing}"], "no config.json"),
+        (["train", "--resume", "{trained}", "--seed", "3"], "own panel, config and seed"),
+        (["train", "--out", "{new}", "--panel", "{panel}", "--set", "loss.discount=0.9"], "0.97"),
+        (["eval", "{missing}"], "no config.json"),
+        (["eval", "{trained}", "--policies", "nobody"], "there is no 'nobody'"),
+        (["eval", "{trained}", "--perturbations", "rain"], "choose from none, friction"),
+        (["eval", "{trained}", "--episodes", "0"], "must be at least 1"),
+    ],
+)
+def test_wrong_input_gives_one_clear_message_and_writes_nothing(
+    argv: list[str],
+    complaint: str,
+    trained: Path,
+    panel: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    if "cuda" in argv and torch.cuda.is_available():
+        pytest.skip("there is a CUDA device")
+    places = {"new": tmp_path / "new", "missing": tmp_path / "no"}
+    places |= {"trained": trained, "panel": panel}
+    assert main([part.format(**places) for part in argv]) == 2
+    said = capsys.readouterr().err
+    assert complaint in said
+    assert "Traceback" not in said
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_panel_of_another_task_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    build_panel(recording_transitions(1, episodes=40), MIXTURE, tmp_path / "panel")
+    argv = ["train", "--panel", str(tmp_path / "panel"), "--out", str(tmp_path / "run")]
+    assert main(argv) == 2
+    said = capsys.readouterr().err
+    assert "observation, action or reward differ" in said
+    assert load_profile("warehouse_amr").task.hash in said
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_dry_run_writes_nothing(
+    tmp_path: Path, panel: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = ["train", "--panel", str(panel), "--out", str(tmp_path / "run"), "--seed", "7"]
+    assert main([*argv, "--dry-run"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["config"]["seed"] == 7
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_docs_list_every_key_of_the_config_and_no_other() -> None:
+    def keys(values: dict[str, object], prefix: str = "") -> set[str]:
+        found = set()
+        for name, value in values.items():
+            nested = isinstance(value, dict) and name != "conditions"
+            found |= keys(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}"}  # type: ignore[arg-type]
+        return found
+
+    known = keys(msgspec.to_builtins(TrainConfig())) | {"target.every"}
+    page = (ROOT / "docs" / "train.md").read_text(encoding="utf-8")
+    listed = {line.split("`")[1] for line in page.splitlines() if line.startswith("| `")}
+    files = {name for name in listed if "." in name and name.endswith((".json", ".parquet"))}
+    assert listed - files - {"checkpoints/", "tensorboard/"} == known
+
+
+def test_the_docs_state_the_defaults() -> None:
+    page = (ROOT / "docs" / "train.md").read_text(encoding="utf-8")
+    defaults = msgspec.to_builtins(TrainConfig())
+    checked = 0
+    for line in page.splitlines():
+        if not line.startswith("| `"):
+            continue
+        key, default = line.split("`")[1], line.split("|")[2].strip()
+        value: object = defaults
+        for part in key.split("."):
+            value = value.get(part) if isinstance(value, dict) else None
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            assert float(default) == value, key
+            checked += 1
+    assert checked > 20

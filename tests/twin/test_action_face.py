@@ -1,0 +1,124 @@
+"""Two faces of one task: an index into the table, or any command within its reach."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+
+import restock  # noqa: F401 - registers the environment
+from restock.errors import ConfigError
+from restock.ingest.task.task import nearest_action, observe, reward
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+
+
+@pytest.mark.parametrize("action", ["discrete", "continuous"])
+def test_each_face_passes_gymnasiums_checker(action: str) -> None:
+    made = gymnasium.make("restock/Warehouse-v0", render_mode="rgb_array", action=action)
+    check_env(made.unwrapped)
+
+
+@pytest.mark.parametrize("action", ["discrete", "continuous"])
+def test_make_vec_by_vector_entry_point_gives_the_native_environment(action: str) -> None:
+    made = gymnasium.make_vec(
+        "restock/Warehouse-v0",
+        num_envs=3,
+        vectorization_mode="vector_entry_point",
+        nthread=2,
+        action=action,
+    )
+    assert isinstance(made.unwrapped, WarehouseVectorEnv)
+    assert made.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    assert made.spec is not None
+    made.action_space.seed(0)
+    observation, _ = made.reset(seed=3)
+    for _ in range(3):
+        assert made.observation_space.contains(observation)
+        observation, earned, over, cut, info = made.step(made.action_space.sample())
+    assert earned.shape == over.shape == cut.shape == (3,)
+    assert ("action" in info) == (action == "continuous")
+
+
+def test_the_space_is_what_the_tasks_actions_span_in_their_units() -> None:
+    made = WarehouseVectorEnv(1, action="continuous")
+    table = np.array(made.task.actions, np.float32)
+    np.testing.assert_array_equal(made.single_action_space.low, table.min(axis=0))
+    np.testing.assert_array_equal(made.single_action_space.high, table.max(axis=0))
+
+
+def test_a_command_of_the_table_does_what_its_index_does() -> None:
+    discrete, continuous = WarehouseVectorEnv(4), WarehouseVectorEnv(4, action="continuous")
+    np.testing.assert_array_equal(discrete.reset(seed=3)[0], continuous.reset(seed=3)[0])
+    table = np.array(discrete.task.actions)
+    rng = np.random.default_rng(0)
+    for action in rng.integers(len(table), size=(30, 4)):
+        one = discrete.step(action)
+        other = continuous.step(table[action])
+        np.testing.assert_array_equal(other[4]["action"], action)
+        np.testing.assert_allclose(other[4]["action_residual"], 0, atol=1e-6)
+        for left, right in zip(one[:4], other[:4], strict=True):
+            np.testing.assert_allclose(left, right, atol=2e-4)  # float32 commands
+
+
+def test_any_command_is_driven_and_seen_and_rewarded_as_its_nearest_action() -> None:
+    made = WarehouseVectorEnv(6, action="continuous")
+    made.reset(seed=1)
+    made.action_space.seed(2)
+    previous = np.zeros(6, np.int64)
+    for _ in range(20):
+        now = {name: column.copy() for name, column in made.signals.items()}
+        command = made.action_space.sample()
+        observation, earned, over, cut, info = made.step(command)
+        after, going = info["signals"], ~(over | cut)
+        np.testing.assert_allclose(after["command_speed_mps"], command[:, 0])
+        np.testing.assert_allclose(after["command_yaw_rate_radps"], command[:, 1])
+        action, residual = nearest_action(made.task, command[:, 0], command[:, 1])
+        np.testing.assert_array_equal(info["action"], action)
+        np.testing.assert_allclose(info["action_residual"], residual)
+        np.testing.assert_array_equal(
+            earned, reward(made.task, now, after, info["progress_m"], action, previous)
+        )
+        np.testing.assert_allclose(
+            observation[going], observe(made.task, after, now, action)[going], atol=1e-6
+        )
+        previous = np.where(going, action, 0)
+
+
+def test_commands_beyond_the_space_are_clipped() -> None:
+    seen = []
+    for command in ([9.0, -9.0], [1.0, -1.2]):
+        made = WarehouseVectorEnv(1, action="continuous")
+        made.reset(seed=5)
+        for _ in range(4):
+            observation, *_, info = made.step(np.array([command], np.float32))
+        assert info["signals"]["command_speed_mps"][0] == 1.0
+        seen.append(observation)
+    np.testing.assert_array_equal(*seen)
+
+
+def test_a_command_that_is_no_number_is_refused() -> None:
+    made = WarehouseVectorEnv(2, action="continuous")
+    made.reset(seed=0)
+    with pytest.raises(ConfigError, match="environment 1 of the twin: an action must be two"):
+        made.step(np.array([[0.0, 0.0], [np.nan, 0.0]]))
+
+
+def test_an_unknown_face_is_refused() -> None:
+    with pytest.raises(ConfigError, match="no action space 'velocity'"):
+        WarehouseVectorEnv(1, action="velocity")
+
+
+def test_state_continues_bit_for_bit_on_the_continuous_face() -> None:
+    def roll(env: WarehouseVectorEnv) -> np.ndarray:
+        env.action_space.seed(7)
+        return np.array([env.step(env.action_space.sample())[0] for _ in range(25)])
+
+    made = WarehouseVectorEnv(3, action="continuous")
+    made.reset(seed=2)
+    roll(made)
+    state = made.get_state()
+    expected = roll(made)
+    made.set_state(state)
+    np.testing.assert_array_equal(roll(made), expected)

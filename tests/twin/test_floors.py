@@ -1,0 +1,348 @@
+"""Generated floors, floors from TOML and from occupancy maps, and several of them in one twin."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.sparse import csgraph
+
+import restock  # noqa: F401 - registers the environment
+from restock.cli import main
+from restock.errors import ConfigError, RunError
+from restock.train.prepare import prepare_new
+from restock.train.twin.env.floor_report import describe_floor
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.floors.floor_file import read_floor, write_floor
+from restock.train.twin.floors.floors import (
+    RECIPES,
+    SPLITS,
+    generate,
+    held_out,
+    open_floor,
+    open_floors,
+    seeds_of,
+    split_of,
+)
+from restock.train.twin.floors.layout import OneWay, Warehouse, default_warehouse
+from restock.train.twin.floors.occupancy_map import cells_of, read_map, write_map
+from restock.train.twin.floors.pgm import read_pgm, write_pgm
+from restock.train.twin.floors.planner import BlockFinder, Planner
+from restock.train.twin.physics.episode import KINDS, EpisodeSpec, draw_episode
+
+SEEDS = st.integers(0, 10_000)
+KINDS_OF_FLOOR = st.sampled_from(sorted(RECIPES))
+
+
+@given(seed=SEEDS, kind=KINDS_OF_FLOOR)
+@settings(max_examples=20, deadline=None)
+def test_on_a_generated_floor_every_goal_is_reached_from_every_aisle(seed: int, kind: str) -> None:
+    floor = generate(seed, RECIPES[kind])
+    assert floor == generate(seed, RECIPES[kind])
+    planner = Planner(floor)
+    goals = {planner.cell(x, y) for x, y in floor.goals}
+    starts = {planner.cell(*segment.area.center) for segment in floor.segments}
+    # By the one-way rules: all lie in one strongly connected part.
+    _, part = csgraph.connected_components(planner._graph, connection="strong")
+    assert len({part[cell] for cell in goals | starts}) == 1
+    for segment in floor.segments:
+        assert segment.width_m >= RECIPES[kind].aisle_m[0] - 1e-6
+
+
+@given(seed=st.integers(0, 2**53 - 1))
+def test_a_seed_belongs_to_one_split(seed: int) -> None:
+    assert [split for split in SPLITS if split == split_of(seed)] == [split_of(seed)]
+
+
+def test_the_splits_share_no_floor() -> None:
+    floors = {split: {f.hash for f in open_floors(f"generated:{split}:40")} for split in SPLITS}
+    assert all(len(found) == 40 for found in floors.values())
+    assert not floors["train"] & floors["test"]
+    assert not floors["train"] & floors["validation"]
+    assert not floors["validation"] & floors["test"]
+    assert held_out("default, generated:train:64", "test") == "default,generated:test"
+    shares = [sum(split_of(seed) == split for seed in range(2000)) / 2000 for split in SPLITS]
+    np.testing.assert_allclose(shares, [0.7, 0.1, 0.2], atol=0.05)
+    assert list(islice(seeds_of("test"), 3)) == [s for s in range(30) if split_of(s) == "test"][:3]
+
+
+@given(seed=SEEDS, kind=KINDS_OF_FLOOR)
+@settings(max_examples=6, deadline=None)
+def test_a_floor_survives_toml_and_an_occupancy_map(
+    seed: int, kind: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp("floor")
+    floor = replace(generate(seed, RECIPES[kind]), map_origin=(-3.0, 2.0, 0.5))
+    write_floor(floor, folder / "floor.toml")
+    assert read_floor(folder / "floor.toml") == floor
+    write_map(floor, folder / "map.yaml")
+    again = read_map(folder / "map.yaml")
+    assert (again.width_m, again.depth_m) == (floor.width_m, floor.depth_m)
+    np.testing.assert_array_equal(cells_of(again, 0.05), cells_of(floor, 0.05))
+    np.testing.assert_allclose(again.map_origin, floor.map_origin, atol=1e-9)
+    ruled = Planner(replace(floor, one_way=()))  # a map has no rules
+    mapped = Planner(again)
+    start = floor.segments[0].area.center
+    for goal in floor.goals[:: max(len(floor.goals) // 4, 1)]:
+        place = (float(goal[0]), float(goal[1]))
+        assert abs(mapped.distance_m(*start, place) - ruled.distance_m(*start, place)) < 0.3
+
+
+def test_aisles_of_both_directions_are_found_on_a_map(tmp_path: Path) -> None:
+    for seed in (1, 3):  # along x, along y
+        floor = replace(generate(seed), docks=())
+        write_map(floor, tmp_path / "map.yaml")
+        found = read_map(tmp_path / "map.yaml").segments
+        assert {segment.along for segment in found} == {floor.segments[0].along}
+        middles = np.array([segment.area.center for segment in found])
+        inside = floor.segment_of(middles[:, 0], middles[:, 1])
+        assert sorted(inside.tolist()) == list(range(len(floor.segments)))
+
+
+@pytest.mark.parametrize("mode", ["trinary", "scale", "raw"])
+@pytest.mark.parametrize("negate", [0, 1])
+def test_every_mode_of_a_map_reads_the_same_free_space(
+    tmp_path: Path, mode: str, negate: int
+) -> None:
+    free = np.zeros((80, 120), np.bool_)
+    free[10:70, 10:110] = True
+    free[30:50, 40:80] = False
+    if mode == "raw":
+        pixels = np.where(free, 0, 100)
+        pixels[0, 0] = 255  # unknown
+    else:
+        pixels = np.where(free, 254, 0)
+        pixels[0, 0] = 205
+        pixels = 255 - pixels if negate else pixels
+    write_pgm(tmp_path / "map.pgm", pixels.astype(np.uint8))
+    (tmp_path / "map.yaml").write_text(
+        f"image: map.pgm\nresolution: 0.1\norigin: [1.0, 2.0, 0.0]\nmode: {mode}\n"
+        f"negate: {negate}\nfree_thresh: 0.25\noccupied_thresh: 0.65\n"
+    )
+    floor = read_map(tmp_path / "map.yaml")
+    assert (floor.width_m, floor.depth_m) == (10.0, 6.0)
+    np.testing.assert_array_equal(cells_of(floor, 0.1), free[10:70, 10:110][::-1].T)
+    assert floor.map_origin == pytest.approx((2.0, 3.0, 0.0))
+
+
+def test_a_map_turned_by_its_origin_goes_back_to_the_map(tmp_path: Path) -> None:
+    write_pgm(tmp_path / "map.pgm", np.pad(np.full((40, 60), 254, np.uint8), 10))
+    (tmp_path / "map.yaml").write_text(
+        f"image: map.pgm\nresolution: 0.1\norigin: [5.0, 0.0, {np.pi / 2}]\n"
+    )
+    floor = read_map(tmp_path / "map.yaml")
+    x, y = floor.to_map(np.array([0.0, 6.0]), np.array([0.0, 0.0]))
+    np.testing.assert_allclose(x, [4.0, 4.0], atol=1e-9)  # the image's x is the map's y
+    np.testing.assert_allclose(y, [1.0, 7.0], atol=1e-9)
+
+
+def test_ascii_and_16_bit_greymaps_with_comments_are_read(tmp_path: Path) -> None:
+    (tmp_path / "a.pgm").write_text("P2 # plain\n# a comment\n3 2\n9\n0 9 9\n0 0 # end\n9\n")
+    np.testing.assert_array_equal(read_pgm(tmp_path / "a.pgm"), [[0, 1, 1], [0, 0, 1]])
+    (tmp_path / "b.pgm").write_bytes(b"P5\n2 1\n65535\n\x00\x00\xff\xff")
+    np.testing.assert_array_equal(read_pgm(tmp_path / "b.pgm"), [[0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (b"\x89PNG", "is no PGM"),
+        (b"P5\n4 4\n255\nab", "cut short: 2 of 16"),
+        (b"P5\n99999 99999\n255\n", "99999 x 99999"),
+        (b"P5\n0 4\n255\n", "0 x 4"),
+        (b"P5\nfour 4\n255\n", "no width"),
+        (b"P5", "no width"),
+        (b"P2\n2 1\n255\n1 x", "no number"),
+        (b"P2\n2 1\n9\n1 10", "outside 0 to 9"),
+        (b"P5\n4 4\n255\n" + bytes(16), "no free place"),
+    ],
+)
+def test_a_broken_map_is_refused_with_its_reason(tmp_path: Path, data: bytes, said: str) -> None:
+    (tmp_path / "map.pgm").write_bytes(data)
+    (tmp_path / "map.yaml").write_text("image: map.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n")
+    with pytest.raises(ConfigError, match=said):
+        read_map(tmp_path / "map.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("resolution: 0.05\norigin: [0, 0, 0]\n", "image"),
+        ("image: a.pgm\nresolution: -1\norigin: [0, 0, 0]\n", "resolution"),
+        ("image: a.pgm\nresolution: 0.05\norigin: [0, 0]\n", "origin"),
+        ("image: a.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nmode: odd\n", "mode"),
+        ("image: gone.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n", "cannot be read"),
+        ("image: [\n", "YAML"),
+        ("", "got `null`"),
+    ],
+)
+def test_a_broken_map_yaml_is_refused_with_its_key(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "map.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=said):
+        read_map(tmp_path / "map.yaml")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("generated:", "generated:-1", "generated:train:0", "generated:holdout", "hall"),
+        *("no.toml", "no.yaml", "default,default", "generated:" + "9" * 30),
+    ],
+)
+def test_a_layout_that_is_none_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError):
+        open_floors(text)
+    with pytest.raises(ConfigError):
+        open_floor("generated:train")
+
+
+def test_a_floor_with_racks_alone_gets_its_aisles_and_goals(tmp_path: Path) -> None:
+    known = default_warehouse()
+    racks = [[r.x_min, r.y_min, r.x_max, r.y_max] for r in known.racks]
+    (tmp_path / "hall.toml").write_text(f"width_m = 12.0\ndepth_m = 10.0\nracks = {racks}\n")
+    floor = read_floor(tmp_path / "hall.toml")
+    assert len(floor.segments) == len(known.segments)
+    assert floor.name == "hall.toml"
+    for kind in KINDS:
+        draw_episode(EpisodeSpec(kind, 3), floor, Planner(floor))
+    (tmp_path / "hall.toml").write_text("width_m = 12.0\ndepth_m = 1e9\nracks = []\n")
+    with pytest.raises(ConfigError, match="outside 1 to 60 m"):
+        read_floor(tmp_path / "hall.toml")
+    (tmp_path / "hall.toml").write_text("width_m = 12.0\ndepth = 10.0\nracks = []\n")
+    with pytest.raises(ConfigError, match="depth"):
+        read_floor(tmp_path / "hall.toml")
+
+
+def test_what_does_not_fit_a_floor_is_refused_before_anything_is_driven(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    hall = tmp_path / "hall.toml"
+    hall.write_text("width_m = 12.0\ndepth_m = 10.0\nracks = [[5.8, 0.0, 6.2, 10.0]]\n")
+    said = "has no room for episodes of blocked_aisle"
+    with pytest.raises(ConfigError, match=said):
+        WarehouseVectorEnv(2, layouts=str(hall))
+    # A share of 0 is never trained on, yet evaluated.
+    shares = "env.conditions={nominal=1, blocked_aisle=0}"
+    with pytest.raises(ConfigError, match=said):
+        prepare_new(tmp_path / "run", None, None, [f"env.layouts={hall}", shares])
+    record = ["record", "--out", str(tmp_path / "a.mcap"), "--missions", "1"]
+    assert main([*record, "--layouts", str(hall)]) != 0
+    assert said in capsys.readouterr().err
+    # Without those conditions it is driven on, and what is sealed off is said.
+    assert main([*record, "--layouts", str(hall), "--conditions", "nominal=1"]) == 0
+    assert "60 of 120 goals cannot be reached" in capsys.readouterr().err
+    prepared = prepare_new(
+        tmp_path / "run", None, None, [f"env.layouts={hall}", "env.conditions={nominal=1}"]
+    )
+    assert "60 of 120 goals cannot be reached" in prepared.describe()
+    assert describe_floor(read_floor(hall))["unreachable_goals"] == 60
+
+
+def test_one_way_rules_turn_the_plan_and_a_shut_in_robot_leaves_against_them() -> None:
+    floor = default_warehouse()
+    lane = floor.segments[2].area  # aisle 2, west
+    start, goal = (lane.x_max - 0.5, lane.center[1]), (lane.x_min - 1.0, lane.center[1])
+    free = Planner(floor).plan(*start, goal)
+    ruled = Planner(replace(floor, one_way=(OneWay(lane, "east"),)))
+    around = ruled.plan(*start, goal)
+    length = [float(np.hypot(*np.diff(way, axis=0).T).sum()) for way in (free, around)]
+    assert length[1] > length[0] + 3.0
+    inside = [lane.contains(x, y) for x, y in around]
+    assert not any(
+        a and b and after[0] < before[0] - 1e-6
+        for a, b, before, after in zip(inside, inside[1:], around, around[1:], strict=False)
+    )
+    # East of the robot the lane is shut: it leaves to the west, against the rule.
+    middle = (lane.x_min + 0.6, lane.center[1])
+    out = ruled.plan(*middle, (lane.x_max + 1.0, lane.center[1]), [(2, 5)])
+    assert out[:, 0].min() < lane.x_min
+
+
+def test_a_block_in_an_aisle_that_runs_north_is_found() -> None:
+    floor = generate(3)
+    area = floor.segments[1].area
+    assert floor.segments[1].along == "y"
+    finder = BlockFinder(floor, 1)
+    pose = np.array([[area.center[0], area.y_min + 0.2, np.pi / 2]])
+    half = area.half_size[0] - 0.15
+    across = np.linspace(-half, half, 9)
+    hits = np.stack([area.center[0] + across, np.full(9, area.y_min + 1.2)], axis=-1)[None]
+    arguments = (np.ones((1, 9), np.bool_), np.array([1.0]), np.array([True]))
+    looks = [finder.update(np.array([0]), pose, hits, *arguments) for _ in range(3)]
+    assert [len(found) for found in looks] == [0, 0, 1]
+    (_, (segment, step)) = looks[2][0]
+    assert segment == 1
+    around = Planner(floor).plan(*pose[0, :2], (area.center[0], area.y_max + 0.8), [(1, step)])
+    near = np.abs(around[:, 1] - (area.y_min + 1.5)) < 0.15
+    assert not (near & (around[:, 0] > area.x_min) & (around[:, 0] < area.x_max)).any()
+
+
+def _drive(env: WarehouseVectorEnv, specs: list[EpisodeSpec], steps: int) -> np.ndarray:
+    env.set_episodes(specs)
+    seen = [env.reset(seed=5)[0]]
+    rng = np.random.default_rng(0)
+    for action in rng.integers(10, size=(steps, len(specs))):
+        seen.append(env.step(action)[0])
+    return np.array(seen)
+
+
+def test_an_episode_is_the_same_alone_and_among_other_floors_whatever_the_threads() -> None:
+    floors = open_floors("default,generated:train:3,narrow:1")
+    specs = [EpisodeSpec(KINDS[i % 4], 70 + i, layout=floors[i % 5].name) for i in range(10)]
+    among = _drive(WarehouseVectorEnv(10, layouts=floors), specs, 40)
+    threads = WarehouseVectorEnv(10, layouts=floors[::-1], nthread=2)
+    np.testing.assert_array_equal(_drive(threads, specs, 40), among)
+    for index in (0, 1, 4):
+        alone = _drive(WarehouseVectorEnv(2, layouts=(floors[index],)), specs[index::5], 0)
+        np.testing.assert_array_equal(alone[0], among[0, index::5])
+    one = WarehouseVectorEnv(10, layouts=(floors[2],))
+    there = [replace_layout(spec, floors[2].name) for spec in specs]
+    many = WarehouseVectorEnv(10, layouts=floors)
+    np.testing.assert_array_equal(_drive(one, there, 40), _drive(many, there, 40))
+
+
+def replace_layout(spec: EpisodeSpec, layout: str) -> EpisodeSpec:
+    return EpisodeSpec(spec.condition, spec.seed, layout=layout)
+
+
+def test_state_continues_on_several_floors_and_is_refused_on_others() -> None:
+    env = WarehouseVectorEnv(6, layouts="generated:train:4", seed=2)
+    env.reset(seed=2)
+    rng = np.random.default_rng(1)
+    actions = rng.integers(10, size=(30, 6))
+    for action in actions:
+        env.step(action)
+    state = env.get_state()
+    expected = [env.step(action)[0] for action in actions]
+    fresh = WarehouseVectorEnv(6, layouts="generated:train:4", seed=9)
+    fresh.reset()
+    fresh.set_state(state)
+    for action, seen in zip(actions, expected, strict=True):
+        np.testing.assert_array_equal(fresh.step(action)[0], seen)
+    with pytest.raises(RunError, match="other floors"):
+        WarehouseVectorEnv(6, layouts="generated:test:4").set_state(state)
+
+
+def test_episodes_are_drawn_on_all_floors_and_info_names_them() -> None:
+    env = WarehouseVectorEnv(64, layouts="generated:train:4", conditions={"nominal": 1.0})
+    _, info = env.reset(seed=1)
+    assert set(info["layout"]) == {floor.name for floor in env.floors}
+    for index in range(64):
+        floor: Warehouse = info["floor"][index]
+        assert floor.name == info["layout"][index] == env.floor_of(index).name
+    with pytest.raises(ConfigError, match="is none of the environment's 4"):
+        _drive(env, [EpisodeSpec("nominal", 1, layout="default")] * 64, 0)
+
+
+def test_the_environment_on_a_generated_floor_passes_gymnasiums_checker() -> None:
+    made = gymnasium.make(
+        "restock/Warehouse-v0", render_mode="rgb_array", layouts="generated:train:2"
+    )
+    check_env(made.unwrapped)

@@ -1,0 +1,307 @@
+"""The gap between twin and logs: what it is under a known perturbation, and what is said of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.paths import SHARED
+
+from restock import cli
+from restock.clustered import NOT_KNOWN, Estimate, quantiles, ratio
+from restock.errors import ConfigError, RunError
+from restock.ingest.pipeline import ingest
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.store.writer import StoreWriter
+from restock.replay.store.store import Store
+from restock.report import write_gap_page
+from restock.train.twin.calibration.gap import AFTER, BEFORE, Gap, GapPlan, measure_gap
+from restock.train.twin.calibration.gap_files import read_gap, write_gap
+from restock.train.twin.calibration.logged_steps import (
+    logged_steps,
+    observations,
+    previous_action,
+    sector_clearance,
+)
+from restock.train.twin.calibration.one_step import AGREES, agreement, empty_floor, one_step
+from restock.train.twin.calibration.path_gap import FLOOR, measured_noise
+from restock.train.twin.calibration.plan_memory import rebuild_plans
+from restock.train.twin.calibration.trust import (
+    TRUSTED,
+    UNDECIDED,
+    UNKNOWN,
+    UNTRUSTED,
+    Limits,
+    judge,
+)
+from restock.train.twin.floors.layout import default_warehouse
+from restock.train.twin.physics.perturbation import Perturbation
+from restock.train.twin.recording.recorder import Plan, record
+
+# What the recorded robot is, and the nominal twin is not.
+TRUE = Perturbation(
+    name="true", payload_kg=30.0, wheel_radius_scale=0.96, latency_s=0.15, gain=0.97
+)
+TURTLEBOT = SHARED / "turtlebot3-sim-humble"
+PLAN = GapPlan(most=24, limits=Limits(segments=10, episodes=3))
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Missions on a dry and on a slippery floor, by a robot that TRUE describes."""
+    folder = tmp_path_factory.mktemp("gap")
+    shares = {"nominal": 0.5, "wheel_slip": 0.5}
+    plan = Plan(missions=10, seed=5, conditions=shares, policy="planner", hardware=TRUE)
+    record(folder / "log.mcap", plan)
+    ingest(folder / "log.mcap", load_profile("warehouse_amr"), store=StoreWriter(folder / "store"))
+    return folder / "store"
+
+
+@pytest.fixture(scope="module")
+def gap(stored: Path) -> Gap:
+    with Store(stored) as store:
+        return measure_gap(store, TRUE, PLAN)
+
+
+def position(gap: Gap, condition: str, source: str, horizon_s: float) -> dict[str, Any]:
+    (row,) = [
+        row
+        for row in gap.paths
+        if (row["condition"], row["source"], row["horizon_s"], row["quantity"])
+        == (condition, source, horizon_s, "position")
+    ]
+    return row
+
+
+@pytest.mark.parametrize("horizon_s", [3.0, 6.0])
+def test_the_true_parameters_close_the_gap_to_near_the_floor(gap: Gap, horizon_s: float) -> None:
+    before, after, floor = (
+        position(gap, "nominal", source, horizon_s)["median"] for source in (BEFORE, AFTER, FLOOR)
+    )
+    assert after < 0.5 * before
+    assert after < 1.6 * floor
+    odometry = position(gap, "nominal", "odometry", horizon_s)["median"]
+    assert after < odometry  # whose wheels are not as large as it takes them to be
+
+
+def test_a_slippery_floor_is_named_and_a_dry_one_is_not(gap: Gap) -> None:
+    said = {found.condition: found for found in gap.verdicts}
+    assert said["wheel_slip"].verdict == UNTRUSTED
+    assert "metres" in said["wheel_slip"].reasons[0] or " m " in said["wheel_slip"].reasons[0]
+    assert said["nominal"].verdict == TRUSTED
+    assert gap.untrusted == ["wheel_slip"]
+    assert any("patches" in line for line in gap.not_done)
+
+
+def test_one_step_gaps_fall_with_the_true_parameters(gap: Gap) -> None:
+    def of(component: str, source: str) -> float:
+        return next(
+            float(row["mean_gap"])
+            for row in gap.observations
+            if (row["component"], row["condition"], row["source"]) == (component, "nominal", source)
+        )
+
+    for component in ("wheel_speed", "gyro_yaw_rate", "near_sin"):
+        assert of(component, AFTER) < min(of(component, BEFORE), of(component, "persistence"))
+    terms = {row["term"] for row in gap.rewards}
+    assert {"reward", "progress_per_m", "goal", "bump"} <= terms
+    whole = {
+        row["source"]: row["mean_gap"]
+        for row in gap.rewards
+        if (row["term"], row["condition"]) == ("progress_per_m", "nominal")
+    }
+    assert whole[AFTER] < whole[BEFORE]
+
+
+def test_the_lidar_is_compared_where_the_floor_is_the_twins(gap: Gap, stored: Path) -> None:
+    sectors = [row for row in gap.observations if row["component"].startswith("clearance_")]
+    assert sectors
+    with Store(stored) as store:
+        steps = logged_steps(store)
+        rows = np.flatnonzero(steps.conditions["nominal"])[::20]
+        assert agreement(steps, store, rows, default_warehouse()) < AGREES / 2
+        assert agreement(steps, store, rows, empty_floor()) > 2 * AGREES
+
+
+def test_what_is_rebuilt_from_a_store_is_what_was_logged(stored: Path) -> None:
+    with Store(stored) as store:
+        steps = logged_steps(store)
+        seen, after = observations(store, steps.transition_id, steps.task.observation_size)
+    assert steps.followed.all()  # the ends of episodes are in the files' metadata
+    speed = steps.task.observation_names.index("wheel_speed")
+    np.testing.assert_array_equal(after[:, speed], steps.after["wheel_speed_mps"])
+    np.testing.assert_allclose(
+        sector_clearance(steps.task, seen).min(axis=1),
+        np.minimum(steps.now["clearance_m"], steps.task.range_max_m),
+        atol=1e-5,
+    )
+    goes_on = ~steps.begins[1:]
+    np.testing.assert_array_equal(
+        previous_action(steps.task, seen)[1:][goes_on], steps.action[:-1][goes_on]
+    )
+    plans = rebuild_plans(steps)
+    assert plans.error_m < 0.01
+    rows = np.arange(len(steps))
+    # From the logged poses themselves the rebuilt plans show what the robot saw.
+    route = plans.seen_after(steps, rows, steps.after)
+    np.testing.assert_allclose(route["waypoint_near_x_m"], steps.after["waypoint_near_x_m"])
+    np.testing.assert_allclose(plans.progress_m(steps, rows, steps.after), steps.progress_m)
+
+
+def test_localisation_noise_is_measured_in_the_log(stored: Path) -> None:
+    with Store(stored) as store:
+        noise = measured_noise(logged_steps(store), TRUE)
+    assert 0.5 * TRUE.localisation_noise_m < noise.position_m < 2 * TRUE.localisation_noise_m
+    assert 0.5 < noise.heading_rad / TRUE.localisation_yaw_noise_rad < 2
+
+
+def test_logged_rewards_are_the_sum_of_their_terms(stored: Path) -> None:
+    with Store(stored) as store:
+        steps = logged_steps(store)
+        rows = np.arange(0, len(steps), 5)
+        found = one_step(
+            store, steps, rebuild_plans(steps), rows, {AFTER: TRUE},
+            warehouse=default_warehouse(), timestep_s=0.01, nthread=1,
+        )  # fmt: skip
+    assert found.unexplained == 0
+    assert found.valid.all()
+    np.testing.assert_allclose(sum(found.logged.terms.values()), found.logged.reward, atol=1e-3)
+
+
+def test_a_gap_is_read_back_as_written_and_is_a_page(gap: Gap, tmp_path: Path) -> None:
+    write_gap(gap, tmp_path / "gap")
+    again = read_gap(tmp_path / "gap")
+    assert again.verdicts == gap.verdicts
+    assert again.about == json.loads(json.dumps(gap.about))
+    assert again.paths == gap.paths
+    page = write_gap_page(tmp_path / "gap").read_text()
+    assert "Do not trust the twin in: wheel slip" in page
+    assert "<script" not in page
+    write_gap(gap, tmp_path / "gap")  # a gap measured before is replaced
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "mine.txt").write_text("mine")
+    with pytest.raises(RunError, match="there already"):
+        write_gap(gap, tmp_path / "other")
+    with pytest.raises(RunError, match="no gap"):
+        read_gap(tmp_path / "other")
+
+
+def test_the_same_seed_measures_the_same(gap: Gap, stored: Path) -> None:
+    with Store(stored) as store:
+        again = measure_gap(store, TRUE, replace(PLAN, nthread=2))
+    assert again.paths == gap.paths
+    assert again.rewards == gap.rewards
+
+
+def run(*args: object) -> int:
+    return cli.main(["twin", "gap", *map(str, args)])
+
+
+def test_the_command_line(stored: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    few = ("--most", 24, "--min-segments", 10, "--min-episodes", 3, "--horizons", "3")
+    (tmp_path / "true.toml").write_text('name = "true"\nwheel_radius_scale = 0.96\n')
+    given = (stored, *few, "--perturbation", tmp_path / "true.toml", "--out", tmp_path / "gap")
+    assert run(*given, "--json", "--check") == 1
+    document = json.loads(capsys.readouterr().out)
+    assert document["untrusted"] == ["wheel_slip"]
+    assert document["about"]["twins"]["calibrated"]["wheel_radius_scale"] == 0.96
+    assert (tmp_path / "gap" / "index.html").is_file()
+    assert run(stored, "--horizons", "soon") == 2
+    assert "no seconds" in capsys.readouterr().err
+    assert run(stored, "--horizons", "1") == 2
+    assert "not driven" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not TURTLEBOT.is_dir(), reason=f"{TURTLEBOT.name} is not here")
+def test_turtlebot3_sim_humble(tmp_path: Path) -> None:
+    ingest(TURTLEBOT, load_profile("turtlebot3"), store=StoreWriter(tmp_path))
+    with Store(tmp_path) as store:
+        gap = measure_gap(store)
+    assert {found.verdict for found in gap.verdicts} == {UNKNOWN}  # one episode of half a minute
+    said = " ".join(gap.not_done)
+    for not_there in ("another floor", "no goal and no plan", "their odometry", "no fitted"):
+        assert not_there in said, not_there
+    assert position(gap, "nominal", BEFORE, 1.0)["median"] < 0.02
+    assert not [row for row in gap.observations if row["component"].startswith("clearance_")]
+
+
+# -- statistics and rule ----------------------------------------------------------------------
+
+
+def test_quantiles_count_clusters_not_rows() -> None:
+    rng = np.random.default_rng(0)
+    values = np.repeat(rng.normal(size=12), 50)  # 12 episodes of equal segments
+    cluster = np.repeat(np.arange(12), 50)
+    (together,) = quantiles(values, cluster, [0.5], rng=np.random.default_rng(1))
+    (apart,) = quantiles(values, np.arange(600), [0.5], rng=np.random.default_rng(1))
+    assert together.value == apart.value == np.quantile(values, 0.5, method="inverted_cdf")
+    assert together.high - together.low > 2 * (apart.high - apart.low)
+
+
+def test_one_cluster_has_no_interval() -> None:
+    (median,) = quantiles(
+        np.array([1.0, 2.0, 3.0]), np.full(3, "a"), [0.5], rng=np.random.default_rng(0)
+    )
+    assert median.value == 2.0
+    assert np.isnan(median.low)
+    mean = ratio(np.array([1.0, 3.0]), np.ones(2), np.full(2, "a"), rng=np.random.default_rng(0))
+    assert mean.value == 2.0
+    assert np.isnan(mean.high)
+
+
+def test_an_interval_holds_the_truth_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(3)
+    hits = 0
+    for _ in range(200):
+        effect = rng.normal(size=30)
+        values = (effect[:, None] + 0.1 * rng.normal(size=(30, 5))).reshape(-1)
+        mean = ratio(values, np.ones(150), np.repeat(np.arange(30), 5), rng=rng, resamples=400)
+        hits += mean.low <= 0 <= mean.high
+    assert 0.88 <= hits / 200 <= 0.99
+
+
+GOOD, BAD, OPEN = Estimate(0.1, 0.05, 0.15), Estimate(0.4, 0.3, 0.5), Estimate(0.2, 0.1, 0.3)
+FINE, WORSE = Estimate(0.3, 0.2, 0.4), Estimate(1.5, 1.2, 1.8)
+
+
+@pytest.mark.parametrize(
+    ("position_p90", "reward", "segments", "verdict"),
+    [
+        (GOOD, FINE, 50, TRUSTED),
+        (BAD, FINE, 50, UNTRUSTED),
+        (GOOD, WORSE, 50, UNTRUSTED),
+        (GOOD, NOT_KNOWN, 50, TRUSTED),
+        (OPEN, FINE, 50, UNDECIDED),
+        (OPEN, WORSE, 50, UNTRUSTED),
+        (BAD, WORSE, 19, UNKNOWN),
+    ],
+)
+def test_the_rule(position_p90: Estimate, reward: Estimate, segments: int, verdict: str) -> None:
+    found = judge(
+        "wheel_slip",
+        limits=Limits(),
+        segments=segments,
+        episodes=10,
+        position_p90=position_p90,
+        reward_ratio=reward,
+    )
+    assert found.verdict == verdict
+    assert bool(found.reasons) == (verdict != TRUSTED)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: GapPlan(horizons_s=()),
+        lambda: GapPlan(horizons_s=(1.0,)),
+        lambda: GapPlan(most=0),
+    ],
+)
+def test_plans_that_cannot_be(make: Callable[[], GapPlan]) -> None:
+    with pytest.raises(ConfigError):
+        make()

@@ -1,0 +1,218 @@
+"""Packed columns are the bytes rosbags would have written, and the sinks keep every message."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+from restock.errors import RecordingError
+from restock.train.twin.recording.bag_writer import Format, Message, Topic, recording_sink
+from restock.train.twin.recording.messages import MessageLayout, build, serialise, stamp, typestore
+from restock.train.twin.recording.robot_topics import plan
+
+STAMP_NS = 1_760_000_000_123_456_789
+
+
+def test_packed_odometry_is_what_rosbags_serialises() -> None:
+    shape = build("nav_msgs/msg/Odometry", header={"frame_id": "odom"}, child_frame_id="base_link")
+    rows = MessageLayout.of(shape).pack(
+        {
+            "header.stamp": np.array([STAMP_NS, STAMP_NS + 20_000_000]),
+            "pose.pose.position.x": np.array([1.5, -2.25]),
+            "twist.covariance": np.arange(72.0).reshape(2, 36),
+        },
+        rows=2,
+    )
+    expected = build(
+        "nav_msgs/msg/Odometry",
+        header={"frame_id": "odom", "stamp": stamp(STAMP_NS + 20_000_000)},
+        child_frame_id="base_link",
+        pose={"pose": {"position": {"x": -2.25}}},
+        twist={"covariance": np.arange(36.0, 72.0)},
+    )
+    assert rows[1] == serialise(expected)
+
+
+@given(
+    frame=st.text(st.characters(codec="ascii", exclude_characters="\0"), max_size=9),
+    names=st.lists(st.sampled_from(["a", "left_wheel_joint", "x" * 7]), max_size=3),
+    ranges=st.lists(st.floats(width=32, allow_nan=False), max_size=5),
+)
+@settings(max_examples=60, deadline=None)
+def test_any_shape_packs_as_rosbags_serialises_it(
+    frame: str, names: list[str], ranges: list[float]
+) -> None:
+    """Alignment after strings and sequences of any length, empty ones too."""
+    numbers = np.arange(len(names), dtype=float)
+    for shape, columns in [
+        (
+            build("sensor_msgs/msg/LaserScan", header={"frame_id": frame}, ranges=ranges),
+            {"ranges": np.array([ranges], np.float32)} if ranges else {},
+        ),
+        (
+            build(
+                "sensor_msgs/msg/JointState",
+                header={"frame_id": frame},
+                name=names,
+                velocity=numbers,
+            ),
+            {"velocity": numbers[None]} if names else {},
+        ),
+        (
+            build(
+                "tf2_msgs/msg/TFMessage",
+                transforms=[{"child_frame_id": name} for name in names],
+            ),
+            {f"transforms[{i}].transform.rotation.w": np.ones(1) for i in range(len(names))},
+        ),
+    ]:
+        layout = MessageLayout.of(shape)
+        assert layout.pack(columns, rows=1) == [serialise(shape)]
+        again = typestore().deserialize_cdr(layout.exemplar, layout.type_name)
+        assert serialise(again) == layout.exemplar
+
+
+def test_one_path_fills_every_item_of_a_sequence() -> None:
+    points = np.array([[0.0, 1.0], [2.0, 3.0], [2.0, 4.0]])
+    path = typestore().deserialize_cdr(plan(STAMP_NS, points), "nav_msgs/msg/Path")
+    assert [[p.pose.position.x, p.pose.position.y] for p in path.poses] == points.tolist()
+    assert {(p.header.stamp.sec, p.header.stamp.nanosec) for p in path.poses} == {
+        divmod(STAMP_NS, 10**9)
+    }
+    assert path.poses[1].pose.orientation.z == pytest.approx(np.sin(np.pi / 4))
+
+
+def test_a_column_of_the_wrong_shape_is_refused() -> None:
+    layout = MessageLayout.of(build("sensor_msgs/msg/LaserScan", ranges=np.zeros(4)))
+    with pytest.raises(ValueError, match=r"LaserScan.ranges: \(2, 3\), not \(2, 4\)"):
+        layout.pack({"ranges": np.zeros((2, 3))}, rows=2)
+    with pytest.raises(KeyError, match="range_minimum"):
+        layout.pack({"range_minimum": np.zeros(2)}, rows=2)
+    with pytest.raises(TypeError, match="no field"):
+        build("sensor_msgs/msg/LaserScan", beams=3)
+
+
+TOPICS = [
+    Topic("/text", "std_msgs/msg/String", latched=True),
+    Topic("/pressed", "std_msgs/msg/Bool"),
+]
+
+
+def _write(path: Path, file_format: Format) -> list[Message]:
+    messages = [
+        Message(
+            STAMP_NS + 1_000_000 * i,
+            STAMP_NS + 1_000_000 * i - 400_000,
+            "/text" if i % 3 else "/pressed",
+            serialise(build("std_msgs/msg/String", data=f"message {i}"))
+            if i % 3
+            else serialise(build("std_msgs/msg/Bool", data=i % 2 == 0)),
+        )
+        for i in range(50)
+    ]
+    with recording_sink(path, file_format, TOPICS) as sink:
+        sink.write(messages[:20])
+        sink.write(messages[20:])
+    return messages
+
+
+@pytest.mark.parametrize(("file_format", "name"), [("mcap", "a.mcap"), ("rosbag2", "a")])
+def test_rosbags_reads_back_every_message(tmp_path: Path, file_format: Format, name: str) -> None:
+    written = _write(tmp_path / name, file_format)
+    with AnyReader([tmp_path / name]) as reader:
+        found = [
+            (log_ns, connection.topic, bytes(data))
+            for connection, log_ns, data in reader.messages()
+        ]
+        texts = [
+            reader.deserialize(data, connection.msgtype).data
+            for connection, _, data in reader.messages()
+            if connection.topic == "/text"
+        ]
+        (text,) = (c for c in reader.connections if c.topic == "/text")
+        qos: Any = text.ext.offered_qos_profiles[0]
+    assert found == [(m.log_ns, m.topic, m.data) for m in written]
+    assert texts == [f"message {i}" for i in range(50) if i % 3]
+    assert qos.durability.name == "TRANSIENT_LOCAL"
+
+
+def test_mcap_reads_back_both_times_and_the_definitions(tmp_path: Path) -> None:
+    written = _write(tmp_path / "a.mcap", "mcap")
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        found = [
+            (message.log_time, message.publish_time, channel.topic, message.data)
+            for _, channel, message in reader.iter_messages()
+        ]
+        summary = reader.get_summary()
+    assert found == [(m.log_ns, m.publish_ns, m.topic, m.data) for m in written]
+    assert summary is not None
+    assert {s.name: s.data for s in summary.schemas.values()}["std_msgs/msg/String"] == (
+        b"string data\n"
+    )
+    assert {index.compression for index in summary.chunk_indexes} == {"zstd"}
+
+
+def test_a_bag_carries_its_definitions_and_no_library_version(tmp_path: Path) -> None:
+    _write(tmp_path / "bag", "rosbag2")
+    database = tmp_path / "bag" / "bag.db3"
+    with sqlite3.connect(database) as connection:
+        kept = dict(
+            connection.execute(
+                "SELECT topic_type, encoded_message_definition FROM message_definitions"
+            )
+        )
+        assert connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+    assert set(kept) == {"std_msgs/msg/String", "std_msgs/msg/Bool"}
+    assert int.from_bytes(database.read_bytes()[96:100], "big") == 3_040_000
+
+
+@pytest.mark.parametrize("file_format", ["mcap", "rosbag2"])
+def test_the_same_messages_give_the_same_bytes_elsewhere(
+    tmp_path: Path, file_format: Format
+) -> None:
+    for folder in ("here", "a/longer way/there"):
+        _write(tmp_path / folder / "log", file_format)
+    first, second = (
+        {
+            p.name: p.read_bytes()
+            for p in sorted(
+                (tmp_path / f / "log").rglob("*")
+                if file_format == "rosbag2"
+                else [tmp_path / f / "log"]
+            )
+        }
+        for f in ("here", "a/longer way/there")
+    )
+    assert first == second
+    assert len(first) == (2 if file_format == "rosbag2" else 1)
+
+
+@pytest.mark.parametrize("file_format", ["mcap", "rosbag2"])
+def test_an_interrupted_recording_leaves_nothing(tmp_path: Path, file_format: Format) -> None:
+    def interrupted() -> None:
+        with recording_sink(tmp_path / "log", file_format, TOPICS) as sink:
+            sink.write([Message(1, 1, "/pressed", serialise(build("std_msgs/msg/Bool")))])
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_there_is_never_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "log.mcap").write_text("precious")
+    with (
+        pytest.raises(RecordingError, match=r"log\.mcap: there is something here already"),
+        recording_sink(tmp_path / "log.mcap", "mcap", TOPICS),
+    ):
+        pass
+    assert (tmp_path / "log.mcap").read_text() == "precious"

@@ -1,0 +1,308 @@
+"""The twin's physics against hand physics, within 15 %, and against itself at a finer timestep."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from restock.ingest.profile.profile import load_profile
+from restock.train.twin.floors.layout import default_warehouse
+from restock.train.twin.physics.controller import ACCEL_LIMIT
+from restock.train.twin.physics.episode import Episode, EpisodeSpec, no_pallets
+from restock.train.twin.physics.friction import NO_PATCH, PATCHES, friction_at
+from restock.train.twin.physics.model import (
+    CASTER_RADIUS_M,
+    MOTOR_KV,
+    MOTOR_LIMIT_NM,
+    TRACK_M,
+    WHEEL_RADIUS_M,
+    build_model,
+)
+from restock.train.twin.physics.perturbation import Perturbation
+from restock.train.twin.physics.simulation import BLOCK_S, Simulation
+
+TASK = load_profile("warehouse_amr").task
+GRAVITY = 9.81
+QUIET = {"latency_s": 0.0}
+
+
+@cache
+def simulation(timestep_s: float, num_envs: int = 1) -> Simulation:
+    return Simulation(num_envs, TASK, default_warehouse(), timestep_s, nthread=1)
+
+
+def start(
+    sim: Simulation,
+    pose: tuple[float, float, float],
+    perturbation: Perturbation,
+    *,
+    patches: NDArray[np.float64] | None = None,
+    pallets: NDArray[np.float64] | None = None,
+) -> None:
+    episode = Episode(
+        spec=EpisodeSpec("nominal", 0),
+        start=pose,
+        goal=(1.0, 1.0),
+        plan_m=np.zeros((2, 2)),
+        patches=np.tile(NO_PATCH, (PATCHES, 1)) if patches is None else patches,
+        pallets=no_pallets() if pallets is None else pallets,
+    )
+    sim.reset(0, episode, perturbation)
+
+
+def drive(sim: Simulation, speed: float, yaw_rate: float, seconds: float) -> None:
+    for _ in range(round(seconds / TASK.control_period_s)):
+        sim.drive(np.array([[speed, yaw_rate]]))
+
+
+def wheel_share() -> float:
+    """The share of the robot's weight that the driven wheels carry, standing."""
+    model, _ = build_model(default_warehouse(), TASK.body)
+    data = mujoco.MjData(model)
+    data.qpos[:3] = 6.0, 5.0, 0.1
+    mujoco.mj_step(model, data, 100)
+    force, wheels, total = np.zeros(6), 0.0, 0.0
+    for index in range(data.ncon):
+        mujoco.mj_contactForce(model, data, index, force)
+        total += force[0]
+        if model.geom_size[data.contact[index].geom2, 0] > CASTER_RADIUS_M:
+            wheels += force[0]
+    return wheels / total
+
+
+def mass(sim: Simulation) -> float:
+    """Of the robot without payload, kg."""
+    return float(sim.model.body_subtreemass[sim.handles.chassis_body])
+
+
+def test_the_driven_wheels_carry_most_of_the_load() -> None:
+    assert 0.85 < wheel_share() < 1.0
+
+
+@pytest.mark.parametrize("friction", [0.1, 0.2, 0.3])
+def test_a_stop_on_slippery_floor_takes_what_coulomb_says(friction: float) -> None:
+    # Wheels locked from 1 m/s: v^2 / (2 mu g), with the share of the weight that brakes.
+    sim = simulation(0.01)
+    start(sim, (6.0, 1.0, np.pi / 2), Perturbation(friction_scale=1.0, **QUIET))
+    drive(sim, 1.0, 0.0, 2.0)
+    sim.set_floor_friction(0, friction)
+    before, speed = sim.pose()[0, 1], sim.qvel[0, 1]
+    sim.controller.set_point[0] = 0.0  # a brake, not the base controller's ramp
+    drive(sim, 0.0, 0.0, 3.0)
+    expected = speed**2 / (2 * friction * GRAVITY * wheel_share())
+    assert sim.pose()[0, 1] - before == pytest.approx(expected, rel=0.15)
+    assert abs(sim.qvel[0, 1]) < 0.01
+
+
+@pytest.mark.parametrize("friction", [0.03, 0.06, 0.1])
+def test_acceleration_is_what_friction_gives(friction: float) -> None:
+    sim = simulation(0.01)
+    scale = friction / 0.8
+    floor = Perturbation(friction_scale=max(scale, 0.05), **QUIET)
+    start(sim, (6.0, 1.0, np.pi / 2), floor)
+    sim.set_floor_friction(0, friction)
+    drive(sim, 1.0, 0.0, 0.4)  # wheels spin from here on
+    before = sim.qvel[0, 1]
+    drive(sim, 1.0, 0.0, 0.4)
+    gained = (sim.qvel[0, 1] - before) / 0.4
+    assert gained == pytest.approx(friction * GRAVITY * wheel_share(), rel=0.15)
+
+
+@pytest.mark.parametrize("friction", [0.05, 0.1, 0.2])
+def test_slip_in_the_first_second_is_what_coulomb_leaves(friction: float) -> None:
+    # The wheels follow the ramp of 4 m/s2 to 1 m/s: 1 - 1 / 8 m in a second. The floor gives
+    # a = mu g share: the robot comes a / 2 m far, or 1 - 1 / (2 a) where it reaches 1 m/s.
+    sim = simulation(0.01)
+    start(sim, (6.0, 1.0, np.pi / 2), Perturbation(**QUIET))
+    sim.set_floor_friction(0, friction)
+    drive(sim, 1.0, 0.0, 1.0)
+    rolled = sim.qpos[0, 7:9].mean() * WHEEL_RADIUS_M
+    given = friction * GRAVITY * wheel_share()
+    way = given / 2 if given < 1 else 1 - 1 / (2 * given)
+    expected = 1 - way / (1 - 1 / (2 * ACCEL_LIMIT[0]))
+    assert 1 - (sim.pose()[0, 1] - 1.0) / rolled == pytest.approx(expected, rel=0.15)
+
+
+def test_slip_falls_with_friction() -> None:
+    slips = []
+    for friction in (0.8, 0.4, 0.2, 0.1, 0.05):
+        sim = simulation(0.01)
+        start(sim, (6.0, 1.0, np.pi / 2), Perturbation(**QUIET))
+        sim.set_floor_friction(0, friction)
+        drive(sim, 1.0, 0.0, 1.0)
+        rolled = sim.qpos[0, 7:9].mean() * WHEEL_RADIUS_M
+        slips.append(1 - (sim.pose()[0, 1] - 1.0) / rolled)
+    assert slips[0] < 0.06
+    assert slips == sorted(slips)
+
+
+def test_yaw_under_split_friction_is_what_the_two_forces_turn() -> None:
+    # Both wheels spin: mu N / 2 each, on arms of half a track, turn the robot about its centre.
+    floor, left = 0.1, 0.5
+    sim = simulation(0.01)
+    start(sim, (6.0, 1.0, np.pi / 2), Perturbation(left_friction_scale=left, **QUIET))
+    sim.set_floor_friction(0, floor)
+    drive(sim, 1.0, 0.0, 0.2)
+    before = sim.qvel[0, 5]
+    drive(sim, 1.0, 0.0, 0.2)
+    data = mujoco.MjData(sim.model)
+    mujoco.mj_forward(sim.model, data)
+    inertia = np.zeros((sim.model.nv, sim.model.nv))
+    mujoco.mj_fullM(sim.model, data, inertia)
+    load = mass(sim) * GRAVITY * wheel_share()
+    torque = (floor - left * floor) * load / 2 * TRACK_M / 2
+    assert (sim.qvel[0, 5] - before) / 0.2 == pytest.approx(torque / inertia[5, 5], rel=0.15)
+
+
+def test_split_friction_turns_the_robot_toward_the_gripping_side() -> None:
+    patches = np.tile(NO_PATCH, (PATCHES, 1))
+    patches[0] = (4.0, 5.0, 2.0, 5.0, 0.02)  # west of x = 6: under the left wheel, driving north
+    sim = simulation(0.01)
+    start(sim, (6.0, 2.0, np.pi / 2), Perturbation(**QUIET), patches=patches)
+    drive(sim, 1.0, 0.0, 0.6)
+    assert sim.pose()[0, 2] > np.pi / 2 + 0.05  # the right wheel pulls, so it turns left
+    assert sim.slipped[0]
+
+
+def test_a_blocked_aisle_stops_the_robot_at_the_pallets_face() -> None:
+    pallets = no_pallets()
+    pallets[0] = (4.0, 3.2, 0.0)
+    pallets[1] = (4.0, 4.05, 0.0)
+    sim = simulation(0.01)
+    start(sim, (1.5, 3.63, 0.0), Perturbation(**QUIET), pallets=pallets)
+    drive(sim, 0.4, 0.0, 6.0)
+    face = 4.0 - 0.6 - TASK.body.length_m / 2
+    assert sim.pose()[0, 0] == pytest.approx(face, abs=0.02)
+    assert sim.bumped[0]
+
+
+@pytest.mark.parametrize("payload", [0.0, 60.0, 120.0])
+def test_speed_while_starting_is_what_the_motors_give_the_mass(payload: float) -> None:
+    # Two motors of torque kv (asked - actual), 18 Nm at most, move the mass and the wheels' own
+    # inertia: integrated by hand at .1 ms, on a floor that grips.
+    sim = simulation(0.005)
+    start(sim, (6.0, 1.0, np.pi / 2), Perturbation(payload_kg=payload, timestep_s=0.005, **QUIET))
+    drive(sim, 1.0, 0.0, 0.2)
+    wheel = sim.model.body_inertia[sim.handles.wheel_bodies[0], 1] + sim.model.dof_armature[6]
+    heavy = mass(sim) + payload + 2 * wheel / WHEEL_RADIUS_M**2
+    speed = 0.0
+    for instant in range(2000):
+        asked = min(ACCEL_LIMIT[0] * instant * 1e-4, 1.0) / WHEEL_RADIUS_M
+        torque = min(MOTOR_KV * (asked - speed / WHEEL_RADIUS_M), MOTOR_LIMIT_NM)
+        speed += 1e-4 * 2 * torque / WHEEL_RADIUS_M / heavy
+    assert sim.qvel[0, 1] == pytest.approx(speed, rel=0.15)
+
+
+@pytest.mark.parametrize("rise", [0.05, -0.05])
+def test_a_stop_on_a_slope_is_shorter_uphill_and_longer_downhill(rise: float) -> None:
+    # Locked wheels: v^2 / (2 g (mu share cos + sin)), uphill with a positive sine.
+    friction = 0.2
+    sim = simulation(0.01)
+    start(sim, (6.0, 1.0, np.pi / 2), Perturbation(**QUIET))
+    drive(sim, 1.0, 0.0, 2.0)
+    sim.apply(0, Perturbation(slope_y=rise, **QUIET))
+    sim.set_floor_friction(0, friction)
+    before, speed = sim.pose()[0, 1], sim.qvel[0, 1]
+    sim.controller.set_point[0] = 0.0
+    drive(sim, 0.0, 0.0, 0.4)
+    angle = np.arctan(rise)
+    decelerates = GRAVITY * (friction * wheel_share() * np.cos(angle) + np.sin(angle))
+    took = speed / decelerates
+    way = speed * 0.4 - decelerates * 0.4**2 / 2 if took > 0.4 else speed**2 / (2 * decelerates)
+    assert sim.pose()[0, 1] - before == pytest.approx(way, rel=0.15)
+    sim.apply(0, Perturbation())
+
+
+def test_motors_hold_a_slope_but_for_the_droop_of_a_velocity_loop() -> None:
+    # The weight along the slope needs torque, which kv gives for a speed: m g sin r^2 / 2 kv.
+    sim = simulation(0.01)
+    start(sim, (6.0, 5.0, np.pi / 2), Perturbation(slope_y=0.05, **QUIET))
+    drive(sim, 0.0, 0.0, 1.0)
+    before = sim.pose()[0, 1]
+    drive(sim, 0.0, 0.0, 1.0)
+    weight = mass(sim) * GRAVITY * np.sin(np.arctan(0.05))
+    droop = weight * WHEEL_RADIUS_M**2 / (2 * MOTOR_KV)
+    assert before - sim.pose()[0, 1] == pytest.approx(droop, rel=0.15)
+    sim.apply(0, Perturbation())
+
+
+def test_a_weak_left_motor_turns_left_by_the_difference_of_its_set_point() -> None:
+    # Yaw rate (right - left) / track.
+    sim = simulation(0.01)
+    start(sim, (3.5, 0.9, 0.0), Perturbation(left_gain=0.9, **QUIET))
+    drive(sim, 0.4, 0.0, 1.0)
+    before = sim.pose()[0, 2]
+    drive(sim, 0.4, 0.0, 1.0)
+    assert sim.pose()[0, 2] - before == pytest.approx(0.4 * 0.1 / TRACK_M, rel=0.15)
+
+
+def test_a_smaller_wheel_drives_shorter_by_its_scale() -> None:
+    way = []
+    for scale in (1.0, 0.95):
+        sim = simulation(0.01)
+        start(sim, (6.0, 1.0, np.pi / 2), Perturbation(wheel_radius_scale=scale, **QUIET))
+        drive(sim, 0.4, 0.0, 4.0)
+        way.append(sim.pose()[0, 1] - 1.0)
+    assert way[1] / way[0] == pytest.approx(0.95, abs=0.01)
+
+
+def test_a_wider_track_turns_slower_by_its_scale() -> None:
+    turned = []
+    for scale in (1.0, 1.08):
+        sim = simulation(0.01)
+        start(sim, (6.0, 5.0, 0.0), Perturbation(track_scale=scale, **QUIET))
+        drive(sim, 0.0, 0.6, 1.0)
+        begin = sim.pose()[0, 2]
+        drive(sim, 0.0, 0.6, 2.0)
+        turned.append(sim.pose()[0, 2] - begin)
+    assert turned[0] / turned[1] == pytest.approx(1.08, abs=0.02)
+
+
+def test_a_worn_left_wheel_turns_a_robot_that_brakes_on_a_wet_floor() -> None:
+    sim = simulation(0.01)
+    start(sim, (6.0, 2.0, np.pi / 2), Perturbation(left_friction_scale=0.3, **QUIET))
+    sim.set_floor_friction(0, 0.1)
+    drive(sim, 1.0, 0.0, 0.6)
+    assert sim.pose()[0, 2] > np.pi / 2 + 0.05  # the right wheel pulls harder
+
+
+def test_latency_delays_the_wheels_by_what_it_says() -> None:
+    sim = simulation(0.01)
+    for latency, still in ((0.0, 0), (0.13, 13), (0.3, 30)):
+        start(sim, (6.0, 1.0, np.pi / 2), Perturbation(latency_s=latency))
+        rows = []
+        for _ in range(3):
+            sim.controller.command(np.array([[1.0, 0.0]]))
+            rows += [sim.controller.wheel_speeds(block * BLOCK_S)[0] for block in range(2)]
+        assert int((np.concatenate(rows)[:, 0] == 0).sum()) == still
+
+
+@pytest.mark.parametrize("friction", [0.8, 0.1, 0.03])
+def test_a_slalom_converges_as_the_timestep_shrinks(friction: float) -> None:
+    ends = {}
+    for timestep in (0.01, 0.005, 0.001):
+        sim = simulation(timestep)
+        start(sim, (6.0, 1.0, np.pi / 2), Perturbation(timestep_s=timestep))
+        sim.set_floor_friction(0, friction)
+        for turn in (0.7, -0.7, 0.7, -0.7):
+            drive(sim, 0.8, turn, 1.0)
+        ends[timestep] = sim.pose()[0, :2]
+    gap = {timestep: np.hypot(*(end - ends[0.001])) for timestep, end in ends.items()}
+    assert gap[0.005] < 0.008
+    assert gap[0.01] < 0.015
+    assert gap[0.005] < gap[0.01]
+
+
+def test_friction_is_looked_up_by_place_and_the_slipperiest_patch_counts() -> None:
+    patches = np.array([[[1.0, 1.0, 0.5, 0.5, 0.1], [1.2, 1.0, 0.5, 0.5, 0.05]]])
+    points = np.array([[[0.6, 1.0], [1.0, 1.0], [3.0, 3.0]]])
+    np.testing.assert_allclose(friction_at(points, patches, np.array([0.8])), [[0.1, 0.05, 0.8]])
+
+
+def test_a_block_is_a_tenth_of_a_second() -> None:
+    sim = simulation(0.01)
+    assert sim.substeps * sim.timestep_s == pytest.approx(BLOCK_S)

@@ -1,0 +1,122 @@
+"""Plans on the known map, and blocks found from the lidar alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.floors.layout import default_warehouse
+from restock.train.twin.floors.planner import CELL_M, PLAN_POINTS, BlockFinder, Planner
+from restock.train.twin.physics.episode import EpisodeSpec, draw_episode, length_m
+
+FLOOR = default_warehouse()
+PLANNER = Planner(FLOOR)
+
+
+def test_plans_keep_clear_of_racks_and_end_at_the_goal() -> None:
+    rng = np.random.default_rng(3)
+    for goal in FLOOR.goals[rng.integers(len(FLOOR.goals), size=20)]:
+        area = FLOOR.segments[rng.integers(len(FLOOR.segments))].area
+        plan = PLANNER.plan(*area.center, tuple(goal))
+        assert plan.shape == (PLAN_POINTS, 2)
+        np.testing.assert_allclose(plan[-1], goal)
+        assert np.hypot(*(plan[0] - area.center)) < 2 * CELL_M
+        for x, y in plan:
+            assert not any(rack.contains(x, y, -0.25) for rack in FLOOR.racks)
+
+
+def test_the_points_of_a_plan_are_evenly_spaced() -> None:
+    plan = PLANNER.plan(3.0, 0.9, (8.5, 6.4))
+    step = np.hypot(*np.diff(plan, axis=0).T)
+    assert step.max() < 1.3 * step.min()
+
+
+def test_a_plan_is_not_much_longer_than_the_way_must_be() -> None:
+    # Aisle 1 west to aisle 3 east through the middle cross-aisle: 2.95 + 5.47 + 2.55 by right
+    # angles; cutting corners may save some of it, nothing may add to it.
+    plan = PLANNER.plan(3.0, 0.9, (8.5, 6.37))
+    assert np.hypot(5.5, 5.47) < length_m(plan) < 5.5 + 5.47
+
+
+def test_a_closed_aisle_is_gone_around() -> None:
+    start, goal = (3.0, 0.9), (8.45, 0.9)
+    straight = PLANNER.plan(*start, goal)
+    around = PLANNER.plan(*start, goal, [(1, 1)])  # aisle 1 east, .3 to .6 m into it
+    assert length_m(around) > length_m(straight) + 3.0
+    west = FLOOR.segments[1].area.x_min + 0.45
+    near = (np.abs(around[:, 0] - west) < 0.15) & (around[:, 1] < 1.8)
+    assert not near.any()
+
+
+def test_where_all_ways_seem_closed_the_latest_closure_is_opened_again() -> None:
+    # Both ends of the goal's aisle segment: there is no way in.
+    plan = PLANNER.plan(3.0, 3.6, (8.45, 0.9), [(1, 0), (1, 8)])
+    np.testing.assert_allclose(plan[-1], (8.45, 0.9))
+
+
+def test_a_place_inside_a_rack_plans_from_the_nearest_free_cell() -> None:
+    rack = FLOOR.racks[0]
+    plan = PLANNER.plan(rack.center[0], rack.y_max - 0.1, (8.45, 6.37))
+    assert np.hypot(plan[0, 0] - rack.center[0], plan[0, 1] - rack.y_max) < 0.8
+
+
+def test_the_same_spec_draws_the_same_episode() -> None:
+    for kind in ("nominal", "wheel_slip", "blocked_aisle", "near_collision"):
+        one, two = (draw_episode(EpisodeSpec(kind, 7), FLOOR, Planner(FLOOR)) for _ in range(2))
+        assert one.start == two.start
+        np.testing.assert_array_equal(one.plan_m, two.plan_m)
+        np.testing.assert_array_equal(one.pallets, two.pallets)
+        np.testing.assert_array_equal(one.patches, two.patches)
+
+
+@pytest.mark.parametrize("block", ["partial", "full"])
+def test_the_lidar_finds_full_blocks_and_passes_partial_ones(block: str) -> None:
+    specs = [EpisodeSpec("blocked_aisle", seed) for seed in range(60)]
+    specs = [s for s in specs if draw_episode(s, FLOOR, PLANNER).block == block][:12]
+    found = 0
+    env = WarehouseVectorEnv(len(specs))
+    env.set_episodes(specs)
+    env.reset()
+    driver = _Straight()
+    for _ in range(120):
+        env.step(driver.act(env))
+        found = sum(bool(closures) for closures in env.navigation.closures)
+    if block == "full":
+        assert found >= 0.75 * len(specs)
+    else:
+        assert found == 0
+
+
+class _Straight:
+    """Follows the near waypoint and stops .5 m before anything."""
+
+    def act(self, env: WarehouseVectorEnv) -> np.ndarray:
+        near = np.arctan2(env.signals["waypoint_near_y_m"], env.signals["waypoint_near_x_m"])
+        action = np.where(np.abs(near) > 0.3, np.where(near > 0, 7, 8), 1)
+        stop = (env.signals["clearance_ahead_m"] < 0.5) & (np.abs(near) < 0.3)
+        return np.where(stop, 0, action)
+
+
+def test_a_person_in_the_aisle_is_no_block() -> None:
+    finder = BlockFinder(FLOOR, 1)
+    area = FLOOR.segments[0].area
+    pose = np.array([[area.x_min, area.center[1], 0.0]])
+    around = np.linspace(-0.25, 0.25, 9)
+    hits = np.stack([np.full(9, area.x_min + 1.0), area.center[1] + around], axis=-1)[None]
+    valid = np.ones((1, 9), np.bool_)
+    for _ in range(10):
+        assert not finder.update(np.array([0]), pose, hits, valid, np.array([1.0]))
+
+
+def test_a_wall_of_returns_is_a_block_after_three_looks() -> None:
+    finder = BlockFinder(FLOOR, 1)
+    area = FLOOR.segments[0].area
+    pose = np.array([[area.x_min, area.center[1], 0.0]])
+    across = np.linspace(-0.7, 0.7, 9)
+    hits = np.stack([np.full(9, area.x_min + 1.0), area.center[1] + across], axis=-1)[None]
+    valid = np.ones((1, 9), np.bool_)
+    looks = [finder.update(np.array([0]), pose, hits, valid, np.array([1.0])) for _ in range(3)]
+    assert [bool(found) for found in looks] == [False, False, True]
+    (robot, (segment, _)) = looks[2][0]
+    assert (robot, segment) == (0, 0)

@@ -1,0 +1,196 @@
+"""What a robot would have logged of a drive: rates, three times a message, the policy's view."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from restock.train.twin.recording.bag_writer import Message
+from restock.train.twin.recording.drive import Drive, Lidar, Motion
+from restock.train.twin.recording.messages import typestore
+from restock.train.twin.recording.odometer import Odometer
+from restock.train.twin.recording.publish import LIDAR_LSB_M, Rates, Robot
+from restock.train.twin.recording.robot_topics import TOPICS
+
+START_NS = 1_772_000_000_000_000_000
+TYPES = {topic.name: topic.type_name for topic in TOPICS}
+SECONDS = 4.0
+
+
+def _drive(rng: np.random.Generator) -> Drive:
+    """A left-hand circle of 1 m radius at .5 m/s, bumped at 1.05 s, replanned at 2 s."""
+    time = np.arange(0, SECONDS + 1e-9, 0.01)
+    yaw = 0.5 * time
+    pose = np.stack([np.sin(yaw), 1 - np.cos(yaw), yaw], axis=-1)
+    rate = np.tile([(0.5 - 0.11) / 0.1, (0.5 + 0.11) / 0.1], (len(time), 1))
+    motion = Motion(
+        time_s=time,
+        pose=pose,
+        wheel_angle_rad=rate * time[:, None],
+        wheel_rate_radps=rate,
+        yaw_rate_radps=np.full(len(time), 0.5),
+        accel_mps2=np.tile([0.0, 0.25], (len(time), 1)),
+        bumped=np.isclose(time, 1.05),
+    )
+    tick = np.arange(21) * 0.2
+    noisy = pose[::20] + rng.normal(0, 0.01, (21, 3))
+    stamp = (tick * 1e9).astype(np.int64)
+    return Drive(
+        goal_m=(3.0, 4.0),
+        motion=motion,
+        tick_s=tick,
+        signals={
+            "stamp_ns": stamp,
+            "pose_stamp_ns": stamp,
+            "pose_x_m": noisy[:, 0],
+            "pose_y_m": noisy[:, 1],
+            "pose_yaw_rad": noisy[:, 2],
+            "wheel_speed_mps": 0.5 + rng.normal(0, 0.01, 21),
+            "wheel_yaw_rate_radps": np.full(21, 0.5),
+            "gyro_yaw_rate_radps": np.full(21, 0.48),
+            "accel_x_mps2": np.full(21, 0.1),
+        },
+        scan_s=np.arange(41) * 0.1,
+        ranges_m=rng.uniform(0.3, 9, (41, 90)),
+        command=np.tile([0.5, 0.5], (20, 1)),
+        true_condition=["nominal"] * 20,
+        policy=[("planner", "1", 0.98)] * 12 + [("operator", "1", 0.97)] * 8,
+        plans=[(0, np.zeros((5, 2))), (10, np.ones((7, 2)))],
+    )
+
+
+@pytest.fixture(scope="module")
+def drive() -> Drive:
+    return _drive(np.random.default_rng(4))
+
+
+def _robot() -> Robot:
+    lidar = Lidar(-3.1, 0.07, 0.05, 10.0)
+    return Robot(
+        np.random.default_rng(3), lidar, Rates(), Odometer(wheel_radius_m=0.1, track_m=0.44)
+    )
+
+
+@pytest.fixture(scope="module")
+def messages(drive: Drive) -> list[Message]:
+    return _robot().publish(drive, START_NS)
+
+
+def _decoded(messages: list[Message]) -> dict[str, list[tuple[int, object]]]:
+    found = defaultdict(list)
+    for message in messages:
+        value = typestore().deserialize_cdr(message.data, TYPES[message.topic])
+        found[message.topic].append((message.log_ns, value))
+    return found
+
+
+def _stamps(rows: list[tuple[int, object]]) -> NDArray[np.int64]:
+    return np.array([v.header.stamp.sec * 10**9 + v.header.stamp.nanosec for _, v in rows])
+
+
+def test_every_topic_has_its_rate(messages: list[Message]) -> None:
+    counts = {topic: len(rows) for topic, rows in _decoded(messages).items()}
+    assert counts == {
+        "/goal_pose": 1,
+        "/plan": 4,  # at 0 and 1 s, and anew at 2 and 3 s
+        "/behaviour_policy": 2,  # the start and the handover
+        "/odom": 201,
+        "/imu": 201,
+        "/joint_states": 81,
+        "/scan": 41,
+        "/amcl_pose": 41,
+        "/tf": 81,
+        "/bumper": 43,  # 41 at 10 Hz, pressed and released between
+        "/ground_truth/condition": 21,
+        "/cmd_vel": 21,  # 20 steps and the stop at the end
+        "/diagnostics": 5,
+        "/ground_truth/perturbation": 1,
+        "/ground_truth/markers": 1,
+        "/ground_truth/traffic": 1,
+    }
+
+
+def test_a_message_is_measured_then_sent_then_received(messages: list[Message]) -> None:
+    assert all(m.publish_ns < m.log_ns for m in messages)
+    assert [m.log_ns for m in messages] == sorted(m.log_ns for m in messages)
+    for topic, rows in _decoded(messages).items():
+        if hasattr(rows[0][1], "header"):
+            delay = np.array([log_ns for log_ns, _ in rows]) - _stamps(rows)
+            assert delay.min() > 0, topic
+            assert delay.max() < 11_000_000, topic
+            assert topic == "/goal_pose" or len(set(delay.tolist())) > 1, topic
+
+
+def test_the_last_measurement_before_a_command_is_what_the_policy_saw(
+    drive: Drive, messages: list[Message]
+) -> None:
+    found = _decoded(messages)
+    for tick, (command_ns, _) in enumerate(found["/cmd_vel"]):
+        held = {
+            topic: [value for log_ns, value in found[topic] if log_ns <= command_ns][-1]
+            for topic in ("/odom", "/imu", "/amcl_pose", "/scan")
+        }
+        signal = {name: column[tick] for name, column in drive.signals.items()}
+        assert held["/odom"].twist.twist.linear.x == pytest.approx(signal["wheel_speed_mps"])
+        assert held["/imu"].angular_velocity.z == pytest.approx(
+            signal["gyro_yaw_rate_radps"], abs=1e-3
+        )
+        assert held["/amcl_pose"].pose.pose.position.x == pytest.approx(signal["pose_x_m"])
+        assert held["/amcl_pose"].header.stamp.nanosec == signal["stamp_ns"] % 10**9
+        np.testing.assert_allclose(
+            held["/scan"].ranges, drive.ranges_m[2 * tick], atol=LIDAR_LSB_M / 2 + 1e-6
+        )
+
+
+def test_a_plan_that_another_replaces_is_not_sent_again_at_that_tick(drive: Drive) -> None:
+    # In floating point a plan of 1.2 s, sent every second, is due a last bit before 2.2 s.
+    changed = replace(drive, plans=[(6, np.zeros((5, 2))), (11, np.ones((7, 2)))])
+    found = _decoded(_robot().publish(changed, START_NS))["/plan"]
+    assert [len(value.poses) for _, value in found] == [5, 7, 7]
+
+
+def test_a_bump_between_two_ticks_is_in_their_interval_alone(messages: list[Message]) -> None:
+    found = _decoded(messages)
+    ticks = np.array([log_ns for log_ns, _ in found["/cmd_vel"]])
+    pressed = [log_ns for log_ns, value in found["/bumper"] if value.data]
+    assert np.searchsorted(ticks, pressed).tolist() == [6]  # after tick 5 (1.0 s), before 6
+
+
+def test_odometry_follows_the_wheels_and_tf_leads_to_the_map(
+    drive: Drive, messages: list[Message]
+) -> None:
+    found = _decoded(messages)
+    last = found["/odom"][-1][1].pose.pose.position
+    assert (last.x, last.y) == pytest.approx(drive.motion.pose[-1, :2], abs=5e-3)
+    to_odom, to_base = found["/tf"][-1][1].transforms
+    assert (to_odom.header.frame_id, to_odom.child_frame_id) == ("map", "odom")
+    assert (to_base.header.frame_id, to_base.child_frame_id) == ("odom", "base_link")
+    yaw = 2 * np.arctan2(to_odom.transform.rotation.z, to_odom.transform.rotation.w)
+    x, y = to_base.transform.translation.x, to_base.transform.translation.y
+    in_map = (
+        to_odom.transform.translation.x + np.cos(yaw) * x - np.sin(yaw) * y,
+        to_odom.transform.translation.y + np.sin(yaw) * x + np.cos(yaw) * y,
+    )
+    seen = drive.signals["pose_x_m"][-1], drive.signals["pose_y_m"][-1]
+    assert in_map == pytest.approx(seen, abs=1e-5)
+
+
+def test_the_same_dice_give_the_same_messages(drive: Drive, messages: list[Message]) -> None:
+    assert _robot().publish(drive, START_NS) == messages
+
+
+def test_odometry_goes_on_from_one_mission_to_the_next(drive: Drive) -> None:
+    robot = _robot()
+    first = _decoded(robot.publish(drive, START_NS))
+    second = _decoded(robot.publish(drive, START_NS + 10**10))
+    before, after = first["/odom"][-1][1].pose.pose, second["/odom"][0][1].pose.pose
+    assert (after.position.x, after.position.y) == pytest.approx(
+        (before.position.x, before.position.y), abs=1e-6
+    )
+    assert second["/joint_states"][0][1].position[0] == pytest.approx(
+        first["/joint_states"][-1][1].position[0], abs=2e-3
+    )

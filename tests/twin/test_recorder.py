@@ -1,0 +1,210 @@
+"""The recorder: the same seed gives the same bytes, any policy drives, nothing is half-done."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from support.kept_run import kept_run
+
+from restock import cli
+from restock.errors import ConfigError, ExitCode
+from restock.ingest.pipeline import ingest
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.store.writer import StoreWriter
+from restock.replay.store.store import Store
+from restock.train.twin.recording.missions import BLOCK, FLEET, NATURAL, parse_shares, schedule
+from restock.train.twin.recording.recorder import HARDWARE, Plan, parse_rates, record
+
+
+def test_both_formats_hold_the_same_drive(tmp_path: Path) -> None:
+    tables = []
+    for name, file_format in (("a.mcap", "mcap"), ("a", "rosbag2")):
+        record(tmp_path / name, Plan(format=file_format, missions=1, seed=3))
+        store = tmp_path / f"store_{file_format}"
+        ingest(tmp_path / name, load_profile("warehouse_amr"), store=StoreWriter(store))
+        columns = "observation, action, reward, next_observation, terminated, truncated, stamp_ns"
+        query = (
+            f"SELECT {columns}, condition, behaviour_policy FROM transitions ORDER BY step_index"
+        )
+        tables.append(Store(store).sql(query).to_arrow_table())
+    assert len(tables[0]) > 20
+    assert tables[0].equals(tables[1])
+
+
+@pytest.mark.parametrize("policy", ["planner", "operator"])
+def test_one_driver_alone_can_be_asked_for(tmp_path: Path, policy: str) -> None:
+    summary = record(tmp_path / "log.mcap", Plan(missions=1, seed=3, policy=policy))
+    assert set(summary.policies) == {f"{policy} 1"}
+    assert summary.succeeded["nominal"] == summary.missions["nominal"] == 1
+
+
+@pytest.mark.parametrize("name", ["a.mcap", "a"])
+def test_the_same_seed_gives_the_same_bytes(tmp_path: Path, name: str) -> None:
+    args = ["record", "--missions", "1", "--seed", "3", "--rates", "odom=10,imu=10,scan=5"]
+    for folder in ("first", "second"):
+        assert cli.main([*args, "--out", str(tmp_path / folder / name)]) == ExitCode.OK
+    assert cli.main([*args[:4], "4", "--out", str(tmp_path / "third" / name)]) == ExitCode.OK
+    first, second, third = (
+        {
+            str(file.relative_to(tmp_path / folder)): file.read_bytes()
+            for file in (tmp_path / folder).rglob("*")
+            if file.is_file()
+        }
+        for folder in ("first", "second", "third")
+    )
+    assert first == second
+    assert first != third
+
+
+def test_json_says_what_was_recorded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "bag"
+    code = cli.main(
+        ["record", "--out", str(out), "--minutes", "0.01", "--policy", "random", "--json"]
+    )
+    said = json.loads(capsys.readouterr().out)
+    assert code == ExitCode.OK
+    assert said["format"] == "rosbag2"
+    assert said["policy_steps"].keys() == {"random 1"}
+    assert sorted(file.name for file in out.iterdir()) == ["bag.db3", "metadata.yaml"]
+    with AnyReader([out]) as reader:
+        assert reader.message_count == said["messages"]
+
+
+def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "log.mcap"
+    assert cli.main(["record", "--out", str(out), "--dry-run", "--json"]) == ExitCode.OK
+    said = json.loads(capsys.readouterr().out)
+    assert (said["minutes"], said["format"], said["conditions"]) == (5.0, "mcap", NATURAL)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--conditions", "icy=1"], "'icy' is no kind of mission"),
+        (["--conditions", "nominal=lots"], "'lots' is no share"),
+        (["--conditions", "nominal=0"], "no condition has a share above 0"),
+        (["--rates", "lidar=5"], "no rate named 'lidar'"),
+        (["--rates", "scan=7"], "'7' is no rate"),
+        (["--missions", "0"], "missions must be above 0"),
+        (["--minutes", "1", "--missions", "1"], "exclude each other"),
+        (["--seed", "-1"], "seed must be 0 or more"),
+        (["--policy", "fred"], "there is no policy 'fred'"),
+        (["--policy", "onnx:nowhere.onnx"], "nowhere.onnx: no such file"),
+        (["--policy", "random", "--epsilon", ".1"], "same probability already"),
+        (["--epsilon", "2"], "must be in [0, 1], got 2.0"),
+        (["--perturbation", "fog"], "there is no perturbation 'fog'"),
+        (["--perturbation", "friction", "--exact"], "exclude each other"),
+        (["--layouts", "moon"], "moon"),
+    ],
+)
+def test_a_wrong_value_is_one_clear_message(
+    flags: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = cli.main(["record", "--out", str(tmp_path / "log.mcap"), *flags])
+    captured = capsys.readouterr()
+    assert code == ExitCode.USAGE
+    assert captured.out == ""
+    assert message in captured.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_recording_is_never_overwritten(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "log.mcap").write_text("precious")
+    assert cli.main(["record", "--out", str(tmp_path / "log.mcap")]) == ExitCode.USAGE
+    assert "never overwritten" in capsys.readouterr().err
+    assert (tmp_path / "log.mcap").read_text() == "precious"
+
+
+def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "restock", "record", "--minutes", "600", "--out"]
+    process = subprocess.Popen([*command, str(tmp_path / "log.mcap")], stderr=subprocess.PIPE)
+    deadline = time.monotonic() + 240
+    while not any(file.stat().st_size for file in tmp_path.rglob("log.mcap")):
+        assert time.monotonic() < deadline, "nothing was ever written"
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=240)
+    assert process.returncode == ExitCode.INTERRUPTED
+    assert b"interrupted" in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_missions_come_at_their_shares_and_rare_ones_come_early() -> None:
+    missions = list(islice(schedule(9, NATURAL, "handover", HARDWARE), 10 * BLOCK))
+    kinds = Counter(mission.spec.condition for mission in missions)
+    drivers = Counter(f"{mission.driver} {mission.version}" for mission in missions)
+    for counted, shares in ((kinds, NATURAL), (drivers, FLEET)):
+        assert {k: n / len(missions) for k, n in counted.items()} == pytest.approx(shares, abs=0.01)
+    assert {mission.spec.condition for mission in missions[:BLOCK]} == set(NATURAL)
+    assert len({mission.spec.seed for mission in missions}) == len(missions)
+
+
+def test_flags_from_python() -> None:
+    assert parse_shares("nominal=.5, wheel_slip=.5") == {"nominal": 0.5, "wheel_slip": 0.5}
+    assert parse_rates("odom=20,scan=5").odom == 20
+    assert parse_rates("").imu == 50
+    with pytest.raises(ConfigError, match="give minutes or missions"):
+        Plan()
+
+
+def test_missions_on_other_floors_come_with_their_maps(tmp_path: Path) -> None:
+    plan = Plan(missions=2, seed=3, policy="planner", layouts="generated:train:2")
+    done = record(tmp_path / "log.mcap", plan)
+    with AnyReader([tmp_path / "log.mcap"]) as reader:
+        sizes = [
+            (grid.info.width, grid.info.height)
+            for connection, _, data in reader.messages()
+            if connection.topic == "/map"
+            for grid in [reader.deserialize(data, connection.msgtype)]
+        ]
+    assert len(sizes) == len(set(sizes)) == done.topics["/map"] == 2
+
+
+class _Creeper:
+    """A policy of a user's own."""
+
+    name, version = "creeper", "3"
+
+    def act(self, env: object, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.full(len(observation), 1), np.full(len(observation), self.chance)
+
+    chance = 1.0
+
+
+def test_a_policy_of_your_own_drives_under_its_own_name(tmp_path: Path) -> None:
+    done = record(tmp_path / "log.mcap", Plan(missions=1, seed=3), policy=_Creeper())
+    assert set(done.policies) == {"creeper 3"}
+    unsure = _Creeper()
+    unsure.chance = 0.5
+    with pytest.raises(ConfigError, match="takes chances of its own"):
+        record(tmp_path / "b.mcap", Plan(missions=1, epsilon=0.1), policy=unsure)
+
+
+def test_an_exported_policy_has_the_tag_of_its_run(tmp_path: Path) -> None:
+    pytest.importorskip("onnx")
+    pytest.importorskip("onnxruntime")
+    from restock.train.evaluation.onnx_policy import export_onnx
+    from restock.train.twin.recording.drivers import load_guest
+
+    run = kept_run(tmp_path / "learner")
+    export_onnx(run, tmp_path / "p.onnx")
+    task = load_profile("warehouse_amr").task
+    tags = {
+        (guest.name, guest.version)
+        for name in (f"run:{run}", f"onnx:{tmp_path / 'p.onnx'}")
+        if (guest := load_guest(name, task)) is not None
+    }
+    assert tags == {("dqn", "learner@7")}

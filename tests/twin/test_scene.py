@@ -1,0 +1,176 @@
+"""The scene of a mission as a viewer gets it: markers, parameters, frames, map, and their QoS."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from support.paths import ROOT
+
+from restock.train.twin.physics.model import PARKED_M
+from restock.train.twin.physics.perturbation import Perturbation
+from restock.train.twin.recording.bag_writer import Format
+from restock.train.twin.recording.messages import typestore
+from restock.train.twin.recording.recorder import HARDWARE, Plan, record
+from restock.train.twin.recording.robot_topics import TOPICS
+from restock.train.twin.recording.scene import (
+    EMPTY,
+    MARKERS,
+    PERTURBATION,
+    TRAFFIC,
+    Scene,
+    mission_markers,
+    perturbation_text,
+    traffic_markers,
+)
+
+MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
+LATCHED = {"/tf_static", "/map", "/behaviour_policy", "/amcl_pose", PERTURBATION, MARKERS, TRAFFIC}
+
+
+def _markers(data: bytes) -> list[Any]:
+    return list(typestore().deserialize_cdr(data, MARKER_ARRAY).markers)
+
+
+def _shown(data: bytes) -> list[tuple[str, int]]:
+    return [(marker.ns, marker.id) for marker in _markers(data)[1:]]
+
+
+def test_parameters_are_said_where_they_differ() -> None:
+    assert json.loads(perturbation_text(Perturbation())) == {"name": "nominal", "values": {}}
+    said = json.loads(perturbation_text(Perturbation(name="wet", friction_scale=0.3)))
+    assert said == {"name": "wet", "values": {"friction_scale": 0.3}}
+
+
+def test_a_mission_shows_its_goal_pallets_and_patches_and_nothing_parked() -> None:
+    scene = Scene(
+        pallets=np.array([[2.0, 3.0, np.pi / 2], [*PARKED_M[:2], 0.0]]),
+        patches=np.array([[1.0, 2.0, 0.5, 0.25, 0.03], [1e6, 1e6, 0.0, 0.0, 1.0]]),
+        traffic=EMPTY.traffic,
+        perturbation=Perturbation(),
+        goal_radius_m=0.4,
+        body_m=(0.7, 0.5, 0.3),
+    )
+    found = _markers(mission_markers(5, scene, (4.0, 1.0)))
+    assert [(m.ns, m.id, m.action) for m in found] == [
+        ("", 0, 3),  # deletes what was there
+        ("goal", 0, 0),
+        ("robot", 0, 0),
+        ("pallet", 0, 0),
+        ("patch", 0, 0),
+    ]
+    _, goal, robot, pallet, patch = found
+    assert (goal.pose.position.x, goal.pose.position.y, goal.scale.x) == (4.0, 1.0, 0.8)
+    assert (robot.header.frame_id, robot.frame_locked) == ("base_link", True)
+    assert pallet.pose.orientation.z == pytest.approx(np.sin(np.pi / 4))
+    assert (pallet.pose.position.x, pallet.pose.position.z) == (2.0, pallet.scale.z / 2)
+    assert (patch.scale.x, patch.scale.y) == (1.0, 0.5)
+    assert {m.header.frame_id for m in (goal, pallet, patch)} == {"map"}
+    assert all(m.header.stamp.nanosec == 5 for m in found)
+
+
+def test_traffic_is_the_whole_scene_in_every_message() -> None:
+    away = [*PARKED_M[:2], 0.0]
+    places = np.array(
+        [
+            [away, away, away],
+            [[1.0, 2.0, 0.5], away, away],
+            [[1.5, 2.0, 0.5], away, [3.0, 4.0, 1.0]],
+            [away, away, away],
+        ]
+    )
+    found = traffic_markers(np.arange(4) * 10**9, places)
+    assert [_shown(data) for data in found] == [
+        [],
+        [("person", 0)],
+        [("person", 0), ("forklift", 2)],
+        [],
+    ]
+    assert {_markers(data)[0].action for data in found} == {3}
+    person, forklift = _markers(found[2])[1:]
+    assert (person.pose.position.x, person.header.stamp.sec) == (1.5, 2)
+    assert 2 * np.arctan2(
+        forklift.pose.orientation.z, forklift.pose.orientation.w
+    ) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("file_format", "name"), [("mcap", "a.mcap"), ("rosbag2", "a")])
+def test_a_recording_holds_frames_map_and_scene_as_viewers_expect(
+    tmp_path: Path, file_format: Format, name: str
+) -> None:
+    kinds = {"near_collision": 1.0, "blocked_aisle": 1.0}
+    done = record(tmp_path / name, Plan(format=file_format, missions=2, seed=4, conditions=kinds))
+    found: dict[str, list[Any]] = {topic.name: [] for topic in TOPICS}
+    with AnyReader([tmp_path / name]) as reader:
+        for connection, _, data in reader.messages():
+            found[connection.topic].append(reader.deserialize(data, connection.msgtype))
+        durability = {
+            c.topic: c.ext.offered_qos_profiles[0].durability.name for c in reader.connections
+        }
+    assert {topic for topic, how in durability.items() if how == "TRANSIENT_LOCAL"} == LATCHED
+
+    links = {
+        (link.header.frame_id, link.child_frame_id)
+        for topic in ("/tf", "/tf_static")
+        for message in found[topic]
+        for link in message.transforms
+    }
+    assert links == {
+        ("map", "odom"),
+        ("odom", "base_link"),
+        ("base_link", "laser_link"),
+        ("base_link", "imu_link"),
+    }
+    frames = {child for _, child in links} | {"map"}
+    used = {
+        message.header.frame_id
+        for topic, messages in found.items()
+        for message in messages
+        if hasattr(message, "header") and topic not in ("/diagnostics", "/joint_states")
+    }
+    assert used <= frames
+
+    (grid,) = found["/map"]
+    cells = np.array(grid.data).reshape(grid.info.height, grid.info.width)
+    assert (cells.shape, grid.header.frame_id) == ((102, 122), "map")  # 12 x 10 m and its walls
+    assert set(np.unique(cells)) == {0, 100}
+    assert (cells[0] == 100).all()
+    x, y = (grid.info.origin.position.x, grid.info.origin.position.y)
+    pose = found["/amcl_pose"][0].pose.pose.position
+    row, column = (int((at - low) / grid.info.resolution) for at, low in ((pose.y, y), (pose.x, x)))
+    assert cells[row, column] == 0  # the robot stands where the map is free
+
+    said = [json.loads(message.data) for message in found[PERTURBATION]]
+    assert said == [json.loads(perturbation_text(HARDWARE))] * 2
+    shown = [{marker.ns for marker in message.markers} for message in found[MARKERS]]
+    assert sum("pallet" in names for names in shown) == done.missions["blocked_aisle"] == 1
+    walking = [m for message in found[TRAFFIC] for m in message.markers if m.ns == "person"]
+    assert len({(m.pose.position.x, m.pose.position.y) for m in walking}) > 2
+
+
+def test_the_foxglove_layout_shows_topics_that_recordings_have() -> None:
+    layout = json.loads((ROOT / "docs" / "foxglove.json").read_text())
+    panels = layout["configById"]
+
+    def placed(node: Any) -> list[str]:
+        if isinstance(node, str):
+            return [node]
+        assert node["direction"] in ("row", "column")
+        return placed(node["first"]) + placed(node["second"])
+
+    assert sorted(placed(layout["layout"])) == sorted(panels)
+    fields = [
+        path.get("value") or path["topicPath"]
+        for config in panels.values()
+        for path in [*config.get("paths", []), *([config] if "topicPath" in config else [])]
+    ]
+    topics = {topic.name for topic in TOPICS}
+    shown = set(panels["3D!floor"]["topics"])
+    assert shown <= topics
+    assert {"/map", "/scan", "/plan", MARKERS, TRAFFIC} <= shown
+    assert {field.partition(".")[0] for field in fields} <= topics
+    assert panels["3D!floor"]["fixedFrame"] == "map"

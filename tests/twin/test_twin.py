@@ -1,0 +1,359 @@
+"""The twin's environments: Gymnasium's rules, determinism, state, and the contract."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+
+import restock  # noqa: F401 - registers the environment
+from restock.errors import ConfigError, RunError
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.signals import SIGNALS
+from restock.ingest.task.task import observe, reward, terminated
+from restock.train.twin.env.policies import PlannerFollower
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.physics.episode import KINDS, EpisodeSpec
+from restock.train.twin.physics.perturbation import (
+    PERTURBATIONS,
+    Perturbation,
+    load_perturbation,
+    load_schedule,
+)
+
+
+def roll(env: WarehouseVectorEnv, steps: int, seed: int) -> list[np.ndarray]:
+    """Everything `steps` random steps give, as arrays."""
+    rng = np.random.default_rng(seed)
+    seen = []
+    for action in rng.integers(env.single_action_space.n, size=(steps, env.num_envs)):
+        observation, earned, over, cut, info = env.step(action)
+        seen.append(np.column_stack([observation, earned, over, cut, info["true_pose"]]))
+    return seen
+
+
+@pytest.fixture(scope="module")
+def env() -> Iterator[WarehouseVectorEnv]:
+    made = WarehouseVectorEnv(8, seed=1)
+    yield made
+    made.close()
+
+
+def test_the_single_environment_passes_gymnasiums_checker() -> None:
+    made = gymnasium.make("restock/Warehouse-v0", render_mode="rgb_array")
+    check_env(made.unwrapped)
+
+
+def test_make_vec_gives_the_native_vector_environment() -> None:
+    made = gymnasium.make_vec("restock/Warehouse-v0", num_envs=3, nthread=2)
+    assert isinstance(made.unwrapped, WarehouseVectorEnv)
+    assert made.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    observation, _ = made.reset(seed=3)
+    assert made.observation_space.contains(observation)
+    observation, earned, over, cut, _ = made.step(made.action_space.sample())
+    assert made.observation_space.contains(observation)
+    assert earned.shape == over.shape == cut.shape == (3,)
+
+
+def test_single_and_vector_environment_are_the_same_environment() -> None:
+    single = gymnasium.make("restock/Warehouse-v0").unwrapped
+    vector = WarehouseVectorEnv(1)
+    one, _ = single.reset(seed=11)
+    many, _ = vector.reset(seed=11)
+    np.testing.assert_array_equal(one, many[0])
+    for action in (2, 2, 3, 7, 9):
+        one, earned, *_ = single.step(action)
+        many, earned_too, *_ = vector.step(np.array([action]))
+        np.testing.assert_array_equal(one, many[0])
+        assert earned == earned_too[0]
+
+
+def test_a_seed_gives_the_same_run_whatever_the_threads_or_the_recorder() -> None:
+    runs = []
+    for nthread, record in ((1, False), (2, False), (1, True)):
+        made = WarehouseVectorEnv(6, nthread=nthread)
+        made.reset(seed=5)
+        if record:
+            made.set_block_callback(lambda live: None, 0.02)
+        runs.append(np.array(roll(made, 50, 0)))
+    np.testing.assert_array_equal(runs[0], runs[1])
+    np.testing.assert_array_equal(runs[0], runs[2])
+
+
+def test_an_episode_is_the_same_in_any_place_and_company() -> None:
+    spec = EpisodeSpec("near_collision", 42)
+    alone, among = WarehouseVectorEnv(1), WarehouseVectorEnv(4, seed=9)
+    alone.set_episodes([spec])
+    among.set_episodes([EpisodeSpec("nominal", 1), EpisodeSpec("wheel_slip", 2), spec])
+    alone.reset(seed=0)
+    among.reset(seed=3)
+    for action in (2, 2, 4, 3, 2, 2, 0, 9):
+        one = alone.step(np.array([action]))[0]
+        many = among.step(np.full(4, action))[0]
+        np.testing.assert_array_equal(one[0], many[2])
+
+
+def test_state_continues_bit_for_bit_through_json_and_a_fresh_environment(
+    env: WarehouseVectorEnv,
+) -> None:
+    env.reset(seed=2)
+    env.simulation.apply(0, Perturbation(payload_kg=10.0))  # restored by the episode's own
+    env.reset(seed=2)
+    roll(env, 260, 0)  # across episode ends
+    state = env.get_state()
+    state = {"arrays": state["arrays"], "json": json.loads(json.dumps(state["json"]))}
+    expected = np.array(roll(env, 40, 1))
+    env.set_state(state)
+    np.testing.assert_array_equal(np.array(roll(env, 40, 1)), expected)
+    fresh = WarehouseVectorEnv(8, seed=77)
+    fresh.reset()
+    fresh.set_state(state)
+    np.testing.assert_array_equal(np.array(roll(fresh, 40, 1)), expected)
+
+
+def test_a_state_of_another_environment_is_refused(env: WarehouseVectorEnv) -> None:
+    env.reset(seed=2)
+    with pytest.raises(RunError, match="8 environments"):
+        WarehouseVectorEnv(2).set_state(env.get_state())
+
+
+def test_autoreset_keeps_the_final_observation(env: WarehouseVectorEnv) -> None:
+    env.reset(seed=4)
+    ended = 0
+    for _ in range(env.task.time_limit_steps):
+        before = env.episode_seed.copy()
+        observation, _, over, cut, info = env.step(np.zeros(8, np.int64))
+        done = over | cut
+        if done.any():
+            np.testing.assert_array_equal(info["_final_obs"], done)
+            np.testing.assert_array_equal(info["episode_seed"], before)  # of the one that ended
+            assert (env.episode_seed[done] != before[done]).all()
+            assert (env.steps[done] == 0).all()
+            assert not np.array_equal(info["final_obs"][done], observation[done])
+            ended += int(done.sum())
+    assert ended == 8  # standing still, every episode is cut at the limit
+    assert not over.any()
+
+
+def test_disabled_autoreset_resets_only_the_masked() -> None:
+    made = WarehouseVectorEnv(3, autoreset_mode=AutoresetMode.DISABLED)
+    made.reset(seed=1)
+    for _ in range(5):
+        made.step(np.full(3, 2))
+    made.reset(options={"reset_mask": np.array([False, True, False])})
+    assert made.steps.tolist() == [5, 0, 5]
+
+
+def test_the_environment_fills_every_signal_and_uses_the_tasks_functions(
+    env: WarehouseVectorEnv,
+) -> None:
+    env.reset(seed=6)
+    names = {signal.name for signal in SIGNALS}
+    rng = np.random.default_rng(0)
+    previous = np.zeros(8, np.int64)
+    for _ in range(30):
+        now = {name: column.copy() for name, column in env.signals.items()}
+        assert set(now) == names
+        action = rng.integers(env.single_action_space.n, size=8)
+        observation, earned, over, cut, info = env.step(action)
+        after = info["signals"]
+        assert all(np.isfinite(after[signal.name]).all() for signal in SIGNALS)
+        expected = reward(env.task, now, after, info["progress_m"], action, previous)
+        going = ~(over | cut)
+        np.testing.assert_array_equal(earned, expected)
+        np.testing.assert_array_equal(over, terminated(env.task, after))
+        seen = observe(env.task, after, now, action)
+        np.testing.assert_allclose(observation[going], seen[going], atol=1e-6)
+        np.testing.assert_allclose(after["command_speed_mps"], _speeds(env)[action])
+        previous = np.where(going, action, 0)
+
+
+def _speeds(env: WarehouseVectorEnv) -> np.ndarray:
+    return np.array([speed for speed, _ in env.task.actions])
+
+
+def test_a_new_plan_makes_no_jump_in_progress() -> None:
+    specs = [EpisodeSpec("blocked_aisle", seed) for seed in range(16)]
+    made = WarehouseVectorEnv(16)
+    made.set_episodes(specs)
+    made.reset(seed=0)
+    driver = PlannerFollower(epsilon=0.0)
+    replans, largest = 0, 0.0
+    for _ in range(100):
+        numbers, begun = made.navigation.plan_number.copy(), made.episodes_begun.copy()
+        action, _ = driver.act(made, made.observation)
+        *_, info = made.step(action)
+        again = (made.navigation.plan_number != numbers) & (made.episodes_begun == begun)
+        replans += int(again.sum())
+        largest = max(largest, float(np.abs(info["progress_m"][again]).max(initial=0.0)))
+    assert replans >= 3
+    assert largest < 0.4  # no more than .2 s of driving
+
+
+def test_fixed_episodes_are_numbered_and_then_run_out() -> None:
+    made = WarehouseVectorEnv(2)
+    made.set_episodes([EpisodeSpec("nominal", seed) for seed in range(3)])
+    _, info = made.reset(seed=0)
+    assert info["episode_number"].tolist() == [0, 1]
+    for _ in range(made.task.time_limit_steps):
+        *_, info = made.step(np.zeros(2, np.int64))
+    assert sorted(made.episode_number.tolist()) == [-1, 2]
+
+
+def test_a_blow_up_truncates_the_episode_and_is_counted(
+    env: WarehouseVectorEnv, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    env.reset(seed=8)
+    count = env.blown_up
+    env.simulation.qvel[3, 0] = np.nan
+    before = env.observation.copy()
+    observation, earned, over, cut, info = env.step(np.full(8, 2))
+    assert info["invalid"].tolist() == [index == 3 for index in range(8)]
+    assert cut[3]
+    assert not over[3]
+    assert env.blown_up == count + 1
+    assert np.isfinite(observation).all()
+    assert np.isfinite(earned).all()
+    np.testing.assert_array_equal(info["final_obs"][3], before[3])
+    observation, *_, info = env.step(np.full(8, 2))
+    assert not info["invalid"].any()
+    assert not list(tmp_path.iterdir())  # and no MUJOCO_LOG.TXT where the user stands
+
+
+def test_conditions_come_in_their_shares() -> None:
+    made = WarehouseVectorEnv(200, conditions={"nominal": 0.5, "wheel_slip": 0.5})
+    made.reset(seed=0)
+    share = (made.episode_condition == "wheel_slip").mean()
+    assert set(made.episode_condition) == {"nominal", "wheel_slip"}
+    assert 0.35 < share < 0.65
+
+
+def test_the_true_condition_shows_where_its_cause_is() -> None:
+    seen: dict[str, set[str]] = {}
+    for kind in KINDS:
+        made = WarehouseVectorEnv(12)
+        made.set_episodes([EpisodeSpec(kind, seed) for seed in range(12)])
+        made.reset(seed=0)
+        driver = PlannerFollower(epsilon=0.0)
+        names: set[str] = set()
+        for _ in range(80):
+            fixed = made.episode_number >= 0
+            action, _ = driver.act(made, made.observation)
+            *_, info = made.step(action)
+            names |= set(info["true_condition"][fixed].tolist())
+        seen[kind] = names
+    assert "wheel_slip" in seen["wheel_slip"]
+    assert "wheel_slip" not in seen["nominal"] | seen["blocked_aisle"] | seen["near_collision"]
+    assert "blocked_aisle" in seen["blocked_aisle"]
+    assert "blocked_aisle" not in seen["nominal"] | seen["wheel_slip"] | seen["near_collision"]
+    assert {"near_collision", "recovery"} <= seen["near_collision"]
+
+
+def test_the_block_callback_samples_the_true_motion() -> None:
+    made = WarehouseVectorEnv(2, conditions={"nominal": 1.0})
+    made.reset(seed=3)
+    lives: list[Any] = []
+    made.set_block_callback(lives.append, 0.02)
+    start = made.simulation.pose()
+    for _ in range(5):
+        *_, info = made.step(np.array([1, 1]))
+    assert len(lives) == 5 * 10
+    np.testing.assert_allclose(np.diff([live.time_s[0] for live in lives]), 0.02)
+    travelled = np.sum([live.speed_mps for live in lives], axis=0) * 0.02
+    moved = np.hypot(*(made.simulation.pose() - start)[:, :2].T)
+    np.testing.assert_allclose(travelled, moved, rtol=0.1)
+    np.testing.assert_array_equal(lives[-1].x_m, info["true_pose"][:, 0])
+
+
+@pytest.mark.parametrize("name", sorted(PERTURBATIONS))
+def test_every_shipped_perturbation_drives(name: str) -> None:
+    made = WarehouseVectorEnv(4, perturbation=PERTURBATIONS[name])
+    made.reset(seed=1)
+    for seen in roll(made, 15, 0):
+        assert np.isfinite(seen).all()
+    assert made.blown_up == 0
+
+
+def test_perturbations_can_differ_between_episodes() -> None:
+    made = WarehouseVectorEnv(2)
+    heavy = PERTURBATIONS["payload"]
+    made.set_episodes([EpisodeSpec("nominal", 1), EpisodeSpec("nominal", 1, heavy)])
+    made.reset(seed=0)
+    mass = made.simulation.batch.expand("body_mass")[:, made.simulation.handles.chassis_body]
+    assert mass[1] - mass[0] == pytest.approx(60.0, rel=0.05)
+
+
+def test_a_schedule_draws_a_perturbation_for_every_episode(tmp_path: Path) -> None:
+    path = tmp_path / "fleet.toml"
+    path.write_text('name = "fleet"\n[ranges]\npayload_kg = [0, 50]\nlatency_s = [0.05, 0.2]\n')
+    schedule = load_schedule(path)
+    made = WarehouseVectorEnv(8, perturbation=schedule)
+    _, info = made.reset(seed=4)
+    assert set(info["perturbation"]) == {"fleet"}
+    drawn = [spec.perturbation for spec in made.specs]
+    loads = [item.payload_kg for item in drawn if item is not None]
+    assert len(set(loads)) == 8
+    assert 0 <= min(loads) <= max(loads) <= 50
+    again = WarehouseVectorEnv(8, perturbation=schedule)
+    again.reset(seed=4)
+    assert again.specs == made.specs
+    state = made.get_state()
+    expected = np.array(roll(made, 10, 0))
+    made.set_state(state)
+    np.testing.assert_array_equal(np.array(roll(made, 10, 0)), expected)
+    path.write_text("[ranges]\npayload_kg = [0, 500]\n")
+    with pytest.raises(ConfigError, match=r"payload_kg must rise within \[0.0, 150.0\]"):
+        load_schedule(path)
+
+
+def test_a_perturbation_is_read_from_toml_and_refused_with_its_range(tmp_path: Any) -> None:
+    path = tmp_path / "wet.toml"
+    path.write_text('name = "wet"\nfriction_scale = 0.5\n')
+    assert load_perturbation(path).friction_scale == 0.5
+    path.write_text("friction_scale = 50\n")
+    with pytest.raises(ConfigError, match=r"friction_scale must be in \[0.05, 2.0\], got 50"):
+        load_perturbation(path)
+    path.write_text("fiction = 1\n")
+    with pytest.raises(ConfigError, match="fiction"):
+        load_perturbation(path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"num_envs": 0}, "num_envs must be 1 or more"),
+        ({"conditions": {"ice": 1.0}}, "ice"),
+        ({"conditions": {"nominal": 0.0}}, "not all 0"),
+        ({"perturbation": Perturbation(timestep_s=0.003)}, "does not divide"),
+    ],
+)
+def test_bad_arguments_say_what_to_do(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        WarehouseVectorEnv(**arguments)
+
+
+def test_an_unknown_kind_of_episode_is_refused() -> None:
+    with pytest.raises(ConfigError, match="no such kind of episode: 'fog'"):
+        EpisodeSpec("fog", 1)
+
+
+def test_the_map_is_drawn_with_its_robot() -> None:
+    made = WarehouseVectorEnv(1, render_mode="rgb_array")
+    made.reset(seed=1)
+    (frame,) = made.render()
+    assert frame.shape == (400, 480, 3)
+    x, y, _ = made.simulation.pose()[0]
+    row, column = 400 - 1 - int(y * 40), int(x * 40)
+    assert frame[row, column].tolist() == [240, 130, 30]  # orange, where the robot is
+
+
+def test_the_task_is_the_profiles() -> None:
+    assert WarehouseVectorEnv(1).task == load_profile("warehouse_amr").task

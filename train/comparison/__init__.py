@@ -1,0 +1,1 @@
+"""May two runs be compared, and what went wrong in one."""

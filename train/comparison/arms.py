@@ -1,0 +1,219 @@
+"""The runs of one arm of a comparison: one method, several seeds; and what sets two arms apart.
+
+What is compared is one thing (the mixture, the algorithm or the target rule); all else must be the
+same, or the comparison says nothing about it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from restock.errors import RunError
+from restock.train.comparison.comparability import Feed
+from restock.train.run.run import Run
+
+Treatment = Literal["algorithm", "target", "mixture", "method"]
+Kind = Literal[
+    "algorithm",
+    "target",
+    "feed",
+    "environment",
+    "store",
+    "evaluation",
+    "task",
+    "software",
+    "free",
+]
+
+# What each treatment allows to differ, besides what decides nothing.
+ALLOWED: Mapping[Treatment, frozenset[Kind]] = {
+    "algorithm": frozenset({"algorithm"}),
+    "target": frozenset({"target"}),
+    "mixture": frozenset({"feed", "environment"}),
+    # Off-policy and policy-gradient methods have no replay in common: what is held is the twin,
+    # its conditions, the environment steps and the evaluation.
+    "method": frozenset({"algorithm", "target", "feed"}),
+}
+_KINDS: dict[str, Kind] = {
+    "config.seed": "free",
+    "config.device": "free",
+    "config.threads": "free",
+    "config.record": "free",
+    "config.env.overlap": "free",
+    "config.profile": "task",
+    "config.target": "target",
+    "config.evaluation.off_policy": "free",
+    "config.evaluation": "evaluation",
+    "config.network": "algorithm",
+    "config.loss": "algorithm",
+    "config.optimizer": "algorithm",
+    "config.env.conditions": "environment",
+    "config.env.perturbation": "environment",
+    "config.env.layouts": "environment",
+    "library.replay": "feed",
+    "library.target": "target",
+    "config": "feed",  # replay, schedule, env, epsilon: which rows there are and how often
+    "panel.store": "store",
+    "panel.store_version": "store",
+    "panel.others": "store",
+    "panel.labels_version": "store",
+    "panel.path": "free",
+    "panel": "feed",
+    "task_hash": "task",
+    "labels_version": "task",
+    "profile": "task",
+    "versions": "software",
+}
+_NO_SETTING = frozenset({"format", "created_ns", "target", "seeds"})  # or said in config as well
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A setting in which two arms (or two runs of one) differ."""
+
+    setting: str
+    kind: Kind
+    first: Any
+    second: Any
+
+
+class Arm:
+    """Runs of one method. Raises RunError where they are not, or have not learnt anything."""
+
+    def __init__(self, name: str, paths: Sequence[Path]) -> None:
+        self.name = name
+        self.runs = [Run.open(path) for path in paths]
+        for run in self.runs:
+            if not run.table("fed_episodes").num_rows:
+                raise RunError(
+                    "has no record of the episodes it was fed",
+                    where=str(run.path),
+                    remedy="it made no update yet, or an older Restock wrote it: train it anew",
+                )
+        seen: dict[Path, None] = {}
+        for run in self.runs:
+            if run.path.resolve() in seen:
+                raise RunError("is named twice", where=str(run.path))
+            seen[run.path.resolve()] = None
+            unlike = [
+                difference
+                for difference in differences(self.runs[0], run)
+                if difference.kind not in ("free", "software")
+            ]
+            if unlike:
+                raise RunError(
+                    f"differs from {self.runs[0].path} in {unlike[0].setting}"
+                    f" ({unlike[0].first!r} against {unlike[0].second!r}): the runs of one arm"
+                    " differ in their seed alone",
+                    where=str(run.path),
+                    remedy="name the runs of one method, then --against those of the other",
+                )
+
+    @cached_property
+    def totals(self) -> dict[str, float]:
+        """What a run of this arm did, in the mean: environment steps and updates."""
+        last = [
+            run.table("progress").slice(run.table("progress").num_rows - 1) for run in self.runs
+        ]
+        return {
+            name: float(np.mean([row[name][0].as_py() for row in last]))
+            for name in ("env_steps", "gradient_steps")
+        }
+
+    def fed(self) -> pa.Table:
+        """Draws by run, cell, tenth and episode."""
+        import duckdb
+
+        query = (
+            files("restock.train.comparison").joinpath("fed_mix.sql").read_text(encoding="utf-8")
+        )
+        parts = []
+        with duckdb.connect() as connection:
+            for number, run in enumerate(self.runs):
+                path = str(run.path / "fed_episodes.parquet")
+                table: pa.Table = connection.sql(query, params={"fed": path}).to_arrow_table()
+                runs = pa.array([number] * table.num_rows, pa.int64())
+                parts.append(table.append_column("run", runs))
+        return pa.concat_tables(parts)
+
+
+def feeds(first: Arm, second: Arm) -> tuple[Feed, Feed]:
+    """What two arms were fed, over the cells of both."""
+    tables = first.fed(), second.fed()
+    cells = sorted({name for table in tables for name in table["cell"].unique().to_pylist()})
+    a, b = (_feed(table, cells) for table in tables)
+    return a, b
+
+
+def _feed(table: pa.Table, cells: list[str]) -> Feed:
+    run = np.asarray(table["run"], np.int64)
+    names = table["episode"].to_numpy(zero_copy_only=False).astype(str)
+    fresh = np.asarray(table["source"].to_numpy(zero_copy_only=False) == "fresh")
+    # Every run has its own fresh episode 7; an episode of the logs is the same one in all runs.
+    owner = np.where(fresh, run, -1)
+    _, episode = np.unique(
+        np.char.add(np.char.add(owner.astype(str), "/"), names), return_inverse=True
+    )
+    place = {name: index for index, name in enumerate(cells)}
+    cell = np.array([place[name] for name in table["cell"].to_pylist()], np.int64)
+
+    def column(name: str) -> NDArray[np.float64]:
+        return np.asarray(table[name], np.float64)
+
+    return Feed(
+        cells,
+        cell,
+        np.asarray(table["tenth"], np.int64),
+        episode,
+        run,
+        column("drawn"),
+        column("weight"),
+    )
+
+
+def differences(first: Run, second: Run) -> list[Difference]:
+    """The settings in which two runs differ, each with what kind of difference it is."""
+    a, b = dict(_flat(first.document)), dict(_flat(second.document))
+    if a.get("panel.id") is None or b.get("panel.id") is None:
+        # One was fed no logs at all: that is one difference of the feed, not one of the store.
+        for settings in (a, b):
+            has = settings.get("panel.id") is not None
+            for name in [name for name in settings if name.split(".")[0] == "panel"]:
+                if not (name == "panel.id" and has):
+                    del settings[name]
+    return [
+        Difference(name, kind_of(name), a.get(name), b.get(name))
+        for name in dict.fromkeys([*a, *b])
+        if a.get(name) != b.get(name)
+    ]
+
+
+def kind_of(setting: str) -> Kind:
+    """What kind of difference a setting makes; the longest known prefix decides."""
+    parts = setting.split(".")
+    for length in range(len(parts), 0, -1):
+        if (kind := _KINDS.get(".".join(parts[:length]))) is not None:
+            return kind
+    return "algorithm"
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
+    for key, value in values.items():
+        if not prefix and key in _NO_SETTING:
+            continue
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
+
+
+__all__ = ["ALLOWED", "Arm", "Difference", "Treatment", "differences", "feeds", "kind_of"]

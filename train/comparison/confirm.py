@@ -1,0 +1,70 @@
+"""The experiment that confirms a diagnosis: the same run with one clock swapped.
+
+If the target was at fault, another target rule on the same feed mends it; if the feed was, the same
+target rule on another feed does. What is left unchanged says as much as what changes.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from restock.errors import RunError
+from restock.train.comparison.diagnose import Cause, Diagnosis, diagnose
+from restock.train.dqn.config import as_overrides
+from restock.train.loop import train
+from restock.train.prepare import prepare_new
+from restock.train.run.run import Run
+
+_NOTHING: frozenset[Cause] = frozenset({"HEALTHY", "UNDETERMINED"})
+
+
+def confirm(run: Run, diagnosis: Diagnosis, out: Path) -> dict[str, Any]:
+    """Train again with one thing swapped, to `out`, and diagnose that.
+
+    Returns `changed` (settings), the new run's `cause`, and `confirmed`: True where the cause is
+    gone, False where it stayed, None where the new run does not say.
+
+    Raises:
+        RunError: there is nothing to confirm.
+    """
+    if diagnosis.cause in _NOTHING:
+        raise RunError(
+            f"is {diagnosis.cause}: there is nothing to confirm",
+            where=str(run.path),
+            remedy=diagnosis.experiment,
+        )
+    changed = swapped(run, diagnosis.cause)
+    panel = run.document["panel"]
+    settings = as_overrides(run.document["config"]) + changed
+    prepared = prepare_new(out, Path(panel["path"]) if panel else None, None, settings)
+    session = prepared.open()
+    try:
+        train(session)
+    finally:
+        session.close()
+    after = diagnose([Run.open(out)])
+    still = after.cause in (diagnosis.cause, "BOTH")
+    return {
+        "changed": changed,
+        "run": str(out),
+        "cause": after.cause,
+        "confirmed": None if after.cause == "UNDETERMINED" else not still,
+        "evidence": after.evidence,
+    }
+
+
+def swapped(run: Run, cause: Cause) -> list[str]:
+    """The settings that swap the suspected clock for one that is known to work."""
+    config = run.document["config"]
+    if cause == "DIVERGENCE":
+        return [f"optimizer.learning_rate={min(config['optimizer']['learning_rate'] / 10, 3e-4)}"]
+    if cause in ("TARGET", "BOTH"):
+        return ["target={rule='polyak', tau=0.005}"]
+    # The feed: all conditions that were evaluated, equally often, and fresh rows alone.
+    share = 1 / len(config["env"]["conditions"])
+    names = list(config["env"]["conditions"])
+    return ["replay.logs_share=0.0", *(f"env.conditions.{name}={share:.6g}" for name in names)]
+
+
+__all__ = ["confirm", "swapped"]

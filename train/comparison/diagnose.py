@@ -1,0 +1,342 @@
+"""Buffer failure or target failure: what a critic gets wrong, and where.
+
+A critic fails in two ways that a falling loss cannot tell apart. Its *replay* may lack, outnumber
+or misstate a condition: then it is wrong on fresh steps of that condition and right elsewhere. Or
+its *target* may follow too slowly, not at all, or too fast: then it is wrong everywhere, or its two
+networks disagree. The evaluations' own steps (`held_out`), which no replay has, tell which:
+
+    G_k  |TD| held out / |TD| in replay, in condition k
+    O_k  |TD| held out in k / the median condition's
+    L    mean |Q - Q_target| / mean |Q|
+    S    |TD| with the online network bootstrapping / |TD| with the target network
+
+A network that generalises, or learns few rows by heart, hides what is wrong with its replay from
+all of these. So three figures look at the rows, not at the critic
+(`restock.train.feed.log_fidelity`): how much of replay a condition is, beside how often it is met;
+how many of its logged rows look like it; and whether their next observations follow from them.
+
+Each figure is its median over the last evaluations. The limits are from faults planted in the twin
+(benchmarks/planted_faults.py; the table is in docs/diagnose.md).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from statistics import median
+from typing import Any, Literal
+
+import numpy as np
+
+from restock.errors import RunError
+from restock.train.run.run import Run
+
+Cause = Literal["HEALTHY", "BUFFER", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED"]
+WINDOWS = 3  # the last, that figures are the median of
+_LEAST_ROWS = 20  # held out, for a condition to be judged
+_LEAST_ALIKE = 50  # … for its look to be known
+
+
+@dataclass(frozen=True)
+class Limits:
+    """From where on a figure is a symptom."""
+
+    gap: float = 3.0  # G_k of a condition; O_k where replay has none of it
+    relative: float = 3.0  # and G_k over the median G
+    gap_everywhere: float = 6.0  # the median G: everything is worse held out
+    lag: float = 0.25  # L: the target is far behind
+    no_lag: float = 0.002  # L below this: there is no target network to speak of
+    clock: float = 2.0  # S
+    explained: float = 0.2  # of the targets' variance: a critic below it has learnt nothing
+    supply: float = 0.1  # a condition's share of replay over its share of what driving meets
+    agreement: float = 0.1  # of a condition's logged rows that look like it
+    unexplained: float = 1.0  # of the variance of its next observations: their mean explains more
+    unexplained_relative: float = 1.6  # and over that of the condition with the least
+    quota_met: float = 0.5  # a smaller part of a quota is worth saying beside a gap
+
+
+@dataclass(frozen=True)
+class Symptom:
+    """One condition in one window, or over several."""
+
+    condition: str
+    gap: float | None  # G_k
+    outlier: float  # O_k
+    replay_share: float
+    met_share: float | None  # of the evaluations' steps
+    agreement: float | None  # of its logged rows with its held-out ones
+    unexplained: float | None  # of the variance of its logged rows' next observations
+    quota_met: float | None
+
+    @property
+    def supply(self) -> float | None:
+        """Its share of replay over its share of what driving meets."""
+        return self.replay_share / self.met_share if self.met_share else None
+
+
+@dataclass(frozen=True)
+class Window:
+    """What one evaluation shows, or several."""
+
+    gradient_steps: int
+    symptoms: list[Symptom]
+    gap_median: float
+    lag: float  # L
+    clock: float  # S
+    explained: float | None  # of the targets' variance, the median condition's
+    q_abs_max: float
+    q_bound: float  # the largest value that rewards seen could add up to
+
+    def relative(self, symptom: Symptom) -> float | None:
+        """G_k over the median G: how much worse held out this condition is than the others."""
+        return symptom.gap / max(self.gap_median, 1e-12) if symptom.gap is not None else None
+
+    def bad(self, limits: Limits) -> dict[str, list[str]]:
+        """The conditions whose replay is in doubt, with what is wrong, for people."""
+        follows = [s.unexplained for s in self.symptoms if s.unexplained is not None]
+        least = min(follows, default=0.0)
+        found = {}
+        for symptom in self.symptoms:
+            said = [*self._supply(symptom, limits), *self._rows(symptom, least, limits)]
+            relative = self.relative(symptom)
+            if relative is not None and symptom.gap is not None:
+                if symptom.gap >= limits.gap and relative >= limits.relative:
+                    said.append(
+                        f"held-out |TD| is {symptom.gap:.1f} times that in replay,"
+                        f" {relative:.1f} times the median condition's gap"
+                    )
+            elif symptom.outlier >= limits.gap:
+                said.append(
+                    f"held-out |TD| is {symptom.outlier:.1f} times the median condition's, and"
+                    " replay has none of it"
+                )
+            if said and symptom.quota_met is not None and symptom.quota_met < limits.quota_met:
+                said.append(f"got {symptom.quota_met:.0%} of its quota")
+            if said:
+                found[symptom.condition] = said
+        return found
+
+    def _supply(self, symptom: Symptom, limits: Limits) -> list[str]:
+        if symptom.supply is None:  # a run from before it was kept
+            return [] if symptom.replay_share else ["is not in replay"]
+        if symptom.supply >= limits.supply:
+            return []
+        share, met = symptom.replay_share, symptom.met_share
+        return [f"is {share:.2%} of replay and {met:.1%} of what driving meets"]
+
+    def _rows(self, symptom: Symptom, least: float, limits: Limits) -> list[str]:
+        said = []
+        if symptom.agreement is not None and symptom.agreement < limits.agreement:
+            said.append(
+                f"of its logged rows {symptom.agreement:.0%} look like it: is the label right?"
+            )
+        rest = symptom.unexplained
+        if (
+            rest is not None
+            and rest >= limits.unexplained
+            and rest >= limits.unexplained_relative * least
+        ):
+            said.append(
+                f"its logged rows leave {rest:.0%} of their next observations unexplained"
+                f" (another condition's {least:.0%}): do they belong together?"
+            )
+        return said
+
+    def target(self, limits: Limits) -> bool:
+        """Whether the target is in doubt."""
+        clocks = not limits.no_lag <= self.lag < limits.lag or self.clock >= limits.clock
+        return clocks or self.gap_median >= limits.gap_everywhere
+
+    def diverged(self, limits: Limits) -> bool:
+        """Whether values are beyond what rewards can add up to, or say nothing of their targets."""
+        if not np.isfinite(self.q_abs_max) or self.q_abs_max > self.q_bound:
+            return True
+        # A frozen target can be far from what it is learnt from; then the target is at fault.
+        if self.explained is None or self.target(limits):
+            return False
+        return self.explained < limits.explained
+
+    def cause(self, limits: Limits) -> Cause:
+        """The rule."""
+        if self.diverged(limits):
+            return "DIVERGENCE"
+        bad = self.bad(limits)
+        buffer = 0 < len(bad) <= len(self.symptoms) / 2
+        if self.target(limits):
+            return "BOTH" if buffer else "TARGET"
+        if buffer:
+            return "BUFFER"
+        return "UNDETERMINED" if bad else "HEALTHY"
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The verdict on one or more runs (seeds of one method), with the evidence."""
+
+    cause: Cause
+    runs: list[Cause]  # each run's own
+    figures: list[Window]  # each run's, over its last windows
+    windows: list[list[Window]]  # each run's, in time
+    evidence: list[str]
+    experiment: str  # what would confirm it
+
+
+def diagnose(runs: Sequence[Run], limits: Limits = Limits()) -> Diagnosis:
+    """Diagnose runs of one method, which differ in their seed.
+
+    Raises:
+        RunError: a run has no evaluation after its updates.
+    """
+    windows = [windows_of(run) for run in runs]
+    figures = [over(found[-WINDOWS:]) for found in windows]
+    causes = [_of_run(found, own, limits) for found, own in zip(windows, figures, strict=True)]
+    ((cause, votes), *_) = Counter(causes).most_common()
+    if votes <= len(causes) / 2:
+        cause = "UNDETERMINED"
+    shown = [own for own, said in zip(figures, causes, strict=True) if said == cause] or figures
+    return Diagnosis(
+        cause,
+        causes,
+        figures,
+        windows,
+        _evidence(shown[0], limits),
+        _experiment(cause, shown, limits),
+    )
+
+
+def _of_run(windows: Sequence[Window], figures: Window, limits: Limits) -> Cause:
+    """What the last windows come to; those that do not agree on the target are not forced."""
+    if windows[-1].diverged(limits) and figures.diverged(limits):
+        return "DIVERGENCE"
+    last = windows[-WINDOWS:]
+    if len(last) < WINDOWS or len({window.target(limits) for window in last}) > 1:
+        return "UNDETERMINED"
+    return figures.cause(limits)
+
+
+def over(windows: Sequence[Window]) -> Window:
+    """The median of each figure over windows, of each condition over those in which it was met."""
+
+    def middle(name: str, of: Sequence[Any] = windows) -> Any:
+        known = [value for item in of if (value := getattr(item, name)) is not None]
+        return median(known) if known else None
+
+    conditions = dict.fromkeys(s.condition for window in windows for s in window.symptoms)
+    symptoms = []
+    for condition in conditions:
+        own = [s for window in windows for s in window.symptoms if s.condition == condition]
+        names = [name for name in Symptom.__dataclass_fields__ if name != "condition"]
+        symptoms.append(Symptom(condition, **{name: middle(name, own) for name in names}))
+    gaps = [symptom.gap for symptom in symptoms if symptom.gap is not None]
+    return Window(
+        gradient_steps=windows[-1].gradient_steps,
+        symptoms=symptoms,
+        gap_median=median(gaps) if gaps else 1.0,
+        lag=middle("lag"),
+        clock=middle("clock"),
+        explained=middle("explained"),
+        q_abs_max=windows[-1].q_abs_max,
+        q_bound=windows[-1].q_bound,
+    )
+
+
+def windows_of(run: Run) -> list[Window]:
+    """The windows of a run, one an evaluation that had updates before it."""
+    import duckdb
+
+    query = files("restock.train.comparison").joinpath("diagnose.sql").read_text(encoding="utf-8")
+    with duckdb.connect() as connection:
+        names = ("held_out", "conditions", "strata", "progress")
+        for name in names:  # one that an older run has not is empty
+            connection.register(f"run_{name}", run.table(name))
+        rows = connection.sql(query).to_arrow_table().to_pylist()
+    if not rows:
+        raise RunError(
+            "has no evaluation to diagnose",
+            where=str(run.path),
+            remedy="let it run past an evaluation (evaluation.every_env_steps)",
+        )
+    bound = _value_bound(run)
+    steps = sorted({row["gradient_steps"] for row in rows})
+    return [_window([row for row in rows if row["gradient_steps"] == at], bound) for at in steps]
+
+
+def _window(rows: list[dict[str, Any]], bound: float) -> Window:
+    judged = [row for row in rows if row["held_out_rows"] >= _LEAST_ROWS] or rows
+    middle = median(row["held_out_td"] for row in judged)
+    symptoms = [
+        Symptom(
+            row["condition"],
+            row["held_out_td"] / row["replay_td"] if row["replay_td"] else None,
+            row["held_out_td"] / max(middle, 1e-12),
+            row["replay_share"] or 0.0,
+            row["met_share"],
+            row["agreement"] if row["held_out_rows"] >= _LEAST_ALIKE else None,
+            row["unexplained"],
+            row["quota_met"],
+        )
+        for row in judged
+    ]
+    gaps = [symptom.gap for symptom in symptoms if symptom.gap is not None]
+    weight = sum(row["held_out_rows"] for row in judged)
+    known = [row["explained"] for row in judged if row["explained"] is not None]
+
+    def mean(name: str) -> float:
+        return float(sum(row[name] * row["held_out_rows"] for row in judged) / weight)
+
+    return Window(
+        gradient_steps=rows[0]["gradient_steps"],
+        symptoms=symptoms,
+        gap_median=median(gaps) if gaps else 1.0,
+        lag=max(rows[0]["lag"] or 0.0, mean("held_out_lag")),
+        clock=mean("held_out_td_online") / max(mean("held_out_td"), 1e-12),
+        explained=median(known) if known else None,
+        q_abs_max=rows[0]["q_abs_max"],
+        q_bound=bound,
+    )
+
+
+def _value_bound(run: Run) -> float:
+    """r_max / (1 - gamma), with the largest reward in the audited batches."""
+    rewards = run.table("audit")["reward"].to_numpy()
+    largest = float(np.abs(rewards).max(initial=0.0)) if len(rewards) else 0.0
+    discount = run.document["config"]["loss"]["discount"]
+    return largest / (1 - discount) if largest > 0 else float("inf")
+
+
+def _told(explained: float | None) -> str:
+    return "" if explained is None else f" {explained:.0%} of the targets' variance explained,"
+
+
+def _evidence(window: Window, limits: Limits) -> list[str]:
+    """What a window shows, for people."""
+    said = [
+        f"after {window.gradient_steps:,} updates: median G {window.gap_median:.2f},"
+        f" L {window.lag:.3f}, S {window.clock:.2f},{_told(window.explained)}"
+        f" max |Q| {window.q_abs_max:.3g} of at most {window.q_bound:.3g}"
+    ]
+    for condition, found in window.bad(limits).items():
+        said += [f"{condition}: {what}" for what in found]
+    return said
+
+
+def _experiment(cause: Cause, windows: Sequence[Window], limits: Limits) -> str:
+    named = dict.fromkeys(name for window in windows for name in window.bad(limits))
+    which = ", ".join(named) or "the condition with the largest gap"
+    return {
+        "HEALTHY": "none needed: no figure is past its limit",
+        "BUFFER": f"train again with more or corrected rows of {which} and the same target rule:"
+        " what is said of them must be gone, and nothing else change",
+        "TARGET": "train again with another target rule (target.tau 0.005) on the same panel:"
+        " L and S must fall, or the median G",
+        "BOTH": f"first change the target rule alone, then the rows of {which} alone: one clock"
+        " at a time",
+        "DIVERGENCE": "train again with a lower optimizer.learning_rate, then with a slower"
+        " target: values above what rewards can add up to, or that say nothing, are nobody's data",
+        "UNDETERMINED": "run longer, or more seeds: the last windows or the runs do not agree",
+    }[cause]
+
+
+__all__ = ["Diagnosis", "Limits", "Symptom", "Window", "diagnose", "windows_of"]

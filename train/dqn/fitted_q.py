@@ -1,0 +1,161 @@
+"""Fitted Q evaluation: the value of a policy, learnt from rows that other policies drove.
+
+Le, Voloshin and Yue 2019 (arXiv:1903.08738); the strongest of the direct methods in Voloshin et al.
+2019 (arXiv:1911.06854). Iteration k is a regression on r + gamma E_{a ~ policy} Q_{k-1}(s', a),
+from Q_0 = 0: after K of them Q is the value of the next K steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from restock.train.dqn.network import Network, QNetwork, clone
+
+F32 = NDArray[np.float32]
+_PART = 8192  # rows
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Transitions, in no particular order."""
+
+    observation: F32  # (N, D)
+    action: NDArray[np.int64]  # (N,)
+    reward: F32  # (N,)
+    next_observation: F32  # (N, D)
+    terminated: NDArray[np.bool_]  # (N,)
+
+    def __len__(self) -> int:
+        return len(self.action)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How a model is fitted."""
+
+    iterations: int = 240  # the time limit of the warehouse task, in steps
+    updates: int = 25  # gradient steps an iteration
+    batch_size: int = 256
+    hidden: Sequence[int] = (128, 128)
+    layer_norm: bool = True
+    learning_rate: float = 1e-3  # falls to a tenth over the iterations
+    cloning_updates: int = 1500  # of the behaviour, where its probabilities are not logged
+
+
+def soft_greedy(network: Network, observation: F32, epsilon: float) -> F32:
+    """The probabilities (N, A) of the greedy policy that acts at random with chance `epsilon`.
+
+    A deterministic policy has none for any action but one, so an episode in which the logs did
+    anything else once says nothing about it.
+    """
+    q = values(network, observation)
+    probability = np.full(q.shape, epsilon / q.shape[1], np.float32)
+    probability[np.arange(len(q)), q.argmax(axis=1)] += 1 - epsilon
+    return probability
+
+
+def fitted_q(
+    rows: Rows,
+    next_probability: F32,
+    *,
+    discount: float,
+    bounds: tuple[float, float] | None = None,
+    fit: Fit = Fit(),
+    seed: int = 0,
+) -> QNetwork:
+    """Fit the values of a policy.
+
+    Args:
+        rows: what was seen.
+        next_probability: (N, A) the policy's, of each action in `next_observation`.
+        discount: of one step.
+        bounds: between which every value is known to be.
+        seed: of the network's beginning and of the batches.
+    """
+    actions = next_probability.shape[1]
+    generator = torch.Generator().manual_seed(seed)
+    network = QNetwork(
+        rows.observation.shape[1],
+        actions,
+        hidden=fit.hidden,
+        layer_norm=fit.layer_norm,
+        generator=generator,
+    )
+    observation, following = map(torch.from_numpy, (rows.observation, rows.next_observation))
+    action, reward = torch.from_numpy(rows.action), torch.from_numpy(rows.reward)
+    going_on = torch.from_numpy(discount * ~rows.terminated).float()
+    policy = torch.from_numpy(next_probability)
+    optimizer = torch.optim.Adam(network.parameters(), lr=fit.learning_rate, fused=True)
+    decay = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.1, fit.iterations)
+    before: QNetwork | None = None
+    for _ in range(fit.iterations):
+        for _ in range(fit.updates):
+            some = torch.randint(len(rows), (fit.batch_size,), generator=generator)
+            target = reward[some]
+            if before is not None:
+                with torch.no_grad():
+                    value = (policy[some] * before(following[some])).sum(dim=1)
+                target = target + going_on[some] * value
+            if bounds is not None:
+                target = target.clamp(*bounds)
+            q = network(observation[some]).gather(1, action[some, None])[:, 0]
+            _descend(optimizer, nn.functional.smooth_l1_loss(q, target))
+        decay.step()
+        before = clone(network)
+    return network
+
+
+def cloned_behaviour(
+    observation: F32,
+    action: NDArray[np.int64],
+    actions: int,
+    *,
+    fit: Fit = Fit(),
+    seed: int = 0,
+) -> QNetwork:
+    """Behaviour cloning: a network whose softmax is the chance of each action in the logs.
+
+    For logs that do not say with which probability they acted. Weights from it are estimates.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    network = QNetwork(
+        observation.shape[1], actions, hidden=fit.hidden, layer_norm=fit.layer_norm,
+        generator=generator,
+    )  # fmt: skip
+    seen, taken = torch.from_numpy(observation), torch.from_numpy(action)
+    optimizer = torch.optim.Adam(network.parameters(), lr=fit.learning_rate, fused=True)
+    for _ in range(fit.cloning_updates):
+        some = torch.randint(len(taken), (fit.batch_size,), generator=generator)
+        _descend(optimizer, nn.functional.cross_entropy(network(seen[some]), taken[some]))
+    return network
+
+
+def chances(clone: QNetwork, observation: F32) -> NDArray[np.float64]:
+    """The chance of each action (N, A) under a cloned behaviour."""
+    logits = values(clone, observation)
+    chance = np.exp(logits - logits.max(axis=1, keepdims=True))
+    return np.asarray(chance / chance.sum(axis=1, keepdims=True), np.float64)
+
+
+@torch.no_grad()
+def values(network: nn.Module, observation: F32) -> NDArray[np.float64]:
+    """Action values (N, A), a part at a time: bounds memory."""
+    starts = range(0, max(len(observation), 1), _PART)
+    parts = [network(torch.from_numpy(observation[at : at + _PART])) for at in starts]
+    return np.asarray(torch.cat(parts).double().numpy())
+
+
+def _descend(optimizer: Any, loss: Tensor) -> None:
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()  # type: ignore[no-untyped-call]
+    optimizer.step()
+
+
+__all__ = ["Fit", "Rows", "chances", "cloned_behaviour", "fitted_q", "soft_greedy", "values"]

@@ -1,0 +1,345 @@
+"""One update: a batch of packed rows to a loss, a step of Adam, a tick of the target's clock."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from restock.errors import ConfigError
+from restock.train.dqn.config import LossConfig, TrainConfig
+from restock.train.dqn.flat_parameters import FlatParameters
+from restock.train.dqn.loss import (
+    Loss,
+    conservative_penalty,
+    dqn_loss,
+    margin_penalty,
+    mean_loss,
+    munchausen_target,
+    quantile_loss,
+    quantile_target,
+    td_target,
+)
+from restock.train.dqn.loss_gradient import conservative_gradient, dqn_gradient, margin_gradient
+from restock.train.dqn.manual_backprop import Kernel, UpdatePath, update_path
+from restock.train.dqn.network import Network, clone, make_network
+from restock.train.dqn.target import TargetUpdate
+
+_MOMENTS = ("exp_avg", "exp_avg_sq")  # of Adam, as PyTorch names them
+
+
+@dataclass(frozen=True)
+class _Terms:
+    """What `Learner.update` was given beside the rows."""
+
+    weight: Tensor | None
+    logged: int
+    conservative: float
+    return_to_go: Tensor | None
+    expert: Tensor | None
+
+
+class Learner:
+    """The online network, its target, its optimizer and how many updates they have seen.
+
+    Batches are packed rows (B, 2D + 3) float32 as `restock.replay.mixture.packed_row` says:
+    `[observation | next_observation | action | reward | discount]`.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        observation_size: int,
+        actions: int,
+        *,
+        path: UpdatePath | None = None,
+    ) -> None:
+        """`path` None takes the fastest that the config allows; both agree but for rounding."""
+        self.device = open_device(config.device)
+        self.loss: LossConfig = config.loss
+        self.max_grad_norm = config.optimizer.max_grad_norm
+        self.network: Network = make_network(
+            config.network,
+            observation_size,
+            actions,
+            generator=torch.Generator().manual_seed(config.seed),
+        ).to(self.device)
+        self.target_network = clone(self.network)
+        self.policy_network = clone(self.network)
+        self._flat = FlatParameters(self.network, learns=True)
+        self._policy = FlatParameters(self.policy_network, learns=False).values
+        slow = FlatParameters(self.target_network, learns=False).values
+        self.target = TargetUpdate(config.target, [self._flat.values], [slow])
+        self.averaging = config.evaluation.averaging
+        self.optimizer = torch.optim.Adam(
+            [self._flat.values], lr=config.optimizer.learning_rate, fused=True
+        )
+        self.path = path or update_path(config.network, config.device)
+        self._kernel = Kernel(self.network) if self.path == "kernel" else None
+        self._target_kernel = Kernel(self.target_network) if self.path == "kernel" else None
+        self.gradient_steps = 0
+
+    def update(
+        self,
+        rows: Tensor,
+        *,
+        weight: Tensor | None = None,
+        logged: int = 0,
+        conservative: float = 0.0,
+        return_to_go: Tensor | None = None,
+        expert: Tensor | None = None,
+    ) -> Loss:
+        """One gradient step on `rows`; the target's clock is ticked by `self.target` afterwards.
+
+        Args:
+            rows: (B, 2D + 3) float32, on the learner's device.
+            weight: (B,) importance weights, or None for ones.
+            logged: how many of the first rows are from logs; the conservative term sees only those.
+            conservative: the weight of that term.
+            return_to_go: (logged,) what the logs got from each of them on, for Cal-QL.
+            expert: (logged,) bool, whether the margin term applies, or None: to none.
+        """
+        terms = _Terms(weight, logged, conservative if logged else 0.0, return_to_go, expert)
+        if self._kernel is not None and self._target_kernel is not None:
+            loss = self._by_hand(self._kernel, self._target_kernel, rows, terms)
+        else:
+            loss = self._by_autograd(rows, terms)
+        if self.max_grad_norm is not None:
+            torch.nn.utils.clip_grad_norm_([self._flat.values], self.max_grad_norm)
+        self.optimizer.step()
+        self.gradient_steps += 1
+        self._average()
+        return loss
+
+    def _by_autograd(self, rows: Tensor, terms: _Terms) -> Loss:
+        """Fill the gradient from a graph: any network."""
+        observation, next_observation, action, reward, discount = unpack(
+            rows, self.network.observation_size
+        )
+        target = self._target(observation, next_observation, action, reward, discount)
+        logged, share = terms.logged, terms.logged / len(rows)
+        losses, penalties = [], []
+        for member in self.network.members:
+            if member.quantiles:
+                spread = member.distribution(observation)
+                q = spread.mean(dim=2)
+                loss = quantile_loss(
+                    spread, action, target, weight=terms.weight, huber_delta=self.loss.huber_delta
+                )
+            else:
+                q = member(observation)
+                loss = dqn_loss(
+                    q, action, target, weight=terms.weight, huber_delta=self.loss.huber_delta
+                )
+            losses.append(loss)
+            if terms.conservative > 0:
+                term = conservative_penalty(q[:logged], action[:logged], terms.return_to_go)
+                penalties.append(terms.conservative * term * share)
+            if terms.expert is not None:
+                term = margin_penalty(
+                    q[:logged], action[:logged], terms.expert, self.loss.margin_size
+                )
+                penalties.append(self.loss.margin * term * share)
+        loss = mean_loss(losses)
+        value = loss.value
+        if penalties:
+            value = value + torch.stack(penalties).sum() / len(losses)
+        self._flat.gradient.zero_()
+        value.backward()  # type: ignore[no-untyped-call]
+        return loss
+
+    @torch.no_grad()
+    def _by_hand(self, online: Kernel, slow: Kernel, rows: Tensor, terms: _Terms) -> Loss:
+        """Fill the gradient by the kernel: the plain network, with every term of the loss."""
+        observation, next_observation, action, reward, discount = unpack(
+            rows, self.network.observation_size
+        )
+        settings, logged = self.loss, terms.logged
+        if settings.munchausen:
+            (q,) = online.forward(observation)
+            slow_q, slow_next_q = slow.forward(observation, next_observation)
+            target = munchausen_target(
+                reward,
+                discount,
+                action,
+                slow_q,
+                slow_next_q,
+                scale=settings.munchausen,
+                temperature=settings.munchausen_temperature,
+                floor=settings.munchausen_floor,
+            )
+        elif settings.double:  # s and s' through the online network together
+            q, next_q = online.forward(observation, next_observation)
+            (slow_q,) = slow.forward(next_observation)
+            target = td_target(reward, discount, slow_q, next_q)
+        else:
+            (q,) = online.forward(observation)
+            (slow_q,) = slow.forward(next_observation)
+            target = td_target(reward, discount, slow_q)
+        loss = dqn_loss(q, action, target, weight=terms.weight, huber_delta=settings.huber_delta)
+        gradient = dqn_gradient(
+            loss.td, action, q.shape[1], weight=terms.weight, huber_delta=settings.huber_delta
+        )
+        share = logged / len(rows)
+        if terms.conservative > 0:
+            term = conservative_gradient(q[:logged], action[:logged], terms.return_to_go)
+            gradient[:logged].add_(term, alpha=terms.conservative * share)
+        if terms.expert is not None:
+            term = margin_gradient(q[:logged], action[:logged], terms.expert, settings.margin_size)
+            gradient[:logged].add_(term, alpha=settings.margin * share)
+        online.backward(gradient)
+        return loss
+
+    @torch.no_grad()
+    def _target(
+        self,
+        observation: Tensor,
+        next_observation: Tensor,
+        action: Tensor,
+        reward: Tensor,
+        discount: Tensor,
+        *,
+        slow: Network | None = None,
+    ) -> Tensor:
+        """What Q(s, a) should be: (B,), or its quantiles (B, N)."""
+        slow = slow or self.target_network
+        if self.loss.munchausen:
+            return munchausen_target(
+                reward,
+                discount,
+                action,
+                slow(observation),
+                slow(next_observation),
+                scale=self.loss.munchausen,
+                temperature=self.loss.munchausen_temperature,
+                floor=self.loss.munchausen_floor,
+            )
+        next_q = self.network(next_observation) if self.loss.double else None
+        if self.network.quantiles:
+            return quantile_target(
+                reward,
+                discount,
+                [member.distribution(next_observation) for member in slow.members],
+                next_q,
+            )
+        targets = [
+            td_target(reward, discount, member(next_observation), next_q) for member in slow.members
+        ]
+        return targets[0] if len(targets) == 1 else torch.stack(targets).amin(dim=0)
+
+    @torch.no_grad()
+    def _average(self) -> None:
+        """`policy_network`, the one that is evaluated and kept, follows as an average of weights.
+
+        The greedy policy of a single update is noisy: a small change of values turns over many
+        actions at once. The average over the last 1 / averaging updates is not (Polyak and
+        Juditsky 1992). Until there are as many, it is the mean of all of them.
+        """
+        rate = max(self.averaging, 1.0 / self.gradient_steps)
+        self._policy.lerp_(self._flat.values, rate)
+
+    @torch.no_grad()
+    def td_error(self, rows: Tensor, *, online: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+        """Of rows, without learning: Q(s, a) - y (B,), Q(s) (B, A), Q_target(s) (B, A).
+
+        `online` lets the online network bootstrap y, as if the target's clock did not lag.
+        """
+        observation, next_observation, action, reward, discount = unpack(
+            rows, self.network.observation_size
+        )
+        target = self._target(
+            observation,
+            next_observation,
+            action,
+            reward,
+            discount,
+            slow=self.network if online else None,
+        )
+        q: Tensor = self.network(observation)
+        value = target.mean(dim=1) if target.ndim == 2 else target
+        return dqn_loss(q, action, value).td, q, self.target_network(observation)
+
+    def greedy(self, observation: NDArray[np.float32]) -> NDArray[np.int64]:
+        """The best action (N,) of each observation (N, D)."""
+        return greedy_actions(self.network, observation)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Tensors and JSON values, for a checkpoint."""
+        return {
+            "network": dict(self.network.state_dict()),
+            "target_network": dict(self.target_network.state_dict()),
+            "policy_network": dict(self.policy_network.state_dict()),
+            "optimizer": self._optimizer_state(),
+            "gradient_steps": self.gradient_steps,
+            "last_sync": self.target.last_sync,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Puts the learner where `state_dict` found it."""
+        self.network.load_state_dict(state["network"])
+        self.target_network.load_state_dict(state["target_network"])
+        self.policy_network.load_state_dict(state["policy_network"])
+        self._load_optimizer_state(state["optimizer"])
+        self.gradient_steps = int(state["gradient_steps"])
+        self.target.last_sync = int(state["last_sync"])
+
+    def _optimizer_state(self) -> dict[str, dict[str, Tensor]]:
+        """Adam's moments a parameter, in the network's order, as if each were its own."""
+        if not (state := self.optimizer.state[self._flat.values]):
+            return {}
+        moments = zip(*(self._flat.views(state[name]) for name in _MOMENTS), strict=True)
+        return {
+            str(index): {"step": state["step"], **dict(zip(_MOMENTS, pair, strict=True))}
+            for index, pair in enumerate(moments)
+        }
+
+    def _load_optimizer_state(self, entries: Mapping[str, Mapping[str, Tensor]]) -> None:
+        self.optimizer.state.clear()
+        if not entries:
+            return
+        state = self.optimizer.state[self._flat.values]
+        ordered = [entries[str(index)] for index in range(len(entries))]
+        state["step"] = ordered[0]["step"].to(self.device, copy=True)
+        for name in _MOMENTS:
+            state[name] = self._flat.flat_of([entry[name] for entry in ordered])
+
+
+def unpack(rows: Tensor, observation_size: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Packed rows to observation, next observation, action (int64), reward and discount."""
+    size = observation_size
+    return (
+        rows[:, :size],
+        rows[:, size : 2 * size],
+        rows[:, 2 * size].long(),
+        rows[:, 2 * size + 1],
+        rows[:, 2 * size + 2],
+    )
+
+
+@torch.inference_mode()
+def greedy_actions(network: Network, observation: NDArray[np.float32]) -> NDArray[np.int64]:
+    """The best action (N,) of each observation (N, D), on the network's device."""
+    device = next(network.parameters()).device
+    values = network(torch.from_numpy(np.ascontiguousarray(observation)).to(device))
+    best: NDArray[np.int64] = values.argmax(dim=1).cpu().numpy()
+    return best
+
+
+def open_device(name: str) -> torch.device:
+    """The device, checked.
+
+    Raises:
+        ConfigError: `cuda` where this PyTorch sees none.
+    """
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ConfigError(
+            f"this PyTorch ({torch.__version__}) sees no CUDA device",
+            where="--device cuda",
+            remedy="use --device cpu, or install a CUDA build of torch on a machine with a GPU",
+        )
+    return torch.device(name)

@@ -1,0 +1,143 @@
+"""The Q network forward and backward, written out: what autograd would do, with less around it.
+
+One pass over several inputs at once fills buffers that are kept from update to update; the
+backward pass reads them and writes every parameter's gradient where the optimizer looks for it.
+Per layer, with x the layer's input (B, I), z = x W^T + b and g the gradient that comes in:
+
+    h = relu(layer_norm(z))                     forward
+    g = g * [h > 0]                             backward: ReLU,
+    g, dgamma, dbeta = layer_norm'(g, z)        LayerNorm (arXiv:1607.06450),
+    dW = g^T x,  db = sum_i g_i,  g = g W       and the product
+
+`tests/train/test_kernel.py` compares it with autograd in double precision. It does the plain
+network alone: dueling heads, quantiles and ensembles keep to autograd, as CUDA does.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from restock.train.dqn.config import NetworkConfig
+from restock.train.dqn.network import Network, QNetwork
+
+UpdatePath = Literal["kernel", "autograd"]
+
+
+def update_path(network: NetworkConfig, device: str) -> UpdatePath:
+    """Which way a run's gradients are made; `config.json` says it as `update_path`."""
+    plain = not network.dueling and not network.quantiles and network.ensemble == 1
+    return "kernel" if plain and torch.device(device).type == "cpu" else "autograd"
+
+
+class _Affine:
+    """The tensors of a Linear or a LayerNorm: weight, bias, and where their gradients go."""
+
+    def __init__(self, module: nn.Linear | nn.LayerNorm) -> None:
+        self.weight, self.bias = module.weight.detach(), module.bias.detach()
+        self.weight_gradient, self.bias_gradient = module.weight.grad, module.bias.grad
+
+
+class _Layer:
+    """A hidden layer, and what its last forward pass left for the backward one."""
+
+    def __init__(self, linear: nn.Linear) -> None:
+        self.linear = _Affine(linear)
+        self.norm: _Affine | None = None
+        self.shape, self.eps = (linear.out_features,), 0.0  # of the norm
+        none = self.linear.weight.new_empty(0)
+        self.before = self.after = none  # (n, H) z and h
+        self.mean = self.inverse_deviation = none  # (n, 1) of z
+
+
+class Kernel:
+    """A plain `QNetwork`, evaluated and, where its parameters have gradients, differentiated.
+
+    Made after `FlatParameters`: it keeps hold of the parameters and gradients that it finds.
+
+    Raises:
+        TypeError: a network that it does not do.
+    """
+
+    def __init__(self, network: Network) -> None:
+        if not isinstance(network, QNetwork) or network.value is not None or network.quantiles:
+            raise TypeError("the kernel does a plain QNetwork alone")
+        self._head = _Affine(network.advantage)
+        self._layers: list[_Layer] = []
+        for module in network.body:
+            if isinstance(module, nn.Linear):
+                self._layers.append(_Layer(module))
+            elif isinstance(module, nn.LayerNorm):
+                self._layers[-1].norm, self._layers[-1].eps = _Affine(module), module.eps
+        self._input = self._head.weight.new_empty(0, network.observation_size)  # (B, D), the first
+        self._rows = 0
+
+    @torch.no_grad()
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Action values (B, A) of each of the inputs (B, D), all of one length, in one pass."""
+        self._input, count = inputs[0], len(inputs[0])
+        if self._rows != count * len(inputs):
+            self._allocate(count * len(inputs))
+        hidden = self._input
+        for index, layer in enumerate(self._layers):
+            weight, bias, out = layer.linear.weight.t(), layer.linear.bias, layer.before
+            if index:
+                torch.addmm(bias, hidden, weight, out=out)
+            else:  # the inputs lie apart in their rows: each fills its part
+                for each, part in zip(inputs, out.chunk(len(inputs)), strict=True):
+                    torch.addmm(bias, each, weight, out=part)
+            hidden = out
+            if (norm := layer.norm) is not None:
+                hidden, layer.mean, layer.inverse_deviation = torch.native_layer_norm(
+                    out, layer.shape, norm.weight, norm.bias, layer.eps
+                )
+            layer.after = hidden.relu_()
+        return torch.addmm(self._head.bias, hidden, self._head.weight.t()).chunk(len(inputs))
+
+    @torch.no_grad()
+    def backward(self, gradient: Tensor) -> None:
+        """Fill every parameter's `grad` from that of the first input's action values, (B, A)."""
+        count = len(self._input)
+        _fill(self._head, gradient, self._layers[-1].after[:count])
+        down = torch.mm(gradient, self._head.weight)
+        for index in range(len(self._layers) - 1, -1, -1):
+            layer = self._layers[index]
+            torch.ops.aten.threshold_backward.grad_input(
+                down, layer.after[:count], 0, grad_input=down
+            )
+            if (norm := layer.norm) is not None:
+                down, weight, bias = torch.ops.aten.native_layer_norm_backward(
+                    down,
+                    layer.before[:count],
+                    layer.shape,
+                    layer.mean[:count],
+                    layer.inverse_deviation[:count],
+                    norm.weight,
+                    norm.bias,
+                    [True, True, True],
+                )
+                _there(norm.weight_gradient).copy_(weight)
+                _there(norm.bias_gradient).copy_(bias)
+            below = self._layers[index - 1].after[:count] if index else self._input
+            _fill(layer.linear, down, below)
+            if index:
+                down = torch.mm(down, layer.linear.weight)
+
+    def _allocate(self, rows: int) -> None:
+        self._rows = rows
+        for layer in self._layers:
+            layer.before = layer.linear.weight.new_empty(rows, *layer.shape)
+
+
+def _fill(affine: _Affine, gradient: Tensor, given: Tensor) -> None:
+    """The gradients of a Linear from that of its output (B, O) and its input (B, I)."""
+    torch.mm(gradient.t(), given, out=_there(affine.weight_gradient))
+    torch.sum(gradient, 0, out=_there(affine.bias_gradient))
+
+
+def _there(gradient: Tensor | None) -> Tensor:
+    if gradient is None:
+        raise RuntimeError("this network does not learn: its parameters have no gradients")
+    return gradient

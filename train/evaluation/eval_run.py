@@ -1,0 +1,289 @@
+"""Evaluating a finished run: its kept policy beside the planner and chance, on the same episodes.
+
+Every policy drives the same seeded episodes, clean and under each perturbation; blocked aisles are
+told apart by how much of the aisle is blocked. Seeds are apart from those that training drew its
+episodes from and from those that chose the checkpoint.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pyarrow as pa
+
+from restock.errors import ConfigError, RunError
+from restock.files import write_table
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.task import Task
+from restock.train.dqn import checkpoint
+from restock.train.dqn.config import TrainConfig, parse_config
+from restock.train.dqn.network import make_network
+from restock.train.evaluation.evaluate import EpisodeResult, GreedyPolicy, Policy, run_episodes
+from restock.train.run.run import Run
+from restock.train.run.run_tables import EVAL_EPISODES
+from restock.train.twin.env.floor_report import refuse_unfit, unfit_kinds
+from restock.train.twin.floors.floors import held_out, open_floors
+from restock.train.twin.physics.episode import KINDS, EpisodeSpec
+from restock.train.twin.physics.perturbation import (
+    PERTURBATIONS,
+    Perturbation,
+    Schedule,
+    find_perturbation,
+)
+
+CLEAN = "none"
+POLICIES = ("agent", "planner", "random")
+FIRST_SEED = 10_000
+
+Results = dict[tuple[str, str], list[EpisodeResult]]  # (policy, perturbation) -> episodes
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to evaluate; every name was checked."""
+
+    run: Run
+    config: TrainConfig
+    policies: tuple[str, ...]
+    perturbations: dict[str, Perturbation | None]  # by the name or file that was asked for
+    episodes: int  # per kind of episode
+    first_seed: int = FIRST_SEED
+    num_envs: int = 32
+    nthread: int = 0  # all cores
+    layouts: str = "default"
+    left_out: dict[str, list[str]] = field(default_factory=dict)  # kinds -> floors without room
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of episodes that every floor has room for."""
+        return tuple(kind for kind in KINDS if kind not in self.left_out)
+
+    @property
+    def total(self) -> int:
+        """Episodes to drive."""
+        return len(self.policies) * len(self.perturbations) * len(self.kinds) * self.episodes
+
+
+def plan_evaluation(
+    path: Path,
+    *,
+    policies: Sequence[str] = POLICIES,
+    perturbations: Sequence[str] = (CLEAN,),
+    episodes: int = 20,
+    first_seed: int = FIRST_SEED,
+    layouts: str | None = None,
+) -> Plan:
+    """Check a request. `layouts` None: the run's, with training floors' test split.
+
+    Raises:
+        RunError: no such run, or it kept no policy yet.
+        ConfigError: a policy or perturbation that does not exist, floors without room for any
+            kind of episode, or no episodes.
+    """
+    run = Run.open(path)
+    config = parse_config(run.document["config"], where=str(path / "config.json"))
+    known = [CLEAN, *(name for name in PERTURBATIONS if name != "nominal")]
+    for flag, asked, there in (
+        ("--policies", policies, list(POLICIES)),
+        ("--perturbations", perturbations, known),
+    ):
+        unknown = [name for name in asked if name not in there and not _is_path(flag, name)]
+        if unknown or not asked:
+            raise ConfigError(
+                f"there is no {', '.join(map(repr, unknown))}" if unknown else "names nothing",
+                where=flag,
+                remedy=f"choose from {', '.join(there)}"
+                + (", onnx:FILE, run:DIRECTORY" if flag == "--policies" else ", FILE.toml"),
+            )
+    if episodes < 1:
+        raise ConfigError(f"must be at least 1, got {episodes}", where="--episodes")
+    if "agent" in policies and not run.best.exists():
+        raise RunError(
+            "has kept no policy yet: its first evaluation is still to come",
+            where=str(path),
+            remedy=f"go on with `restock train --resume {path}`",
+        )
+    layouts = layouts or held_out(config.env.layouts, "test")
+    floors = open_floors(layouts)
+    plan = Plan(
+        run,
+        config,
+        tuple(dict.fromkeys(policies)),
+        {name: _perturb(name) for name in perturbations},
+        episodes,
+        first_seed,
+        layouts=layouts,
+        left_out=unfit_kinds(floors),
+    )
+    if not plan.kinds:
+        refuse_unfit(floors, KINDS)
+    for name in plan.policies:
+        if _is_path("--policies", name):
+            make_policy(name, plan)  # what is wrong with it is said before anything is driven
+    return plan
+
+
+def _is_path(flag: str, name: str) -> bool:
+    if flag == "--policies":
+        kind, _, path = name.partition(":")
+        return kind in ("onnx", "run") and bool(path)
+    return name.endswith(".toml")
+
+
+def evaluate(plan: Plan, progress: Callable[[int], None] | None = None) -> Results:
+    """Drive all episodes, and write them to the run's `eval/episodes.parquet`."""
+    from restock.train.twin.env.vector_env import DEFAULT_CONDITIONS, WarehouseVectorEnv
+
+    profile = load_profile(plan.config.profile)
+    task = profile.task
+    env = WarehouseVectorEnv(
+        plan.num_envs,
+        nthread=plan.nthread,
+        task=task,
+        seed=plan.first_seed,
+        layouts=plan.layouts,
+        conditions={kind: DEFAULT_CONDITIONS[kind] for kind in plan.kinds},
+    )
+    # One queue a policy, over all perturbations: few environments then wait for the last episodes.
+    asked = [
+        (name, EpisodeSpec(kind, plan.first_seed + index, perturbation))
+        for name, perturbation in plan.perturbations.items()
+        for index in range(plan.episodes)
+        for kind in plan.kinds
+    ]
+    results: Results = {}
+    for policy in plan.policies:
+        driven = run_episodes(
+            env,
+            make_policy(policy, plan),
+            [spec for _, spec in asked],
+            control_period_s=task.control_period_s,
+            time_limit_steps=task.time_limit_steps,
+            progress=progress,
+        )
+        for (perturbation, _), result in zip(asked, driven, strict=True):
+            results.setdefault((policy, perturbation), []).append(result)
+    write_table(episodes_table(results), plan.run.path / "eval" / "episodes.parquet")
+    return results
+
+
+def _perturb(name: str) -> Perturbation | None:
+    """The parameters that episodes are driven under; None: as they are.
+
+    Raises:
+        ConfigError: no such name or file, a schedule, or another timestep than evaluation's.
+    """
+    if name == CLEAN:
+        return None
+    found = find_perturbation(name, where="--perturbations")
+    if isinstance(found, Schedule):
+        raise ConfigError(
+            "is a schedule: policies are compared under the same parameters",
+            where=name,
+            remedy="give the TOML file of one perturbation",
+        )
+    if found.timestep_s != Perturbation().timestep_s:
+        raise ConfigError(
+            f"holds for a timestep of {found.timestep_s:g} s, the evaluation runs at"
+            f" {Perturbation().timestep_s:g} s",
+            where=name,
+            remedy="effective parameters are those of a timestep: fit them at this one",
+        )
+    return found
+
+
+def make_policy(name: str, plan: Plan) -> Policy:
+    """The run's kept policy, a scripted one, or one that is named."""
+    from restock.train.twin.env.policies import PlannerFollower, RandomPolicy
+
+    if name == "agent":
+        return load_agent(plan.run)
+    if name == "planner":
+        return PlannerFollower(epsilon=0.0, seed=plan.first_seed)
+    named = load_policy(name, load_profile(plan.config.profile).task)
+    return RandomPolicy(seed=plan.first_seed) if named is None else named
+
+
+def load_policy(name: str, task: Task) -> Policy | None:
+    """The policy that `run:DIRECTORY` (its best) or `onnx:FILE` names; None for other names.
+
+    Raises:
+        ConfigError: no such file, or a policy of another task.
+        RunError: no such run, one without a policy, or a damaged one.
+    """
+    kind, _, path = name.partition(":")
+    if kind == "onnx" and path:
+        from restock.train.evaluation.onnx_policy import OnnxPolicy
+
+        return OnnxPolicy(Path(path), task)
+    if kind != "run" or not path:
+        return None
+    run = Run.open(Path(path))
+    agent = load_agent(run)
+    own = load_profile(parse_config(run.document["config"], where=path).profile).task
+    if own.hash != task.hash:
+        raise ConfigError(
+            f"was trained on task {own.hash}, this is {task.hash}",
+            where=path,
+            remedy="name a run of this task",
+        )
+    return agent
+
+
+def load_agent(run: Run) -> GreedyPolicy:
+    """The policy that a run kept as its best, greedy.
+
+    Raises:
+        RunError: no checkpoint, a damaged one, or one of a task that the profile no longer is.
+    """
+    config = parse_config(run.document["config"], where=str(run.path / "config.json"))
+    state = checkpoint.load(run.best)
+    task = load_profile(config.profile).task
+    if state["task_hash"] != task.hash:
+        raise RunError(
+            f"its policy was trained on task {state['task_hash']}, profile"
+            f" {config.profile!r} now defines {task.hash}",
+            where=str(run.best),
+            remedy="train again: observations or actions have changed their meaning",
+        )
+    network = make_network(config.network, state["observation_size"], state["actions"])
+    network.load_state_dict(state["network"])
+    return GreedyPolicy(network.eval(), version=f"{run.path.name}@{state['gradient_steps']}")
+
+
+def episodes_table(results: Results) -> pa.Table:
+    """One row an episode."""
+    rows = [
+        {
+            "policy": policy,
+            **result.row,
+            "perturbation": perturbation,
+            "end_x_m": result.end_x_m,
+            "end_y_m": result.end_y_m,
+            "failure": result.failure,
+        }
+        for (policy, perturbation), episodes in results.items()
+        for result in episodes
+    ]
+    return pa.Table.from_pylist(rows, schema=EVAL_EPISODES)
+
+
+def settings(plan: Plan) -> dict[str, Any]:
+    """What was asked, for the JSON output."""
+    return {
+        "run": str(plan.run.path),
+        "policies": list(plan.policies),
+        "perturbations": {
+            name: msgspec.to_builtins(perturbation or Perturbation())
+            for name, perturbation in plan.perturbations.items()
+        },
+        "episodes_per_kind": plan.episodes,
+        "first_seed": plan.first_seed,
+        "layouts": plan.layouts,
+        "kinds": list(plan.kinds),
+        "left_out": plan.left_out,
+    }

@@ -1,0 +1,263 @@
+"""Evaluation: policies on the same seeded episodes, in the twin, without exploration.
+
+An episode is fully determined by its spec (condition, seed, perturbation), so every policy, run
+and checkpoint meets the same episodes and results can be compared episode by episode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.stats import wilson
+from restock.train.dqn.learner import greedy_actions
+from restock.train.dqn.network import Network
+from restock.train.feed.fresh_perturbations import values_entries
+from restock.train.twin.physics.episode import EpisodeSpec
+
+STUCK_WINDOW_S, STUCK_RADIUS_M = 10.0, 0.5
+
+
+class Twin(Protocol):
+    """What training and evaluation need of the vectorised environment (`WarehouseVectorEnv`)."""
+
+    num_envs: int
+
+    @property
+    def signals(self) -> dict[str, NDArray[Any]]: ...
+    def set_episodes(self, specs: Iterable[EpisodeSpec], /) -> None: ...
+    def reset(self, *, seed: int | None = None) -> tuple[NDArray[Any], dict[str, Any]]: ...
+    def step(self, actions: NDArray[Any], /) -> tuple[Any, Any, Any, Any, dict[str, Any]]: ...
+    def get_state(self) -> dict[str, Any]: ...
+    def set_state(self, state: dict[str, Any], /) -> None: ...
+
+
+class Policy(Protocol):
+    """What can drive the twin."""
+
+    name: str
+    version: str
+
+    def act(
+        self, env: Any, observation: NDArray[np.float32]
+    ) -> tuple[NDArray[np.int64], NDArray[Any]]: ...
+
+
+class GreedyPolicy:
+    """A Q network, always taking its best action."""
+
+    name = "agent"
+
+    def __init__(self, network: Network, version: str = "") -> None:
+        self.network, self.version = network, version
+
+    def act(
+        self, env: Any, observation: NDArray[np.float32]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        action = greedy_actions(self.network, observation)
+        return action, np.ones(len(action), np.float32)
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """How one episode went."""
+
+    condition: str
+    block: str  # none | partial | full
+    episode_seed: int
+    success: bool
+    bumps: int  # contacts begun
+    time_s: float
+    undiscounted_return: float
+    end_x_m: float
+    end_y_m: float
+    failure: str | None  # stuck | timeout | bump | cut
+    perturbation: str = "nominal"
+    perturbation_values: str = "{}"  # JSON: those that are not nominal
+    layout: str = "default"
+
+    @property
+    def row(self) -> dict[str, Any]:
+        """What every table of episodes says of one."""
+        return {
+            "condition": self.condition,
+            "block": self.block,
+            "episode_seed": self.episode_seed,
+            "perturbation": self.perturbation,
+            "layout": self.layout,
+            "perturbation_values": values_entries(self.perturbation_values),
+            "success": self.success,
+            "bumps": self.bumps,
+            "time_s": self.time_s,
+            "return": self.undiscounted_return,
+        }
+
+
+def fixed_episodes(conditions: Sequence[str], episodes: int, first_seed: int) -> list[EpisodeSpec]:
+    """The same episodes always: `episodes` per condition, seeds from `first_seed`."""
+    return [
+        EpisodeSpec(condition, first_seed + index)
+        for index in range(episodes)
+        for condition in conditions
+    ]
+
+
+def run_episodes(
+    env: Twin,
+    policy: Policy,
+    specs: Sequence[EpisodeSpec],
+    *,
+    control_period_s: float,
+    time_limit_steps: int,
+    progress: Callable[[int], None] | None = None,
+) -> list[EpisodeResult]:
+    """Drive every episode to its end, N at a time; results in the order of `specs`."""
+    results: list[EpisodeResult | None] = [None] * len(specs)
+    env.set_episodes(specs)
+    observation, _ = env.reset()
+    window = round(STUCK_WINDOW_S / control_period_s)
+    steps = np.zeros(env.num_envs, np.int64)
+    bumps = np.zeros(env.num_envs, np.int64)
+    touching = np.zeros(env.num_envs, np.bool_)
+    total = np.zeros(env.num_envs)
+    track = np.zeros((env.num_envs, time_limit_steps + 1, 2))
+    track[:, 0] = _position(env.signals)
+    left = len(specs)
+    while left:
+        action, _ = policy.act(env, observation)
+        observation, reward, terminated, truncated, info = env.step(action)
+        after = info["signals"]
+        steps += 1
+        total += reward
+        bumped = np.asarray(after["bumped"], np.bool_)
+        bumps += bumped & ~touching
+        touching = bumped
+        envs = np.arange(env.num_envs)
+        track[envs, np.minimum(steps, time_limit_steps)] = _position(after)
+        ended = np.flatnonzero(terminated | truncated)
+        for place in ended:
+            index = int(info["episode_number"][place])
+            # -1: the environment was done early and drives on, unrecorded.
+            if index >= 0:
+                count = int(steps[place])
+                end = track[place, min(count, time_limit_steps)]
+                before = track[place, max(count - window, 0)]
+                success = bool(info["success"][place])
+                values = info.get("perturbation_values")
+                results[index] = EpisodeResult(
+                    perturbation=str(info["perturbation"][place]),
+                    layout=str(info["layout"][place]) if "layout" in info else "default",
+                    perturbation_values="{}" if values is None else str(values[place]),
+                    condition=specs[index].condition,
+                    block=str(info["block"][place]),
+                    episode_seed=specs[index].seed,
+                    success=success,
+                    bumps=int(bumps[place]),
+                    time_s=count * control_period_s,
+                    undiscounted_return=float(total[place]),
+                    end_x_m=float(end[0]),
+                    end_y_m=float(end[1]),
+                    failure=None
+                    if success
+                    else _failure(
+                        bool(terminated[place]),
+                        count < time_limit_steps,
+                        float(np.hypot(*(end - before))) < STUCK_RADIUS_M,
+                    ),
+                )
+                left -= 1
+                if progress is not None:
+                    progress(1)
+        steps[ended], bumps[ended], total[ended], touching[ended] = 0, 0, 0.0, False
+        track[ended, 0] = _position(env.signals)[ended]
+    return [result for result in results if result is not None]
+
+
+def _position(signals: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
+    return np.stack([signals["pose_x_m"], signals["pose_y_m"]], axis=-1)
+
+
+def _failure(terminated: bool, early: bool, still: bool) -> str:
+    if terminated:
+        return "bump"
+    if early:
+        return "cut"
+    return "stuck" if still else "timeout"
+
+
+@dataclass(frozen=True)
+class Score:
+    """What a greedy evaluation came to."""
+
+    success: dict[str, float]  # per condition
+    success_mean: float  # over conditions, each counting the same
+    return_mean: float
+
+    def beats(self, other: Score | None) -> bool:
+        """Higher mean success over conditions; on a tie, higher return."""
+        if other is None:
+            return True
+        mine, theirs = (
+            (self.success_mean, self.return_mean),
+            (
+                other.success_mean,
+                other.return_mean,
+            ),
+        )
+        return mine > theirs
+
+
+def score(results: Sequence[EpisodeResult]) -> Score:
+    """Means over episodes within a condition, then over conditions."""
+    conditions = dict.fromkeys(result.condition for result in results)
+    by = {name: [r for r in results if r.condition == name] for name in conditions}
+    success = {name: float(np.mean([r.success for r in group])) for name, group in by.items()}
+    returns = [float(np.mean([r.undiscounted_return for r in group])) for group in by.values()]
+    return Score(success, float(np.mean(list(success.values()))), float(np.mean(returns)))
+
+
+def summary_rows(
+    results: Mapping[tuple[str, str], Sequence[EpisodeResult]],
+) -> list[dict[str, Any]]:
+    """Per (policy, perturbation) and condition, blocked aisles by partial and full: a table's rows.
+
+    Success comes with its Wilson 95 % interval.
+    """
+    rows = []
+    for (policy, perturbation), episodes in results.items():
+        cells: dict[str, list[EpisodeResult]] = {}
+        for result in episodes:
+            cells.setdefault(cell_name(result.condition, result.block), []).append(result)
+        for cell in sorted(cells, key=_cell_order):
+            group = cells[cell]
+            successes = sum(result.success for result in group)
+            low, high = wilson(successes, len(group))
+            arrived = [result.time_s for result in group if result.success]
+            rows.append(
+                {
+                    "policy": policy,
+                    "perturbation": perturbation,
+                    "condition": cell,
+                    "episodes": len(group),
+                    "success": successes / len(group),
+                    "success_low": low,
+                    "success_high": high,
+                    "bumps_per_episode": float(np.mean([r.bumps for r in group])),
+                    "time_s": float(np.mean(arrived)) if arrived else None,
+                    "return": float(np.mean([r.undiscounted_return for r in group])),
+                }
+            )
+    return rows
+
+
+def cell_name(condition: str, block: str) -> str:
+    """`blocked_aisle (partial)`, but `nominal`."""
+    return condition if block in ("none", "") else f"{condition} ({block})"
+
+
+def _cell_order(cell: str) -> tuple[int, str]:
+    return (0 if cell == "nominal" else 1, cell)

@@ -1,0 +1,224 @@
+"""A policy as an ONNX file: for a robot that has no PyTorch, and for whatever else can act.
+
+The file says all that is needed to use it rightly: the task (observation entries in order, the
+action table in m/s and rad/s, the control period) stands in its metadata as JSON.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from restock import __version__
+from restock.errors import ConfigError, RunError
+from restock.files import write_bytes
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.task import Task
+from restock.train.dqn.config import parse_config
+from restock.train.dqn.network import Network, QNetwork
+from restock.train.evaluation.eval_run import load_agent
+from restock.train.run.run import Run
+
+FORMAT = "restock-policy/1"
+_OPSET = 18
+
+
+def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
+    """Write a run's kept policy to `out`: input `observation` (N, D), outputs `values` (N, A) and
+    `action` (N,).
+
+    Raises:
+        RunError: no such run, no policy kept, or there is something at `out` already.
+        ConfigError: the extra `onnx` is not installed.
+    """
+    onnx = _library("onnx")
+    run = Run.open(run_path)
+    if out.exists():
+        raise RunError("is there already", where=str(out), remedy="choose another --out")
+    agent = load_agent(run)
+    profile = load_profile(parse_config(run.document["config"], where=str(run_path)).profile)
+    model = to_onnx(agent.network)
+    said = {
+        "format": FORMAT,
+        "task": msgspec.json.encode(profile.task).decode(),
+        "task_hash": profile.task.hash,
+        "observation": msgspec.json.encode(profile.task.observation_names).decode(),
+        "actions": msgspec.json.encode(profile.task.actions).decode(),
+        "profile": profile.name,
+        "run": run.path.resolve().name,
+        "version": agent.version,
+        "restock_version": __version__,
+    }
+    onnx.helper.set_model_props(model, said)
+    onnx.checker.check_model(model, full_check=True)
+    write_bytes(out, model.SerializeToString())
+    return {"path": str(out), "bytes": out.stat().st_size, **said}
+
+
+def to_onnx(network: Network) -> Any:
+    """The network as an ONNX model, node for layer."""
+    onnx = _library("onnx")
+    graph = _Graph(onnx)
+    values = [graph.values(member, f"m{index}") for index, member in enumerate(network.members)]
+    if len(values) == 1:
+        graph.node("Identity", values, "values")
+    else:
+        graph.node("Mean", values, "values")
+    graph.node("ArgMax", ["values"], "action", axis=1, keepdims=0)
+    tensor, kinds = onnx.helper.make_tensor_value_info, onnx.TensorProto
+    return onnx.helper.make_model(
+        onnx.helper.make_graph(
+            graph.nodes,
+            "policy",
+            [tensor("observation", kinds.FLOAT, ["N", network.observation_size])],
+            [
+                tensor("values", kinds.FLOAT, ["N", network.actions]),
+                tensor("action", kinds.INT64, ["N"]),
+            ],
+            graph.constants,
+        ),
+        opset_imports=[onnx.helper.make_opsetid("", _OPSET)],
+        ir_version=10,  # of the format; runtimes of the last years read it
+        producer_name="restock",
+        producer_version=__version__,
+    )
+
+
+class _Graph:
+    """Nodes and constants of a graph under way."""
+
+    def __init__(self, onnx: Any) -> None:
+        self._onnx = onnx
+        self.nodes: list[Any] = []
+        self.constants: list[Any] = []
+
+    def node(self, kind: str, inputs: Sequence[str], output: str, **settings: Any) -> str:
+        self.nodes.append(self._onnx.helper.make_node(kind, list(inputs), [output], **settings))
+        return output
+
+    def constant(self, name: str, value: NDArray[Any]) -> str:
+        self.constants.append(self._onnx.numpy_helper.from_array(value, name))
+        return name
+
+    def linear(self, layer: nn.Linear, inputs: str, name: str) -> str:
+        weight = self.constant(f"{name}.weight", _array(layer.weight))
+        bias = self.constant(f"{name}.bias", _array(layer.bias))
+        return self.node("Gemm", [inputs, weight, bias], name, transB=1)
+
+    def values(self, network: QNetwork, name: str) -> str:
+        """Action values (N, A) of one network."""
+        now = "observation"
+        for index, layer in enumerate(network.body):
+            place = f"{name}.{index}"
+            if isinstance(layer, nn.Linear):
+                now = self.linear(layer, now, place)
+            elif isinstance(layer, nn.LayerNorm):
+                scale = self.constant(f"{place}.scale", _array(layer.weight))
+                bias = self.constant(f"{place}.shift", _array(layer.bias))
+                now = self.node(
+                    "LayerNormalization", [now, scale, bias], place, axis=-1, epsilon=layer.eps
+                )
+            else:
+                now = self.node("Relu", [now], place)
+        spread = self.linear(network.advantage, now, f"{name}.advantage")
+        if network.quantiles:
+            shape = np.array([0, network.actions, network.quantiles])
+            sizes = self.constant(f"{name}.sizes", shape.astype(np.int64))
+            spread = self.node("Reshape", [spread, sizes], f"{name}.quantiles")
+            spread = self.mean(spread, 2, f"{name}.means", keep=False)
+        if network.value is None:
+            return spread
+        value = self.linear(network.value, now, f"{name}.value")
+        if network.quantiles:
+            value = self.mean(value, 1, f"{name}.value_mean")
+        middle = self.mean(spread, 1, f"{name}.middle")
+        centred = self.node("Sub", [spread, middle], f"{name}.centred")
+        return self.node("Add", [value, centred], f"{name}.values")
+
+    def mean(self, inputs: str, axis: int, name: str, *, keep: bool = True) -> str:
+        axes = self.constant(f"{name}.axes", np.array([axis], np.int64))
+        return self.node("ReduceMean", [inputs, axes], name, keepdims=int(keep))
+
+
+class OnnxPolicy:
+    """Acts by an ONNX file: greedily, by its output `action`.
+
+    Raises:
+        ConfigError: no such file, not a policy of this task, or the extra `onnx` is missing.
+    """
+
+    def __init__(self, path: Path, task: Task) -> None:
+        runtime = _library("onnxruntime")
+        if not path.is_file():
+            raise ConfigError(
+                "no such file", where=str(path), remedy="restock export RUN --to onnx"
+            )
+        options = runtime.SessionOptions()
+        options.intra_op_num_threads = 1
+        options.log_severity_level = 4
+        try:
+            self._session = runtime.InferenceSession(
+                str(path), options, providers=["CPUExecutionProvider"]
+            )
+        except Exception as error:
+            raise ConfigError(
+                f"is not an ONNX model: {str(error).splitlines()[0]}", where=str(path)
+            ) from error
+        said = self._session.get_modelmeta().custom_metadata_map
+        if said.get("format") == FORMAT and said.get("task_hash") != task.hash:
+            raise ConfigError(
+                f"was made for task {said.get('task_hash')}, this is {task.hash}",
+                where=str(path),
+                remedy="export it again from a run of this task",
+            )
+        (given,) = self._session.get_inputs()[:1]
+        if len(self._session.get_inputs()) != 1 or given.shape[-1] != task.observation_size:
+            raise ConfigError(
+                f"takes {[i.shape for i in self._session.get_inputs()]}, the task's observation"
+                f" is (N, {task.observation_size})",
+                where=str(path),
+            )
+        self._input, self._actions = given.name, len(task.actions)
+        names = [output.name for output in self._session.get_outputs()]
+        # A model of another make: its first output is taken for action values.
+        self._output = "action" if "action" in names else names[0]
+        self._path = path
+        self.name, self.version = f"onnx:{path}", said.get("version", "")
+
+    def act(
+        self, env: Any, observation: NDArray[np.float32]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """The best action (N,) of each observation (N, D), and 1 for its probability."""
+        (found,) = self._session.run([self._output], {self._input: observation})
+        action = found if found.ndim == 1 else found.argmax(axis=1)
+        if action.shape != (len(observation),) or not np.isin(action, range(self._actions)).all():
+            raise ConfigError(
+                f"its output {self._output} {found.shape} holds no action of the {self._actions}",
+                where=str(self._path),
+            )
+        return action.astype(np.int64), np.ones(len(action), np.float32)
+
+
+def _array(tensor: torch.Tensor) -> NDArray[np.float32]:
+    return np.ascontiguousarray(tensor.detach().cpu().numpy())
+
+
+def _library(name: str) -> Any:
+    from importlib import import_module
+
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise ConfigError(
+            f"needs {name}, which is not installed", remedy="pip install 'restock[onnx]'"
+        ) from error
+
+
+__all__ = ["OnnxPolicy", "export_onnx", "to_onnx"]

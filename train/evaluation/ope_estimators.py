@@ -1,0 +1,210 @@
+"""What a policy is worth, judged from episodes that other policies drove: before it drives itself.
+
+Three estimators, each a few lines, over n logged episodes padded to T steps:
+
+- the model's own word, fitted Q evaluation (`restock.train.dqn.fitted_q`; Le et al. 2019,
+  arXiv:1903.08738): the mean of V(s_0). No importance weights, and as wrong as the model is;
+- per-decision weighted importance sampling (Precup, Sutton and Singh 2000): each reward counts by
+  how much likelier the evaluated policy was to get that far. No model; consistent;
+- weighted doubly robust (Jiang and Li 2016, arXiv:1511.03722; Thomas and Brunskill 2016,
+  arXiv:1604.00923): the model's word, and what importance sampling says of the model's errors.
+
+The weights of two policies that differ grow apart with every step, until one episode speaks for
+all. The effective sample size tells, and below a stated share of the episodes the estimators that
+weigh are refused: a number from one episode is not printed as if it were from a hundred.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.stats import percentiles
+
+F64 = NDArray[np.float64]
+
+FQE, PDWIS, WDR, LOGGED = "fqe", "pdwis", "wdr", "logged"
+_TINY = 1e-300
+
+
+@dataclass(frozen=True)
+class Logged:
+    """Logged episodes as the evaluated policy and its model see them. After an episode's end
+    `ratio` is 1 and all else 0, as if it stayed where it is and got nothing."""
+
+    ratio: F64  # (n, T) probability of the action, evaluated policy / behaviour policy
+    reward: F64  # (n, T)
+    q: F64  # (n, T) the model's value of the action that was taken
+    next_value: F64  # (n, T) the model's value of where it led; 0 where the episode terminated
+    start_value: F64  # (n,) the model's value of where the episode began
+    discount: float
+
+    def __len__(self) -> int:
+        return len(self.ratio)
+
+    def of(self, episodes: NDArray[np.bool_]) -> Logged:
+        """Some of the episodes."""
+        return replace(
+            self,
+            ratio=self.ratio[episodes],
+            reward=self.reward[episodes],
+            q=self.q[episodes],
+            next_value=self.next_value[episodes],
+            start_value=self.start_value[episodes],
+        )
+
+    def until(self, horizon: int | None) -> Logged:
+        """The first steps alone: importance sampling then knows of no reward after them, and
+        doubly robust takes the model's word for it."""
+        return replace(
+            self,
+            ratio=self.ratio[:, :horizon],
+            reward=self.reward[:, :horizon],
+            q=self.q[:, :horizon],
+            next_value=self.next_value[:, :horizon],
+        )
+
+    @property
+    def discounts(self) -> F64:
+        """Of each step, (T,)."""
+        return np.asarray(self.discount ** np.arange(self.reward.shape[1]), np.float64)
+
+
+def once(episodes: int) -> F64:
+    """Every episode counted once: (1, n)."""
+    return np.ones((1, episodes))
+
+
+def log_weights(ratio: F64) -> F64:
+    """The log of each episode's product of ratios up to each step, (n, T); -inf for 0."""
+    with np.errstate(divide="ignore"):
+        return np.cumsum(np.log(ratio), axis=1)
+
+
+def relative_weights(ratio: F64) -> F64:
+    """Products of ratios up to each step (n, T), the largest of each step 1: only shares count."""
+    logs = log_weights(ratio)
+    most = logs.max(axis=0, initial=-np.inf)
+    return np.exp(logs - np.where(np.isfinite(most), most, 0.0))
+
+
+def per_decision(logged: Logged, counts: F64, *, weighted: bool = True) -> F64:
+    """(Weighted) per-decision importance sampling; `counts` (B, n) of each episode -> (B,).
+
+    Unweighted it is unbiased, and its variance grows with every step; weighted it is consistent.
+    """
+    return _weigh(logged.ratio, logged.reward, counts, weighted) @ logged.discounts
+
+
+def doubly_robust(logged: Logged, counts: F64, *, weighted: bool = True) -> F64:
+    """(Weighted) doubly robust; `counts` (B, n) of each episode -> (B,).
+
+    What the model says of the starts, and the weighted sum of where it was wrong on the way:
+    right if either the model or the behaviour's probabilities are.
+    """
+    error = logged.reward + logged.discount * logged.next_value - logged.q
+    correction = _weigh(logged.ratio, error, counts, weighted) @ logged.discounts
+    return fitted(logged, counts) + correction
+
+
+def fitted(logged: Logged, counts: F64) -> F64:
+    """The model's word: the mean value of the starts; `counts` (B, n) -> (B,)."""
+    return np.asarray(counts @ logged.start_value / counts.sum(axis=1), np.float64)
+
+
+def observed(logged: Logged, counts: F64) -> F64:
+    """What the behaviour policies got themselves; `counts` (B, n) -> (B,)."""
+    return np.asarray(counts @ (logged.reward @ logged.discounts) / counts.sum(axis=1), np.float64)
+
+
+def _weigh(ratio: F64, values: F64, counts: F64, weighted: bool) -> F64:
+    """The weighted mean of `values` (n, T) over episodes, at each step: (B, T)."""
+    weight = relative_weights(ratio) if weighted else np.exp(log_weights(ratio))
+    total = counts @ weight if weighted else counts.sum(axis=1, keepdims=True)
+    return np.asarray(counts @ (weight * values) / np.maximum(total, _TINY), np.float64)
+
+
+def effective_episodes(ratio: F64) -> F64:
+    """How many equally weighted episodes the weights are worth at each step, (T,) (Kish 1965)."""
+    weight = relative_weights(ratio)
+    return np.asarray(
+        weight.sum(axis=0) ** 2 / np.maximum((weight**2).sum(axis=0), _TINY), np.float64
+    )
+
+
+@dataclass(frozen=True)
+class Gate:
+    """What importance weights must be worth, at every step, for their estimates to be shown."""
+
+    share: float = 0.2  # of the episodes
+    episodes: float = 5.0
+
+    def refusal(self, logged: Logged) -> str | None:
+        """Why the estimators that weigh are refused, or None."""
+        least, reach = self.measure(logged)
+        if reach == logged.ratio.shape[1] and len(logged):
+            return None
+        return (
+            f"the weights are worth {least:.1f} of {len(logged)} episodes, less than"
+            f" {max(self.episodes, self.share * len(logged)):.1f}: policy and logs agree for"
+            f" {reach} of {logged.ratio.shape[1]} steps"
+        )
+
+    def measure(self, logged: Logged) -> tuple[float, int]:
+        """The least effective number of episodes, and for how many first steps it is enough."""
+        if not len(logged):
+            return 0.0, 0
+        effective = effective_episodes(logged.ratio)
+        short = np.flatnonzero(effective < max(self.episodes, self.share * len(logged)))
+        reach = int(short[0]) if len(short) else len(effective)
+        return float(effective.min(initial=np.inf)), reach
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One estimator's answer: a value with its interval, or why there is none."""
+
+    estimator: str
+    value: float | None
+    low: float | None = None  # None: a single episode has no interval
+    high: float | None = None
+    refused: str | None = None
+
+
+def estimate(
+    logged: Logged,
+    *,
+    gate: Gate = Gate(),
+    horizon: int | None = None,
+    rng: np.random.Generator,
+    resamples: int = 2000,
+    confidence: float = 0.95,
+) -> list[Estimate]:
+    """Every estimator, with a percentile bootstrap interval over whole episodes.
+
+    The interval holds what other episodes would have changed. The model was fitted on others and
+    stays as it is, so what is wrong with it is in no interval.
+    """
+    near = logged.until(horizon)
+    refused = gate.refusal(near)
+    counts = rng.multinomial(len(logged), np.full(len(logged), 1 / len(logged)), size=resamples)
+    found = []
+    for name, of, estimator in (
+        (LOGGED, logged, observed),
+        (FQE, logged, fitted),
+        (PDWIS, near, per_decision),
+        (WDR, near, doubly_robust),
+    ):
+        if name in (PDWIS, WDR) and refused is not None:
+            found.append(Estimate(name, None, refused=refused))
+            continue
+        value = float(estimator(of, once(len(logged)))[0])
+        draws = estimator(of, counts.astype(np.float64))
+        interval = percentiles(draws, confidence) if len(logged) > 1 else (None, None)
+        found.append(Estimate(name, value, *interval))
+    return found
+
+
+__all__ = ["Estimate", "Gate", "Logged", "doubly_robust", "estimate", "fitted", "per_decision"]

@@ -1,0 +1,225 @@
+"""Did a run get worse than a baseline: per perturbation and condition, on the same episodes.
+
+A baseline is another run, or a file that keeps one's evaluation under a name, small enough to be
+committed beside the code that a pipeline tests. Differences are paired by episode: what an episode
+is like is the same for both, so only what the policies made of it is left to vary.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from restock.errors import RunError
+from restock.files import write_table
+from restock.stats import iqm, percentiles
+from restock.train.evaluation.evaluate import cell_name
+from restock.train.run.run import Run
+from restock.train.run.run_tables import EVAL_EPISODES
+
+FOLDER = Path("baselines")  # where names are looked up, in the working directory
+EVERY = "all"
+Verdict = Literal["better", "worse", "no difference shown", "refused"]
+_KEY = b"restock-baseline"
+_RESAMPLES = 2000
+_Key = tuple[int, str]  # seed, and the values of the perturbation in force
+_Episodes = dict[_Key, tuple[float, float]]  # success and return
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """A policy's episodes, and what it must share with another to be compared with it."""
+
+    name: str
+    task_hash: str
+    cells: dict[tuple[str, str], _Episodes]  # by perturbation and condition (with its block)
+
+
+def of_run(path: Path) -> Evaluated:
+    """What `restock eval` wrote of a run's own policy.
+
+    Raises:
+        RunError: no run, or it was not evaluated.
+    """
+    run = Run.open(path)
+    return Evaluated(str(path), str(run.document.get("task_hash")), _cells(_agent(run)))
+
+
+def of_baseline(name: str) -> Evaluated:
+    """A baseline by the directory of a run, a file, or the name that it was saved under.
+
+    Raises:
+        RunError: there is none.
+    """
+    path = Path(name)
+    if path.is_dir():
+        return of_run(path)
+    file = baseline_file(name)
+    if not file.is_file():
+        known = ", ".join(sorted(found.stem for found in FOLDER.glob("*.parquet")))
+        raise RunError(
+            f"is neither a run nor a baseline; there are {known or 'none'} in {FOLDER}/",
+            where=name,
+            remedy="`restock eval RUN --save-as-baseline NAME` keeps one",
+        )
+    try:
+        table = pq.read_table(file, schema=EVAL_EPISODES)
+        said = json.loads((pq.read_schema(file).metadata or {})[_KEY])
+    except (pa.ArrowException, KeyError, ValueError) as error:
+        raise RunError(
+            "is not a baseline", where=str(file), remedy="save it anew with --save-as-baseline"
+        ) from error
+    return Evaluated(f"{name} ({said['run']})", said["task_hash"], _cells(table))
+
+
+def save_baseline(path: Path, name: str) -> Path:
+    """Keep a run's evaluation under a name; returns the file. One of the name is replaced.
+
+    Raises:
+        RunError: no run, or it was not evaluated.
+    """
+    run = Run.open(path)
+    said = {"run": path.name, "task_hash": str(run.document.get("task_hash"))}
+    table = _agent(run).replace_schema_metadata({_KEY: json.dumps(said).encode()})
+    file = baseline_file(name)
+    write_table(table, file)
+    return file
+
+
+def baseline_file(name: str) -> Path:
+    """`baselines/NAME.parquet`, or the file that is named."""
+    return Path(name) if name.endswith(".parquet") else FOLDER / f"{name}.parquet"
+
+
+def regression(
+    baseline: Evaluated, candidate: Evaluated, *, margin: float = 0.05, seed: int = 0
+) -> list[dict[str, Any]]:
+    """One row a perturbation and condition of the baseline, and one of each perturbation's all.
+
+    `worse` is a success lower by more than `margin`, with the paired 95 % interval below 0;
+    `better` is an interval above 0. A cell whose episodes are not the same is `refused`.
+
+    Raises:
+        RunError: the two are of different tasks.
+    """
+    if baseline.task_hash != candidate.task_hash:
+        raise RunError(
+            f"is of task {candidate.task_hash}, the baseline {baseline.name} of"
+            f" {baseline.task_hash}: their episodes are not the same",
+            where=candidate.name,
+            remedy="evaluate a baseline that was trained on this task",
+        )
+    rng = np.random.default_rng(seed)
+    rows = []
+    for perturbation in dict.fromkeys(cell[0] for cell in baseline.cells):
+        pairs = []
+        for cell in sorted(key for key in baseline.cells if key[0] == perturbation):
+            theirs, ours = baseline.cells[cell], candidate.cells.get(cell, {})
+            if theirs.keys() != ours.keys():
+                rows.append(_refused(cell, theirs, ours))
+                continue
+            pair = np.array([[theirs[key], ours[key]] for key in sorted(theirs)])
+            pairs.append(pair)
+            rows.append(_row(cell, [pair], margin, rng))
+        if len(pairs) > 1:
+            rows.append(_row((perturbation, EVERY), pairs, margin, rng))
+    return rows
+
+
+def regressed(rows: Sequence[dict[str, Any]]) -> bool:
+    """Whether a pipeline should stop: something is worse, or could not be compared."""
+    return any(row["verdict"] in ("worse", "refused") for row in rows)
+
+
+def _row(
+    cell: tuple[str, str], pairs: list[NDArray[Any]], margin: float, rng: np.random.Generator
+) -> dict[str, Any]:
+    """Conditions count the same, however many episodes they have.
+
+    Args:
+        pairs: of each condition (n, 2, 2): episodes x (baseline, candidate) x (success, return).
+    """
+    difference = [pair[:, 1, 0] - pair[:, 0, 0] for pair in pairs]
+    draws = np.mean(
+        [d[rng.integers(len(d), size=(_RESAMPLES, len(d)))].mean(axis=1) for d in difference],
+        axis=0,
+    )
+    low, high = percentiles(draws)
+    middle = float(np.mean([d.mean() for d in difference]))
+    success = [float(np.mean([pair[:, arm, 0].mean() for pair in pairs])) for arm in (0, 1)]
+    together = np.concatenate(pairs)[:, :, 1]
+    verdict: Verdict = "no difference shown"
+    if high < 0 and middle < -margin:
+        verdict = "worse"
+    elif low > 0:
+        verdict = "better"
+    return {
+        "perturbation": cell[0],
+        "condition": cell[1],
+        "episodes": len(together),
+        "baseline": success[0],
+        "candidate": success[1],
+        "difference": middle,
+        "difference_low": low,
+        "difference_high": high,
+        "return_iqm": [iqm(together[:, 0]), iqm(together[:, 1])],
+        "improvement": float(np.mean([_better(pair) for pair in pairs])),
+        "verdict": verdict,
+        "reason": None,
+    }
+
+
+def _better(pair: NDArray[Any]) -> float:
+    """P(the candidate's return beats the baseline's on the same episode), ties counting half."""
+    more = pair[:, 1, 1] - pair[:, 0, 1]
+    return float(np.mean((more > 0) + 0.5 * (more == 0)))
+
+
+def _refused(cell: tuple[str, str], theirs: _Episodes, ours: _Episodes) -> dict[str, Any]:
+    shared = len(theirs.keys() & ours.keys())
+    values = ("baseline", "candidate", "difference", "difference_low", "difference_high")
+    return {
+        "perturbation": cell[0],
+        "condition": cell[1],
+        "episodes": shared,
+        **dict.fromkeys(values),
+        "return_iqm": None,
+        "improvement": None,
+        "verdict": "refused",
+        "reason": f"not the same episodes: {len(theirs)} of the baseline, {len(ours)} of the"
+        f" candidate, {shared} in both",
+    }
+
+
+def _agent(run: Run) -> pa.Table:
+    path = run.path / "eval" / "episodes.parquet"
+    if path.is_file():
+        table = pq.read_table(path, schema=EVAL_EPISODES)
+        if len(own := table.filter(pa.compute.equal(table["policy"], "agent"))):
+            return own
+    raise RunError(
+        "has no evaluation of its own policy",
+        where=str(run.path),
+        remedy=f"run `restock eval {run.path} --policies agent`",
+    )
+
+
+def _cells(table: pa.Table) -> dict[tuple[str, str], _Episodes]:
+    cells: dict[tuple[str, str], _Episodes] = {}
+    for row in table.to_pylist():
+        cell = row["perturbation"], cell_name(row["condition"], row["block"])
+        result = float(row["success"]), float(row["return"])
+        key = int(row["episode_seed"]), str(sorted(row["perturbation_values"] or ()))
+        cells.setdefault(cell, {})[key] = result
+    return cells
+
+
+__all__ = ["Evaluated", "of_baseline", "of_run", "regressed", "regression", "save_baseline"]

@@ -1,0 +1,280 @@
+"""What a batch is made of: rows of logs by quota, and fresh rows from the twin.
+
+The half-and-half batch of online learning with logs (RLPD, arXiv:2302.02948) is put together here,
+from two sources that share one packed row layout, by one gather each. How large the half is, and
+what each stratum has of it, is the diet's to say (`restock.replay.sampling.share_controller`).
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from restock.errors import MixtureError
+from restock.replay.mixture.packed_row import F32, F64, Ints
+from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.share_controller import Diet, PlannedDraws
+from restock.train.dqn.checkpoint import generator_state, restore_generator
+from restock.train.feed.logged_sampler import Drawing, LogDraws
+
+if TYPE_CHECKING:
+    from restock.replay.panel.panel import Panel
+
+_NO_ROWS: Ints = np.empty(0, np.int64)
+_UNPLANNED = PlannedDraws()
+_NOTHING = Drawing(_NO_ROWS, _NO_ROWS, None, np.empty(0))
+_IN_MEMORY_BYTES = 4 << 30  # larger panels stay memory-mapped
+
+
+@dataclass(frozen=True)
+class Coded:
+    """A column of few distinct values: a code per row into `names`."""
+
+    codes: NDArray[np.int32]  # (n,)
+    names: list[str]
+
+    @classmethod
+    def of(cls, column: pa.ChunkedArray) -> Coded:
+        encoded = column.combine_chunks().dictionary_encode()
+        if isinstance(encoded, pa.ChunkedArray):
+            encoded = encoded.combine_chunks()
+        codes = encoded.indices.fill_null(len(encoded.dictionary))
+        names = [*encoded.dictionary.to_pylist(), "unknown"]
+        return cls(np.asarray(codes, np.int32), names)
+
+    def name(self, row: int) -> str:
+        return str(self.names[self.codes[row]])
+
+    def known(self, row: int) -> str | None:
+        """The same, or None where the column has none."""
+        code = self.codes[row]
+        return str(self.names[code]) if code < len(self.names) - 1 else None
+
+
+@dataclass(frozen=True)
+class Logs:
+    """The logged rows that a run draws from, with what is to be recorded about them."""
+
+    rows: Tensor  # (n, W) float32
+    strata: list[str]
+    timings: list[str]  # pre | post, of each stratum
+    stratum_rows: list[Ints]  # the rows of each stratum
+    shares: NDArray[np.float64]  # (S,)
+    weights: F32 | None  # (n,) importance weights, or None where all are 1
+    as_of_ns: int  # calendar ages are against it
+    transition_id: Ints  # (n,)
+    stamp_ns: Ints  # (n,), when each was logged: measurement stamps may be a simulator's
+    condition: Coded
+    behaviour_policy: Coded
+    behaviour_version: Coded
+    episode: Coded
+
+    perturbation: Coded | None = None  # of the twin; null for hardware
+    panel: Panel | None = None  # where they are from
+    planned: PlannedDraws = _UNPLANNED  # what the run will draw
+    huber_delta: float = 1.0  # of the run's loss: the floor of LAP's priorities
+
+    @classmethod
+    def of_panel(
+        cls,
+        panel: Panel,
+        planned: PlannedDraws = _UNPLANNED,
+        huber_delta: float = 1.0,
+    ) -> Logs:
+        """A panel's rows in memory (memory-mapped where it is larger than 4 GiB)."""
+        rows = np.asarray(panel.rows)
+        if rows.nbytes <= _IN_MEMORY_BYTES and panel.header.mixture.sampling == "memory":
+            rows = np.array(rows)
+        with warnings.catch_warnings():  # a read-only map is fine: nothing writes to it
+            warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
+            tensor = torch.from_numpy(rows)
+        weights = panel.weights
+        meta = panel.meta
+        return cls(
+            rows=tensor,
+            strata=[stratum.name for stratum in panel.strata],
+            timings=[stratum.timing for stratum in panel.strata],
+            stratum_rows=panel.stratum_rows(),
+            shares=np.array([stratum.share for stratum in panel.strata]),
+            weights=None if np.all(weights == 1) else weights,
+            as_of_ns=panel.header.newest_ns,
+            transition_id=np.asarray(meta["transition_id"], np.int64),
+            stamp_ns=np.asarray(meta["logged_ns"], np.int64),
+            condition=Coded.of(meta["condition"]),
+            behaviour_policy=Coded.of(meta["behaviour_policy"]),
+            behaviour_version=Coded.of(meta["behaviour_version"]),
+            episode=Coded.of(meta["episode_id"]),
+            perturbation=Coded.of(
+                meta["perturbation"]
+                if "perturbation" in meta.column_names  # a panel from before has no such column
+                else pa.chunked_array([pa.nulls(len(meta), pa.string())])
+            ),
+            panel=panel,
+            planned=planned,
+            huber_delta=huber_delta,
+        )
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """One batch: the logged rows first, then the fresh ones."""
+
+    rows: Tensor  # (B, W) float32, on the learner's device; valid until the next draw
+    weight: Tensor | None  # (B,) float32
+    log_rows: Ints  # (L,) rows of the panel
+    log_stratum: Ints = field(default_factory=lambda: _NO_ROWS)  # (L,)
+    slots: Ints = field(default_factory=lambda: _NO_ROWS)  # (B - L,) slots of the ring
+    quota: F64 = field(default_factory=lambda: np.empty(0))  # (S,) shares in force, of the logs
+
+    @property
+    def logged(self) -> int:
+        return len(self.log_rows)
+
+
+class Batches:
+    """Draws batches: all from logs while offline, `logs_share` of them from logs online.
+
+    Without logs every batch is fresh. Each source has its own generator, seeded from `seed`.
+
+    Args:
+        logs_share: of an online batch; None leaves it to the mixture of the logs' panel.
+
+    Raises:
+        MixtureError: the panel's rows cannot bear what the run will draw, where that is refused.
+    """
+
+    def __init__(
+        self,
+        logs: Logs | None,
+        ring: FreshRing,
+        *,
+        batch_size: int,
+        logs_share: float | None,
+        seed: int,
+        device: torch.device,
+    ) -> None:
+        self.logs, self.ring, self.device = logs, ring, device
+        self.batch_size = batch_size
+        self._rng = np.random.default_rng([seed, 1])
+        self._fresh = torch.from_numpy(ring.rows)  # shares memory with the ring
+        self._buffer = torch.empty((batch_size, ring.rows.shape[1]))
+        self._draws: LogDraws | None = None
+        self._logs_on_device: Tensor | None = None
+        self._max_age: int | None = None  # of fresh rows, in environment steps
+        if logs is not None:
+            self._draws = LogDraws(logs, logs_share, batch_size, seed)
+            if not self._draws.gathers:
+                self._logs_on_device = logs.rows.to(device)
+            if logs.panel is not None:
+                self._max_age = logs.panel.header.mixture.max_age_env_steps
+
+    @property
+    def diet(self) -> Diet | None:
+        """The shares in force, and what was drawn; None without logs."""
+        return self._draws.diet if self._draws is not None else None
+
+    def describe(self) -> list[dict[str, Any]]:
+        """Rows for the run's table `shares`; none without logs."""
+        return self._draws.describe() if self._draws is not None else []
+
+    def draw_offline(self) -> Batch:
+        """A batch from logs alone.
+
+        Raises:
+            MixtureError: every row was drawn as often as it may be.
+        """
+        if self._draws is None:
+            raise RuntimeError("there are no logs to draw from")
+        drawn = self._draws.draw(self.batch_size)
+        if len(drawn.rows) < self.batch_size:
+            raise MixtureError(
+                f"every row of the panel was drawn {self._draws.diet.max_replays} times",
+                remedy="train on with fewer offline updates, or mix with more draws a row",
+            )
+        return self._gather(drawn, _NO_ROWS)
+
+    def draw_online(self, env_steps: int = 0) -> Batch:
+        """A batch from logs and the fresh ring, after `env_steps` environment steps."""
+        drawn = _NOTHING
+        if self._draws is not None:
+            self._draws.move_to(env_steps)
+            if logged := round(self.batch_size * self._draws.diet.logs_share):
+                drawn = self._draws.draw(logged)
+        slots = _NO_ROWS
+        if len(drawn.rows) < self.batch_size:
+            slots = self._sample_fresh(self.batch_size - len(drawn.rows), env_steps)
+        return self._gather(drawn, slots)
+
+    def learnt(self, batch: Batch, td: Tensor) -> None:
+        """The TD errors (B,) of a batch, once it was learnt from: priorities and shares follow."""
+        if self._draws is not None and self._draws.listens and batch.logged:
+            td_abs = td[: batch.logged].detach().abs().cpu().numpy()
+            self._draws.update(batch.log_rows, batch.log_stratum, td_abs)
+
+    def _sample_fresh(self, count: int, env_steps: int) -> Ints:
+        if self._max_age is None:
+            return self.ring.sample(count, self._rng)
+        collected = self.ring.meta["env_step"][: len(self.ring)]
+        young = np.flatnonzero(collected >= env_steps - self._max_age)
+        if not len(young):
+            raise MixtureError(
+                f"no fresh row is younger than max_age_env_steps = {self._max_age}",
+                remedy="mix with a larger one",
+            )
+        return young[self._rng.integers(len(young), size=count)]
+
+    def _gather(self, drawn: Drawing, slots: Ints) -> Batch:
+        logged, size = len(drawn.rows), len(drawn.rows) + len(slots)
+        packed = self._buffer[:size]
+        on_cpu = self.device.type == "cpu"
+        if logged and self._draws is not None and self._draws.gathers:
+            self._draws.gather(drawn.rows, packed[:logged].numpy())
+        elif logged and on_cpu:
+            index = torch.from_numpy(drawn.rows)
+            torch.index_select(self._logs_tensor, 0, index, out=packed[:logged])
+        if len(slots):
+            torch.index_select(self._fresh, 0, torch.from_numpy(slots), out=packed[logged:])
+        if not on_cpu:
+            parts = [packed[logged:].to(self.device)]
+            if logged and self._logs_on_device is None:
+                parts.insert(0, packed[:logged].to(self.device))
+            elif logged:
+                index = torch.from_numpy(drawn.rows).to(self.device)
+                parts.insert(0, self._logs_tensor.index_select(0, index))
+            packed = torch.cat(parts)
+        weight = None
+        if drawn.weight is not None:
+            weight = torch.ones(size)
+            weight[:logged] = torch.from_numpy(drawn.weight)
+            weight = weight.to(self.device)
+        return Batch(packed, weight, drawn.rows, drawn.strata, slots, drawn.quota)
+
+    @property
+    def _logs_tensor(self) -> Tensor:
+        if self._logs_on_device is None:
+            raise RuntimeError("there are no logs to draw from")
+        return self._logs_on_device
+
+    def state_dict(self) -> dict[str, Any]:
+        """Arrays and JSON values."""
+        return {
+            "fresh": generator_state(self._rng),
+            "logs": self._draws.state_dict() if self._draws is not None else None,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Puts the draws to come where `state_dict` found them."""
+        restore_generator(self._rng, state["fresh"])
+        if self._draws is not None:
+            self._draws.load_state_dict(state["logs"])

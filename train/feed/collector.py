@@ -1,0 +1,341 @@
+"""Collecting: the twin's steps into the fresh ring, and labels for the episodes that ended.
+
+Finished episodes are labelled by the very conditions that label logs, over the same signals,
+several episodes per query.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from restock.ingest.task.conditions import NOMINAL, Condition, label, primary
+from restock.ingest.task.signals import STORED_SIGNALS
+from restock.ingest.task.task import Task
+from restock.replay.ring.ring import FreshRing
+from restock.train.evaluation.evaluate import Twin
+from restock.train.feed.fresh_log import FreshLog
+from restock.train.feed.fresh_perturbations import FreshPerturbations, values_entries
+from restock.train.twin.floors.layout import DEFAULT
+
+_EPISODES_PER_QUERY = 8
+_NO_VALUES = ("{}",)  # of a twin that has only a name for them
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A training episode that ended; a row of the run's `episodes`."""
+
+    env_steps: int
+    gradient_steps: int
+    key: int  # of the ring
+    env: int
+    episode_seed: int
+    perturbation: str
+    true_condition: str
+    block: str
+    undiscounted_return: float
+    success: bool
+    bumps: int
+    steps: int
+    signals: dict[str, NDArray[Any]]  # (steps + 1,) each
+    perturbation_values: str = "{}"  # JSON: those that are not nominal
+    layout: str = DEFAULT
+    zones: list[str] | None = None  # (steps + 1,) on its layout; None: what the profile says
+
+
+class Collector:
+    """Steps the twin and keeps what the labels need.
+
+    `start` sends the actions off (to a thread, with an executor), `finish` takes the result in;
+    between them the learner may learn from what the ring held before.
+    """
+
+    def __init__(
+        self,
+        env: Twin,
+        ring: FreshRing,
+        conditions: Sequence[Condition],
+        task: Task,
+        executor: Executor | None,
+    ) -> None:
+        self.env, self.ring, self.task = env, ring, task
+        self.conditions = list(conditions)
+        self._codes = {name: code for code, name in enumerate(ring.conditions)}
+        self._executor = executor
+        self._actions = np.asarray(task.actions, np.float64)
+        count, length = env.num_envs, task.time_limit_steps + 1
+        self._history: dict[str, NDArray[Any]] = {
+            signal.name: np.zeros((count, length), signal.dtype) for signal in STORED_SIGNALS
+        }
+        self._steps = np.zeros(count, np.int64)
+        self._return = np.zeros(count)
+        self._bumps = np.zeros(count, np.int64)
+        self._touching = np.zeros(count, np.bool_)
+        self._unlabelled: list[Ended] = []
+        self.invalid_steps = 0  # whose physics blew up
+        self.observation: NDArray[np.float32] = np.zeros(0, np.float32)
+        self._sent: tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int16]] | None = None
+        self._future: Future[Any] | None = None
+        self._result: Any = None
+        self.perturbations = FreshPerturbations()
+        self.log: FreshLog | None = None
+        self._saved_log: Mapping[str, Any] | None = None
+
+    def keep(self, folder: Path) -> FreshLog:
+        """Keep labelled episodes whole in `folder` from here on, or go on as a checkpoint did."""
+        longest = self.task.time_limit_steps
+        self.log = FreshLog(folder, self.ring.observation_size, longest, self._steps)
+        if self._saved_log is not None:
+            self.log.load_state_dict(self._saved_log)
+        return self.log
+
+    def check_conditions(self) -> None:
+        """Raises ConfigError now, not after minutes of driving, if a condition's SQL cannot run."""
+        columns: dict[str, Any] = {
+            name: np.zeros(0, np.int64) for name in ("episode_index", "step_index")
+        }
+        columns |= {name: history[:0, 0] for name, history in self._history.items()}
+        label(pa.table(columns), self.conditions)
+
+    def reset(self, seed: int) -> None:
+        """Begin: the first observations (N, D)."""
+        self.observation, _ = self.env.reset(seed=seed)
+
+    @property
+    def steps(self) -> NDArray[np.int64]:
+        """Of the episode under way in each environment so far, (N,)."""
+        return self._steps
+
+    def start(
+        self,
+        action: NDArray[np.int64],
+        probability: NDArray[np.float32],
+        policy: NDArray[np.int16] | int = 0,
+    ) -> None:
+        """Send one action per environment, (N,); `policy` is the ring's code of who chose it."""
+        envs = np.arange(self.env.num_envs)
+        now = self.env.signals
+        for name, history in self._history.items():
+            history[envs, self._steps] = now[name]
+        # The command in force over the step that begins, as a log has it.
+        self._history["command_speed_mps"][envs, self._steps] = self._actions[action, 0]
+        self._history["command_yaw_rate_radps"][envs, self._steps] = self._actions[action, 1]
+        self._sent = (action, probability, np.broadcast_to(np.int16(policy), action.shape))
+        if self._executor is not None:
+            self._future = self._executor.submit(self.env.step, action)
+        else:
+            self._result = self.env.step(action)
+
+    def finish(self, *, env_steps: int, gradient_steps: int, acting_step: int) -> list[Ended]:
+        """Take the step's result into the ring.
+
+        Args:
+            env_steps: of the run before this step.
+            gradient_steps: of the run, now.
+            acting_step: the gradient step of the network that chose the actions.
+
+        Returns the episodes that ended.
+        """
+        if self._sent is None:
+            raise RuntimeError("finish() without start()")
+        result = self._future.result() if self._future is not None else self._result
+        self._future = self._result = None
+        observation, reward, terminated, truncated, info = result
+        (action, probability, policy), self._sent = self._sent, None
+        ended = np.asarray(terminated | truncated, np.bool_)
+        following = np.array(observation, copy=True)
+        for place in np.flatnonzero(ended):  # SAME_STEP: `observation` is the next episode's first
+            following[place] = info["final_obs"][place]
+        keys = self.ring.append(
+            observation=self.observation,
+            action=action,
+            reward=reward,
+            terminated=terminated,
+            truncated=truncated,
+            next_observation=following,
+            env_step=env_steps,
+            gradient_step=acting_step,
+            policy_version=acting_step,
+            behaviour_policy=policy,
+            action_probability=probability,
+        )
+        if info["invalid"].any():
+            self._drop(keys, info["invalid"])
+        if self.log is not None:
+            self.log.began(self._steps, self.observation, acting_step)
+            self.log.took(
+                self._steps,
+                action=action,
+                probability=probability,
+                policy=policy,
+                reward=reward,
+                progress_m=info["progress_m"],
+                truth=info["true_condition"],
+            )
+        self.observation = np.array(observation, copy=True)
+        after = info["signals"]
+        bumped = np.asarray(after["bumped"], np.bool_)
+        self._steps += 1
+        self._return += reward
+        self._bumps += bumped & ~self._touching
+        self._touching = bumped
+        values = info.get("perturbation_values", _NO_VALUES * self.env.num_envs)
+        self.perturbations.note(keys, info["perturbation"], values)
+        finished = []
+        for place in np.flatnonzero(ended):
+            count = int(self._steps[place])
+            for name, history in self._history.items():
+                history[place, count] = after[name][place]
+            finished.append(
+                Ended(
+                    env_steps=env_steps + self.env.num_envs,
+                    gradient_steps=gradient_steps,
+                    key=int(keys[place]),
+                    env=int(place),
+                    episode_seed=int(info["episode_seed"][place]),
+                    perturbation=str(info["perturbation"][place]),
+                    perturbation_values=str(values[place]),
+                    layout=str(info["layout"][place]) if "layout" in info else DEFAULT,
+                    zones=self._zones(info, int(place), count),
+                    true_condition=str(info["episode_condition"][place]),
+                    block=str(info["block"][place]),
+                    undiscounted_return=float(self._return[place]),
+                    success=bool(info["success"][place]),
+                    bumps=int(self._bumps[place]),
+                    steps=count,
+                    signals={
+                        name: history[place, : count + 1].copy()
+                        for name, history in self._history.items()
+                    },
+                )
+            )
+            if self.log is not None:
+                self.log.ended(
+                    int(place),
+                    finished[-1],
+                    following[place],
+                    terminated=bool(terminated[place]),
+                    broken=bool(info["invalid"][place]),
+                )
+        self._steps[ended], self._return[ended], self._bumps[ended] = 0, 0.0, 0
+        self._touching[ended] = False
+        self._unlabelled.extend(finished)
+        return finished
+
+    def _zones(self, info: Mapping[str, Any], env: int, count: int) -> list[str] | None:
+        """`LAYOUT/zone` of an ended episode's steps: the profile's are of the default floor."""
+        if "floor" not in info or (floor := info["floor"][env]).name == DEFAULT:
+            return None
+        x, y = (self._history[f"pose_{axis}_m"][env, : count + 1] for axis in "xy")
+        return [f"{floor.name}/{zone}" for zone in floor.zone_of(x, y)]
+
+    def _drop(self, keys: NDArray[np.int64], invalid: NDArray[np.bool_]) -> None:
+        """A step whose physics blew up must not be learnt from: its row repeats the one before."""
+        ring = self.ring
+        for key in keys[invalid]:
+            slots = np.flatnonzero(ring.meta["episode"][: len(ring)] == key)
+            order = slots[np.argsort(ring.meta["episode_step"][slots])]
+            if len(order) > 1:
+                ring.rows[order[-1]] = ring.rows[order[-2]]
+            self.invalid_steps += 1
+
+    def label(self, *, all_of_them: bool = False) -> list[dict[str, Any]]:
+        """Label the ended episodes once enough are waiting; rows for the run's `episodes`."""
+        waiting = self._unlabelled
+        if not waiting or (len(waiting) < _EPISODES_PER_QUERY and not all_of_them):
+            return []
+        self._unlabelled = []
+        self.perturbations.forget(self.ring.meta["episode"][: len(self.ring)])
+        labels = label(steps_table(waiting), self.conditions)
+        if self.log is not None:
+            self.log.labelled(waiting, labels)
+        names = primary(labels, self.conditions)
+        codes = np.array([self._codes[name] for name in names] or [], np.int64)
+        rows, begin = [], 0
+        for episode in waiting:
+            inside = slice(begin, begin + episode.steps)  # the last step is no transition
+            begin += episode.steps + 1
+            self.ring.set_labels(
+                episode.key,
+                codes[inside] if len(codes) else np.zeros(episode.steps, np.int64),
+            )
+            rows.append(
+                {
+                    "env_steps": episode.env_steps,
+                    "gradient_steps": episode.gradient_steps,
+                    "episode": episode.key,
+                    "env": episode.env,
+                    "episode_seed": episode.episode_seed,
+                    "perturbation": episode.perturbation,
+                    "perturbation_values": values_entries(episode.perturbation_values),
+                    "layout": episode.layout,
+                    "true_condition": episode.true_condition,
+                    "block": episode.block,
+                    "conditions": [name for name, held in labels.items() if held[inside].any()],
+                    "return": episode.undiscounted_return,
+                    "success": episode.success,
+                    "bumps": episode.bumps,
+                    "steps": episode.steps,
+                    "time_s": episode.steps * self.task.control_period_s,
+                }
+            )
+        return rows
+
+    def state_dict(self) -> dict[str, Any]:
+        """Arrays and JSON values. Call between `finish` and `start`, never while a step is out."""
+        if self._sent is not None:
+            raise RuntimeError("a step is under way")
+        return {
+            "observation": self.observation,
+            "steps": self._steps,
+            "return": self._return,
+            "bumps": self._bumps,
+            "touching": self._touching,
+            "invalid_steps": self.invalid_steps,
+            "history": self._history,
+            "perturbations": self.perturbations.state_dict(),
+            "log": self.log.state_dict() if self.log is not None else None,
+            "unlabelled": [
+                {name: getattr(episode, name) for name in Ended.__dataclass_fields__}
+                for episode in self._unlabelled
+            ],
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Puts the collector where `state_dict` found it; the twin has its own state."""
+        self.observation = np.array(state["observation"])
+        self._steps = np.array(state["steps"])
+        self._return = np.array(state["return"])
+        self._bumps = np.array(state["bumps"])
+        self._touching = np.array(state["touching"])
+        self.invalid_steps = int(state["invalid_steps"])
+        self._history = {name: np.array(values) for name, values in state["history"].items()}
+        self._unlabelled = [Ended(**episode) for episode in state["unlabelled"]]
+        self._saved_log = state.get("log")
+        self.perturbations.load_state_dict(state.get("perturbations", {}))
+
+
+def ring_conditions(conditions: Sequence[Condition]) -> list[str]:
+    """The names that a ring's labels index: by priority, nominal last."""
+    ordered = sorted(conditions, key=lambda condition: (condition.priority, condition.name))
+    return [condition.name for condition in ordered] + [NOMINAL]
+
+
+def steps_table(episodes: Sequence[Ended]) -> pa.Table:
+    """The steps of episodes, as `restock.ingest.task.conditions.label` takes them."""
+    lengths = [episode.steps + 1 for episode in episodes]
+    columns: dict[str, Any] = {
+        "episode_index": np.repeat(np.arange(len(episodes)), lengths),
+        "step_index": np.concatenate([np.arange(length) for length in lengths]),
+    }
+    for name in episodes[0].signals:
+        columns[name] = np.concatenate([episode.signals[name] for episode in episodes])
+    return pa.table(columns)

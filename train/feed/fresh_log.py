@@ -1,0 +1,138 @@
+"""What was collected, kept whole: labelled episodes of the twin, to be put in a store like logs.
+
+The ring keeps packed n-step rows and forgets the oldest. Here every labelled episode is kept in the
+run's directory, steps and signals, until `restock train --flush-fresh STORE` writes them as one
+recording of format `twin`: the same columns, labels and provenance as a robot's log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.train.dqn import checkpoint
+
+if TYPE_CHECKING:
+    from restock.train.feed.collector import Ended
+
+Bools = NDArray[np.bool_]
+_STEP = ("action", "probability", "policy", "reward", "progress_m", "truth")
+_KINDS = {"action": "i2", "policy": "i2", "truth": "<U32"}
+
+
+class FreshLog:
+    """Episodes of N environments, kept in `folder` a file each time some are labelled.
+
+    Args:
+        longest: steps of an episode at most.
+        begun: (N,) steps that the episodes under way already have: those are not kept, unless a
+            checkpoint brings their beginning.
+    """
+
+    def __init__(
+        self, folder: Path, observation_size: int, longest: int, begun: NDArray[np.int64]
+    ) -> None:
+        self.folder = folder
+        count = len(begun)
+        self._whole: Bools = np.asarray(begun == 0)
+        self._version = np.zeros(count, np.int64)  # gradient step at the episode's begin
+        self._observation = np.zeros((count, longest + 1, observation_size), np.float32)
+        self._steps: dict[str, NDArray[Any]] = {
+            name: np.zeros((count, longest), _KINDS.get(name, "f4")) for name in _STEP
+        }
+        self._waiting: dict[str, dict[str, Any]] = {}  # ended, not labelled; by the ring's key
+        self.parts = 0  # files written
+        self.dropped_steps = 0  # whose physics blew up
+
+    def began(self, at: NDArray[np.int64], observation: NDArray[np.float32], version: int) -> None:
+        """Before a step: the observations (N, D) it starts from, `at` (N,) in their episodes."""
+        first = at == 0
+        self._whole |= first
+        self._version[first] = version
+        self._observation[np.arange(len(at)), at] = observation
+
+    def took(self, at: NDArray[np.int64], **values: NDArray[Any]) -> None:
+        """After it: action, probability, policy, reward, progress_m and truth (N,)."""
+        for name, value in values.items():
+            self._steps[name][np.arange(len(at)), at] = value
+
+    def ended(
+        self, env: int, episode: Ended, last: NDArray[np.float32], *, terminated: bool, broken: bool
+    ) -> None:
+        """An episode is over, with observation `last` (D,); `broken` where its physics blew up."""
+        if not self._whole[env]:
+            return
+        count = episode.steps - int(broken)  # a step that blew up is none
+        self.dropped_steps += int(broken)
+        if not count:
+            return
+        self._observation[env, episode.steps] = last
+        self._waiting[str(episode.key)] = {
+            "count": count,
+            "terminated": terminated and not broken,
+            "version": int(self._version[env]),
+            "perturbation": episode.perturbation,
+            "layout": episode.layout,
+            "zones": None if episode.zones is None else episode.zones[: count + 1],
+            "perturbation_values": episode.perturbation_values,
+            "observation": self._observation[env, : count + 1].copy(),
+            **{name: column[env, :count].copy() for name, column in self._steps.items()},
+        }
+
+    def labelled(self, episodes: Sequence[Ended], labels: Mapping[str, Bools]) -> None:
+        """Keep ended episodes; `labels` are over their steps, (steps + 1) each, end to end."""
+        kept: dict[str, dict[str, Any]] = {}
+        begin = 0
+        for episode in episodes:
+            found = self._waiting.pop(str(episode.key), None)
+            if found is not None:
+                inside = slice(begin, begin + found["count"] + 1)
+                kept[f"{len(kept):06d}"] = found | {
+                    "signals": {
+                        name: column[: found["count"] + 1]
+                        for name, column in episode.signals.items()
+                    },
+                    "labels": {name: holds[inside] for name, holds in labels.items()},
+                }
+            begin += episode.steps + 1
+        if kept:
+            checkpoint.save(self.folder / f"{self.parts:06d}.episodes", kept)
+            self.parts += 1
+
+    def state_dict(self) -> dict[str, Any]:
+        """Arrays and JSON values; the files stay where they are."""
+        return {
+            "whole": self._whole,
+            "version": self._version,
+            "observation": self._observation,
+            "steps": self._steps,
+            "waiting": self._waiting,
+            "parts": self.parts,
+            "dropped_steps": self.dropped_steps,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Puts the log where `state_dict` found it; files written since go, their steps come."""
+        self._whole = np.array(state["whole"], np.bool_)
+        self._version = np.array(state["version"], np.int64)
+        self._observation = np.array(state["observation"], np.float32)
+        self._steps |= {name: np.array(column) for name, column in state["steps"].items()}
+        self._waiting = {key: dict(episode) for key, episode in state["waiting"].items()}
+        self.parts, self.dropped_steps = int(state["parts"]), int(state["dropped_steps"])
+        for path in episode_files(self.folder)[self.parts :]:
+            path.unlink()
+
+
+def episode_files(folder: Path) -> list[Path]:
+    """The files of a log, in order."""
+    return sorted(folder.glob("*.episodes"))
+
+
+def read_episodes(folder: Path) -> list[dict[str, Any]]:
+    """Every episode kept, in order: count, terminated, version, observation (T + 1, D), the values
+    of each step (T,), signals (T + 1,) and labels (T + 1,)."""
+    return [episode for path in episode_files(folder) for episode in checkpoint.load(path).values()]

@@ -1,0 +1,1 @@
+"""Other libraries in the twin and on the mixtures."""

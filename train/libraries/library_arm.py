@@ -1,0 +1,247 @@
+"""Another library's algorithm as an arm of a study: trained in the same twin, kept as a run.
+
+Stable-Baselines3's DQN and PPO learn with their own code. The environment, its conditions, the
+number of environment steps, the fixed episodes that choose the policy to keep, the discount and the
+network's widths are those of the study's settings; DQN also has their replay (one buffer drawn
+uniformly, as `restock.train.libraries.sb3_buffer` records it), exploration and target rule. What
+is kept is the policy in Restock's own network, weight for weight, so `restock eval`, `export` and
+`compare` take the run as any other. What the library was called with is in `config.json`, under
+`library`.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from restock.errors import ConfigError, RestockError
+from restock.files import write_text
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.task import Task
+from restock.train.dqn import checkpoint
+from restock.train.dqn.config import NetworkConfig, TrainConfig, load_config
+from restock.train.dqn.network import QNetwork, make_network
+from restock.train.dqn.target import Hard, describe
+from restock.train.evaluation.evaluate import (
+    GreedyPolicy,
+    Score,
+    fixed_episodes,
+    run_episodes,
+    score,
+)
+from restock.train.prepare import make_twin, resolve_config
+from restock.train.run.run import Run, now_ns, software_versions
+from restock.train.twin.floors.floors import held_out
+
+Library = Literal["sb3-dqn", "sb3-ppo"]
+DISTRIBUTION = "stable-baselines3"
+DONE = "library.json"  # in the run's directory: it was trained to its end
+_EVALUATION_ENVS = 32
+
+
+class LibraryArm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One run that is to be made."""
+
+    out: str
+    library: Library
+    settings: tuple[str, ...] = ()  # key=value, as of `restock train --set`
+    arguments: dict[str, Any] = msgspec.field(default_factory=dict)  # the algorithm's own
+
+
+def check_installed() -> None:
+    """Raises ConfigError where Stable-Baselines3 is not installed."""
+    try:
+        found = importlib.util.find_spec("stable_baselines3") is not None
+    except ValueError:  # a module that was blocked
+        found = False
+    if not found:
+        raise ConfigError(
+            "an arm trains with Stable-Baselines3, which is not installed",
+            remedy="pip install stable-baselines3",
+        )
+
+
+def resolve(settings: tuple[str, ...], library: Library) -> TrainConfig:
+    """The study's settings as the library can follow them.
+
+    Raises:
+        ConfigError: settings that it has no counterpart of.
+    """
+    config = load_config(None, settings)
+    plain = NetworkConfig(hidden=config.network.hidden, layer_norm=False)
+    asked = msgspec.structs.replace(config.network, layer_norm=False)
+    refused = [
+        name
+        for name, bad in (
+            ("network", asked != plain),
+            ("loss.munchausen", config.loss.munchausen > 0),
+            ("replay.ring_reserved", config.replay.ring_reserved > 0),
+            ("schedule.seconds", config.schedule.seconds is not None),
+            ("guard.margin", config.guard.margin is not None),
+            ("guide.env_steps", config.guide.env_steps > 0),
+        )
+        if bad
+    ]
+    if refused:
+        raise ConfigError(
+            f"{library} has no {', '.join(refused)} as the settings ask for",
+            remedy="give those to the other arms, not to the whole study",
+        )
+    loss = msgspec.structs.replace(config.loss, double=False)
+    return resolve_config(msgspec.structs.replace(config, network=plain, loss=loss), None)
+
+
+def dqn_arguments(config: TrainConfig) -> dict[str, Any]:
+    """What makes `stable_baselines3.DQN` follow a config: its clocks count calls and steps."""
+    count, schedule = config.env.num_envs, config.schedule
+    per_call = schedule.updates_per_env_step * count
+    calls, updates = (1, round(per_call)) if per_call >= 1 else (round(1 / per_call), 1)
+    target = config.target
+    if isinstance(target, Hard):
+        interval, tau = round(target.every / schedule.updates_per_env_step), 1.0
+    else:  # moves once after all updates of a call, as far as it would have moved in them
+        interval, tau = calls * count, 1 - (1 - target.tau) ** updates
+    return {
+        "learning_rate": config.optimizer.learning_rate,
+        "buffer_size": config.replay.ring_capacity,
+        "learning_starts": schedule.warmup_env_steps,
+        "batch_size": config.replay.batch_size,
+        "gamma": config.loss.discount,
+        "train_freq": calls,
+        "gradient_steps": updates,
+        "target_update_interval": interval,
+        "tau": tau,
+        "exploration_fraction": min(config.epsilon.steps / max(schedule.env_steps, 1), 1.0),
+        "exploration_initial_eps": config.epsilon.start,
+        "exploration_final_eps": config.epsilon.end,
+        "max_grad_norm": config.optimizer.max_grad_norm or 10.0,
+    }
+
+
+def ppo_arguments(config: TrainConfig) -> dict[str, Any]:
+    """`stable_baselines3.PPO`'s own defaults, but for the rollout: 2,048 steps of all together."""
+    steps = min(2048, config.schedule.env_steps) // config.env.num_envs
+    return {"gamma": config.loss.discount, "n_steps": max(steps, 2)}
+
+
+class Evaluations:
+    """The fixed episodes of a study, driven now and then; the best policy is kept."""
+
+    def __init__(self, run: Run, config: TrainConfig, task: Task) -> None:
+        self.run, self.config, self.task = run, config, task
+        names = list(config.env.conditions)
+        given = config.evaluation
+        self.specs = fixed_episodes(names, given.episodes, given.seed)
+        count = min(_EVALUATION_ENVS, len(self.specs))
+        layouts = given.layouts or held_out(config.env.layouts, "validation")
+        self.env = make_twin(config, load_profile(config.profile), count, layouts=layouts)
+        self.best: Score | None = None
+        self.at = 0  # environment steps of the last one
+
+    def due(self, env_steps: int) -> bool:
+        return env_steps - self.at >= self.config.evaluation.every_env_steps
+
+    def drive(self, network: QNetwork, env_steps: int, gradient_steps: int) -> None:
+        """Evaluate a policy; keep it if it is the best so far."""
+        results = run_episodes(
+            self.env,
+            GreedyPolicy(network),
+            self.specs,
+            control_period_s=self.task.control_period_s,
+            time_limit_steps=self.task.time_limit_steps,
+        )
+        self.at, found = env_steps, score(results)
+        clocks = {"env_steps": env_steps, "gradient_steps": gradient_steps}
+        if best := found.beats(self.best):
+            self.best = found
+            state = {
+                "network": dict(network.state_dict()),
+                "observation_size": network.observation_size,
+                "actions": network.actions,
+                "task_hash": self.task.hash,
+                "score": asdict(found),
+            }
+            checkpoint.save(self.run.best, state | clocks)
+        self.run.append("evaluations", [{**clocks, **r.row, "best": best} for r in results])
+        self.run.flush()
+
+
+def train_library(arm: LibraryArm) -> None:
+    """Make the run.
+
+    Raises:
+        ConfigError: the library is not installed, or refuses its arguments.
+        RunError: there is something at `arm.out` already.
+    """
+    check_installed()
+    from importlib.metadata import version
+
+    from restock.train.libraries import sb3_drive
+
+    config = resolve(arm.settings, arm.library)
+    profile = load_profile(config.profile)
+    on_policy = arm.library == "sb3-ppo"
+    arguments = (ppo_arguments if on_policy else dqn_arguments)(config) | arm.arguments
+    known = {"name": DISTRIBUTION, "version": version(DISTRIBUTION), "algorithm": arm.library}
+    if on_policy:  # what its settings say of these is not in force
+        known |= {"replay": "none: each rollout is learnt from, then forgotten", "target": "none"}
+    elif arm.arguments:  # its own words may have changed replay, exploration or target
+        known |= {"replay": f"changed by {arm.arguments}", "target": f"changed by {arm.arguments}"}
+    run = Run.create(
+        Path(arm.out),
+        {
+            "created_ns": now_ns(),
+            "library": known | {"arguments": arguments},
+            "config": msgspec.to_builtins(config),
+            "panel": None,
+            "target": {"rule": "none"} if on_policy else describe(config.target),
+            "task_hash": profile.task.hash,
+            "labels_version": profile.labels_version,
+            "profile": {"name": profile.name, "hash": profile.hash},
+            "seeds": {"run": config.seed, "evaluation": config.evaluation.seed},
+            "versions": software_versions() | {DISTRIBUTION: version(DISTRIBUTION)},
+        },
+    )
+    began = time.monotonic()
+    evaluations = Evaluations(run, config, profile.task)
+    drive = sb3_drive.ppo if on_policy else sb3_drive.dqn
+    env_steps, updates = drive(config, arguments, run, evaluations)
+    told = {"env_steps": env_steps, "updates": updates, "wall_s": time.monotonic() - began}
+    write_text(run.path / DONE, json.dumps(told, indent=1) + "\n")
+
+
+def as_network(config: TrainConfig, task: Task, linears: list[Any]) -> QNetwork:
+    """A library's layers, in order, as Restock's network: the same numbers for the same input."""
+    import torch
+
+    network = make_network(config.network, task.observation_size, len(task.actions))
+    assert isinstance(network, QNetwork)  # an ensemble was refused
+    ours = [module for module in network.modules() if isinstance(module, torch.nn.Linear)]
+    with torch.no_grad():
+        for mine, theirs in zip(ours, linears, strict=True):
+            mine.weight.copy_(theirs.weight)
+            mine.bias.copy_(theirs.bias)
+    return network.eval()
+
+
+def main(words: list[str]) -> int:
+    """`python -m restock.train.libraries.library_arm JSON`: one run, in a process of its own."""
+    try:
+        train_library(msgspec.json.decode(words[0], type=LibraryArm))
+    except RestockError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return int(error.exit_code)
+    return 0
+
+
+__all__ = ["DONE", "Library", "LibraryArm", "check_installed", "train_library"]
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

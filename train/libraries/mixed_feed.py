@@ -1,0 +1,262 @@
+"""What another library's replay buffer draws, labels and writes down: logs by quota, and fresh.
+
+The library owns the training loop. Its buffer is a subclass (`restock.train.libraries.sb3_buffer`,
+`restock.train.libraries.tianshou_buffer`) that asks this class for rows of the panel, tells it
+every step and every batch, and so leaves a run directory with the same tables as `restock train`
+does: `strata`, `ages`, `policies`, `fed_episodes`, `episodes`, `audit` and `progress`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from restock.errors import ConfigError, MixtureError, PanelError
+from restock.ingest.profile.profile import load_profile
+from restock.replay.panel.panel import Panel
+from restock.train.dqn.loss import Loss
+from restock.train.feed.batch_record import FeedRecord
+from restock.train.feed.batches import Batch, Logs
+from restock.train.feed.logged_sampler import Drawing, LogDraws
+from restock.train.libraries.fresh_meta import FreshMeta
+from restock.train.libraries.info_labels import InfoLabels
+from restock.train.libraries.library_run import NullsForNaN, create_run, episode_row, known
+from restock.train.run.run import Run
+from restock.train.run.run_tables import TABLES
+
+Ints = NDArray[np.int64]
+_NO_ROWS: Ints = np.empty(0, np.int64)
+NO_LOGS = Drawing(_NO_ROWS, _NO_ROWS, None, np.empty(0))
+
+
+class MixedFeed:
+    """The part that does not depend on the library.
+
+    Args:
+        library: the distribution whose loop this is, e.g. "stable-baselines3".
+        num_envs: N.
+        observation_size: D, of the library's environment.
+        panel: a panel or its directory; None for fresh rows alone.
+        run: the run directory to make; None keeps no record.
+        logs_share: of a batch; default the panel's own.
+        profile: whose task and conditions the environment has.
+        seed: of the draws and of which batches are audited.
+        audit_share: of all batches, each row of which is written down.
+        log_every: batches summed into one row of each table.
+
+    Raises:
+        ConfigError: a share outside [0, 1].
+        PanelError: a panel of another task than the environment's.
+        RunError: something is at `run` already.
+    """
+
+    def __init__(
+        self,
+        library: str,
+        num_envs: int,
+        observation_size: int,
+        *,
+        panel: Panel | str | Path | None,
+        run: str | Path | None,
+        logs_share: float | None,
+        profile: str,
+        seed: int,
+        audit_share: float,
+        log_every: int,
+    ) -> None:
+        definition = load_profile(profile)
+        self.panel = Panel.open(panel) if isinstance(panel, str | Path) else panel
+        if logs_share is not None and not 0 <= logs_share <= 1:
+            raise ConfigError(f"logs_share must be in [0, 1], got {logs_share:g}")
+        self.logs_share = logs_share
+        if self.panel is not None:
+            _check(self.panel, definition.task.hash, profile, observation_size)
+        self.logs = Logs.of_panel(self.panel) if self.panel is not None else None
+        self.seed, self.log_every, self.audit_share = seed, log_every, audit_share
+        self.rng = np.random.default_rng([seed, 1])
+        self.labels = InfoLabels(definition.conditions, num_envs)
+        self.num_envs, self.library = num_envs, library
+        self.env_steps = self.batches = self.invalid_steps = 0
+        self._draws: LogDraws | None = None
+        self._phase = "offline"
+        self._open = 0  # batches since the last rows were written
+        self._episodes: dict[int, dict[str, Any]] = {}
+        self._begun = time.monotonic()
+        self.run: Run | None = None
+        if run is not None:
+            settings = {
+                "logs_share": logs_share,
+                "seed": seed,
+                "audit_share": audit_share,
+                "num_envs": num_envs,
+            }
+            self.run = create_run(Path(run), library, definition, self.panel, settings)
+        self.record: FeedRecord | None = None
+        self.fresh: Any = None
+
+    def keep_record(self, fresh: Any) -> None:
+        """Say what the fresh rows are: a `FreshRing`, or a `FreshMeta`."""
+        self.fresh = fresh
+        if self.run is not None:
+            sink: Any = NullsForNaN(self.run)
+            self.record = FeedRecord(
+                sink, self.logs, fresh, audit_share=self.audit_share, seed=self.seed
+            )
+
+    # -- steps ----------------------------------------------------------------------------------
+
+    def take(self, envs: Ints, keys: Ints, ended: NDArray[Any], infos: Sequence[Any]) -> None:
+        """One step of `envs` (n,), of the episodes `keys` (n,): labels those that ended."""
+        self.env_steps += len(envs)
+        for env, key, over, info in zip(
+            envs.tolist(), keys.tolist(), np.asarray(ended).tolist(), infos, strict=True
+        ):
+            self.labels.step(env, info, ended=bool(over), key=key)
+            if over and self.run is not None:
+                self._episodes[key] = episode_row(env, key, info) | {
+                    "env_steps": self.env_steps,
+                    "gradient_steps": self.batches,
+                }
+        self.label()
+
+    def label(self, *, all_of_them: bool = False) -> None:
+        """Label what ended."""
+        for labelled in self.labels.label(all_of_them=all_of_them):
+            self.fresh.set_labels(labelled.key, labelled.codes)
+            if labelled.key in self._episodes:
+                self._episodes[labelled.key]["conditions"] = labelled.conditions
+
+    # -- batches --------------------------------------------------------------------------------
+
+    def draw_logs(self, batch_size: int) -> Drawing:
+        """The logged rows (L,) of a batch, by the mixture; all of it where nothing is fresh.
+
+        Raises:
+            MixtureError: nothing is fresh, and the panel's rows were drawn as often as they may be.
+        """
+        if self.logs is None:
+            return NO_LOGS
+        if self._draws is None:
+            self._draws = LogDraws(self.logs, self.logs_share, batch_size, self.seed)
+        count = batch_size
+        if len(self.fresh):
+            self._draws.move_to(self.env_steps)
+            count = round(batch_size * self._draws.diet.logs_share)
+        drawing = self._draws.draw(count) if count else NO_LOGS
+        if not len(self.fresh) and len(drawing.rows) < batch_size:
+            raise MixtureError(
+                f"every row of the panel was drawn {self._draws.diet.max_replays} times",
+                remedy="collect steps, or mix with more draws a row",
+            )
+        return drawing
+
+    def sample_fresh(self, slots: Ints, count: int) -> Ints:
+        """`count` of the filled `slots` (n,), alike; only those that the mixture deems young.
+
+        Raises:
+            MixtureError: there is none.
+        """
+        if not count:
+            return _NO_ROWS
+        most = self.panel.header.mixture.max_age_env_steps if self.panel is not None else None
+        if most is not None:
+            slots = slots[self.fresh.meta["env_step"][slots] >= self.env_steps - most]
+        if not len(slots):
+            raise MixtureError(
+                "there is no fresh row to draw" + (f" younger than {most} steps" if most else ""),
+                remedy="collect steps before learning",
+            )
+        return slots[self.rng.integers(len(slots), size=count)]
+
+    def drawn(
+        self,
+        packed: NDArray[np.float32],
+        drawing: Drawing,
+        slots: Ints,
+        *,
+        weight: NDArray[np.float32] | None = None,
+        td: NDArray[np.float32] | None = None,
+        q: NDArray[np.float32] | None = None,
+    ) -> None:
+        """The batch of one update, logs first: packed rows (B, W), and what is known of them.
+
+        `weight` as applied, `td` (Q - target) and `q` (B,); unknown ones are null in the tables.
+        Priorities and adaptive shares follow `td` where it is known.
+        """
+        if td is not None and self._draws is not None and self._draws.listens:
+            count = len(drawing.rows)
+            self._draws.update(drawing.rows, drawing.strata, np.abs(td[:count]))
+        phase = "online" if len(slots) else "offline"
+        if phase != self._phase:
+            self.flush()  # an interval is of one phase
+            self._phase = phase
+        self.batches += 1
+        if self.record is None:
+            return
+        unknown = np.full(len(packed), np.nan, np.float32)
+        batch = Batch(
+            rows=torch.from_numpy(packed),
+            weight=None if weight is None else torch.from_numpy(weight),
+            log_rows=drawing.rows,
+            log_stratum=drawing.strata,
+            slots=slots,
+            quota=drawing.quota,
+        )
+        loss = Loss(
+            value=torch.zeros(()),
+            td=torch.from_numpy(unknown if td is None else td),
+            q=torch.from_numpy(unknown if q is None else q),
+        )
+        self.record.batch(self.batches, self.env_steps, batch, loss, 0)
+        self._open += 1
+        if self._open >= self.log_every:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write the rows of the open interval; the run's files are whole after it."""
+        if self.record is None or self.run is None:
+            return
+        self.label(all_of_them=True)
+        means = self.record.flush(self.env_steps, self.batches, self._phase)
+        if self._open:
+            row = {
+                "env_steps": self.env_steps,
+                "gradient_steps": self.batches,
+                "wall_s": time.monotonic() - self._begun,
+                "phase": self._phase,
+                "updates": self._open,
+                "ring_rows": len(self.fresh),
+                "episodes": len(self._episodes),
+                **{name: known(value) for name, value in means.items()},
+            }
+            blank = dict.fromkeys(TABLES["progress"].names)
+            self.run.append("progress", [blank | row])
+        if self._episodes:
+            blank = dict.fromkeys(TABLES["episodes"].names)
+            rows = [blank | row for row in self._episodes.values()]
+            self.run.append("episodes", rows)
+        self._open, self._episodes = 0, {}
+        self.run.flush()
+
+    def fresh_meta(self, capacity: int) -> FreshMeta:
+        """Metadata beside a buffer that the library keeps."""
+        name = self.library
+        return FreshMeta(
+            capacity, self.num_envs, conditions=self.labels.names, behaviour_policy=name
+        )
+
+
+def _check(panel: Panel, task_hash: str, profile: str, observation_size: int) -> None:
+    if panel.task_hash != task_hash or panel.observation_size != observation_size:
+        raise PanelError(
+            f"its rows are of task {panel.task_hash} ({panel.observation_size} entries an"
+            f" observation), the environment's ({profile}) is {task_hash} ({observation_size})",
+            where=str(panel.path),
+            remedy=f"ingest the logs with `--profile {profile}` and mix anew",
+        )

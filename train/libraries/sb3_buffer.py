@@ -1,0 +1,300 @@
+"""Logs and fresh rows in the replay buffer of Stable-Baselines3's off-policy algorithms.
+
+    model = DQN(
+        "MlpPolicy",
+        env,
+        replay_buffer_class=MixtureReplayBuffer,
+        replay_buffer_kwargs={"panel": "panel/", "run": "runs/sb3", "ignore_weights": True},
+    )
+    model.learn(20_000)
+    model.replay_buffer.close()
+
+Each batch is `logs_share` rows of the panel, by its quotas, and fresh rows for the rest; while
+nothing is fresh, all of it is logs, so `model.train` can be called before `model.learn`. Rows carry
+their own discount (gamma^n, n as the panel and `n_step` have it), which replaces the model's gamma.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+
+from restock.errors import MixtureError
+from restock.replay.panel.panel import Panel
+from restock.replay.ring.ring import FreshRing
+from restock.replay.store.store import Store
+from restock.train.libraries.mixed_feed import MixedFeed
+
+Critic = Callable[[ReplayBufferSamples], tuple[torch.Tensor, torch.Tensor]]
+SB3 = "stable-baselines3"
+
+
+class MixtureReplayBuffer(ReplayBuffer):
+    """A `replay_buffer_class` that mixes a panel of logs with what the algorithm collects.
+
+    `replay_buffer_kwargs` may hold:
+
+    - `panel`: a panel or its directory; without one all rows are fresh.
+    - `run`: a directory to make, with the tables of `restock train`'s runs.
+    - `logs_share`: of a batch; default the panel's own.
+    - `n_step`, `discount`: of fresh rows; default 1, and the panel's discount or .99.
+    - `ignore_weights`: the panel's importance weights are not used: Stable-Baselines3's losses
+      have no place for any. Without it a panel that has weights is refused.
+    - `commands`: (n, 2), the command of every row of the panel, for a continuous action space; see
+      `logged_commands`. Default: the task's action that was nearest to it.
+    - `profile`, `seed`, `audit_share`, `log_every`: see `MixedFeed`.
+
+    `critic`, if set, is asked for (Q, TD) of every batch, (B,) each, which are then recorded by
+    condition; `dqn_critic(model)` makes one. It costs its forward passes.
+
+    Raises:
+        MixtureError: weights that cannot be applied, or `optimize_memory_usage`.
+        PanelError: a panel of another task, or with other actions.
+    """
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        device: torch.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        handle_timeout_termination: bool = True,
+        *,
+        panel: Panel | str | Path | None = None,
+        run: str | Path | None = None,
+        logs_share: float | None = None,
+        n_step: int = 1,
+        discount: float | None = None,
+        ignore_weights: bool = False,
+        commands: NDArray[Any] | None = None,
+        profile: str = "warehouse_amr",
+        seed: int = 0,
+        audit_share: float = 0.01,
+        log_every: int = 500,
+    ) -> None:
+        if optimize_memory_usage:
+            raise MixtureError("optimize_memory_usage cannot be had with a mixture")
+        # The rows are kept below, packed as the panel's are; the parent keeps next to nothing.
+        super().__init__(n_envs, observation_space, action_space, device, n_envs=n_envs)
+        self.handle_timeout_termination = handle_timeout_termination
+        self.buffer_size = max(buffer_size, n_envs * n_step)
+        size = int(np.prod(self.obs_shape))
+        panel = Panel.open(panel) if isinstance(panel, str | Path) else panel
+        if panel is not None and not ignore_weights and weighted(panel):
+            raise MixtureError(
+                "its rows have importance weights, and Stable-Baselines3's losses take none",
+                where=str(panel.path),
+                remedy='mix with `correction = {pre = "none", post = "none"}` and without'
+                ' `within = "per"`, or say ignore_weights=True',
+            )
+        if discount is None:
+            discount = panel.discount if panel is not None else 0.99
+        self.feed = MixedFeed(
+            SB3,
+            n_envs,
+            size,
+            panel=panel,
+            run=run,
+            logs_share=logs_share,
+            profile=profile,
+            seed=seed,
+            audit_share=audit_share,
+            log_every=log_every,
+        )
+        self.ring = FreshRing(
+            self.buffer_size,
+            n_envs,
+            size,
+            discount=discount,
+            n_step=n_step,
+            conditions=self.feed.labels.names,
+            behaviour_policies=(SB3,),
+        )
+        self.feed.keep_record(self.ring)
+        self.continuous = isinstance(action_space, spaces.Box)
+        self._fresh_actions = np.zeros((self.buffer_size, self.action_dim), np.float32)
+        self._waiting_actions: dict[tuple[int, int], NDArray[np.float32]] = {}
+        self._steps = np.zeros(n_envs, np.int64)  # of the running episodes
+        self._log_actions = self._logged_actions(panel, commands)
+        self.critic: Critic | None = None
+
+    def _logged_actions(
+        self, panel: Panel | None, commands: NDArray[Any] | None
+    ) -> NDArray[np.float32] | None:
+        """(n, A) as Stable-Baselines3 keeps actions: indices, or commands scaled to [-1, 1]."""
+        if panel is None:
+            return None
+        index = panel.rows[:, panel.columns["action"]]
+        if not self.continuous:
+            return np.ascontiguousarray(index)
+        if commands is None:
+            commands = np.asarray(panel.task.actions)[index[:, 0].astype(np.int64)]
+        if commands.shape != (len(panel), self.action_dim):
+            raise MixtureError(
+                f"commands have the shape {commands.shape}, not {(len(panel), self.action_dim)}",
+                where=str(panel.path),
+            )
+        low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
+        scaled: NDArray[np.float32] = np.float32(2) * (commands - low) / (high - low) - np.float32(
+            1
+        )
+        return np.clip(scaled, -1, 1).astype(np.float32)
+
+    def size(self) -> int:
+        """Fresh rows held."""
+        return len(self.ring)
+
+    def reset(self) -> None:
+        """Stable-Baselines3 calls this only where a buffer is made."""
+        self.pos, self.full = 0, False
+
+    def add(
+        self,
+        obs: NDArray[Any],
+        next_obs: NDArray[Any],
+        action: NDArray[Any],
+        reward: NDArray[Any],
+        done: NDArray[Any],
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """One step of every environment; `next_obs` is the last one where an episode ended."""
+        ring = self.ring
+        done = np.asarray(done, np.bool_)
+        cut = np.array([bool(info.get("TimeLimit.truncated", False)) for info in infos]) & done
+        cut &= self.handle_timeout_termination
+        chosen = action.reshape(self.n_envs, self.action_dim)
+        index = chosen[:, 0]
+        if self.continuous:  # for the record: the task's action that was nearest
+            index = np.array([info.get("action", 0) for info in infos])
+        before = ring.appended
+        keys = ring.append(
+            observation=np.reshape(obs, (self.n_envs, -1)),
+            action=index,
+            reward=reward,
+            terminated=done & ~cut,
+            truncated=cut,
+            next_observation=np.reshape(next_obs, (self.n_envs, -1)),
+            env_step=self.feed.env_steps,
+            gradient_step=self.feed.batches,
+            policy_version=self.feed.batches,
+        )
+        for key, step, own in zip(keys.tolist(), self._steps.tolist(), chosen, strict=True):
+            self._waiting_actions[key, step] = np.array(own, np.float32)
+        # An n-step row comes out steps later: its episode and step say whose action it has.
+        for slot in (np.arange(before, ring.appended) % ring.capacity).tolist():
+            place = int(ring.meta["episode"][slot]), int(ring.meta["episode_step"][slot])
+            self._fresh_actions[slot] = self._waiting_actions.pop(place)
+        for env in (env for env, info in enumerate(infos) if info.get("invalid", False)):
+            self._drop(int(keys[env]), int(self._steps[env]))
+        self._steps = np.where(done, 0, self._steps + 1)
+        self.feed.take(np.arange(self.n_envs), keys, done, infos)
+        self.pos, self.full = ring.appended % ring.capacity, ring.appended >= ring.capacity
+
+    def _drop(self, key: int, step: int) -> None:
+        """A step whose physics blew up must not be learnt from: its row repeats the one before."""
+        meta, ring = self.ring.meta, self.ring
+        mine = meta["episode"][: len(ring)] == key
+        steps = meta["episode_step"][: len(ring)]
+        bad, good = np.flatnonzero(mine & (steps == step)), np.flatnonzero(mine & (steps < step))
+        if len(bad) and len(good):
+            before = good[np.argmax(steps[good])]
+            ring.rows[bad] = ring.rows[before]
+            self._fresh_actions[bad] = self._fresh_actions[before]
+        self.feed.invalid_steps += 1
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        """A batch: logs first, then fresh rows."""
+        feed, ring = self.feed, self.ring
+        drawing = feed.draw_logs(batch_size)
+        slots = feed.sample_fresh(np.arange(len(ring)), batch_size - len(drawing.rows))
+        parts, actions = [ring.rows[slots]], [self._fresh_actions[slots]]
+        if feed.panel is not None and self._log_actions is not None:
+            parts.insert(0, feed.panel.rows[drawing.rows])
+            actions.insert(0, self._log_actions[drawing.rows])
+        packed, action = np.concatenate(parts), np.concatenate(actions)
+        samples = self._samples(packed, action, env)
+        td = q = None
+        if self.critic is not None:
+            with torch.no_grad():
+                q, td = (part.float().cpu().numpy().ravel() for part in self.critic(samples))
+        feed.drawn(packed, drawing, slots, td=td, q=q)
+        return samples
+
+    def _samples(
+        self, packed: NDArray[np.float32], action: NDArray[np.float32], env: VecNormalize | None
+    ) -> ReplayBufferSamples:
+        column = self.ring.columns
+        shape = (len(packed), *self.obs_shape)
+
+        def observed(name: str) -> torch.Tensor:
+            part = np.ascontiguousarray(packed[:, column[name]]).reshape(shape)
+            return self.to_torch(np.asarray(self._normalize_obs(part, env)))
+
+        discount = packed[:, column["discount"]]
+        return ReplayBufferSamples(
+            observations=observed("observation"),
+            actions=self.to_torch(action if self.continuous else action.astype(np.int64)),
+            next_observations=observed("next_observation"),
+            dones=self.to_torch((discount == 0).astype(np.float32)),
+            rewards=self.to_torch(self._normalize_reward(packed[:, column["reward"]], env)),
+            discounts=self.to_torch(discount),
+        )
+
+    def close(self) -> None:
+        """Write what the record still holds; the run is whole after it."""
+        self.feed.flush()
+
+
+def weighted(panel: Panel) -> bool:
+    """Whether batches of a panel are to be weighted: by corrections, or by PER within a stratum."""
+    by_rule = any(stratum.within == "per" for stratum in panel.strata)
+    return by_rule or any(stratum.correction != "none" for stratum in panel.strata)
+
+
+def dqn_critic(model: Any) -> Critic:
+    """Q and TD of a batch as `stable_baselines3.DQN` is about to learn from it."""
+
+    def critic(samples: ReplayBufferSamples) -> tuple[torch.Tensor, torch.Tensor]:
+        after = model.q_net_target(samples.next_observations).max(dim=1, keepdim=True).values
+        discount = samples.discounts if samples.discounts is not None else model.gamma
+        target = samples.rewards + (1 - samples.dones) * discount * after
+        q = model.q_net(samples.observations).gather(1, samples.actions.long())
+        return q, q - target
+
+    return critic
+
+
+def logged_commands(panel: Panel, store: str | Path) -> NDArray[np.float32]:
+    """The command (m/s, rad/s) of every row of a panel, (n, 2), from its store.
+
+    Raises:
+        MixtureError: the store lacks rows of the panel.
+    """
+    with Store(store) as opened:
+        opened.connection.register("wanted", panel.meta.select(["transition_id"]))
+        found = opened.connection.sql(
+            "SELECT transition_id, command_speed_mps, command_yaw_rate_radps"
+            " FROM transitions SEMI JOIN wanted USING (transition_id) ORDER BY transition_id"
+        ).to_arrow_table()
+    ids = found["transition_id"].to_numpy()
+    wanted = panel.meta["transition_id"].to_numpy()
+    if (missing := ~np.isin(wanted, ids)).any():
+        raise MixtureError(
+            f"{missing.sum()} rows of the panel are not in it",
+            where=str(store),
+            remedy="give the store that the panel was made from",
+        )
+    row = np.searchsorted(ids, wanted)
+    names = ("command_speed_mps", "command_yaw_rate_radps")
+    return np.stack([found[name].to_numpy()[row] for name in names], axis=1).astype(np.float32)

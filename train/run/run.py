@@ -1,0 +1,233 @@
+"""A run: one directory that holds everything about it, readable at any moment, even after a kill.
+
+config.json            what was asked for and with what: resolved config, panel, task, versions
+progress.parquet …     the tables of `run_tables`, each replaced in one step at a flush
+checkpoints/           latest.safetensors (all state) and best.safetensors (the policy kept)
+tensorboard/           the same curves as events
+eval/                  what `restock eval` measured
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from restock.errors import RunError
+from restock.files import write_table, write_text
+from restock.train.run.run_tables import TABLES
+
+if TYPE_CHECKING:
+    from restock.replay.panel.panel import Panel
+
+FORMAT = "restock-run/1"
+_LONG_TABLE = 4096  # rows
+Rows = Sequence[Mapping[str, Any]]
+
+
+class Run:
+    """A run directory. `create` makes a new one, `open` takes an existing one."""
+
+    def __init__(self, path: Path, document: dict[str, Any]) -> None:
+        self.path, self.document = path, document
+        self._written: dict[str, pa.Table] = {}
+        self._pending: dict[str, list[pa.Table]] = {name: [] for name in TABLES}
+        self._on_disk: dict[str, int] = {}  # rows per table
+
+    @classmethod
+    def create(cls, path: Path, document: Mapping[str, Any]) -> Run:
+        """A new directory with `config.json`.
+
+        Raises:
+            RunError: there is something at `path` already.
+        """
+        check_free(path)
+        path.mkdir(parents=True, exist_ok=True)
+        whole = {"format": FORMAT, **document}
+        write_text(path / "config.json", json.dumps(whole, indent=1) + "\n")
+        run = cls(path, whole)
+        run._written = {name: schema.empty_table() for name, schema in TABLES.items()}
+        run.flush()
+        return run
+
+    @classmethod
+    def open(cls, path: Path) -> Run:
+        """An existing run.
+
+        Raises:
+            RunError: there is none at `path`, or of a format this version does not know.
+        """
+        config = path / "config.json"
+        try:
+            document = json.loads(config.read_text(encoding="utf-8"))
+        except FileNotFoundError as error:
+            raise RunError(
+                "is not a run directory: it has no config.json",
+                where=str(path),
+                remedy="give the directory that `restock train --out` wrote",
+            ) from error
+        except (OSError, ValueError) as error:
+            raise RunError(f"cannot be read: {error}", where=str(config)) from error
+        found = document.get("format") if isinstance(document, dict) else None
+        if found != FORMAT:
+            raise RunError(
+                f"has format {found!r}, this Restock reads {FORMAT!r}", where=str(config)
+            )
+        run = cls(path, document)
+        for name, schema in TABLES.items():
+            file = path / f"{name}.parquet"
+            run._written[name] = (
+                pq.read_table(file, schema=schema) if file.exists() else schema.empty_table()
+            )
+            run._on_disk[name] = run._written[name].num_rows
+        return run
+
+    @property
+    def latest(self) -> Path:
+        return self.path / "checkpoints" / "latest.safetensors"
+
+    @property
+    def best(self) -> Path:
+        return self.path / "checkpoints" / "best.safetensors"
+
+    def append(self, table: str, rows: Rows) -> None:
+        """Add rows to a table; `flush` writes them. Every column must be given.
+
+        Raises:
+            KeyError: a row lacks a column or has one that the table does not.
+        """
+        if not rows:
+            return
+        schema = TABLES[table]
+        for row in rows:
+            if row.keys() != set(schema.names):
+                raise KeyError(f"{table}: {sorted(row.keys() ^ set(schema.names))}")
+        columns = {name: [row[name] for row in rows] for name in schema.names}
+        self.append_columns(table, columns)
+
+    def append_columns(self, table: str, columns: Mapping[str, Any]) -> None:
+        """Add rows given as columns (arrays, lists or scalars that hold for all rows)."""
+        self._pending[table].append(_to_table(columns, TABLES[table]))
+
+    def table(self, name: str) -> pa.Table:
+        """A table with all rows appended so far, flushed or not."""
+        if self._pending[name]:
+            self._written[name] = pa.concat_tables([self._written[name], *self._pending[name]])
+            self._pending[name] = []
+        return self._written[name]
+
+    def flush(self, *, everything: bool = True) -> None:
+        """Write every table that has new rows, or is not there yet; each in one step.
+
+        Without `everything` a long table waits until it has grown by a sixteenth, so that a run
+        of any length spends little on writing; a checkpoint always writes everything.
+        """
+        for name in TABLES:
+            path = self.path / f"{name}.parquet"
+            rows = self._written[name].num_rows + sum(part.num_rows for part in self._pending[name])
+            on_disk = self._on_disk.get(name, 0)
+            new = rows - on_disk
+            due = new and (everything or on_disk < _LONG_TABLE or new >= on_disk / 16)
+            if due or not path.exists():
+                self._write(name)
+
+    def _write(self, name: str) -> None:
+        table = self.table(name)
+        write_table(table, self.path / f"{name}.parquet")
+        self._on_disk[name] = table.num_rows
+
+    def row_counts(self) -> dict[str, int]:
+        """Rows per table, for a checkpoint."""
+        return {name: self.table(name).num_rows for name in TABLES}
+
+    def truncate(self, counts: Mapping[str, int]) -> None:
+        """Forget rows that were written after the checkpoint that `counts` is from.
+
+        Raises:
+            RunError: a table has fewer rows than the checkpoint knew of.
+        """
+        for name in TABLES:
+            table, count = self.table(name), int(counts.get(name, 0))
+            if table.num_rows < count:
+                raise RunError(
+                    f"has {table.num_rows} rows, the checkpoint was taken after {count}",
+                    where=str(self.path / f"{name}.parquet"),
+                    remedy="the run directory was changed by hand; start the run anew",
+                )
+            self._written[name] = table.slice(0, count)
+            if table.num_rows != count:
+                self._write(name)
+
+
+def check_free(path: Path) -> None:
+    """Raises RunError when there is something at `path` that a new run would overwrite."""
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise RunError(
+            "is there already",
+            where=str(path),
+            remedy="choose another --out, remove it, or continue it with"
+            f" `restock train --resume {path}`",
+        )
+
+
+def software_versions() -> dict[str, str]:
+    """What decides a run's numbers besides its config."""
+    from platform import python_version
+
+    from restock import __version__
+
+    names = ("torch", "mujoco", "gymnasium", "numpy", "duckdb", "pyarrow")
+    return {
+        "restock": __version__,
+        "python": python_version(),
+        **{name: version(name) for name in names},
+    }
+
+
+def panel_document(panel: Panel) -> dict[str, Any]:
+    """What a run's `config.json` says of its panel, whoever trains."""
+    header = panel.header
+    return {
+        "path": str(panel.path.resolve()),
+        "id": panel.id,
+        "store": header.store,
+        "store_version": panel.store_version,
+        "others": [msgspec.structs.asdict(store) for store in header.others],
+        "rows": len(panel),
+        "n_step": panel.n_step,
+        "discount": panel.discount,
+        "labels_version": header.labels_version,
+    }
+
+
+def now_ns() -> int:
+    """Wall time, to which the ages of logged rows refer."""
+    return time.time_ns()
+
+
+def _to_table(columns: Mapping[str, Any], schema: pa.Schema) -> pa.Table:
+    missing = set(schema.names) ^ set(columns)
+    if missing:
+        raise KeyError(f"columns {sorted(missing)}")
+    lengths = {len(value) for value in columns.values() if _is_column(value)}
+    if len(lengths) != 1:
+        raise ValueError(f"columns of lengths {sorted(lengths)}")
+    (length,) = lengths
+    arrays = []
+    for field in schema:
+        value = columns[field.name]
+        if not _is_column(value):
+            value = [value] * length
+        arrays.append(pa.array(value, field.type, from_pandas=False))
+    return pa.Table.from_arrays(arrays, schema=schema)
+
+
+def _is_column(value: Any) -> bool:
+    return hasattr(value, "__len__") and not isinstance(value, str | bytes)

@@ -1,0 +1,1 @@
+"""Methods x mixtures x seeds, ending in one comparison."""

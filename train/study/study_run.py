@@ -1,0 +1,176 @@
+"""Running a study: every arm with every seed, then the comparisons through the gate.
+
+A study is a TOML file and a directory. What is there already is not done again: a panel that was
+built, a run that has ended, an evaluation that was driven. So a study that was interrupted, or got
+another seed or arm, goes on where it was.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from restock.errors import RestockError, RunError
+from restock.files import write_text
+from restock.train.comparison.compare import Comparison, compare
+from restock.train.libraries.library_arm import DONE, Library, LibraryArm, check_installed, resolve
+from restock.train.study.study import ArmConfig, Job, Plan
+
+Say = Callable[[str], None]
+Engine = Literal["processes", "ray"]
+
+
+def run_study(
+    plan: Plan,
+    *,
+    workers: int = 1,
+    engine: Engine = "processes",
+    say: Say = lambda line: None,
+) -> list[Comparison]:
+    """Do what is not done yet, then compare every arm with its baseline, in the order of the arms.
+
+    `engine` "ray" gives each run to a Ray cluster: see `restock.train.study.study_on_ray`.
+
+    Raises:
+        RunError: a run failed (its log says why), or was made by another version of the study.
+        ConfigError: a library that an arm trains with, or Ray, is not installed.
+    """
+    for arm in plan.study.arms:
+        if arm.library is not None:
+            check_installed()
+            resolve(tuple(plan.settings(arm, plan.study.seeds[0])), arm.library)
+    for job in plan.jobs:
+        if job.done.exists() and job.done.read_text(encoding="utf-8") != plan.fingerprint(job):
+            raise RunError(
+                "was made for other settings than the study now has",
+                where=str(job.path),
+                remedy="remove it, or give the study another --out",
+            )
+    for arm in plan.study.arms:
+        _build(plan, arm, say)
+    todo = [job for job in plan.jobs if not job.done.exists()]
+    say(f"{len(plan.jobs) - len(todo)} of {len(plan.jobs)} runs are there already")
+    if engine == "ray":
+        from restock.train.study.study_on_ray import run_on_ray
+
+        run_on_ray(plan, todo, workers=workers, say=say)
+    else:
+        _run_here(plan, todo, workers, say)
+    return [
+        compare(plan.runs(pair.baseline), plan.runs(pair.arm), treatment=pair.treatment)
+        for pair in plan.study.pairs
+    ]
+
+
+def _run_here(plan: Plan, todo: Sequence[Job], workers: int, say: Say) -> None:
+    with ThreadPoolExecutor(max_workers=workers) as pool:
+        futures = [pool.submit(run_job, plan, job, say) for job in todo]
+        try:
+            for future in futures:
+                future.result()
+        finally:  # after a failure or Ctrl-C nothing more is begun; what runs checkpoints and ends
+            for future in futures:
+                future.cancel()
+
+
+def _build(plan: Plan, arm: ArmConfig, say: Say) -> None:
+    """An arm's panel, if it is a mixture that has not been packed yet."""
+    out = plan.panel(arm)
+    if out is None or out.exists() or arm.mixture is None or plan.study.store is None:
+        return
+    store = plan.study.store
+    if "://" not in store:
+        store = str(plan.folder / store)
+    mixture = plan.folder / arm.mixture
+    name = str(mixture) if mixture.is_file() else arm.mixture
+    say(f"packing {name} for {arm.name}")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    _restock(["mix", store, "--mixture", name, "--out", str(out)], plan.out / "logs" / "mix.log")
+
+
+def run_job(plan: Plan, job: Job, say: Say) -> None:
+    """Train and evaluate one run; taken up from its checkpoint if it has one."""
+    log = plan.out / "logs" / f"{job.path.name}.log"
+    if job.arm.library is not None:
+        _train_library(plan, job, job.arm.library, log, say)
+    else:
+        _train(plan, job, log, say)
+    asked = plan.study.evaluation
+    perturbations = ",".join(asked.perturbations)
+    say(f"{job.path.name}: evaluating")
+    _restock(
+        [
+            *("eval", str(job.path), "--policies", "agent", "--perturbations", perturbations),
+            *("--episodes", str(asked.episodes), "--seed", str(asked.seed)),
+        ],
+        log,
+    )
+    write_text(job.done, plan.fingerprint(job))
+
+
+def _train_library(plan: Plan, job: Job, library: Library, log: Path, say: Say) -> None:
+    """Another library keeps no checkpoint to go on from: a run that was cut begins anew."""
+    if (job.path / DONE).exists():
+        return
+    if job.path.exists():
+        shutil.rmtree(job.path)
+    settings = tuple(plan.settings(job.arm, job.seed))
+    asked = LibraryArm(str(job.path), library, settings, job.arm.arguments)
+    say(f"{job.path.name}: training with {library}")
+    _command("restock.train.libraries.library_arm", [msgspec.json.encode(asked).decode()], log)
+
+
+def _train(plan: Plan, job: Job, log: Path, say: Say) -> None:
+    panel = plan.panel(job.arm)
+    checkpoint = job.path / "checkpoints" / "latest.safetensors"
+    if (job.path / "config.json").exists() and not checkpoint.exists():
+        shutil.rmtree(job.path)  # cut before its first checkpoint: nothing to go on from
+    if checkpoint.exists():
+        arguments = ["train", "--resume", str(job.path)]
+    else:
+        sets = [word for setting in plan.settings(job.arm, job.seed) for word in ("--set", setting)]
+        arguments = ["train", "--out", str(job.path), *sets]
+        arguments += ["--panel", str(panel)] if panel is not None else []
+    say(f"{job.path.name}: training")
+    _restock(arguments, log)
+
+
+def _restock(arguments: Sequence[str], log: Path) -> None:
+    """One verb in a process of its own, its words in a log."""
+    _command("restock", arguments, log)
+
+
+def _command(module: str, arguments: Sequence[str], log: Path) -> None:
+    what = f"{module} {arguments[0]}" if module == "restock" else module
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("a", encoding="utf-8") as file:
+        file.write(f"$ {module} {' '.join(arguments)}\n")
+        file.flush()
+        ended = subprocess.run(
+            [sys.executable, "-m", module, *arguments],
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            stdin=subprocess.DEVNULL,
+            env={**os.environ, "NO_COLOR": "1"},
+            check=False,
+        )
+    if ended.returncode == 130:
+        raise KeyboardInterrupt
+    if ended.returncode not in (0, 3):
+        last = [line for line in log.read_text(encoding="utf-8").splitlines() if line.strip()][-3:]
+        raise RestockError(
+            f"`{what}` failed with exit code {ended.returncode}: " + " / ".join(last),
+            where=str(log),
+            remedy="mend it and run the study again: what is done is kept",
+        )
+
+
+__all__ = ["Engine", "Say", "run_job", "run_study"]

@@ -1,0 +1,1 @@
+"""The twin fitted to logs, and how far it is from them."""

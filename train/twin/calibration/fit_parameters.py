@@ -1,0 +1,136 @@
+"""What can be fitted: each parameter's range, the step it is varied by, and when it is known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.errors import ConfigError
+from restock.ingest.task.task import Task
+from restock.train.twin.physics.perturbation import RANGES, Perturbation
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One field of a `Perturbation` that a log can say something about."""
+
+    name: str
+    unit: str
+    step: float  # of a difference quotient; of a `ratio` the relative step
+    known: float  # a 95 % interval of more than +- this (of a ratio: its logarithm) says too little
+    doc: str
+    ratio: bool = False  # searched by its logarithm
+    default: bool = True
+    own_body: bool = False  # says something of the twin's own body only
+
+
+PARAMETERS: dict[str, Parameter] = {
+    item.name: item
+    for item in (
+        Parameter(
+            *("friction_scale", "", 0.04, 0.4, "the floor's grip: seen where wheels slide"),
+            ratio=True,
+            own_body=True,
+        ),
+        Parameter(
+            *("left_friction_scale", "", 0.04, 0.4, "grip of the left wheel, likewise"),
+            ratio=True,
+            default=False,
+            own_body=True,
+        ),
+        Parameter(
+            *("payload_kg", "kg", 2.0, 20.0, "load: seen while speeds change"), own_body=True
+        ),
+        Parameter("wheel_radius_scale", "", 0.004, 0.02, "way over ground, by the wheels' way"),
+        Parameter("track_scale", "", 0.004, 0.02, "turn over ground, by the wheels' turn"),
+        Parameter("latency_s", "s", 0.01, 0.03, "from an observation to the wheels' set point"),
+        Parameter("gain", "", 0.005, 0.02, "wheel speed, by the commanded one"),
+        Parameter("gyro_bias_radps", "rad/s", 0.001, 0.01, "what the gyro says at rest"),
+    )
+}
+DEFAULT = tuple(item.name for item in PARAMETERS.values() if item.default)
+
+
+def parse_parameters(text: str) -> tuple[str, ...]:
+    """`latency_s,gain` to names. Raises ConfigError where one is none of `PARAMETERS`."""
+    names = tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
+    unknown = [name for name in names if name not in PARAMETERS]
+    if unknown or not names:
+        raise ConfigError(
+            f"{unknown[0]!r} cannot be fitted" if unknown else "no parameter is named",
+            where="--parameters",
+            remedy=f"name some of {', '.join(PARAMETERS)}",
+        )
+    return names
+
+
+class Coordinates:
+    """Between perturbations and points z of the unit cube, one axis a parameter that is fitted.
+
+    What is not fitted is as in `base`.
+    """
+
+    def __init__(self, names: Sequence[str], base: Perturbation, task: Task) -> None:
+        self.names, self.base = tuple(names), base
+        self.parameters = [PARAMETERS[name] for name in names]
+        ends = np.array([RANGES[name] for name in names], np.float64).reshape(-1, 2)
+        if "latency_s" in self.names:  # four commands are kept, and a later one is not simulated
+            most = min(RANGES["latency_s"][1], 4 * task.control_period_s)
+            ends[self.names.index("latency_s"), 1] = most
+        self._ratio = np.array([item.ratio for item in self.parameters], np.bool_)
+        ends[self._ratio] = np.log(ends[self._ratio])
+        self._low, self._span = ends[:, 0], ends[:, 1] - ends[:, 0]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def steps(self) -> F64:
+        """Of difference quotients, (n,) in z."""
+        return np.array([item.step for item in self.parameters]) / self._span
+
+    @property
+    def known(self) -> F64:
+        """Half widths of intervals beyond which a parameter is not known, (n,) in z."""
+        return np.array([item.known for item in self.parameters]) / self._span
+
+    def values(self, z: F64) -> F64:
+        """Parameters (..., n) at points (..., n)."""
+        inner = self._low + np.asarray(z) * self._span
+        return np.where(self._ratio, np.exp(np.where(self._ratio, inner, 0.0)), inner)
+
+    def point(self, perturbation: Perturbation) -> F64:
+        """Where a perturbation is, (n,), moved into the cube."""
+        found = np.array([getattr(perturbation, name) for name in self.names], np.float64)
+        inner = np.where(self._ratio, np.log(np.where(self._ratio, found, 1.0)), found)
+        return np.clip((inner - self._low) / self._span, 0.0, 1.0)
+
+    def perturbation(self, z: F64) -> Perturbation:
+        """The perturbation at a point (n,)."""
+        # Rounded so that equal points are equal, and ends of ranges are within them.
+        found = dict(zip(self.names, (round(float(v), 9) for v in self.values(z)), strict=True))
+        return msgspec.structs.replace(self.base, **found)
+
+    def drivable(self, z: F64, timestep_s: float) -> F64:
+        """The point (n,) with the nearest latency that is some physics steps."""
+        moved = z.copy()
+        if "latency_s" in self.names:
+            at = self.names.index("latency_s")
+            tick = timestep_s / self._span[at]
+            moved[at] = np.clip(np.round(z[at] / tick), 0, np.floor(1 / tick + 1e-9)) * tick
+        return moved
+
+    def without(self, name: str) -> Coordinates:
+        """The same with one parameter fewer; it stays as in `base`."""
+        made = object.__new__(Coordinates)
+        keep = [index for index, own in enumerate(self.names) if own != name]
+        made.names, made.base = tuple(self.names[i] for i in keep), self.base
+        made.parameters = [self.parameters[i] for i in keep]
+        made._ratio, made._low, made._span = self._ratio[keep], self._low[keep], self._span[keep]
+        return made

@@ -1,0 +1,278 @@
+"""How far open-loop replays are from their log: pose and signals at the end of each horizon.
+
+Beside the twins stand two yardsticks. `odometry` is the logged wheel odometry, dead-reckoned from
+the same first pose: a twin that is no better predicts no better than the wheels already tell.
+`floor` is what a perfect twin would show: the twin's own paths, seen through localisation and
+sensor noise, and begun from a first pose that is as wrong as a localised one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.ingest.task.signals import wrap_angle
+from restock.replay.store.store import Store
+from restock.train.twin.calibration.log_segments import Segments, segments
+from restock.train.twin.calibration.logged_steps import NOMINAL, LoggedSteps
+from restock.train.twin.calibration.open_loop import replay
+from restock.train.twin.physics.model import body_velocity
+from restock.train.twin.physics.perturbation import Perturbation
+from restock.train.twin.physics.sensing import DRIFT_TIME_S
+
+F64 = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+SIGNALS = {
+    "wheel_speed_mps": "m/s",
+    "wheel_yaw_rate_radps": "rad/s",
+    "gyro_yaw_rate_radps": "rad/s",
+    "localised_speed_mps": "m/s",
+    "accel_x_mps2": "m/s2",
+}
+QUANTITIES = {"position": "m", "heading": "rad", **SIGNALS}
+ODOMETRY, FLOOR = "odometry", "floor"
+_AT_ONCE = 4096  # segments replayed at a time: bounds memory
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What a log's sensors add, standard deviations."""
+
+    position_m: float  # white, of each axis, as measured in the log
+    heading_rad: float  # white, as measured in the log
+    drift_m: float  # wanders over DRIFT_TIME_S, of each axis; as the twin assumes it
+    encoder_radps: float
+    gyro_radps: float
+    accel_mps2: float
+
+
+@dataclass(frozen=True)
+class PathGap:
+    """The gaps of S segments of one horizon."""
+
+    horizon_s: float
+    episode_id: NDArray[np.str_]  # (S,)
+    holds: dict[str, Bools]  # condition -> (S,) counted for it
+    gaps: dict[str, dict[str, F64]]  # source -> quantity -> (S,); NaN where not known
+    left_out: dict[str, int]
+
+
+def path_gap(
+    store: Store,
+    steps: LoggedSteps,
+    horizon_s: float,
+    twins: Mapping[str, Perturbation],
+    noise: Noise,
+    *,
+    most: int,
+    seed: int,
+    timestep_s: float,
+    nthread: int,
+) -> PathGap:
+    """Replay segments of `horizon_s`, which overlap by half, at most `most` a condition.
+
+    A segment counts for every condition that holds at any of its steps; for `nominal` where none
+    does. A gap of a pose is at the segment's end, of a signal its root mean square on the way.
+
+    Raises:
+        ConfigError: a horizon that is not some control periods.
+        StoreError: as `segments`.
+    """
+    period = steps.task.control_period_s
+    stride_s = max(round(horizon_s / 2 / period), 1) * period
+    cut = segments(store, horizon_s, stride_s=stride_s, task_hash=steps.task.hash)
+    holds = _holds(steps, cut)
+    chosen = _choose(holds, most, np.random.default_rng([seed, cut.horizon_steps]))
+    used = np.flatnonzero(np.any(list(chosen.values()), axis=0))
+    rng = np.random.default_rng([seed, cut.horizon_steps, 1])
+    found: dict[str, dict[str, list[F64]]] = {}
+    for begin in range(0, len(used), _AT_ONCE):
+        part = cut.take(used[begin : begin + _AT_ONCE])
+        for source, gaps in _gaps(part, twins, noise, rng, timestep_s, nthread).items():
+            for quantity, values in gaps.items():
+                found.setdefault(source, {}).setdefault(quantity, []).append(values)
+    return PathGap(
+        horizon_s,
+        cut.episode_id[used],
+        {name: mask[used] for name, mask in chosen.items()},
+        {s: {q: np.concatenate(v) for q, v in gaps.items()} for s, gaps in found.items()},
+        dict(cut.left_out),
+    )
+
+
+def measured_noise(steps: LoggedSteps, twin: Perturbation) -> Noise:
+    """The noise of a log: localisation's white part from the log, the rest as the twin assumes.
+
+    Over one step, the distance between the motion of the localised pose and that of the wheels is
+    mostly noise (in the median over nominal steps). Where it is next to nothing, the pose is the
+    odometry itself, and is taken to have no noise.
+    """
+    now, after, period = steps.now, steps.after, steps.task.control_period_s
+    elapsed = (after["pose_stamp_ns"] - now["pose_stamp_ns"]) * 1e-9
+    good = steps.followed & steps.conditions[NOMINAL] & (np.abs(elapsed - period) < 0.05 * period)
+    heading = now["pose_yaw_rad"][good]
+    x, y = ((after[n][good] - now[n][good]) for n in ("pose_x_m", "pose_y_m"))
+    turn = wrap_angle(after["pose_yaw_rad"][good] - heading)
+    sideways = -np.sin(heading + turn / 2) * x + np.cos(heading + turn / 2) * y
+    rate = (now["gyro_yaw_rate_radps"][good] + after["gyro_yaw_rate_radps"][good]) / 2
+    straight = np.abs(rate) < 0.1
+    if straight.sum() < 20:
+        white, yaw = twin.localisation_noise_m, twin.localisation_yaw_noise_rad
+    else:
+        white = _spread(sideways[straight]) / np.sqrt(2)
+        yaw = _spread((turn - rate * period)[straight]) / np.sqrt(2)
+    drift = twin.localisation_drift_m
+    if white < 0.1 * twin.localisation_noise_m:
+        white = yaw = drift = 0.0
+    else:  # a step's share of the drift is not white
+        keep = np.exp(-period / DRIFT_TIME_S)
+        white = float(np.sqrt(max(white**2 - drift**2 * (1 - keep), 0.0)))
+    return Noise(
+        white,
+        float(yaw),
+        drift,
+        twin.encoder_noise_radps,
+        twin.gyro_noise_radps,
+        twin.accel_noise_mps2,
+    )
+
+
+def _spread(values: F64) -> float:
+    """A standard deviation that a few outliers do not move."""
+    return float(1.4826 * np.median(np.abs(values - np.median(values))))
+
+
+def _holds(steps: LoggedSteps, cut: Segments) -> dict[str, Bools]:
+    first = steps.find(cut.transition_id)
+    rows = first[:, None] + np.arange(cut.horizon_steps)
+    held = {n: mask[rows].any(axis=1) for n, mask in steps.conditions.items() if n != NOMINAL}
+    return {NOMINAL: steps.conditions[NOMINAL][rows].all(axis=1), **held}
+
+
+def _choose(holds: Mapping[str, Bools], most: int, rng: np.random.Generator) -> dict[str, Bools]:
+    """At most `most` segments of each condition, drawn evenly."""
+    chosen = {}
+    for name, mask in holds.items():
+        kept, members = mask.copy(), np.flatnonzero(mask)
+        if len(members) > most:
+            kept[rng.permutation(members)[most:]] = False
+        chosen[name] = kept
+    return chosen
+
+
+def _gaps(
+    part: Segments,
+    twins: Mapping[str, Perturbation],
+    noise: Noise,
+    rng: np.random.Generator,
+    timestep_s: float,
+    nthread: int,
+) -> dict[str, dict[str, F64]]:
+    """Source -> quantity -> (S,) of these segments."""
+    replayed = replay(part, list(twins.values()), timestep_s=timestep_s, nthread=nthread)
+    logged = {name: part.signals[name] for name in SIGNALS}
+    fresh = part.pose_fresh[:, -1]
+    found = {}
+    for index, (name, twin) in enumerate(twins.items()):
+        signals = {signal: replayed.signals[signal][index] for signal in SIGNALS}
+        signals["gyro_yaw_rate_radps"] = signals["gyro_yaw_rate_radps"] + twin.gyro_bias_radps
+        found[name] = _gap(replayed.pose[index], signals, part.pose, logged, fresh)
+        for values in found[name].values():
+            values[replayed.blown_up[index]] = np.nan
+    found[ODOMETRY] = _gap(_dead_reckon(part), {}, part.pose, logged, fresh)
+    last = len(twins) - 1
+    truth = {name: replayed.signals[name][last] for name in SIGNALS}
+    path = replayed.pose[last]
+    sensed = path + _pose_noise(path.shape, noise, part.task.control_period_s, rng)
+    seen = _sense(truth, sensed, path, noise, part.task.control_period_s, rng)
+    found[FLOOR] = _gap(_lay(path, sensed[:, 0]), truth, sensed, seen, fresh)
+    return found
+
+
+def _gap(
+    pose: F64, signals: Mapping[str, F64], goal: F64, logged: Mapping[str, F64], fresh: Bools
+) -> dict[str, F64]:
+    off = pose[:, -1] - goal[:, -1]
+    found = {
+        "position": np.where(fresh, np.hypot(off[:, 0], off[:, 1]), np.nan),
+        "heading": np.where(fresh, np.abs(wrap_angle(off[:, 2])), np.nan),
+    }
+    for name, values in signals.items():
+        squared = (values[:, 1:] - logged[name][:, 1:]) ** 2
+        found[name] = np.sqrt(squared.mean(axis=1))
+    return found
+
+
+def _dead_reckon(part: Segments) -> F64:
+    """Poses (S, K + 1, 3) from the logged wheel odometry and the first logged pose."""
+    period = part.task.control_period_s
+    speed, rate = part.signals["wheel_speed_mps"], part.signals["wheel_yaw_rate_radps"]
+    turn = (rate[:, 1:] + rate[:, :-1]) / 2 * period
+    ahead = (speed[:, 1:] + speed[:, :-1]) / 2 * period
+    start = part.pose[:, :1]
+    heading = np.concatenate([start[..., 2], start[..., 2] + np.cumsum(turn, axis=1)], axis=1)
+    middle = (heading[:, 1:] + heading[:, :-1]) / 2
+    pose = np.empty((*heading.shape, 3))
+    pose[..., 2] = heading
+    for axis, way in enumerate((np.cos(middle), np.sin(middle))):
+        pose[:, 0, axis] = start[:, 0, axis]
+        pose[:, 1:, axis] = start[..., axis] + np.cumsum(ahead * way, axis=1)
+    return pose
+
+
+def _pose_noise(
+    shape: tuple[int, ...], noise: Noise, period_s: float, rng: np.random.Generator
+) -> F64:
+    """Localisation errors (S, K + 1, 3): white, and a drift that wanders."""
+    white = np.array([noise.position_m, noise.position_m, noise.heading_rad])
+    error = rng.standard_normal(shape) * white
+    keep = float(np.exp(-period_s / DRIFT_TIME_S))
+    drift = rng.standard_normal((shape[0], shape[1], 2))
+    for step in range(1, shape[1]):
+        drift[:, step] = keep * drift[:, step - 1] + np.sqrt(1 - keep**2) * drift[:, step]
+    error[..., :2] += noise.drift_m * drift
+    return np.asarray(error, np.float64)
+
+
+def _sense(
+    truth: Mapping[str, F64],
+    sensed: F64,
+    path: F64,
+    noise: Noise,
+    period_s: float,
+    rng: np.random.Generator,
+) -> dict[str, F64]:
+    """The signals that sensors would make of true ones."""
+    shape = path.shape[:2]
+    wheels = rng.standard_normal((2, *shape)) * noise.encoder_radps
+    speed, rate = body_velocity(wheels[0], wheels[1])
+    step = np.diff(sensed[..., :2] - path[..., :2], axis=1, prepend=0.0)
+    heading = path[..., 2]
+    along = (np.cos(heading) * step[..., 0] + np.sin(heading) * step[..., 1]) / period_s
+    added = {
+        "wheel_speed_mps": speed,
+        "wheel_yaw_rate_radps": rate,
+        "gyro_yaw_rate_radps": rng.standard_normal(shape) * noise.gyro_radps,
+        "localised_speed_mps": along,
+        "accel_x_mps2": rng.standard_normal(shape) * noise.accel_mps2,
+    }
+    return {name: values + added[name] for name, values in truth.items()}
+
+
+def _lay(pose: F64, onto: F64) -> F64:
+    """Paths (S, K + 1, 3) moved as one so that each first pose is `onto` (S, 3)."""
+    turn = (onto[:, 2] - pose[:, 0, 2])[:, None]
+    x, y = pose[..., 0] - pose[:, :1, 0], pose[..., 1] - pose[:, :1, 1]
+    return np.stack(
+        [
+            onto[:, :1] + np.cos(turn) * x - np.sin(turn) * y,
+            onto[:, 1:2] + np.sin(turn) * x + np.cos(turn) * y,
+            pose[..., 2] + turn,
+        ],
+        axis=-1,
+    )

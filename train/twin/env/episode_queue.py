@@ -1,0 +1,68 @@
+"""Which episode each of N environments begins next: fixed ones in their order, then drawn ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from restock.errors import ConfigError
+from restock.train.twin.physics.episode import KINDS, EpisodeSpec
+from restock.train.twin.physics.perturbation import Schedule
+
+DEFAULT_CONDITIONS: Mapping[str, float] = {
+    "nominal": 0.55,
+    "wheel_slip": 0.15,
+    "blocked_aisle": 0.15,
+    "near_collision": 0.15,
+}
+
+
+class EpisodeQueue:
+    """An environment's n-th drawn episode is the same whatever the others do.
+
+    `conditions` are shares per kind of episode; a schedule draws each a perturbation.
+
+    Raises:
+        ConfigError: an unknown condition, or shares that are no shares.
+    """
+
+    def __init__(
+        self, num_envs: int, conditions: Mapping[str, float], schedule: Schedule | None, seed: int
+    ) -> None:
+        self.seed, self.schedule = seed, schedule
+        self.drawn = np.zeros(num_envs, np.int64)  # episodes so far, per environment
+        self.fixed: list[EpisodeSpec] = []
+        self.next_fixed = 0
+        self.set_conditions(conditions)
+
+    def set_conditions(self, conditions: Mapping[str, float]) -> None:
+        """Shares per kind of episode, for episodes that begin from now on."""
+        unknown = set(conditions) - set(KINDS)
+        total = sum(conditions.values())
+        if unknown or min(conditions.values(), default=-1) < 0 or total <= 0:
+            raise ConfigError(
+                f"conditions {dict(conditions)} are not shares per kind of episode",
+                where="the twin",
+                remedy=f"give numbers of at least 0, not all 0, for {', '.join(KINDS)}",
+            )
+        shares = np.array([conditions.get(kind, 0.0) for kind in KINDS])
+        self.conditions = {k: float(conditions[k]) for k in KINDS if k in conditions}
+        self._cumulative = np.cumsum(shares) / total
+
+    def set_fixed(self, specs: Iterable[EpisodeSpec]) -> None:
+        """These next, in order, whichever environment asks."""
+        self.fixed, self.next_fixed = list(specs), 0
+
+    def next(self, env: int) -> tuple[EpisodeSpec, int]:
+        """The episode that an environment begins now, and its place among the fixed, or -1."""
+        if self.next_fixed < len(self.fixed):
+            self.next_fixed += 1
+            return self.fixed[self.next_fixed - 1], self.next_fixed - 1
+        draw = np.random.SeedSequence([self.seed, env, int(self.drawn[env])]).generate_state(3)
+        self.drawn[env] += 1
+        kind = np.searchsorted(self._cumulative, draw[0] / 2**32, side="right")
+        seed = int(draw[1]) << 20 ^ int(draw[2])
+        rng = np.random.default_rng([seed, 1])
+        perturbation = self.schedule.draw(rng) if self.schedule else None
+        return EpisodeSpec(KINDS[int(kind)], seed, perturbation), -1

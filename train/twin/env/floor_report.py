@@ -1,0 +1,98 @@
+"""What a floor is and which episodes fit on it, before anything is trained there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csgraph
+
+from restock.errors import ConfigError
+from restock.train.twin.floors.layout import Warehouse
+from restock.train.twin.floors.planner import Planner
+from restock.train.twin.physics.episode import KINDS, EpisodeSpec, draw_episode
+
+
+def describe_floor(floor: Warehouse) -> dict[str, Any]:
+    """Plain values: sizes in metres, counts, unreachable goals, and the kinds of episodes that fit.
+
+    A goal is unreachable where no robot gets there from the largest part of the floor, by its
+    one-way rules. `hash` names the floor whatever it is called.
+    """
+    widths = [segment.width_m for segment in floor.segments]
+    return {
+        "name": floor.name,
+        "hash": floor.hash,
+        "width_m": floor.width_m,
+        "depth_m": floor.depth_m,
+        "racks": len(floor.racks),
+        "aisle_segments": len(floor.segments),
+        "narrowest_aisle_m": round(min(widths), 3) if widths else None,
+        "widest_aisle_m": round(max(widths), 3) if widths else None,
+        "one_way_rules": len(floor.one_way),
+        "docks": len(floor.docks),
+        "goals": len(floor.goals),
+        "unreachable_goals": unreachable_goals(floor),
+        "map_origin": list(floor.map_origin),
+        "episodes": list(fitting_kinds(floor)),
+    }
+
+
+def refuse_unfit(floors: Iterable[Warehouse], kinds: Iterable[str]) -> None:
+    """Raises ConfigError where a floor has no room for one of these kinds of episodes."""
+    kinds = tuple(kinds)
+    for floor in floors:
+        unfit = [kind for kind in kinds if kind not in fitting_kinds(floor)]
+        if unfit:
+            raise ConfigError(
+                f"{floor.name} has no room for episodes of {', '.join(unfit)}",
+                where="layouts",
+                remedy="train and record without these conditions, or give it more aisles or room;"
+                " `restock twin layout` says what fits on a floor",
+            )
+
+
+def unfit_kinds(floors: Iterable[Warehouse]) -> dict[str, list[str]]:
+    """The kinds of episodes that some floor has no room for, and the names of those floors."""
+    found: dict[str, list[str]] = {}
+    for floor in floors:
+        for kind in KINDS:
+            if kind not in fitting_kinds(floor):
+                found.setdefault(kind, []).append(floor.name)
+    return found
+
+
+def sealed(floors: Iterable[Warehouse]) -> list[str]:
+    """A line a floor that has goals which no robot reaches: its episodes never go there."""
+    return [
+        f"{floor.name}: {count} of {len(floor.goals)} goals cannot be reached from the others"
+        for floor in floors
+        if (count := unreachable_goals(floor))
+    ]
+
+
+def unreachable_goals(floor: Warehouse) -> int:
+    """How many goals a robot cannot reach from the part with the most of them, and come back."""
+    planner = Planner(floor)
+    _, part = csgraph.connected_components(planner._graph, connection="strong")
+    cells = np.array([planner.cell(x, y) for x, y in floor.goals])
+    return len(cells) - int(np.bincount(part[cells]).max())
+
+
+@lru_cache(maxsize=1024)
+def fitting_kinds(floor: Warehouse) -> tuple[str, ...]:
+    """The kinds of episodes that could be drawn on a floor, whatever their seed (of three)."""
+    planner = Planner(floor)
+    return tuple(
+        kind for kind in KINDS if all(_fits(kind, seed, floor, planner) for seed in range(3))
+    )
+
+
+def _fits(kind: str, seed: int, floor: Warehouse, planner: Planner) -> bool:
+    try:
+        draw_episode(EpisodeSpec(kind, seed), floor, planner)
+    except ConfigError:
+        return False
+    return True

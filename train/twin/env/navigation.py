@@ -1,0 +1,105 @@
+"""Navigation of N robots: whose plan is in force, and when it is made anew.
+
+A plan is made anew when the robot strays from it, or when its lidar has found an aisle wholly
+blocked. What it found it remembers for the rest of the episode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.ingest.task.task import Task
+from restock.train.twin.floors.layout import Warehouse
+from restock.train.twin.floors.planner import PLAN_POINTS, BlockFinder, Closure, Planner, planners
+from restock.train.twin.physics.episode import Episode
+from restock.train.twin.physics.sensing import Sensing, Signals
+
+F64 = NDArray[np.float64]
+
+STRAYED_M = 0.6
+LOOK_M = 1.9  # something this near ahead makes the finder look at the scan
+
+
+class Navigation:
+    """Plans and goals of N robots, each on one of `floors`."""
+
+    def __init__(self, floors: Sequence[Warehouse], num_envs: int, task: Task) -> None:
+        self.task = task
+        self.planners = planners(floors)
+        self.finder = BlockFinder(floors, num_envs)
+        self.floor = self.finder.floor  # (N,) on which of the floors
+        self._any_along_y = any(floor.segment_along_y.any() for floor in floors)
+        self.plans_m = np.zeros((num_envs, PLAN_POINTS, 2))
+        self.goals_m = np.zeros((num_envs, 2))
+        self.closures: list[list[Closure]] = [[] for _ in range(num_envs)]
+        self.plan_number = np.zeros(num_envs, np.int64)  # rises with every new plan
+
+    def planner_of(self, env: int) -> Planner:
+        """The planner of the floor that a robot is on."""
+        return self.planners[int(self.floor[env])]
+
+    def reset(self, env: int, episode: Episode, floor: int = 0) -> None:
+        """Begin an episode with its first plan."""
+        self.floor[env] = floor
+        self.plans_m[env], self.goals_m[env] = episode.plan_m, episode.goal
+        self.closures[env] = []
+        self.plan_number[env] += 1
+        self.finder.reset(np.array([env]))
+
+    def update(self, signals: Signals, offset_m: F64, sensing: Sensing) -> NDArray[np.int64]:
+        """Look at the new signals; returns whose plan changed."""
+        again = set(np.flatnonzero(offset_m > STRAYED_M).tolist())
+        again |= self._find_blocks(signals, sensing)
+        for env in again:
+            self.plans_m[env] = self.planner_of(env).plan(
+                float(signals["pose_x_m"][env]),
+                float(signals["pose_y_m"][env]),
+                (float(self.goals_m[env, 0]), float(self.goals_m[env, 1])),
+                self.closures[env],
+            )
+            self.plan_number[env] += 1
+        return np.array(sorted(again), np.int64)
+
+    def _find_blocks(self, signals: Signals, sensing: Sensing) -> set[int]:
+        """Look for blocked aisles where something is near ahead; returns whose map changed."""
+        yaw = signals["pose_yaw_rad"]
+        toward_x = (
+            np.cos(yaw) * signals["waypoint_near_x_m"] - np.sin(yaw) * signals["waypoint_near_y_m"]
+        )
+        near_ahead = signals["clearance_ahead_m"] < LOOK_M
+        if self._any_along_y:
+            toward_y = (
+                np.sin(yaw) * signals["waypoint_near_x_m"]
+                + np.cos(yaw) * signals["waypoint_near_y_m"]
+            )
+            along_y = np.abs(toward_y) > np.abs(toward_x)
+            toward = np.where(along_y, toward_y, toward_x)
+        else:
+            along_y, toward = np.zeros(len(yaw), np.bool_), toward_x
+        ids = np.flatnonzero(near_ahead & (np.abs(toward) > 0.4))
+        if not len(ids):
+            return set()
+        ranges = sensing.ranges_m[ids]
+        pose = np.stack([signals["pose_x_m"], signals["pose_y_m"], yaw], axis=-1)[ids]
+        bearing = pose[:, 2, None] + sensing.simulation.bearings_rad
+        valid = (ranges > self.task.range_min_m) & np.isfinite(ranges)
+        reach = np.where(valid, ranges, 0.0)
+        ahead = self.task.body.lidar_x_m
+        hits = np.stack(
+            [
+                (pose[:, 0] + ahead * np.cos(pose[:, 2]))[:, None] + reach * np.cos(bearing),
+                (pose[:, 1] + ahead * np.sin(pose[:, 2]))[:, None] + reach * np.sin(bearing),
+            ],
+            axis=-1,
+        )
+        heading = np.sign(toward[ids])
+        found = self.finder.update(ids, pose, hits, valid, heading, along_y[ids])
+        changed = set()
+        for env, closure in found:
+            if closure not in self.closures[env]:
+                self.closures[env].append(closure)
+                changed.add(env)
+        return changed

@@ -1,0 +1,256 @@
+"""Who drives: scripted behaviour policies, each with a name and a version that go into the log.
+
+A policy's `act(env, observation)` gives the actions (N,) and the probability (N,) that it gives
+to each: a small share of its actions is random, so that the log covers more than its habits.
+`acting` (N,) names who chose the last actions, which differs from `name` where control is handed
+over. Policies draw from their own seeded generator.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+
+F64 = NDArray[np.float64]
+Actions = NDArray[np.int64]
+
+STUCK_STEPS = 15
+SLIP_STEPS = 4
+MIN_HELD_STEPS = 15
+
+
+class Policy(Protocol):
+    """What drives a `WarehouseVectorEnv`."""
+
+    name: str
+    version: str
+    acting: NDArray[np.str_]  # (N,) who chose the last actions
+    acting_version: NDArray[np.str_]  # (N,)
+
+    def act(self, env: WarehouseVectorEnv, observation: NDArray[np.float32]) -> tuple[Actions, F64]:
+        """Actions (N,) and the probabilities (N,) they had."""
+        ...
+
+
+class Overseer(Policy, Protocol):
+    """A policy that can be called in, and knows when it is no longer needed."""
+
+    def sees_trouble(self, env: WarehouseVectorEnv) -> NDArray[np.bool_]:
+        """Where (N,) it would not hand back yet."""
+        ...
+
+
+class SoftPolicy:
+    """A policy that takes a random action with probability `epsilon`."""
+
+    name = "soft"
+    version = "1"
+
+    def __init__(self, *, epsilon: float, seed: int = 0) -> None:
+        self.epsilon = epsilon
+        self._rng = np.random.default_rng([seed, sum(self.name.encode())])
+        self.acting = np.array([], "U16")
+        self.acting_version = np.array([], "U16")
+
+    def choose(self, env: WarehouseVectorEnv) -> Actions:
+        """The action (N,) it would take without chance."""
+        raise NotImplementedError
+
+    def certain(self, env: WarehouseVectorEnv) -> NDArray[np.bool_]:
+        """Where (N,) it leaves nothing to chance; nowhere, unless a policy says so."""
+        return np.zeros(env.num_envs, np.bool_)
+
+    def act(self, env: WarehouseVectorEnv, observation: NDArray[np.float32]) -> tuple[Actions, F64]:
+        """Actions (N,) and the probabilities (N,) they had."""
+        chosen = self.choose(env)
+        count = len(env.task.actions)
+        epsilon = np.where(self.certain(env), 0.0, self.epsilon)
+        chance = self._rng.random(env.num_envs) < epsilon
+        action = np.where(chance, self._rng.integers(count, size=env.num_envs), chosen)
+        probability = np.where(action == chosen, 1 - epsilon, 0.0) + epsilon / count
+        self.acting = np.full(env.num_envs, self.name, "U16")
+        self.acting_version = np.full(env.num_envs, self.version, "U16")
+        return action, probability
+
+
+class RandomPolicy(SoftPolicy):
+    """Every action with the same probability."""
+
+    name = "random"
+
+    def __init__(self, *, seed: int = 0) -> None:
+        super().__init__(epsilon=1.0, seed=seed)
+
+    def choose(self, env: WarehouseVectorEnv) -> Actions:
+        """Nothing in particular."""
+        return np.zeros(env.num_envs, np.int64)
+
+
+class PlannerFollower(SoftPolicy):
+    """Follows the plan, slows for turns and obstacles, stops when something is close ahead.
+
+    It sees what the robot sees: waypoints and lidar clearances. It never leaves its plan, so a
+    pallet that blocks part of the aisle stops it for good.
+    """
+
+    name = "planner"
+    stop_m = 0.30
+    slow_m = 0.80
+    pivot_m = 0.14  # room that turning on the spot needs around the body
+
+    def __init__(self, *, epsilon: float = 0.02, seed: int = 0) -> None:
+        super().__init__(epsilon=epsilon, seed=seed)
+
+    def choose(self, env: WarehouseVectorEnv) -> Actions:
+        """The action of the nearest velocity to what the plan asks for."""
+        signals = env.signals
+        near = np.arctan2(signals["waypoint_near_y_m"], signals["waypoint_near_x_m"])
+        far = np.arctan2(signals["waypoint_far_y_m"], signals["waypoint_far_x_m"])
+        front = self._front(env)
+        left, right = near > 0, near < 0
+        bend = np.abs(near)
+
+        action = np.full(env.num_envs, self._index(env, 1.0, 0.0))
+        slow = (np.abs(far) > 0.5) | (front < self.slow_m) | (signals["goal_distance_m"] < 0.8)
+        action[slow] = self._index(env, 0.4, 0.0)
+        for turning, side in ((left, 1.0), (right, -1.0)):
+            fast = turning & (bend > 0.12) & ~slow
+            action[fast] = self._index(env, 0.8, side * 0.7)
+            careful = turning & (bend > 0.12) & slow
+            careful |= turning & (bend > 0.45)
+            action[careful] = self._index(env, 0.35, side * 0.6)
+        blocked = front < self.stop_m
+        action[blocked] = 0
+        for turning, side in ((left, 1.0), (right, -1.0)):
+            pivot = turning & (bend > 0.9) & (signals["clearance_m"] > self.pivot_m)
+            action[pivot] = self._index(env, 0.0, side * 1.2)
+        return action
+
+    def certain(self, env: WarehouseVectorEnv) -> NDArray[np.bool_]:
+        """Its safety stop leaves nothing to chance, nor does it where anything is near."""
+        near = env.signals["clearance_m"] < self.stop_m
+        return np.asarray(near | (self._front(env) < 2 * self.stop_m), np.bool_)
+
+    def _front(self, env: WarehouseVectorEnv) -> F64:
+        """The smallest clearance (N,) within 30 degrees of straight ahead."""
+        clearance = env.signals["sector_clearance_m"]
+        count = clearance.shape[1]
+        half = max(round(count * 30 / 360), 1)
+        front: F64 = clearance[:, count // 2 - half : count // 2 + half].min(axis=1)
+        return front
+
+    def _index(self, env: WarehouseVectorEnv, speed_mps: float, yaw_rate_radps: float) -> int:
+        table = np.asarray(env.task.actions)
+        return int(np.abs(table - (speed_mps, yaw_rate_radps)).sum(axis=1).argmin())
+
+
+@dataclass(frozen=True)
+class HandoverEvent:
+    """Control passed from one policy to another."""
+
+    env: int
+    episode_seed: int
+    step: int  # of the episode
+    giver: str
+    taker: str
+    reason: str  # stuck, bumped, slipping, clear
+
+
+class Handover:
+    """The planner drives; the operator takes over in trouble and hands back when it is past.
+
+    Trouble is what the robot itself notices: no way made for 3 s, the bumper, or wheels that
+    disagree with the localisation. `events` keeps every handover, oldest first.
+    """
+
+    version = "1"
+
+    def __init__(self, planner: Policy, operator: Overseer) -> None:
+        self.planner, self.operator = planner, operator
+        self.name = f"{planner.name}+{operator.name}"
+        self.events: list[HandoverEvent] = []
+        self.acting = np.array([], "U16")
+        self.acting_version = np.array([], "U16")
+        self._taken: NDArray[np.bool_] | None = None
+
+    def _prepare(self, count: int) -> None:
+        self._taken = np.zeros(count, np.bool_)
+        self._held = np.zeros(count, np.int64)  # steps since the last handover
+        self._still = np.zeros(count, np.int64)  # steps without way made
+        self._slipping = np.zeros(count, np.int64)
+        self._anchor = np.zeros((count, 3))
+
+    def act(self, env: WarehouseVectorEnv, observation: NDArray[np.float32]) -> tuple[Actions, F64]:
+        """The actions of whoever drives each robot, and their probabilities."""
+        if self._taken is None or len(self._taken) != env.num_envs:
+            self._prepare(env.num_envs)
+        assert self._taken is not None  # for the type checker: _prepare made it
+        self._watch(env)
+        action, probability = self.planner.act(env, observation)
+        if self._taken.any():
+            theirs, theirs_probability = self.operator.act(env, observation)
+            action = np.where(self._taken, theirs, action)
+            probability = np.where(self._taken, theirs_probability, probability)
+        names = self.planner.name, self.operator.name
+        self.acting = np.where(self._taken, names[1], names[0]).astype("U16")
+        versions = self.planner.version, self.operator.version
+        self.acting_version = np.where(self._taken, versions[1], versions[0]).astype("U16")
+        return action, probability
+
+    def _watch(self, env: WarehouseVectorEnv) -> None:
+        """Decide whose turn it is, everywhere."""
+        assert self._taken is not None
+        signals = env.signals
+        begun = env.steps == 0
+        self._taken[begun] = False
+        self._held[begun] = self._still[begun] = self._slipping[begun] = 0
+        pose = np.stack(
+            [signals["pose_x_m"], signals["pose_y_m"], signals["pose_yaw_rad"]], axis=-1
+        )
+        moved = np.abs(pose - self._anchor)
+        moved[:, 2] = np.minimum(moved[:, 2], 2 * np.pi - moved[:, 2])
+        away = (moved > (0.25, 0.25, 0.6)).any(axis=1) | begun
+        self._anchor[away] = pose[away]
+        self._still = np.where(away, 0, self._still + 1)
+        slip = np.abs(signals["wheel_speed_mps"] - signals["localised_speed_mps"]) > 0.3
+        slip |= np.abs(signals["wheel_yaw_rate_radps"] - signals["gyro_yaw_rate_radps"]) > 0.5
+        self._slipping = np.where(slip, self._slipping + 1, np.maximum(self._slipping - 1, 0))
+        self._held += 1
+        stuck = self._still >= STUCK_STEPS
+        slipping = self._slipping >= SLIP_STEPS
+        trouble = stuck | signals["bumped"] | slipping
+        for index in np.flatnonzero(trouble & ~self._taken):
+            reason = (
+                "bumped" if signals["bumped"][index] else "slipping" if slipping[index] else "stuck"
+            )
+            self._pass(env, int(index), True, reason)
+        clear = (
+            (signals["clearance_m"] > 0.2)
+            & (self._slipping == 0)
+            & ~signals["bumped"]
+            & (self._held >= MIN_HELD_STEPS)
+            & ~self.operator.sees_trouble(env)
+        )
+        for index in np.flatnonzero(clear & self._taken):
+            self._pass(env, int(index), False, "clear")
+
+    def _pass(self, env: WarehouseVectorEnv, index: int, taken: bool, reason: str) -> None:
+        assert self._taken is not None
+        names = self.planner.name, self.operator.name
+        self._taken[index] = taken
+        self._held[index] = self._still[index] = 0
+        self.events.append(
+            HandoverEvent(
+                env=index,
+                episode_seed=int(env.episode_seed[index]),
+                step=int(env.steps[index]),
+                giver=names[not taken],
+                taker=names[taken],
+                reason=reason,
+            )
+        )

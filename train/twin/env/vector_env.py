@@ -1,0 +1,419 @@
+"""The twin as a Gymnasium vector environment: N warehouses stepped in one native call.
+
+    env = WarehouseVectorEnv(16, conditions={"nominal": 0.55, "wheel_slip": 0.15, ...}, seed=1)
+    observation, info = env.reset(seed=1)
+    observation, reward, terminated, truncated, info = env.step(actions)
+
+Actions index the task's table; with `action="continuous"` they are (N, 2) speeds in m/s and yaw
+rates in rad/s over the same task: see `restock.train.twin.env.action_face`.
+
+Autoreset is SAME_STEP (in the metadata): where an episode ends, `observation` is already the next
+episode's first, and the last one is in `info["final_obs"]`. Bootstrap on truncation, never on
+termination.
+
+`info` holds arrays (N,) about the step just taken, whole even where an episode ended:
+
+- `signals`: the stored signals at t + 1, before any autoreset (`env.signals`: after it). Its
+  `command_*` columns are the commands of [t, t + 1); `progress_m` along the plan in force at t;
+- `true_condition`: what was physically so over [t, t + 1); `episode_condition`, `block` (none,
+  partial, full), `episode_seed`, `perturbation` and `layout` (their names), `floor` (the layout
+  itself), `episode_number` (place in `set_episodes`, or -1); `perturbation_values`, as JSON those
+  that are not nominal;
+- `success` (at the goal without any bump, at the episode's end), `bumps` (steps with a bump so
+  far), `episode_steps`, `true_pose` (N, 3);
+- `invalid`: the physics blew up: the episode is truncated and the step must not enter replay;
+- `final_obs`, with the mask `_final_obs`;
+- on the continuous face `action`, the nearest of the task's, and `action_residual`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from restock.errors import ConfigError
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.task import Task, observe, reached_goal, reward, terminated
+from restock.train.twin.env.action_face import Face, action_face
+from restock.train.twin.env.camera import Camera, View, check_view
+from restock.train.twin.env.draw import draw_map
+from restock.train.twin.env.episode_queue import DEFAULT_CONDITIONS, EpisodeQueue
+from restock.train.twin.env.floor_report import refuse_unfit
+from restock.train.twin.env.navigation import Navigation
+from restock.train.twin.floors.floors import open_floors
+from restock.train.twin.floors.layout import DEFAULT, Warehouse, default_warehouse
+from restock.train.twin.physics.episode import Episode, EpisodeSpec, draw_episode
+from restock.train.twin.physics.perturbation import Perturbation, Schedule
+from restock.train.twin.physics.sensing import Sensing, Signals, add_motion, add_route
+from restock.train.twin.physics.simulation import Live, Physics, Simulation
+from restock.train.twin.physics.truth import Truth
+
+OBSERVATION_LIMIT = 20.0  # no sensor of this robot gives more; holds the space's bounds
+
+
+class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]):
+    """N warehouses. See the module for what `info` holds."""
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium declares it
+        "render_modes": ["rgb_array"],
+        "render_fps": 5,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        conditions: Mapping[str, float] | None = None,
+        perturbation: Perturbation | Schedule | None = None,
+        seed: int = 0,
+        nthread: int = 1,
+        render_mode: str | None = None,
+        task: Task | None = None,
+        warehouse: Warehouse | None = None,
+        layouts: str | Sequence[Warehouse] = DEFAULT,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        action: Face = "discrete",
+        physics: Physics = "mujoco",
+        camera: View | None = None,
+    ) -> None:
+        """`conditions` are shares of episodes per kind; `nthread` 0 uses every core; `physics`
+        "warp" steps on MuJoCo Warp's device: see docs/mjwarp.md.
+
+        A `perturbation` holds for every episode whose spec has none of its own; a schedule draws
+        one for each such episode (fixed episodes get its base). `env.specs` tells them.
+
+        `layouts` are floors, or what `restock.train.twin.floors.floors.open_floors` reads, such as
+        `generated:train`: an episode whose spec names none of them is on one that its seed draws.
+        `warehouse` is the one floor, in their place.
+
+        `render()` draws a top-down map, or with a `camera` ("chase", "overhead") renders over EGL.
+
+        Raises:
+            ConfigError: an unknown condition, shares that are no shares, a floor without room for
+                a condition's episodes, no environments, an action space that is not there, or an
+                autoreset mode other than SAME_STEP and DISABLED.
+        """
+        if num_envs < 1:
+            raise ConfigError(f"num_envs must be 1 or more, got {num_envs}", where="the twin")
+        self.num_envs = num_envs
+        check_view(camera)
+        self.render_mode, self.view = render_mode, camera
+        self._camera: Camera | None = None
+        self.task = task or load_profile("warehouse_amr").task
+        self.floors = _floors(warehouse, layouts)
+        self._layout_names = np.array([floor.name for floor in self.floors])
+        self._floor_objects = np.empty(len(self.floors), object)
+        self._floor_objects[:] = self.floors
+        self._floor_index = {floor.name: index for index, floor in enumerate(self.floors)}
+        self.layout = np.zeros(num_envs, np.int64)  # of the running episodes, among the floors
+        schedule = perturbation if isinstance(perturbation, Schedule) else None
+        base = perturbation.base if isinstance(perturbation, Schedule) else perturbation
+        self.perturbation = base or Perturbation()
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
+            raise ConfigError("autoreset is SameStep or Disabled", where="the twin")
+        self.metadata = {**type(self).metadata, "autoreset_mode": self.autoreset_mode}
+        self.queue = EpisodeQueue(num_envs, conditions or DEFAULT_CONDITIONS, schedule, seed)
+        refuse_unfit(self.floors, [kind for kind, share in self.queue.conditions.items() if share])
+
+        limit = np.full(self.task.observation_size, OBSERVATION_LIMIT, np.float32)
+        self.single_observation_space = gymnasium.spaces.Box(-limit, limit, dtype=np.float32)
+        self.face = action_face(action, self.task, num_envs)
+        self.single_action_space = self.face.space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+
+        timestep = self.perturbation.timestep_s
+        self.simulation = Simulation(
+            num_envs, self.task, self.floors, timestep, nthread, physics=physics
+        )
+        self.sensing = Sensing(self.simulation, self.task)
+        self.truth = Truth(self.task, num_envs)
+        self.navigation = Navigation(self.floors, num_envs, self.task)
+        self.episodes: list[Episode | None] = [None] * num_envs
+        self.specs: list[EpisodeSpec] = [EpisodeSpec("nominal", 0)] * num_envs
+        self.blown_up = 0  # episodes that ended in a NaN or a blow-up
+        self.signals: Signals = {}
+        self.observation = np.zeros((num_envs, self.task.observation_size), np.float32)
+        self.previous_action = np.zeros(num_envs, np.int64)
+        self.steps = np.zeros(num_envs, np.int64)  # of the running episodes
+        self.bumps = np.zeros(num_envs, np.int64)
+        self.episodes_begun = np.zeros(num_envs, np.int64)  # rises with every episode
+        self.episode_number = np.full(num_envs, -1)
+        self.episode_seed = np.zeros(num_envs, np.int64)
+        self.episode_condition = np.full(num_envs, "nominal", "U16")
+        self.block = np.full(num_envs, "none", "U8")
+        self.perturbation_name = np.full(num_envs, "nominal", "U32")
+        self.perturbation_values = np.full(num_envs, "{}", object)  # JSON, what is not nominal
+
+    # -- floors ---------------------------------------------------------------------------------
+
+    @property
+    def warehouse(self) -> Warehouse:
+        """The floor, where there is one; the first of several."""
+        return self.floors[0]
+
+    def floor_of(self, env: int) -> Warehouse:
+        """The floor that an environment's episode is on."""
+        return self.floors[int(self.layout[env])]
+
+    def by_floor(self) -> Iterator[tuple[NDArray[np.int64], Warehouse]]:
+        """The environments on each floor, and the floor."""
+        for index in np.unique(self.layout):
+            yield np.flatnonzero(self.layout == index), self.floors[index]
+
+    def _floor_for(self, spec: EpisodeSpec) -> int:
+        """Which floor an episode is on: by name, or by its seed."""
+        if spec.layout is None:
+            if len(self.floors) == 1:
+                return 0
+            return int(np.random.default_rng([spec.seed, 2]).integers(len(self.floors)))
+        if spec.layout not in self._floor_index:
+            raise ConfigError(
+                f"an episode asks for layout {spec.layout!r}, which is none of the environment's"
+                f" {len(self.floors)}",
+                where=f"episode {spec.condition}/{spec.seed}",
+                remedy="make the environment with that layout",
+            )
+        return self._floor_index[spec.layout]
+
+    # -- episodes -------------------------------------------------------------------------------
+
+    def set_conditions(self, conditions: Mapping[str, float]) -> None:
+        """Shares per kind of episode, for episodes that begin from now on."""
+        self.queue.set_conditions(conditions)
+
+    def set_episodes(self, specs: Iterable[EpisodeSpec]) -> None:
+        """Run these episodes, in order, from the next reset on; then episodes drawn as usual.
+
+        `info["episode_number"]` names them by their place; -1 is an episode beyond their end.
+        """
+        self.queue.set_fixed(specs)
+
+    def _begin(self, ids: NDArray[np.int64]) -> None:
+        """Start the next episode of each environment in `ids`."""
+        for env in ids.tolist():
+            spec, self.episode_number[env] = self.queue.next(env)
+            self._lay_out(env, spec)
+        self.steps[ids] = self.bumps[ids] = self.previous_action[ids] = 0
+        first = self.sensing.sense(ids, self.steps[ids])
+        add_motion(first, None)
+        add_route(self.task, first, self.navigation.plans_m[ids], self.navigation.goals_m[ids])
+        observed = observe(self.task, first, first, self.previous_action[ids])
+        self.observation[ids] = _bounded(observed)
+        if self.signals:
+            for name, column in self.signals.items():
+                column[ids] = first[name]
+        else:
+            self.signals = first
+
+    def _lay_out(self, env: int, spec: EpisodeSpec) -> None:
+        perturbation = spec.perturbation or self.perturbation
+        if perturbation.timestep_s != self.simulation.timestep_s:
+            raise ConfigError(
+                f"an episode asks for timestep_s = {perturbation.timestep_s}, the environment"
+                f" runs at {self.simulation.timestep_s}",
+                where=f"episode {spec.condition}/{spec.seed}",
+                remedy="make the environment with that perturbation",
+            )
+        floor = self._floor_for(spec)
+        episode = draw_episode(spec, self.floors[floor], self.navigation.planners[floor])
+        self.episodes[env], self.specs[env] = episode, spec
+        self.layout[env] = floor
+        self.simulation.reset(env, episode, perturbation, floor)
+        self.sensing.reset(env, episode.noise, perturbation)
+        self.navigation.reset(env, episode, floor)
+        self.truth.reset(np.array([env]))
+        self.episode_condition[env], self.block[env] = spec.condition, episode.block
+        self.episode_seed[env] = spec.seed
+        self.perturbation_name[env] = perturbation.name
+        self.perturbation_values[env] = json.dumps(perturbation.changed())
+        self.episodes_begun[env] += 1
+
+    # -- gymnasium ------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin an episode everywhere, or where `options["reset_mask"]` (N,) says."""
+        super().reset(seed=seed)
+        ids = np.arange(self.num_envs)
+        mask = (options or {}).get("reset_mask")
+        if mask is not None and self.signals:
+            ids = np.flatnonzero(mask)
+        if seed is not None:
+            self.queue.seed = seed
+            self.queue.drawn[ids] = 0
+        if len(ids) == self.num_envs:
+            self.signals = {}
+        else:
+            self.signals = {name: column.copy() for name, column in self.signals.items()}
+        self._begin(ids)
+        return self.observation.copy(), self._info_now()
+
+    def step(
+        self, actions: NDArray[Any]
+    ) -> tuple[
+        NDArray[np.float32],
+        NDArray[np.float32],
+        NDArray[np.bool_],
+        NDArray[np.bool_],
+        dict[str, Any],
+    ]:
+        """One control period everywhere. `actions` (N,) index the task's actions, or are (N, 2)."""
+        action, command, chosen = self.face.read(actions)
+        now, sim, task = self.signals, self.simulation, self.task
+        everyone = np.arange(self.num_envs)
+        self.truth.look(sim.pose(), self.navigation.plans_m, sim.pallets, everyone)
+        sim.drive(command)
+        self.steps += 1
+
+        after = self.sensing.sense(everyone, self.steps)
+        add_motion(after, now)
+        plans, goals = self.navigation.plans_m, self.navigation.goals_m
+        offset = add_route(task, after, plans, goals)
+        progress = now["route_remaining_m"] - after["route_remaining_m"]
+        earned = reward(task, now, after, progress, action, self.previous_action)
+        over = terminated(task, after)
+        invalid = sim.blown_up
+        self.bumps += sim.bumped
+        changed = self.navigation.update(after, offset, self.sensing)
+        if len(changed):  # a new plan counts from t + 1 on: it never makes progress jump
+            self._see_new_plans(after, changed)
+
+        over &= ~invalid
+        cut = ((self.steps >= task.time_limit_steps) & ~over) | invalid
+        observed = _bounded(observe(task, after, now, action))
+        info = self._info_after(after, progress, over, invalid) | chosen
+        if invalid.any():
+            self.blown_up += int(invalid.sum())
+            earned = np.where(invalid, np.float32(0), earned)
+            observed[invalid] = self.observation[invalid]
+        self.observation, self.signals, self.previous_action = observed, after, action.copy()
+        done = over | cut
+        if done.any() and self.autoreset_mode is AutoresetMode.SAME_STEP:
+            info["final_obs"], info["_final_obs"] = observed.copy(), done.copy()
+            self.signals = {name: column.copy() for name, column in after.items()}
+            self._begin(np.flatnonzero(done))
+        return self.observation.copy(), earned, over, cut, info
+
+    def _see_new_plans(self, after: Signals, ids: NDArray[np.int64]) -> None:
+        rows: Signals = {name: column[ids] for name, column in after.items()}
+        add_route(self.task, rows, self.navigation.plans_m[ids], self.navigation.goals_m[ids])
+        for name, column in rows.items():
+            after[name][ids] = column
+
+    def _info_now(self) -> dict[str, Any]:
+        return {
+            "signals": {name: column.copy() for name, column in self.signals.items()},
+            "episode_condition": self.episode_condition.copy(),
+            "block": self.block.copy(),
+            "episode_seed": self.episode_seed.copy(),
+            "perturbation": self.perturbation_name.copy(),
+            "perturbation_values": self.perturbation_values.copy(),
+            "layout": self._layout_names[self.layout],
+            "floor": self._floor_objects[self.layout],
+            "episode_number": self.episode_number.copy(),
+            "episode_steps": self.steps.copy(),
+            "bumps": self.bumps.copy(),
+            "true_pose": self.simulation.pose(),
+        }
+
+    def _info_after(
+        self,
+        after: Signals,
+        progress_m: NDArray[np.float64],
+        over: NDArray[np.bool_],
+        invalid: NDArray[np.bool_],
+    ) -> dict[str, Any]:
+        sim = self.simulation
+        condition = self.truth.conclude(sim.slipped, sim.bumped, self.sensing.true_clearance_m)
+        return self._info_now() | {
+            "signals": after,
+            "progress_m": progress_m,
+            "true_condition": condition,
+            "success": over & reached_goal(self.task, after) & (self.bumps == 0),
+            "invalid": invalid.copy(),
+        }
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """A frame of every environment, (H, W, 3) uint8 each; the top-down map needs no GL.
+
+        Raises:
+            ConfigError: a camera was asked for, and there is no EGL.
+        """
+        if self.render_mode is None:
+            return None
+        if self.view is not None:
+            if self._camera is None:
+                self._camera = Camera(self.view)
+            return tuple(self._camera.frame(self, env) for env in range(self.num_envs))
+        return tuple(draw_map(self, env) for env in range(self.num_envs))
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Give the camera's context back; Gymnasium's `close` calls it."""
+        if self._camera is not None:
+            self._camera.close()
+            self._camera = None
+
+    # -- recorders ------------------------------------------------------------------------------
+
+    def set_block_callback(
+        self, callback: Callable[[Live], None] | None, period_s: float = 0.02
+    ) -> None:
+        """Call back every `period_s` of simulated time within steps, with the true state.
+
+        The physics is the same with and without. `period_s` is rounded to whole substeps and
+        must divide .1 s to be evenly spaced. Called before any autoreset of the step.
+        """
+        self.simulation.callback = callback
+        self.simulation.callback_period_s = period_s
+
+    # -- state ----------------------------------------------------------------------------------
+
+    def get_state(self) -> dict[str, Any]:
+        """Everything a bit-exact continuation needs: {"arrays": {name: array}, "json": {...}}."""
+        from restock.train.twin.env.env_state import get_state
+
+        return get_state(self)
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Continue from a state of `get_state` of an environment made with the same arguments."""
+        from restock.train.twin.env.env_state import set_state
+
+        set_state(self, state)
+
+
+def _floors(
+    warehouse: Warehouse | None, layouts: str | Sequence[Warehouse]
+) -> tuple[Warehouse, ...]:
+    """The floors that were asked for. Raises ConfigError for none, or two of one name."""
+    if warehouse is not None:
+        if layouts != DEFAULT:
+            raise ConfigError("give a warehouse or layouts, not both", where="the twin")
+        return (warehouse,)
+    if layouts == DEFAULT:
+        return (default_warehouse(),)
+    floors = open_floors(layouts) if isinstance(layouts, str) else tuple(layouts)
+    if not floors or len({floor.name for floor in floors}) < len(floors):
+        raise ConfigError(
+            f"{len(floors)} layouts are none, or two have one name",
+            where="the twin",
+            remedy="give floors that differ in their name",
+        )
+    return floors
+
+
+def _bounded(observation: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.clip(np.nan_to_num(observation), -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+
+
+__all__ = ["DEFAULT_CONDITIONS", "OBSERVATION_LIMIT", "WarehouseVectorEnv"]

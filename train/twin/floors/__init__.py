@@ -1,0 +1,1 @@
+"""Where a robot drives: generated floors, floors from files and maps, and plans on them."""

@@ -1,0 +1,145 @@
+"""Aisles, crossings and goals of a floor that is known only as free cells.
+
+An aisle segment is a straight, narrow, free corridor between racks or walls on two sides: pallets
+can close it, and the lidar can tell that they do. Both directions are looked at.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from restock.train.twin.floors.layout import Axis, Rect, Segment
+
+Cells = NDArray[np.bool_]  # (X, Y), free where True
+
+WIDTH_M = (0.7, 2.6)  # of a corridor
+LENGTH_M = 1.8  # a pallet, and room before and behind it
+EDGE_M = 0.15  # how far a corridor's side may wander: a map's racks are not straight
+CROSSING_M = 2.0
+GOAL_ROOM_M = 0.5  # from a goal to the nearest obstacle, where there is that much
+GOALS = 200
+
+
+@dataclass(frozen=True)
+class _Corridor:
+    """Columns first to last (exclusive) of a corridor, and its sides, in cells."""
+
+    first: int
+    last: int
+    low: int
+    high: int
+
+
+def find_segments(free: Cells, cell_m: float) -> tuple[Segment, ...]:
+    """The aisle segments of a floor's free cells, from the south-west, longest aisles kept."""
+    found: list[tuple[Axis, _Corridor]] = [("x", c) for c in _corridors(free, cell_m)]
+    found += [("y", c) for c in _corridors(free.T, cell_m)]
+    found.sort(key=lambda item: item[1].first - item[1].last)
+    taken = np.zeros_like(free)
+    kept: list[tuple[Rect, Axis]] = []
+    for along, corridor in found:
+        cells = taken if along == "x" else taken.T
+        inside = cells[corridor.first : corridor.last, corridor.low : corridor.high]
+        if inside.any():
+            continue
+        inside[:] = True
+        edges = (corridor.first, corridor.low, corridor.last, corridor.high)
+        box = Rect(*(round(edge * cell_m, 6) for edge in edges))
+        kept.append((box if along == "x" else box.transposed, along))
+    kept.sort(key=lambda item: (item[1], item[0].y_min, item[0].x_min))
+    return tuple(
+        Segment(f"aisle_{index + 1}", index, area, along)
+        for index, (area, along) in enumerate(kept)
+    )
+
+
+def _corridors(free: Cells, cell_m: float) -> list[_Corridor]:
+    """Corridors along the first axis: runs of free cells across it, joined while sides agree."""
+    low, high = WIDTH_M[0] / cell_m - 1e-6, WIDTH_M[1] / cell_m + 1e-6
+    wander = EDGE_M / cell_m + 1e-6
+    open_: list[tuple[_Corridor, int, int]] = []  # with the widest sides seen
+    found: list[_Corridor] = []
+
+    def close(corridor: _Corridor) -> None:
+        length = corridor.last - corridor.first
+        long_enough = max(LENGTH_M / cell_m, 1.2 * (corridor.high - corridor.low)) - 1e-6
+        if length >= long_enough and corridor.high - corridor.low >= low:
+            found.append(corridor)
+
+    for column in range(free.shape[0]):
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], free[column], [False]])))
+        runs = [(int(a), int(b)) for a, b in edges.reshape(-1, 2) if low <= b - a <= high]
+        going = []
+        for corridor, widest_low, widest_high in open_:
+            match = next(
+                (
+                    run
+                    for run in runs
+                    if max(run[0], corridor.low) - min(run[0], widest_low) <= wander
+                    and max(run[1], widest_high) - min(run[1], corridor.high) <= wander
+                ),
+                None,
+            )
+            if match is None:
+                close(corridor)
+                continue
+            runs.remove(match)
+            longer = _Corridor(
+                corridor.first,
+                column + 1,
+                max(match[0], corridor.low),
+                min(match[1], corridor.high),
+            )
+            going.append((longer, min(match[0], widest_low), max(match[1], widest_high)))
+        open_ = going + [(_Corridor(column, column + 1, a, b), a, b) for a, b in runs]
+    for corridor, _, _ in open_:
+        close(corridor)
+    return found
+
+
+def find_crossings(segments: tuple[Segment, ...], free: Cells, cell_m: float) -> tuple[Rect, ...]:
+    """Free places off the ends of the aisle segments, where others come from the side."""
+    found: dict[Rect, None] = {}
+    for segment in segments:
+        turned = segment.along == "y"
+        area = segment.lengthwise
+        cells = free.T if turned else free
+        low, high = round(area.y_min / cell_m), round(area.y_max / cell_m)
+        for at, step in ((round(area.x_min / cell_m) - 1, -1), (round(area.x_max / cell_m), 1)):
+            reach = 0
+            while (
+                reach * cell_m < CROSSING_M
+                and 0 <= at + reach * step < cells.shape[0]
+                and cells[at + reach * step, low:high].all()
+            ):
+                reach += 1
+            if reach * cell_m < 0.8:
+                continue
+            ends = sorted((at - min(step, 0), at - min(step, 0) + reach * step))
+            box = Rect(*(round(e * cell_m, 6) for e in (ends[0], low, ends[1], high)))
+            found[box.transposed if turned else box] = None
+    return tuple(found)
+
+
+def find_goals(
+    free: Cells, cell_m: float, spacing_m: float = 1.0
+) -> tuple[tuple[float, float], ...]:
+    """Places with room around them, evenly over the free cells; at most GOALS."""
+    room = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * cell_m
+    stride = max(round(spacing_m / cell_m), 1)
+    places = []
+    for i in range(0, free.shape[0], stride):
+        for j in range(0, free.shape[1], stride):
+            window = room[i : i + stride, j : j + stride]
+            best = np.unravel_index(int(window.argmax()), window.shape)
+            if window[best] >= GOAL_ROOM_M:
+                x, y = (i + best[0] + 0.5) * cell_m, (j + best[1] + 0.5) * cell_m
+                places.append((round(float(x), 6), round(float(y), 6)))
+    if len(places) > GOALS:
+        kept = np.linspace(0, len(places) - 1, GOALS).astype(int)
+        places = [places[index] for index in kept]
+    return tuple(places)

@@ -1,0 +1,317 @@
+"""A warehouse floor: racks, aisles, crossings, docks and one-way rules, in metres.
+
+The floor's frame has its origin in the south-west corner, x east and y north; `map_origin` places
+it in the map that a robot localises in. Floors are generated, read from TOML, or read from an
+occupancy map: see `restock.train.twin.floors.floors`. `default_warehouse()` is the floor that logs
+and twin share.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.errors import ConfigError
+
+F64 = NDArray[np.float64]
+Axis = Literal["x", "y"]
+Heading = Literal["east", "north", "west", "south"]
+
+HEADINGS: dict[str, tuple[int, int]] = {
+    "east": (1, 0),
+    "north": (0, 1),
+    "west": (-1, 0),
+    "south": (0, -1),
+}
+DEFAULT = "default"
+ELSEWHERE = "elsewhere"
+MAX_SIDE_M = 60.0  # a plan of a floor larger than this takes seconds
+MAX_RACKS = 400
+BAY_M = 0.6  # between the goals along an aisle
+
+
+@dataclass(frozen=True)
+class Rect:
+    """An axis-aligned rectangle."""
+
+    x_min: float
+    y_min: float
+    x_max: float
+    y_max: float
+
+    @property
+    def center(self) -> tuple[float, float]:
+        return (self.x_min + self.x_max) / 2, (self.y_min + self.y_max) / 2
+
+    @property
+    def half_size(self) -> tuple[float, float]:
+        return (self.x_max - self.x_min) / 2, (self.y_max - self.y_min) / 2
+
+    def contains(self, x_m: float, y_m: float, margin_m: float = 0.0) -> bool:
+        """Whether the point lies inside, at least `margin_m` from every side."""
+        return (
+            self.x_min + margin_m <= x_m <= self.x_max - margin_m
+            and self.y_min + margin_m <= y_m <= self.y_max - margin_m
+        )
+
+    @property
+    def transposed(self) -> Rect:
+        """With x and y exchanged."""
+        return Rect(self.y_min, self.x_min, self.y_max, self.x_max)
+
+
+@dataclass(frozen=True)
+class Segment:
+    """The part of an aisle between two cross-aisles: what a block closes.
+
+    It runs along `along` and is shut in by racks or walls on its two other sides.
+    """
+
+    name: str  # aisle_2_west
+    aisle: int
+    area: Rect
+    along: Axis = "x"
+
+    @property
+    def lengthwise(self) -> Rect:
+        """Its area with x along the aisle: x and y exchanged where it runs north and south."""
+        return self.area if self.along == "x" else self.area.transposed
+
+    @property
+    def width_m(self) -> float:
+        """From rack to rack."""
+        return self.lengthwise.y_max - self.lengthwise.y_min
+
+
+@dataclass(frozen=True)
+class Dock:
+    """A named place where robots are sent to load and unload."""
+
+    name: str
+    area: Rect
+
+
+@dataclass(frozen=True)
+class OneWay:
+    """A part of the floor where robots drive in one direction only, or turn, or cross it."""
+
+    area: Rect
+    heading: Heading
+
+
+@dataclass(frozen=True)
+class Warehouse:
+    """A floor. Walls stand around it; within, everything is free but the racks."""
+
+    width_m: float
+    depth_m: float
+    racks: tuple[Rect, ...]
+    segments: tuple[Segment, ...]
+    goals_m: tuple[tuple[float, float], ...]  # where a robot may be sent, the docks aside
+    crossings: tuple[Rect, ...] = ()  # where traffic crosses: an aisle meets a cross-aisle
+    cross_zones: tuple[tuple[str, Rect], ...] = ()  # named parts beside aisles and docks
+    docks: tuple[Dock, ...] = ()
+    one_way: tuple[OneWay, ...] = ()
+    name: str = DEFAULT
+    wall_m: float = 0.1
+    map_origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x, y, yaw of the corner, in the map
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError where the numbers cannot be a floor."""
+        where = f"layout {self.name}"
+        for side in (self.width_m, self.depth_m):
+            if not 1.0 <= side <= MAX_SIDE_M:
+                raise ConfigError(
+                    f"a side of {side:g} m is outside 1 to {MAX_SIDE_M:g} m",
+                    where=where,
+                    remedy="cut the floor to the part that the robots drive in",
+                )
+        if len(self.racks) > MAX_RACKS:
+            raise ConfigError(
+                f"{len(self.racks)} racks are more than {MAX_RACKS}",
+                where=where,
+                remedy="join racks that touch, or cut the floor",
+            )
+        areas = [("rack", rack) for rack in self.racks]
+        areas += [(segment.name, segment.area) for segment in self.segments]
+        areas += [(dock.name, dock.area) for dock in self.docks]
+        areas += [("one-way part", rule.area) for rule in self.one_way]
+        areas += self.cross_zones
+        for what, box in areas:
+            inside = -1e-9 <= box.x_min < box.x_max <= self.width_m + 1e-9
+            if not inside or not -1e-9 <= box.y_min < box.y_max <= self.depth_m + 1e-9:
+                raise ConfigError(
+                    f"{what} {_box(box)} is no box within 0 to {self.width_m:g} m by 0 to"
+                    f" {self.depth_m:g} m",
+                    where=where,
+                    remedy="give a box as x0, y0, x1, y1 with x0 < x1 and y0 < y1, in metres",
+                )
+        if not len(self.goals):
+            raise ConfigError(
+                "has no place that a robot could be sent to", where=where, remedy="give docks"
+            )
+
+    @cached_property
+    def goals(self) -> F64:
+        """Where a robot may be sent, (G, 2): bays, crossings and docks."""
+        docks = tuple(dock.area.center for dock in self.docks)
+        return np.array(self.goals_m + docks, np.float64).reshape(-1, 2)
+
+    @cached_property
+    def starts(self) -> tuple[Segment, ...]:
+        """Where episodes begin: aisle segments; around the goals where a floor has none."""
+        around = (Rect(x - 0.5, y - 0.5, x + 0.5, y + 0.5) for x, y in self.goals.tolist())
+        return self.segments or tuple(Segment("start", 0, area) for area in around)
+
+    @cached_property
+    def zones(self) -> dict[str, Rect]:
+        """Named parts of the floor, for coverage; where they overlap the first one counts."""
+        named = {dock.name: dock.area for dock in self.docks}
+        named |= dict(self.cross_zones)
+        return named | {segment.name: segment.area for segment in self.segments}
+
+    def zone_of(self, x_m: F64, y_m: F64) -> list[str]:
+        """The name of the first zone that holds each point (N,), or `elsewhere`."""
+        names = np.array([*self.zones, ELSEWHERE], object)
+        boxes = np.array([[a.x_min, a.y_min, a.x_max, a.y_max] for a in self.zones.values()])
+        inside = np.ones((len(x_m), len(names)), np.bool_)
+        inside[:, :-1] = _inside(boxes.reshape(-1, 4), x_m, y_m)
+        return [str(name) for name in names[inside.argmax(axis=1)]]
+
+    def segment_of(self, x_m: F64, y_m: F64) -> NDArray[np.int64]:
+        """The index of the aisle segment each point lies in, (N,); -1 for none."""
+        if not self.segments:
+            return np.full(np.shape(x_m), -1, np.int64)
+        found = _inside(self.segment_edges, x_m, y_m)
+        return np.where(found.any(axis=1), found.argmax(axis=1), -1).astype(np.int64)
+
+    @cached_property
+    def segment_edges(self) -> F64:
+        """(S, 4): x_min, y_min, x_max, y_max of each aisle segment."""
+        return np.array(
+            [(a.x_min, a.y_min, a.x_max, a.y_max) for a in (s.area for s in self.segments)]
+        ).reshape(-1, 4)
+
+    @cached_property
+    def segment_along_y(self) -> NDArray[np.bool_]:
+        """(S,) which aisle segments run north and south."""
+        return np.array([segment.along == "y" for segment in self.segments], np.bool_)
+
+    @cached_property
+    def hash(self) -> str:
+        """Names everything but the name, 12 hex digits."""
+        content = asdict(self) | {"name": ""}
+        return hashlib.blake2b(msgspec.json.encode(content), digest_size=6).hexdigest()
+
+    def to_map(self, x_m: F64, y_m: F64) -> tuple[F64, F64]:
+        """Places of the floor in the frame of the map it was read from."""
+        x0, y0, yaw = self.map_origin
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        return x0 + cos * x_m - sin * y_m, y0 + sin * x_m + cos * y_m
+
+
+def _box(box: Rect) -> str:
+    return f"[{box.x_min:g}, {box.y_min:g}, {box.x_max:g}, {box.y_max:g}]"
+
+
+def _inside(edges: F64, x_m: F64, y_m: F64) -> NDArray[np.bool_]:
+    """Which boxes (B, 4) hold each point, (N, B)."""
+    x, y = np.asarray(x_m)[:, None], np.asarray(y_m)[:, None]
+    inside: NDArray[np.bool_] = (
+        (edges[:, 0] <= x) & (x <= edges[:, 2]) & (edges[:, 1] <= y) & (y <= edges[:, 3])
+    )
+    return inside
+
+
+Strip = tuple[float, float]
+
+
+def strip_warehouse(
+    width_m: float,
+    depth_m: float,
+    aisle_y_m: tuple[Strip, ...],
+    cross_x_m: tuple[Strip, ...],
+    *,
+    name: str = DEFAULT,
+    docks: tuple[Dock, ...] = (),
+    one_way: tuple[OneWay, ...] = (),
+    open_racks: frozenset[int] = frozenset(),
+) -> Warehouse:
+    """Racks in a grid: aisles (south, north) and cross-aisles (west, east) are the free strips.
+
+    `open_racks` are left out: floor to walk on. An aisle segment beside such a place is no segment.
+    """
+    for what, strips, end in (
+        ("aisles", aisle_y_m, depth_m),
+        ("cross-aisles", cross_x_m, width_m),
+    ):
+        edges = [edge for strip in strips for edge in strip]
+        if len(strips) < 2 or edges != sorted(edges) or edges[0] < 0 or edges[-1] > end:
+            raise ConfigError(
+                f"{what} {strips} are not two or more strips in order within 0 to {end} m",
+                where="warehouse layout",
+                remedy="give each strip as (start, end) in metres, in rising order",
+            )
+    blocks = [
+        Rect(west[1], south[1], east[0], north[0])
+        for south, north in pairwise(aisle_y_m)
+        for west, east in pairwise(cross_x_m)
+    ]
+    columns = len(cross_x_m) - 1
+    racks = tuple(block for index, block in enumerate(blocks) if index not in open_racks)
+    part = ("west", "east") if columns == 2 else tuple(str(i + 1) for i in range(columns))
+    segments = tuple(
+        Segment(f"aisle_{aisle + 1}_{part[column]}", aisle, Rect(west[1], south, east[0], north))
+        for aisle, (south, north) in enumerate(aisle_y_m)
+        for column, (west, east) in enumerate(pairwise(cross_x_m))
+        if not open_racks & {(aisle - 1) * columns + column, aisle * columns + column}
+    )
+    crossings = tuple(
+        Rect(west, south, east, north) for south, north in aisle_y_m for west, east in cross_x_m
+    )
+    thirds = ("west", "middle", "east") if columns == 2 else ()
+    return Warehouse(
+        width_m=width_m,
+        depth_m=depth_m,
+        racks=racks,
+        segments=segments,
+        goals_m=bays(segments) + tuple(crossing.center for crossing in crossings),
+        crossings=crossings,
+        cross_zones=tuple(
+            (f"cross_{thirds[i] if thirds else i + 1}", Rect(west, 0.0, east, depth_m))
+            for i, (west, east) in enumerate(cross_x_m)
+        ),
+        docks=docks,
+        one_way=one_way,
+        name=name,
+    )
+
+
+def bays(segments: tuple[Segment, ...]) -> tuple[tuple[float, float], ...]:
+    """The goals along aisle segments, in their middle."""
+    found: list[tuple[float, float]] = []
+    for segment in segments:
+        area = segment.lengthwise
+        places = np.arange(area.x_min + 0.45, area.x_max - 0.2, BAY_M).tolist()
+        middle = area.center[1]
+        found += [(at, middle) if segment.along == "x" else (middle, at) for at in places]
+    return tuple(found)
+
+
+def default_warehouse() -> Warehouse:
+    """12 x 10 m: four aisles 1.8 m wide, three cross-aisles 2.2 m wide, six racks."""
+    rack, aisle = 2.8 / 3, 1.8
+    starts = [index * (aisle + rack) for index in range(4)]
+    return strip_warehouse(
+        width_m=12.0,
+        depth_m=10.0,
+        aisle_y_m=tuple((round(y, 3), round(y + aisle, 3)) for y in starts),
+        cross_x_m=((0.0, 2.2), (4.9, 7.1), (9.8, 12.0)),
+    )

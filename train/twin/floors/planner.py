@@ -1,0 +1,396 @@
+"""The robot's navigation stack: plans on the known aisle map, and what the lidar adds to it.
+
+It knows the racks and the walls. Pallets, people and wet floors it does not: a wholly blocked
+aisle is found from the lidar (`find_blocks`) and then closed on the grid, and the plan made anew.
+Plans are shortest paths on a .1 m grid whose cells cost more near racks, one Dijkstra tree per
+goal and set of closures, cached; a plan is read off the tree, smoothed and resampled. One-way rules
+are directed edges; a robot that they shut in behind a block leaves against them.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse import csgraph
+
+from restock.train.twin.floors.layout import HEADINGS, Warehouse
+
+F64 = NDArray[np.float64]
+
+CELL_M = 0.1
+PLAN_POINTS = 48
+ROBOT_RADIUS_M = 0.3  # half the width and a margin: no cell nearer to a rack is used
+WIDE_M = 0.85  # from this clearance on, cells cost no more than their length
+NEAR_COST = 3.0  # how much more a cell at ROBOT_RADIUS_M costs
+_TREES_KEPT = 2048
+_TREES_KEPT_BYTES = 1 << 29  # of all planners that `planners` makes together
+
+Closure = tuple[int, int]  # aisle segment, and the place along it in steps of CLOSURE_STEP_M
+CLOSURE_STEP_M = 0.3
+
+
+@dataclass
+class Planner:
+    """Plans for one warehouse. Shared by all environments; holds only a cache."""
+
+    warehouse: Warehouse
+    trees_kept: int = _TREES_KEPT
+    _trees: OrderedDict[tuple[int, tuple[Closure, ...]], tuple[F64, NDArray[np.int32]]] = field(
+        default_factory=OrderedDict
+    )
+
+    def __post_init__(self) -> None:
+        self.shape = (
+            round(self.warehouse.width_m / CELL_M),
+            round(self.warehouse.depth_m / CELL_M),
+        )
+        self._clearance_m = _rack_clearance(self.warehouse, self.shape)
+        self._graph = self._build_graph(self._clearance_m)
+        self._unruled = (
+            Planner(replace(self.warehouse, one_way=()), max(self.trees_kept // 8, 8))
+            if self.warehouse.one_way
+            else None
+        )
+
+    def plan(
+        self,
+        x_m: float,
+        y_m: float,
+        goal: tuple[float, float],
+        closures: Sequence[Closure] = (),
+    ) -> F64:
+        """The plan from a place to a goal, (PLAN_POINTS, 2), first point near the place.
+
+        Where closures leave no way, those that shut the robot off are opened again: a robot
+        that believed everything shut would stand for ever. A free place without a way by the
+        one-way rules gets one without them.
+        """
+        cell = self.cell(x_m, y_m)
+        if self._unruled is not None and self._clearance_m.flat[cell] >= ROBOT_RADIUS_M:
+            ruled = self._tree(self.cell(*goal), tuple(sorted(closures)))[0]
+            if not np.isfinite(ruled[cell]):
+                return self._unruled.plan(x_m, y_m, goal, closures)
+        for kept in range(len(closures), -1, -1):
+            distance, before = self._tree(self.cell(*goal), tuple(sorted(closures[:kept])))
+            start = cell if np.isfinite(distance[cell]) else self._nearest(cell, distance)
+            if start >= 0:
+                break
+        return self._read_off(start, before, goal)
+
+    def plan_around(
+        self,
+        x_m: float,
+        y_m: float,
+        goal: tuple[float, float],
+        boxes: F64,
+        half_m: tuple[float, float],
+    ) -> F64 | None:
+        """A plan past boxes (K, 3) (x, y, yaw) that the map does not know; None: no way.
+
+        For those who see more than the robot does. Not cached.
+        """
+        clearance = self._clearance_m
+        for x, y, yaw in boxes:
+            gap = box_distance(*_cell_middles(self.shape), (x, y), half_m, yaw)
+            clearance = np.minimum(clearance, gap)
+        graph = self._build_graph(clearance)
+        distance, before = csgraph.dijkstra(
+            graph, indices=self.cell(*goal), return_predecessors=True
+        )
+        cell = self.cell(x_m, y_m)
+        start = cell if np.isfinite(distance[cell]) else self._nearest(cell, distance)
+        return self._read_off(start, before, goal) if start >= 0 else None
+
+    def _read_off(self, start: int, before: NDArray[np.int32], goal: tuple[float, float]) -> F64:
+        """From a cell along the tree to the goal, smoothed and resampled."""
+        cells = [start]
+        while before[cells[-1]] >= 0:
+            cells.append(int(before[cells[-1]]))
+        way = np.stack(np.unravel_index(np.array(cells), self.shape), axis=-1) * CELL_M + CELL_M / 2
+        way[-1] = goal
+        return _resample(_smooth(way))
+
+    def distance_m(self, x_m: float, y_m: float, goal: tuple[float, float]) -> float:
+        """Cost-weighted length of the way to the goal on the known map; inf where there is none."""
+        return float(self._tree(self.cell(*goal), ())[0][self.cell(x_m, y_m)])
+
+    def cell(self, x_m: float, y_m: float) -> int:
+        """The index of the cell that holds a place; the nearest one for a place off the map."""
+        i = min(max(int(x_m / CELL_M), 0), self.shape[0] - 1)
+        j = min(max(int(y_m / CELL_M), 0), self.shape[1] - 1)
+        return i * self.shape[1] + j
+
+    def _nearest(self, cell: int, distance: F64) -> int:
+        """The reachable cell nearest to one that is not, such as one too near to a rack."""
+        i, j = divmod(cell, self.shape[1])
+        low_i, low_j = max(i - 8, 0), max(j - 8, 0)
+        window = distance.reshape(self.shape)[low_i : i + 9, low_j : j + 9]
+        found = np.argwhere(np.isfinite(window))
+        if not len(found):
+            return -1
+        gap = ((found + np.array([low_i - i, low_j - j])) ** 2).sum(axis=1)
+        best = found[np.argmin(gap)]
+        return int((low_i + best[0]) * self.shape[1] + low_j + best[1])
+
+    def _tree(self, goal_cell: int, closures: tuple[Closure, ...]) -> tuple[F64, NDArray[np.int32]]:
+        key = (goal_cell, closures)
+        if key in self._trees:
+            self._trees.move_to_end(key)
+            return self._trees[key]
+        graph = self._graph
+        if closures:
+            clearance = self._clearance_m.copy()
+            for closure in closures:
+                clearance[self._closed_cells(closure)] = 0.0
+            graph = self._build_graph(clearance)
+        distance, before = csgraph.dijkstra(graph, indices=goal_cell, return_predecessors=True)
+        tree = distance, before.astype(np.int32)
+        self._trees[key] = tree
+        if len(self._trees) > self.trees_kept:
+            self._trees.popitem(last=False)
+        return tree
+
+    def _closed_cells(self, closure: Closure) -> tuple[slice, slice]:
+        segment, step = closure
+        turned = self.warehouse.segments[segment].along == "y"
+        area = self.warehouse.segments[segment].lengthwise
+        middle = area.x_min + (step + 0.5) * CLOSURE_STEP_M
+        i0, i1 = (round((middle + side * 0.2) / CELL_M) for side in (-1, 1))
+        along = slice(max(i0, 0), i1 + 1)
+        across = slice(int(area.y_min / CELL_M), int(area.y_max / CELL_M) + 1)
+        return (across, along) if turned else (along, across)
+
+    def _build_graph(self, clearance_m: F64) -> sparse.csr_matrix:
+        """Cells joined to their eight neighbours, at length times the cost of both ends.
+
+        Edges run against the robot's way: trees grow from the goal.
+        """
+        free = clearance_m >= ROBOT_RADIUS_M
+        near = np.clip((WIDE_M - clearance_m) / (WIDE_M - ROBOT_RADIUS_M), 0.0, 1.0)
+        cost = 1.0 + NEAR_COST * near**2
+        index = np.arange(free.size).reshape(self.shape)
+        against = self._against_rules()
+        rows: list[NDArray[Any]] = []
+        columns: list[NDArray[Any]] = []
+        weights: list[NDArray[Any]] = []
+        back_rows: list[NDArray[Any]] = []
+        back_columns: list[NDArray[Any]] = []
+        back_weights: list[NDArray[Any]] = []
+        for di, dj in ((1, 0), (0, 1), (1, 1), (1, -1)):
+            here = (slice(0, self.shape[0] - di), slice(max(-dj, 0), self.shape[1] - max(dj, 0)))
+            there = (slice(di, None), slice(max(dj, 0), self.shape[1] + min(dj, 0)))
+            both = free[here] & free[there]
+            one, other = index[here][both], index[there][both]
+            length = CELL_M * np.hypot(di, dj)
+            weight = length * (cost[here][both] + cost[there][both]) / 2
+            # one -> other in the graph is the robot's way from `other` to `one`, by (-di, -dj).
+            for step, found, start, end in (
+                ((-di, -dj), (rows, columns, weights), one, other),
+                ((di, dj), (back_rows, back_columns, back_weights), other, one),
+            ):
+                kept = _allowed(against, step, one, other)
+                found[0].append(start[kept])
+                found[1].append(end[kept])
+                found[2].append(weight[kept])
+        parts = (rows + back_rows, columns + back_columns, weights + back_weights)
+        row, column, value = map(np.concatenate, parts)
+        return sparse.csr_matrix((value, (row, column)), shape=(free.size, free.size))
+
+    def _against_rules(self) -> list[tuple[tuple[int, int], NDArray[np.bool_]]]:
+        """Each one-way rule: its heading, and the cells (size,) that it holds in."""
+        x, y = _cell_middles(self.shape)
+        rules = []
+        for rule in self.warehouse.one_way:
+            area = rule.area
+            inside = (area.x_min < x) & (x < area.x_max) & (area.y_min < y) & (y < area.y_max)
+            rules.append((HEADINGS[rule.heading], inside.ravel()))
+        return rules
+
+
+def _allowed(
+    rules: list[tuple[tuple[int, int], NDArray[np.bool_]]],
+    step: tuple[int, int],
+    one: NDArray[np.int64],
+    other: NDArray[np.int64],
+) -> NDArray[np.bool_]:
+    """Which edges between cells a robot may take by `step`: none against a rule."""
+    allowed = np.ones(len(one), np.bool_)
+    for heading, inside in rules:
+        if heading[0] * step[0] + heading[1] * step[1] < 0:
+            allowed &= ~(inside[one] & inside[other])
+    return allowed
+
+
+def planners(floors: Sequence[Warehouse]) -> list[Planner]:
+    """A planner a floor; together their caches stay within some 500 MB."""
+    cells = max(round(f.width_m / CELL_M) * round(f.depth_m / CELL_M) for f in floors)
+    kept = _TREES_KEPT_BYTES // (12 * max(cells, 1) * len(floors))
+    return [Planner(floor, min(max(kept, 16), _TREES_KEPT)) for floor in floors]
+
+
+def _rack_clearance(warehouse: Warehouse, shape: tuple[int, int]) -> F64:
+    """From every cell's middle to the nearest rack or wall, in metres."""
+    x, y = _cell_middles(shape)
+    clearance = np.minimum(
+        np.minimum(x, warehouse.width_m - x), np.minimum(y, warehouse.depth_m - y)
+    )
+    for rack in warehouse.racks:
+        gap = box_distance(x, y, rack.center, rack.half_size, 0.0)
+        clearance = np.minimum(clearance, gap)
+    return clearance
+
+
+def _cell_middles(shape: tuple[int, int]) -> tuple[F64, F64]:
+    x = (np.arange(shape[0]) + 0.5)[:, None] * CELL_M
+    y = (np.arange(shape[1]) + 0.5)[None, :] * CELL_M
+    return np.broadcast_to(x, shape), np.broadcast_to(y, shape)
+
+
+def box_distance(
+    x_m: F64, y_m: F64, center: tuple[float, float], half: tuple[float, float], yaw_rad: float
+) -> F64:
+    """From points to a box, in metres; 0 inside."""
+    dx, dy = x_m - center[0], y_m - center[1]
+    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    outside_x = np.maximum(np.abs(cos * dx + sin * dy) - half[0], 0.0)
+    outside_y = np.maximum(np.abs(cos * dy - sin * dx) - half[1], 0.0)
+    distance: F64 = np.hypot(outside_x, outside_y)
+    return distance
+
+
+def _smooth(way: NDArray[Any], half_window: int = 4) -> F64:
+    """A moving average over the cells of a way, which takes off the grid's corners."""
+    if len(way) < 3:
+        return way
+    padded = np.concatenate(
+        [np.repeat(way[:1], half_window, 0), way, np.repeat(way[-1:], half_window, 0)]
+    )
+    total = np.cumsum(np.concatenate([np.zeros((1, 2)), padded]), axis=0)
+    width = 2 * half_window + 1
+    smooth: F64 = (total[width:] - total[:-width]) / width
+    smooth[0], smooth[-1] = way[0], way[-1]
+    return smooth
+
+
+def _resample(way: F64) -> F64:
+    """PLAN_POINTS points at equal distances along a polyline."""
+    length = np.hypot(*np.diff(way, axis=0).T)
+    arc = np.concatenate([[0.0], np.cumsum(length)])
+    at = np.linspace(0.0, arc[-1], PLAN_POINTS)
+    return np.stack([np.interp(at, arc, way[:, 0]), np.interp(at, arc, way[:, 1])], axis=-1)
+
+
+@dataclass
+class BlockFinder:
+    """Finds wholly blocked aisles from the lidar, over time. State for N robots.
+
+    Within the aisle segment ahead, lidar returns that are neither rack nor wall are gathered up
+    to `reach_m` away. If no free gap across the aisle is as wide as `passable_m`, and that is so
+    for `persistence` steps at the same place, the aisle is blocked there. Robots may be on several
+    floors: `floor` (N,) says on which of `warehouses` each is.
+    """
+
+    warehouses: Warehouse | Sequence[Warehouse]
+    num: int
+    reach_m: float = 2.0
+    passable_m: float = 0.6
+    persistence: int = 3
+
+    def __post_init__(self) -> None:
+        self.seen = np.zeros(self.num, np.int64)  # steps in a row
+        self.place = np.full((self.num, 2), -1, np.int64)  # of the last sighting: a closure
+        self.floor = np.zeros(self.num, np.int64)
+        given = self.warehouses
+        self.floors = (given,) if isinstance(given, Warehouse) else tuple(given)
+
+    def reset(self, ids: NDArray[np.int64]) -> None:
+        self.seen[ids] = 0
+        self.place[ids] = -1
+
+    def update(
+        self,
+        ids: NDArray[np.int64],
+        pose: F64,
+        hits_m: F64,
+        valid: NDArray[np.bool_],
+        heading: F64,
+        along_y: NDArray[np.bool_] | None = None,
+    ) -> list[tuple[int, Closure]]:
+        """Look at one scan of each robot in `ids`; returns (robot, closure) for blocks found.
+
+        `pose` (n, 3) is localised, `hits_m` (n, B, 2) are the returns in the map frame, `valid`
+        (n, B) which of them are returns, `heading` (n,) the sign of the way along x, or along y
+        where `along_y` (n,) says that it mostly runs that way.
+        """
+        turned = np.zeros(len(ids), np.bool_) if along_y is None else along_y
+        segment, edges = self._segments_ahead(ids, pose, heading, turned)
+        swap = turned[:, None]
+        pose = np.where(swap, pose[:, [1, 0, 2]], pose)
+        heading_x = heading
+        x = np.where(swap, hits_m[..., 1], hits_m[..., 0])
+        y = np.where(swap, hits_m[..., 0], hits_m[..., 1])
+        ahead = (x - pose[:, None, 0]) * heading_x[:, None]
+        rack = 0.1  # returns this near to a rack are the rack
+        own = (
+            valid
+            & (segment >= 0)[:, None]
+            & (ahead > 0.1)
+            & (ahead < self.reach_m)
+            & (y > edges[:, 1, None] + rack)
+            & (y < edges[:, 3, None] - rack)
+            & (x > edges[:, 0, None] - 0.1)
+            & (x < edges[:, 2, None] + 0.1)
+        )
+        face = np.where(own, ahead, np.inf).min(axis=1)
+        own &= ahead < face[:, None] + 0.5
+        across = np.where(own, y, edges[:, 3, None])
+        across = np.concatenate([edges[:, 1, None], across, edges[:, 3, None]], axis=1)
+        across.sort(axis=1)
+        gap = np.diff(across, axis=1).max(axis=1)
+        shut = own.any(axis=1) & (gap < self.passable_m)
+        middle = pose[:, 0] + heading_x * (np.where(shut, face, 0.0) + 0.3)
+        step = ((middle - edges[:, 0]) / CLOSURE_STEP_M).astype(np.int64)
+        step = np.clip(step, 0, ((edges[:, 2] - edges[:, 0]) / CLOSURE_STEP_M).astype(np.int64) - 1)
+        place = np.stack([segment, step], axis=1)
+        same = (place[:, 0] == self.place[ids, 0]) & (np.abs(step - self.place[ids, 1]) <= 1)
+        self.seen[ids] = np.where(shut, np.where(same, self.seen[ids] + 1, 1), 0)
+        self.place[ids] = np.where(shut[:, None], place, -1)
+        found = np.flatnonzero(self.seen[ids] >= self.persistence)
+        self.seen[ids[found]] = 0
+        return [(int(ids[k]), (int(place[k, 0]), int(place[k, 1]))) for k in found]
+
+    def _segments_ahead(
+        self,
+        ids: NDArray[np.int64],
+        pose: F64,
+        heading: F64,
+        turned: NDArray[np.bool_],
+    ) -> tuple[NDArray[np.int64], F64]:
+        """The aisle segment (n,) each robot is in, or the one just ahead of it; -1 for none.
+
+        With its edges (n, 4), x and y exchanged for robots that are `turned`. Only segments that
+        run the robot's way count.
+        """
+        segment = np.full(len(ids), -1, np.int64)
+        edges = np.zeros((len(ids), 4))
+        x, y = pose[:, 0], pose[:, 1]
+        then_x, then_y = x + 0.8 * heading * ~turned, y + 0.8 * heading * turned
+        floors = self.floor[ids]
+        for number in np.unique(floors):
+            warehouse = self.floors[number]
+            on = np.flatnonzero(floors == number)
+            if not len(warehouse.segments):
+                continue
+            for at_x, at_y in ((then_x[on], then_y[on]), (x[on], y[on])):
+                found = warehouse.segment_of(at_x, at_y)
+                fits = (found >= 0) & (warehouse.segment_along_y[found] == turned[on])
+                segment[on] = np.where(fits, found, segment[on])
+            edges[on] = warehouse.segment_edges[segment[on]]
+        edges = np.where(turned[:, None], edges[:, [1, 0, 3, 2]], edges)
+        return segment, edges

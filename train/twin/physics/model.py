@@ -1,0 +1,286 @@
+"""The MuJoCo model of the twin: warehouse, robot, pallets and traffic, built with MjSpec.
+
+The contact parameters are measured, not guessed: stiff wheel contacts chatter when they slide and
+then do not converge with the timestep; these soft ones do (see docs/twin.md). Wheels collide as
+spheres, because a sphere's one contact point costs less than a cylinder's, and are drawn as
+cylinders. Pallets and traffic are mocap bodies, so that a layout is only a set of positions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.ingest.task.scan import Body
+from restock.train.twin.floors.layout import Warehouse
+
+F64 = NDArray[np.float64]
+
+FLOOR_FRICTION = 0.8
+WHEEL_RADIUS_M = 0.10
+TRACK_M = 0.44  # between the wheels' contact points
+CASTER_RADIUS_M = 0.04
+CASTER_X_M = 0.27
+CASTER_LIFT_M = 0.001  # so that the driven wheels carry most of the load
+CHASSIS_KG = 50.0
+CHASSIS_HEIGHT_M = 0.26
+CHASSIS_Z_M = 0.17  # of the middle of the chassis over the floor
+LIDAR_Z_M = 0.22
+MOTOR_KV = 8.0
+MOTOR_LIMIT_NM = 18.0
+
+PALLETS = 2
+PALLET_HALF_M = (0.60, 0.40, 0.30)  # long side along the aisle
+PEOPLE = 2
+PERSON_RADIUS_M = 0.25
+FORKLIFTS = 1
+FORKLIFT_HALF_M = (0.60, 0.40, 0.60)
+PARKED_M = (-50.0, -50.0, 1.0)  # where bodies wait that no episode uses
+PARKED_RACK_M = (-60.0, -60.0, 1.0)
+RACK_HALF_HEIGHT_M = 0.75
+WALL_HALF_HEIGHT_M = 0.5
+
+OBSTACLE_GROUP, ROBOT_GROUP, FLOOR_GROUP, DRAWN_GROUP = 0, 1, 2, 3
+_FLOOR, _ROLLING, _OBSTACLE, _CHASSIS = (1, 0), (0, 1), (2, 0), (0, 2)
+
+
+@dataclass(frozen=True)
+class Handles:
+    """Where things are in the model's arrays."""
+
+    chassis_body: int
+    wheel_bodies: tuple[int, int]  # left, right
+    wheel_geoms: tuple[int, int]
+    building: slice  # the geoms of racks and walls
+    pallets: slice  # of the mocap bodies
+    people: slice
+    forklifts: slice
+    accelerometer: slice  # of sensordata
+    bumper: int
+
+
+def build_model(
+    warehouse: Warehouse, body: Body, timestep_s: float = 0.01, rack_slots: int | None = None
+) -> tuple[mujoco.MjModel, Handles]:
+    """The compiled model. State: free joint of the chassis, left and right wheel hinge.
+
+    With `rack_slots` there are boxes for so many racks: those that the floor has none for lie
+    `PARKED_RACK_M` away, to be placed by `building_boxes`.
+    """
+    spec = mujoco.MjSpec()
+    option = spec.option
+    option.timestep = timestep_s
+    option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = 10
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.noslip_iterations = 0
+    # One robot among a handful of boxes: both only cost time here (8 % and 3 % of a step).
+    option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
+    option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
+    _add_building(spec, warehouse, len(warehouse.racks) if rack_slots is None else rack_slots)
+    _add_robot(spec, body)
+    _add_mocap(spec)
+    model = spec.compile()
+    return model, _handles(model)
+
+
+def building_boxes(warehouse: Warehouse, rack_slots: int) -> tuple[F64, F64]:
+    """Middles and half sizes (rack_slots + 4, 3) of racks and walls, in the model's order."""
+    thick, width, depth = warehouse.wall_m, warehouse.width_m, warehouse.depth_m
+    middle = np.full((rack_slots + 4, 3), PARKED_RACK_M)
+    half = np.full((rack_slots + 4, 3), 0.1)
+    for index, rack in enumerate(warehouse.racks):
+        middle[index] = (*rack.center, RACK_HALF_HEIGHT_M)
+        half[index] = (*rack.half_size, RACK_HALF_HEIGHT_M)
+    for index, (center, size) in enumerate(
+        (
+            ((-thick, depth / 2), (thick, depth / 2 + 2 * thick)),
+            ((width + thick, depth / 2), (thick, depth / 2 + 2 * thick)),
+            ((width / 2, -thick), (width / 2, thick)),
+            ((width / 2, depth + thick), (width / 2, thick)),
+        )
+    ):
+        middle[rack_slots + index] = (*center, WALL_HALF_HEIGHT_M)
+        half[rack_slots + index] = (*size, WALL_HALF_HEIGHT_M)
+    return middle, half
+
+
+def _add_building(spec: Any, warehouse: Warehouse, rack_slots: int) -> None:
+    world = spec.worldbody
+    world.add_light(pos=[warehouse.width_m / 2, warehouse.depth_m / 2, 8], dir=[0, 0, -1])
+    world.add_geom(
+        name="floor",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        pos=[warehouse.width_m / 2, warehouse.depth_m / 2, 0],
+        size=[warehouse.width_m, warehouse.depth_m, 0.1],
+        friction=[FLOOR_FRICTION, 0.005, 0.0001],
+        rgba=[0.82, 0.83, 0.84, 1],
+        group=FLOOR_GROUP,
+        **_mask(_FLOOR),
+    )
+    names = [f"rack_{index}" for index in range(rack_slots)]
+    names += [f"wall_{side}" for side in ("west", "east", "south", "north")]
+    for name, middle, half in zip(names, *building_boxes(warehouse, rack_slots), strict=True):
+        world.add_geom(
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=middle,
+            size=half,
+            rgba=[0.36, 0.43, 0.53, 1] if name.startswith("rack") else [0.62, 0.64, 0.66, 1],
+            group=OBSTACLE_GROUP,
+            **_mask(_OBSTACLE),
+        )
+
+
+def _add_robot(spec: Any, body: Body) -> None:
+    chassis = spec.worldbody.add_body(name="chassis", pos=[1, 1, WHEEL_RADIUS_M])
+    chassis.add_freejoint()
+    chassis.add_geom(
+        name="chassis",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=[0, 0, CHASSIS_Z_M - WHEEL_RADIUS_M],
+        size=[body.length_m / 2, body.width_m / 2, CHASSIS_HEIGHT_M / 2],
+        mass=CHASSIS_KG,
+        rgba=[0.95, 0.55, 0.15, 1],
+        group=ROBOT_GROUP,
+        **_mask(_CHASSIS),
+    )
+    chassis.add_site(name="imu", pos=[0, 0, 0])
+    soft = {"solref": [0.02, 1], "solimp": [0, 0.95, 0.004, 0.5, 2]}
+    for name, x in (("front", CASTER_X_M), ("back", -CASTER_X_M)):
+        chassis.add_geom(
+            name=f"caster_{name}",
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            pos=[x, 0, CASTER_RADIUS_M - WHEEL_RADIUS_M + CASTER_LIFT_M],
+            size=[CASTER_RADIUS_M, 0, 0],
+            mass=0.5,
+            condim=1,
+            priority=3,
+            group=ROBOT_GROUP,
+            **soft,
+            **_mask(_ROLLING),
+        )
+    for name, side in (("left", 1), ("right", -1)):
+        wheel = chassis.add_body(name=f"{name}_wheel", pos=[0, side * TRACK_M / 2, 0])
+        wheel.add_joint(
+            name=f"{name}_wheel_joint",
+            type=mujoco.mjtJoint.mjJNT_HINGE,
+            axis=[0, 1, 0],
+            armature=0.02,
+            damping=[0.05, 0, 0],
+        )
+        wheel.add_geom(
+            name=f"{name}_wheel",
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=[WHEEL_RADIUS_M, 0, 0],
+            mass=2.0,
+            condim=3,
+            priority=3,
+            friction=[FLOOR_FRICTION, 0.005, 0.0001],
+            group=DRAWN_GROUP + 1,  # hidden by default: the cylinder is what is drawn
+            **soft,
+            **_mask(_ROLLING),
+        )
+        wheel.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+            size=[WHEEL_RADIUS_M, 0.025, 0],
+            quat=[0.7071068, 0.7071068, 0, 0],
+            mass=0,
+            contype=0,
+            conaffinity=0,
+            rgba=[0.1, 0.1, 0.1, 1],
+            group=ROBOT_GROUP,
+        )
+        motor = spec.add_actuator(
+            name=f"{name}_motor",
+            target=f"{name}_wheel_joint",
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            forcerange=[-MOTOR_LIMIT_NM, MOTOR_LIMIT_NM],
+            forcelimited=True,
+        )
+        motor.set_to_velocity(kv=MOTOR_KV)
+    spec.add_sensor(
+        name="accelerometer",
+        type=mujoco.mjtSensor.mjSENS_ACCELEROMETER,
+        objtype=mujoco.mjtObj.mjOBJ_SITE,
+        objname="imu",
+    )
+    spec.add_sensor(
+        name="bumper",
+        type=mujoco.mjtSensor.mjSENS_CONTACT,
+        objtype=mujoco.mjtObj.mjOBJ_GEOM,
+        objname="chassis",
+        intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND), 0, 1],
+    )
+
+
+def _add_mocap(spec: Any) -> None:
+    box, cylinder = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
+    person = (PERSON_RADIUS_M, 0.85, 0.0)
+    for kind, count, shape, size, rgba in (
+        ("pallet", PALLETS, box, PALLET_HALF_M, [0.70, 0.52, 0.32, 1]),
+        ("person", PEOPLE, cylinder, person, [0.20, 0.45, 0.80, 1]),
+        ("forklift", FORKLIFTS, box, FORKLIFT_HALF_M, [0.90, 0.75, 0.10, 1]),
+    ):
+        for index in range(count):
+            body = spec.worldbody.add_body(name=f"{kind}_{index}", mocap=True, pos=list(PARKED_M))
+            body.add_geom(
+                type=shape, size=list(size), rgba=rgba, group=OBSTACLE_GROUP, **_mask(_OBSTACLE)
+            )
+
+
+def _mask(bits: tuple[int, int]) -> dict[str, int]:
+    return {"contype": bits[0], "conaffinity": bits[1]}
+
+
+def _handles(model: mujoco.MjModel) -> Handles:
+    def mocap(kind: str, count: int) -> slice:
+        first = int(model.body(f"{kind}_0").mocapid[0])
+        return slice(first, first + count)
+
+    accelerometer = int(model.sensor("accelerometer").adr[0])
+    return Handles(
+        chassis_body=model.body("chassis").id,
+        wheel_bodies=(model.body("left_wheel").id, model.body("right_wheel").id),
+        wheel_geoms=(model.geom("left_wheel").id, model.geom("right_wheel").id),
+        building=slice(model.geom("floor").id + 1, model.geom("wall_north").id + 1),
+        pallets=mocap("pallet", PALLETS),
+        people=mocap("person", PEOPLE),
+        forklifts=mocap("forklift", FORKLIFTS),
+        accelerometer=slice(accelerometer, accelerometer + 3),
+        bumper=int(model.sensor("bumper").adr[0]),
+    )
+
+
+def pallet_half_m(yaw_rad: F64) -> F64:
+    """Half sizes (..., 2) along x and y of pallets by heading (...): across, they are exchanged."""
+    across = np.abs(np.sin(yaw_rad))[..., None] > 0.7
+    return np.where(across, PALLET_HALF_M[1::-1], PALLET_HALF_M[:2])
+
+
+def wheel_commands(
+    speed_mps: NDArray[Any], yaw_rate_radps: NDArray[Any]
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Body velocity to the left and right wheels' speeds in rad/s, at the nominal radius."""
+    turn = yaw_rate_radps * (TRACK_M / 2)
+    return (speed_mps - turn) / WHEEL_RADIUS_M, (speed_mps + turn) / WHEEL_RADIUS_M
+
+
+def body_velocity(
+    left_radps: NDArray[Any], right_radps: NDArray[Any]
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Wheel speeds in rad/s to forward speed (m/s) and yaw rate (rad/s): wheel odometry."""
+    speed = (left_radps + right_radps) * (WHEEL_RADIUS_M / 2)
+    return speed, (right_radps - left_radps) * (WHEEL_RADIUS_M / TRACK_M)
+
+
+def yaw_of(quat: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Heading (N,) from unit quaternions (N, 4), w first."""
+    w, x, y, z = quat[..., 0], quat[..., 1], quat[..., 2], quat[..., 3]
+    heading: NDArray[np.float64] = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return heading

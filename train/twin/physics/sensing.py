@@ -1,0 +1,150 @@
+"""What the twin's robot senses: the signals of `restock.ingest.task.signals`, from the simulation.
+
+The functions that turn ranges into clearances and plans into waypoints are ingest's own; here are
+only the sensors: lidar, localisation, encoders, gyroscope, accelerometer and bumper, with the
+noise of a perturbation. All noise of an episode is drawn when it begins, from its own seed.
+"""
+
+from __future__ import annotations
+
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from restock.ingest.task.route import view_route
+from restock.ingest.task.scan import SectorMap
+from restock.ingest.task.signals import localised_velocity, wrap_angle
+from restock.ingest.task.task import Task, clearance_ahead
+from restock.train.twin.physics.model import body_velocity
+from restock.train.twin.physics.perturbation import Perturbation
+from restock.train.twin.physics.simulation import Simulation
+
+F64 = NDArray[np.float64]
+Ids = NDArray[np.int64]
+Signals = dict[str, NDArray[Any]]
+
+FIRST_STAMP_NS = 1_000_000_000  # of an episode's first step: stamps are never 0
+DRIFT_TIME_S = 3.0
+_SCALARS = 9  # x, y, yaw, drift x, drift y, left, right, gyro, accel
+
+
+class Sensing:
+    """The sensors of N robots."""
+
+    def __init__(self, simulation: Simulation, task: Task) -> None:
+        self.simulation, self.task = simulation, task
+        self.sectors = SectorMap.build(simulation.bearings_rad, task.sectors, task.body)
+        num, steps = simulation.num_envs, task.time_limit_steps + 1
+        self._noise = np.zeros((num, steps, _SCALARS + simulation.beams), np.float32)
+        self._scale = np.zeros((num, _SCALARS))
+        self._bias = np.zeros((num, 3))  # of a wheel's speed, the gyroscope, the accelerometer
+        self._scan_every = np.ones(num, np.int64)  # steps
+        self._pose_every = np.ones(num, np.int64)
+        self.pose = np.zeros((num, 3))  # as localised last
+        self.pose_stamp_ns = np.zeros(num, np.int64)  # when that was
+        self._range_noise_m = np.zeros(num)
+        self._dropout_beyond = np.full(num, np.inf)
+        self.ranges_m = np.zeros((num, simulation.beams))  # as measured at the last step
+        self.true_clearance_m = np.zeros(num)
+
+    def reset(self, env: int, seeds: np.random.SeedSequence, perturbation: Perturbation) -> None:
+        """Draw an episode's noise."""
+        rng = np.random.Generator(np.random.SFC64(seeds))
+        rng.standard_normal(dtype=np.float32, out=self._noise[env])
+        p = perturbation
+        self._scale[env] = (
+            *(p.localisation_noise_m, p.localisation_noise_m, p.localisation_yaw_noise_rad),
+            *(p.localisation_drift_m, p.localisation_drift_m),
+            *(p.encoder_noise_radps, p.encoder_noise_radps),
+            *(p.gyro_noise_radps, p.accel_noise_mps2),
+        )
+        self._bias[env] = p.encoder_bias_radps, p.gyro_bias_radps, p.accel_bias_mps2
+        period_s = self.task.control_period_s
+        self._scan_every[env] = max(round(p.lidar_period_s / period_s), 1)
+        self._pose_every[env] = max(round(p.localisation_period_s / period_s), 1)
+        self._range_noise_m[env] = p.lidar_noise_m
+        # A beam is lost where its own noise falls in the tail of that probability.
+        self._dropout_beyond[env] = (
+            NormalDist().inv_cdf(1 - p.lidar_dropout / 2) if p.lidar_dropout else np.inf
+        )
+        self._wander(env)
+
+    def _wander(self, env: int) -> None:
+        """The localisation's drift: steps of an autoregressive walk of unit variance."""
+        keep = np.exp(-self.task.control_period_s / DRIFT_TIME_S)
+        drift = self._noise[env, :, 3:5]
+        drift[1:] *= np.sqrt(1 - keep**2)
+        drift[:] = lfilter([1.0], [1.0, -keep], drift, axis=0)
+
+    def sense(self, ids: Ids, step: NDArray[np.int64]) -> Signals:
+        """Everything but the route and localised speeds, for `ids` (n,) at their steps (n,)."""
+        sim, task = self.simulation, self.task
+        noise = self._noise[ids, step]
+        scalar = noise[:, :_SCALARS] * self._scale[ids]
+        true_ranges = sim.cast(ids)
+        self.true_clearance_m[ids] = np.maximum(true_ranges - self.sectors.reach_m, 0.0).min(axis=1)
+        beam = noise[:, _SCALARS:].astype(np.float64)
+        lost = np.abs(beam) > self._dropout_beyond[ids, None]
+        ranges = np.maximum(true_ranges + beam * self._range_noise_m[ids, None], 0.0)
+        ranges[lost] = np.inf
+        stale = step % self._scan_every[ids] != 0
+        ranges[stale] = self.ranges_m[ids[stale]]
+        self.ranges_m[ids] = ranges
+        clearance = self.sectors.clearance(ranges, task.range_min_m, task.range_max_m)
+        pose = sim.pose()[ids]
+        localised = np.column_stack(
+            [
+                pose[:, 0] + scalar[:, 0] + scalar[:, 3],
+                pose[:, 1] + scalar[:, 1] + scalar[:, 4],
+                wrap_angle(pose[:, 2] + scalar[:, 2]),
+            ]
+        )
+        bias = self._bias[ids]
+        wheels = sim.qvel[ids, 6:8] + scalar[:, 5:7] + bias[:, :1]
+        speed, yaw_rate = body_velocity(wheels[:, 0], wheels[:, 1])
+        period_ns = round(task.control_period_s * 1e9)
+        stamp = FIRST_STAMP_NS + step * period_ns
+        fresh = step % self._pose_every[ids] == 0
+        self.pose[ids[fresh]] = localised[fresh]
+        self.pose_stamp_ns[ids[fresh]] = stamp[fresh]
+        held = self.pose[ids]
+        return {
+            "stamp_ns": stamp,
+            "pose_x_m": held[:, 0],
+            "pose_y_m": held[:, 1],
+            "pose_yaw_rad": held[:, 2],
+            "pose_stamp_ns": self.pose_stamp_ns[ids],
+            "wheel_speed_mps": speed,
+            "wheel_yaw_rate_radps": yaw_rate,
+            "gyro_yaw_rate_radps": sim.qvel[ids, 5] + bias[:, 1] + scalar[:, 7],
+            "accel_x_mps2": sim.accel[ids, 0] + scalar[:, 8] + bias[:, 2],
+            "sector_clearance_m": clearance,
+            "clearance_m": clearance.min(axis=1),
+            "bumped": sim.bumped[ids].copy(),
+            "command_speed_mps": sim.controller.commands[ids, 0, 0].copy(),
+            "command_yaw_rate_radps": sim.controller.commands[ids, 0, 1].copy(),
+        }
+
+
+def add_motion(signals: Signals, before: Signals | None) -> None:
+    """Speeds from the last two localised poses; from the wheels at an episode's first step."""
+    forward, lateral = localised_velocity(signals, signals if before is None else before)
+    signals["localised_speed_mps"], signals["localised_lateral_mps"] = forward, lateral
+
+
+def add_route(task: Task, signals: Signals, plans_m: F64, goals_m: F64) -> F64:
+    """What robots see of plans (n, P, 2) and goals (n, 2); returns how far off plan they are."""
+    x, y, yaw = signals["pose_x_m"], signals["pose_y_m"], signals["pose_yaw_rad"]
+    view = view_route(plans_m, x, y, yaw, (task.near_m, task.far_m))
+    near, far = view.look_ahead_m[:, 0], view.look_ahead_m[:, 1]
+    signals["waypoint_near_x_m"], signals["waypoint_near_y_m"] = near[:, 0], near[:, 1]
+    signals["waypoint_far_x_m"], signals["waypoint_far_y_m"] = far[:, 0], far[:, 1]
+    signals["route_remaining_m"] = view.remaining_m
+    signals["goal_distance_m"] = np.hypot(goals_m[:, 0] - x, goals_m[:, 1] - y)
+    signals["clearance_ahead_m"] = clearance_ahead(
+        task, signals["sector_clearance_m"], near[:, 0], near[:, 1]
+    )
+    return view.offset_m

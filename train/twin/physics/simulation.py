@@ -1,0 +1,335 @@
+"""The physics of N warehouses at once: one `mujoco.batch.Batch`, and what is written into it.
+
+A control period is driven in blocks of .1 s. Before each block, friction is looked up under every
+wheel and traffic moves; within it the base controller's ramp and the actuators' latency act at
+every substep. Results do not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+from numpy.typing import NDArray
+
+from restock.errors import ConfigError
+from restock.ingest.task.task import Task
+from restock.train.twin.floors.layout import Warehouse
+from restock.train.twin.physics.controller import BaseController
+from restock.train.twin.physics.episode import Episode
+from restock.train.twin.physics.friction import NO_PATCH, PATCHES, SLIPPERY_BELOW, friction_at
+from restock.train.twin.physics.model import (
+    FLOOR_FRICTION,
+    LIDAR_Z_M,
+    OBSTACLE_GROUP,
+    TRACK_M,
+    build_model,
+    yaw_of,
+)
+from restock.train.twin.physics.perturbation import Perturbation
+from restock.train.twin.physics.robot_body import RobotBody
+from restock.train.twin.physics.scenery import Scenery, quaternion
+
+F64 = NDArray[np.float64]
+Ids = NDArray[np.int64]
+Physics = Literal["mujoco", "warp"]  # warp: see `restock.train.twin.physics.warp_batch`
+
+BLOCK_S = 0.1
+REST_Z_M = 0.09756  # of the chassis frame, standing still
+LIDAR_BEAMS = 72
+_CONTROLLED = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_MOCAP_POS)
+
+
+@dataclass(frozen=True)
+class Live:
+    """The true state of every environment at an instant between two blocks, for recorders."""
+
+    time_s: F64  # (N,) since the episode began
+    x_m: F64
+    y_m: F64
+    yaw_rad: F64
+    speed_mps: F64  # (N,) over ground, forward
+    lateral_mps: F64  # (N,) over ground, to the left
+    yaw_rate_radps: F64
+    wheel_angle_rad: F64  # (N, 2) left, right
+    wheel_speed_radps: F64  # (N, 2)
+    accel_mps2: F64  # (N, 3) of the accelerometer, mean since the call before
+    bumped: NDArray[np.bool_]  # (N,) at any substep since the call before
+    set_point: F64  # (N, 2) speed and yaw rate asked of the wheels now
+
+
+class Simulation:
+    """N robots in N warehouses. Arrays lead with the environment."""
+
+    def __init__(
+        self,
+        num_envs: int,
+        task: Task,
+        floors: Warehouse | Sequence[Warehouse],
+        timestep_s: float,
+        nthread: int,
+        *,
+        physics: Physics = "mujoco",
+        beams: int = LIDAR_BEAMS,
+    ) -> None:
+        """On several `floors`, `reset` says on which of them each episode is."""
+        floors = (floors,) if isinstance(floors, Warehouse) else tuple(floors)
+        self.num_envs, self.task = num_envs, task
+        self.beams = beams
+        self.timestep_s = timestep_s
+        self.substeps = round(BLOCK_S / timestep_s)
+        self.blocks = round(task.control_period_s / BLOCK_S)
+        _check_times(task, timestep_s, self.substeps, self.blocks)
+        slots = max(len(floor.racks) for floor in floors)
+        self.model, self.handles = build_model(floors[0], task.body, timestep_s, slots)
+        _no_log_file()
+        self.batch = _batch(physics)(self.model, num_envs, nthread)
+        self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
+        self._ctrl = self.batch.bind("ctrl")
+        self._friction = self.batch.expand("geom_friction")
+        self._control = np.zeros((num_envs, self.substeps, 2 + 3 * self.model.nmocap))
+        half_m = task.body.length_m / 2, task.body.width_m / 2
+        self.scenery = Scenery(
+            self.batch, self.handles, floors, slots, half_m, self._control[:, :, 2:]
+        )
+        self.traffic, self.pallets = self.scenery.traffic, self.scenery.pallets
+        self.body = RobotBody(self.batch, self.model, self.handles, num_envs)
+        self.patches = np.tile(NO_PATCH, (num_envs, PATCHES, 1)).astype(np.float64)
+        self.controller = BaseController(num_envs, task.control_period_s, timestep_s, self.substeps)
+        self.time_s = np.zeros(num_envs)
+        self.bumped = np.zeros(num_envs, np.bool_)  # in the last control period
+        self.accel = np.zeros((num_envs, 3))  # mean over the last half block
+        self.slipped = np.zeros(num_envs, np.bool_)  # on a patch, in the last control period
+        self.blown_up = np.zeros(num_envs, np.bool_)
+        self.base_friction = np.full(num_envs, FLOOR_FRICTION)
+        self.left_friction = np.ones(num_envs)
+
+        bearings = np.arange(beams) * (2 * np.pi / beams) - np.pi
+        self.bearings_rad = bearings + np.pi / beams
+        self._beam = np.stack([np.cos(self.bearings_rad), np.sin(self.bearings_rad)], axis=-1)
+        self._groups = np.zeros(6, np.uint8)
+        self._groups[OBSTACLE_GROUP] = 1
+        self._has_patches = np.zeros(num_envs, np.bool_)
+        self.callback: Callable[[Live], None] | None = None
+        self.callback_period_s = 0.02
+
+    # -- layout ---------------------------------------------------------------------------------
+
+    def reset(self, env: int, episode: Episode, perturbation: Perturbation, floor: int = 0) -> None:
+        """Put one environment at the start of an episode, on one of the floors."""
+        self.scenery.build(env, floor)
+        self.batch.reset(np.array([env]), stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+        self.batch.warning[env] = 0
+        self.place_robot(env, *episode.start)
+        self.apply(env, perturbation)
+        patches = episode.patches.copy()
+        patches[:, 4] *= perturbation.patch_friction_scale
+        self.patches[env] = patches
+        self.scenery.reset(env, episode)
+        self._has_patches[env] = (patches[:, 2] > 0).any()
+        self.controller.reset(env)
+        self.accel[env] = 0.0
+        self.time_s[env] = 0.0
+        self.bumped[env] = self.slipped[env] = self.blown_up[env] = False
+
+    def place_robot(self, env: int, x_m: float, y_m: float, yaw_rad: float) -> None:
+        """Stand the robot still at a pose."""
+        self.qpos[env] = 0.0
+        self.qpos[env, :3] = x_m, y_m, REST_Z_M
+        self.qpos[env, 3:7] = quaternion(np.array([yaw_rad]))[0]
+        self.qvel[env] = 0.0
+        self._ctrl[env] = 0.0
+
+    def apply(self, env: int, perturbation: Perturbation) -> None:
+        """Write a perturbation's physics into one environment."""
+        self.left_friction[env] = perturbation.left_friction_scale
+        self.set_floor_friction(env, FLOOR_FRICTION * perturbation.friction_scale)
+        self.controller.latency_s[env] = perturbation.latency_s
+        self.controller.gain[env] = perturbation.gain
+        self.controller.left_gain[env] = perturbation.left_gain
+        self.body.apply(env, perturbation)
+
+    def set_floor_friction(self, env: int, friction: float) -> None:
+        """The floor's friction coefficient where no patch lies."""
+        self.base_friction[env] = friction
+        left, right = self.handles.wheel_geoms
+        self._friction[env, left, 0] = friction * self.left_friction[env]
+        self._friction[env, right, 0] = friction
+
+    # -- motion ---------------------------------------------------------------------------------
+
+    def drive(self, command: F64) -> None:
+        """Drive one control period under commands (N, 2): forward speed, yaw rate."""
+        self.controller.command(command)
+        self.bumped[:] = False
+        self.slipped[:] = False
+        touched = self.bumped.copy()
+        for block in range(self.blocks):
+            pose = self.pose()
+            self.scenery.walk(self.traffic.advance(pose, self.qvel[:, :2], touched, BLOCK_S))
+            icy = np.flatnonzero(self._has_patches)
+            slippery = self._write_friction(icy, pose[icy])
+            touched = self._run(self.controller.wheel_speeds(block * BLOCK_S))
+            self.bumped |= touched
+            if slippery.any():
+                self.slipped[icy] |= self._slipping(icy, slippery)
+        warnings = np.asarray(self.batch.warning).reshape(self.num_envs, -1)
+        self.blown_up = np.asarray((warnings > 0).any(axis=1), np.bool_)
+
+    def _run(self, wheels: F64) -> NDArray[np.bool_]:
+        """One block of substeps under wheel speeds (N, S, 2); returns whose bumper was pressed."""
+        control = self._control
+        control[:, :, :2] = wheels
+        touched = np.zeros(self.num_envs, np.bool_)
+        if self.callback is None:
+            parts = [(0, self.substeps)]
+        else:
+            stride = max(round(self.callback_period_s / self.timestep_s), 1)
+            starts = range(0, self.substeps, stride)
+            parts = [(start, min(start + stride, self.substeps)) for start in starts]
+        records = []
+        for start, stop in parts:
+            part = control[:, start:stop]
+            record = self.batch.rollout(stop - start, part, _CONTROLLED, ("sensordata",))
+            sensed = record["sensordata"]
+            pressed = (sensed[:, :, self.handles.bumper] > 0).any(axis=1)
+            touched |= pressed
+            self.time_s += (stop - start) * self.timestep_s
+            records.append(sensed[:, :, self.handles.accelerometer])
+            if self.callback is not None:
+                self.callback(self.live(records[-1].mean(axis=1), pressed))
+        accel = records[0] if len(records) == 1 else np.concatenate(records, axis=1)
+        self.accel = accel[:, self.substeps // 2 :].mean(axis=1)
+        return touched
+
+    def live(self, accel: F64, pressed: NDArray[np.bool_]) -> Live:
+        """The true state now."""
+        pose = self.pose()
+        cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+        vx, vy = self.qvel[:, 0], self.qvel[:, 1]
+        return Live(
+            time_s=self.time_s.copy(),
+            x_m=pose[:, 0],
+            y_m=pose[:, 1],
+            yaw_rad=pose[:, 2],
+            speed_mps=cos * vx + sin * vy,
+            lateral_mps=-sin * vx + cos * vy,
+            yaw_rate_radps=self.qvel[:, 5].copy(),
+            wheel_angle_rad=self.qpos[:, 7:9].copy(),
+            wheel_speed_radps=self.qvel[:, 6:8].copy(),
+            accel_mps2=accel,
+            bumped=pressed,
+            set_point=self.controller.set_point.copy(),
+        )
+
+    def pose(self) -> F64:
+        """True x, y and heading, (N, 3)."""
+        return np.column_stack([self.qpos[:, :2], yaw_of(self.qpos[:, 3:7])])
+
+    def _write_friction(self, ids: Ids, pose: F64) -> NDArray[np.bool_]:
+        """Friction under the wheels of `ids`; returns (n, 2) which of them stand on a patch."""
+        base = self.base_friction[ids]
+        friction = friction_at(self._wheel_points(pose), self.patches[ids], base)
+        left, right = self.handles.wheel_geoms
+        self._friction[ids, left, 0] = friction[:, 0] * self.left_friction[ids]
+        self._friction[ids, right, 0] = friction[:, 1]
+        return friction < np.minimum(SLIPPERY_BELOW, base[:, None] - 1e-9)
+
+    def _wheel_points(self, pose: F64) -> F64:
+        across = np.stack([-np.sin(pose[:, 2]), np.cos(pose[:, 2])], axis=-1) * (TRACK_M / 2)
+        return np.stack([pose[:, :2] + across, pose[:, :2] - across], axis=1)
+
+    def _slipping(self, ids: Ids, slippery: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Whose wheel (n, 2) is on a patch and moves over the floor by more than .15 m/s."""
+        velocity, heading = self.qvel[ids], yaw_of(self.qpos[ids, 3:7])
+        cos, sin = np.cos(heading), np.sin(heading)
+        forward = cos * velocity[:, 0] + sin * velocity[:, 1]
+        lateral = cos * velocity[:, 1] - sin * velocity[:, 0]
+        turn = velocity[:, 5] * (TRACK_M / 2)
+        ground = np.stack([forward - turn, forward + turn], axis=-1)
+        slip = np.hypot(velocity[:, 6:8] * self.body.radius_m[ids, None] - ground, lateral[:, None])
+        return np.asarray((slippery & (slip > 0.15)).any(axis=1), np.bool_)
+
+    # -- sensing --------------------------------------------------------------------------------
+
+    def cast(self, ids: Ids) -> F64:
+        """True lidar ranges (n, beams) in metres now; inf where nothing is hit."""
+        heading = yaw_of(self.qpos[ids, 3:7])
+        cos, sin = np.cos(heading), np.sin(heading)
+        rays = np.zeros((len(ids), self.beams, 3))
+        rays[..., 0] = cos[:, None] * self._beam[:, 0] - sin[:, None] * self._beam[:, 1]
+        rays[..., 1] = sin[:, None] * self._beam[:, 0] + cos[:, None] * self._beam[:, 1]
+        origin = np.full((len(ids), 1, 3), LIDAR_Z_M)
+        ahead = self.task.body.lidar_x_m
+        origin[:, 0, 0] = self.qpos[ids, 0] + cos * ahead
+        origin[:, 0, 1] = self.qpos[ids, 1] + sin * ahead
+        distance = self.batch.ray(origin, rays, self._groups, ids=ids)[0]
+        return np.where(distance < 0, np.inf, distance)
+
+    # -- state ----------------------------------------------------------------------------------
+
+    _ARRAYS = ("time_s", "bumped", "slipped", "accel", "blown_up")
+    _CONTROLLER = ("commands", "set_point")
+    _TRAFFIC = (
+        *("state", "travelled_m", "waited_s", "position_m", "heading_rad"),
+        "attentive",
+    )
+
+    def get_state(self) -> dict[str, NDArray[Any]]:
+        """Everything that changes during an episode, as arrays."""
+        state = {name: getattr(self, name).copy() for name in self._ARRAYS}
+        state |= {name: getattr(self.controller, name).copy() for name in self._CONTROLLER}
+        state |= {f"traffic_{name}": getattr(self.traffic, name).copy() for name in self._TRAFFIC}
+        state["walked"] = self.scenery.walked.copy()
+        return state | {"physics": self.batch.state.copy()}
+
+    def set_state(self, state: dict[str, NDArray[Any]]) -> None:
+        """Undo to a state of `get_state`; layouts must have been reset to the same episodes."""
+        for name in self._ARRAYS:
+            setattr(self, name, state[name].copy())
+        for name in self._CONTROLLER:
+            setattr(self.controller, name, state[name].copy())
+        for name in self._TRAFFIC:
+            setattr(self.traffic, name, state[f"traffic_{name}"].copy())
+        self.batch.state[:] = state["physics"]
+        self.scenery.walked = state["walked"].copy()
+        self.scenery.stand_still(np.arange(self.num_envs))
+
+
+def _batch(physics: Physics) -> Any:
+    if physics == "mujoco":
+        return Batch
+    if physics == "warp":
+        from restock.train.twin.physics.warp_batch import WarpBatch
+
+        return WarpBatch
+    raise ConfigError(
+        f"there is no physics {physics!r}", where="the twin", remedy="use mujoco or warp"
+    )
+
+
+def _check_times(task: Task, timestep_s: float, substeps: int, blocks: int) -> None:
+    if abs(substeps * timestep_s - BLOCK_S) > 1e-9:
+        raise ConfigError(
+            f"timestep_s = {timestep_s} does not divide {BLOCK_S} s",
+            where="perturbation",
+            remedy="use .01, .005, .002 or .001",
+        )
+    if abs(blocks * BLOCK_S - task.control_period_s) > 1e-9 or blocks < 1:
+        raise ConfigError(
+            f"control_period_s = {task.control_period_s} is no multiple of {BLOCK_S} s",
+            where="task",
+            remedy="the twin drives in blocks of .1 s",
+        )
+
+
+def _no_log_file() -> None:
+    """No MUJOCO_LOG.TXT wherever the user happens to stand: blow-ups are counted and reported."""
+    config = mujoco.MjLogConfig.get()
+    if config.logto_file:
+        config.logto_file = False
+        config.set()

@@ -1,0 +1,247 @@
+"""People and forklifts: each walks a given way once the robot comes near, and may not look out.
+
+An attentive one stops .5 m off the robot. An inattentive one walks on into the way of a robot that
+drives at them, and stops only before one that stands, turns or backs off. Whoever has waited for
+2 s, or was touched, steps back and lets the robot pass. Movement is kinematic: traffic pushes the
+robot, not the reverse.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.train.twin.floors.layout import Warehouse
+from restock.train.twin.physics.model import FORKLIFTS, PARKED_M, PEOPLE, PERSON_RADIUS_M
+
+F64 = NDArray[np.float64]
+
+AGENTS = PEOPLE + FORKLIFTS  # the people first
+WAY_POINTS = 24
+FORKLIFT_RADIUS_M = 0.5  # of the circle that stands for it when it looks out
+YIELD_M = 0.5
+PASSING_M = 0.6  # from a plan to the side of who stands by it: half the robot and a margin
+STANDING_M = 0.15  # how near an inattentive one comes to a robot that stands or backs off
+RETREAT_M = 2.0  # how far off the robot a retreat ends
+DRIVEN_AT_MPS = 0.15  # closing speed by which a robot is said to drive at someone
+WAIT_S = 2.0
+HIDDEN, WAITING, WALKING, RETREATING = 0, 1, 2, 3
+
+
+@dataclass(frozen=True)
+class Walk:
+    """One agent's way, (WAY_POINTS, 2) evenly spaced, and how it behaves on it."""
+
+    way_m: F64
+    speed_mps: float
+    trigger: tuple[float, float, float]  # x, y, and how near the robot must come to it
+    attentive: bool
+
+
+def draw_walks(
+    rng: np.random.Generator, warehouse: Warehouse, plan: F64
+) -> tuple[Walk | None, ...] | None:
+    """One or two people and perhaps a forklift on the robot's way; None where none fits."""
+    walks: list[Walk | None] = [None] * AGENTS
+    crossings = _crossings_on(plan, warehouse)
+    for slot in range(1 + int(rng.random() < 0.35)):
+        oncoming = rng.random() < 0.4 or not crossings
+        walks[slot] = (
+            _oncoming(rng, plan)
+            if oncoming
+            else _crossing(rng, warehouse, plan, crossings[rng.integers(len(crossings))], 0.3)
+        )
+    if crossings and rng.random() < 0.65:  # there is room for half of them
+        place = crossings[rng.integers(len(crossings))]
+        walks[PEOPLE] = _crossing(rng, warehouse, plan, place, 0.6)
+    return tuple(walks) if any(walk is not None for walk in walks) else None
+
+
+def _crossings_on(plan: F64, warehouse: Warehouse) -> list[int]:
+    """Points of the plan inside a crossing, at least 1.5 m from its ends."""
+    spacing = float(np.hypot(*(plan[1] - plan[0])))
+    margin = int(1.5 / max(spacing, 1e-6)) + 1
+    return [
+        index
+        for index in range(margin, len(plan) - margin)
+        if any(c.contains(plan[index, 0], plan[index, 1], 0.3) for c in warehouse.crossings)
+    ]
+
+
+def _crossing(
+    rng: np.random.Generator, warehouse: Warehouse, plan: F64, index: int, half_width_m: float
+) -> Walk | None:
+    """Straight across the plan at one of its points, as far as the racks allow."""
+    place = plan[index]
+    along = plan[min(index + 2, len(plan) - 1)] - plan[max(index - 2, 0)]
+    across = np.array([0.0, 1.0]) if abs(along[0]) > abs(along[1]) else np.array([1.0, 0.0])
+    across = across * rng.choice([-1.0, 1.0])
+    reach = [_free_m(warehouse, place, side * across, half_width_m) for side in (-1, 1)]
+    if min(reach) < 1.0 and max(reach) < 2.0:
+        return None
+    start, end = place - across * min(reach[0], 4.0), place + across * min(reach[1], 4.0)
+    ends = np.stack([start, end])
+    off_plan = np.hypot(*(ends[:, None] - plan[None]).transpose(2, 0, 1)).min(axis=1)
+    if off_plan.min() < half_width_m + PASSING_M:
+        return None  # who waits or has arrived there would leave no room to pass
+    speed = rng.uniform(0.5, 1.1)
+    arrival_s = float(np.hypot(*(place - start))) / speed + rng.uniform(-0.6, 0.6)
+    return Walk(
+        np.linspace(start, end, WAY_POINTS),
+        speed,
+        (float(place[0]), float(place[1]), float(np.clip(0.8 * arrival_s, 1.2, 4.0))),
+        bool(rng.random() < 0.4),
+    )
+
+
+def _oncoming(rng: np.random.Generator, plan: F64) -> Walk:
+    """Along the robot's plan, the other way, some way to one side of it."""
+    spacing = float(np.hypot(*(plan[1] - plan[0])))
+    length = spacing * (len(plan) - 1)
+    meet_m = rng.uniform(0.4, 0.7) * length
+    at = np.linspace(min(meet_m + 3.5, length), max(meet_m - 5.0, 0.0), WAY_POINTS)
+    place = np.clip(at / spacing, 0, len(plan) - 1.001)
+    first = place.astype(int)
+    way = plan[first] + (place - first)[:, None] * (plan[first + 1] - plan[first])
+    along = np.gradient(way, axis=0)
+    along /= np.maximum(np.hypot(*along.T), 1e-9)[:, None]
+    offset = rng.uniform(0.25, 0.5) * rng.choice([-1.0, 1.0])
+    way = way + offset * np.stack([-along[:, 1], along[:, 0]], axis=-1)
+    meet = plan[int(meet_m / spacing)]
+    return Walk(
+        way,
+        rng.uniform(0.5, 1.0),
+        (float(meet[0]), float(meet[1]), float(rng.uniform(2.0, 3.5))),
+        bool(rng.random() < 0.4),
+    )
+
+
+def _free_m(warehouse: Warehouse, place: F64, direction: F64, half_width_m: float) -> float:
+    """How far one can go from a place in a direction before a rack or wall is too near."""
+    for step in range(1, 60):
+        x, y = place + direction * (0.1 * step)
+        on_floor = (
+            half_width_m <= x <= warehouse.width_m - half_width_m
+            and half_width_m <= y <= warehouse.depth_m - half_width_m
+        )
+        if not on_floor or any(rack.contains(x, y, -half_width_m) for rack in warehouse.racks):
+            return 0.1 * (step - 1)
+    return 6.0
+
+
+class Traffic:
+    """The agents of N environments: positions over time. All arrays are (N, AGENTS, ...)."""
+
+    def __init__(self, num_envs: int, body_half_m: tuple[float, float]) -> None:
+        shape = (num_envs, AGENTS)
+        self.body_half_m = np.array(body_half_m)
+        self.radius_m = np.array([PERSON_RADIUS_M] * PEOPLE + [FORKLIFT_RADIUS_M] * FORKLIFTS)
+        self.way_m = np.zeros((*shape, WAY_POINTS, 2))
+        self.length_m = np.ones(shape)
+        self.speed_mps = np.zeros(shape)
+        self.trigger = np.zeros((*shape, 3))
+        self.attentive = np.zeros(shape, np.bool_)
+        self.state = np.full(shape, HIDDEN)
+        self.travelled_m = np.zeros(shape)
+        self.waited_s = np.zeros(shape)
+        self.position_m = np.full((*shape, 2), PARKED_M[0])
+        self.heading_rad = np.zeros(shape)
+        self.active = np.zeros(num_envs, np.bool_)  # whether the environment has any traffic
+
+    def reset(self, env: int, walks: tuple[Walk | None, ...]) -> None:
+        """Lay out the ways of one environment's agents."""
+        self.active[env] = any(walk is not None for walk in walks)
+        self.state[env] = HIDDEN
+        self.travelled_m[env] = self.waited_s[env] = self.heading_rad[env] = 0.0
+        self.position_m[env] = PARKED_M[0]
+        for agent, walk in enumerate(walks):
+            if walk is not None:
+                self.state[env, agent] = WAITING
+                self.way_m[env, agent] = walk.way_m
+                self.length_m[env, agent] = np.hypot(*np.diff(walk.way_m, axis=0).T).sum()
+                self.speed_mps[env, agent] = walk.speed_mps
+                self.trigger[env, agent] = walk.trigger
+                self.attentive[env, agent] = walk.attentive
+                self._place(np.array([env]))
+
+    def advance(
+        self, robot: F64, velocity: F64, touched: NDArray[np.bool_], elapsed_s: float
+    ) -> NDArray[np.int64]:
+        """Move the agents for `elapsed_s`; returns the environments where some are under way.
+
+        `robot` (N, 3) is x, y, yaw, `velocity` (N, 2) in the map frame; `touched` (N,) says whose
+        bumper was pressed in the time before.
+        """
+        ids = np.flatnonzero(self.active)
+        if not len(ids):
+            return ids
+        trigger = self.trigger[ids]
+        near = np.hypot(
+            trigger[..., 0] - robot[ids, None, 0], trigger[..., 1] - robot[ids, None, 1]
+        )
+        starts = (self.state[ids] == WAITING) & (near <= trigger[..., 2])
+        self.state[ids] = np.where(starts, WALKING, self.state[ids])
+        ids = ids[(self.state[ids] >= WALKING).any(axis=1)]
+        if not len(ids):
+            return ids
+        pose, state = robot[ids], self.state[ids]
+        gap, toward = self._gap(ids, pose)
+        careless = np.where(self._driven_at(ids, pose, velocity[ids]), 0.0, STANDING_M)
+        look_out = np.where(self.attentive[ids], YIELD_M, careless)
+        held = (state == WALKING) & toward & (gap < look_out)
+        waited = np.where(held, self.waited_s[ids] + elapsed_s, 0.0)
+        hit = touched[ids, None] & (gap < 0.2) & ((state == WALKING) | (state == RETREATING))
+        self.attentive[ids] |= hit  # having been touched, one looks out
+        state = np.where((hit & toward) | (waited > WAIT_S), RETREATING, state)
+        state = np.where(
+            (state == RETREATING) & ((gap > RETREAT_M) | (hit & ~toward)), WALKING, state
+        )
+        pace = np.where(state == RETREATING, -0.6, np.where((state == WALKING) & ~held, 1.0, 0.0))
+        travelled = self.travelled_m[ids] + pace * self.speed_mps[ids] * elapsed_s
+        # Who is back at the start or at the end of the way leaves the floor, out of sight.
+        left = ((travelled >= self.length_m[ids]) & (gap > 1.0)) | (
+            (travelled <= 0.0) & (state == RETREATING)
+        )
+        self.state[ids] = np.where(left, HIDDEN, state)
+        self.waited_s[ids] = waited
+        self.travelled_m[ids] = np.clip(travelled, 0.0, self.length_m[ids])
+        self._place(ids)
+        return ids
+
+    def _place(self, ids: NDArray[np.int64]) -> None:
+        """Positions from how far each has travelled along its way."""
+        shown = self.state[ids] != HIDDEN
+        share = self.travelled_m[ids] / self.length_m[ids] * (WAY_POINTS - 1)
+        first = np.clip(share.astype(np.int64), 0, WAY_POINTS - 2)
+        way = self.way_m[ids]
+        here = np.take_along_axis(way, first[..., None, None], axis=2)[:, :, 0]
+        there = np.take_along_axis(way, first[..., None, None] + 1, axis=2)[:, :, 0]
+        step = there - here
+        point = here + (share - first)[..., None] * step
+        self.position_m[ids] = np.where(shown[..., None], point, PARKED_M[0])
+        self.heading_rad[ids] = np.where(shown, np.arctan2(step[..., 1], step[..., 0]), 0.0)
+
+    def _driven_at(self, ids: NDArray[np.int64], pose: F64, velocity: F64) -> NDArray[np.bool_]:
+        """Which agents (n, AGENTS) the robot comes nearer to by driving."""
+        delta = self.position_m[ids] - pose[:, None, :2]
+        distance = np.maximum(np.hypot(delta[..., 0], delta[..., 1]), 1e-9)
+        closing = (
+            delta[..., 0] * velocity[:, None, 0] + delta[..., 1] * velocity[:, None, 1]
+        ) / distance
+        return np.asarray(closing > DRIVEN_AT_MPS, np.bool_)
+
+    def _gap(self, ids: NDArray[np.int64], pose: F64) -> tuple[F64, NDArray[np.bool_]]:
+        """From each agent's circle to the robot's outline, and whether it walks toward it."""
+        delta = self.position_m[ids] - pose[:, None, :2]
+        cos, sin = np.cos(pose[:, 2])[:, None], np.sin(pose[:, 2])[:, None]
+        local = np.stack(
+            [cos * delta[..., 0] + sin * delta[..., 1], -sin * delta[..., 0] + cos * delta[..., 1]],
+            axis=-1,
+        )
+        outside = np.maximum(np.abs(local) - self.body_half_m, 0.0)
+        gap = np.hypot(outside[..., 0], outside[..., 1]) - self.radius_m
+        heading = self.heading_rad[ids]
+        toward = -(np.cos(heading) * delta[..., 0] + np.sin(heading) * delta[..., 1]) > 0
+        return gap, toward

@@ -1,0 +1,1 @@
+"""Drives, written as a robot would log them."""

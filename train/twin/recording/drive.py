@@ -1,0 +1,68 @@
+"""One mission as the twin drove it: what a recorder has to know to write what a robot would log."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.ingest.task.signals import Columns
+from restock.train.twin.recording.scene import EMPTY, Scene
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Lidar:
+    """The geometry of a planar lidar's scan, in its own frame."""
+
+    angle_min_rad: float
+    angle_increment_rad: float
+    range_min_m: float
+    range_max_m: float
+    x_m: float = 0.0  # ahead of the robot's middle
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The true motion, at every physics step of the mission (M of them, the start included)."""
+
+    time_s: F64  # (M,) from the start of the mission
+    pose: F64  # (M, 3) x_m, y_m, yaw_rad (not wrapped) in the map
+    wheel_angle_rad: F64  # (M, 2) left, right
+    wheel_rate_radps: F64  # (M, 2)
+    yaw_rate_radps: F64  # (M,)
+    accel_mps2: F64  # (M, 2) of the body, forward and left
+    bumped: NDArray[np.bool_]  # (M,) the bumper touched something
+
+    def at(self, values: F64, time_s: F64) -> F64:
+        """One of the columns above, (M,) or (M, 2), interpolated at times (n,)."""
+        if values.ndim == 1:
+            return np.interp(time_s, self.time_s, values)
+        columns = [np.interp(time_s, self.time_s, column) for column in values.T]
+        return np.stack(columns, axis=-1)
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A mission: true motion between the control ticks, and what the twin saw and did at them.
+
+    There are T commands and T + 1 ticks: the last tick is where the mission ended.
+    """
+
+    goal_m: tuple[float, float]
+    motion: Motion
+    tick_s: F64  # (T + 1,) from the start of the mission
+    signals: Columns  # each (T + 1, …): what the policy saw
+    scan_s: F64  # (K,) when the lidar scanned; the first tick is among them
+    ranges_m: F64  # (K, B) as measured; inf where nothing came back
+    command: F64  # (T, 2) speed_mps, yaw_rate_radps
+    true_condition: list[str]  # T
+    policy: list[tuple[str, str, float]]  # T of (name, version, probability of the action)
+    plans: list[tuple[int, F64]]  # (tick from which it is in force, (P, 2) points)
+    scene: Scene = EMPTY
+    gyro_bias_radps: float = 0.0
+    gyro_noise_radps: float = 0.0
+    accel_noise_mps2: float = 0.0
+    encoder_noise_radps: float = 0.0

@@ -1,0 +1,268 @@
+"""Drives missions in the twin, several robots at a time, and keeps what a recorder needs.
+
+The missions come out in the order they were given, each as a `Drive`, however long each took.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.floors.layout import DEFAULT, Warehouse
+from restock.train.twin.physics.episode import EpisodeSpec
+from restock.train.twin.physics.model import CHASSIS_Z_M
+from restock.train.twin.physics.perturbation import Perturbation, Schedule
+from restock.train.twin.physics.simulation import BLOCK_S, Live
+from restock.train.twin.recording.drive import Drive, Motion
+from restock.train.twin.recording.missions import Mission
+from restock.train.twin.recording.scene import Scene
+
+F64 = NDArray[np.float64]
+ROBOTS = 8  # at a time
+MOTION_PERIOD_S = 0.02
+
+
+class Crew(Protocol):
+    """Who drives: acts for every robot, each by its own mission's driver."""
+
+    def begin(self, robot: int, mission: Mission) -> None:
+        """Robot `robot` starts a mission."""
+        ...
+
+    def act(
+        self, env: WarehouseVectorEnv
+    ) -> tuple[NDArray[np.int64], list[tuple[str, str]], NDArray[np.float64]]:
+        """Actions (N,), who chose each as (policy, version), and its probability (N,)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Driven:
+    """A mission that was driven: its T steps as the twin has them."""
+
+    mission: Mission
+    drive: Drive
+    observation: NDArray[np.float32]  # (T + 1, D)
+    action: NDArray[np.int64]  # (T,)
+    reward: NDArray[np.float32]  # (T,)
+    success: bool
+    block: str
+    terminated: bool  # at its last step; else it was cut there
+    floor: Warehouse
+
+
+@dataclass
+class _Log:
+    """One robot's mission as it goes."""
+
+    place: int  # among the missions
+    mission: Mission
+    rng: np.random.Generator  # of the scans between ticks
+    signals: list[dict[str, Any]] = field(default_factory=list)  # T + 1 rows
+    observation: list[NDArray[np.float32]] = field(default_factory=list)  # T + 1
+    action: list[int] = field(default_factory=list)
+    reward: list[float] = field(default_factory=list)
+    policy: list[tuple[str, str, float]] = field(default_factory=list)
+    truth: list[str] = field(default_factory=list)
+    motion: list[Live] = field(default_factory=list)  # of all robots
+    scan_s: list[float] = field(default_factory=list)
+    ranges_m: list[F64] = field(default_factory=list)
+    plans: list[tuple[int, F64]] = field(default_factory=list)
+    plan_number: int = -1
+    pallets: F64 = field(default_factory=lambda: np.zeros((0, 3)))
+    patches: F64 = field(default_factory=lambda: np.zeros((0, 5)))
+    traffic: list[F64] = field(default_factory=list)  # T + 1
+
+
+class Fleet:
+    """N robots that drive missions in the twin, under one set of effective parameters.
+
+    Args:
+        hardware: those parameters, where a mission names none of its own.
+        layouts: the floors, as `restock.train.twin.floors.floors.open_floors` reads them; a
+        mission that names     none is on one that its seed draws.
+        conditions: the kinds of the missions to come (keys), which must fit on the floors.
+        scan_hz: the lidar scans at every control tick, and above 5 Hz once more between two.
+    """
+
+    def __init__(
+        self,
+        hardware: Perturbation | Schedule,
+        *,
+        layouts: str = DEFAULT,
+        conditions: Mapping[str, float] | None = None,
+        scan_hz: float = 10.0,
+        robots: int = ROBOTS,
+    ) -> None:
+        self.env = WarehouseVectorEnv(
+            robots,
+            perturbation=hardware,
+            layouts=layouts,
+            conditions=conditions,
+            autoreset_mode=AutoresetMode.DISABLED,
+        )
+        self.period_s = self.env.task.control_period_s
+        self._scans_between = scan_hz * self.period_s > 1
+        self._logs: list[_Log | None] = [None] * robots
+        self._motion: list[Live] = []  # of the step at hand
+        self._scan: F64 | None = None  # true ranges half-way through it
+        self.env.set_block_callback(self._note_motion, MOTION_PERIOD_S)
+
+    def drive(self, missions: Iterator[Mission], crew: Crew) -> Iterator[Driven]:
+        """Drive missions, for as long as there are more and the caller wants them."""
+        env, numbered = self.env, enumerate(missions)
+        finished: dict[int, Driven] = {}
+        delivered = 0
+        self._begin(np.arange(env.num_envs), numbered, crew)
+        while any(log is not None for log in self._logs):
+            action, policy, probability = crew.act(env)
+            self._motion, self._scan = [], None
+            _, reward, terminated, truncated, info = env.step(action)
+            ended = np.flatnonzero(terminated | truncated)
+            for robot, log in enumerate(self._logs):
+                if log is not None:
+                    log.action.append(int(action[robot]))
+                    log.policy.append((*policy[robot], float(probability[robot])))
+                    log.reward.append(float(reward[robot]))
+                    log.truth.append(str(info["true_condition"][robot]))
+                    self._note_step(log, robot, info)
+            for robot in ended.tolist():
+                if (log := self._logs[robot]) is not None:
+                    finished[log.place] = self._finish(
+                        log, robot, info, terminated=bool(terminated[robot])
+                    )
+            if len(ended):
+                self._begin(ended, numbered, crew)
+            while delivered in finished:
+                yield finished.pop(delivered)
+                delivered += 1
+
+    def _begin(
+        self, robots: NDArray[np.int64], missions: Iterator[tuple[int, Mission]], crew: Crew
+    ) -> None:
+        """Give each of these robots its next mission; one without any drives on unrecorded."""
+        env = self.env
+        given = [next(missions, None) for _ in robots]
+        idle = EpisodeSpec("nominal", 0)
+        env.set_episodes([idle if entry is None else entry[1].spec for entry in given])
+        mask = np.zeros(env.num_envs, np.bool_)
+        mask[robots] = True
+        env.reset(options={"reset_mask": mask})
+        still = np.zeros((env.num_envs, 3))
+        standing = env.simulation.live(still, np.zeros(env.num_envs, np.bool_))
+        for robot, entry in zip(robots.tolist(), given, strict=True):
+            if entry is None:
+                self._logs[robot] = None
+                continue
+            place, mission = entry
+            log = _Log(place, mission, np.random.Generator(np.random.PCG64(mission.spec.seed)))
+            log.motion.append(standing)
+            log.pallets = env.simulation.pallets[robot].copy()
+            log.patches = env.simulation.patches[robot].copy()
+            self._logs[robot] = log
+            self._note_tick(log, robot, env.signals)
+            crew.begin(robot, mission)
+
+    def _note_motion(self, live: Live) -> None:
+        self._motion.append(live)
+        if self._scans_between and len(self._motion) == round(BLOCK_S / MOTION_PERIOD_S):
+            self._scan = self.env.simulation.cast(np.arange(self.env.num_envs))
+
+    def _note_step(self, log: _Log, robot: int, info: Mapping[str, Any]) -> None:
+        """What came of the action."""
+        log.motion.extend(self._motion)
+        if self._scan is not None and not self._hardware(log).lidar_period_s:
+            log.scan_s.append(round((len(log.action) - 1) * self.period_s + BLOCK_S, 6))
+            log.ranges_m.append(self._measured(log, self._scan[robot]))
+        self._note_tick(log, robot, info["signals"])
+
+    def _note_tick(self, log: _Log, robot: int, signals: Mapping[str, NDArray[Any]]) -> None:
+        """What the policy sees at a tick."""
+        env, tick = self.env, len(log.action)
+        log.signals.append({name: column[robot] for name, column in signals.items()})
+        log.observation.append(env.observation[robot].copy())
+        every = max(round(self._hardware(log).lidar_period_s / self.period_s), 1)
+        if tick % every == 0:  # else the robot goes on with the scan before
+            log.scan_s.append(round(tick * self.period_s, 6))
+            log.ranges_m.append(env.sensing.ranges_m[robot].copy())
+        traffic = env.simulation.traffic
+        log.traffic.append(np.column_stack([traffic.position_m[robot], traffic.heading_rad[robot]]))
+        number = int(env.navigation.plan_number[robot])
+        if number != log.plan_number:
+            log.plans.append((tick, env.navigation.plans_m[robot].copy()))
+            log.plan_number = number
+
+    def _hardware(self, log: _Log) -> Perturbation:
+        return log.mission.spec.perturbation or self.env.perturbation
+
+    def _measured(self, log: _Log, true_ranges_m: F64) -> F64:
+        """A scan between ticks: the same noise and dropout, drawn anew."""
+        hardware = self._hardware(log)
+        ranges = true_ranges_m + log.rng.normal(0, hardware.lidar_noise_m, len(true_ranges_m))
+        lost = log.rng.random(len(ranges)) < hardware.lidar_dropout
+        return np.where(lost, np.inf, np.maximum(ranges, 0.0))
+
+    def _finish(
+        self, log: _Log, robot: int, info: Mapping[str, Any], *, terminated: bool
+    ) -> Driven:
+        env = self.env
+        goal = env.navigation.goals_m[robot]
+        names = log.signals[0].keys()
+        hardware = self._hardware(log)
+        action = np.array(log.action, np.int64)
+        drive = Drive(
+            goal_m=(float(goal[0]), float(goal[1])),
+            motion=_motion_of(log.motion, robot),
+            tick_s=np.round(np.arange(len(log.signals)) * self.period_s, 6),
+            signals={name: np.array([row[name] for row in log.signals]) for name in names},
+            scan_s=np.array(log.scan_s),
+            ranges_m=np.array(log.ranges_m),
+            command=np.asarray(env.task.actions, np.float64)[action],
+            true_condition=log.truth,
+            policy=log.policy,
+            plans=log.plans,
+            scene=Scene(
+                pallets=log.pallets,
+                patches=log.patches,
+                traffic=np.array(log.traffic),
+                perturbation=hardware,
+                goal_radius_m=env.task.goal_radius_m,
+                body_m=(env.task.body.length_m, env.task.body.width_m, 2 * CHASSIS_Z_M),
+            ),
+            gyro_bias_radps=hardware.gyro_bias_radps,
+            gyro_noise_radps=hardware.gyro_noise_radps,
+            accel_noise_mps2=hardware.accel_noise_mps2,
+            encoder_noise_radps=hardware.encoder_noise_radps,
+        )
+        return Driven(
+            mission=log.mission,
+            drive=drive,
+            observation=np.array(log.observation),
+            action=action,
+            reward=np.array(log.reward, np.float32),
+            success=bool(info["success"][robot]),
+            block=str(info["block"][robot]),
+            terminated=terminated,
+            floor=env.floor_of(robot),
+        )
+
+
+def _motion_of(lives: list[Live], robot: int) -> Motion:
+    """One robot's motion out of all robots'."""
+    pose = np.array([(live.x_m[robot], live.y_m[robot], live.yaw_rad[robot]) for live in lives])
+    pose[:, 2] = np.unwrap(pose[:, 2])
+    return Motion(
+        time_s=np.round(np.arange(len(lives)) * MOTION_PERIOD_S, 6),
+        pose=pose,
+        wheel_angle_rad=np.array([live.wheel_angle_rad[robot] for live in lives]),
+        wheel_rate_radps=np.array([live.wheel_speed_radps[robot] for live in lives]),
+        yaw_rate_radps=np.array([live.yaw_rate_radps[robot] for live in lives]),
+        accel_mps2=np.array([live.accel_mps2[robot, :2] for live in lives]),
+        bumped=np.array([live.bumped[robot] for live in lives]),
+    )

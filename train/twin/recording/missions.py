@@ -1,0 +1,119 @@
+"""Which missions a recorded fleet drives: conditions at their rarity, drivers at their shares."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from restock.errors import ConfigError
+from restock.train.twin.physics.episode import KINDS, EpisodeSpec
+from restock.train.twin.physics.perturbation import Perturbation, Schedule
+from restock.train.twin.recording.drivers import HANDOVER
+
+# What a site that runs well sees.
+NATURAL = {"nominal": 0.80, "wheel_slip": 0.07, "blocked_aisle": 0.07, "near_collision": 0.06}
+# How the fleet is driven: the planner (and its next release, on a few robots), whom an operator
+# helps out, and missions that an operator drives throughout.
+FLEET = {"planner 1": 0.70, "planner 2": 0.18, "operator 1": 0.12}
+BLOCK = 20  # missions dealt at a time, so that every condition comes up in a short recording too
+
+PAUSE_S = (4.0, 12.0)  # between missions, unrecorded
+
+
+@dataclass(frozen=True)
+class Mission:
+    """One mission to be driven and recorded."""
+
+    spec: EpisodeSpec
+    driver: str  # planner, operator, random, or the name of a policy
+    version: str
+    handover: bool  # whether the operator takes over when the driver is stuck
+    pause_s: float  # before the next mission
+
+
+def schedule(
+    seed: int,
+    conditions: Mapping[str, float],
+    driver: str,
+    hardware: Perturbation | Schedule,
+    *,
+    version: str = "1",
+) -> Iterator[Mission]:
+    """The missions of a recording, without end; the same for the same arguments.
+
+    `driver` is `handover` (the fleet) or the name of whoever drives all of them.
+    """
+    rng = np.random.Generator(np.random.PCG64([seed, 0x6D697373]))
+    kinds = _deal(conditions, rng)
+    drivers = _deal(FLEET, rng)
+    while True:
+        name, version = next(drivers).split() if driver == HANDOVER else (driver, version)
+        kind, mission_seed = next(kinds), int(rng.integers(1 << 31))
+        yield Mission(
+            EpisodeSpec(kind, mission_seed, _in_force(hardware, mission_seed)),
+            name,
+            version,
+            handover=driver == HANDOVER and name == "planner",
+            pause_s=round(float(rng.uniform(*PAUSE_S)), 3),
+        )
+
+
+def _in_force(hardware: Perturbation | Schedule, mission_seed: int) -> Perturbation:
+    if isinstance(hardware, Perturbation):
+        return hardware
+    return hardware.draw(np.random.default_rng([mission_seed, 1]))
+
+
+def _deal(shares: Mapping[str, float], rng: np.random.Generator) -> Iterator[str]:
+    """Names at their shares, block by block: what rounding leaves over is carried on."""
+    names = [name for name, share in shares.items() if share > 0]
+    share = np.array([shares[name] for name in names])
+    owed = np.zeros(len(names))
+    while True:
+        owed += share / share.sum() * BLOCK
+        count = np.floor(owed).astype(int)
+        for index in np.argsort(count - owed, kind="stable")[: BLOCK - count.sum()]:
+            count[index] += 1
+        owed -= count
+        yield from (
+            names[index] for index in rng.permutation(np.repeat(np.arange(len(names)), count))
+        )
+
+
+def parse_shares(text: str) -> dict[str, float]:
+    """`nominal=0.8,wheel_slip=0.2` to shares; conditions left out get none.
+
+    Raises:
+        ConfigError: no such condition, no number, or nothing above 0.
+    """
+    shares: dict[str, float] = {}
+    for part in filter(None, (part.strip() for part in text.split(","))):
+        name, _, number = part.partition("=")
+        if name not in KINDS or name in shares:
+            what = "given twice" if name in shares else "is no kind of mission"
+            raise ConfigError(
+                f"{name!r} {what}",
+                where="--conditions",
+                remedy=f"give shares of {', '.join(KINDS)}",
+            )
+        try:
+            share = float(number)
+        except ValueError:
+            share = -1.0
+        if not 0 <= share < float("inf"):
+            raise ConfigError(
+                f"{number!r} is no share",
+                where=f"--conditions {name}",
+                remedy="such as nominal=0.8",
+            )
+        shares[name] = share
+    if not sum(shares.values()) > 0:
+        raise ConfigError(
+            "no condition has a share above 0", where="--conditions", remedy="such as nominal=1"
+        )
+    return shares
+
+
+__all__ = ["FLEET", "NATURAL", "Mission", "parse_shares", "schedule"]

@@ -1,0 +1,327 @@
+"""A drive to the messages a robot would have logged: rates, stamps, delays and resolution.
+
+Three times belong to a message. The header's stamp is when the thing was measured; the publish
+time is when the driver sent it; the log time is when the recorder received it. Sensors run on
+their own rates, and one of their samples falls on every control tick (the navigation stack waits
+for the scan, then commands), so that what the policy saw is what the recording says at the tick.
+A command is sent some milliseconds after its tick: the planner has to think.
+
+At a tick a sensor's value is the twin's own measurement; between ticks it is the true motion plus
+noise of the same size. All values then take the resolution of the hardware, which also is what
+lets real recordings compress.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.ingest.task.signals import wrap_angle
+from restock.train.twin.recording import robot_topics as topics
+from restock.train.twin.recording.bag_writer import Message
+from restock.train.twin.recording.drive import Drive, Lidar
+from restock.train.twin.recording.odometer import Odometer
+from restock.train.twin.recording.scene import (
+    MARKERS,
+    PERTURBATION,
+    TRAFFIC,
+    mission_markers,
+    perturbation_text,
+    traffic_markers,
+)
+from restock.train.twin.recording.transport import send
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+GYRO_LSB_RADPS = 2.0**-10
+ACCEL_LSB_MPS2 = 2.0**-8
+LIDAR_LSB_M = 2.0**-9  # some 2 mm
+THINKING_S = (0.012, 0.016)  # from a tick to its command; longer than any sensor's delay
+BUMPER_POLL_S = 0.02
+JITTER_S = 4e-4  # of a sensor's timer
+TICK_TOLERANCE_S = 1e-6
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Messages a second of each periodic topic. Commands come once a control tick."""
+
+    odom: float = 50.0
+    imu: float = 50.0
+    joint_states: float = 20.0
+    scan: float = 10.0
+    amcl_pose: float = 10.0
+    tf: float = 20.0
+    bumper: float = 10.0
+    diagnostics: float = 1.0
+    plan: float = 1.0  # and whenever it changes
+    traffic: float = 2.0  # while anyone moves
+
+
+@dataclass
+class Robot:
+    """The robot that logs: what it carries from one mission to the next, and its own dice."""
+
+    rng: np.random.Generator
+    lidar: Lidar
+    rates: Rates
+    odometer: Odometer
+    driven_s: float = 0.0
+    _start_ns: int = 0  # of the mission at hand
+
+    def publish(self, drive: Drive, start_ns: int) -> list[Message]:
+        """All messages of one mission that starts at `start_ns`, in the order of log time."""
+        self._start_ns = start_ns
+        reckoned = self.odometer.dead_reckoning(drive.motion)  # (M, 3), at the motion's times
+        found = [
+            *self._announcements(drive),
+            *self._odometry(drive, reckoned),
+            *self._inertial(drive),
+            *self._joints(drive),
+            *self._scans(drive),
+            *self._localisation(drive, reckoned),
+            *self._bumper(drive),
+            *self._ticks(drive),
+            *self._diagnostics(drive),
+            *self._scene(drive),
+        ]
+        self.odometer.carry_on(drive.motion, reckoned)
+        self.driven_s += float(drive.tick_s[-1])
+        found.sort(key=lambda message: message.log_ns)  # stable: ties keep the order above
+        return found
+
+    def static(
+        self,
+        start_ns: int,
+        occupied: NDArray[np.bool_],
+        cell_m: float,
+        origin_m: tuple[float, float] = (0.0, 0.0),
+    ) -> list[Message]:
+        """What is sent when a recording or a floor begins: the sensors' places and the map."""
+        self._start_ns = start_ns
+        at = np.zeros(1)
+        return [
+            *self._send("/tf_static", at, [topics.static_transforms(start_ns, self.lidar.x_m)]),
+            *self._send("/map", at, [topics.occupancy_map(start_ns, occupied, cell_m, origin_m)]),
+        ]
+
+    def _announcements(self, drive: Drive) -> list[Message]:
+        """The goal, the plans (on change and about once a second), and who drives."""
+        found = self._send(
+            "/goal_pose", np.zeros(1), [topics.goal(self._stamp(0.0), *drive.goal_m)]
+        )
+        end_s = float(drive.tick_s[-1])
+        starts = [float(drive.tick_s[tick]) for tick, _ in drive.plans]
+        for start_s, until_s, (_, points) in zip(
+            starts, [*starts[1:], end_s], drive.plans, strict=True
+        ):
+            # Not at `until_s` itself, where the next one comes: it may be a last bit too late.
+            until_s = max(until_s - TICK_TOLERANCE_S, start_s + TICK_TOLERANCE_S)
+            times = np.arange(start_s, until_s, 1 / self.rates.plan)
+            messages = [topics.plan(self._stamp(time), points) for time in times.tolist()]
+            found += self._send("/plan", times, messages)
+        changed = [
+            tick
+            for tick, policy in enumerate(drive.policy)
+            if tick == 0 or policy != drive.policy[tick - 1]
+        ]
+        texts = [topics.behaviour_policy(*drive.policy[tick]) for tick in changed]
+        return found + self._send("/behaviour_policy", drive.tick_s[changed], texts)
+
+    def _odometry(self, drive: Drive, reckoned: F64) -> list[Message]:
+        times, tick = self._sample(drive, self.rates.odom)
+        rate = drive.motion.at(drive.motion.wheel_rate_radps, times)
+        rate += self.rng.normal(0, drive.encoder_noise_radps, rate.shape)
+        rate += drive.scene.perturbation.encoder_bias_radps
+        speed, turn = self.odometer.speeds(rate)
+        speed = _at_ticks(speed, tick, drive.signals["wheel_speed_mps"])
+        turn = _at_ticks(turn, tick, drive.signals["wheel_yaw_rate_radps"])
+        x, y, yaw = drive.motion.at(reckoned, times).T
+        data = topics.odometry(
+            self._stamps(times), _f32(x), _f32(y), _f32(wrap_angle(yaw)), _f32(speed), _f32(turn)
+        )
+        return self._send("/odom", times, data)
+
+    def _inertial(self, drive: Drive) -> list[Message]:
+        times, tick = self._sample(drive, self.rates.imu)
+        gyro = drive.motion.at(drive.motion.yaw_rate_radps, times) + drive.gyro_bias_radps
+        gyro += self.rng.normal(0, drive.gyro_noise_radps, len(times))
+        accel = drive.motion.at(drive.motion.accel_mps2, times)
+        accel += self.rng.normal(0, drive.accel_noise_mps2, accel.shape)
+        accel[:, 0] += drive.scene.perturbation.accel_bias_mps2
+        gyro = _at_ticks(gyro, tick, drive.signals["gyro_yaw_rate_radps"])
+        ahead = _at_ticks(accel[:, 0], tick, drive.signals["accel_x_mps2"])
+        data = topics.imu(
+            self._stamps(times),
+            _rounded(gyro, GYRO_LSB_RADPS),
+            _rounded(ahead, ACCEL_LSB_MPS2),
+            _rounded(accel[:, 1], ACCEL_LSB_MPS2),
+        )
+        return self._send("/imu", times, data)
+
+    def _joints(self, drive: Drive) -> list[Message]:
+        times, _ = self._sample(drive, self.rates.joint_states)
+        angle = self.odometer.wheel_angles(drive.motion, times)
+        rate = drive.motion.at(drive.motion.wheel_rate_radps, times)
+        data = topics.joint_states(self._stamps(times), _f32(angle), _f32(rate))
+        return self._send("/joint_states", times, data)
+
+    def _scans(self, drive: Drive) -> list[Message]:
+        lidar = self.lidar
+        data = topics.scans(
+            self._stamps(drive.scan_s),
+            _rounded(drive.ranges_m, LIDAR_LSB_M),
+            angle_min_rad=lidar.angle_min_rad,
+            angle_increment_rad=lidar.angle_increment_rad,
+            range_min_m=lidar.range_min_m,
+            range_max_m=lidar.range_max_m,
+            scan_time_s=max(1 / self.rates.scan, drive.scene.perturbation.lidar_period_s),
+        )
+        return self._send("/scan", drive.scan_s, data)
+
+    def _localisation(self, drive: Drive, reckoned: F64) -> list[Message]:
+        """/amcl_pose, and /tf with it: the localiser corrects `odom` within `map`."""
+        times, tick = self._sample(drive, self.rates.amcl_pose)
+        age_s = (drive.signals["stamp_ns"] - drive.signals["pose_stamp_ns"]) * 1e-9
+        if drive.scene.perturbation.localisation_period_s:  # slow: nothing new at other times
+            fresh = (tick >= 0) & (age_s[tick] == 0)
+            times, tick = times[fresh], tick[fresh]
+        seen = np.stack(
+            [drive.signals[f"pose_{name}"] for name in ("x_m", "y_m", "yaw_rad")], axis=-1
+        )
+        error = seen - drive.motion.at(drive.motion.pose, drive.tick_s)
+        error[:, 2] = wrap_angle(error[:, 2])
+        between = drive.motion.at(drive.motion.pose, times)
+        between += np.stack([np.interp(times, drive.tick_s, e) for e in error.T], axis=-1)
+        x, y, yaw = _at_ticks(between, tick, seen).T
+        measured_s = times - _at_ticks(np.zeros(len(times)), tick, age_s)
+        data = topics.localised_poses(
+            self._stamps(measured_s), _f32(x), _f32(y), _f32(wrap_angle(yaw))
+        )
+        found = self._send("/amcl_pose", times, data)
+
+        tf_s, _ = self._sample(drive, self.rates.tf)
+        newest = np.clip(np.searchsorted(times, tf_s, "right") - 1, 0, None)
+        base_then = drive.motion.at(reckoned, measured_s)
+        correction = _between(base_then, np.stack([x, y, yaw], axis=-1))[newest]
+        odom_to_base = drive.motion.at(reckoned, tf_s)
+        data = topics.transforms(self._stamps(tf_s), _pose(correction), _pose(odom_to_base))
+        return found + self._send("/tf", tf_s, data)
+
+    def _bumper(self, drive: Drive) -> list[Message]:
+        """Polled; sent when it changes, at its rate, and at every poll while it is pressed."""
+        end_s = float(drive.tick_s[-1])
+        polls = np.arange(round(end_s / BUMPER_POLL_S) + 1) * BUMPER_POLL_S
+        edges = np.searchsorted(drive.motion.time_s, polls + 1e-9, "right")
+        touched = np.concatenate([[0], np.cumsum(drive.motion.bumped)])
+        pressed = np.diff(touched[edges], prepend=touched[0]) > 0
+        every = max(round(1 / (self.rates.bumper * BUMPER_POLL_S)), 1)
+        changed = np.diff(pressed, prepend=pressed[:1])
+        sent = pressed | changed | (np.arange(len(polls)) % every == 0)
+        return self._send("/bumper", polls[sent], topics.bumpers(pressed[sent]))
+
+    def _ticks(self, drive: Drive) -> list[Message]:
+        """The command of every tick, a stop at the last, and the simulator's own truth."""
+        command = np.concatenate([drive.command, np.zeros((1, 2))])
+        thinking = self.rng.uniform(*THINKING_S, len(command))
+        truth = [*drive.true_condition, drive.true_condition[-1]]
+        return [
+            *self._send("/ground_truth/condition", drive.tick_s, [topics.text(t) for t in truth]),
+            *self._send("/cmd_vel", drive.tick_s + thinking, topics.commands(*command.T)),
+        ]
+
+    def _diagnostics(self, drive: Drive) -> list[Message]:
+        times, _ = self._sample(drive, self.rates.diagnostics)
+        volts = 26.4 - (self.driven_s + times) / 3600 * 0.55
+        scan = np.searchsorted(drive.scan_s, times + 1e-9, "right") - 1
+        returns = np.isfinite(drive.ranges_m[scan]).mean(axis=1)
+        data = []
+        for time, voltage, share in zip(times.tolist(), volts, returns, strict=True):
+            low = 1 if voltage < 24.0 else 0
+            status = [
+                ("battery", low, "low" if low else "ok", {"voltage": f"{voltage:.2f}"}),
+                ("lidar", 0, "ok", {"returns": f"{share:.2f}"}),
+            ]
+            data.append(topics.diagnostics(self._stamp(time), status))
+        return self._send("/diagnostics", times, data)
+
+    def _scene(self, drive: Drive) -> list[Message]:
+        """The parameters in force, what stands and lies, and who walks: on change, at its rate."""
+        scene, at, start_ns = drive.scene, np.zeros(1), self._stamp(0.0)
+        due = np.diff(np.floor(drive.tick_s * self.rates.traffic + 1e-6), prepend=-1) > 0
+        due = due[: len(scene.traffic)]
+        ticks = np.flatnonzero(due)
+        places = scene.traffic[ticks]
+        # The first clears what the mission before has left.
+        moved = np.ones(len(ticks), np.bool_)
+        moved[1:] = (places[1:] != places[:-1]).any(axis=(1, 2))
+        ticks, places = ticks[moved], places[moved]
+        times = drive.tick_s[ticks]
+        return [
+            *self._send(PERTURBATION, at, [topics.text(perturbation_text(scene.perturbation))]),
+            *self._send(MARKERS, at, [mission_markers(start_ns, scene, drive.goal_m)]),
+            *self._send(TRAFFIC, times, traffic_markers(self._stamps(times), places)),
+        ]
+
+    def _sample(self, drive: Drive, rate_hz: float) -> tuple[F64, NDArray[np.intp]]:
+        """When a sensor measures (n,), and the tick of each sample (n,), or -1 between ticks.
+
+        Between ticks its timer jitters.
+        """
+        end_s = float(drive.tick_s[-1])
+        times = np.arange(int(end_s * rate_hz + 1e-6) + 1) / rate_hz
+        tick = np.rint(times / end_s * (len(drive.tick_s) - 1)).astype(np.intp)
+        tick = np.where(np.abs(drive.tick_s[tick] - times) < TICK_TOLERANCE_S, tick, -1)
+        jitter = self.rng.uniform(-JITTER_S, JITTER_S, len(times))
+        return np.where(tick >= 0, drive.tick_s[tick], times + jitter), tick
+
+    def _send(self, topic: str, measured_s: F64, data: Sequence[bytes]) -> list[Message]:
+        at_ns = self._start_ns + np.rint(np.asarray(measured_s) * 1e9).astype(np.int64)
+        return send(topic, at_ns, data, self.rng)
+
+    def _stamps(self, time_s: F64) -> I64:
+        """Header stamps, at the microsecond."""
+        stamps: I64 = self._start_ns + np.rint(time_s * 1e6).astype(np.int64) * 1000
+        return stamps
+
+    def _stamp(self, time_s: float) -> int:
+        return self._start_ns + round(time_s * 1e6) * 1000
+
+
+def _at_ticks(between: F64, tick: NDArray[np.intp], seen: NDArray[Any]) -> F64:
+    """`between` (n, …), with the twin's own measurement `seen` (T + 1, …) at the ticks."""
+    on_tick = (tick >= 0).reshape(-1, *[1] * (between.ndim - 1))
+    return np.where(on_tick, seen[tick], between)
+
+
+def _rounded(values: F64, lsb: float) -> F64:
+    return np.rint(values / lsb) * lsb
+
+
+def _f32(values: F64) -> F64:
+    """The values as the robot's controllers compute them, in single precision."""
+    return values.astype(np.float32).astype(np.float64)
+
+
+def _pose(rows: F64) -> tuple[F64, F64, F64]:
+    x, y, yaw = rows.T
+    return _f32(x), _f32(y), _f32(wrap_angle(yaw))
+
+
+def _between(inner: F64, outer: F64) -> F64:
+    """The frame (n, 3) in which poses `inner` (n, 3) are poses `outer` (n, 3)."""
+    yaw = outer[:, 2] - inner[:, 2]
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    return np.stack(
+        [
+            outer[:, 0] - (cos * inner[:, 0] - sin * inner[:, 1]),
+            outer[:, 1] - (sin * inner[:, 0] + cos * inner[:, 1]),
+            yaw,
+        ],
+        axis=-1,
+    )

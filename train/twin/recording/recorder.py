@@ -1,0 +1,279 @@
+"""`restock record`: missions driven by the stand-in for the hardware, written as a robot's logs.
+
+The stand-in is the twin with other effective parameters than training assumes, so that there is a
+gap between logs and simulator to be found, and physics at half the timestep. Missions are driven,
+published and written one after another: memory does not grow with the recording's length.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from itertools import islice, pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.errors import ConfigError
+from restock.ingest.profile.profile import load_profile
+from restock.train.twin.floors.layout import DEFAULT, Warehouse
+from restock.train.twin.physics.model import TRACK_M, WHEEL_RADIUS_M
+from restock.train.twin.physics.perturbation import Perturbation, Schedule
+from restock.train.twin.physics.simulation import LIDAR_BEAMS
+from restock.train.twin.recording.bag_writer import Format, recording_sink
+from restock.train.twin.recording.crew import FleetCrew
+from restock.train.twin.recording.drive import Lidar
+from restock.train.twin.recording.drivers import HANDOVER, Chooser, Guest, check_epsilon, load_guest
+from restock.train.twin.recording.fleet import Fleet
+from restock.train.twin.recording.missions import NATURAL, schedule
+from restock.train.twin.recording.odometer import Odometer
+from restock.train.twin.recording.publish import Rates, Robot
+from restock.train.twin.recording.robot_topics import TOPICS
+
+HARDWARE = Perturbation(
+    name="stand-in hardware",
+    friction_scale=0.85,
+    patch_friction_scale=1.1,
+    payload_kg=20.0,
+    wheel_radius_scale=0.985,
+    latency_s=0.08,
+    gain=0.98,
+    lidar_noise_m=0.015,
+    lidar_dropout=0.01,
+    localisation_noise_m=0.005,
+    localisation_drift_m=0.025,
+    encoder_noise_radps=0.04,
+    gyro_noise_radps=0.008,
+    gyro_bias_radps=0.004,
+    accel_noise_mps2=0.08,
+    timestep_s=0.005,
+)
+NOISELESS = Perturbation(
+    name="nominal without noise",
+    lidar_noise_m=0.0,
+    lidar_dropout=0.0,
+    localisation_noise_m=0.0,
+    localisation_drift_m=0.0,
+    localisation_yaw_noise_rad=0.0,
+    encoder_noise_radps=0.0,
+    gyro_noise_radps=0.0,
+    accel_noise_mps2=0.0,
+)
+FIRST_NS = 1_772_438_400_000_000_000  # 2026-03-02, 08:00 UTC: a fixed morning, for the same bytes
+LIDAR_RANGE_M = (0.05, 25.0)
+MAP_CELL_M = 0.1
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be recorded. `minutes` or `missions` says when to stop."""
+
+    format: Format = "mcap"
+    minutes: float | None = None
+    missions: int | None = None
+    seed: int = 0
+    conditions: Mapping[str, float] = field(default_factory=lambda: dict(NATURAL))
+    policy: str = HANDOVER  # or planner, operator, random, run:DIRECTORY, onnx:FILE
+    epsilon: float | None = None  # share of random actions; None: what each driver has of its own
+    rates: Rates = field(default_factory=Rates)
+    hardware: Perturbation | Schedule = HARDWARE  # a schedule draws one for every mission
+    layouts: str = DEFAULT  # floors, as `restock.train.twin.floors.floors.open_floors` reads them
+    start_ns: int = FIRST_NS  # when the first mission starts
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError where the recording would have no end, or nothing in it."""
+        if (self.minutes is None) == (self.missions is None):
+            raise ConfigError("give minutes or missions, one of them", where="recording")
+        for name in ("minutes", "missions"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < float("inf"):
+                raise ConfigError(f"{name} must be above 0, got {value}", where="recording")
+        if self.seed < 0:
+            raise ConfigError(f"seed must be 0 or more, got {self.seed}", where="recording")
+        check_epsilon(self.epsilon, self.policy)
+
+    def describe(self) -> dict[str, Any]:
+        """As JSON has it."""
+        return {
+            "format": self.format,
+            "minutes": self.minutes,
+            "missions": self.missions,
+            "seed": self.seed,
+            "conditions": dict(self.conditions),
+            "policy": self.policy,
+            "epsilon": self.epsilon,
+            "rates_hz": {item.name: getattr(self.rates, item.name) for item in fields(Rates)},
+            "hardware": self.hardware.name,
+            "layouts": self.layouts,
+            "topics": [topic.name for topic in TOPICS],
+        }
+
+
+@dataclass
+class Summary:
+    """What was recorded."""
+
+    path: Path
+    plan: Plan
+    missions: Counter[str] = field(default_factory=Counter)  # by kind
+    succeeded: Counter[str] = field(default_factory=Counter)
+    steps: Counter[str] = field(default_factory=Counter)  # by true condition
+    policies: Counter[str] = field(default_factory=Counter)  # steps
+    handovers: int = 0
+    topics: Counter[str] = field(default_factory=Counter)  # messages
+    minutes: float = 0.0
+    work_s: float = 0.0
+
+    def describe(self) -> dict[str, Any]:
+        """As `restock record --json` prints it."""
+        files = [self.path] if self.path.is_file() else list(self.path.iterdir())
+        return {
+            "path": str(self.path),
+            "format": self.plan.format,
+            "seed": self.plan.seed,
+            "size_bytes": sum(file.stat().st_size for file in files),
+            "minutes": round(self.minutes, 3),
+            "missions": dict(self.missions),
+            "succeeded": {kind: self.succeeded[kind] for kind in self.missions},
+            "steps": dict(self.steps),
+            "policy_steps": dict(self.policies),
+            "handovers": self.handovers,
+            "messages": sum(self.topics.values()),
+            "topics": {topic.name: self.topics[topic.name] for topic in TOPICS},
+            "work_s": round(self.work_s, 2),
+        }
+
+
+def record(
+    path: Path,
+    plan: Plan,
+    *,
+    policy: Chooser | None = None,
+    on_mission: Callable[[int, float], None] | None = None,
+) -> Summary:
+    """Drive and write a recording; `on_mission(1, minutes)` is called after each mission.
+
+    A `policy` of your own drives in place of the one that the plan names: whatever has a `name`,
+    a `version` and `act(env, observation)`.
+
+    Raises:
+        RecordingError: there is something at `path`, or its folder cannot be written to.
+        ConfigError, RunError: the plan's policy cannot be loaded.
+    """
+    begun = time.perf_counter()
+    guest = load_policy(plan) if policy is None else _guest(plan, policy)
+    fleet = Fleet(
+        plan.hardware,
+        layouts=plan.layouts,
+        conditions=plan.conditions,
+        scan_hz=plan.rates.scan,
+    )
+    robot = _robot(plan, fleet)
+    summary = Summary(path, plan)
+    driver, version = (plan.policy, "1") if guest is None else (guest.name, guest.version)
+    missions = schedule(plan.seed, plan.conditions, driver, plan.hardware, version=version)
+    crew = FleetCrew(fleet.env.num_envs, seed=plan.seed, epsilon=plan.epsilon, guest=guest)
+    start_ns = plan.start_ns
+    with recording_sink(path, plan.format, TOPICS) as sink:
+        floor: Warehouse | None = None
+        for driven in fleet.drive(islice(missions, plan.missions), crew):
+            if driven.floor is not floor:  # the map comes once, and again on another floor
+                floor = driven.floor
+                cells = _occupied(floor, MAP_CELL_M)
+                static = robot.static(start_ns, cells, MAP_CELL_M, (-MAP_CELL_M, -MAP_CELL_M))
+                sink.write(static)
+                summary.topics.update(message.topic for message in static)
+            start_ns += 50_000_000  # after the latched messages, or the pause
+            messages = robot.publish(driven.drive, start_ns)
+            sink.write(messages)
+            summary.topics.update(message.topic for message in messages)
+            seconds = float(driven.drive.tick_s[-1])
+            kind = driven.mission.spec.condition
+            summary.missions[kind] += 1
+            summary.succeeded[kind] += driven.success
+            summary.steps.update(driven.drive.true_condition)
+            who = [f"{name} {version}" for name, version, _ in driven.drive.policy]
+            summary.policies.update(who)
+            summary.handovers += sum(a != b for a, b in pairwise(who))
+            summary.minutes += seconds / 60
+            start_ns += round((seconds + driven.mission.pause_s) * 1e9)
+            if on_mission is not None:
+                on_mission(1, seconds / 60)
+            if plan.minutes is not None and summary.minutes >= plan.minutes:
+                break
+    summary.work_s = time.perf_counter() - begun
+    return summary
+
+
+def load_policy(plan: Plan) -> Guest | None:
+    """The policy that the plan names; None where scripts drive.
+
+    Raises:
+        ConfigError, RunError: there is none, or it is one of another task.
+    """
+    task = load_profile("warehouse_amr").task
+    return load_guest(plan.policy, task, epsilon=plan.epsilon or 0.0, seed=plan.seed)
+
+
+def _guest(plan: Plan, policy: Chooser) -> Guest:
+    return Guest(policy, epsilon=plan.epsilon or 0.0, seed=plan.seed)
+
+
+def parse_rates(text: str) -> Rates:
+    """`odom=20,scan=5` to rates; topics left out keep their default.
+
+    Raises:
+        ConfigError: no such topic, or no rate it can have.
+    """
+    given: dict[str, float] = {}
+    for part in filter(None, (part.strip() for part in text.split(","))):
+        name, _, number = part.partition("=")
+        if name not in {item.name for item in fields(Rates)}:
+            raise ConfigError(
+                f"no rate named {name!r}",
+                where="--rates",
+                remedy=f"give {', '.join(item.name for item in fields(Rates))}",
+            )
+        try:
+            given[name] = float(number)
+        except ValueError:
+            given[name] = 0.0
+        allowed = given[name] in (5, 10) if name == "scan" else 0 < given[name] <= 200
+        if not allowed:
+            raise ConfigError(
+                f"{number!r} is no rate in Hz",
+                where=f"--rates {name}",
+                remedy="5 or 10" if name == "scan" else "above 0, at most 200",
+            )
+    return replace(Rates(), **given)
+
+
+def _robot(plan: Plan, fleet: Fleet) -> Robot:
+    bearings = fleet.env.simulation.bearings_rad
+    lidar = Lidar(
+        angle_min_rad=float(bearings[0]),
+        angle_increment_rad=2 * np.pi / LIDAR_BEAMS,
+        range_min_m=LIDAR_RANGE_M[0],
+        range_max_m=LIDAR_RANGE_M[1],
+        x_m=fleet.env.task.body.lidar_x_m,
+    )
+    rng = np.random.Generator(np.random.PCG64([plan.seed, 0x726F62]))
+    return Robot(rng, lidar, plan.rates, Odometer(WHEEL_RADIUS_M, TRACK_M))
+
+
+def _occupied(warehouse: Warehouse, cell_m: float) -> NDArray[np.bool_]:
+    """The known map as cells, (rows of y, columns of x): the racks, and one cell of wall around."""
+    x = (np.arange(round(warehouse.width_m / cell_m)) + 0.5) * cell_m
+    y = (np.arange(round(warehouse.depth_m / cell_m)) + 0.5) * cell_m
+    cells = np.zeros((len(y), len(x)), np.bool_)
+    for rack in warehouse.racks:
+        inside_y, inside_x = (
+            (rack.y_min <= y) & (y <= rack.y_max),
+            (rack.x_min <= x) & (x <= rack.x_max),
+        )
+        cells |= inside_y[:, None] & inside_x[None, :]
+    return np.pad(cells, 1, constant_values=True)

@@ -1,0 +1,333 @@
+"""The topics of the recorded robot: their names, types and frames, and columns to messages.
+
+They are the topics the `warehouse_amr` profile reads, named and framed as a Nav2 robot names
+them (REP 105: map > odom > base_link), so that Foxglove and RViz show a recording as it is.
+Every packer takes columns of (n,) values and stamps of (n,) int64 nanoseconds.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.train.twin.recording.bag_writer import Topic
+from restock.train.twin.recording.messages import MessageLayout, build, serialise, stamp
+from restock.train.twin.recording.scene import SCENE_TOPICS
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+TOPICS: tuple[Topic, ...] = (
+    Topic("/tf_static", "tf2_msgs/msg/TFMessage", latched=True),
+    Topic("/map", "nav_msgs/msg/OccupancyGrid", latched=True),
+    Topic("/behaviour_policy", "std_msgs/msg/String", latched=True),
+    Topic("/goal_pose", "geometry_msgs/msg/PoseStamped"),
+    Topic("/plan", "nav_msgs/msg/Path"),
+    Topic("/odom", "nav_msgs/msg/Odometry"),
+    Topic("/imu", "sensor_msgs/msg/Imu", reliable=False),
+    Topic("/joint_states", "sensor_msgs/msg/JointState"),
+    Topic("/scan", "sensor_msgs/msg/LaserScan", reliable=False),
+    Topic("/bumper", "std_msgs/msg/Bool"),
+    Topic("/amcl_pose", "geometry_msgs/msg/PoseWithCovarianceStamped", latched=True),
+    Topic("/tf", "tf2_msgs/msg/TFMessage"),
+    Topic("/ground_truth/condition", "std_msgs/msg/String"),
+    Topic("/cmd_vel", "geometry_msgs/msg/Twist"),
+    Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"),
+    *SCENE_TOPICS,
+)
+LASER_FRAME, IMU_FRAME = "laser_link", "imu_link"
+WHEEL_JOINTS = ("left_wheel_joint", "right_wheel_joint")
+
+
+def odometry(
+    stamp_ns: I64, x_m: F64, y_m: F64, yaw_rad: F64, speed_mps: F64, yaw_rate_radps: F64
+) -> list[bytes]:
+    """Dead reckoning in `odom`, twist in `base_link`."""
+    return _odometry_layout().pack(
+        {
+            "header.stamp": stamp_ns,
+            "pose.pose.position.x": x_m,
+            "pose.pose.position.y": y_m,
+            **_orientation("pose.pose.orientation", yaw_rad),
+            "twist.twist.linear.x": speed_mps,
+            "twist.twist.angular.z": yaw_rate_radps,
+        },
+        len(stamp_ns),
+    )
+
+
+@functools.cache
+def _odometry_layout() -> MessageLayout:
+    return MessageLayout.of(
+        build(
+            "nav_msgs/msg/Odometry",
+            header={"frame_id": "odom"},
+            child_frame_id="base_link",
+            pose={"covariance": _diagonal(6, {0: 1e-3, 1: 1e-3, 5: 1e-2})},
+            twist={"covariance": _diagonal(6, {0: 1e-4, 1: 1e-6, 5: 1e-3})},
+        )
+    )
+
+
+def imu(stamp_ns: I64, yaw_rate_radps: F64, accel_x_mps2: F64, accel_y_mps2: F64) -> list[bytes]:
+    """Rates and accelerations; no orientation (covariance[0] = -1, as sensor_msgs/Imu has it)."""
+    return _imu_layout().pack(
+        {
+            "header.stamp": stamp_ns,
+            "angular_velocity.z": yaw_rate_radps,
+            "linear_acceleration.x": accel_x_mps2,
+            "linear_acceleration.y": accel_y_mps2,
+        },
+        len(stamp_ns),
+    )
+
+
+@functools.cache
+def _imu_layout() -> MessageLayout:
+    return MessageLayout.of(
+        build(
+            "sensor_msgs/msg/Imu",
+            header={"frame_id": IMU_FRAME},
+            orientation_covariance=[-1.0] + [0.0] * 8,
+            angular_velocity_covariance=_diagonal(3, {0: 4e-4, 1: 4e-4, 2: 4e-4}),
+            linear_acceleration={"z": 9.80665},
+            linear_acceleration_covariance=_diagonal(3, {0: 1e-2, 1: 1e-2, 2: 1e-2}),
+        )
+    )
+
+
+def joint_states(stamp_ns: I64, angle_rad: F64, rate_radps: F64) -> list[bytes]:
+    """Wheel angles and rates, each (n, 2): left, right."""
+    return _joint_layout().pack(
+        {"header.stamp": stamp_ns, "position": angle_rad, "velocity": rate_radps}, len(stamp_ns)
+    )
+
+
+@functools.cache
+def _joint_layout() -> MessageLayout:
+    return MessageLayout.of(
+        build(
+            "sensor_msgs/msg/JointState",
+            name=WHEEL_JOINTS,
+            position=np.zeros(2),
+            velocity=np.zeros(2),
+        )
+    )
+
+
+def scans(
+    stamp_ns: I64,
+    ranges_m: F64,
+    *,
+    angle_min_rad: float,
+    angle_increment_rad: float,
+    range_min_m: float,
+    range_max_m: float,
+    scan_time_s: float,
+) -> list[bytes]:
+    """Lidar scans: ranges (n, B), inf where nothing came back."""
+    beams = ranges_m.shape[1]
+    layout = MessageLayout.of(
+        build(
+            "sensor_msgs/msg/LaserScan",
+            header={"frame_id": LASER_FRAME},
+            angle_min=angle_min_rad,
+            angle_max=angle_min_rad + angle_increment_rad * (beams - 1),
+            angle_increment=angle_increment_rad,
+            scan_time=scan_time_s,
+            range_min=range_min_m,
+            range_max=range_max_m,
+            ranges=np.zeros(beams, np.float32),
+        )
+    )
+    return layout.pack({"header.stamp": stamp_ns, "ranges": ranges_m}, len(stamp_ns))
+
+
+def commands(speed_mps: F64, yaw_rate_radps: F64) -> list[bytes]:
+    """Velocity commands."""
+    layout = MessageLayout.of(build("geometry_msgs/msg/Twist"))
+    return layout.pack({"linear.x": speed_mps, "angular.z": yaw_rate_radps}, len(speed_mps))
+
+
+def localised_poses(stamp_ns: I64, x_m: F64, y_m: F64, yaw_rad: F64) -> list[bytes]:
+    """Poses in `map`, as a localiser publishes them."""
+    return _pose_layout().pack(
+        {
+            "header.stamp": stamp_ns,
+            "pose.pose.position.x": x_m,
+            "pose.pose.position.y": y_m,
+            **_orientation("pose.pose.orientation", yaw_rad),
+        },
+        len(stamp_ns),
+    )
+
+
+@functools.cache
+def _pose_layout() -> MessageLayout:
+    return MessageLayout.of(
+        build(
+            "geometry_msgs/msg/PoseWithCovarianceStamped",
+            header={"frame_id": "map"},
+            pose={"covariance": _diagonal(6, {0: 4e-4, 1: 4e-4, 5: 1e-4})},
+        )
+    )
+
+
+def transforms(
+    stamp_ns: I64, map_to_odom: tuple[F64, F64, F64], odom_to_base: tuple[F64, F64, F64]
+) -> list[bytes]:
+    """map > odom > base_link, each (x, y, yaw) of (n,) values."""
+    columns: dict[str, NDArray[Any]] = {}
+    for index, (x_m, y_m, yaw_rad) in enumerate((map_to_odom, odom_to_base)):
+        at = f"transforms[{index}]"
+        columns |= {
+            f"{at}.header.stamp": stamp_ns,
+            f"{at}.transform.translation.x": x_m,
+            f"{at}.transform.translation.y": y_m,
+            **_orientation(f"{at}.transform.rotation", yaw_rad),
+        }
+    return _transform_layout().pack(columns, len(stamp_ns))
+
+
+@functools.cache
+def _transform_layout() -> MessageLayout:
+    return MessageLayout.of(
+        build(
+            "tf2_msgs/msg/TFMessage",
+            transforms=[
+                {"header": {"frame_id": "map"}, "child_frame_id": "odom"},
+                {"header": {"frame_id": "odom"}, "child_frame_id": "base_link"},
+            ],
+        )
+    )
+
+
+def static_transforms(stamp_ns: int, lidar_x_m: float, lidar_z_m: float = 0.2) -> bytes:
+    """Where the lidar and the IMU sit on the robot."""
+    return serialise(
+        build(
+            "tf2_msgs/msg/TFMessage",
+            transforms=[
+                {
+                    "header": {"frame_id": "base_link", "stamp": stamp(stamp_ns)},
+                    "child_frame_id": frame,
+                    "transform": {"translation": {"x": x, "z": z}},
+                }
+                for frame, x, z in ((LASER_FRAME, lidar_x_m, lidar_z_m), (IMU_FRAME, 0.0, 0.1))
+            ],
+        )
+    )
+
+
+def bumpers(pressed: NDArray[np.bool_]) -> list[bytes]:
+    """Bumper states."""
+    layout = MessageLayout.of(build("std_msgs/msg/Bool"))
+    return layout.pack({"data": pressed}, len(pressed))
+
+
+@functools.lru_cache(maxsize=256)
+def text(content: str) -> bytes:
+    """A string."""
+    return serialise(build("std_msgs/msg/String", data=content))
+
+
+def behaviour_policy(name: str, version: str, probability: float) -> bytes:
+    """Who drives from here on, and with what probability it chose what it commands."""
+    content = {"policy": name, "version": version, "probability": round(probability, 4)}
+    return text(json.dumps(content))
+
+
+def goal(stamp_ns: int, x_m: float, y_m: float) -> bytes:
+    """A navigation goal in `map`."""
+    return serialise(
+        build(
+            "geometry_msgs/msg/PoseStamped",
+            header={"frame_id": "map", "stamp": stamp(stamp_ns)},
+            pose={"position": {"x": float(x_m), "y": float(y_m)}},
+        )
+    )
+
+
+def plan(stamp_ns: int, points_m: F64) -> bytes:
+    """A plan in `map`: (P, 2) points, each facing the next."""
+    step = np.diff(points_m, axis=0, append=points_m[-1:])
+    if len(step) > 1:
+        step[-1] = step[-2]
+    yaw = np.arctan2(step[:, 1], step[:, 0])
+    columns = {
+        "header.stamp": np.array([stamp_ns]),
+        "poses[].header.stamp": np.full((1, len(points_m)), stamp_ns),
+        "poses[].pose.position.x": points_m[None, :, 0],
+        "poses[].pose.position.y": points_m[None, :, 1],
+        **_orientation("poses[].pose.orientation", yaw[None]),
+    }
+    return _path_layout(len(points_m)).pack(columns, 1)[0]
+
+
+@functools.lru_cache(maxsize=512)
+def _path_layout(points: int) -> MessageLayout:
+    header = {"frame_id": "map"}
+    return MessageLayout.of(
+        build("nav_msgs/msg/Path", header=header, poses=[{"header": header}] * points)
+    )
+
+
+def occupancy_map(
+    stamp_ns: int,
+    occupied: NDArray[np.bool_],
+    resolution_m: float,
+    origin_m: tuple[float, float] = (0.0, 0.0),
+) -> bytes:
+    """The known map: cells (rows north, columns east from `origin_m`), occupied or free."""
+    return serialise(
+        build(
+            "nav_msgs/msg/OccupancyGrid",
+            header={"frame_id": "map", "stamp": stamp(stamp_ns)},
+            info={
+                "map_load_time": stamp(stamp_ns),
+                "resolution": resolution_m,
+                "width": occupied.shape[1],
+                "height": occupied.shape[0],
+                "origin": {"position": {"x": origin_m[0], "y": origin_m[1]}},
+            },
+            data=np.where(occupied, 100, 0).astype(np.int8).ravel(),
+        )
+    )
+
+
+def diagnostics(
+    stamp_ns: int, statuses: Sequence[tuple[str, int, str, Mapping[str, str]]]
+) -> bytes:
+    """Statuses as (name, level, message, values): level 0 OK, 1 warning, 2 error."""
+    return serialise(
+        build(
+            "diagnostic_msgs/msg/DiagnosticArray",
+            header={"stamp": stamp(stamp_ns)},
+            status=[
+                {
+                    "name": name,
+                    "level": level,
+                    "message": message,
+                    "hardware_id": "simulated stand-in",
+                    "values": [{"key": key, "value": value} for key, value in values.items()],
+                }
+                for name, level, message, values in statuses
+            ],
+        )
+    )
+
+
+def _orientation(path: str, yaw_rad: F64) -> dict[str, F64]:
+    return {f"{path}.z": np.sin(yaw_rad / 2), f"{path}.w": np.cos(yaw_rad / 2)}
+
+
+def _diagonal(size: int, entries: Mapping[int, float]) -> F64:
+    values = np.zeros((size, size))
+    for index, value in entries.items():
+        values[index, index] = value
+    return values.ravel()
