@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from support.driven_robot import Drive, write_bag
+from support.paths import ROOT
 
 from restock.cli import main
 from restock.errors import ConfigError
@@ -35,7 +36,7 @@ def cluster() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-        patch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))
+        patch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT / "tests"), *sys.path]))
         ray.init(address="local", num_cpus=2, include_dashboard=False, logging_level="error")
         yield
         ray.shutdown()

@@ -25,7 +25,7 @@ MAY_IMPORT = {
     "ingest/propose": "containers decoding profile steps",
     "ingest/steps": "containers decoding profile task",
     "ingest/store": "containers decoding profile steps task",
-    "replay": "panel store",
+    "replay": "panel store ingest/store",
     "replay/store": "ingest/store ingest/task",
     "replay/mixture": "",
     "replay/sampling": "mixture",
@@ -49,10 +49,10 @@ MAY_IMPORT = {
     ),
     "train/comparison": "train dqn run",
     "train/libraries": (
-        "train dqn evaluation feed run twin/env twin/floors twin/physics replay/mixture replay/panel"
+        "train dqn evaluation feed run twin/floors twin/physics replay/mixture replay/panel"
         " replay/ring replay/store ingest/profile ingest/task"
     ),
-    "train/study": "comparison dqn libraries run ingest",
+    "train/study": "comparison dqn libraries ingest",
     "train/twin": "",
     "train/twin/floors": "",
     "train/twin/physics": "twin/floors ingest/task",
@@ -87,15 +87,11 @@ def imports(path: Path) -> Iterator[str]:
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative imports hide the layer they cross"
-            module = node.module or ""
-            inside = (f"{module}.{alias.name}" for alias in node.names)
-            names = [
-                n if n.replace(".", "/").removeprefix("restock/") in MODULES else "" for n in inside
-            ]
-            names = [
-                name or (module if module != "restock" else f"restock.{alias.name}")
-                for name, alias in zip(names, node.names, strict=True)
-            ]
+            for alias in node.names:
+                inside = f"{node.module}.{alias.name}"
+                is_module = inside.replace(".", "/").removeprefix("restock/") in MODULES
+                shared = node.module == "restock"
+                names.append(inside if is_module or shared else node.module or "")
         for name in names:
             if name.startswith("restock."):
                 yield name.removeprefix("restock.").replace(".", "/")
