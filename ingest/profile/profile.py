@@ -32,7 +32,6 @@ from restock.ingest.profile.inputs import (
     Inputs,
     check_input,
 )
-from restock.ingest.steps.transforms import Frames
 from restock.ingest.task.condition_files import with_files
 from restock.ingest.task.conditions import Condition, label, labels_version, shipped
 from restock.ingest.task.schema import steps_schema
@@ -56,6 +55,22 @@ class Episodes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_pose_jump_m: float = 1.0  # between two steps: the robot was carried, or relocalised
     goal_moved_m: float = 0.01  # a goal further than this from the last one is a new one
     plan_goal_tolerance_m: float = 0.5  # a plan that ends further from the goal is for another
+
+
+class Frames(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The `[frames]` of a profile: poses are of `base` in `fixed`."""
+
+    fixed: str = "map"
+    base: str = "base_link"
+    max_age_s: float = 0.5  # of a transform of `topic`, at the step
+    topic: str = "/tf"
+    static_topic: str = "/tf_static"
+
+    def __post_init__(self) -> None:
+        if self.fixed.strip("/") == self.base.strip("/"):
+            raise ValueError(f"fixed and base are the same frame: {self.base!r}")
+        if not self.max_age_s > 0:
+            raise ValueError(f"max_age_s must be above 0, got {self.max_age_s}")
 
 
 class Zone(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -264,6 +279,7 @@ __all__ = [
     "INPUT_FIELDS",
     "Clock",
     "Episodes",
+    "Frames",
     "Input",
     "Inputs",
     "Profile",

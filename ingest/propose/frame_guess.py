@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from restock.ingest.containers.recording import Recording
-from restock.ingest.steps.transforms import FIELDS, Edges, Frames, upward
+from restock.ingest.profile.profile import Frames
+from restock.ingest.steps.transforms import FIELDS, Edges, upward
 
 FIXED = ("map", "odom", "world")  # best first
 BASES = ("base_link", "base_footprint", "base")

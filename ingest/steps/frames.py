@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.ingest.profile.profile import Frames
 from restock.ingest.steps.align import Segment
-from restock.ingest.steps.transforms import AXES, PARENT, TURN, Edges, Frames, plain
+from restock.ingest.steps.transforms import AXES, PARENT, TURN, Edges, plain
 
 F64 = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from restock.ingest.decoding.columns import Ragged, TopicColumns
+from restock.ingest.profile.profile import Frames
 from restock.ingest.steps.clocks import STAMP
 
 Ints = NDArray[np.int64]
@@ -25,22 +25,6 @@ FIELDS = (
 )
 PARENT = "parent"
 FRAME_ID = "header.frame_id"
-
-
-class Frames(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The `[frames]` of a profile: poses are of `base` in `fixed`."""
-
-    fixed: str = "map"
-    base: str = "base_link"
-    max_age_s: float = 0.5  # of a transform of `topic`, at the step
-    topic: str = "/tf"
-    static_topic: str = "/tf_static"
-
-    def __post_init__(self) -> None:
-        if self.fixed.strip("/") == self.base.strip("/"):
-            raise ValueError(f"fixed and base are the same frame: {self.base!r}")
-        if not self.max_age_s > 0:
-            raise ValueError(f"max_age_s must be above 0, got {self.max_age_s}")
 
 
 @dataclass(frozen=True)
