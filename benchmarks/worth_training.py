@@ -36,8 +36,9 @@ from numpy.typing import NDArray
 from restock.cli import main as restock
 from restock.stats import percentiles, wilson
 from restock.train.evaluation.eval_run import load_agent
-from restock.train.evaluation.evaluate import Policy, run_episodes
+from restock.train.evaluation.evaluate import run_episodes
 from restock.train.run.run import Run
+from restock.train.twin.env.interface import Policy
 from restock.train.twin.env.operator_policy import Operator
 from restock.train.twin.env.policies import PlannerFollower, RandomPolicy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv

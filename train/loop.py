@@ -28,7 +28,7 @@ from restock.train.feed.batches import Batch
 from restock.train.feed.probe import Probe
 from restock.train.guard import Fall, falls, roll_back
 from restock.train.session import Interval, Session
-from restock.train.twin.env.explore import epsilon_greedy
+from restock.train.twin.env.interface import epsilon_greedy
 
 Notify = Callable[[str, dict[str, Any]], None]  # an event's name ("progress", "evaluation"), values
 

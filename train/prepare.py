@@ -17,14 +17,13 @@ from restock.train.dqn.config import TrainConfig, apply_overrides, load_config, 
 from restock.train.dqn.learner import open_device
 from restock.train.dqn.manual_backprop import update_path
 from restock.train.dqn.target import describe
-from restock.train.evaluation.evaluate import Twin
 from restock.train.feed.batches import Logs
 from restock.train.feed.logged_sampler import diet_of
 from restock.train.run.kept_checkpoints import check_earlier, go_back
 from restock.train.run.run import Run, check_free, now_ns, panel_document, software_versions
 from restock.train.session import Session, open_session
-from restock.train.twin.env.explore import AFTER_LOGS
 from restock.train.twin.env.floor_report import refuse_unfit, sealed
+from restock.train.twin.env.interface import AFTER_LOGS, Twin
 from restock.train.twin.floors.floors import held_out, open_floors
 from restock.train.twin.physics.episode import KINDS
 from restock.train.twin.physics.perturbation import PERTURBATIONS, find_perturbation

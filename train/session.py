@@ -22,7 +22,7 @@ from restock.replay.ring.ring import FreshRing
 from restock.train.dqn import checkpoint
 from restock.train.dqn.config import TrainConfig
 from restock.train.dqn.learner import Learner
-from restock.train.evaluation.evaluate import Score, Twin
+from restock.train.evaluation.evaluate import Score
 from restock.train.evaluation.evaluation_buffer import HeldOut
 from restock.train.feed.batch_record import FeedRecord
 from restock.train.feed.batches import Batches, Logs
@@ -34,6 +34,7 @@ from restock.train.jump_start import POLICIES, Guide
 from restock.train.run.events import Events
 from restock.train.run.kept_checkpoints import earlier, keep
 from restock.train.run.run import Run
+from restock.train.twin.env.interface import Twin
 
 
 @dataclass

@@ -18,7 +18,7 @@ from restock.errors import ConfigError
 from restock.toml import toml_value
 from restock.train.dqn.target import Polyak, TargetRule
 from restock.train.jump_start import GuideConfig
-from restock.train.twin.env.explore import LinearEpsilon
+from restock.train.twin.env.interface import LinearEpsilon
 from restock.train.twin.physics.perturbation import find_perturbation
 
 # Shares of true conditions among the episodes of the twin.

@@ -22,10 +22,11 @@ from restock.ingest.task.task import Task
 from restock.train.dqn import checkpoint
 from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.dqn.network import make_network
-from restock.train.evaluation.evaluate import EpisodeResult, GreedyPolicy, Policy, run_episodes
+from restock.train.evaluation.evaluate import EpisodeResult, GreedyPolicy, run_episodes
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES
 from restock.train.twin.env.floor_report import refuse_unfit, unfit_kinds
+from restock.train.twin.env.interface import Policy
 from restock.train.twin.floors.floors import held_out, open_floors
 from restock.train.twin.physics.episode import KINDS, EpisodeSpec
 from restock.train.twin.physics.perturbation import (

@@ -6,9 +6,9 @@ and checkpoint meets the same episodes and results can be compared episode by ep
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,34 +17,10 @@ from restock.stats import wilson
 from restock.train.dqn.learner import greedy_actions
 from restock.train.dqn.network import Network
 from restock.train.feed.fresh_perturbations import values_entries
+from restock.train.twin.env.interface import Policy, Twin
 from restock.train.twin.physics.episode import EpisodeSpec
 
 STUCK_WINDOW_S, STUCK_RADIUS_M = 10.0, 0.5
-
-
-class Twin(Protocol):
-    """What training and evaluation need of the vectorised environment (`WarehouseVectorEnv`)."""
-
-    num_envs: int
-
-    @property
-    def signals(self) -> dict[str, NDArray[Any]]: ...
-    def set_episodes(self, specs: Iterable[EpisodeSpec], /) -> None: ...
-    def reset(self, *, seed: int | None = None) -> tuple[NDArray[Any], dict[str, Any]]: ...
-    def step(self, actions: NDArray[Any], /) -> tuple[Any, Any, Any, Any, dict[str, Any]]: ...
-    def get_state(self) -> dict[str, Any]: ...
-    def set_state(self, state: dict[str, Any], /) -> None: ...
-
-
-class Policy(Protocol):
-    """What can drive the twin."""
-
-    name: str
-    version: str
-
-    def act(
-        self, env: Any, observation: NDArray[np.float32]
-    ) -> tuple[NDArray[np.int64], NDArray[Any]]: ...
 
 
 class GreedyPolicy:

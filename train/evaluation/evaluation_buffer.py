@@ -20,10 +20,10 @@ from restock.ingest.task.task import Task
 from restock.replay.ring.ring import FreshRing
 from restock.train.dqn.learner import Learner
 from restock.train.dqn.target import value_lag
-from restock.train.evaluation.evaluate import Twin
 from restock.train.feed.collector import Collector
 from restock.train.feed.log_fidelity import LogFidelity
 from restock.train.feed.probe import Probe
+from restock.train.twin.env.interface import Twin
 from restock.train.twin.physics.episode import EpisodeSpec
 
 Step = tuple[Any, Any, Any, Any, dict[str, Any]]

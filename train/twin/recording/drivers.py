@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from restock.errors import ConfigError
 from restock.ingest.task.task import Task
-from restock.train.twin.env.explore import epsilon_greedy
+from restock.train.twin.env.interface import epsilon_greedy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
 HANDOVER = "handover"

@@ -1,0 +1,74 @@
+"""What an environment and a policy know of each other, and how a policy explores.
+
+`Twin` is what training and evaluation ask of an environment, `Policy` is whatever drives in one:
+a trained network, an ONNX file, a script, one of your own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from restock.toml import Checked
+
+if TYPE_CHECKING:  # an episode needs MuJoCo; a run's config does not
+    from restock.train.twin.physics.episode import EpisodeSpec
+
+AFTER_LOGS = 0.2  # the offline phase has learnt to drive: more exploration would only undo that
+
+Probability = Annotated[float, Meta(ge=0, le=1)]
+
+
+class Twin(Protocol):
+    """What training and evaluation need of a vectorised environment (`WarehouseVectorEnv`)."""
+
+    num_envs: int
+
+    @property
+    def signals(self) -> dict[str, NDArray[Any]]: ...
+    def set_episodes(self, specs: Iterable[EpisodeSpec], /) -> None: ...
+    def reset(self, *, seed: int | None = None) -> tuple[NDArray[Any], dict[str, Any]]: ...
+    def step(self, actions: NDArray[Any], /) -> tuple[Any, Any, Any, Any, dict[str, Any]]: ...
+    def get_state(self) -> dict[str, Any]: ...
+    def set_state(self, state: dict[str, Any], /) -> None: ...
+
+
+class Policy(Protocol):
+    """What drives in a twin. Its name and version tag what it did in the logs."""
+
+    name: str
+    version: str
+
+    def act(
+        self, env: Any, observation: NDArray[np.float32]
+    ) -> tuple[NDArray[np.int64], NDArray[Any]]:
+        """Actions (N,) for observations (N, D), and the probabilities (N,) they had."""
+        ...
+
+
+class LinearEpsilon(Checked, frozen=True):
+    """The probability of a uniformly random action: from `start` to `end` over `steps`."""
+
+    start: Probability | None = None  # None: 1 without logs, AFTER_LOGS with them
+    end: Probability = 0.05
+    steps: Annotated[int, Meta(ge=1)] = 20_000  # environment steps, counted from the first
+
+    def at(self, env_steps: int) -> float:
+        """Epsilon after `env_steps` environment steps."""
+        start = 1.0 if self.start is None else self.start
+        return start + min(env_steps / self.steps, 1.0) * (self.end - start)
+
+
+def epsilon_greedy(
+    greedy: NDArray[Any], actions: int, epsilon: float, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Greedy actions (N,) to the actions to take (N,) and the probability of each (N,)."""
+    explores = rng.random(len(greedy)) < epsilon
+    uniform = rng.integers(actions, size=len(greedy))
+    action = np.where(explores, uniform, greedy).astype(np.int64)
+    probability = epsilon / actions + (1 - epsilon) * (action == greedy)
+    return action, probability.astype(np.float32)
