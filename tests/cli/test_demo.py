@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from restock import cli
-from restock.demo import MARKER, Stage, prepare, run_demo, stages
+from restock.cli.demo import MARKER, Stage, prepare, run_demo, stages
 from restock.errors import RestockError
 
 SILENT = lambda message: None  # noqa: E731

@@ -1,8 +1,8 @@
 """The front door: `restock VERB …`. One module a verb; each is imported only when it is called.
 
-A verb's module holds one dataclass, named like the verb: its docstring is the help, its fields
-are the flags, and `run()` does the work and returns an exit code. stdout is data, stderr is
-progress and messages.
+A verb's module holds one dataclass, `IngestCommand` for `restock ingest`: its docstring is the
+help, its fields are the flags, and `run()` does the work and returns an exit code. stdout is data,
+stderr is progress and messages.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 from restock.errors import ExitCode, RestockError
 
-# verb -> what it does, in the order of the work; the module is restock.cli.<verb>
+# verb -> what it does, in the order of the work
 VERBS = {
     "record": "drive the simulated stand-in and write what a real robot would log",
     "info": "what is in these recordings?",
@@ -35,6 +35,13 @@ VERBS = {
     "report": "one HTML page with all of it",
     "demo": "all of the above, on sample_logs/",
 }
+# folder -> the verbs whose modules it holds
+FOLDERS = {
+    "data": ("info", "profile", "ingest", "label", "sql", "audit", "mix", "export"),
+    "learning": ("train", "eval", "study", "compare", "trace", "diagnose", "report"),
+    "twin": ("record", "twin"),
+}
+_FOLDER_OF = {verb: f"{folder}." for folder, verbs in FOLDERS.items() for verb in verbs}
 
 
 def usage() -> str:
@@ -88,7 +95,8 @@ def _dispatch(args: list[str]) -> int:
 
     import tyro
 
-    command = getattr(importlib.import_module(f"restock.cli.{verb}"), verb.capitalize())
+    module = importlib.import_module(f"restock.cli.{_FOLDER_OF.get(verb, '')}{verb}")
+    command = getattr(module, f"{verb.capitalize()}Command")
     try:
         parsed = tyro.cli(
             command,

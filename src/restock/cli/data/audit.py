@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Audit:
+class AuditCommand:
     """Is what the store holds good enough to learn from? Exits 1 when an audit fails.
 
     Each audit is a query that returns offending rows, with a severity: an error fails, a warning

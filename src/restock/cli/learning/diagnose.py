@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Diagnose:
+class DiagnoseCommand:
     """Tell a failure of the buffer from a failure of the target.
 
     Compares replay with the periodic evaluations' own steps, which no replay has, condition by

@@ -17,7 +17,7 @@ _TABLES = ("clocks", "signals", "stand_ins")  # of a manifest: for `--json` and 
 
 
 @dataclass
-class Trace:
+class TraceCommand:
     """Where did a row that the critic was fed come from? Down to the recording's messages.
 
     Of a RUN, ROW is an audited row, STEP/ROW: the gradient step and the row of its batch. Without

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Train:
+class TrainCommand:
     """Train a DQN: offline on a panel of logs, then online in the twin on logs and fresh rows.
 
     Writes a run directory: resolved config, metrics and replay audit as Parquet, checkpoints (the

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Compare:
+class CompareCommand:
     """Compare two methods, unless their critics were fed differently: then it is refused, exit 1.
 
     Name the treatment: the one thing that may differ. Under `algorithm` (network, loss, optimizer)

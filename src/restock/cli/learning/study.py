@@ -11,7 +11,7 @@ import tyro
 
 
 @dataclass
-class Study:
+class StudyCommand:
     """Train and evaluate every arm of a study with every seed, then compare them through the gate.
 
     The study is a TOML file: a store, arms (a mixture or a panel, and settings), seeds, what is

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 if TYPE_CHECKING:
-    from restock.train.twin.calibration.gap import Gap as Measured
+    from restock.train.twin.calibration.gap import Gap
     from restock.train.twin.physics.perturbation import Perturbation
 
 _IN_SAMPLE = (
@@ -19,7 +19,7 @@ _IN_SAMPLE = (
 
 
 @dataclass
-class Gap:
+class GapCommand:
     """Drive a store's logged commands again in the twin, and say how far it is from the log.
 
     Per condition: how far pose and signals are off after 1, 3 and 6 s, open loop, and how far
@@ -145,7 +145,7 @@ def _seconds(text: str) -> tuple[float, ...]:
         ) from None
 
 
-def _show(gap: Measured) -> None:
+def _show(gap: Gap) -> None:
     from restock.cli.output import print_table, stdout
     from restock.report.twin_gap import headline, source_name
 

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 if TYPE_CHECKING:
-    from restock.train.twin.calibration.fit import Fit as Fitted
+    from restock.train.twin.calibration.fit import Fit
 
 
 @dataclass
-class Fit:
+class FitCommand:
     """Fit the twin's robot to a store's logs, and write a perturbation that training uses.
 
     Drives the logged commands again in the twin, open loop on an empty floor, and looks for the
@@ -87,7 +87,7 @@ class Fit:
             output.say(f"wrote {out}")
         return ExitCode.OK
 
-    def _fit(self, store: Any, recordings: tuple[str, ...]) -> Fitted:
+    def _fit(self, store: Any, recordings: tuple[str, ...]) -> Fit:
         from restock.cli import output
         from restock.train.twin.calibration.fit import fit
         from restock.train.twin.calibration.fit_parameters import DEFAULT, parse_parameters
@@ -112,7 +112,7 @@ class Fit:
         )
 
 
-def _show(fit: Fitted) -> None:
+def _show(fit: Fit) -> None:
     from restock.cli import output
 
     rows = [

@@ -10,7 +10,7 @@ import tyro
 
 
 @dataclass
-class Eval:
+class EvalCommand:
     """Drive a run's kept policy through fixed episodes, beside the scripted planner and chance.
 
     Every policy meets the same seeded episodes of every condition that its floors have room for,
@@ -112,8 +112,8 @@ class Eval:
         return int(ExitCode.FAILED if failed else ExitCode.OK)
 
     def _show(self, document: dict[str, Any]) -> None:
+        from restock.cli.learning.eval_tables import show_regression
         from restock.cli.output import print_table, say
-        from restock.cli.regressed import show_regression
 
         if (rows := document.get("results")) is not None:
             shown = [
@@ -136,7 +136,7 @@ class Eval:
             say(f"baseline saved as {document['saved']}")
 
     def _judge(self, logs: str) -> int:
-        from restock.cli.judged import show_judged
+        from restock.cli.learning.eval_tables import show_judged
         from restock.cli.output import progress
         from restock.errors import ConfigError
         from restock.train.evaluation.ope import Judging

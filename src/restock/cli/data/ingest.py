@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Ingest:
+class IngestCommand:
     """Turn recordings into labelled transitions in a store, one atomic commit a recording.
 
     PATH is an MCAP file, a rosbag2 folder or one of its files, a ROS 1 bag, a folder of many

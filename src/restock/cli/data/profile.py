@@ -14,7 +14,7 @@ from restock.errors import ConfigError, ExitCode, RecordingError
 
 
 @dataclass
-class Profile:
+class ProfileCommand:
     """Propose a profile for an unknown robot, or check one against a recording.
 
     `restock profile new RECORDING` proposes one from what is in the file: topics by type and name,
@@ -74,7 +74,7 @@ class Profile:
 
     def _check(self) -> int:
         from restock.cli import output
-        from restock.cli.ingest import as_json, show
+        from restock.cli.data.ingest import as_json, show
         from restock.ingest.containers.open_recording import open_recording
         from restock.ingest.pipeline import ingest
         from restock.ingest.profile.profile import load_profile

@@ -13,7 +13,7 @@ from restock.cli.output import print_json
 
 
 @dataclass
-class Report:
+class ReportCommand:
     """Write one self-contained HTML page about a run; it opens without a network.
 
     What the critic was fed (intended, drawn and available share per stratum, ages, behaviour

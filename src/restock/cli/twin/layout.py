@@ -12,7 +12,7 @@ from restock.errors import RestockError
 
 
 @dataclass
-class Layout:
+class LayoutCommand:
     """Look at a floor: its size, aisles and goals, and which episodes fit on it.
 
     A floor is `default`, `generated:SEED`, `narrow:SEED`, a TOML file, or the map.yaml of a ROS

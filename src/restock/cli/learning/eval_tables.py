@@ -1,4 +1,4 @@
-"""What `restock eval --on-logs` prints: a row a measure and condition, its estimators beside."""
+"""What `restock eval` prints for `--on-logs` and for `--baseline`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def show_judged(path: Path, judged: Judged, how: Judging, *, as_json: bool) -> None:
-    """Print the estimates, and why those that weigh are refused where they are."""
+    """A row a measure and condition, its estimators beside; and why weighting is refused."""
     from restock.cli.output import print_json, print_table, say
 
     if as_json:
@@ -59,4 +59,39 @@ def _value(row: dict[str, Any]) -> str:
     return f"{row['value']:.2f} [{row['low']:.2f}, {row['high']:.2f}]"
 
 
-__all__ = ["show_judged"]
+def show_regression(rows: list[dict[str, Any]], baseline: str, margin: float) -> None:
+    """A row a perturbation and condition, and one line that says what it comes to."""
+    from restock.cli.output import print_table, say
+
+    print_table(
+        [_regression_row(row) for row in rows],
+        title=f"success against the baseline {baseline}, paired by episode [95 %]",
+    )
+    for row in rows:
+        if row["reason"]:
+            say(f"{row['perturbation']}, {row['condition']}: {row['reason']}")
+    if any(row["verdict"] == "refused" for row in rows):
+        say("drive both with the same --episodes, --perturbations and --seed")
+    worse = [f"{r['condition']} ({r['perturbation']})" for r in rows if r["verdict"] == "worse"]
+    if worse:
+        say(f"WORSE by more than {margin:g}, with the interval below 0: {', '.join(worse)}")
+
+
+def _regression_row(row: dict[str, Any]) -> dict[str, Any]:
+    known = row["baseline"] is not None
+    return {
+        "perturbation": row["perturbation"],
+        "condition": row["condition"],
+        "episodes": row["episodes"],
+        "baseline": f"{row['baseline']:.2f}" if known else "",
+        "candidate": f"{row['candidate']:.2f}" if known else "",
+        "difference": f"{row['difference']:+.2f} [{row['difference_low']:+.2f},"
+        f" {row['difference_high']:+.2f}]"
+        if known
+        else "",
+        "P(improvement)": f"{row['improvement']:.2f}" if known else "",
+        "": row["verdict"],
+    }
+
+
+__all__ = ["show_judged", "show_regression"]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Label:
+class LabelCommand:
     """Label a store's transitions anew where their conditions have changed.
 
     Conditions run over the signals that are stored: no recording is read, and observations,

@@ -19,7 +19,7 @@ EXPANDED_ROWS = 20  # at most so many rows too wide for the terminal are printed
 
 
 @dataclass
-class Sql:
+class SqlCommand:
     """Any question to a store, a run directory or a panel, in DuckDB's SQL.
 
     A store has the views transitions, recordings, episodes, coverage, coverage_by_condition,

@@ -14,7 +14,7 @@ NAMED = 10  # attachments and metadata records that are listed
 
 
 @dataclass
-class Info:
+class InfoCommand:
     """What is in these recordings: format, duration, topics, types, counts and rates.
 
     PATH is an MCAP file, a rosbag2 folder or one of its files, a ROS 1 bag, a folder of many

@@ -10,7 +10,7 @@ import tyro
 
 
 @dataclass
-class Export:
+class ExportCommand:
     """Transitions as another library's data set, or a run's policy as an ONNX file.
 
     Takes a panel, or the rows of a query to a store, and puts them back together into episodes:

@@ -19,7 +19,7 @@ _WIDE = 110  # columns of a terminal from which on the table says more
 
 
 @dataclass
-class Mix:
+class MixCommand:
     """A pinned replay panel: which transitions a run is fed, in which shares.
 
     Works a mixture out against a store and packs the chosen transitions into one memory-mapped

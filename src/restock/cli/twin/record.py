@@ -10,7 +10,7 @@ from restock.errors import RestockError
 
 
 @dataclass
-class Record:
+class RecordCommand:
     """Drive the simulated stand-in for the hardware and write what a real robot would log.
 
     The stand-in is the twin with other friction, payload, wheels, latency and sensors than

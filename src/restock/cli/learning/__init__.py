@@ -1,0 +1,1 @@
+"""Verbs about runs: train, evaluate, compare, trace, diagnose and report."""

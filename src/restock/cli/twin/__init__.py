@@ -1,0 +1,1 @@
+"""Verbs about the simulated warehouse: record in it, fit it to logs, measure how far it is."""

@@ -1,0 +1,31 @@
+"""`restock twin`: the twin against the logs. One module a job, beside this one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+
+from restock.cli.twin.fit import FitCommand
+from restock.cli.twin.gap import GapCommand
+from restock.cli.twin.layout import LayoutCommand
+
+
+@dataclass
+class TwinCommand:
+    """The twin against the logs, how its robot is fitted to them and how far it is from them; and
+    the floors it drives on.
+
+    See docs/calibration.md and docs/layouts.md. `restock twin JOB --help` explains one job.
+    """
+
+    job: tyro.conf.OmitArgPrefixes[
+        Annotated[FitCommand, tyro.conf.subcommand("fit", prefix_name=False)]
+        | Annotated[GapCommand, tyro.conf.subcommand("gap", prefix_name=False)]
+        | Annotated[LayoutCommand, tyro.conf.subcommand("layout", prefix_name=False)]
+    ]
+
+    def run(self) -> int:
+        """Do the job."""
+        return self.job.run()
