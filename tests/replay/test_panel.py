@@ -343,7 +343,7 @@ def test_a_killed_build_leaves_nothing_in_the_way(transitions: pa.Table, tmp_pat
     pq.write_table(transitions, table)
     code = (
         "import os, signal, sys, pyarrow.parquet as pq\n"
-        "from restock.replay import build, pack\n"
+        "from restock.replay.panel import build, pack\n"
         "from restock.replay.mixture.mixture import load_mixture\n"
         "pack.Packer.write_meta = lambda *_: os.kill(os.getpid(), signal.SIGKILL)\n"
         "build.build_panel(pq.read_table(sys.argv[1]), load_mixture('uniform'), sys.argv[2])\n"
