@@ -1,7 +1,9 @@
 """The house: which folder may import which, each with one purpose, none too full, no cycles.
 
 Every import counts, those in functions and under TYPE_CHECKING too. All may import `restock`'s own
-modules (errors, files, state, statistics, TOML), which import nothing but each other.
+modules (errors, files, state, statistics, TOML), which import nothing but each other. The front
+door is exempt: `restock/__init__.py`, `__main__.py`, the rooms' `__init__.py` and `twin.py` import
+by name, and only when a name is asked for; no module of Restock imports from them.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import pytest
 from support.paths import ROOT
 
 MOST_MODULES = 15
+ROOMS = ["ingest", "replay", "train", "report", "cli"]
 SHARED = {"errors", "files", "state", "stats", "toml"}
 MAY_IMPORT = {
     "ingest": "containers profile steps store task",
@@ -61,21 +64,52 @@ MAY_IMPORT = {
     "train/twin/calibration": (
         "twin/floors twin/physics replay/store ingest/profile ingest/steps ingest/store ingest/task"
     ),
+    "report": "replay/panel replay/store train/run train/twin/calibration train/twin/floors",
+    "cli": "ingest/steps",
+    "cli/data": (
+        "cli ingest ingest/containers ingest/profile ingest/propose ingest/steps ingest/store"
+        " ingest/task replay replay/export replay/mixture replay/panel replay/store"
+        " train/evaluation"
+    ),
+    "cli/learning": (
+        "cli report ingest/store replay/store replay/trace train train/comparison"
+        " train/evaluation train/run train/study train/twin/calibration"
+    ),
+    "cli/twin": (
+        "cli report replay/store train/twin/calibration train/twin/env train/twin/floors"
+        " train/twin/physics train/twin/recording"
+    ),
 }
 
 
 def folders() -> dict[str, list[Path]]:
-    """Each folder of the three rooms with its modules."""
+    """Each folder of the three rooms, the command line and the report with its modules."""
     found: dict[str, list[Path]] = {}
-    for room in ("ingest", "replay", "train"):
-        for path in sorted((ROOT / room).rglob("*.py")):
-            found.setdefault(path.parent.relative_to(ROOT).as_posix(), []).append(path)
+    for room in ROOMS:
+        for path in sorted((home(room) / room).rglob("*.py")):
+            found.setdefault(path.parent.relative_to(home(room)).as_posix(), []).append(path)
     return found
 
 
+def home(folder: str) -> Path:
+    """Where a folder lies: the three rooms at the top, the front door's in `src/restock`."""
+    front = folder.split("/")[0] in ("cli", "report")
+    return ROOT / "src" / "restock" if front else ROOT
+
+
 FOLDERS = folders()
+FRONT_DOOR = {
+    "__init__",
+    "__main__",
+    "ingest/__init__",
+    "replay/__init__",
+    "train/__init__",
+    "twin",
+}
 MODULES = {
-    path.relative_to(ROOT).with_suffix("").as_posix() for f in FOLDERS.values() for path in f
+    path.relative_to(home(folder)).with_suffix("").as_posix()
+    for folder, paths in FOLDERS.items()
+    for path in paths
 }
 
 
@@ -112,9 +146,7 @@ def allowed(folder: str) -> set[str]:
     """The table's short names, looked up in the folder's own room first."""
     room = folder.split("/")[0]
     return {
-        name
-        if name in FOLDERS and name.split("/")[0] in ("ingest", "replay", "train")
-        else f"{room}/{name}"
+        name if name in FOLDERS and name.split("/")[0] in ROOMS else f"{room}/{name}"
         for name in MAY_IMPORT[folder].split()
     }
 
@@ -130,7 +162,8 @@ def test_a_folder_imports_only_what_the_table_allows(folder: str) -> None:
 def test_a_folder_has_one_purpose_and_room_for_it(folder: str) -> None:
     modules = [path for path in FOLDERS[folder] if path.name != "__init__.py"]
     assert len(modules) <= MOST_MODULES
-    purpose = ast.get_docstring(ast.parse((ROOT / folder / "__init__.py").read_text("utf-8")))
+    text = (home(folder) / folder / "__init__.py").read_text("utf-8")
+    purpose = ast.get_docstring(ast.parse(text))
     assert purpose
     assert len(purpose.splitlines()[0]) > 20
 
@@ -139,11 +172,18 @@ def test_there_are_no_cycles() -> None:
     TopologicalSorter({folder: allowed(folder) for folder in MAY_IMPORT}).prepare()
 
 
-def test_imports_run_from_train_to_replay_to_ingest() -> None:
-    order = ["ingest", "replay", "train"]
+def test_imports_run_from_the_command_line_to_train_to_replay_to_ingest() -> None:
     for folder in MAY_IMPORT:
         for other in allowed(folder):
-            assert order.index(other.split("/")[0]) <= order.index(folder.split("/")[0])
+            assert ROOMS.index(other.split("/")[0]) <= ROOMS.index(folder.split("/")[0])
+
+
+def test_the_front_door_is_small_and_nothing_behind_it_uses_it() -> None:
+    assert len(list((ROOT / "src" / "restock").glob("*.py"))) <= MOST_MODULES
+    faces = {name.removesuffix("/__init__") for name in FRONT_DOOR}
+    for paths in FOLDERS.values():
+        for path in paths:
+            assert not faces & set(imports(path)) or path.name == "__init__.py", path
 
 
 def test_the_twin_knows_no_learner() -> None:
