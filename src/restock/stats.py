@@ -1,15 +1,36 @@
-"""Statistics of evaluations: intervals that say how much a number can be trusted."""
+"""Statistics of evaluations and logs: intervals that say how much a number can be trusted.
+
+Every bootstrap is a percentile interval (Efron and Tibshirani 1993) over what varies on its own:
+values within a stratum, episodes that two arms share, or whole clusters, because segments of one
+episode are not independent. All draws come from the generator that is given.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
+
+_WEIGHTS_AT_ONCE = 4_000_000  # in memory
+
+
+@dataclass(frozen=True)
+class ConfidenceInterval:
+    """A statistic and its interval, in the unit of the values; NaN is unknown."""
+
+    value: float
+    low: float
+    high: float
+
+
+NOT_KNOWN = ConfidenceInterval(float("nan"), float("nan"), float("nan"))
 
 
 def wilson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -21,8 +42,6 @@ def wilson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float
         raise ValueError(f"successes must be in [0, trials], got {successes} of {trials}")
     if trials == 0:
         return 0.0, 1.0
-    from statistics import NormalDist
-
     z = NormalDist().inv_cdf(0.5 + confidence / 2)
     share = successes / trials
     centre = (share + z * z / (2 * trials)) / (1 + z * z / trials)
@@ -50,6 +69,26 @@ def median(values: NDArray[Any]) -> float:
     return float(np.median(values))
 
 
+def probability_of_improvement(better: NDArray[Any], worse: NDArray[Any]) -> float:
+    """P(a value of `better` beats one of `worse`), ties counting half (Mann-Whitney)."""
+    return _wins(np.asarray(better, np.float64)[:, None] - np.asarray(worse, np.float64)[None, :])
+
+
+def paired_improvement(better: NDArray[Any], worse: NDArray[Any]) -> float:
+    """P(a value of `better` (n,) beats that of `worse` at its place), ties counting half."""
+    return _wins(np.asarray(better, np.float64) - np.asarray(worse, np.float64))
+
+
+def _wins(difference: F64) -> float:
+    return float(np.mean((difference > 0) + 0.5 * (difference == 0)))
+
+
+def percentiles(draws: NDArray[Any], confidence: float = 0.95) -> tuple[float, float]:
+    """The percentile interval of a statistic's bootstrap draws (R,)."""
+    low, high = np.quantile(draws, _tails(confidence))
+    return float(low), float(high)
+
+
 def bootstrap(
     strata: Sequence[NDArray[Any]],
     statistic: Callable[[F64], float] = mean,
@@ -58,7 +97,7 @@ def bootstrap(
     resamples: int = 2000,
     confidence: float = 0.95,
 ) -> tuple[float, float]:
-    """A stratified percentile bootstrap interval of `statistic` over all values together.
+    """A stratified bootstrap interval of `statistic` over all values together.
 
     Each stratum (a condition, say) is resampled within itself, so that every resample holds the
     same number of values of each: what varies is the episodes, not the mix.
@@ -73,14 +112,135 @@ def bootstrap(
     return percentiles(draws, confidence)
 
 
-def percentiles(draws: NDArray[Any], confidence: float = 0.95) -> tuple[float, float]:
-    """The percentile interval of a statistic's bootstrap draws (R,)."""
+def mean_over_strata(
+    strata: Sequence[NDArray[Any]],
+    *,
+    rng: np.random.Generator,
+    resamples: int = 2000,
+    confidence: float = 0.95,
+) -> ConfidenceInterval:
+    """The mean of the strata's means, each (n,) counting the same however many values it has.
+
+    Given paired differences it is a paired bootstrap: pairs are drawn whole.
+    """
+    means = [
+        values[rng.integers(len(values), size=(resamples, len(values)))].mean(axis=1)
+        for values in strata
+    ]
+    value = float(np.mean([values.mean() for values in strata]))
+    return ConfidenceInterval(value, *percentiles(np.mean(means, axis=0), confidence))
+
+
+def difference_of_arms(
+    first: NDArray[Any],
+    second: NDArray[Any],
+    *,
+    rng: np.random.Generator,
+    resamples: int = 2000,
+    confidence: float = 0.95,
+) -> ConfidenceInterval:
+    """mean(second) - mean(first) of two arms that drove the same episodes.
+
+    Runs are drawn within each arm and episodes jointly for both (the pairing), so the interval
+    holds both what another seed and what other episodes would have changed.
+
+    Args:
+        first, second: (runs, episodes), the same episodes in the same order.
+    """
+    draws = np.empty(resamples)
+    for index in range(resamples):
+        episodes = rng.integers(first.shape[1], size=first.shape[1])
+        means = [
+            arm[rng.integers(len(arm), size=len(arm))][:, episodes].mean()
+            for arm in (first, second)
+        ]
+        draws[index] = means[1] - means[0]
+    return ConfidenceInterval(float(second.mean() - first.mean()), *percentiles(draws, confidence))
+
+
+def cluster_counts(clusters: int, resamples: int, rng: np.random.Generator) -> F64:
+    """How often a bootstrap over whole clusters draws each of them, (R, C)."""
+    return rng.multinomial(clusters, np.full(clusters, 1 / clusters), resamples).astype(np.float64)
+
+
+def clustered_quantiles(
+    values: NDArray[Any],
+    cluster: NDArray[Any],
+    shares: Sequence[float],
+    *,
+    rng: np.random.Generator,
+    resamples: int = 1000,
+    confidence: float = 0.95,
+) -> list[ConfidenceInterval]:
+    """Quantiles of values (N,) whose clusters are (N,), each value counting once.
+
+    A quantile is the smallest value that has at least that share of the values at or below it.
+    With one cluster there is nothing to resample: the ends are NaN.
+    """
+    values = np.asarray(values, np.float64)
+    if not len(values):
+        return [NOT_KNOWN] * len(shares)
+    order = np.argsort(values, kind="stable")
+    values, place = values[order], np.unique(cluster, return_inverse=True)[1].reshape(-1)[order]
+    number = int(place.max()) + 1
+    at = _quantile_rows(values, np.ones((1, len(values))), shares)[0]
+    if number < 2:
+        return [ConfidenceInterval(float(value), float("nan"), float("nan")) for value in at]
+    draws, chunk = [], max(_WEIGHTS_AT_ONCE // len(values), 1)
+    for start in range(0, resamples, chunk):
+        counts = cluster_counts(number, min(chunk, resamples - start), rng)
+        draws.append(_quantile_rows(values, counts[:, place], shares))
+    return _intervals(at, np.concatenate(draws), confidence)
+
+
+def clustered_ratio(
+    above: NDArray[Any],
+    below: NDArray[Any],
+    cluster: NDArray[Any],
+    *,
+    rng: np.random.Generator,
+    resamples: int = 1000,
+    confidence: float = 0.95,
+) -> ConfidenceInterval:
+    """sum(above) / sum(below) of (N,) each; a mean where `below` is ones.
+
+    With one cluster there is nothing to resample: the ends are NaN.
+    """
+    if not len(above) or not np.sum(below):
+        return NOT_KNOWN
+    place = np.unique(cluster, return_inverse=True)[1].reshape(-1)
+    number = int(place.max()) + 1
+    top = np.bincount(place, np.asarray(above, np.float64), number)
+    bottom = np.bincount(place, np.asarray(below, np.float64), number)
+    at = np.array([top.sum() / bottom.sum()])
+    if number < 2:
+        return ConfidenceInterval(float(at[0]), float("nan"), float("nan"))
+    counts = cluster_counts(number, resamples, rng)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        drawn = (counts @ top) / (counts @ bottom)
+    drawn = drawn[np.isfinite(drawn)]
+    return _intervals(at, drawn[:, None], confidence)[0] if len(drawn) else NOT_KNOWN
+
+
+def _quantile_rows(values: F64, weights: F64, shares: Sequence[float]) -> F64:
+    """Weighted quantiles (R, Q) of sorted values (N,) under weights (R, N)."""
+    total = np.cumsum(weights, axis=1)
+    rows = np.empty((len(weights), len(shares)))
+    for column, share in enumerate(shares):
+        reached = total >= share * total[:, -1:] - 1e-9
+        rows[:, column] = values[np.argmax(reached, axis=1)]
+    return rows
+
+
+def _intervals(at: F64, draws: F64, confidence: float) -> list[ConfidenceInterval]:
+    """Of statistics (Q,) with their draws (R, Q)."""
+    low, high = np.quantile(draws, _tails(confidence), axis=0)
+    return [
+        ConfidenceInterval(float(value), float(least), float(most))
+        for value, least, most in zip(at, low, high, strict=True)
+    ]
+
+
+def _tails(confidence: float) -> list[float]:
     tail = (1 - confidence) / 2
-    low, high = np.quantile(draws, [tail, 1 - tail])
-    return float(low), float(high)
-
-
-def probability_of_improvement(better: NDArray[Any], worse: NDArray[Any]) -> float:
-    """P(a value of `better` beats one of `worse`), ties counting half (Mann-Whitney)."""
-    difference = np.asarray(better, np.float64)[:, None] - np.asarray(worse, np.float64)[None, :]
-    return float(np.mean((difference > 0) + 0.5 * (difference == 0)))
+    return [tail, 1 - tail]

@@ -16,7 +16,6 @@ import pytest
 from support.stores import TASK
 
 from restock import cli
-from restock.clustered import Estimate
 from restock.errors import RunError
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
@@ -24,6 +23,7 @@ from restock.replay.store.store import Store
 from restock.report import build_report
 from restock.report.facts import gather
 from restock.report.feed import flattery
+from restock.stats import ConfidenceInterval
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES, TABLES
 from restock.train.twin.calibration.gap import Gap
@@ -237,7 +237,7 @@ def test_a_measured_gap_is_a_section(run: Path, tmp_path: Path) -> None:
     position = {"condition": "nominal", "horizon_s": 3.0, "quantity": "position", "unit": "m"}
     position |= {"source": "nominal", "segments": 40, "episodes": 9}
     position |= {f"{q}{end}": 0.5 for q in ("median", "p90") for end in ("", "_low", "_high")}
-    far = Estimate(0.5, 0.4, 0.6)
+    far = ConfidenceInterval(0.5, 0.4, 0.6)
     gap = Gap(
         about={"limits": asdict(Limits()), "store_version": 7, "twins": {"nominal": {}}},
         paths=[position],

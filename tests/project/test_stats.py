@@ -7,7 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from restock.stats import bootstrap, iqm, probability_of_improvement, wilson
+from restock.stats import (
+    bootstrap,
+    clustered_quantiles,
+    clustered_ratio,
+    difference_of_arms,
+    iqm,
+    mean_over_strata,
+    paired_improvement,
+    probability_of_improvement,
+    wilson,
+)
 
 
 def test_wilson_against_the_published_values() -> None:
@@ -48,3 +58,56 @@ def test_bootstrap_is_seeded_and_covers_the_mean() -> None:
 
 def test_probability_of_improvement_counts_ties_half() -> None:
     assert probability_of_improvement(np.array([1.0, 2.0]), np.array([1.0, 0.0])) == 0.875
+    assert paired_improvement(np.array([1.0, 2.0]), np.array([1.0, 0.0])) == 0.75
+
+
+def test_pairing_removes_what_the_episodes_share() -> None:
+    rng = np.random.default_rng(0)
+    episodes = rng.normal(0, 10, 40)  # far more than what sets the arms apart
+    first = episodes + rng.normal(0, 0.1, (3, 40))
+    second = episodes + 1 + rng.normal(0, 0.1, (4, 40))
+    found = difference_of_arms(first, second, rng=np.random.default_rng(1))
+    assert found == difference_of_arms(first, second, rng=np.random.default_rng(1))
+    assert found.value == pytest.approx(1, abs=0.1)
+    assert found.low < found.value < found.high < found.low + 0.2
+
+
+def test_strata_count_the_same_whatever_their_sizes() -> None:
+    found = mean_over_strata([np.zeros(100), np.ones(4)], rng=np.random.default_rng(0))
+    assert (found.value, found.low, found.high) == (0.5, 0.5, 0.5)
+
+
+def test_quantiles_count_clusters_not_rows() -> None:
+    rng = np.random.default_rng(0)
+    values = np.repeat(rng.normal(size=12), 50)  # 12 episodes of equal segments
+    cluster = np.repeat(np.arange(12), 50)
+    (together,) = clustered_quantiles(values, cluster, [0.5], rng=np.random.default_rng(1))
+    (apart,) = clustered_quantiles(values, np.arange(600), [0.5], rng=np.random.default_rng(1))
+    assert together.value == apart.value == np.quantile(values, 0.5, method="inverted_cdf")
+    assert together.high - together.low > 2 * (apart.high - apart.low)
+
+
+def test_one_cluster_has_no_interval() -> None:
+    (median,) = clustered_quantiles(
+        np.array([1.0, 2.0, 3.0]), np.full(3, "a"), [0.5], rng=np.random.default_rng(0)
+    )
+    assert median.value == 2.0
+    assert np.isnan(median.low)
+    mean = clustered_ratio(
+        np.array([1.0, 3.0]), np.ones(2), np.full(2, "a"), rng=np.random.default_rng(0)
+    )
+    assert mean.value == 2.0
+    assert np.isnan(mean.high)
+
+
+def test_an_interval_holds_the_truth_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(3)
+    hits = 0
+    for _ in range(200):
+        effect = rng.normal(size=30)
+        values = (effect[:, None] + 0.1 * rng.normal(size=(30, 5))).reshape(-1)
+        mean = clustered_ratio(
+            values, np.ones(150), np.repeat(np.arange(30), 5), rng=rng, resamples=400
+        )
+        hits += mean.low <= 0 <= mean.high
+    assert 0.88 <= hits / 200 <= 0.99

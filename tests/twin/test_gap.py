@@ -13,13 +13,16 @@ import pytest
 from support.paths import SHARED
 
 from restock import cli
-from restock.clustered import NOT_KNOWN, Estimate, quantiles, ratio
 from restock.errors import ConfigError, RunError
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 from restock.report import write_gap_page
+from restock.stats import (
+    NOT_KNOWN,
+    ConfidenceInterval,
+)
 from restock.train.twin.calibration.gap import AFTER, BEFORE, Gap, GapPlan, measure_gap
 from restock.train.twin.calibration.gap_files import read_gap, write_gap
 from restock.train.twin.calibration.logged_steps import (
@@ -230,43 +233,15 @@ def test_turtlebot3_sim_humble(tmp_path: Path) -> None:
     assert not [row for row in gap.observations if row["component"].startswith("clearance_")]
 
 
-# -- statistics and rule ----------------------------------------------------------------------
+# -- the rule --------------------------------------------------------------------------------
 
 
-def test_quantiles_count_clusters_not_rows() -> None:
-    rng = np.random.default_rng(0)
-    values = np.repeat(rng.normal(size=12), 50)  # 12 episodes of equal segments
-    cluster = np.repeat(np.arange(12), 50)
-    (together,) = quantiles(values, cluster, [0.5], rng=np.random.default_rng(1))
-    (apart,) = quantiles(values, np.arange(600), [0.5], rng=np.random.default_rng(1))
-    assert together.value == apart.value == np.quantile(values, 0.5, method="inverted_cdf")
-    assert together.high - together.low > 2 * (apart.high - apart.low)
-
-
-def test_one_cluster_has_no_interval() -> None:
-    (median,) = quantiles(
-        np.array([1.0, 2.0, 3.0]), np.full(3, "a"), [0.5], rng=np.random.default_rng(0)
-    )
-    assert median.value == 2.0
-    assert np.isnan(median.low)
-    mean = ratio(np.array([1.0, 3.0]), np.ones(2), np.full(2, "a"), rng=np.random.default_rng(0))
-    assert mean.value == 2.0
-    assert np.isnan(mean.high)
-
-
-def test_an_interval_holds_the_truth_as_often_as_it_says() -> None:
-    rng = np.random.default_rng(3)
-    hits = 0
-    for _ in range(200):
-        effect = rng.normal(size=30)
-        values = (effect[:, None] + 0.1 * rng.normal(size=(30, 5))).reshape(-1)
-        mean = ratio(values, np.ones(150), np.repeat(np.arange(30), 5), rng=rng, resamples=400)
-        hits += mean.low <= 0 <= mean.high
-    assert 0.88 <= hits / 200 <= 0.99
-
-
-GOOD, BAD, OPEN = Estimate(0.1, 0.05, 0.15), Estimate(0.4, 0.3, 0.5), Estimate(0.2, 0.1, 0.3)
-FINE, WORSE = Estimate(0.3, 0.2, 0.4), Estimate(1.5, 1.2, 1.8)
+GOOD, BAD, OPEN = (
+    ConfidenceInterval(0.1, 0.05, 0.15),
+    ConfidenceInterval(0.4, 0.3, 0.5),
+    ConfidenceInterval(0.2, 0.1, 0.3),
+)
+FINE, WORSE = ConfidenceInterval(0.3, 0.2, 0.4), ConfidenceInterval(1.5, 1.2, 1.8)
 
 
 @pytest.mark.parametrize(
@@ -281,7 +256,9 @@ FINE, WORSE = Estimate(0.3, 0.2, 0.4), Estimate(1.5, 1.2, 1.8)
         (BAD, WORSE, 19, UNKNOWN),
     ],
 )
-def test_the_rule(position_p90: Estimate, reward: Estimate, segments: int, verdict: str) -> None:
+def test_the_rule(
+    position_p90: ConfidenceInterval, reward: ConfidenceInterval, segments: int, verdict: str
+) -> None:
     found = judge(
         "wheel_slip",
         limits=Limits(),

@@ -16,12 +16,11 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from restock.errors import RunError
-from restock.stats import iqm, percentiles, probability_of_improvement
+from restock.stats import difference_of_arms, iqm, probability_of_improvement
 from restock.train.comparison.arms import Arm
 from restock.train.run.run import Run
 
 Cell = tuple[str, str]  # perturbation, condition (with the kind of block)
-_RESAMPLES = 2000
 
 
 def outcomes(first: Arm, second: Arm, rng: np.random.Generator) -> tuple[str, list[dict[str, Any]]]:
@@ -56,14 +55,7 @@ def _row(
     b: NDArray[np.float64],
     rng: np.random.Generator,
 ) -> dict[str, Any]:
-    differences = np.empty(_RESAMPLES)
-    for index in range(_RESAMPLES):
-        episodes = rng.integers(a.shape[1], size=a.shape[1])
-        means = [
-            arm[rng.integers(len(arm), size=len(arm))][:, episodes, 0].mean() for arm in (a, b)
-        ]
-        differences[index] = means[1] - means[0]
-    low, high = percentiles(differences)
+    difference = difference_of_arms(a[..., 0], b[..., 0], rng=rng)
     # Episode by episode, over all pairs of runs.
     better = [
         probability_of_improvement(b[:, index, 1], a[:, index, 1]) for index in range(a.shape[1])
@@ -74,9 +66,9 @@ def _row(
         "episodes": a.shape[1],
         "runs": [len(a), len(b)],
         "success": [float(a[..., 0].mean()), float(b[..., 0].mean())],
-        "difference": float(b[..., 0].mean() - a[..., 0].mean()),
-        "difference_low": low,
-        "difference_high": high,
+        "difference": difference.value,
+        "difference_low": difference.low,
+        "difference_high": difference.high,
         "return_iqm": [iqm(a[..., 1]), iqm(b[..., 1])],
         "improvement": float(np.mean(better)),
     }

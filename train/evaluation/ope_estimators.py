@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.stats import percentiles
+from restock.stats import cluster_counts, percentiles
 
 F64 = NDArray[np.float64]
 
@@ -189,7 +189,7 @@ def estimate(
     """
     near = logged.until(horizon)
     refused = gate.refusal(near)
-    counts = rng.multinomial(len(logged), np.full(len(logged), 1 / len(logged)), size=resamples)
+    counts = cluster_counts(len(logged), resamples, rng)
     found = []
     for name, of, estimator in (
         (LOGGED, logged, observed),
@@ -201,7 +201,7 @@ def estimate(
             found.append(Estimate(name, None, refused=refused))
             continue
         value = float(estimator(of, once(len(logged)))[0])
-        draws = estimator(of, counts.astype(np.float64))
+        draws = estimator(of, counts)
         interval = percentiles(draws, confidence) if len(logged) > 1 else (None, None)
         found.append(Estimate(name, value, *interval))
     return found

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from restock.errors import RunError
 from restock.files import write_table
-from restock.stats import iqm, percentiles
+from restock.stats import iqm, mean_over_strata, paired_improvement
 from restock.train.evaluation.evaluate import cell_name
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES
@@ -29,7 +29,6 @@ FOLDER = Path("baselines")  # where names are looked up, in the working director
 EVERY = "all"
 Verdict = Literal["better", "worse", "no difference shown", "refused"]
 _KEY = b"restock-baseline"
-_RESAMPLES = 2000
 _Key = tuple[int, str]  # seed, and the values of the perturbation in force
 _Episodes = dict[_Key, tuple[float, float]]  # success and return
 
@@ -147,19 +146,13 @@ def _row(
     Args:
         pairs: of each condition (n, 2, 2): episodes x (baseline, candidate) x (success, return).
     """
-    difference = [pair[:, 1, 0] - pair[:, 0, 0] for pair in pairs]
-    draws = np.mean(
-        [d[rng.integers(len(d), size=(_RESAMPLES, len(d)))].mean(axis=1) for d in difference],
-        axis=0,
-    )
-    low, high = percentiles(draws)
-    middle = float(np.mean([d.mean() for d in difference]))
+    difference = mean_over_strata([pair[:, 1, 0] - pair[:, 0, 0] for pair in pairs], rng=rng)
     success = [float(np.mean([pair[:, arm, 0].mean() for pair in pairs])) for arm in (0, 1)]
     together = np.concatenate(pairs)[:, :, 1]
     verdict: Verdict = "no difference shown"
-    if high < 0 and middle < -margin:
+    if difference.high < 0 and difference.value < -margin:
         verdict = "worse"
-    elif low > 0:
+    elif difference.low > 0:
         verdict = "better"
     return {
         "perturbation": cell[0],
@@ -167,20 +160,16 @@ def _row(
         "episodes": len(together),
         "baseline": success[0],
         "candidate": success[1],
-        "difference": middle,
-        "difference_low": low,
-        "difference_high": high,
+        "difference": difference.value,
+        "difference_low": difference.low,
+        "difference_high": difference.high,
         "return_iqm": [iqm(together[:, 0]), iqm(together[:, 1])],
-        "improvement": float(np.mean([_better(pair) for pair in pairs])),
+        "improvement": float(
+            np.mean([paired_improvement(pair[:, 1, 1], pair[:, 0, 1]) for pair in pairs])
+        ),
         "verdict": verdict,
         "reason": None,
     }
-
-
-def _better(pair: NDArray[Any]) -> float:
-    """P(the candidate's return beats the baseline's on the same episode), ties counting half."""
-    more = pair[:, 1, 1] - pair[:, 0, 1]
-    return float(np.mean((more > 0) + 0.5 * (more == 0)))
 
 
 def _refused(cell: tuple[str, str], theirs: _Episodes, ours: _Episodes) -> dict[str, Any]:

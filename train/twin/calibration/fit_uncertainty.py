@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
+from restock.stats import cluster_counts
 from restock.train.twin.calibration.fit_solver import Problem, Solution, cost, weights
 
 F64 = NDArray[np.float64]
@@ -60,7 +61,7 @@ def uncertainty(solution: Solution, episode: NDArray[np.str_], seed: int) -> Unc
     # A parameter without any information would make every other infinite: a hair's breadth of it.
     ridge = np.diag(1e-6 / known**2)
     rng = np.random.Generator(np.random.PCG64(seed))
-    drawn = rng.multinomial(count, np.full(count, 1 / count), size=RESAMPLES).astype(np.float64)
+    drawn = cluster_counts(count, RESAMPLES, rng)
     h = np.einsum("bc,cij->bij", drawn, hessian) + ridge
     g = drawn @ gradient
     moved = -np.linalg.solve(h, g[..., None])[..., 0]

@@ -15,9 +15,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.clustered import NOT_KNOWN, Estimate
 from restock.errors import ConfigError, StoreError
 from restock.replay.store.store import Store
+from restock.stats import NOT_KNOWN, ConfidenceInterval
 from restock.train.twin.calibration.gap_rows import (
     Rows,
     estimate,
@@ -191,7 +191,7 @@ def _verdicts(
     limits: Limits,
     best: str,
     moved: Rows,
-    ratios: Mapping[tuple[str, str], Estimate],
+    ratios: Mapping[tuple[str, str], ConfidenceInterval],
 ) -> tuple[Verdict, ...]:
     at = {
         row["condition"]: row

@@ -10,9 +10,9 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from restock.clustered import Estimate
 from restock.errors import RunError
 from restock.files import write_table, write_text
+from restock.stats import ConfidenceInterval
 from restock.train.twin.calibration.gap import Gap
 from restock.train.twin.calibration.trust import Verdict
 
@@ -121,5 +121,5 @@ def _as_verdict(values: dict[str, Any]) -> Verdict:
     read = dict(values)
     for name in ("position_p90", "reward_ratio"):
         known = {k: float("nan") if v is None else float(v) for k, v in values[name].items()}
-        read[name] = Estimate(**known)
+        read[name] = ConfidenceInterval(**known)
     return Verdict(**{**read, "reasons": tuple(values["reasons"])})

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.clustered import Estimate, quantiles, ratio
+from restock.stats import ConfidenceInterval, clustered_quantiles, clustered_ratio
 from restock.train.twin.calibration.logged_steps import LoggedSteps
 from restock.train.twin.calibration.one_step import OneStep
 from restock.train.twin.calibration.path_gap import QUANTITIES, PathGap
@@ -26,7 +26,7 @@ def path_rows(paths: list[PathGap], rng: np.random.Generator) -> Rows:
                 for quantity, values in gaps.items():
                     known = mask & np.isfinite(values)
                     episode = path.episode_id[known]
-                    median, p90 = quantiles(values[known], episode, (0.5, 0.9), rng=rng)
+                    median, p90 = clustered_quantiles(values[known], episode, (0.5, 0.9), rng=rng)
                     found.append(
                         {
                             "condition": condition,
@@ -65,7 +65,7 @@ def observation_rows(
             episode = steps.episode_id[stepped.rows[rows]]
             for source, values in seen.items():
                 off = np.abs(values[rows, column] - stepped.logged.observation[rows, column])
-                mean = ratio(off, np.ones(len(off)), episode, rng=rng)
+                mean = clustered_ratio(off, np.ones(len(off)), episode, rng=rng)
                 found.append(
                     {
                         "condition": condition,
@@ -83,7 +83,7 @@ def reward_rows(
     stepped: OneStep,
     chosen: Mapping[str, NDArray[np.bool_]],
     rng: np.random.Generator,
-) -> tuple[Rows, dict[tuple[str, str], Estimate]]:
+) -> tuple[Rows, dict[tuple[str, str], ConfidenceInterval]]:
     """Gaps by term, and by (condition, source) the whole gap over the reward's own spread.
 
     The spread is the distance of a step's reward from the median, taken to be a step's cost at
@@ -100,9 +100,9 @@ def reward_rows(
                 off = values[rows] - logged[term][rows]
                 there = logged[term][rows]
                 spread = np.abs(there - np.median(there)) if len(there) else there
-                mean = ratio(np.abs(off), np.ones(len(off)), episode, rng=rng)
+                mean = clustered_ratio(np.abs(off), np.ones(len(off)), episode, rng=rng)
                 if term == "reward":
-                    ratios[condition, source] = ratio(
+                    ratios[condition, source] = clustered_ratio(
                         np.abs(off), np.maximum(spread, least), episode, rng=rng
                     )
                 found.append(
@@ -120,12 +120,14 @@ def reward_rows(
     return found, ratios
 
 
-def _spread_out(name: str, found: Estimate) -> dict[str, float | None]:
+def _spread_out(name: str, found: ConfidenceInterval) -> dict[str, float | None]:
     """An estimate as values of a row; NaN as None."""
     values = {name: found.value, f"{name}_low": found.low, f"{name}_high": found.high}
     return {key: None if np.isnan(value) else value for key, value in values.items()}
 
 
-def estimate(row: Mapping[str, Any], name: str) -> Estimate:
+def estimate(row: Mapping[str, Any], name: str) -> ConfidenceInterval:
     values = (row[name], row[f"{name}_low"], row[f"{name}_high"])
-    return Estimate(*(float("nan") if value is None else float(value) for value in values))
+    return ConfidenceInterval(
+        *(float("nan") if value is None else float(value) for value in values)
+    )

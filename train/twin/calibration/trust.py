@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from restock.clustered import Estimate
+from restock.stats import ConfidenceInterval
 
 TRUSTED, UNTRUSTED = "trusted", "untrusted"
 UNDECIDED, UNKNOWN = "undecided", "unknown"
@@ -36,8 +36,8 @@ class Verdict:
     reasons: tuple[str, ...]
     segments: int
     episodes: int
-    position_p90: Estimate  # m, at the limits' horizon
-    reward_ratio: Estimate
+    position_p90: ConfidenceInterval  # m, at the limits' horizon
+    reward_ratio: ConfidenceInterval
 
 
 def judge(
@@ -46,8 +46,8 @@ def judge(
     limits: Limits,
     segments: int,
     episodes: int,
-    position_p90: Estimate,
-    reward_ratio: Estimate,
+    position_p90: ConfidenceInterval,
+    reward_ratio: ConfidenceInterval,
 ) -> Verdict:
     """The verdict on one condition."""
     off, open_ = [], []
