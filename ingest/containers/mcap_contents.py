@@ -11,11 +11,11 @@ import mmap
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from restock.ingest.containers.mapped import FORGET_BYTES, forget
 from restock.ingest.containers.mcap_chunk import HEAD_SIZE, Chunk
 from restock.ingest.containers.mcap_records import MAGIC, PREFIX, Malformed, Op, parse, walk
 from restock.ingest.decoding.channel import Extra
 
+FORGET_BYTES = 64 << 20  # read this much, then let go of it
 # What the survey keeps is bounded, whatever a file is made of.
 MOST_CHUNKS = 1_000_000
 MOST_NAMED = 10_000  # attachments and metadata records; the others are counted
@@ -167,3 +167,17 @@ def cut_chunk_at(file: mmap.mmap, at: int, end: int) -> Chunk | None:
     stored = int.from_bytes(file[records - 8 : records], "little")
     stop = min(records + stored, end)
     return Chunk(at, records, stop, size, crc, compression, (start_ns, end_ns))
+
+
+def forget(file: mmap.mmap, start: int = 0, stop: int | None = None) -> None:
+    """Let go of the pages of file[start:stop]; reading them again brings them back.
+
+    Until then each page that was read counts as this process' memory, whatever the system's
+    cache does with it: a large recording would look like a leak, and hit a limit like one.
+    """
+    if not hasattr(mmap, "MADV_DONTNEED"):  # no such advice on this system
+        return
+    low = -(-start // mmap.PAGESIZE) * mmap.PAGESIZE
+    high = len(file) if stop is None else min(stop // mmap.PAGESIZE * mmap.PAGESIZE, len(file))
+    if low < high:
+        file.madvise(mmap.MADV_DONTNEED, low, high - low)

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from restock.errors import RecordingError
 from restock.ingest.containers import mcap_chunk
-from restock.ingest.containers.mapped import FORGET_BYTES, forget
 from restock.ingest.containers.mcap_chunk import LATEST_NS, Chunk, Messages
-from restock.ingest.containers.mcap_contents import survey
+from restock.ingest.containers.mcap_contents import FORGET_BYTES, forget, survey
 from restock.ingest.containers.mcap_group import Checks, ChunkReader, batch_of
 from restock.ingest.containers.mcap_records import MAGIC
 from restock.ingest.containers.mcap_salvage import resume

@@ -17,9 +17,9 @@ from restock.ingest.containers import discover
 from restock.ingest.containers.compression import decompress_file
 from restock.ingest.containers.discover import METADATA, recordings_in
 from restock.ingest.containers.mcap_file import McapFile
-from restock.ingest.containers.message_account import Account, Loss, TopicInfo
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.sqlite_file import SqliteFile
+from restock.ingest.containers.topic_reading import Account, Loss, TopicInfo
 from restock.ingest.decoding.channel import Damage, Storage
 from restock.ingest.decoding.columns import Ragged, TopicColumns
 from restock.ingest.decoding.decoders import READABLE

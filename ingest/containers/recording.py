@@ -16,8 +16,14 @@ from typing import Self
 
 from restock.errors import RecordingError
 from restock.ingest.containers.compression import decompressed
-from restock.ingest.containers.message_account import Account, Loss, TopicInfo
-from restock.ingest.containers.topic_reading import Reduction, TopicReading, together
+from restock.ingest.containers.topic_reading import (
+    Account,
+    Loss,
+    Reduction,
+    TopicInfo,
+    TopicReading,
+    together,
+)
 from restock.ingest.decoding.channel import Channel, Damage, Extra, Integrity, Storage
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.decoding.decoders import decoder_of, type_of

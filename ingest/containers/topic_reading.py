@@ -12,9 +12,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from restock.ingest.containers.compression import decompressed
-from restock.ingest.containers.message_account import Account, TopicInfo
-from restock.ingest.decoding.columns import I64, Batch, FieldColumn, TopicColumns, take
-from restock.ingest.decoding.growing_columns import GrowingArray, GrowingColumn
+from restock.ingest.decoding.columns import (
+    I64,
+    Batch,
+    FieldColumn,
+    GrowingArray,
+    GrowingColumn,
+    TopicColumns,
+    take,
+)
 from restock.ingest.decoding.row_by_row import Decoded
 
 SMALL_ROWS = 1024  # batches of fewer messages are put together, up to
@@ -24,6 +30,45 @@ LATEST_NS = 2**63 - 1
 ABSURD = "logged at an absurd time, before 1970 or after 2262"
 
 Fields = Mapping[str, FieldColumn]
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """What a recording says about a topic before anything is read."""
+
+    name: str
+    type: str  # "nav_msgs/msg/Odometry"; "" where the container names none
+    expected: int  # messages, by the container's own count
+    encoding: str  # "cdr", "json", "protobuf", "ros1", …
+    definition: str  # "embedded", a distribution's name, or "" where it cannot be decoded
+    skipped: str | None  # why it cannot be decoded, or None
+
+
+@dataclass
+class Account:
+    """What became of a topic's messages: expected = decoded + lost, always."""
+
+    topic: str
+    type: str
+    expected: int  # by the container's own count
+    read: int = 0  # payloads that came out of the container
+    decoded: int = 0
+    reasons: dict[str, int] = field(default_factory=dict)  # why the rest were not decoded
+    log_backsteps: int = 0  # messages logged before the one that lies before them in the file
+
+    @property
+    def lost(self) -> int:
+        """Messages that the container counts and that gave no row."""
+        return max(self.expected - self.decoded, 0)
+
+
+@dataclass(frozen=True)
+class Loss:
+    """Messages or bytes of a recording that could not be had, and why."""
+
+    topic: str | None  # None: of the file as a whole
+    messages: int | None  # None: unknown
+    reason: str
 
 
 @dataclass(frozen=True)

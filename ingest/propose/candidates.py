@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
-from restock.ingest.containers.message_account import TopicInfo
 from restock.ingest.containers.recording import Recording
+from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.decoding.columns import Ragged, TopicColumns
 from restock.ingest.profile.custom_signal import CustomSignal, name_problem
 from restock.ingest.steps.custom_columns import column_of, custom_reduction

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from restock.ingest.containers.message_account import TopicInfo
 from restock.ingest.containers.recording import Recording
+from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.profile.inputs import FALLBACKS
 from restock.ingest.propose.candidates import candidates
 from restock.ingest.propose.frame_guess import transform_frames

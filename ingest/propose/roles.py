@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from restock.ingest.containers.message_account import TopicInfo
+from restock.ingest.containers.topic_reading import TopicInfo
 
 _TWIST = {"speed_mps": "linear.x", "yaw_rate_radps": "angular.z"}
 _POSE = {"x_m": "position.x", "y_m": "position.y", "orientation": "orientation"}

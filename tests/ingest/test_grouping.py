@@ -19,9 +19,8 @@ from support.driven_robot import write_bag as write_drive
 from restock.ingest.containers import mcap_file, sqlite_file
 from restock.ingest.containers import topic_reading as reading
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.decoding import growing_columns as growing
-from restock.ingest.decoding.columns import Ragged, TopicColumns, equal, offsets_of
-from restock.ingest.decoding.growing_columns import GrowingColumn
+from restock.ingest.decoding import columns as growing
+from restock.ingest.decoding.columns import GrowingColumn, Ragged, TopicColumns, equal, offsets_of
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.steps.episodes import split
