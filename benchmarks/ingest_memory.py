@@ -23,8 +23,8 @@ from restock.ingest.store.writer import StoreWriter
 outcome = ingest(sys.argv[1], load_profile("turtlebot3"), store=StoreWriter(sys.argv[2]))
 with open("/proc/self/status") as file:  # the system's ru_maxrss would count the parent's, too
     peak = int(re.search(r"VmHWM:\\s+(\\d+) kB", file.read())[1])
-print(json.dumps({"transitions": outcome.manifest["transitions"], "losses": outcome.losses,
-                  "peak_mb": peak / 1024, "cpu_s": time.process_time()}))
+answer = {"transitions": outcome.manifest["transitions"], "lost_messages": outcome.lost_messages}
+print(json.dumps(answer | {"peak_mb": peak / 1024, "cpu_s": time.process_time()}))
 """
 
 

@@ -62,7 +62,7 @@ def restock_columns(path: Path, wanted: dict[str, list[str]] | None = None) -> d
     with open_recording(path) as recording:
         fields = wanted or {topic: recording.leaves(topic) for topic in recording.topics}
         columns = recording.read(fields)
-        assert not recording.losses
+        assert not recording.lost_messages
         return columns
 
 

@@ -44,7 +44,7 @@ with (
     from restock.ingest.containers.open_recording import open_recording
     from restock.ingest.decoding.cdr import ColumnDecoder
     from restock.ingest.decoding.channel import Channel
-    from restock.ingest.decoding.columns import Batch, equal, take
+    from restock.ingest.decoding.columns import MessageBatch, equal, take
     from restock.ingest.decoding.decoders import decoder_of, type_of
     from restock.ingest.decoding.field_paths import CannotDecode
     from restock.ingest.decoding.row_by_row import RowDecoder
@@ -103,7 +103,7 @@ def _read(path: Path, *, salvage: bool) -> None:
                     require(bool((np.diff(columns.log_time_ns) >= 0).all()), "in order")
                     for path_, column in columns.fields.items():
                         require(len(column) == len(columns), f"as many rows in {path_}")
-            json.dumps([opened.integrity, *(loss.reason for loss in opened.losses)])
+            json.dumps([opened.integrity, *(loss.reason for loss in opened.lost_messages)])
     except RestockError:
         pass
 
@@ -123,7 +123,7 @@ def ros1(data: bytes) -> None:
 
 def _beside_rosbags(encoding: str, form: str, definition: bytes, payloads: list[bytes]) -> None:
     channel = Channel(1, "/t", "pkg/msg/T", encoding, form, definition)
-    batch = Batch.of(payloads, range(len(payloads)), range(len(payloads)))
+    batch = MessageBatch.of(payloads, range(len(payloads)), range(len(payloads)))
     try:
         kind = type_of(channel, "humble", lambda: payloads)
         leaves = kind.leaves()[:MOST_LEAVES]
@@ -154,7 +154,7 @@ def protobuf(data: bytes) -> None:
 
 
 def _decode(channel: Channel, payloads: list[bytes]) -> None:
-    batch = Batch.of(payloads, range(len(payloads)), range(len(payloads)))
+    batch = MessageBatch.of(payloads, range(len(payloads)), range(len(payloads)))
     try:
         kind = type_of(channel, "humble", lambda: payloads)
         decoder = decoder_of(channel, kind, kind.leaves()[:MOST_LEAVES])

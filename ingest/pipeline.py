@@ -44,14 +44,14 @@ class Outcome:
     named: dict[str, int] = field(default_factory=dict)  # … and is the row's one condition
     scores: list[LabelScore] = field(default_factory=list)
     endings: dict[str, int] = field(default_factory=dict)  # episodes by what ended them
-    losses: list[str] = field(default_factory=list)  # messages or bytes that could not be had
+    lost_messages: list[str] = field(default_factory=list)  # or lost bytes, and why
     notes: list[str] = field(default_factory=list)
     version: int | None = None  # of the store's transitions, where they were written
 
     @property
     def lossy(self) -> bool:
         """Whether data of the topics used was lost."""
-        return bool(self.losses)
+        return bool(self.lost_messages)
 
 
 def ingest(
@@ -142,7 +142,7 @@ class _Ingest:
             first,
             scores,
             dict(Counter(episode.ended_by for episode in episodes.episodes).most_common()),
-            self._losses(),
+            self._lost_messages(),
             self._notes(steps, table),
             at,
         )
@@ -165,11 +165,11 @@ class _Ingest:
             "unused": self.recording.messages - expected,
         }
 
-    def _losses(self) -> list[str]:
+    def _lost_messages(self) -> list[str]:
         return [
             f"{loss.topic or 'the file'}: {loss.reason}"
             + (f" ({loss.messages:,} messages)" if loss.messages is not None else "")
-            for loss in self.recording.losses
+            for loss in self.recording.lost_messages
         ]
 
     def _notes(self, steps: Steps, table: pa.Table) -> list[str]:

@@ -10,7 +10,7 @@ import zstandard
 
 from restock.errors import RecordingError
 from restock.ingest.containers.discover import ZSTD_MAGIC
-from restock.ingest.decoding.columns import Batch
+from restock.ingest.decoding.columns import MessageBatch
 
 # What decompresses to more than both is taken for an attack (or for an accident).
 PLAUSIBLE_SIZE = 256 << 20
@@ -55,7 +55,7 @@ def decompress_file(path: Path, target: Path, *, salvage: bool) -> str | None:
     return problem
 
 
-def decompressed(batch: Batch) -> Iterator[tuple[Batch, int]]:
+def decompressed(batch: MessageBatch) -> Iterator[tuple[MessageBatch, int]]:
     """The batch with zstd payloads decompressed, and how many could not be: in pieces of about
     PIECE bytes, for they may hold many times more than the batch.
 
@@ -80,9 +80,9 @@ def decompressed(batch: Batch) -> Iterator[tuple[Batch, int]]:
     yield _piece(batch, payloads, good), bad
 
 
-def _piece(batch: Batch, payloads: list[bytes], good: list[int]) -> Batch:
+def _piece(batch: MessageBatch, payloads: list[bytes], good: list[int]) -> MessageBatch:
     rows = np.asarray(good, np.intp)
-    return Batch.of(payloads, batch.log_time_ns[rows], batch.publish_time_ns[rows])
+    return MessageBatch.of(payloads, batch.log_time_ns[rows], batch.publish_time_ns[rows])
 
 
 def _plain(payload: bytes) -> bytes:
@@ -106,7 +106,7 @@ def _plain(payload: bytes) -> bytes:
     raise zstandard.ZstdError("cut short")
 
 
-def _any_zstd(batch: Batch) -> bool:
+def _any_zstd(batch: MessageBatch) -> bool:
     long = batch.start[batch.stop - batch.start >= len(ZSTD_MAGIC)]
     long = long[batch.buffer[long] == ZSTD_MAGIC[0]]
     same = [batch.buffer[long + at] == byte for at, byte in enumerate(ZSTD_MAGIC)]

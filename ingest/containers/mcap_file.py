@@ -19,7 +19,7 @@ from restock.ingest.containers.mcap_group import Checks, ChunkReader, batch_of
 from restock.ingest.containers.mcap_records import MAGIC
 from restock.ingest.containers.mcap_salvage import resume
 from restock.ingest.decoding.channel import Channel, Integrity
-from restock.ingest.decoding.columns import Batch
+from restock.ingest.decoding.columns import MessageBatch
 
 GROUP_BYTES = 8 << 20  # of chunks decoded together: enough to amortise numpy's calls
 
@@ -156,7 +156,7 @@ class McapFile:
 
     # -- reading ---------------------------------------------------------------------------
 
-    def batches(self, channels: Collection[int]) -> Iterator[tuple[int, Batch]]:
+    def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
         """Loose messages first, then groups of chunks of about 8 MiB.
 
         A batch is valid until the next one is asked for: its buffer is used again.

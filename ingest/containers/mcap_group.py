@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from restock.ingest.containers import mcap_chunk
 from restock.ingest.containers.mcap_chunk import BadChunk, Chunk, Indexed, Messages, Positions
 from restock.ingest.decoding.channel import Damage, Integrity
-from restock.ingest.decoding.columns import Batch
+from restock.ingest.decoding.columns import MessageBatch
 
 _Part: TypeAlias = tuple[Chunk, int, int]  # a chunk, and where it lies: first byte, bytes
 
@@ -75,7 +75,7 @@ class ChunkReader:
             self.walked[chunk.at] = self._walk_part(chunk, self.inflate(chunk))
         return self.walked[chunk.at]
 
-    def read(self, group: list[Chunk], wanted: set[int]) -> Iterator[tuple[int, Batch]]:
+    def read(self, group: list[Chunk], wanted: set[int]) -> Iterator[tuple[int, MessageBatch]]:
         """The messages of these channels in some chunks; a batch is valid until the next."""
         buffer, parts = self._inflate_group(group)
         whole = self._by_index(parts, buffer, wanted)
@@ -189,9 +189,9 @@ class ChunkReader:
         return positions
 
 
-def batch_of(buffer: NDArray[np.uint8], parts: list[Messages]) -> Batch:
+def batch_of(buffer: NDArray[np.uint8], parts: list[Messages]) -> MessageBatch:
     """Messages from several places of one buffer, as one batch."""
-    return Batch(
+    return MessageBatch(
         buffer,
         np.concatenate([part.start for part in parts]),
         np.concatenate([part.stop for part in parts]),

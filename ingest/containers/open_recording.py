@@ -19,7 +19,7 @@ from restock.ingest.containers.discover import METADATA, recordings_in
 from restock.ingest.containers.mcap_file import McapFile
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.sqlite_file import SqliteFile
-from restock.ingest.containers.topic_reading import Account, Loss, TopicInfo
+from restock.ingest.containers.topic_reading import Account, LostMessages, TopicInfo
 from restock.ingest.decoding.channel import Damage, Storage
 from restock.ingest.decoding.columns import Ragged, TopicColumns
 from restock.ingest.decoding.decoders import READABLE
@@ -36,7 +36,7 @@ def open_recording(
         typestore: the distribution ("humble", "jazzy", …) whose message definitions are used
             where a recording carries none, as older sqlite3 bags do.
         salvage: read what can still be read of a file that is cut short or damaged, instead of
-            refusing it; what is missing is in the recording's `losses`.
+            refusing it; what is missing is in the recording's `lost_messages`.
 
     Raises:
         RecordingError: no such file, empty, a Git LFS pointer, no recording, cut short (unless
@@ -199,7 +199,7 @@ def _claims(metadata: dict[str, Any]) -> list[tuple[dict[str, Any], Any]]:
 
 __all__ = [
     "Account",
-    "Loss",
+    "LostMessages",
     "Ragged",
     "Recording",
     "TopicColumns",

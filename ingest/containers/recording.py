@@ -18,7 +18,7 @@ from restock.errors import RecordingError
 from restock.ingest.containers.compression import decompressed
 from restock.ingest.containers.topic_reading import (
     Account,
-    Loss,
+    LostMessages,
     Reduction,
     TopicInfo,
     TopicReading,
@@ -49,8 +49,8 @@ class Recording:
     """One recording, open: an MCAP file, or a bag with all its files.
 
     `topics` names every topic with its type and count; `read` decodes some of them. After it
-    `accounts` says per topic what was expected, read, decoded and skipped, and `losses` what is
-    missing. Use as a context manager, or call `close`.
+    `accounts` says per topic what was expected, read, decoded and skipped, and `lost_messages`
+    what is missing. Use as a context manager, or call `close`.
     """
 
     def __init__(
@@ -153,11 +153,16 @@ class Recording:
         return [extra for storage in self._storages for extra in storage.extras]
 
     @property
-    def losses(self) -> list[Loss]:
+    def lost_messages(self) -> list[LostMessages]:
         """What is missing: of the files, and of the topics that were read."""
-        found = [Loss(None, sum(item.messages.values()) or None, item.what) for item in self.damage]
+        found = [
+            LostMessages(None, sum(item.messages.values()) or None, item.what)
+            for item in self.damage
+        ]
         for account in self.accounts.values():
-            found += [Loss(account.topic, n, reason) for reason, n in account.reasons.items() if n]
+            found += [
+                LostMessages(account.topic, n, reason) for reason, n in account.reasons.items() if n
+            ]
         return found
 
     def leaves(self, topic: str) -> list[str]:

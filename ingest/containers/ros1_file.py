@@ -16,7 +16,7 @@ from rosbags.rosbag1.reader import Chunk, Header, IndexData, RecordType
 
 from restock.errors import RecordingError
 from restock.ingest.decoding.channel import Channel, Damage, Extra, Integrity
-from restock.ingest.decoding.columns import Batch
+from restock.ingest.decoding.columns import MessageBatch
 
 # A chunk's size is the file's word: what decompresses to more than both is refused.
 PLAUSIBLE_SIZE = 64 << 20
@@ -69,7 +69,7 @@ class Ros1File:
             (min(low for low, _ in stamps), max(high for _, high in stamps)) if stamps else None
         )
 
-    def batches(self, channels: Collection[int]) -> Iterator[tuple[int, Batch]]:
+    def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
         """Chunk by chunk; a chunk that is damaged costs only its own messages."""
         places: dict[int, dict[int, list[int]]] = {}  # chunk -> channel -> offsets in it
         for channel in channels:
@@ -93,7 +93,7 @@ class Ros1File:
         self._reader.close()
 
 
-def _batch(data: bytes, channel: int, offsets: list[int]) -> Batch:
+def _batch(data: bytes, channel: int, offsets: list[int]) -> MessageBatch:
     """The messages of one connection whose records are at these offsets of a chunk."""
     file = io.BytesIO(data)
     start, stop, stamps = list[int](), list[int](), list[int]()
@@ -113,7 +113,7 @@ def _batch(data: bytes, channel: int, offsets: list[int]) -> Batch:
         stamps.append(header.get_time("time"))
     times = np.asarray(stamps, np.int64)
     bounds = np.asarray(start, np.int64), np.asarray(stop, np.int64)
-    return Batch(np.frombuffer(data, np.uint8), *bounds, times, times)
+    return MessageBatch(np.frombuffer(data, np.uint8), *bounds, times, times)
 
 
 def _uint32(file: io.BytesIO) -> int:

@@ -12,7 +12,6 @@ import shutil
 import sqlite3
 import tempfile
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -21,7 +20,7 @@ import numpy as np
 
 from restock.errors import RecordingError
 from restock.ingest.decoding.channel import Channel, Damage, Extra, Integrity
-from restock.ingest.decoding.columns import Batch
+from restock.ingest.decoding.columns import MessageBatch, PendingBatch
 
 MAGIC = b"SQLite format 3\x00"
 ROWS_PER_FETCH = 1000
@@ -177,7 +176,7 @@ class SqliteFile:
         if all(item.what != what for item in self.damage):
             self.damage.append(Damage(what))
 
-    def batches(self, channels: Collection[int]) -> Iterator[tuple[int, Batch]]:
+    def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
         """One pass in rowid order, which is the order of arrival."""
         wanted = [channel for channel in channels if channel in self.channels]
         marks = ",".join("?" * len(wanted))
@@ -190,15 +189,15 @@ class SqliteFile:
         except sqlite3.DatabaseError as error:
             self._damaged(f"its rows are lost: {error}")
             return
-        held: dict[int, _Rows] = {}
+        pending: dict[int, PendingBatch] = {}
         size = count = 0
         while rows := self._fetch(cursor, size // count if count else BYTES_PER_BATCH // 16):
             if size >= BYTES_PER_BATCH:
-                yield from ((channel, rows.batch()) for channel, rows in held.items())
-                held, size, count = {}, 0, 0
-            size += _hold(rows, held)
+                yield from ((channel, some.batch()) for channel, some in pending.items())
+                pending, size, count = {}, 0, 0
+            size += _add_rows(rows, pending)
             count += len(rows)
-        yield from ((channel, rows.batch()) for channel, rows in held.items())
+        yield from ((channel, some.batch()) for channel, some in pending.items())
 
     def _fetch(self, cursor: sqlite3.Cursor, row_bytes: int) -> list[tuple[int, int, Any]]:
         """Some rows, fewer of larger ones: how large they are shows in those before."""
@@ -217,30 +216,18 @@ class SqliteFile:
             self._copy.cleanup()
 
 
-@dataclass
-class _Rows:
-    """Rows of one topic that wait to be a batch."""
-
-    stamps: list[int] = field(default_factory=list)
-    payloads: list[bytes] = field(default_factory=list)
-
-    def batch(self) -> Batch:
-        return Batch.of(self.payloads, self.stamps, self.stamps)
-
-
-def _hold(rows: list[tuple[int, int, Any]], held: dict[int, _Rows]) -> int:
-    """Sort (topic, stamp, data) rows by topic; returns how many bytes they hold."""
+def _add_rows(rows: list[tuple[int, int, Any]], pending: dict[int, PendingBatch]) -> int:
+    """Sort (topic, stamp, data) rows by topic; returns how many bytes they take."""
     topics, stamps, payloads = zip(*rows, strict=True)
     if set(map(type, payloads)) != {bytes}:
         payloads = tuple(
             data if isinstance(data, bytes) else str(data or "").encode() for data in payloads
         )
-    numbers = np.array(topics)
-    for topic in np.unique(numbers).tolist():
-        waiting = held.setdefault(topic, _Rows())
-        mine = np.flatnonzero(numbers == topic).tolist()
-        waiting.stamps += [stamps[row] for row in mine]
-        waiting.payloads += [payloads[row] for row in mine]
+    topic_of, stamp_ns = np.array(topics), np.array(stamps, np.int64)
+    for topic in np.unique(topic_of).tolist():
+        chosen = np.flatnonzero(topic_of == topic)
+        some = [payloads[row] for row in chosen.tolist()]
+        pending.setdefault(topic, PendingBatch()).add(some, stamp_ns[chosen], stamp_ns[chosen])
     return sum(map(len, payloads)) + 64 * len(rows)
 
 

@@ -13,11 +13,11 @@ import numpy as np
 
 from restock.ingest.containers.compression import decompressed
 from restock.ingest.decoding.columns import (
-    I64,
-    Batch,
     FieldColumn,
     GrowingArray,
     GrowingColumn,
+    MessageBatch,
+    PendingBatch,
     TopicColumns,
     take,
 )
@@ -63,7 +63,7 @@ class Account:
 
 
 @dataclass(frozen=True)
-class Loss:
+class LostMessages:
     """Messages or bytes of a recording that could not be had, and why."""
 
     topic: str | None  # None: of the file as a whole
@@ -115,7 +115,7 @@ class TopicReading:
         """Messages that are not read at all."""
         self._add({reason: count})
 
-    def take(self, decode: Callable[[Batch], Decoded], batch: Batch) -> None:
+    def take(self, decode: Callable[[MessageBatch], Decoded], batch: MessageBatch) -> None:
         """Decode a batch and keep its columns."""
         self._account.read += len(batch)
         for plain, damaged in decompressed(batch):
@@ -123,7 +123,7 @@ class TopicReading:
                 self._add({"its zstd data is damaged": damaged})
             self._take(decode, plain)
 
-    def _take(self, decode: Callable[[Batch], Decoded], batch: Batch) -> None:
+    def _take(self, decode: Callable[[MessageBatch], Decoded], batch: MessageBatch) -> None:
         account = self._account
         sane = (batch.log_time_ns >= 0) & (batch.log_time_ns < LATEST_NS)
         if not sane.all():
@@ -171,53 +171,25 @@ class TopicReading:
         return TopicColumns(log, publish, fields)
 
 
-@dataclass
-class _Held:
-    """Small batches of one channel, waiting for more."""
-
-    payloads: list[bytes] = field(default_factory=list)
-    log_time_ns: list[I64] = field(default_factory=list)
-    publish_time_ns: list[I64] = field(default_factory=list)
-    size: int = 0  # bytes
-
-    def add(self, batch: Batch) -> None:
-        self.payloads += batch.payloads()
-        self.log_time_ns.append(batch.log_time_ns)
-        self.publish_time_ns.append(batch.publish_time_ns)
-        self.size += _bytes(batch)
-
-    def batch(self) -> Batch:
-        return Batch.of(
-            self.payloads,
-            np.concatenate(self.log_time_ns),
-            np.concatenate(self.publish_time_ns),
-        )
-
-
-def together(batches: Iterable[tuple[int, Batch]]) -> Iterator[tuple[int, Batch]]:
+def together(batches: Iterable[tuple[int, MessageBatch]]) -> Iterator[tuple[int, MessageBatch]]:
     """The same messages by channel, in the same order, with small batches put together.
 
     Decoding has a price per batch, beside that per message: of a topic of few messages a second
     there are only a handful in 8 MiB of a recording.
     """
-    held: dict[int, _Held] = {}
+    pending: dict[int, PendingBatch] = {}
     for channel, batch in batches:
-        small = len(batch) < SMALL_ROWS and _bytes(batch) < TOGETHER_BYTES // 4
-        if small:
-            waiting = held.setdefault(channel, _Held())
-            waiting.add(batch)
-            if len(waiting.payloads) >= TOGETHER_ROWS or waiting.size >= TOGETHER_BYTES:
-                yield channel, held.pop(channel).batch()
+        if len(batch) < SMALL_ROWS and batch.size_bytes < TOGETHER_BYTES // 4:
+            waiting = pending.setdefault(channel, PendingBatch())
+            waiting.add(batch.payloads(), batch.log_time_ns, batch.publish_time_ns)
+            if len(waiting) >= TOGETHER_ROWS or waiting.size_bytes >= TOGETHER_BYTES:
+                yield channel, pending.pop(channel).batch()
             continue
-        if channel in held:
-            yield channel, held.pop(channel).batch()
+        if channel in pending:
+            yield channel, pending.pop(channel).batch()
         yield channel, batch
-    for channel, waiting in held.items():
+    for channel, waiting in pending.items():
         yield channel, waiting.batch()
-
-
-def _bytes(batch: Batch) -> int:
-    return int((batch.stop - batch.start).sum())
 
 
 __all__ = ["Fields", "Reduction", "TopicReading", "together"]

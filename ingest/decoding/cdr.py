@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from restock.ingest.decoding.cdr_compile import compile_plan
 from restock.ingest.decoding.cdr_frame import TOO_LONG, BadRows, Columns, Frame, Order
-from restock.ingest.decoding.columns import Batch, FieldColumn, join, take
+from restock.ingest.decoding.columns import FieldColumn, MessageBatch, join, take
 from restock.ingest.decoding.definitions import RosType
 from restock.ingest.decoding.field_paths import Leaf
 from restock.ingest.decoding.row_by_row import Decoded, RowDecoder
@@ -48,7 +48,7 @@ class ColumnDecoder:
         """Columns without a row."""
         return self._named(self._plan.empty())
 
-    def decode(self, batch: Batch) -> Decoded:
+    def decode(self, batch: MessageBatch) -> Decoded:
         """The batch's columns; a message that does not decode is counted, by reason."""
         if self._ros1:
             every = np.arange(len(batch))
@@ -70,7 +70,7 @@ class ColumnDecoder:
         return self._join(parts, bad)
 
     def _decode_rows(
-        self, batch: Batch, rows: NDArray[np.intp], order: Order, header: int
+        self, batch: MessageBatch, rows: NDArray[np.intp], order: Order, header: int
     ) -> Decoded:
         bad: dict[str, int] = {}
         for _ in range(RESTARTS):
@@ -91,7 +91,9 @@ class ColumnDecoder:
             return Decoded(rows, self._named(found), bad)
         return self._one_by_one(batch, rows, bad)
 
-    def _one_by_one(self, batch: Batch, rows: NDArray[np.intp], bad: dict[str, int]) -> Decoded:
+    def _one_by_one(
+        self, batch: MessageBatch, rows: NDArray[np.intp], bad: dict[str, int]
+    ) -> Decoded:
         """What is wrong differs from row to row: let every row fail for itself."""
         part = batch.select(rows)
         slow = RowDecoder(self._message, self._leaves, ros1=self._ros1).decode(part)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
 from restock.errors import visible
-from restock.ingest.decoding.columns import Batch
+from restock.ingest.decoding.columns import MessageBatch
 
 Integrity = Literal["verified", "unverified", "damaged"]
 
@@ -77,7 +77,7 @@ class Storage(Protocol):
         """Whether checksums vouch for what was read so far."""
         ...
 
-    def batches(self, channels: Collection[int]) -> Iterator[tuple[int, Batch]]:
+    def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
         """The messages of these channels, by channel, in file order within each channel."""
         ...
 

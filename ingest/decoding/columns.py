@@ -1,4 +1,4 @@
-"""Columns of messages: what a reader hands over. Payload batches in, arrays per field out."""
+"""Batches of messages and columns of their fields: what readers hand over, and what it becomes."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ class TopicColumns:
 
 
 @dataclass(frozen=True)
-class Batch:
+class MessageBatch:
     """Serialised messages of one channel: slices of one buffer, in file order."""
 
     buffer: NDArray[np.uint8]
@@ -147,15 +147,20 @@ class Batch:
     def __len__(self) -> int:
         return len(self.start)
 
-    def select(self, rows: NDArray[np.intp]) -> Batch:
+    def select(self, rows: NDArray[np.intp]) -> MessageBatch:
         """These rows, in the same buffer."""
-        return Batch(
+        return MessageBatch(
             self.buffer,
             self.start[rows],
             self.stop[rows],
             self.log_time_ns[rows],
             self.publish_time_ns[rows],
         )
+
+    @property
+    def size_bytes(self) -> int:
+        """Of all payloads."""
+        return int((self.stop - self.start).sum())
 
     def payloads(self) -> list[bytes]:
         """Each message's bytes."""
@@ -164,7 +169,7 @@ class Batch:
         return [bytes(view[start:stop]) for start, stop in bounds]
 
     @classmethod
-    def of(cls, payloads: Sequence[bytes], log_time_ns: Any, publish_time_ns: Any) -> Batch:
+    def of(cls, payloads: Sequence[bytes], log_time_ns: Any, publish_time_ns: Any) -> MessageBatch:
         """Payloads laid one after the other."""
         offsets = offsets_of(np.fromiter(map(len, payloads), np.int64, len(payloads)))
         return cls(
@@ -174,6 +179,30 @@ class Batch:
             np.asarray(log_time_ns, np.int64),
             np.asarray(publish_time_ns, np.int64),
         )
+
+
+class PendingBatch:
+    """Messages of one channel that wait for more of them, to be decoded together."""
+
+    def __init__(self) -> None:
+        self._payloads = list[bytes]()
+        self._log_time_ns, self._publish_time_ns = list[I64](), list[I64]()
+        self.size_bytes = 0
+
+    def __len__(self) -> int:
+        return len(self._payloads)
+
+    def add(self, payloads: Sequence[bytes], log_time_ns: I64, publish_time_ns: I64) -> None:
+        """Some more, in file order."""
+        self._payloads += payloads
+        self._log_time_ns.append(log_time_ns)
+        self._publish_time_ns.append(publish_time_ns)
+        self.size_bytes += sum(map(len, payloads))
+
+    def batch(self) -> MessageBatch:
+        """All of them."""
+        log, publish = np.concatenate(self._log_time_ns), np.concatenate(self._publish_time_ns)
+        return MessageBatch.of(self._payloads, log, publish)
 
 
 class GrowingArray:

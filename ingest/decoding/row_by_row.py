@@ -16,7 +16,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_typestore
 from rosbags.typesys.base import normalize_fieldname
 
-from restock.ingest.decoding.columns import Batch, FieldColumn, Ragged, join, offsets_of
+from restock.ingest.decoding.columns import FieldColumn, MessageBatch, Ragged, join, offsets_of
 from restock.ingest.decoding.definitions import RosType
 from restock.ingest.decoding.field_paths import DTYPES, CannotDecode, FieldType, Leaf
 
@@ -39,7 +39,7 @@ class Decoder(Protocol):
         """Columns without a row."""
         ...
 
-    def decode(self, batch: Batch) -> Decoded:
+    def decode(self, batch: MessageBatch) -> Decoded:
         """The batch's columns; a message that does not decode is counted, by reason."""
         ...
 
@@ -82,7 +82,7 @@ class ParsedDecoder:
         """Columns without a row."""
         return self._columns([])
 
-    def decode(self, batch: Batch) -> Decoded:
+    def decode(self, batch: MessageBatch) -> Decoded:
         """The batch's columns; a message that does not decode is counted, by reason."""
         parts, rows, bad = [self.empty()], list[int](), dict[str, int]()
         for some in _slices(batch):
@@ -111,7 +111,7 @@ class ParsedDecoder:
         return {leaf.path: column_of(messages, leaf, self._parser) for leaf in self._leaves}
 
 
-def _slices(batch: Batch) -> Iterator[range]:
+def _slices(batch: MessageBatch) -> Iterator[range]:
     """The batch's rows, of about BYTES_AT_ONCE each time."""
     lengths = (batch.stop - batch.start).tolist()
     start = size = 0

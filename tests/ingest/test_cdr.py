@@ -15,7 +15,7 @@ from support.paths import SHARED
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.cdr import ColumnDecoder
 from restock.ingest.decoding.channel import Channel
-from restock.ingest.decoding.columns import Batch, Ragged, equal
+from restock.ingest.decoding.columns import MessageBatch, Ragged, equal
 from restock.ingest.decoding.definitions import RosType, message_type
 from restock.ingest.decoding.field_paths import CannotDecode, Leaf
 from restock.ingest.decoding.row_by_row import RowDecoder
@@ -27,11 +27,13 @@ PRIMITIVES = [
 REPEATS = ["", "", "", "[]", "[]", "[<=5]", "[3]", "[1]"]
 
 
-def batch(payloads: list[bytes], lead: int = 3) -> Batch:
+def batch(payloads: list[bytes], lead: int = 3) -> MessageBatch:
     """Payloads at odd places of one buffer, as in a chunk."""
     padded = [b"\xaa" * lead + payload for payload in payloads]
-    whole = Batch.of(padded, np.arange(len(payloads)), np.arange(len(payloads)))
-    return Batch(whole.buffer, whole.start + lead, whole.stop, whole.log_time_ns, whole.log_time_ns)
+    whole = MessageBatch.of(padded, np.arange(len(payloads)), np.arange(len(payloads)))
+    return MessageBatch(
+        whole.buffer, whole.start + lead, whole.stop, whole.log_time_ns, whole.log_time_ns
+    )
 
 
 def agree(message: RosType, payloads: list[bytes], *, ros1: bool = False) -> None:
@@ -199,7 +201,7 @@ def test_other_peoples_messages_decode_as_rosbags_does(name: str) -> None:
             message = message_type(stream.channel, "humble")
             for _, found in stream.storage.batches([stream.channel.id]):
                 few = slice(None, 40)
-                part = Batch(
+                part = MessageBatch(
                     found.buffer, found.start[few], found.stop[few], *[found.log_time_ns[few]] * 2
                 )
                 ros1 = info.encoding == "ros1"

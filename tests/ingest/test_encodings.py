@@ -106,7 +106,7 @@ def test_json_with_and_without_a_schema(schema: bytes, tmp_path: Path) -> None:
         assert recording.topics["/pose"].definition == ("embedded" if schema else "inferred")
         assert recording.leaves("/pose") == LEAVES
         columns = recording.read({"/pose": LEAVES})["/pose"].fields
-        assert not recording.losses
+        assert not recording.lost_messages
     assert columns["timestamp"].tolist() == [  # type: ignore[union-attr]
         (1_700_000_000 + row) * 10**9 + 5 for row in range(4)
     ]
@@ -279,7 +279,7 @@ def test_protobuf(tmp_path: Path) -> None:
         ]
         wanted = [*leaves, "timestamp.nanos", "inner.count"]
         columns: dict[str, Any] = dict(recording.read({"/scan": wanted})["/scan"].fields)
-        assert not recording.losses
+        assert not recording.lost_messages
     assert columns["timestamp"].tolist() == [START_NS + row for row in range(4)]
     assert columns["timestamp.nanos"].tolist() == [0, 1, 2, 3]
     assert columns["took"].tolist() == [-1_500_000_000] * 4
@@ -545,7 +545,7 @@ def test_the_same_drive_in_every_encoding(tmp_path: Path) -> None:
             using = load_profile(str(tmp_path / "proto.toml"))
         store = StoreWriter(tmp_path / encoding)
         outcome = ingest(path, using, store=store)
-        assert not outcome.losses
+        assert not outcome.lost_messages
         tables[encoding] = DeltaTable(str(tmp_path / encoding / "transitions")).to_pyarrow_table()
         assert outcome.manifest["transitions"] > 300
     for encoding in ("json", "protobuf"):

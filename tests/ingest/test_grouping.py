@@ -50,7 +50,7 @@ def read(path: Path, size: int, rows: int, *, salvage: bool) -> dict[str, Any]:
             return {
                 "columns": columns,
                 "accounts": recording.accounts,
-                "losses": recording.losses,
+                "lost_messages": recording.lost_messages,
                 "integrity": recording.integrity,
             }
 

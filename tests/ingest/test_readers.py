@@ -160,7 +160,7 @@ def test_every_container_gives_the_same_columns(container: str, mcap: Path, tmp_
         open_recording(CONTAINERS[container](tmp_path)) as other,
     ):
         expected, found = everything(reference), everything(other)
-        assert not other.losses
+        assert not other.lost_messages
         assert not [note for note in other.notes if "no metadata" not in note]
         assert {name: topic.type for name, topic in other.topics.items()} == TOPICS
         same(expected, found)
@@ -304,7 +304,7 @@ def test_a_cut_mcap_is_refused_and_salvaged(mcap: Path, tmp_path: Path) -> None:
             found = everything(recording)
             expected = everything(full)
             assert recording.integrity == "damaged"
-            assert "cut short" in recording.losses[0].reason
+            assert "cut short" in recording.lost_messages[0].reason
             got = sum(len(columns) for columns in found.values())
             assert got > 0.6 * share * 140
             # What came is what is in the whole file, from the start of each topic.
@@ -322,7 +322,7 @@ def test_a_cut_sqlite_bag_is_refused_and_salvaged(tmp_path: Path) -> None:
     with open_recording(file, salvage=True) as recording:
         found = everything(recording)
         assert 0.3 * 2100 < sum(len(columns) for columns in found.values()) < 2100
-        assert recording.losses
+        assert recording.lost_messages
 
 
 def test_a_bad_chunk_loses_only_itself(mcap: Path, tmp_path: Path) -> None:
@@ -337,7 +337,7 @@ def test_a_bad_chunk_loses_only_itself(mcap: Path, tmp_path: Path) -> None:
         found = everything(recording)
         lost = sum(chunks[1].counts().values())
         assert sum(len(columns) for columns in found.values()) == 140 - lost
-        assert recording.losses[0].messages == lost
+        assert recording.lost_messages[0].messages == lost
         assert recording.integrity == "damaged"
         assert sum(account.lost for account in recording.accounts.values()) == lost
 
@@ -383,7 +383,9 @@ def test_metadata_is_not_believed(tmp_path: Path) -> None:
     metadata.write_text(text.replace("run.db3", str(outside)))
     with open_recording(bag) as recording:
         assert [file.parent for file in recording.files] == [bag]
-        assert any("secret.db3, which is not there" in loss.reason for loss in recording.losses)
+        assert any(
+            "secret.db3, which is not there" in loss.reason for loss in recording.lost_messages
+        )
     metadata.write_text(text.replace("message_count: 20", "message_count: 21"))
     with open_recording(bag) as recording:
         assert any("counts 21 messages on /odom" in note for note in recording.notes)
@@ -410,7 +412,7 @@ def test_statistics_that_count_more_than_there_is(tmp_path: Path) -> None:
         everything(recording)
         lost = [account for account in recording.accounts.values() if account.lost]
         assert [account.lost for account in lost] == [5]
-        assert recording.losses[0].reason == "counted by the container, but not in it"
+        assert recording.lost_messages[0].reason == "counted by the container, but not in it"
 
 
 def test_an_unknown_type_skips_its_topic_by_name(tmp_path: Path) -> None:
@@ -423,7 +425,7 @@ def test_an_unknown_type_skips_its_topic_by_name(tmp_path: Path) -> None:
         found = recording.read({"/odom": ["x"], "/bumper": ["data"]})
         assert list(found) == ["/bumper"]
         assert recording.accounts["/odom"].expected == recording.accounts["/odom"].lost == 20
-        assert [loss.topic for loss in recording.losses] == ["/odom"]
+        assert [loss.topic for loss in recording.lost_messages] == ["/odom"]
 
 
 def test_absurd_log_times_are_counted_by_name(tmp_path: Path) -> None:

@@ -162,7 +162,7 @@ def trip(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 
 
 def test_every_step_is_there_in_its_episode_and_no_other(trip: Trip) -> None:
-    assert trip.outcome.losses == []
+    assert trip.outcome.lost_messages == []
     assert trip.rows.num_rows == sum(trip.steps)
     episode = [index for index, steps in enumerate(trip.steps) for _ in range(steps)]
     assert trip.rows["episode_index"].to_pylist() == episode

@@ -38,7 +38,7 @@ def read(path: Path) -> tuple[int, list[str], int]:
         assert recording.integrity == "damaged"
         return (
             decoded,
-            [loss.reason for loss in recording.losses],
+            [loss.reason for loss in recording.lost_messages],
             sum(account.lost for account in accounts),
         )
 
@@ -60,20 +60,20 @@ def test_by_the_chunk_index(compression: CompressionType, tmp_path: Path) -> Non
     """The length of the third chunk's record is damaged, and nothing else."""
     path = write_mcap(tmp_path / "run.mcap", compression=compression)
     third = chunks_of(path)[2][0]
-    decoded, losses, lost = read(damaged(path, third + 1, HUGE))
+    decoded, reasons, lost = read(damaged(path, third + 1, HUGE))
     assert decoded == COUNT
     assert lost == 0
-    assert losses[0].startswith(f"cut short or damaged at byte {third:,}")
+    assert reasons[0].startswith(f"cut short or damaged at byte {third:,}")
 
 
 def test_a_chunk_that_is_gone_is_counted(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "run.mcap", use_statistics=True)
     third = chunks_of(path)[2][0]
     held = sum(McapFile(path)._contents.chunks[2].counts().values())
-    decoded, losses, lost = read(damaged(path, third, b"\x05" + HUGE + b"\xff" * 60))
+    decoded, reasons, lost = read(damaged(path, third, b"\x05" + HUGE + b"\xff" * 60))
     assert decoded == COUNT - held
     assert lost == held
-    assert any(f"chunk at byte {third:,} is lost" in loss for loss in losses)
+    assert any(f"chunk at byte {third:,} is lost" in loss for loss in reasons)
 
 
 def test_a_wrong_length_that_leads_astray(tmp_path: Path) -> None:
@@ -95,10 +95,10 @@ def test_without_a_summary_chunks_show_themselves(
     places = chunks_of(path)
     held = sum(McapFile(path)._contents.chunks[2].counts().values())
     wreck = b"\x05" + HUGE + b"\xff" * 60
-    decoded, losses, _ = read(damaged(path, places[2][0], wreck, drop_end=50))
+    decoded, reasons, _ = read(damaged(path, places[2][0], wreck, drop_end=50))
     assert decoded == COUNT - held
     lost = places[3][0] - places[2][0]
-    assert any(loss.startswith(f"{lost:,} bytes from byte {places[2][0]:,} on") for loss in losses)
+    assert any(loss.startswith(f"{lost:,} bytes from byte {places[2][0]:,} on") for loss in reasons)
 
 
 def test_twice_damaged_without_a_summary(tmp_path: Path) -> None:
@@ -108,9 +108,9 @@ def test_twice_damaged_without_a_summary(tmp_path: Path) -> None:
     held = sum(sum(chunks[at].counts().values()) for at in (2, 5))
     wreck = b"\x05" + HUGE + b"\xff" * 60
     damaged(path, places[5][0], wreck)
-    decoded, losses, _ = read(damaged(path, places[2][0], wreck, drop_end=50))
+    decoded, reasons, _ = read(damaged(path, places[2][0], wreck, drop_end=50))
     assert decoded == COUNT - held
-    assert sum("bytes from byte" in loss for loss in losses) == 3  # and what is left at the end
+    assert sum("bytes from byte" in loss for loss in reasons) == 3  # and what is left at the end
 
 
 def test_a_chunk_that_only_looks_like_one(tmp_path: Path) -> None:
@@ -120,9 +120,9 @@ def test_a_chunk_that_only_looks_like_one(tmp_path: Path) -> None:
     content = path.read_bytes()
     records = list(walk(content, len(MAGIC), len(content) - len(MAGIC)))
     at = [start - 9 for opcode, start, _ in records if opcode == Op.MESSAGE][70]
-    decoded, losses, _ = read(damaged(path, at, b"\x05" + HUGE + fake, drop_end=50))
+    decoded, reasons, _ = read(damaged(path, at, b"\x05" + HUGE + fake, drop_end=50))
     assert decoded == 70
-    assert any("bytes from byte" in loss for loss in losses)
+    assert any("bytes from byte" in loss for loss in reasons)
 
 
 def test_info_shows_what_was_lost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

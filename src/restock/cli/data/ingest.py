@@ -132,7 +132,7 @@ def as_json(outcome: Outcome) -> dict[str, Any]:
             for p, r in [(score["precision"], score["recall"])]
         ],
         "endings": outcome.endings,
-        "losses": outcome.losses,
+        "lost_messages": outcome.lost_messages,
         "notes": outcome.notes,
         **row,
     }
@@ -209,7 +209,7 @@ def show(outcome: Outcome) -> None:
         console.print(f"no {item['input']}: {item['instead']}", markup=False)
     for note in outcome.notes:
         console.print(note, markup=False, soft_wrap=True)
-    for loss in outcome.losses:
+    for loss in outcome.lost_messages:
         console.print(f"lost: {loss}", markup=False, soft_wrap=True)
     console.print()
 
