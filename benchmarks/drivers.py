@@ -20,12 +20,12 @@ import numpy as np
 
 from restock.stats import wilson
 from restock.train.twin.env.operator_policy import Operator
-from restock.train.twin.env.policies import Handover, PlannerFollower, Policy, RandomPolicy
+from restock.train.twin.env.policies import BehaviourPolicy, Handover, PlannerFollower, RandomPolicy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.episode import KINDS, EpisodeSpec
 from restock.train.twin.physics.perturbation import PERTURBATIONS
 
-DRIVERS: dict[str, Callable[[], Policy]] = {
+DRIVERS: dict[str, Callable[[], BehaviourPolicy]] = {
     "planner": PlannerFollower,
     "operator": Operator,
     "planner+operator": lambda: Handover(PlannerFollower(), Operator()),
@@ -44,7 +44,9 @@ TARGETS = {  # (driver, condition): lowest and highest success that will do
 }
 
 
-def drive(policy: Policy, kind: str, episodes: int, perturbation: str) -> dict[str, list[Any]]:
+def drive(
+    policy: BehaviourPolicy, kind: str, episodes: int, perturbation: str
+) -> dict[str, list[Any]]:
     """(success, bumped, seconds) of each episode, by condition and kind of block."""
     env = WarehouseVectorEnv(min(episodes, 32), perturbation=PERTURBATIONS[perturbation])
     env.set_episodes([EpisodeSpec(kind, FIRST_SEED + index) for index in range(episodes)])

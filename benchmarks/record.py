@@ -20,7 +20,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from restock.train.twin.recording.recorder import Plan, record
+from restock.train.twin.recording.recorder import RecordingPlan, record
 
 MOST_S_PER_MINUTE = 2.0
 MOST_GROWTH_MIB = 64
@@ -30,7 +30,9 @@ def measure(file_format: str, minutes: float) -> dict[str, Any]:
     """One recording at the default rates, in this process."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / ("log.mcap" if file_format == "mcap" else "log")
-        plan = Plan(format="mcap" if file_format == "mcap" else "rosbag2", minutes=minutes, seed=1)
+        plan = RecordingPlan(
+            format="mcap" if file_format == "mcap" else "rosbag2", minutes=minutes, seed=1
+        )
         begun = time.process_time()
         done = record(path, plan).describe()
         work_s = time.process_time() - begun

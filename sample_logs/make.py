@@ -71,7 +71,7 @@ def run_on_baseline() -> int:
 def record_all(folder: Path, *, quick: bool) -> dict[str, object]:
     """Both recordings; returns what was recorded in each."""
     from restock.train.twin.recording.publish import Rates
-    from restock.train.twin.recording.recorder import FIRST_NS, Plan, record
+    from restock.train.twin.recording.recorder import FIRST_NS, RecordingPlan, record
 
     # Rates as a fleet thins its logs out to: the control clock's 5 Hz for most topics.
     monday = Rates(odom=10, imu=10, joint_states=5, scan=5, amcl_pose=5, tf=5, bumper=5, plan=0.5)
@@ -87,15 +87,15 @@ def record_all(folder: Path, *, quick: bool) -> dict[str, object]:
         diagnostics=0.2,
     )
     plans = {
-        "amr_monday.mcap": Plan(format="mcap", minutes=24.0, seed=20260302, rates=monday),
-        "amr_tuesday": Plan(
+        "amr_monday.mcap": RecordingPlan(format="mcap", minutes=24.0, seed=20260302, rates=monday),
+        "amr_tuesday": RecordingPlan(
             format="rosbag2", minutes=2.4, seed=20260397, rates=tuesday, start_ns=FIRST_NS + DAY_NS
         ),
     }
     made: dict[str, object] = {}
     for name, plan in plans.items():
         if quick:
-            plan = Plan(plan.format, None, 2, plan.seed, rates=plan.rates, start_ns=plan.start_ns)
+            plan = RecordingPlan(plan.format, None, 2, plan.seed, rates=plan.rates, start_ns=plan.start_ns)
         done = record(folder / name, plan).describe()
         made[name] = {
             key: done[key]

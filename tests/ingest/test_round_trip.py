@@ -35,18 +35,18 @@ from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from support.kept_run import kept_run
 
+from restock.cli.record import load_policy
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 from restock.train.twin.recording.bag_writer import Format
-from restock.train.twin.recording.crew import FleetCrew
-from restock.train.twin.recording.drivers import HANDOVER
+from restock.train.twin.recording.drivers import BehaviourPolicies, ExternalPolicy
 from restock.train.twin.recording.fleet import Driven, Fleet
-from restock.train.twin.recording.missions import Mission, schedule
+from restock.train.twin.recording.missions import HANDOVER, Mission, schedule
 from restock.train.twin.recording.publish import ACCEL_LSB_MPS2, GYRO_LSB_RADPS, LIDAR_LSB_M
-from restock.train.twin.recording.recorder import HARDWARE, NOISELESS, Plan, load_policy, record
+from restock.train.twin.recording.recorder import HARDWARE, NOISELESS, RecordingPlan, record
 from restock.train.twin.recording.robot_topics import TOPICS
 
 TASK = load_profile("warehouse_amr").task
@@ -106,7 +106,7 @@ class Trip:
 
     case: Case
     folder: Path
-    plan: Plan = field(init=False)
+    plan: RecordingPlan = field(init=False)
     driven: list[Driven] = field(init=False)
     rows: pa.Table = field(init=False)
 
@@ -114,7 +114,7 @@ class Trip:
         case, policy = self.case, self.case.policy
         if policy == "run:":
             policy += str(kept_run(self.folder / "learner"))
-        self.plan = Plan(
+        self.plan = RecordingPlan(
             format=case.format,
             missions=MISSIONS,
             seed=7,
@@ -124,13 +124,16 @@ class Trip:
             hardware=case.hardware,
         )
         self.path = self.folder / ("log.mcap" if case.format == "mcap" else "log")
-        self.summary = record(self.path, self.plan)
+        loaded = load_policy(policy)
+        self.summary = record(self.path, self.plan, policy=loaded)
         # The same missions once more: the twin is deterministic, and nothing of it is on disk.
         fleet = Fleet(case.hardware, scan_hz=self.plan.rates.scan)
-        guest = load_policy(self.plan)
-        crew = FleetCrew(fleet.env.num_envs, seed=7, epsilon=case.epsilon, guest=guest)
-        self.missions = list(islice(_missions(self.plan, guest), MISSIONS))
-        self.driven = list(fleet.drive(iter(self.missions), crew))
+        external = loaded and ExternalPolicy(loaded, epsilon=case.epsilon or 0.0, seed=7)
+        drivers = BehaviourPolicies(
+            fleet.env.num_envs, seed=7, epsilon=case.epsilon, external=external
+        )
+        self.missions = list(islice(_missions(self.plan, loaded), MISSIONS))
+        self.driven = list(fleet.drive(iter(self.missions), drivers))
         store = self.folder / "store"
         self.outcome = ingest(self.path, load_profile("warehouse_amr"), store=StoreWriter(store))
         query = "FROM transitions ORDER BY episode_index, step_index"
@@ -151,8 +154,8 @@ class Trip:
         return [len(driven.action) for driven in self.driven]
 
 
-def _missions(plan: Plan, guest: Any) -> Any:
-    driver, version = (plan.policy, "1") if guest is None else (guest.name, guest.version)
+def _missions(plan: RecordingPlan, policy: Any) -> Any:
+    driver, version = (plan.policy, "1") if policy is None else (policy.name, policy.version)
     return schedule(plan.seed, plan.conditions, driver, plan.hardware, version=version)
 
 

@@ -38,7 +38,7 @@ from restock.train.twin.physics.perturbation import (
     load_perturbation,
     load_schedule,
 )
-from restock.train.twin.recording.recorder import HARDWARE, NOISELESS, Plan, record
+from restock.train.twin.recording.recorder import HARDWARE, NOISELESS, RecordingPlan, record
 
 BAGS = SHARED
 # Late, slow and on smaller wheels than anybody told the base; sensors as the stand-in has them.
@@ -60,7 +60,7 @@ def store_of(folder: Path, hardware: Perturbation, *, missions: int, seed: int =
     recording = folder / f"{seed}.mcap"
     record(
         recording,
-        Plan(missions=missions, seed=seed, conditions={"nominal": 1.0}, hardware=hardware),
+        RecordingPlan(missions=missions, seed=seed, conditions={"nominal": 1.0}, hardware=hardware),
     )
     ingest(recording, load_profile("warehouse_amr"), store=StoreWriter(folder / "store"))
     return folder / "store"

@@ -44,7 +44,7 @@ from restock.train.twin.calibration.trust import (
 )
 from restock.train.twin.floors.layout import default_warehouse
 from restock.train.twin.physics.perturbation import Perturbation
-from restock.train.twin.recording.recorder import Plan, record
+from restock.train.twin.recording.recorder import RecordingPlan, record
 
 # What the recorded robot is, and the nominal twin is not.
 TRUE = Perturbation(
@@ -59,7 +59,7 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Missions on a dry and on a slippery floor, by a robot that TRUE describes."""
     folder = tmp_path_factory.mktemp("gap")
     shares = {"nominal": 0.5, "wheel_slip": 0.5}
-    plan = Plan(missions=10, seed=5, conditions=shares, policy="planner", hardware=TRUE)
+    plan = RecordingPlan(missions=10, seed=5, conditions=shares, policy="planner", hardware=TRUE)
     record(folder / "log.mcap", plan)
     ingest(folder / "log.mcap", load_profile("warehouse_amr"), store=StoreWriter(folder / "store"))
     return folder / "store"

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from restock.train.twin.env.operator_policy import Operator
-from restock.train.twin.env.policies import Handover, PlannerFollower, Policy, RandomPolicy
+from restock.train.twin.env.policies import BehaviourPolicy, Handover, PlannerFollower, RandomPolicy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.episode import EpisodeSpec
 
 
-def success(policy: Policy, kind: str, count: int = 24) -> dict[str, float]:
+def success(policy: BehaviourPolicy, kind: str, count: int = 24) -> dict[str, float]:
     """Success by block kind ('none' outside blocked aisles), over fixed episodes."""
     env = WarehouseVectorEnv(count)
     env.set_episodes([EpisodeSpec(kind, 500 + index) for index in range(count)])

@@ -17,19 +17,20 @@ from rosbags.highlevel import AnyReader
 from support.kept_run import kept_run
 
 from restock import cli
+from restock.cli.record import load_policy
 from restock.errors import ConfigError, ExitCode
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 from restock.train.twin.recording.missions import BLOCK, FLEET, NATURAL, parse_shares, schedule
-from restock.train.twin.recording.recorder import HARDWARE, Plan, parse_rates, record
+from restock.train.twin.recording.recorder import HARDWARE, RecordingPlan, parse_rates, record
 
 
 def test_both_formats_hold_the_same_drive(tmp_path: Path) -> None:
     tables = []
     for name, file_format in (("a.mcap", "mcap"), ("a", "rosbag2")):
-        record(tmp_path / name, Plan(format=file_format, missions=1, seed=3))
+        record(tmp_path / name, RecordingPlan(format=file_format, missions=1, seed=3))
         store = tmp_path / f"store_{file_format}"
         ingest(tmp_path / name, load_profile("warehouse_amr"), store=StoreWriter(store))
         columns = "observation, action, reward, next_observation, terminated, truncated, stamp_ns"
@@ -43,7 +44,7 @@ def test_both_formats_hold_the_same_drive(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("policy", ["planner", "operator"])
 def test_one_driver_alone_can_be_asked_for(tmp_path: Path, policy: str) -> None:
-    summary = record(tmp_path / "log.mcap", Plan(missions=1, seed=3, policy=policy))
+    summary = record(tmp_path / "log.mcap", RecordingPlan(missions=1, seed=3, policy=policy))
     assert set(summary.policies) == {f"{policy} 1"}
     assert summary.succeeded["nominal"] == summary.missions["nominal"] == 1
 
@@ -157,11 +158,11 @@ def test_flags_from_python() -> None:
     assert parse_rates("odom=20,scan=5").odom == 20
     assert parse_rates("").imu == 50
     with pytest.raises(ConfigError, match="give minutes or missions"):
-        Plan()
+        RecordingPlan()
 
 
 def test_missions_on_other_floors_come_with_their_maps(tmp_path: Path) -> None:
-    plan = Plan(missions=2, seed=3, policy="planner", layouts="generated:train:2")
+    plan = RecordingPlan(missions=2, seed=3, policy="planner", layouts="generated:train:2")
     done = record(tmp_path / "log.mcap", plan)
     with AnyReader([tmp_path / "log.mcap"]) as reader:
         sizes = [
@@ -185,26 +186,24 @@ class _Creeper:
 
 
 def test_a_policy_of_your_own_drives_under_its_own_name(tmp_path: Path) -> None:
-    done = record(tmp_path / "log.mcap", Plan(missions=1, seed=3), policy=_Creeper())
+    done = record(tmp_path / "log.mcap", RecordingPlan(missions=1, seed=3), policy=_Creeper())
     assert set(done.policies) == {"creeper 3"}
     unsure = _Creeper()
     unsure.chance = 0.5
-    with pytest.raises(ConfigError, match="takes chances of its own"):
-        record(tmp_path / "b.mcap", Plan(missions=1, epsilon=0.1), policy=unsure)
+    with pytest.raises(ConfigError, match="is stochastic itself"):
+        record(tmp_path / "b.mcap", RecordingPlan(missions=1, epsilon=0.1), policy=unsure)
 
 
 def test_an_exported_policy_has_the_tag_of_its_run(tmp_path: Path) -> None:
     pytest.importorskip("onnx")
     pytest.importorskip("onnxruntime")
     from restock.train.evaluation.onnx_policy import export_onnx
-    from restock.train.twin.recording.drivers import load_guest
 
     run = kept_run(tmp_path / "learner")
     export_onnx(run, tmp_path / "p.onnx")
-    task = load_profile("warehouse_amr").task
     tags = {
-        (guest.name, guest.version)
+        (policy.name, policy.version)
         for name in (f"run:{run}", f"onnx:{tmp_path / 'p.onnx'}")
-        if (guest := load_guest(name, task)) is not None
+        if (policy := load_policy(name)) is not None
     }
     assert tags == {("dqn", "learner@7")}

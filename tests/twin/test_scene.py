@@ -15,7 +15,7 @@ from restock.train.twin.physics.model import PARKED_M
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.recording.bag_writer import Format
 from restock.train.twin.recording.messages import typestore
-from restock.train.twin.recording.recorder import HARDWARE, Plan, record
+from restock.train.twin.recording.recorder import HARDWARE, RecordingPlan, record
 from restock.train.twin.recording.robot_topics import TOPICS
 from restock.train.twin.recording.scene import (
     EMPTY,
@@ -103,7 +103,9 @@ def test_a_recording_holds_frames_map_and_scene_as_viewers_expect(
     tmp_path: Path, file_format: Format, name: str
 ) -> None:
     kinds = {"near_collision": 1.0, "blocked_aisle": 1.0}
-    done = record(tmp_path / name, Plan(format=file_format, missions=2, seed=4, conditions=kinds))
+    done = record(
+        tmp_path / name, RecordingPlan(format=file_format, missions=2, seed=4, conditions=kinds)
+    )
     found: dict[str, list[Any]] = {topic.name: [] for topic in TOPICS}
     with AnyReader([tmp_path / name]) as reader:
         for connection, _, data in reader.messages():

@@ -14,6 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.train.twin.env.interface import Policy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
 F64 = NDArray[np.float64]
@@ -24,20 +25,14 @@ SLIP_STEPS = 4
 MIN_HELD_STEPS = 15
 
 
-class Policy(Protocol):
-    """What drives a `WarehouseVectorEnv`."""
+class BehaviourPolicy(Policy, Protocol):
+    """A policy that says who chose each of its last actions."""
 
-    name: str
-    version: str
-    acting: NDArray[np.str_]  # (N,) who chose the last actions
+    acting: NDArray[np.str_]  # (N,) names
     acting_version: NDArray[np.str_]  # (N,)
 
-    def act(self, env: WarehouseVectorEnv, observation: NDArray[np.float32]) -> tuple[Actions, F64]:
-        """Actions (N,) and the probabilities (N,) they had."""
-        ...
 
-
-class Overseer(Policy, Protocol):
+class Overseer(BehaviourPolicy, Protocol):
     """A policy that can be called in, and knows when it is no longer needed."""
 
     def sees_trouble(self, env: WarehouseVectorEnv) -> NDArray[np.bool_]:
@@ -58,11 +53,11 @@ class SoftPolicy:
         self.acting_version = np.array([], "U16")
 
     def choose(self, env: WarehouseVectorEnv) -> Actions:
-        """The action (N,) it would take without chance."""
+        """The action (N,) it would take without exploration."""
         raise NotImplementedError
 
     def certain(self, env: WarehouseVectorEnv) -> NDArray[np.bool_]:
-        """Where (N,) it leaves nothing to chance; nowhere, unless a policy says so."""
+        """Where (N,) it does not explore; nowhere, unless a policy says so."""
         return np.zeros(env.num_envs, np.bool_)
 
     def act(self, env: WarehouseVectorEnv, observation: NDArray[np.float32]) -> tuple[Actions, F64]:
@@ -70,8 +65,8 @@ class SoftPolicy:
         chosen = self.choose(env)
         count = len(env.task.actions)
         epsilon = np.where(self.certain(env), 0.0, self.epsilon)
-        chance = self._rng.random(env.num_envs) < epsilon
-        action = np.where(chance, self._rng.integers(count, size=env.num_envs), chosen)
+        explores = self._rng.random(env.num_envs) < epsilon
+        action = np.where(explores, self._rng.integers(count, size=env.num_envs), chosen)
         probability = np.where(action == chosen, 1 - epsilon, 0.0) + epsilon / count
         self.acting = np.full(env.num_envs, self.name, "U16")
         self.acting_version = np.full(env.num_envs, self.version, "U16")
@@ -170,7 +165,7 @@ class Handover:
 
     version = "1"
 
-    def __init__(self, planner: Policy, operator: Overseer) -> None:
+    def __init__(self, planner: BehaviourPolicy, operator: Overseer) -> None:
         self.planner, self.operator = planner, operator
         self.name = f"{planner.name}+{operator.name}"
         self.events: list[HandoverEvent] = []

@@ -1,120 +1,122 @@
-"""Who can drive the recorded fleet: scripted drivers, and any policy that acts on observations.
+"""Who drives the recorded fleet: each robot by its own mission's driver, at its own turn.
 
-A policy is named as `restock eval` names it: `run:DIRECTORY` (what the run kept as its best),
-`onnx:FILE`. Whoever drives is tagged with a name, a version and the probability of every action,
-so that what it recorded is its own behaviour policy in the store.
+A driver is a script of `restock.train.twin.env.policies`, or any policy that acts on observations.
+Each is tagged with a name, a version and the probability of every action, so that what it drove is
+its own behaviour policy in the store.
 """
 
 from __future__ import annotations
-
-import hashlib
-from pathlib import Path
-from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import ConfigError
-from restock.ingest.task.task import Task
-from restock.train.twin.env.interface import epsilon_greedy
+from restock.train.twin.env.interface import Policy, epsilon_greedy
+from restock.train.twin.env.operator_policy import Operator
+from restock.train.twin.env.policies import (
+    BehaviourPolicy,
+    Handover,
+    PlannerFollower,
+    RandomPolicy,
+)
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.recording.missions import Mission
 
-HANDOVER = "handover"
-SCRIPTED = ("planner", "operator", "random")
-LEARNED = "dqn"  # the behaviour policy's name of what `restock train` made
-
-
-class Chooser(Protocol):
-    """What drives by observations: a run's policy, an ONNX file, one of your own."""
-
-    name: str
-    version: str
-
-    def act(
-        self, env: Any, observation: NDArray[np.float32]
-    ) -> tuple[NDArray[np.int64], NDArray[Any]]:
-        """Actions (N,) for observations (N, D), and the probabilities (N,) they had."""
-        ...
+F64 = NDArray[np.float64]
+Actions = NDArray[np.int64]
+_Key = tuple[str, str, bool]  # a mission's driver, its version, whether the operator takes over
 
 
-class Guest:
-    """A policy at the wheel of the fleet; with probability `epsilon` its action is any action."""
+class CarefulPlanner(PlannerFollower):
+    """The planner's next release, on a few robots at first: slows and stops farther away."""
 
-    def __init__(
-        self,
-        policy: Chooser,
-        *,
-        epsilon: float = 0.0,
-        seed: int = 0,
-        name: str | None = None,
-        version: str | None = None,
-    ) -> None:
+    version = "2"
+    stop_m = 0.40
+    slow_m = 1.20
+
+
+class ExternalPolicy:
+    """A policy from outside at the wheel; with probability `epsilon` its action is any action."""
+
+    def __init__(self, policy: Policy, *, epsilon: float = 0.0, seed: int = 0) -> None:
         self.policy, self.epsilon = policy, epsilon
-        self.name = policy.name if name is None else name
-        self.version = policy.version if version is None else version
+        self.name, self.version = policy.name, policy.version
         self._rng = np.random.default_rng([seed, 0x6775])
         self.acting = np.array([], np.str_)
         self.acting_version = np.array([], np.str_)
 
-    def act(
-        self, env: WarehouseVectorEnv, observation: NDArray[np.float32]
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def act(self, env: WarehouseVectorEnv, observation: NDArray[np.float32]) -> tuple[Actions, F64]:
         """Actions (N,) and the probabilities (N,) they had.
 
         Raises:
-            ConfigError: epsilon is asked of a policy that leaves something to chance itself.
+            ConfigError: epsilon is set for a policy that is itself stochastic.
         """
-        action, probability = self.policy.act(env, observation)
-        chance = np.asarray(probability, np.float64)
+        action, given = self.policy.act(env, observation)
+        probability = np.asarray(given, np.float64)
         if self.epsilon:
-            if (chance < 1).any():
+            if (probability < 1).any():
                 raise ConfigError(
-                    f"{self.name} takes chances of its own: what it would have given to an action"
-                    " that epsilon takes is not known",
+                    f"{self.name} is stochastic itself: the probability that it would have given"
+                    " to an action that epsilon chooses is not known",
                     where="--epsilon",
                     remedy="leave it out",
                 )
             actions = len(env.task.actions)
             action, explored = epsilon_greedy(action, actions, self.epsilon, self._rng)
-            chance = explored.astype(np.float64)
+            probability = explored.astype(np.float64)
         self.acting = np.full(len(action), self.name)
         self.acting_version = np.full(len(action), self.version)
-        return np.asarray(action, np.int64), chance
+        return np.asarray(action, np.int64), probability
 
 
-def load_guest(name: str, task: Task, *, epsilon: float = 0.0, seed: int = 0) -> Guest | None:
-    """The policy that `run:DIRECTORY` or `onnx:FILE` names; None for the names of scripts.
+class BehaviourPolicies:
+    """The drivers of N robots that run side by side. A driver that no robot has now does not act.
 
-    Raises:
-        ConfigError: no such policy, or one of another task.
-        RunError: a run without a policy, or a damaged one.
+    Args:
+        epsilon: share of random actions of the scripted drivers; None: each one's default.
+        external: drives all missions in place of the scripts.
     """
-    if name in (HANDOVER, *SCRIPTED):
-        return None
-    from restock.train.evaluation.eval_run import load_policy
 
-    policy = load_policy(name, task)
-    if policy is None:
-        raise ConfigError(
-            f"there is no policy {name!r}",
-            where="--policy",
-            remedy=f"give {', '.join((HANDOVER, *SCRIPTED))}, run:DIRECTORY or onnx:FILE",
-        )
-    if policy.version:  # made by Restock: the same policy has the same tag from a run or a file
-        return Guest(policy, epsilon=epsilon, seed=seed, name=LEARNED)
-    digest = hashlib.sha256(Path(name.removeprefix("onnx:")).read_bytes()).hexdigest()[:12]
-    return Guest(policy, epsilon=epsilon, seed=seed, name="onnx", version=digest)
+    def __init__(
+        self,
+        robots: int,
+        *,
+        seed: int,
+        epsilon: float | None = None,
+        external: ExternalPolicy | None = None,
+    ) -> None:
+        self._seed, self._external = seed, external
+        self._epsilon = {} if epsilon is None else {"epsilon": epsilon}
+        self._drivers: dict[_Key, BehaviourPolicy] = {}
+        self._keys: list[_Key] = [("planner", "1", False)] * robots
 
+    def begin(self, robot: int, mission: Mission) -> None:
+        """Robot `robot` starts a mission."""
+        self._keys[robot] = (mission.driver, mission.version, mission.handover)
 
-def check_epsilon(epsilon: float | None, policy: str) -> None:
-    """Raises ConfigError where `policy` cannot take that share of random actions."""
-    if epsilon is None:
-        return
-    if not 0 <= epsilon <= 1:
-        raise ConfigError(f"must be in [0, 1], got {epsilon}", where="--epsilon")
-    if policy == "random":
-        raise ConfigError(
-            "random takes every action with the same probability already",
-            where="--epsilon",
-            remedy="leave it out",
-        )
+    def act(self, env: WarehouseVectorEnv) -> tuple[Actions, list[tuple[str, str]], F64]:
+        """Actions (N,), who chose each as (policy, version), and its probability (N,)."""
+        action = np.zeros(env.num_envs, np.int64)
+        probability = np.ones(env.num_envs)
+        tags = [("", "")] * env.num_envs
+        for key in sorted(set(self._keys)):
+            if key not in self._drivers:
+                self._drivers[key] = self._make(*key)
+            driver = self._drivers[key]
+            actions, probabilities = driver.act(env, env.observation)
+            for robot in (robot for robot, own in enumerate(self._keys) if own == key):
+                action[robot], probability[robot] = actions[robot], probabilities[robot]
+                tags[robot] = (str(driver.acting[robot]), str(driver.acting_version[robot]))
+        return action, tags, probability
+
+    def _make(self, name: str, version: str, handover: bool) -> BehaviourPolicy:
+        if self._external is not None:
+            return self._external
+        seed = self._seed * 16 + len(self._drivers)  # every driver draws from its own
+        if name == "random":
+            return RandomPolicy(seed=seed)
+        if name == "operator":
+            return Operator(seed=seed, **self._epsilon)
+        kind = CarefulPlanner if version == "2" else PlannerFollower
+        planner = kind(seed=seed, **self._epsilon)
+        return Handover(planner, Operator(seed=seed, **self._epsilon)) if handover else planner

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -20,26 +20,13 @@ from restock.train.twin.physics.model import CHASSIS_Z_M
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 from restock.train.twin.physics.simulation import BLOCK_S, Live
 from restock.train.twin.recording.drive import Drive, Motion
+from restock.train.twin.recording.drivers import BehaviourPolicies
 from restock.train.twin.recording.missions import Mission
 from restock.train.twin.recording.scene import Scene
 
 F64 = NDArray[np.float64]
 ROBOTS = 8  # at a time
 MOTION_PERIOD_S = 0.02
-
-
-class Crew(Protocol):
-    """Who drives: acts for every robot, each by its own mission's driver."""
-
-    def begin(self, robot: int, mission: Mission) -> None:
-        """Robot `robot` starts a mission."""
-        ...
-
-    def act(
-        self, env: WarehouseVectorEnv
-    ) -> tuple[NDArray[np.int64], list[tuple[str, str]], NDArray[np.float64]]:
-        """Actions (N,), who chose each as (policy, version), and its probability (N,)."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -114,21 +101,21 @@ class Fleet:
         self._scan: F64 | None = None  # true ranges half-way through it
         self.env.set_block_callback(self._note_motion, MOTION_PERIOD_S)
 
-    def drive(self, missions: Iterator[Mission], crew: Crew) -> Iterator[Driven]:
+    def drive(self, missions: Iterator[Mission], policies: BehaviourPolicies) -> Iterator[Driven]:
         """Drive missions, for as long as there are more and the caller wants them."""
         env, numbered = self.env, enumerate(missions)
         finished: dict[int, Driven] = {}
         delivered = 0
-        self._begin(np.arange(env.num_envs), numbered, crew)
+        self._begin(np.arange(env.num_envs), numbered, policies)
         while any(log is not None for log in self._logs):
-            action, policy, probability = crew.act(env)
+            action, tags, probability = policies.act(env)
             self._motion, self._scan = [], None
             _, reward, terminated, truncated, info = env.step(action)
             ended = np.flatnonzero(terminated | truncated)
             for robot, log in enumerate(self._logs):
                 if log is not None:
                     log.action.append(int(action[robot]))
-                    log.policy.append((*policy[robot], float(probability[robot])))
+                    log.policy.append((*tags[robot], float(probability[robot])))
                     log.reward.append(float(reward[robot]))
                     log.truth.append(str(info["true_condition"][robot]))
                     self._note_step(log, robot, info)
@@ -138,13 +125,16 @@ class Fleet:
                         log, robot, info, terminated=bool(terminated[robot])
                     )
             if len(ended):
-                self._begin(ended, numbered, crew)
+                self._begin(ended, numbered, policies)
             while delivered in finished:
                 yield finished.pop(delivered)
                 delivered += 1
 
     def _begin(
-        self, robots: NDArray[np.int64], missions: Iterator[tuple[int, Mission]], crew: Crew
+        self,
+        robots: NDArray[np.int64],
+        missions: Iterator[tuple[int, Mission]],
+        policies: BehaviourPolicies,
     ) -> None:
         """Give each of these robots its next mission; one without any drives on unrecorded."""
         env = self.env
@@ -167,7 +157,7 @@ class Fleet:
             log.patches = env.simulation.patches[robot].copy()
             self._logs[robot] = log
             self._note_tick(log, robot, env.signals)
-            crew.begin(robot, mission)
+            policies.begin(robot, mission)
 
     def _note_motion(self, live: Live) -> None:
         self._motion.append(live)

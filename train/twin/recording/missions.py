@@ -10,8 +10,9 @@ import numpy as np
 from restock.errors import ConfigError
 from restock.train.twin.physics.episode import KINDS, EpisodeSpec
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
-from restock.train.twin.recording.drivers import HANDOVER
 
+HANDOVER = "handover"  # the fleet: planners, and an operator who takes over from them
+SCRIPTED = (HANDOVER, "planner", "operator", "random")
 # What a site that runs well sees.
 NATURAL = {"nominal": 0.80, "wheel_slip": 0.07, "blocked_aisle": 0.07, "near_collision": 0.06}
 # How the fleet is driven: the planner (and its next release, on a few robots), whom an operator

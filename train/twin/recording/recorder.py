@@ -19,17 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import ConfigError
-from restock.ingest.profile.profile import load_profile
+from restock.train.twin.env.interface import Policy
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.physics.model import TRACK_M, WHEEL_RADIUS_M
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 from restock.train.twin.physics.simulation import LIDAR_BEAMS
 from restock.train.twin.recording.bag_writer import Format, recording_sink
-from restock.train.twin.recording.crew import FleetCrew
 from restock.train.twin.recording.drive import Lidar
-from restock.train.twin.recording.drivers import HANDOVER, Chooser, Guest, check_epsilon, load_guest
+from restock.train.twin.recording.drivers import BehaviourPolicies, ExternalPolicy
 from restock.train.twin.recording.fleet import Fleet
-from restock.train.twin.recording.missions import NATURAL, schedule
+from restock.train.twin.recording.missions import HANDOVER, NATURAL, SCRIPTED, schedule
 from restock.train.twin.recording.odometer import Odometer
 from restock.train.twin.recording.publish import Rates, Robot
 from restock.train.twin.recording.robot_topics import TOPICS
@@ -69,7 +68,7 @@ MAP_CELL_M = 0.1
 
 
 @dataclass(frozen=True)
-class Plan:
+class RecordingPlan:
     """What is to be recorded. `minutes` or `missions` says when to stop."""
 
     format: Format = "mcap"
@@ -77,7 +76,7 @@ class Plan:
     missions: int | None = None
     seed: int = 0
     conditions: Mapping[str, float] = field(default_factory=lambda: dict(NATURAL))
-    policy: str = HANDOVER  # or planner, operator, random, run:DIRECTORY, onnx:FILE
+    policy: str = HANDOVER  # or planner, operator, random, or what `record` is given
     epsilon: float | None = None  # share of random actions; None: what each driver has of its own
     rates: Rates = field(default_factory=Rates)
     hardware: Perturbation | Schedule = HARDWARE  # a schedule draws one for every mission
@@ -94,7 +93,14 @@ class Plan:
                 raise ConfigError(f"{name} must be above 0, got {value}", where="recording")
         if self.seed < 0:
             raise ConfigError(f"seed must be 0 or more, got {self.seed}", where="recording")
-        check_epsilon(self.epsilon, self.policy)
+        if self.epsilon is not None and not 0 <= self.epsilon <= 1:
+            raise ConfigError(f"must be in [0, 1], got {self.epsilon}", where="--epsilon")
+        if self.epsilon is not None and self.policy == "random":
+            raise ConfigError(
+                "random takes every action with the same probability already",
+                where="--epsilon",
+                remedy="leave it out",
+            )
 
     def describe(self) -> dict[str, Any]:
         """As JSON has it."""
@@ -118,7 +124,7 @@ class Summary:
     """What was recorded."""
 
     path: Path
-    plan: Plan
+    plan: RecordingPlan
     missions: Counter[str] = field(default_factory=Counter)  # by kind
     succeeded: Counter[str] = field(default_factory=Counter)
     steps: Counter[str] = field(default_factory=Counter)  # by true condition
@@ -150,22 +156,30 @@ class Summary:
 
 def record(
     path: Path,
-    plan: Plan,
+    plan: RecordingPlan,
     *,
-    policy: Chooser | None = None,
+    policy: Policy | None = None,
     on_mission: Callable[[int, float], None] | None = None,
 ) -> Summary:
     """Drive and write a recording; `on_mission(1, minutes)` is called after each mission.
 
-    A `policy` of your own drives in place of the one that the plan names: whatever has a `name`,
-    a `version` and `act(env, observation)`.
+    A `policy` drives in place of the script that the plan names: a trained one, or whatever of your
+    own has a `name`, a `version` and `act(env, observation)`.
 
     Raises:
         RecordingError: there is something at `path`, or its folder cannot be written to.
-        ConfigError, RunError: the plan's policy cannot be loaded.
+        ConfigError: the plan names no script, and no policy was given.
     """
     begun = time.perf_counter()
-    guest = load_policy(plan) if policy is None else _guest(plan, policy)
+    external = None
+    if policy is not None:
+        external = ExternalPolicy(policy, epsilon=plan.epsilon or 0.0, seed=plan.seed)
+    elif plan.policy not in SCRIPTED:
+        raise ConfigError(
+            f"there is no policy {plan.policy!r}",
+            where="recording",
+            remedy=f"give {', '.join(SCRIPTED)}, or a policy that was loaded",
+        )
     fleet = Fleet(
         plan.hardware,
         layouts=plan.layouts,
@@ -174,13 +188,15 @@ def record(
     )
     robot = _robot(plan, fleet)
     summary = Summary(path, plan)
-    driver, version = (plan.policy, "1") if guest is None else (guest.name, guest.version)
+    driver, version = (plan.policy, "1") if policy is None else (policy.name, policy.version)
     missions = schedule(plan.seed, plan.conditions, driver, plan.hardware, version=version)
-    crew = FleetCrew(fleet.env.num_envs, seed=plan.seed, epsilon=plan.epsilon, guest=guest)
+    drivers = BehaviourPolicies(
+        fleet.env.num_envs, seed=plan.seed, epsilon=plan.epsilon, external=external
+    )
     start_ns = plan.start_ns
     with recording_sink(path, plan.format, TOPICS) as sink:
         floor: Warehouse | None = None
-        for driven in fleet.drive(islice(missions, plan.missions), crew):
+        for driven in fleet.drive(islice(missions, plan.missions), drivers):
             if driven.floor is not floor:  # the map comes once, and again on another floor
                 floor = driven.floor
                 cells = _occupied(floor, MAP_CELL_M)
@@ -207,20 +223,6 @@ def record(
                 break
     summary.work_s = time.perf_counter() - begun
     return summary
-
-
-def load_policy(plan: Plan) -> Guest | None:
-    """The policy that the plan names; None where scripts drive.
-
-    Raises:
-        ConfigError, RunError: there is none, or it is one of another task.
-    """
-    task = load_profile("warehouse_amr").task
-    return load_guest(plan.policy, task, epsilon=plan.epsilon or 0.0, seed=plan.seed)
-
-
-def _guest(plan: Plan, policy: Chooser) -> Guest:
-    return Guest(policy, epsilon=plan.epsilon or 0.0, seed=plan.seed)
 
 
 def parse_rates(text: str) -> Rates:
@@ -252,7 +254,7 @@ def parse_rates(text: str) -> Rates:
     return replace(Rates(), **given)
 
 
-def _robot(plan: Plan, fleet: Fleet) -> Robot:
+def _robot(plan: RecordingPlan, fleet: Fleet) -> Robot:
     bearings = fleet.env.simulation.bearings_rad
     lidar = Lidar(
         angle_min_rad=float(bearings[0]),

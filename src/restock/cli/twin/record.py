@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from restock.errors import RestockError
+from restock.errors import ConfigError, RestockError
+
+if TYPE_CHECKING:
+    from restock.train.twin.env.interface import Policy
+
+LEARNED = "dqn"  # the behaviour policy's name of what `restock train` made
 
 
 @dataclass
@@ -70,8 +76,7 @@ class RecordCommand:
         from restock.train.twin.recording.recorder import (
             HARDWARE,
             NOISELESS,
-            Plan,
-            load_policy,
+            RecordingPlan,
             parse_rates,
             record,
         )
@@ -81,7 +86,7 @@ class RecordCommand:
         if self.exact and self.perturbation is not None:
             raise RestockError("--exact and --perturbation exclude each other", remedy="give one")
         hardware = NOISELESS if self.exact else HARDWARE
-        plan = Plan(
+        plan = RecordingPlan(
             format=self.format or ("mcap" if self.out.suffix == ".mcap" else "rosbag2"),
             minutes=5.0 if self.minutes is None and self.missions is None else self.minutes,
             missions=self.missions,
@@ -97,7 +102,7 @@ class RecordCommand:
                 else find_perturbation(self.perturbation, where="--perturbation")
             ),
         )
-        load_policy(plan)  # what is wrong with it is said before anything is driven
+        policy = load_policy(plan.policy)
         floors = open_floors(plan.layouts)
         refuse_unfit(floors, [kind for kind, share in plan.conditions.items() if share])
         refuse_existing(self.out)
@@ -113,11 +118,40 @@ class RecordCommand:
             def driven(missions: int, minutes: float) -> None:
                 advance(minutes if plan.minutes is not None else missions)
 
-            done = record(self.out, plan, on_mission=driven).describe()
+            done = record(self.out, plan, policy=policy, on_mission=driven).describe()
         if self.json:
             output.print_json(done)
         else:
             _print_recording(done)
+
+
+def load_policy(name: str) -> Policy | None:
+    """The policy that `run:DIRECTORY` or `onnx:FILE` names, tagged; None for the names of scripts.
+
+    Raises:
+        ConfigError: no such policy, or one of another task.
+        RunError: a run without a policy, or a damaged one.
+    """
+    from restock.train.twin.recording.missions import SCRIPTED
+
+    if name in SCRIPTED:
+        return None
+    from restock.ingest.profile.profile import load_profile
+    from restock.train.evaluation import eval_run
+
+    policy = eval_run.load_policy(name, load_profile("warehouse_amr").task)
+    if policy is None:
+        raise ConfigError(
+            f"there is no policy {name!r}",
+            where="--policy",
+            remedy=f"give {', '.join(SCRIPTED)}, run:DIRECTORY or onnx:FILE",
+        )
+    if policy.version:  # made by Restock: the same policy has the same tag from a run or a file
+        policy.name = LEARNED
+    else:
+        file = Path(name.removeprefix("onnx:"))
+        policy.name, policy.version = "onnx", hashlib.sha256(file.read_bytes()).hexdigest()[:12]
+    return policy
 
 
 def _print_recording(done: dict[str, Any]) -> None:
