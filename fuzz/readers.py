@@ -48,7 +48,7 @@ with (
     from restock.ingest.decoding.decoders import decoder_of, type_of
     from restock.ingest.decoding.field_paths import CannotDecode
     from restock.ingest.decoding.row_by_row import RowDecoder
-    from restock.ingest.describe import describe
+    from restock.ingest.describe import describe_recording
 
 LONGEST_INPUT = 1 << 14
 SECONDS_EACH = 30
@@ -90,7 +90,7 @@ def metadata(data: bytes) -> None:
 
 def _read(path: Path, *, salvage: bool) -> None:
     try:
-        describe(path, salvage=salvage)
+        describe_recording(path, salvage=salvage)
         with open_recording(path, salvage=salvage) as opened:
             wanted = {topic: opened.leaves(topic)[:MOST_LEAVES] for topic in opened.topics}
             found = opened.read(wanted)

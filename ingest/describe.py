@@ -15,7 +15,7 @@ NANOSECONDS = 1_000_000_000
 JUMP_S = 1.0  # a change of (log time - stamp) that means a clock was set, as in profiles
 
 
-def describe(
+def describe_recording(
     path: Path | str,
     *,
     typestore: str | None = None,

@@ -39,7 +39,7 @@ class Relabelled:
     scores: list[LabelScore] = field(default_factory=list)
 
 
-def relabel(
+def relabel_store(
     store: StoreWriter,
     conditions_of: Callable[[str], Sequence[Condition]],
     *,

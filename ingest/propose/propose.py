@@ -52,7 +52,7 @@ class Commands:
     topic: str = ""
 
 
-def propose(recording: Recording, name: str) -> Proposal:
+def propose_profile(recording: Recording, name: str) -> Proposal:
     """A profile for recordings like this one."""
     topics = {n: t for n, t in recording.topics.items() if t.skipped is None and t.expected}
     roles = {role: topics_for(topics, kinds) for role, kinds in KINDS.items()}

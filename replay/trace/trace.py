@@ -34,7 +34,7 @@ class Trace:
 
 
 @dataclass(frozen=True)
-class Where:
+class TracePlaces:
     """Places that are not where they were, and what a trace may use."""
 
     store: str | None = None
@@ -43,7 +43,7 @@ class Where:
     profile: str | None = None
 
 
-def trace(place: str | Path, row: str, where: Where | None = None) -> Trace:
+def trace_row(place: str | Path, row: str, where: TracePlaces | None = None) -> Trace:
     """Follow one row of a run, a panel or a store down to its messages.
 
     Args:
@@ -57,7 +57,7 @@ def trace(place: str | Path, row: str, where: Where | None = None) -> Trace:
             where it was.
         RecordingError: the recording given is not the one the row is of.
     """
-    path, where = Path(place), where or Where()
+    path, where = Path(place), where or TracePlaces()
     found = Trace()
     if (path / RUN_CONFIG).is_file():
         _of_run(found, path, row, where)
@@ -87,7 +87,7 @@ def audited_rows(run: str | Path, limit: int = 20) -> list[dict[str, Any]]:
         return rows_of(connection, sql_file("trace_rows.sql"), {"file": table, "limit": limit})
 
 
-def _of_run(found: Trace, run: Path, row: str, where: Where) -> None:
+def _of_run(found: Trace, run: Path, row: str, where: TracePlaces) -> None:
     document = json.loads((run / RUN_CONFIG).read_text(encoding="utf-8"))
     found.audit = audit = _audit_row(run, row)
     if audit["source"] == "fresh":
@@ -115,7 +115,7 @@ def _of_run(found: Trace, run: Path, row: str, where: Where) -> None:
     _of_panel(found, panel, int(number), where)
 
 
-def _of_panel(found: Trace, panel: Panel, number: int, where: Where) -> None:
+def _of_panel(found: Trace, panel: Panel, number: int, where: TracePlaces) -> None:
     if not 0 <= number < len(panel):
         raise PanelError(f"has rows 0 to {len(panel) - 1}, not {number}", where=str(panel.path))
     meta = panel.meta.slice(number, 1).to_pylist()[0]
@@ -142,7 +142,7 @@ def _of_panel(found: Trace, panel: Panel, number: int, where: Where) -> None:
         found.notes.append("the observation in the store is not the one that was packed")
 
 
-def _origin(sources: list[Source], transition: int, where: Where) -> Origin:
+def _origin(sources: list[Source], transition: int, where: TracePlaces) -> Origin:
     return find_origin(sources, transition, recording=where.recording, profile=where.profile)
 
 

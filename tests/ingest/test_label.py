@@ -13,7 +13,7 @@ from support.paths import ROOT
 from restock.cli import main
 from restock.errors import StoreError
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.relabel import relabel
+from restock.ingest.relabel import relabel_store
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.conditions import Condition, label, labels_version
 from restock.replay.store.store import Store
@@ -51,7 +51,7 @@ def test_the_same_conditions_over_the_store_give_the_same_labels(store, capsys):
     profile = load_profile(store.parent / "amr.toml")
     # One more condition that never holds: another version, the same labels otherwise.
     conditions = [*profile.conditions, Condition("never", "pre", "false")]
-    outcomes, version = relabel(StoreWriter(store), lambda name: conditions)
+    outcomes, version = relabel_store(StoreWriter(store), lambda name: conditions)
     found = {outcome.source_file: outcome.changed for outcome in outcomes}
     assert set(found.values()) == {0}
     assert version is not None
@@ -125,7 +125,7 @@ def test_a_recording_that_was_ingested_meanwhile_is_left_alone(store, tmp_path):
 
     writer.rows = rows_and_a_rival  # type: ignore[method-assign]
     with pytest.raises(StoreError, match="ingested anew meanwhile"):
-        relabel(writer, conditions_of)
+        relabel_store(writer, conditions_of)
     assert {name for (name,) in rows(store, "condition")} == {"nominal", "soon"}
 
 
@@ -134,7 +134,7 @@ def test_rows_without_their_episodes_ends_are_refused(store):
     original = writer.rows
     writer.rows = lambda *key: original(*key).replace_schema_metadata(None)  # type: ignore[method-assign]
     with pytest.raises(StoreError, match="without the ends of their episodes"):
-        relabel(writer, lambda name: [Condition("always", "pre", "true")])
+        relabel_store(writer, lambda name: [Condition("always", "pre", "true")])
 
 
 def test_wrong_usage(store, tmp_path, capsys):

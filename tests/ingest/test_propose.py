@@ -14,7 +14,7 @@ from support.paths import ROOT, SHARED
 from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.profile.profile import load_profile, parse_profile
-from restock.ingest.propose.propose import propose
+from restock.ingest.propose.propose import propose_profile
 
 SAMPLES = ROOT / "sample_logs"
 ROBOTS = {  # of others -> transitions of the proposal
@@ -69,7 +69,7 @@ def test_of_the_sample_bag_and_with_all_its_signals(tmp_path, capsys):
 
 def test_it_says_rates_roles_clock_lidar_and_frames(capsys):
     with open_recording(SAMPLES / "amr_tuesday") as recording:
-        text = propose(recording, "amr").toml
+        text = propose_profile(recording, "amr").toml
     assert re.search(r"^# /odom +nav_msgs/msg/Odometry +\d+\.\d Hz  wheels$", text, re.M)
     assert 'alignment = "header.stamp"  # log time is 0.002 s ahead of it' in text
     assert "range_min_m = 0.05" in text
@@ -83,7 +83,7 @@ def test_without_a_pose_topic_the_pose_is_from_transforms(tmp_path, capsys):
     """A recording of the sample's topics but for /amcl_pose."""
     with open_recording(SAMPLES / "amr_tuesday") as recording:
         del recording.topics["/amcl_pose"]
-        text = propose(recording, "amr").toml
+        text = propose_profile(recording, "amr").toml
     assert "# [inputs.pose]  # from transforms, by [frames]" in text
     profile = parse_profile(text, where="p")
     assert profile.inputs.pose is None

@@ -22,7 +22,7 @@ from restock.ingest.containers.open_recording import (
     recordings_in,
 )
 from restock.ingest.decoding.columns import Ragged, equal
-from restock.ingest.describe import describe
+from restock.ingest.describe import describe_recording
 
 
 def everything(recording: Recording) -> dict[str, TopicColumns]:
@@ -463,7 +463,7 @@ def test_absurd_log_times_are_counted_by_name(tmp_path: Path) -> None:
             assert (columns.publish_time_ns > 0).all()
             reasons = recording.accounts["/t"].reasons
             assert reasons == {"logged at an absurd time, before 1970 or after 2262": 3}
-        assert any("absurd stamps" in note for note in describe(file)["notes"])
+        assert any("absurd stamps" in note for note in describe_recording(file)["notes"])
 
 
 # -- recordings that other people made ------------------------------------------------------

@@ -28,7 +28,7 @@ from restock.replay.panel.panel import Panel
 from restock.replay.places import open_place
 from restock.replay.store.audit import load_audits, load_thresholds, run_audits
 from restock.replay.store.store import Store
-from restock.replay.trace.trace import Where, audited_rows, trace
+from restock.replay.trace.trace import TracePlaces, audited_rows, trace_row
 
 RECORDING = ROOT / "sample_logs" / "amr_tuesday"
 MIXTURE = parse_mixture("n_step = 3\n[each_condition]\nshare = 'natural'\n[held_out]\nby = 'none'")
@@ -101,7 +101,7 @@ def write_run(path: Path, panel: Panel) -> None:
 
 
 def test_an_audited_row_leads_to_the_messages_it_was_made_of(places: Places) -> None:
-    found = trace(places.run, "7/1", Where(recording=RECORDING))
+    found = trace_row(places.run, "7/1", TracePlaces(recording=RECORDING))
     assert found.panel is not None
     assert found.panel["row"] == 100
     assert found.panel["same_bytes_as_sampled"]
@@ -136,7 +136,7 @@ def test_the_parts_of_a_reward_sum_to_it(places: Places) -> None:
     steps = places.rows("FROM transitions ORDER BY transition_id")
     whole = 0
     for row in steps[::80]:
-        origin = trace(places.store, str(row["transition_id"])).origin
+        origin = trace_row(places.store, str(row["transition_id"])).origin
         assert origin is not None
         last = row["terminated"] or row["truncated"]
         assert (origin.reward_parts is None) == last
@@ -148,15 +148,15 @@ def test_the_parts_of_a_reward_sum_to_it(places: Places) -> None:
 
 def test_every_row_of_the_recording_finds_its_tick(places: Places) -> None:
     for row in places.rows("FROM transitions ORDER BY hash(transition_id) LIMIT 3"):
-        where = Where(recording=RECORDING)
-        origin = trace(places.store, str(row["transition_id"]), where).origin
+        where = TracePlaces(recording=RECORDING)
+        origin = trace_row(places.store, str(row["transition_id"]), where).origin
         assert origin is not None
         imu = next(message for message in origin.messages if message.input == "imu")
         assert imu.fields["angular_velocity.z"] == pytest.approx(row["gyro_yaw_rate_radps"])
 
 
 def test_a_fresh_row_leads_to_what_lays_its_episode_out_again(places: Places) -> None:
-    found = trace(places.run, "7/3")
+    found = trace_row(places.run, "7/3")
     assert found.origin is None
     assert found.episode == {
         "run_seed": 5,
@@ -181,27 +181,27 @@ def test_rows_are_listed_of_runs_alone(places: Places, capsys: pytest.CaptureFix
 
 
 def test_a_row_of_the_panel_can_be_followed_too(places: Places) -> None:
-    found = trace(places.panel, "5")
+    found = trace_row(places.panel, "5")
     assert found.panel is not None
     assert found.origin is not None
     assert found.panel["transition_id"] == found.origin.transition["transition_id"]
     with pytest.raises(PanelError, match="has rows 0 to"):
-        trace(places.panel, "1000000")
+        trace_row(places.panel, "1000000")
 
 
 def test_what_is_not_there_is_said(places: Places, tmp_path: Path) -> None:
     with pytest.raises(RunError, match="names no audit row"):
-        trace(places.run, "12")
+        trace_row(places.run, "12")
     with pytest.raises(RunError, match="was not audited"):
-        trace(places.run, "8/0")
+        trace_row(places.run, "8/0")
     with pytest.raises(StoreError, match="no transition 5"):
-        trace(places.store, "5")
+        trace_row(places.store, "5")
     with pytest.raises(StoreError, match="is no transition id"):
-        trace(places.store, "seven")
+        trace_row(places.store, "seven")
     with pytest.raises(StoreError, match="neither a run, a panel nor a store"):
-        trace(tmp_path, "1")
+        trace_row(tmp_path, "1")
     with pytest.raises(StoreError, match="nothing is there"):
-        trace(tmp_path / "nowhere", "1")
+        trace_row(tmp_path / "nowhere", "1")
 
 
 def test_places_that_were_moved_are_asked_for_and_taken(places: Places, tmp_path: Path) -> None:
@@ -212,24 +212,24 @@ def test_places_that_were_moved_are_asked_for_and_taken(places: Places, tmp_path
     write_run(tmp_path / "run", Panel.open(panel))
     store.rename(tmp_path / "elsewhere")
     with pytest.raises(StoreError, match=r"--store"):
-        trace(tmp_path / "run", "7/0")
+        trace_row(tmp_path / "run", "7/0")
     panel.rename(tmp_path / "moved")
     with pytest.raises(PanelError, match=r"--panel"):
-        trace(tmp_path / "run", "7/0")
-    moved = Where(store=str(tmp_path / "elsewhere"), panel=tmp_path / "moved")
-    found = trace(tmp_path / "run", "7/0", moved)
+        trace_row(tmp_path / "run", "7/0")
+    moved = TracePlaces(store=str(tmp_path / "elsewhere"), panel=tmp_path / "moved")
+    found = trace_row(tmp_path / "run", "7/0", moved)
     assert found.origin is not None
     assert found.origin.store["path"] == str(tmp_path / "elsewhere")
     build_panel(recording_transitions(1), MIXTURE, tmp_path / "other", task=TASK)
     with pytest.raises(PanelError, match="the run was fed"):
-        trace(tmp_path / "run", "7/0", Where(panel=tmp_path / "other"))
+        trace_row(tmp_path / "run", "7/0", TracePlaces(panel=tmp_path / "other"))
 
 
 def test_another_recording_is_refused(places: Places) -> None:
     (row,) = places.rows("SELECT transition_id FROM transitions LIMIT 1")
     other = RECORDING.with_name("amr_monday.mcap")
     with pytest.raises(RecordingError, match="the row is of"):
-        trace(places.store, str(row["transition_id"]), Where(recording=other))
+        trace_row(places.store, str(row["transition_id"]), TracePlaces(recording=other))
 
 
 def test_a_row_that_was_labelled_anew_since_says_so(tmp_path: Path) -> None:
@@ -241,12 +241,12 @@ def test_a_row_that_was_labelled_anew_since_says_so(tmp_path: Path) -> None:
     place = later.schema.get_field_index("condition")
     named = pa.array(np.where(np.arange(len(later)) == 0, "recovery", later["condition"]))
     replace_recording(tmp_path / "store", later.set_column(place, later.schema.field(place), named))
-    found = trace(tmp_path / "panel", "0").origin
+    found = trace_row(tmp_path / "panel", "0").origin
     assert found is not None
     assert found.transition["condition"] == before["condition"][0].as_py()
     assert any("anew since" in note and "-> recovery" in note for note in found.notes)
     replace_recording(tmp_path / "store", later.slice(1))
-    found = trace(tmp_path / "panel", "0").origin
+    found = trace_row(tmp_path / "panel", "0").origin
     assert found is not None
     assert "the newest version of the store has this row no more" in found.notes
 
@@ -296,7 +296,7 @@ def test_a_store_that_an_older_version_wrote_audits_mixes_and_traces(tmp_path: P
         panel = tmp_path / f"panel{expected}"
         with Store(store) as opened:
             assert len(build_panel(opened, MIXTURE, panel)) == expected
-        origin = trace(panel, "3").origin
+        origin = trace_row(panel, "3").origin
         assert origin is not None
         assert origin.recording is not None
         assert origin.recording.get("clocks") is None

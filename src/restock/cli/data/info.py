@@ -39,7 +39,7 @@ class InfoCommand:
         """Describe each recording; the exit code of the worst of them."""
         from restock.cli import output
         from restock.ingest.containers.open_recording import recordings_in
-        from restock.ingest.describe import describe
+        from restock.ingest.describe import describe_recording
 
         if not self.paths:
             raise RecordingError("no path given", remedy="restock info PATH [PATH …]")
@@ -54,7 +54,7 @@ class InfoCommand:
                 continue
             for path in paths:
                 try:
-                    entry = describe(
+                    entry = describe_recording(
                         path, typestore=self.typestore, salvage=self.salvage, clocks=self.clocks
                     )
                 except RecordingError as error:

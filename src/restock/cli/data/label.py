@@ -42,10 +42,10 @@ class LabelCommand:
     def run(self) -> int:
         """Label, and say what changed."""
         from restock.cli import output
-        from restock.ingest.relabel import open_for_relabel, relabel
+        from restock.ingest.relabel import open_for_relabel, relabel_store
 
         store = open_for_relabel(self.store)
-        outcomes, version = relabel(store, self._conditions_of(), dry_run=self.dry_run)
+        outcomes, version = relabel_store(store, self._conditions_of(), dry_run=self.dry_run)
         rows = [as_json(outcome) for outcome in outcomes]
         if self.json:
             output.print_json({"version": version, "dry_run": self.dry_run, "recordings": rows})

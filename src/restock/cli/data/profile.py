@@ -53,13 +53,13 @@ class ProfileCommand:
     def _new(self) -> int:
         from restock.cli import output
         from restock.ingest.containers.open_recording import open_recording
-        from restock.ingest.propose.propose import propose
+        from restock.ingest.propose.propose import propose_profile
 
         if self.out is not None and self.out.exists():
             raise ConfigError("is there already", where=str(self.out), remedy="name another --out")
         stem = (self.out or Path(self.paths[0])).stem
         with open_recording(self.paths[0], typestore=self.typestore) as recording:
-            proposal = propose(recording, re.sub(r"\W+", "_", stem).strip("_") or "robot")
+            proposal = propose_profile(recording, re.sub(r"\W+", "_", stem).strip("_") or "robot")
         if self.out is not None:
             self.out.write_text(proposal.toml, encoding="utf-8")
         if self.json:

@@ -47,7 +47,7 @@ class TraceCommand:
     def run(self) -> None:
         """Trace, and print what was found."""
         from restock.cli import output
-        from restock.replay.trace.trace import Where, audited_rows, trace
+        from restock.replay.trace.trace import TracePlaces, audited_rows, trace_row
 
         if self.row is None:
             listed = audited_rows(self.place, self.rows)
@@ -58,8 +58,8 @@ class TraceCommand:
             if listed:
                 output.say(f"`restock trace {self.place} {listed[0]['row']}` follows one")
             return
-        where = Where(self.store, self.panel, self.recording, self.profile)
-        found = trace(self.place, self.row, where)
+        where = TracePlaces(self.store, self.panel, self.recording, self.profile)
+        found = trace_row(self.place, self.row, where)
         if self.json:
             output.print_json(document(found))
         else:
