@@ -32,10 +32,10 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from numpy.typing import NDArray
-from restock.cli.record import load_policy
 from rosbags.highlevel import AnyReader
 from support.kept_run import kept_run
 
+from restock.cli.twin.record import load_policy
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter

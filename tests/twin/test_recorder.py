@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from restock.cli.record import load_policy
 from rosbags.highlevel import AnyReader
 from support.kept_run import kept_run
 
 from restock import cli
+from restock.cli.twin.record import load_policy
 from restock.errors import ConfigError, ExitCode
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
