@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from restock.train.dqn.config import DEFAULT_CONDITIONS
 from restock.train.loop import TrainingInterrupted, train
 from restock.train.prepare import prepare_new
 
@@ -104,7 +103,6 @@ def stable_baselines3(steps: int, seed: int) -> Stretch:
             "restock/Warehouse-v0",
             n_envs=ENVS,
             seed=seed,
-            env_kwargs={"conditions": dict(DEFAULT_CONDITIONS)},
         ),
         learning_rate=1e-3,
         buffer_size=100_000,

@@ -176,7 +176,7 @@ def _rows(
 
 
 def _policies(episodes: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Who chose each step; an older run had no guide."""
+    """Who chose each step; an older run had no jump start."""
     codes = [episode.get("policy", np.zeros(int(episode["count"]), int)) for episode in episodes]
     return [POLICIES[code] for code in np.concatenate(codes)]
 

@@ -1,7 +1,7 @@
 """A start by the logs' behaviour: it drives the first steps of episodes, ever fewer of them.
 
 A network that was cloned from the logs (`restock.train.dqn.fitted_q.cloned_behaviour`) acts as
-whoever drove then, for a number of steps drawn anew for each episode, and hands over to what is
+whoever drove then, for a number of steps drawn for each episode, and hands over to what is
 being learnt. So the first fresh rows are from where the logs have been, and exploration begins at
 ever earlier places (jump-start reinforcement learning, arXiv:2204.02372, with random switching).
 """
@@ -11,13 +11,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from restock.errors import ConfigError
 from restock.train.dqn.checkpoint import generator_state, restore_generator
+from restock.train.dqn.config import JumpStartConfig
 from restock.train.dqn.fitted_q import Fit, chances, cloned_behaviour
 from restock.train.dqn.network import QNetwork
 from restock.train.feed.batches import Logs
@@ -26,24 +26,12 @@ POLICIES = ("dqn", "cloned")  # who acts, by its code in the ring
 Ints = NDArray[np.int64]
 
 
-class GuideConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    env_steps: int = 0  # over which it drives ever less; 0: it never drives
-    horizon_steps: int = 60  # of an episode that it drives at most, to begin with
-
-    def __post_init__(self) -> None:
-        if self.env_steps < 0 or self.horizon_steps < 1:
-            raise ValueError("guide.env_steps must be at least 0, guide.horizon_steps at least 1")
-
-    def horizon(self, env_steps: int) -> int:
-        """The most steps of an episode that begins after `env_steps`."""
-        left = max(1.0 - env_steps / self.env_steps, 0.0) if self.env_steps else 0.0
-        return round(self.horizon_steps * left)
-
-
-class Guide:
+class JumpStart:
     """Drives N environments for the first steps of their episodes."""
 
-    def __init__(self, config: GuideConfig, network: QNetwork, num_envs: int, seed: int) -> None:
+    def __init__(
+        self, config: JumpStartConfig, network: QNetwork, num_envs: int, seed: int
+    ) -> None:
         self.config, self.network = config, network
         self._until: Ints = np.zeros(num_envs, np.int64)  # step of the episode at which it stops
         self._rng = np.random.default_rng([seed, 6])
@@ -51,13 +39,13 @@ class Guide:
     @classmethod
     def of(
         cls,
-        config: GuideConfig,
+        config: JumpStartConfig,
         logs: Logs | None,
         size: tuple[int, int, int],
         seed: int,
         *,
         resume: bool = False,
-    ) -> Guide | None:
+    ) -> JumpStart | None:
         """Cloned from all rows of the logs alike; None where it never drives.
 
         Args:
@@ -71,7 +59,7 @@ class Guide:
             return None
         if logs is None:
             raise ConfigError(
-                "guide.env_steps is about the logs' behaviour, and there are none",
+                "jump_start.env_steps is about the logs' behaviour, and there are none",
                 remedy="give --panel, or leave it out",
             )
         num_envs, observation_size, actions = size
@@ -97,16 +85,16 @@ class Guide:
         policy = np.zeros(len(action), np.int16)
         begins, horizon = np.flatnonzero(step == 0), self.config.horizon(env_steps)
         self._until[begins] = self._rng.integers(horizon + 1, size=len(begins))
-        guided = np.flatnonzero(step < self._until)
-        if not len(guided):
+        cloned = np.flatnonzero(step < self._until)
+        if not len(cloned):
             return action, probability, policy
-        chance = chances(self.network, np.ascontiguousarray(observation[guided]))
-        drawn = (self._rng.random((len(guided), 1)) > chance.cumsum(axis=1)).sum(axis=1)
-        drawn = np.minimum(drawn, chance.shape[1] - 1)
+        of_each = chances(self.network, np.ascontiguousarray(observation[cloned]))  # (n, A)
+        chosen = (self._rng.random((len(cloned), 1)) > of_each.cumsum(axis=1)).sum(axis=1)
+        chosen = np.minimum(chosen, of_each.shape[1] - 1)
         action, probability = action.copy(), probability.copy()
-        action[guided] = drawn
-        probability[guided] = chance[np.arange(len(guided)), drawn]
-        policy[guided] = POLICIES.index("cloned")
+        action[cloned] = chosen
+        probability[cloned] = of_each[np.arange(len(cloned)), chosen]
+        policy[cloned] = POLICIES.index("cloned")
         return action, probability, policy
 
     def state_dict(self) -> dict[str, Any]:
@@ -118,7 +106,7 @@ class Guide:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts the guide where `state_dict` found it."""
+        """Puts it where `state_dict` found it."""
         self.network.load_state_dict(
             {name: torch.as_tensor(value) for name, value in state["network"].items()}
         )
@@ -126,4 +114,4 @@ class Guide:
         restore_generator(self._rng, state["rng"])
 
 
-__all__ = ["POLICIES", "Guide", "GuideConfig"]
+__all__ = ["POLICIES", "JumpStart"]

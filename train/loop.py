@@ -98,8 +98,8 @@ def train(
         )
         acting_step = learner.gradient_steps
         policy: NDArray[np.int16] | int = 0
-        if session.guide is not None:  # for the first steps of an episode, as the logs' drivers did
-            action, probability, policy = session.guide.take_over(
+        if session.jump_start is not None:  # the logs' behaviour drives an episode's first steps
+            action, probability, policy = session.jump_start.take_over(
                 action,
                 probability,
                 session.collector.observation,

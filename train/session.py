@@ -30,7 +30,7 @@ from restock.train.feed.collector import Collector, ring_conditions
 from restock.train.feed.log_fidelity import LogFidelity
 from restock.train.feed.log_terms import LogTerms
 from restock.train.feed.probe import Probe
-from restock.train.jump_start import POLICIES, Guide
+from restock.train.jump_start import POLICIES, JumpStart
 from restock.train.run.events import Events
 from restock.train.run.kept_checkpoints import earlier, keep
 from restock.train.run.run import Run
@@ -86,7 +86,7 @@ class Session:
     executor: ThreadPoolExecutor | None
     logs: Logs | None
     log_terms: LogTerms
-    guide: Guide | None
+    jump_start: JumpStart | None
     clock: Clock = field(default_factory=Clock)
     interval: Interval = field(default_factory=Interval)
     best: Score | None = None
@@ -119,7 +119,7 @@ class Session:
                 "env": self.env.get_state(),
                 "feed": self.feed.state_dict(),
                 "probe": self.probe.state_dict() if self.probe else None,
-                "guide": self.guide.state_dict() if self.guide else None,
+                "jump_start": self.jump_start.state_dict() if self.jump_start else None,
                 "exploration": checkpoint.generator_state(self.exploration),
                 "tables": self.run.row_counts(),
             },
@@ -139,8 +139,8 @@ class Session:
         self.collector.load_state_dict(state["collector"])
         self.feed.load_state_dict(state["feed"])
         self.probe = Probe.from_state(state["probe"]) if state["probe"] else None
-        if self.guide is not None:
-            self.guide.load_state_dict(state["guide"])
+        if self.jump_start is not None:
+            self.jump_start.load_state_dict(state["jump_start"])
         checkpoint.restore_generator(self.exploration, state["exploration"])
         self.run.truncate(state["tables"])
         self._started = time.monotonic()
@@ -241,8 +241,8 @@ def open_session(
         executor=executor,
         logs=logs,
         log_terms=LogTerms.of(config.loss, logs, learner.device),
-        guide=Guide.of(
-            config.guide,
+        jump_start=JumpStart.of(
+            config.jump_start,
             logs,
             (env.num_envs, task.observation_size, len(task.actions)),
             seed,

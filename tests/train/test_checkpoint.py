@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from restock.errors import RunError
 from restock.train.dqn import checkpoint
@@ -72,3 +73,10 @@ def test_a_damaged_or_foreign_file_gives_one_clear_error(tmp_path: Path, content
 def test_a_missing_checkpoint_says_so(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="there is no checkpoint"):
         checkpoint.load(tmp_path / "none")
+
+
+def test_a_checkpoint_of_an_earlier_version_is_refused_with_a_remedy(tmp_path: Path) -> None:
+    path = tmp_path / "latest.safetensors"
+    save_file({}, path, metadata={"format": "restock-checkpoint/1", "state": "{}"})
+    with pytest.raises(RunError, match=r"by an earlier Restock .*\n.*make it again with"):
+        checkpoint.load(path)

@@ -110,7 +110,7 @@ def test_the_clocks_of_dqn_are_the_configs() -> None:
         ("network.dueling=true", "has no network"),
         ("loss.munchausen=0.9", "has no loss.munchausen"),
         ("guard.margin=0.1", "has no guard.margin"),
-        ("guide.env_steps=100", "has no guide.env_steps"),
+        ("jump_start.env_steps=100", "has no jump_start.env_steps"),
     ],
 )
 def test_settings_without_a_counterpart_are_refused(setting: str, said: str) -> None:

@@ -21,7 +21,8 @@ from safetensors.torch import save_file
 
 from restock.errors import RunError
 
-FORMAT = "restock-checkpoint/1"
+FORMAT = "restock-checkpoint/2"
+_EARLIER = ("restock-checkpoint/1",)
 _ARRAY, _STRINGS, _NUMPY = "__array__", "__strings__", "numpy"
 
 
@@ -60,7 +61,14 @@ def load(path: Path) -> dict[str, Any]:
     try:
         with safe_open(path, framework="pt") as opened:
             metadata = opened.metadata() or {}
-            if metadata.get("format") != FORMAT:
+            form = metadata.get("format")
+            if form in _EARLIER:
+                raise RunError(
+                    f"was written by an earlier Restock ({form}, this one reads {FORMAT})",
+                    where=str(path),
+                    remedy="make it again with `restock train`",
+                )
+            if form != FORMAT:
                 raise RunError("is not a checkpoint of Restock", where=str(path))
             tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:

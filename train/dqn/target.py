@@ -8,20 +8,19 @@ that the run's config, metrics and checkpoints all carry.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import torch
+from msgspec import Meta
+
+from restock.toml import Checked
 
 
-class Hard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="rule", tag="hard"):
+class Hard(Checked, frozen=True, tag_field="rule", tag="hard"):
     """Copy the online network at every `every`-th update (arXiv:1312.5602)."""
 
-    every: int = 1000
-
-    def __post_init__(self) -> None:
-        if self.every < 1:
-            raise ValueError(f"target.every must be at least 1, got {self.every}")
+    every: Annotated[int, Meta(ge=1)] = 1000
 
     @property
     def effective_lag(self) -> float:
@@ -36,16 +35,10 @@ class Hard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="r
         return f"hard every {self.every}"
 
 
-class Polyak(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="rule", tag="polyak"
-):
+class Polyak(Checked, frozen=True, tag_field="rule", tag="polyak"):
     """target += tau * (online - target), after every update (arXiv:1509.02971)."""
 
-    tau: float = 0.005
-
-    def __post_init__(self) -> None:
-        if not 0 < self.tau <= 1:
-            raise ValueError(f"target.tau must be in (0, 1], got {self.tau}")
+    tau: Annotated[float, Meta(gt=0, le=1)] = 0.005
 
     @property
     def effective_lag(self) -> float:

@@ -137,7 +137,8 @@ def _is_path(flag: str, name: str) -> bool:
 
 def evaluate(plan: Plan, progress: Callable[[int], None] | None = None) -> Results:
     """Drive all episodes, and write them to the run's `eval/episodes.parquet`."""
-    from restock.train.twin.env.vector_env import DEFAULT_CONDITIONS, WarehouseVectorEnv
+    from restock.train.twin.env.interface import DEFAULT_CONDITIONS
+    from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
     profile = load_profile(plan.config.profile)
     task = profile.task

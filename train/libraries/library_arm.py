@@ -85,7 +85,7 @@ def resolve(settings: tuple[str, ...], library: Library) -> TrainConfig:
             ("replay.ring_reserved", config.replay.ring_reserved > 0),
             ("schedule.seconds", config.schedule.seconds is not None),
             ("guard.margin", config.guard.margin is not None),
-            ("guide.env_steps", config.guide.env_steps > 0),
+            ("jump_start.env_steps", config.jump_start.env_steps > 0),
         )
         if bad
     ]

@@ -27,7 +27,8 @@ from restock.train.run.run_tables import TABLES
 if TYPE_CHECKING:
     from restock.replay.panel.panel import Panel
 
-FORMAT = "restock-run/1"
+FORMAT = "restock-run/2"
+_EARLIER = ("restock-run/1",)
 _LONG_TABLE = 4096  # rows
 Rows = Sequence[Mapping[str, Any]]
 
@@ -75,11 +76,15 @@ class Run:
             ) from error
         except (OSError, ValueError) as error:
             raise RunError(f"cannot be read: {error}", where=str(config)) from error
-        found = document.get("format") if isinstance(document, dict) else None
-        if found != FORMAT:
+        form = document.get("format") if isinstance(document, dict) else None
+        if form in _EARLIER:
             raise RunError(
-                f"has format {found!r}, this Restock reads {FORMAT!r}", where=str(config)
+                f"was written by an earlier Restock ({form}, this one reads {FORMAT})",
+                where=str(path),
+                remedy="make it again with `restock train`",
             )
+        if form != FORMAT:
+            raise RunError(f"has format {form!r}, this Restock reads {FORMAT!r}", where=str(config))
         run = cls(path, document)
         for name, schema in TABLES.items():
             file = path / f"{name}.parquet"

@@ -10,13 +10,6 @@ from restock.errors import ConfigError
 from restock.train.twin.physics.episode import KINDS, EpisodeSpec
 from restock.train.twin.physics.perturbation import Schedule
 
-DEFAULT_CONDITIONS: Mapping[str, float] = {
-    "nominal": 0.55,
-    "wheel_slip": 0.15,
-    "blocked_aisle": 0.15,
-    "near_collision": 0.15,
-}
-
 
 class EpisodeQueue:
     """An environment's n-th drawn episode is the same whatever the others do.

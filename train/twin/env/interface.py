@@ -6,7 +6,7 @@ a trained network, an ONNX file, a script, one of your own.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import numpy as np
@@ -18,6 +18,13 @@ from restock.toml import Checked
 if TYPE_CHECKING:  # an episode needs MuJoCo; a run's config does not
     from restock.train.twin.physics.episode import EpisodeSpec
 
+# Shares among the episodes that are drawn, where nothing else is asked for.
+DEFAULT_CONDITIONS: Mapping[str, float] = {
+    "nominal": 0.4,
+    "wheel_slip": 0.2,
+    "blocked_aisle": 0.2,
+    "near_collision": 0.2,
+}
 AFTER_LOGS = 0.2  # the offline phase has learnt to drive: more exploration would only undo that
 
 Probability = Annotated[float, Meta(ge=0, le=1)]

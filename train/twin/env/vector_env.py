@@ -1,6 +1,6 @@
 """The twin as a Gymnasium vector environment: N warehouses stepped in one native call.
 
-    env = WarehouseVectorEnv(16, conditions={"nominal": 0.55, "wheel_slip": 0.15, ...}, seed=1)
+    env = WarehouseVectorEnv(16, conditions={"nominal": 0.4, "wheel_slip": 0.2, ...}, seed=1)
     observation, info = env.reset(seed=1)
     observation, reward, terminated, truncated, info = env.step(actions)
 
@@ -44,8 +44,9 @@ from restock.ingest.task.task import Task, observe, reached_goal, reward, termin
 from restock.train.twin.env.action_face import Face, action_face
 from restock.train.twin.env.camera import Camera, View, check_view
 from restock.train.twin.env.draw import draw_map
-from restock.train.twin.env.episode_queue import DEFAULT_CONDITIONS, EpisodeQueue
+from restock.train.twin.env.episode_queue import EpisodeQueue
 from restock.train.twin.env.floor_report import refuse_unfit
+from restock.train.twin.env.interface import DEFAULT_CONDITIONS
 from restock.train.twin.env.navigation import Navigation
 from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.layout import DEFAULT, Warehouse, default_warehouse
@@ -416,4 +417,4 @@ def _bounded(observation: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.clip(np.nan_to_num(observation), -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
 
-__all__ = ["DEFAULT_CONDITIONS", "OBSERVATION_LIMIT", "WarehouseVectorEnv"]
+__all__ = ["OBSERVATION_LIMIT", "WarehouseVectorEnv"]

@@ -1,0 +1,74 @@
+"""The configuration of a run: unknown, renamed and out-of-range values are refused by their key."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import msgspec
+import pytest
+
+from restock.errors import ConfigError
+from restock.ingest.profile.profile import load_profile
+from restock.train.dqn.config import TrainConfig, load_config, parse_config
+from restock.train.prepare import make_twin
+
+
+def test_the_config_refuses_unknown_keys_with_their_path() -> None:
+    with pytest.raises(ConfigError, match=r"unknown key `target\.taw`"):
+        parse_config({"target": {"rule": "polyak", "taw": 1}}, where="x.toml")
+    with pytest.raises(ConfigError, match=r"logs_share must be in \[0, 1\], got 2"):
+        parse_config({"replay": {"logs_share": 2.0}}, where="x.toml")
+
+
+def test_the_target_rule_is_written_with_its_name() -> None:
+    assert msgspec.to_builtins(TrainConfig())["target"] == {"rule": "polyak", "tau": 0.005}
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("loss.discount=1.0", r"loss\.discount must be in \[0, 1\), got 1"),
+        ("network.hidden=[64, 0]", r"network\.hidden\[1\] must be at least 1, got 0"),
+        ("network.hidden=[]", r"network\.hidden must name the width"),
+        ("network.quantiles=1", r"network\.quantiles must be 0 or above 1, got 1"),
+        ("loss.munchausen_floor=1", r"loss\.munchausen_floor must be at most 0, got 1"),
+        ("optimizer.learning_rate=0", r"optimizer\.learning_rate must be above 0, got 0"),
+        ("optimizer.max_grad_norm=-1", r"optimizer\.max_grad_norm must be above 0, got -1"),
+        ("replay.ring_capacity=8", r"replay\.ring_capacity must hold .* a batch of 128, got 8"),
+        ("schedule.offline_updates=-1", r"schedule\.offline_updates must be at least 0, got -1"),
+        ("epsilon.start=1.5", r"epsilon\.start must be in \[0, 1\], got 1\.5"),
+        ("env.conditions.nominal=-1", r"env\.conditions\.nominal must be at least 0, got -1"),
+        ("env.conditions={nominal = 0}", r"env\.conditions must have a share above 0"),
+        ("guard.conditions=['fog']", r"guard\.conditions: fog is not among env\.conditions"),
+        ("evaluation.averaging=0", r"evaluation\.averaging must be in \(0, 1\], got 0"),
+        ("jump_start.horizon_steps=0", r"jump_start\.horizon_steps must be at least 1, got 0"),
+        ("target={rule='polyak', tau=2}", r"target\.tau must be in \(0, 1\], got 2"),
+    ],
+)
+def test_a_value_out_of_range_is_named_with_its_range(override: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load_config(None, [override])
+
+
+def test_a_key_of_an_earlier_version_is_refused_with_its_new_name(tmp_path: Path) -> None:
+    old = tmp_path / "old.toml"
+    old.write_text("[guide]\nenv_steps = 100\n")
+    for path, overrides in ((old, []), (None, ["guide.env_steps=100"])):
+        with pytest.raises(ConfigError, match="unknown key `guide`") as refused:
+            load_config(path, overrides)
+        assert "now called `jump_start`" in str(refused.value)
+
+
+def test_the_default_shares_are_those_of_the_environment_itself() -> None:
+    trained: Any = make_twin(TrainConfig(), load_profile("warehouse_amr"), 2)
+    made: Any = gymnasium.make_vec("restock/Warehouse-v0", num_envs=2)
+    try:
+        shares = made.unwrapped.queue.conditions
+        assert shares == trained.queue.conditions
+        others = dict.fromkeys(("wheel_slip", "blocked_aisle", "near_collision"), 0.2)
+        assert shares == {"nominal": 0.4, **others}
+    finally:
+        trained.close()
+        made.close()
