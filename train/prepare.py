@@ -24,7 +24,7 @@ from restock.train.run.run import Run, check_free, now_ns, panel_document, softw
 from restock.train.session import Session, open_session
 from restock.train.twin.env.floor_report import refuse_unfit, sealed
 from restock.train.twin.env.interface import AFTER_LOGS, Twin
-from restock.train.twin.floors.floors import held_out, open_floors
+from restock.train.twin.floors.floors import layouts_of_split, open_floors
 from restock.train.twin.physics.episode import KINDS
 from restock.train.twin.physics.perturbation import PERTURBATIONS, find_perturbation
 
@@ -187,7 +187,7 @@ def make_twin(
 
 
 def _evaluation_layouts(config: TrainConfig) -> str:
-    return config.evaluation.layouts or held_out(config.env.layouts, "validation")
+    return config.evaluation.layouts or layouts_of_split(config.env.layouts, "validation")
 
 
 def resolve_config(config: TrainConfig, panel: Panel | None) -> TrainConfig:

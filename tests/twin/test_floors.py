@@ -25,7 +25,7 @@ from restock.train.twin.floors.floors import (
     RECIPES,
     SPLITS,
     generate,
-    held_out,
+    layouts_of_split,
     open_floor,
     open_floors,
     seeds_of,
@@ -67,7 +67,7 @@ def test_the_splits_share_no_floor() -> None:
     assert not floors["train"] & floors["test"]
     assert not floors["train"] & floors["validation"]
     assert not floors["validation"] & floors["test"]
-    assert held_out("default, generated:train:64", "test") == "default,generated:test"
+    assert layouts_of_split("default, generated:train:64", "test") == "default,generated:test"
     shares = [sum(split_of(seed) == split for seed in range(2000)) / 2000 for split in SPLITS]
     np.testing.assert_allclose(shares, [0.7, 0.1, 0.2], atol=0.05)
     assert list(islice(seeds_of("test"), 3)) == [s for s in range(30) if split_of(s) == "test"][:3]
@@ -138,9 +138,8 @@ def test_a_map_turned_by_its_origin_goes_back_to_the_map(tmp_path: Path) -> None
         f"image: map.pgm\nresolution: 0.1\norigin: [5.0, 0.0, {np.pi / 2}]\n"
     )
     floor = read_map(tmp_path / "map.yaml")
-    x, y = floor.to_map(np.array([0.0, 6.0]), np.array([0.0, 0.0]))
-    np.testing.assert_allclose(x, [4.0, 4.0], atol=1e-9)  # the image's x is the map's y
-    np.testing.assert_allclose(y, [1.0, 7.0], atol=1e-9)
+    # The image's x is the map's y: the floor's corner, 1 m and 1 m into the image, is at (4, 1).
+    assert floor.map_origin == pytest.approx((4.0, 1.0, np.pi / 2), abs=1e-9)
 
 
 def test_ascii_and_16_bit_greymaps_with_comments_are_read(tmp_path: Path) -> None:

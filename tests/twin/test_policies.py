@@ -49,9 +49,9 @@ def test_the_operator_takes_over_from_a_stuck_planner_and_hands_back() -> None:
     policy = Handover(PlannerFollower(), Operator())
     blocked = success(policy, "blocked_aisle")
     assert blocked["partial"] >= 0.5
-    takers = [event.taker for event in policy.events if event.episode_seed < 600]
-    assert takers.count("operator") >= 8
-    assert takers.count("planner") >= 5
+    drivers = [event.driver for event in policy.events if event.episode_seed < 600]
+    assert drivers.count("operator") >= 8
+    assert drivers.count("planner") >= 5
     assert {event.reason for event in policy.events} <= {"stuck", "bumped", "slipping", "clear"}
 
 

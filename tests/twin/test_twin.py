@@ -81,7 +81,7 @@ def test_a_seed_gives_the_same_run_whatever_the_threads_or_the_recorder() -> Non
         made = WarehouseVectorEnv(6, nthread=nthread)
         made.reset(seed=5)
         if record:
-            made.set_block_callback(lambda live: None, 0.02)
+            made.set_block_callback(lambda state: None, 0.02)
         runs.append(np.array(roll(made, 50, 0)))
     np.testing.assert_array_equal(runs[0], runs[1])
     np.testing.assert_array_equal(runs[0], runs[2])
@@ -260,17 +260,17 @@ def test_the_true_condition_shows_where_its_cause_is() -> None:
 def test_the_block_callback_samples_the_true_motion() -> None:
     made = WarehouseVectorEnv(2, conditions={"nominal": 1.0})
     made.reset(seed=3)
-    lives: list[Any] = []
-    made.set_block_callback(lives.append, 0.02)
+    states: list[Any] = []
+    made.set_block_callback(states.append, 0.02)
     start = made.simulation.pose()
     for _ in range(5):
         *_, info = made.step(np.array([1, 1]))
-    assert len(lives) == 5 * 10
-    np.testing.assert_allclose(np.diff([live.time_s[0] for live in lives]), 0.02)
-    travelled = np.sum([live.speed_mps for live in lives], axis=0) * 0.02
+    assert len(states) == 5 * 10
+    np.testing.assert_allclose(np.diff([state.time_s[0] for state in states]), 0.02)
+    travelled = np.sum([state.speed_mps for state in states], axis=0) * 0.02
     moved = np.hypot(*(made.simulation.pose() - start)[:, :2].T)
     np.testing.assert_allclose(travelled, moved, rtol=0.1)
-    np.testing.assert_array_equal(lives[-1].x_m, info["true_pose"][:, 0])
+    np.testing.assert_array_equal(states[-1].x_m, info["true_pose"][:, 0])
 
 
 @pytest.mark.parametrize("name", sorted(PERTURBATIONS))

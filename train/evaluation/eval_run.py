@@ -27,7 +27,7 @@ from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES
 from restock.train.twin.env.floor_report import refuse_unfit, unfit_kinds
 from restock.train.twin.env.interface import Policy
-from restock.train.twin.floors.floors import held_out, open_floors
+from restock.train.twin.floors.floors import layouts_of_split, open_floors
 from restock.train.twin.physics.episode import KINDS, EpisodeSpec
 from restock.train.twin.physics.perturbation import (
     PERTURBATIONS,
@@ -108,7 +108,7 @@ def plan_evaluation(
             where=str(path),
             remedy=f"go on with `restock train --resume {path}`",
         )
-    layouts = layouts or held_out(config.env.layouts, "test")
+    layouts = layouts or layouts_of_split(config.env.layouts, "test")
     floors = open_floors(layouts)
     plan = Plan(
         run,

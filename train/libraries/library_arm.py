@@ -38,7 +38,7 @@ from restock.train.evaluation.evaluate import (
 )
 from restock.train.prepare import make_twin, resolve_config
 from restock.train.run.run import Run, now_ns, software_versions
-from restock.train.twin.floors.floors import held_out
+from restock.train.twin.floors.floors import layouts_of_split
 
 Library = Literal["sb3-dqn", "sb3-ppo"]
 DISTRIBUTION = "stable-baselines3"
@@ -140,7 +140,7 @@ class Evaluations:
         given = config.evaluation
         self.specs = fixed_episodes(names, given.episodes, given.seed)
         count = min(_EVALUATION_ENVS, len(self.specs))
-        layouts = given.layouts or held_out(config.env.layouts, "validation")
+        layouts = given.layouts or layouts_of_split(config.env.layouts, "validation")
         self.env = make_twin(config, load_profile(config.profile), count, layouts=layouts)
         self.best: Score | None = None
         self.at = 0  # environment steps of the last one

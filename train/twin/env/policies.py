@@ -151,8 +151,7 @@ class HandoverEvent:
     env: int
     episode_seed: int
     step: int  # of the episode
-    giver: str
-    taker: str
+    driver: str  # who drives from here on
     reason: str  # stuck, bumped, slipping, clear
 
 
@@ -244,8 +243,7 @@ class Handover:
                 env=index,
                 episode_seed=int(env.episode_seed[index]),
                 step=int(env.steps[index]),
-                giver=names[not taken],
-                taker=names[taken],
+                driver=names[taken],
                 reason=reason,
             )
         )

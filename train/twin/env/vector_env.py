@@ -53,7 +53,7 @@ from restock.train.twin.floors.layout import DEFAULT, Warehouse, default_warehou
 from restock.train.twin.physics.episode import Episode, EpisodeSpec, draw_episode
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 from restock.train.twin.physics.sensing import Sensing, Signals, add_motion, add_route
-from restock.train.twin.physics.simulation import Live, Physics, Simulation
+from restock.train.twin.physics.simulation import BodyState, Physics, Simulation
 from restock.train.twin.physics.truth import Truth
 
 OBSERVATION_LIMIT = 20.0  # no sensor of this robot gives more; holds the space's bounds
@@ -368,7 +368,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
     # -- recorders ------------------------------------------------------------------------------
 
     def set_block_callback(
-        self, callback: Callable[[Live], None] | None, period_s: float = 0.02
+        self, callback: Callable[[BodyState], None] | None, period_s: float = 0.02
     ) -> None:
         """Call back every `period_s` of simulated time within steps, with the true state.
 
@@ -396,7 +396,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
 def _floors(
     warehouse: Warehouse | None, layouts: str | Sequence[Warehouse]
 ) -> tuple[Warehouse, ...]:
-    """The floors that were asked for. Raises ConfigError for none, or two of one name."""
+    """The floors of an environment. Raises ConfigError for none, or two of one name."""
     if warehouse is not None:
         if layouts != DEFAULT:
             raise ConfigError("give a warehouse or layouts, not both", where="the twin")
@@ -404,9 +404,10 @@ def _floors(
     if layouts == DEFAULT:
         return (default_warehouse(),)
     floors = open_floors(layouts) if isinstance(layouts, str) else tuple(layouts)
-    if not floors or len({floor.name for floor in floors}) < len(floors):
+    names = [floor.name for floor in floors]
+    if not floors or len(set(names)) < len(names):
         raise ConfigError(
-            f"{len(floors)} layouts are none, or two have one name",
+            f"layout names must be unique, got {names}" if floors else "there must be a layout",
             where="the twin",
             remedy="give floors that differ in their name",
         )

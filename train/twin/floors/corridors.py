@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from restock.train.twin.floors.layout import Axis, Rect, Segment
+from restock.train.twin.floors.layout import AisleSegment, Axis, Rect
 
 Cells = NDArray[np.bool_]  # (X, Y), free where True
 
@@ -34,7 +34,7 @@ class _Corridor:
     high: int
 
 
-def find_segments(free: Cells, cell_m: float) -> tuple[Segment, ...]:
+def find_segments(free: Cells, cell_m: float) -> tuple[AisleSegment, ...]:
     """The aisle segments of a floor's free cells, from the south-west, longest aisles kept."""
     found: list[tuple[Axis, _Corridor]] = [("x", c) for c in _corridors(free, cell_m)]
     found += [("y", c) for c in _corridors(free.T, cell_m)]
@@ -52,7 +52,7 @@ def find_segments(free: Cells, cell_m: float) -> tuple[Segment, ...]:
         kept.append((box if along == "x" else box.transposed, along))
     kept.sort(key=lambda item: (item[1], item[0].y_min, item[0].x_min))
     return tuple(
-        Segment(f"aisle_{index + 1}", index, area, along)
+        AisleSegment(f"aisle_{index + 1}", index, area, along)
         for index, (area, along) in enumerate(kept)
     )
 
@@ -101,7 +101,9 @@ def _corridors(free: Cells, cell_m: float) -> list[_Corridor]:
     return found
 
 
-def find_crossings(segments: tuple[Segment, ...], free: Cells, cell_m: float) -> tuple[Rect, ...]:
+def find_crossings(
+    segments: tuple[AisleSegment, ...], free: Cells, cell_m: float
+) -> tuple[Rect, ...]:
     """Free places off the ends of the aisle segments, where others come from the side."""
     found: dict[Rect, None] = {}
     for segment in segments:

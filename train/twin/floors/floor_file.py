@@ -28,12 +28,12 @@ from restock.errors import ConfigError
 from restock.toml import toml_value
 from restock.train.twin.floors.corridors import find_crossings, find_goals, find_segments
 from restock.train.twin.floors.layout import (
+    AisleSegment,
     Axis,
     Dock,
     Heading,
     OneWay,
     Rect,
-    Segment,
     Warehouse,
     bays,
 )
@@ -108,7 +108,7 @@ def read_floor(path: Path) -> Warehouse:
     segments = (
         find_segments(free, CELL_M)
         if said.aisles is None
-        else tuple(Segment(a.name, a.aisle, Rect(*a.box_m), a.along) for a in said.aisles)
+        else tuple(AisleSegment(a.name, a.aisle, Rect(*a.box_m), a.along) for a in said.aisles)
     )
     crossings = (
         find_crossings(segments, free, CELL_M)

@@ -27,11 +27,11 @@ import numpy as np
 from restock.errors import ConfigError
 from restock.train.twin.floors.layout import (
     DEFAULT,
+    AisleSegment,
     Dock,
     Heading,
     OneWay,
     Rect,
-    Segment,
     Warehouse,
     default_warehouse,
     strip_warehouse,
@@ -158,7 +158,7 @@ def turned(floor: Warehouse) -> Warehouse:
         depth_m=floor.width_m,
         racks=tuple(rack.transposed for rack in floor.racks),
         segments=tuple(
-            Segment(s.name, s.aisle, s.area.transposed, "y" if s.along == "x" else "x")
+            AisleSegment(s.name, s.aisle, s.area.transposed, "y" if s.along == "x" else "x")
             for s in floor.segments
         ),
         goals_m=tuple((y, x) for x, y in floor.goals_m),
@@ -183,7 +183,7 @@ def open_floors(text: str) -> tuple[Warehouse, ...]:
     return tuple(found)
 
 
-def held_out(text: str, split: Split) -> str:
+def layouts_of_split(text: str, split: Split) -> str:
     """What `open_floors` reads, with the training floors replaced by those of another split."""
     parts = [part.strip() for part in text.split(",")]
     return ",".join(

@@ -68,7 +68,7 @@ class Rect:
 
 
 @dataclass(frozen=True)
-class Segment:
+class AisleSegment:
     """The part of an aisle between two cross-aisles: what a block closes.
 
     It runs along `along` and is shut in by racks or walls on its two other sides.
@@ -113,7 +113,7 @@ class Warehouse:
     width_m: float
     depth_m: float
     racks: tuple[Rect, ...]
-    segments: tuple[Segment, ...]
+    segments: tuple[AisleSegment, ...]
     goals_m: tuple[tuple[float, float], ...]  # where a robot may be sent, the docks aside
     crossings: tuple[Rect, ...] = ()  # where traffic crosses: an aisle meets a cross-aisle
     cross_zones: tuple[tuple[str, Rect], ...] = ()  # named parts beside aisles and docks
@@ -165,10 +165,10 @@ class Warehouse:
         return np.array(self.goals_m + docks, np.float64).reshape(-1, 2)
 
     @cached_property
-    def starts(self) -> tuple[Segment, ...]:
+    def starts(self) -> tuple[AisleSegment, ...]:
         """Where episodes begin: aisle segments; around the goals where a floor has none."""
         around = (Rect(x - 0.5, y - 0.5, x + 0.5, y + 0.5) for x, y in self.goals.tolist())
-        return self.segments or tuple(Segment("start", 0, area) for area in around)
+        return self.segments or tuple(AisleSegment("start", 0, area) for area in around)
 
     @cached_property
     def zones(self) -> dict[str, Rect]:
@@ -209,12 +209,6 @@ class Warehouse:
         """Names everything but the name, 12 hex digits."""
         content = asdict(self) | {"name": ""}
         return hashlib.blake2b(msgspec.json.encode(content), digest_size=6).hexdigest()
-
-    def to_map(self, x_m: F64, y_m: F64) -> tuple[F64, F64]:
-        """Places of the floor in the frame of the map it was read from."""
-        x0, y0, yaw = self.map_origin
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        return x0 + cos * x_m - sin * y_m, y0 + sin * x_m + cos * y_m
 
 
 def _box(box: Rect) -> str:
@@ -268,7 +262,9 @@ def strip_warehouse(
     racks = tuple(block for index, block in enumerate(blocks) if index not in open_racks)
     part = ("west", "east") if columns == 2 else tuple(str(i + 1) for i in range(columns))
     segments = tuple(
-        Segment(f"aisle_{aisle + 1}_{part[column]}", aisle, Rect(west[1], south, east[0], north))
+        AisleSegment(
+            f"aisle_{aisle + 1}_{part[column]}", aisle, Rect(west[1], south, east[0], north)
+        )
         for aisle, (south, north) in enumerate(aisle_y_m)
         for column, (west, east) in enumerate(pairwise(cross_x_m))
         if not open_racks & {(aisle - 1) * columns + column, aisle * columns + column}
@@ -294,7 +290,7 @@ def strip_warehouse(
     )
 
 
-def bays(segments: tuple[Segment, ...]) -> tuple[tuple[float, float], ...]:
+def bays(segments: tuple[AisleSegment, ...]) -> tuple[tuple[float, float], ...]:
     """The goals along aisle segments, in their middle."""
     found: list[tuple[float, float]] = []
     for segment in segments:

@@ -29,7 +29,6 @@ from restock.train.twin.physics.traffic import AGENTS, Walk, draw_walks
 F64 = NDArray[np.float64]
 
 KINDS = ("nominal", "wheel_slip", "blocked_aisle", "near_collision")
-BLOCKS = ("none", "partial", "full")
 PATH_M = (4.0, 11.0)
 PATCH_FRICTION = (0.02, 0.045)  # oil or wet ice on sealed concrete
 GAP_M = (0.80, 1.00)

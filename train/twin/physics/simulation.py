@@ -45,7 +45,7 @@ _CONTROLLED = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_MOCAP_P
 
 
 @dataclass(frozen=True)
-class Live:
+class BodyState:
     """The true state of every environment at an instant between two blocks, for recorders."""
 
     time_s: F64  # (N,) since the episode began
@@ -114,7 +114,7 @@ class Simulation:
         self._groups = np.zeros(6, np.uint8)
         self._groups[OBSTACLE_GROUP] = 1
         self._has_patches = np.zeros(num_envs, np.bool_)
-        self.callback: Callable[[Live], None] | None = None
+        self.callback: Callable[[BodyState], None] | None = None
         self.callback_period_s = 0.02
 
     # -- layout ---------------------------------------------------------------------------------
@@ -201,17 +201,17 @@ class Simulation:
             self.time_s += (stop - start) * self.timestep_s
             records.append(sensed[:, :, self.handles.accelerometer])
             if self.callback is not None:
-                self.callback(self.live(records[-1].mean(axis=1), pressed))
+                self.callback(self.body_state(records[-1].mean(axis=1), pressed))
         accel = records[0] if len(records) == 1 else np.concatenate(records, axis=1)
         self.accel = accel[:, self.substeps // 2 :].mean(axis=1)
         return touched
 
-    def live(self, accel: F64, pressed: NDArray[np.bool_]) -> Live:
+    def body_state(self, accel: F64, pressed: NDArray[np.bool_]) -> BodyState:
         """The true state now."""
         pose = self.pose()
         cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
         vx, vy = self.qvel[:, 0], self.qvel[:, 1]
-        return Live(
+        return BodyState(
             time_s=self.time_s.copy(),
             x_m=pose[:, 0],
             y_m=pose[:, 1],

@@ -18,7 +18,7 @@ from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.model import CHASSIS_Z_M
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
-from restock.train.twin.physics.simulation import BLOCK_S, Live
+from restock.train.twin.physics.simulation import BLOCK_S, BodyState
 from restock.train.twin.recording.drive import Drive, Motion
 from restock.train.twin.recording.drivers import BehaviourPolicies
 from restock.train.twin.recording.missions import Mission
@@ -57,7 +57,7 @@ class _Log:
     reward: list[float] = field(default_factory=list)
     policy: list[tuple[str, str, float]] = field(default_factory=list)
     truth: list[str] = field(default_factory=list)
-    motion: list[Live] = field(default_factory=list)  # of all robots
+    motion: list[BodyState] = field(default_factory=list)  # of all robots
     scan_s: list[float] = field(default_factory=list)
     ranges_m: list[F64] = field(default_factory=list)
     plans: list[tuple[int, F64]] = field(default_factory=list)
@@ -97,7 +97,7 @@ class Fleet:
         self.period_s = self.env.task.control_period_s
         self._scans_between = scan_hz * self.period_s > 1
         self._logs: list[_Log | None] = [None] * robots
-        self._motion: list[Live] = []  # of the step at hand
+        self._motion: list[BodyState] = []  # of the step at hand
         self._scan: F64 | None = None  # true ranges half-way through it
         self.env.set_block_callback(self._note_motion, MOTION_PERIOD_S)
 
@@ -145,7 +145,7 @@ class Fleet:
         mask[robots] = True
         env.reset(options={"reset_mask": mask})
         still = np.zeros((env.num_envs, 3))
-        standing = env.simulation.live(still, np.zeros(env.num_envs, np.bool_))
+        standing = env.simulation.body_state(still, np.zeros(env.num_envs, np.bool_))
         for robot, entry in zip(robots.tolist(), given, strict=True):
             if entry is None:
                 self._logs[robot] = None
@@ -159,8 +159,8 @@ class Fleet:
             self._note_tick(log, robot, env.signals)
             policies.begin(robot, mission)
 
-    def _note_motion(self, live: Live) -> None:
-        self._motion.append(live)
+    def _note_motion(self, state: BodyState) -> None:
+        self._motion.append(state)
         if self._scans_between and len(self._motion) == round(BLOCK_S / MOTION_PERIOD_S):
             self._scan = self.env.simulation.cast(np.arange(self.env.num_envs))
 
@@ -243,16 +243,18 @@ class Fleet:
         )
 
 
-def _motion_of(lives: list[Live], robot: int) -> Motion:
+def _motion_of(states: list[BodyState], robot: int) -> Motion:
     """One robot's motion out of all robots'."""
-    pose = np.array([(live.x_m[robot], live.y_m[robot], live.yaw_rad[robot]) for live in lives])
+    pose = np.array(
+        [(state.x_m[robot], state.y_m[robot], state.yaw_rad[robot]) for state in states]
+    )
     pose[:, 2] = np.unwrap(pose[:, 2])
     return Motion(
-        time_s=np.round(np.arange(len(lives)) * MOTION_PERIOD_S, 6),
+        time_s=np.round(np.arange(len(states)) * MOTION_PERIOD_S, 6),
         pose=pose,
-        wheel_angle_rad=np.array([live.wheel_angle_rad[robot] for live in lives]),
-        wheel_rate_radps=np.array([live.wheel_speed_radps[robot] for live in lives]),
-        yaw_rate_radps=np.array([live.yaw_rate_radps[robot] for live in lives]),
-        accel_mps2=np.array([live.accel_mps2[robot, :2] for live in lives]),
-        bumped=np.array([live.bumped[robot] for live in lives]),
+        wheel_angle_rad=np.array([state.wheel_angle_rad[robot] for state in states]),
+        wheel_rate_radps=np.array([state.wheel_speed_radps[robot] for state in states]),
+        yaw_rate_radps=np.array([state.yaw_rate_radps[robot] for state in states]),
+        accel_mps2=np.array([state.accel_mps2[robot, :2] for state in states]),
+        bumped=np.array([state.bumped[robot] for state in states]),
     )
