@@ -20,7 +20,7 @@ from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 from restock.train.twin.calibration.fit import Estimate, Fit, _fine, fit
 from restock.train.twin.calibration.fit_estimates import untold
-from restock.train.twin.calibration.fit_files import schedule, write
+from restock.train.twin.calibration.fit_files import schedule, write_fit
 from restock.train.twin.calibration.fit_parameters import (
     DEFAULT,
     PARAMETERS,
@@ -29,9 +29,9 @@ from restock.train.twin.calibration.fit_parameters import (
 )
 from restock.train.twin.calibration.fit_scope import cuts, sides, usable
 from restock.train.twin.calibration.fit_uncertainty import uncertainty
-from restock.train.twin.calibration.log_segments import Segments, segments
+from restock.train.twin.calibration.log_segments import Segments, log_segments
 from restock.train.twin.calibration.mismatch import Mismatch, position_gap_m
-from restock.train.twin.calibration.open_loop import replay
+from restock.train.twin.calibration.open_loop import replay_segments
 from restock.train.twin.physics.perturbation import (
     RANGES,
     Perturbation,
@@ -79,12 +79,12 @@ def noiseless(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def log(known: Path) -> Iterator[Segments]:
     with Store(known) as store:
-        yield segments(store, 2.0)
+        yield log_segments(store, 2.0)
 
 
 def test_every_step_of_a_store_is_in_a_segment_or_left_out_with_a_reason(known: Path) -> None:
     with Store(known) as store:
-        found = segments(store, 2.0)
+        found = log_segments(store, 2.0)
         rows = store.sql("SELECT count(*) FROM transitions").fetchall()[0][0]
     assert len(found) * found.horizon_steps + sum(found.left_out.values()) == rows
     assert found.signals["pose_x_m"].shape == (len(found), found.horizon_steps + 1)
@@ -95,7 +95,7 @@ def test_every_step_of_a_store_is_in_a_segment_or_left_out_with_a_reason(known: 
 
 def test_segments_are_the_rows_of_the_store(known: Path) -> None:
     with Store(known) as store:
-        found = segments(store, 1.0, stride_s=3.0)
+        found = log_segments(store, 1.0, stride_s=3.0)
         first = found.transition_id[-1]
         rows = store.sql(
             "SELECT pose_x_m, command_speed_mps, condition FROM transitions"
@@ -108,9 +108,9 @@ def test_segments_are_the_rows_of_the_store(known: Path) -> None:
 
 def test_the_twin_that_was_recorded_without_noise_repeats_itself(noiseless: Path) -> None:
     with Store(noiseless) as store:
-        found = segments(store, 3.0)
+        found = log_segments(store, 3.0)
     free = found.take(~found.signals["bumped"].any(axis=1))
-    replayed = replay(free, [NOISELESS, KNOWN])
+    replayed = replay_segments(free, [NOISELESS, KNOWN])
     same, other = position_gap_m(free, replayed)[:, :, -1]
     assert same.max() < 0.005
     assert np.median(other) > 0.05
@@ -119,8 +119,8 @@ def test_the_twin_that_was_recorded_without_noise_repeats_itself(noiseless: Path
 
 
 def test_a_replay_does_not_depend_on_what_else_is_replayed(log: Segments) -> None:
-    alone = replay(log.take(np.array([1])), [KNOWN])
-    among = replay(log, [Perturbation(), KNOWN], nthread=2)
+    alone = replay_segments(log.take(np.array([1])), [KNOWN])
+    among = replay_segments(log, [Perturbation(), KNOWN], nthread=2)
     for name, values in alone.signals.items():
         assert np.array_equal(values[0, 0], among.signals[name][1, 1])
 
@@ -160,10 +160,10 @@ def test_known_latency_gain_and_wheels_are_recovered(known: Path, tmp_path: Path
     gap = next(item for item in found.held_out if item.horizon_s == 3.0)
     assert gap.after_m < 0.5 * gap.before_m
 
-    write(tmp_path / "fitted.toml", [found])
+    write_fit(tmp_path / "fitted.toml", [found])
     assert load_perturbation(tmp_path / "fitted.toml") == found.perturbation
     with pytest.raises(ConfigError, match="is there already"):
-        write(tmp_path / "fitted.toml", [found])
+        write_fit(tmp_path / "fitted.toml", [found])
 
 
 def test_friction_under_wheels_that_stand_is_not_told_and_stays(log: Segments) -> None:
@@ -206,7 +206,7 @@ def test_a_schedule_of_several_fits_spans_what_all_of_them_told(tmp_path: Path) 
 
     fits = [one(0.9, True), one(0.96, False)]
     assert schedule(fits).ranges == {"gain": (0.9, 0.96)}
-    write(tmp_path / "fleet.toml", fits)
+    write_fit(tmp_path / "fleet.toml", fits)
     assert load_schedule(tmp_path / "fleet.toml") == schedule(fits)
 
 

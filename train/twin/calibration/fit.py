@@ -26,9 +26,9 @@ from restock.train.twin.calibration.fit_result import Estimate, Fit, Gap
 from restock.train.twin.calibration.fit_scope import HELD_OUT, Scope, cuts, scope, sides, usable
 from restock.train.twin.calibration.fit_solver import Problem, Solution, noise, search, solve
 from restock.train.twin.calibration.fit_uncertainty import uncertainty
-from restock.train.twin.calibration.log_segments import Segments, segments
+from restock.train.twin.calibration.log_segments import Segments, log_segments
 from restock.train.twin.calibration.mismatch import CHANNELS, Mismatch, position_gap_m
-from restock.train.twin.calibration.open_loop import replay
+from restock.train.twin.calibration.open_loop import replay_segments
 from restock.train.twin.physics.perturbation import Perturbation
 
 F64 = NDArray[np.float64]
@@ -83,7 +83,7 @@ def fit(
             where=str(store.path),
             remedy="name others with --parameters, or use another log",
         )
-    every = segments(store, horizon_s, recordings=recordings, task_hash=task_hash)
+    every = log_segments(store, horizon_s, recordings=recordings, task_hash=task_hash)
     if not len(every):
         raise StoreError(
             f"no stretch of {horizon_s:g} s: {every.left_out}", where=str(store.path),
@@ -215,13 +215,13 @@ def _held_out(
     period_s = store.task(task_hash).control_period_s
     for wanted_s in HELD_OUT_S:
         horizon_s = max(round(wanted_s / period_s), 1) * period_s
-        every = segments(store, horizon_s, recordings=recordings, task_hash=task_hash)
+        every = log_segments(store, horizon_s, recordings=recordings, task_hash=task_hash)
         good, _ = usable(every)
         _, after = sides(good, cut) if len(good) else (None, np.zeros(0, np.bool_))
         if not after.any():
             continue
         held: Segments = good.take(after)
-        replayed = replay(held, [base, fitted], timestep_s=timestep_s, nthread=nthread)
+        replayed = replay_segments(held, [base, fitted], timestep_s=timestep_s, nthread=nthread)
         end = position_gap_m(held, replayed)[:, :, -1]
         rng = np.random.Generator(np.random.PCG64(seed))
         interval = bootstrap([end[1]], median, rng=rng, resamples=1000)

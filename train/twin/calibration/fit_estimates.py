@@ -9,7 +9,7 @@ from restock.train.twin.calibration.fit_result import Estimate
 from restock.train.twin.calibration.fit_solver import Problem, Solution
 from restock.train.twin.calibration.fit_uncertainty import Uncertainty, profile
 from restock.train.twin.calibration.mismatch import Mismatch
-from restock.train.twin.calibration.open_loop import replay
+from restock.train.twin.calibration.open_loop import replay_segments
 
 F64 = NDArray[np.float64]
 
@@ -52,7 +52,7 @@ def _unknown(
         reason = "at the end of its range the log does not change with it"
     if parameter.name in ("friction_scale", "left_friction_scale"):
         now = coordinates.perturbation(solution.z)
-        sliding = replay(
+        sliding = replay_segments(
             mismatch.segments, [now], timestep_s=mismatch.timestep_s, nthread=mismatch.nthread
         ).sliding_mps
         share = float((sliding > SLIDES_MPS).mean())

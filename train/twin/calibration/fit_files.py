@@ -32,7 +32,7 @@ def schedule(fits: Sequence[Fit]) -> Schedule:
     )
 
 
-def write(path: Path, fits: Sequence[Fit]) -> None:
+def write_fit(path: Path, fits: Sequence[Fit]) -> None:
     """Write the perturbation of one fit, or the schedule of several, whole or not at all.
 
     Raises:

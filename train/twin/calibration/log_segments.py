@@ -85,7 +85,7 @@ class Segments:
         return replace(self, signals=signals, **arrays)
 
 
-def segments(
+def log_segments(
     store: Store,
     horizon_s: float,
     *,

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from restock.ingest.task.signals import wrap_angle
 from restock.train.twin.calibration.log_segments import Segments
-from restock.train.twin.calibration.open_loop import Replayed, replay
+from restock.train.twin.calibration.open_loop import Replayed, replay_segments
 from restock.train.twin.physics.perturbation import Perturbation
 
 F64 = NDArray[np.float64]
@@ -98,7 +98,9 @@ class Mismatch:
             new = list(dict.fromkeys(twins))
         if not new:
             return
-        replayed = replay(self.segments, new, timestep_s=self.timestep_s, nthread=self.nthread)
+        replayed = replay_segments(
+            self.segments, new, timestep_s=self.timestep_s, nthread=self.nthread
+        )
         self.replays += len(new)
         found = residuals(self.segments, replayed)
         for index, twin in enumerate(new):

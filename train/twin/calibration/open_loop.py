@@ -58,7 +58,7 @@ class Replayed:
         return np.stack([self.signals[name] for name in POSE], axis=-1)
 
 
-def replay(
+def replay_segments(
     segments: Segments,
     perturbations: Sequence[Perturbation],
     *,

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from restock.ingest.task.signals import wrap_angle
 from restock.replay.store.store import Store
-from restock.train.twin.calibration.log_segments import Segments, segments
+from restock.train.twin.calibration.log_segments import Segments, log_segments
 from restock.train.twin.calibration.logged_steps import NOMINAL, LoggedSteps
-from restock.train.twin.calibration.open_loop import replay
+from restock.train.twin.calibration.open_loop import replay_segments
 from restock.train.twin.physics.model import body_velocity
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.sensing import DRIFT_TIME_S
@@ -85,7 +85,7 @@ def path_gap(
     """
     period = steps.task.control_period_s
     stride_s = max(round(horizon_s / 2 / period), 1) * period
-    cut = segments(store, horizon_s, stride_s=stride_s, task_hash=steps.task.hash)
+    cut = log_segments(store, horizon_s, stride_s=stride_s, task_hash=steps.task.hash)
     holds = _holds(steps, cut)
     chosen = _choose(holds, most, np.random.default_rng([seed, cut.horizon_steps]))
     used = np.flatnonzero(np.any(list(chosen.values()), axis=0))
@@ -174,7 +174,7 @@ def _gaps(
     nthread: int,
 ) -> dict[str, dict[str, F64]]:
     """Source -> quantity -> (S,) of these segments."""
-    replayed = replay(part, list(twins.values()), timestep_s=timestep_s, nthread=nthread)
+    replayed = replay_segments(part, list(twins.values()), timestep_s=timestep_s, nthread=nthread)
     logged = {name: part.signals[name] for name in SIGNALS}
     fresh = part.pose_fresh[:, -1]
     found = {}

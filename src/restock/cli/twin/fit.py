@@ -65,7 +65,7 @@ class FitCommand:
         from restock.cli import output
         from restock.errors import ConfigError, ExitCode
         from restock.replay.store.store import Store
-        from restock.train.twin.calibration.fit_files import write
+        from restock.train.twin.calibration.fit_files import write_fit
         from restock.train.twin.calibration.log_segments import recordings_of
 
         if self.out is not None and self.out.exists():
@@ -77,7 +77,7 @@ class FitCommand:
             fits = [self._fit(store, group) for group in groups]
         out = None if self.dry_run else self.out
         if out is not None:
-            write(out, fits)
+            write_fit(out, fits)
         if self.json:
             output.print_json({"fits": [item.describe() for item in fits], "out": out})
         else:
