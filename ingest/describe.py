@@ -35,7 +35,7 @@ def describe_recording(
         duration_s = (span[1] - span[0]) / NANOSECONDS if span else None
         notes = list(recording.notes)
         if span and (span[0] < 0 or span[1] == LATEST_NS):
-            notes.append("its log times reach before 1970 or beyond 2262: absurd stamps")
+            notes.append("its log times reach before 1970 or beyond 2262: implausible stamps")
         compared = _clocks(recording) if clocks else {}
         return {
             "path": str(path),

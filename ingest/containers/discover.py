@@ -1,4 +1,4 @@
-"""Which recordings are there: files, bag folders, folders of many, globs; what a file is."""
+"""Finding recordings: files, bag folders, folders of many, globs; and what a file is."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ ROS1_MAGIC = b"#ROSBAG V"
 LFS_MAGIC = b"version https://git-lfs"
 METADATA = "metadata.yaml"
 LARGEST_METADATA = 2 << 20  # real ones have some kB, and the parser is slow
-# What the YAML library raises of a document that is none, or of one that it does not expect.
-_NO_YAML = (
+# What the YAML library raises of an invalid document, or of one that it does not expect.
+_INVALID_YAML = (
     *(YAMLError, KeyError, IndexError, TypeError, ValueError, AttributeError, AssertionError),
     *(RecursionError, OverflowError, NotImplementedError),
 )
@@ -32,20 +32,20 @@ def recordings_in(path: Path | str) -> list[Path]:
     glob. A bag with all its split files is one recording, named by its folder.
 
     Raises:
-        RecordingError: nothing there, or no recording in it.
+        RecordingError: no such path, or no recording in it.
     """
     path = Path(path)
     if path.is_file():
         return [path]
     if path.is_dir():
-        found = _in_folder(path)
-        if not found:
+        recordings = _in_folder(path)
+        if not recordings:
             raise RecordingError(
                 "no recording in this folder",
                 where=str(path),
                 remedy=f"recordings end in {', '.join(ENDINGS[:3])} or are rosbag2 folders",
             )
-        return found
+        return recordings
     matches = sorted(Path(name) for name in glob.glob(str(path), recursive=True))  # noqa: PTH207
     if matches:
         every = [item for match in matches for item in _matched(match)]
@@ -62,15 +62,15 @@ def _matched(match: Path) -> list[Path]:
 def _in_folder(folder: Path) -> list[Path]:
     if is_bag(folder):
         return [folder]
-    found = []
+    recordings = []
     for item in sorted(folder.iterdir()):
         if item.name.startswith("."):
             continue
         if item.is_dir() and not item.is_symlink():
-            found += _in_folder(item)
+            recordings += _in_folder(item)
         elif item.is_file() and is_storage_name(item):
-            found.append(item)
-    return found
+            recordings.append(item)
+    return recordings
 
 
 def is_storage_name(path: Path) -> bool:
@@ -88,7 +88,7 @@ def is_bag(folder: Path) -> bool:
 
 
 def bag_files(folder: Path, metadata: dict[str, Any]) -> tuple[list[Path], list[str]]:
-    """A bag's storage files in order, and the names that its metadata lists but are not there.
+    """A bag's storage files in order, and the names that its metadata lists but are missing.
 
     The metadata's paths are not trusted: only files in the folder itself are read.
     """
@@ -96,7 +96,7 @@ def bag_files(folder: Path, metadata: dict[str, Any]) -> tuple[list[Path], list[
     listed = listed if isinstance(listed, list) else []
     names = [Path(name).name for name in listed if isinstance(name, str)]
     present = {item.name: item for item in folder.iterdir() if item.is_file()}
-    there = {name: item for name, item in present.items() if is_storage_name(item)}
+    storages = {name: item for name, item in present.items() if is_storage_name(item)}
     order = []
     missing = []
     for name in dict.fromkeys(names):
@@ -108,7 +108,7 @@ def bag_files(folder: Path, metadata: dict[str, Any]) -> tuple[list[Path], list[
         elif match not in order:
             order.append(match)
     stems = {re.sub(r"\.zstd?$", "", name) for name in order}
-    rest = [name for name in there if re.sub(r"\.zstd?$", "", name) not in stems]
+    rest = [name for name in storages if re.sub(r"\.zstd?$", "", name) not in stems]
     return [present[name] for name in (*order, *sorted(rest, key=_natural))], missing
 
 
@@ -126,20 +126,20 @@ def read_metadata(folder: Path) -> tuple[dict[str, Any], str | None]:
         if file.stat().st_size > LARGEST_METADATA:
             return {}, f"{METADATA} has {file.stat().st_size:,} bytes: not read"
         document = YAML(typ="safe", pure=True).load(file.read_text(encoding="utf-8"))
-        found = document["rosbag2_bagfile_information"]
-    except _NO_YAML as error:
+        metadata = document["rosbag2_bagfile_information"]
+    except _INVALID_YAML as error:
         why = (str(error).splitlines() or [type(error).__name__])[0]
         return {}, f"{METADATA} cannot be used: {visible(why[:200])}"
-    if not isinstance(found, dict):
+    if not isinstance(metadata, dict):
         return {}, f"{METADATA} cannot be used: not a mapping"
-    return found, None
+    return metadata, None
 
 
 def kind_of(path: Path) -> Kind | Literal["zstd"]:
     """What a file is, by its first bytes.
 
     Raises:
-        RecordingError: it is not there, empty, a Git LFS pointer or no recording.
+        RecordingError: it is missing, empty, a Git LFS pointer or not a recording.
     """
     where = str(path)
     try:
@@ -164,7 +164,7 @@ def kind_of(path: Path) -> Kind | Literal["zstd"]:
     if head.startswith(ZSTD_MAGIC):
         return "zstd"
     raise RecordingError(
-        "not a recording: its first bytes are those of no MCAP, sqlite3 or ROS 1 bag file",
+        "not a recording: neither an MCAP, a sqlite3 nor a ROS 1 bag file by its first bytes",
         where=where,
         remedy="recordings are .mcap files, rosbag2 folders or their .db3 files, and .bag files",
     )

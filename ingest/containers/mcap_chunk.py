@@ -41,7 +41,7 @@ Positions: TypeAlias = dict[int, I64]  # of message records, by channel
 
 
 class BadChunk(Exception):
-    """A chunk whose content cannot be had."""
+    """A chunk whose content cannot be read."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def inflate_into(chunk: Chunk, file: Any, room: NDArray[np.uint8]) -> None:
     """
     if chunk.compression == "zstd" and _unpack(file[chunk.start : chunk.stop], room):
         _check(chunk, room.data)
-    else:  # whatever is wrong with it is found and named there
+    else:  # which names what is wrong with it
         room[:] = np.frombuffer(inflate(chunk, file), np.uint8)
 
 
@@ -133,7 +133,7 @@ def _check(chunk: Chunk, data: Any) -> None:
         raise BadChunk("its CRC does not match")
 
 
-def inflate_what_is_there(chunk: Chunk, file: Any) -> bytes:
+def inflate_partly(chunk: Chunk, file: Any) -> bytes:
     """The part of a cut or damaged chunk that still decompresses; unchecked."""
     stored = file[chunk.start : chunk.stop]
     limit = min(chunk.size, max(PLAUSIBLE_SIZE, PLAUSIBLE_RATIO * len(stored)), LARGEST_CHUNK)
@@ -174,7 +174,7 @@ def _decompress(compression: str, stored: bytes, size: int) -> bytes:
             return data
     except (zstandard.ZstdError, RuntimeError, EOFError, OSError) as error:
         raise BadChunk(f"its {compression} data is damaged ({error})") from error
-    raise BadChunk(f"compression {compression!r} is not known")
+    raise BadChunk(f"compression {compression!r} is not supported")
 
 
 @dataclass(frozen=True)
@@ -191,14 +191,14 @@ def indexed_messages(
 ) -> Messages | None:
     """A channel's messages by its index entries in some chunks, which lie in this order.
 
-    None where the index does not fit what is there: then the chunks are to be walked.
+    None where the index does not fit the chunks: then they are to be walked.
     """
     if any(len(part.entries) % _INDEX.itemsize for part in parts):
         return None
     offset = np.frombuffer(b"".join(part.entries for part in parts), _INDEX)["offset"]
     if not len(offset):
-        none = np.zeros(0, np.int64)
-        return Messages(none, none, none, none)
+        empty = np.zeros(0, np.int64)
+        return Messages(empty, empty, empty, empty)
     counts = [len(part.entries) // _INDEX.itemsize for part in parts]
     base = np.repeat(np.array([part.base for part in parts], np.int64), counts)
     size = np.repeat(np.array([part.size for part in parts], np.int64), counts)
@@ -252,11 +252,11 @@ def walked_messages(part: Any) -> tuple[Positions, str | None]:
         != end
     ):
         cut = f"cut within a record, {end - position:,} bytes before its end"
-    found = np.array(places, np.int64)
-    head = gather(np.frombuffer(part, np.uint8), found, _START)
-    found = found[(head["op"] == Op.MESSAGE) & (head["length"] >= HEAD_SIZE - PREFIX)]
-    numbers = gather(np.frombuffer(part, np.uint8), found, _START)["channel"]
-    return {number: found[numbers == number] for number in np.unique(numbers).tolist()}, cut
+    at = np.array(places, np.int64)
+    head = gather(np.frombuffer(part, np.uint8), at, _START)
+    at = at[(head["op"] == Op.MESSAGE) & (head["length"] >= HEAD_SIZE - PREFIX)]
+    numbers = gather(np.frombuffer(part, np.uint8), at, _START)["channel"]
+    return {number: at[numbers == number] for number in np.unique(numbers).tolist()}, cut
 
 
 def messages_at(buffer: NDArray[np.uint8], positions: Any) -> Messages:

@@ -34,7 +34,7 @@ class Contents:
     statistics: dict[str, Any] | None = None
     data_end: tuple[int, int] = (0, 0)  # position, and CRC of the data section (0: unchecked)
     cut: Malformed | None = None  # where and why the walk could not go on
-    cut_chunk: Chunk | None = None  # the chunk it could not pass, with what there is of it
+    cut_chunk: Chunk | None = None  # the chunk it could not pass, with what is left of it
     resumed: bool = False  # beyond the cut, up to a whole summary
     damaged: list[str] = field(default_factory=list)  # records that could not be parsed
     extras: list[Extra] = field(default_factory=list)  # attachments and metadata records
@@ -42,11 +42,11 @@ class Contents:
 
     def indexed_counts(self) -> dict[int, int]:
         """Messages per channel as far as they are known without looking into chunks."""
-        found = {channel: len(positions) for channel, positions in self.loose.items()}
+        counts = {channel: len(positions) for channel, positions in self.loose.items()}
         for chunk in self.chunks:
             for channel, count in chunk.counts().items():
-                found[channel] = found.get(channel, 0) + count
-        return found
+                counts[channel] = counts.get(channel, 0) + count
+        return counts
 
     def claimed_counts(self) -> dict[int, int] | None:
         """Messages per channel by the statistics; None where they are missing or incomplete."""

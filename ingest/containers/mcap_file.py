@@ -68,27 +68,27 @@ class McapFile:
         if self._contents.cut_chunk:
             self._contents.chunks.append(self._contents.cut_chunk)
 
-    # -- what is there ---------------------------------------------------------------------
+    # -- contents ---------------------------------------------------------------------
 
     def _count(self) -> dict[int, int]:
         """By the statistics where there are any, else by the index, else by walking chunks."""
         contents = self._contents
         claimed = contents.claimed_counts()
-        found = contents.indexed_counts()
+        counts = contents.indexed_counts()
         if claimed is not None:
             indexed = all(chunk.index for chunk in contents.chunks)
-            if indexed and any(count > found.get(number, 0) for number, count in claimed.items()):
+            if indexed and any(count > counts.get(number, 0) for number, count in claimed.items()):
                 contents.distrust_index()  # it leaves messages out; look for them
                 return claimed
-            more = {number for number, count in found.items() if count > claimed.get(number, 0)}
+            more = {number for number, count in counts.items() if count > claimed.get(number, 0)}
             if more:
                 self.notes.append("its statistics count fewer messages than it holds")
-            return {**claimed, **{number: found[number] for number in more}}
+            return {**claimed, **{number: counts[number] for number in more}}
         for chunk in contents.chunks:
             if not chunk.index:
                 for number, positions in self._chunks.walk(chunk).items():
-                    found[number] = found.get(number, 0) + len(positions)
-        return found
+                    counts[number] = counts.get(number, 0) + len(positions)
+        return counts
 
     def _channels(self) -> dict[int, Channel]:
         contents = self._contents
@@ -103,10 +103,10 @@ class McapFile:
             more_schemas, more_channels = mcap_chunk.definitions(data, 0, len(data))
             schemas = {**more_schemas, **schemas}
             channels = {**more_channels, **channels}
-        found = {}
+        named = {}
         for number, channel in channels.items():
             schema = schemas.get(channel["schema_id"], {})
-            found[number] = Channel(
+            named[number] = Channel(
                 number,
                 channel["topic"],
                 schema.get("name", ""),
@@ -114,10 +114,10 @@ class McapFile:
                 schema.get("encoding", ""),
                 schema.get("data", b""),
             )
-        for number in needed - found.keys():
+        for number in needed - named.keys():
             what = f"{self.counts[number]} messages of channel {number}, which the file never names"
             self._checks.damaged(what, {number: self.counts[number]})
-        return found
+        return named
 
     def _span(self) -> tuple[int, int] | None:
         contents = self._contents
@@ -144,12 +144,12 @@ class McapFile:
         if not crc:
             self._checks.unchecked += 1
             return
-        found = 0
+        computed = 0
         for start in range(0, position, FORGET_BYTES):
             stop = min(start + FORGET_BYTES, position)
-            found = zlib.crc32(self._buffer[start:stop].data, found)
+            computed = zlib.crc32(self._buffer[start:stop].data, computed)
             forget(self._file, start, stop)
-        if found == crc:
+        if computed == crc:
             self._checks.verified += 1
         else:
             self._checks.damaged("the CRC of its data section does not match", {})
@@ -159,14 +159,14 @@ class McapFile:
     def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
         """Loose messages first, then groups of chunks of about 8 MiB.
 
-        A batch is valid until the next one is asked for: its buffer is used again.
+        A batch is valid until the next one is read: its buffer is used again.
         """
         wanted = set(channels)
         loose = wanted & self._contents.loose.keys()
         if loose:
             self._check_loose()
-        for channel, found in self._loose(loose):
-            yield channel, batch_of(self._buffer, [found])
+        for channel, messages in self._loose(loose):
+            yield channel, batch_of(self._buffer, [messages])
         for group in self._groups(wanted):
             yield from self._chunks.read(group, wanted)
             forget(self._file, group[0].at, group[-1].stop)

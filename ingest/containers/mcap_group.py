@@ -20,7 +20,7 @@ _Part: TypeAlias = tuple[Chunk, int, int]  # a chunk, and where it lies: first b
 
 @dataclass
 class Checks:
-    """What was found of a file's soundness so far."""
+    """The state of a file's integrity so far."""
 
     damage: list[Damage] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -40,7 +40,7 @@ class Checks:
             self.damage.append(Damage(what, messages))
 
     def lost(self, chunk: Chunk, why: BadChunk) -> None:
-        """A chunk that cannot be had."""
+        """A chunk that cannot be read."""
         self.damaged(f"chunk at byte {chunk.at:,} is lost: {why}", chunk.counts())
 
     def read(self, chunk: Chunk) -> None:
@@ -58,9 +58,9 @@ class ChunkReader:
         self._scratch = np.zeros(0, np.uint8)
 
     def inflate(self, chunk: Chunk) -> bytes:
-        """One chunk's records; nothing where they cannot be had."""
+        """One chunk's records; nothing where they cannot be read."""
         if chunk is self._cut:
-            return mcap_chunk.inflate_what_is_there(chunk, self._file)
+            return mcap_chunk.inflate_partly(chunk, self._file)
         try:
             data = mcap_chunk.inflate(chunk, self._file)
         except BadChunk as bad:
@@ -83,13 +83,13 @@ class ChunkReader:
             for channel in sorted(whole):
                 yield channel, batch_of(buffer, [whole[channel]])
             return
-        found: dict[int, list[Messages]] = {}
+        located: dict[int, list[Messages]] = {}
         for part in parts:
             for channel, messages in self._locate(part, buffer, wanted):
                 if len(messages):
-                    found.setdefault(channel, []).append(messages)
-        for channel in sorted(found):
-            yield channel, batch_of(buffer, found[channel])
+                    located.setdefault(channel, []).append(messages)
+        for channel in sorted(located):
+            yield channel, batch_of(buffer, located[channel])
 
     def _by_index(
         self,
@@ -106,20 +106,20 @@ class ChunkReader:
                 start, stop = chunk.index[channel]
                 one = Indexed(base, size, self._file[start:stop])
                 entries.setdefault(channel, []).append(one)
-        found = {}
+        located = {}
         for channel, indexed in entries.items():
             messages = mcap_chunk.indexed_messages(buffer, indexed, channel)
             if messages is None:
                 return None
             if len(messages):
-                found[channel] = messages
-        return found
+                located[channel] = messages
+        return located
 
     def _inflate_group(self, group: list[Chunk]) -> tuple[NDArray[np.uint8], list[_Part]]:
         """What these chunks hold, in memory that is used again, and where; without bad ones."""
         cut, torn = self._cut, b""
         if cut is not None and cut in group:
-            torn = mcap_chunk.inflate_what_is_there(cut, self._file)
+            torn = mcap_chunk.inflate_partly(cut, self._file)
         rooms = [
             (chunk, len(torn) if chunk is cut else chunk.size)
             for chunk in group
@@ -150,7 +150,7 @@ class ChunkReader:
         return True
 
     def _inflate_into(self, chunk: Chunk, room: NDArray[np.uint8]) -> bool:
-        """Fill the room with the chunk's records, if they can be had."""
+        """Fill the room with the chunk's records, if they can be read."""
         try:
             mcap_chunk.inflate_into(chunk, self._file, room)
         except BadChunk as bad:

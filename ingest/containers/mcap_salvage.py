@@ -1,8 +1,8 @@
-"""Beyond the damage in an MCAP file: chunks that can be proven to be there are read again.
+"""Beyond the damage in an MCAP file: chunks whose place can be proven are read again.
 
 Where the summary at the file's end is whole, its chunk index says where chunks are; a chunk's own
-record must say the same. Without one, a compressed chunk shows by the name of its compression and
-two lengths that must agree. Its CRC is checked when it is read, as always.
+record must say the same. Without one, a compressed chunk is recognised by the name of its
+compression and two lengths that must agree. Its CRC is checked when it is read, as always.
 """
 
 from __future__ import annotations
@@ -53,27 +53,27 @@ def _summary(file: mmap.mmap) -> _Summary | None:
     if at < len(MAGIC) or file[end:] != MAGIC or file[at] != Op.FOOTER:
         return None
     footer = parse(Op.FOOTER, file, at + PREFIX, end)
-    found = _Summary()
-    found.start = footer["summary_start"]
-    if not len(MAGIC) <= found.start <= at:
+    summary = _Summary()
+    summary.start = footer["summary_start"]
+    if not len(MAGIC) <= summary.start <= at:
         return None
-    checked = memoryview(file)[found.start : at + PREFIX + 16]
+    checked = memoryview(file)[summary.start : at + PREFIX + 16]
     try:
         if footer["summary_crc"] and zlib.crc32(checked) != footer["summary_crc"]:
             return None
     finally:
         checked.release()
     try:
-        for opcode, start, stop in walk(file, found.start, at):
+        for opcode, start, stop in walk(file, summary.start, at):
             if opcode == Op.CHUNK_INDEX:
-                found.indexed.append(parse(Op.CHUNK_INDEX, file, start, stop))
+                summary.indexed.append(parse(Op.CHUNK_INDEX, file, start, stop))
             elif opcode == Op.STATISTICS:
-                found.statistics = parse(Op.STATISTICS, file, start, stop)
+                summary.statistics = parse(Op.STATISTICS, file, start, stop)
             elif opcode in (Op.SCHEMA, Op.CHANNEL):
-                found.definitions.append((opcode, start, stop))
+                summary.definitions.append((opcode, start, stop))
     except Malformed:
         return None
-    return found
+    return summary
 
 
 def _by_index(file: mmap.mmap, contents: Contents, summary: _Summary, cut: int) -> list[str]:
@@ -96,7 +96,7 @@ def _by_index(file: mmap.mmap, contents: Contents, summary: _Summary, cut: int) 
     for opcode, start, stop in summary.definitions:
         take_record(contents, file, opcode, start, stop)
     contents.statistics = summary.statistics
-    # Messages outside chunks that the walk took for such within the damage are none.
+    # What the walk took for messages outside chunks, but lies within the damage, is dropped.
     contents.loose = {
         channel: whole
         for channel, places in contents.loose.items()
@@ -112,15 +112,14 @@ def _within(at: int, chunks: list[Chunk]) -> bool:
 
 
 def _by_scan(file: mmap.mmap, contents: Contents, cut: int) -> list[str]:
-    """Go on at each next chunk that shows itself, walking from there to the next damage."""
+    """Go on at each next chunk that can be recognised, walking from it to the next damage."""
     lost = []
-    for at in _shown(file, cut + 1):
+    for at in _recognised(file, cut + 1):
         if at < cut:
             continue  # within what was walked since
-        first = (
+        lost.append(
             f"{at - cut:,} bytes from byte {cut:,} on are lost: reading goes on at the next chunk"
         )
-        lost.append(first)
         if contents.cut_chunk is not None:  # it ends where the next begins, at the latest
             contents.cut_chunk = cut_chunk_at(file, contents.cut_chunk.at, at)
             if contents.cut_chunk is not None:
@@ -133,13 +132,13 @@ def _by_scan(file: mmap.mmap, contents: Contents, cut: int) -> list[str]:
                     contents.resumed = contents.statistics is not None
                     return lost
                 take_record(contents, file, opcode, start, stop)
-        except Malformed as again:
-            cut = again.at
+        except Malformed as next_cut:
+            cut = next_cut.at
             contents.cut_chunk = cut_chunk_at(file, cut, len(file))
     return [*lost, f"{len(file) - cut:,} bytes from byte {cut:,} on are lost"]
 
 
-def _shown(file: mmap.mmap, start: int) -> Iterator[int]:
+def _recognised(file: mmap.mmap, start: int) -> Iterator[int]:
     """Where chunks with a compression by name are, by two lengths that agree."""
     nearest = {name: file.find(name, start) for name in _NAMES}
     while places := {at: name for name, at in nearest.items() if at >= 0}:

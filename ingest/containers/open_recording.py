@@ -88,7 +88,7 @@ class _Opening:
     def _bag(self) -> tuple[list[Path], dict[str, Any]]:
         if not discover.is_bag(self.path):
             raise RecordingError(
-                f"a folder that is no bag: it has no {METADATA}",
+                f"a folder that is not a bag: it has no {METADATA}",
                 where=str(self.path),
                 remedy="name one recording, or use `recordings_in` to find those in a folder",
             )
@@ -104,7 +104,7 @@ class _Opening:
                 remedy="copy the whole folder",
             )
         for name in missing:
-            self.damage.append(Damage(f"{METADATA} lists {name}, which is not there"))
+            self.damage.append(Damage(f"{METADATA} lists {name}, which is missing"))
         return files, metadata
 
     def _open_file(self, file: Path, *, inner: bool = False) -> None:
@@ -143,7 +143,7 @@ class _Opening:
         kind = self.kinds[0]
         if any(other != kind for other in self.kinds):
             raise RecordingError(
-                f"a bag of both {' and '.join(sorted(set(self.kinds)))} files",
+                f"a bag that mixes {' and '.join(sorted(set(self.kinds)))} files",
                 where=str(self.path),
                 remedy="name its files one by one",
             )
@@ -159,14 +159,14 @@ class _Opening:
             if isinstance(storage, SqliteFile)
             or (isinstance(storage, McapFile) and storage.profile == "ros2")
         ]
-        found = {channel.encoding for storage in ros2 for channel in storage.channels.values()}
-        said = [topic.get("serialization_format") for topic, _ in _claims(metadata)]
-        claimed = {name for name in said if isinstance(name, str)}
-        for formats in (found, claimed - {""}):
-            if formats and not formats & set(READABLE):
-                names = ", ".join(sorted(map(repr, formats)))
+        encodings = {channel.encoding for storage in ros2 for channel in storage.channels.values()}
+        formats = [topic.get("serialization_format") for topic, _ in _claims(metadata)]
+        claimed = {name for name in formats if isinstance(name, str)}
+        for names in (encodings, claimed - {""}):
+            if names and not names & set(READABLE):
+                listed = ", ".join(sorted(map(repr, names)))
                 raise RecordingError(
-                    f"its messages are serialised as {names}, and only CDR is read",
+                    f"its messages are serialised as {listed}, and only CDR is supported",
                     where=str(self.path),
                     remedy="`ros2 bag convert` with that middleware installed rewrites it as cdr",
                 )
@@ -179,10 +179,10 @@ class _Opening:
                 continue
             name = visible(name)  # as the files' own names are
             info = recording.topics.get(name)
-            there = info.expected if info else 0
-            if there != count:
+            counted = info.expected if info else 0
+            if counted != count:
                 recording.notes.append(
-                    f"{METADATA} counts {count} messages on {name}, the files hold {there}"
+                    f"{METADATA} counts {count} messages on {name}, the files hold {counted}"
                 )
 
 

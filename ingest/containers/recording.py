@@ -79,7 +79,7 @@ class Recording:
         notes: Sequence[str],
         cleanup: Sequence[Callable[[], None]],
     ) -> None:
-        """Take over what was found, and what is to be done at the end, from who opened it."""
+        """Take over the damage and notes of opening its files, and what is to be cleaned up."""
         self._bag_damage += damage
         self.notes += [*notes, *(note for storage in self._storages for note in storage.notes)]
         self._cleanup += cleanup
@@ -137,10 +137,10 @@ class Recording:
     @property
     def integrity(self) -> Integrity:
         """Whether checksums vouch for what was read; final after `read`."""
-        found = {storage.integrity for storage in self._storages}
-        if "damaged" in found or self._bag_damage:
+        states = {storage.integrity for storage in self._storages}
+        if "damaged" in states or self._bag_damage:
             return "damaged"
-        return "unverified" if "unverified" in found else "verified"
+        return "unverified" if "unverified" in states else "verified"
 
     @property
     def damage(self) -> list[Damage]:
@@ -155,15 +155,14 @@ class Recording:
     @property
     def lost_messages(self) -> list[LostMessages]:
         """What is missing: of the files, and of the topics that were read."""
-        found = [
+        lost = [
             LostMessages(None, sum(item.messages.values()) or None, item.what)
             for item in self.damage
         ]
         for account in self.accounts.values():
-            found += [
-                LostMessages(account.topic, n, reason) for reason, n in account.reasons.items() if n
-            ]
-        return found
+            reasons = account.reasons.items()
+            lost += [LostMessages(account.topic, count, why) for why, count in reasons if count]
+        return lost
 
     def leaves(self, topic: str) -> list[str]:
         """Every field path of a topic's messages; empty where it cannot be decoded."""
@@ -195,7 +194,7 @@ class Recording:
             raise RecordingError(
                 f"no topic named {unknown[0]!r}",
                 where=str(self.path),
-                remedy=f"it has {', '.join(sorted(self._streams)) or 'none'}",
+                remedy=f"it has {', '.join(sorted(self._streams)) or 'no topics'}",
             )
         readings = {
             topic: TopicReading(self.topics[topic], paths, (reductions or {}).get(topic))
@@ -237,13 +236,13 @@ class Recording:
     def _decoder(self, topic: str, stream: _Stream, paths: Sequence[str]) -> Decoder:
         channel, kind = stream.channel, self._type(stream)
         if channel.type != self.topics[topic].type:
-            raise CannotDecode(f"it also carries {channel.type}, beside {self.topics[topic].type}")
+            raise CannotDecode(f"it carries both {self.topics[topic].type} and {channel.type}")
         try:
             leaves = [kind.leaf(path) for path in paths]
             first = self._type(self._streams[topic][0])
             for leaf, before in zip(leaves, map(first.leaf, paths), strict=True):
                 if (leaf.kind, leaf.dims) != (before.kind, before.dims):
-                    raise CannotDecode(f"{leaf.path} is a {leaf.kind} here, a {before.kind} before")
+                    raise CannotDecode(f"{leaf.path} is both a {before.kind} and a {leaf.kind}")
         except RecordingError as error:
             raise RecordingError(
                 error.what, where=f"{self.path}, {topic}", remedy=error.remedy

@@ -46,9 +46,9 @@ class Ros1File:
             self._reader.open()
         except _BROKEN as error:
             raise RecordingError(
-                f"a ROS 1 bag that cannot be read: {error}",
+                f"ROS 1 bag cannot be read: {error}",
                 where=str(path),
-                remedy="`rosbag reindex` mends a bag whose recording was cut short",
+                remedy="`rosbag reindex` repairs a bag whose recording was cut short",
             ) from error
         self.channels = {
             connection.id: Channel(
@@ -79,14 +79,14 @@ class Ros1File:
             wanted = places[position]
             try:
                 data = self._reader.inflated(position)
-                found = [(channel, _batch(data, channel, at)) for channel, at in wanted.items()]
+                batches = [(channel, _batch(data, channel, at)) for channel, at in wanted.items()]
             except _BROKEN as error:
                 self.integrity = "damaged"
                 what = f"chunk at byte {position:,} is lost: {error}"
                 counts = {channel: len(offsets) for channel, offsets in wanted.items()}
                 self.damage.append(Damage(what, counts))
                 continue
-            yield from found
+            yield from batches
 
     def close(self) -> None:
         """Let go of the file."""
@@ -121,10 +121,10 @@ def _uint32(file: io.BytesIO) -> int:
 
 
 class _Bag(Reader):
-    """rosbags' reader, which believes what a bag says of its sizes, made to doubt it."""
+    """rosbags' reader, which trusts the sizes in a bag, with these checked."""
 
     def __init__(self, path: Path) -> None:
-        super().__init__(_Doubted(path))  # type: ignore[arg-type]
+        super().__init__(_BoundedPath(path))  # type: ignore[arg-type]
         self._size = path.stat().st_size
         self._entries = 0
         self._chunks: dict[int, tuple[str, int]] = {}  # position -> compression, size inside
@@ -133,7 +133,7 @@ class _Bag(Reader):
         assert self.bio
         position = self.bio.tell()
         if position in self._chunks:
-            raise ReaderError("two chunks at the same place")
+            raise ReaderError("two chunks at the same position")
         header = Header.read(self.bio, RecordType.CHUNK)
         self._chunks[position] = header.get_string("compression"), header.get_uint32("size")
         self.bio.seek(position)
@@ -170,8 +170,8 @@ class _Bag(Reader):
         return bytes(data)
 
 
-class _Doubted:
-    """A file of which no more can be asked than there is."""
+class _BoundedPath:
+    """A file of which no more can be read than it has."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -183,10 +183,10 @@ class _Doubted:
         return self._path.exists()
 
     def open(self, mode: str) -> Any:
-        return _Bounded(self._path.open(mode, buffering=0), self._path.stat().st_size)
+        return _BoundedFile(self._path.open(mode, buffering=0), self._path.stat().st_size)
 
 
-class _Bounded(io.BufferedReader):
+class _BoundedFile(io.BufferedReader):
     def __init__(self, raw: Any, size: int) -> None:
         super().__init__(raw)
         self._size = size

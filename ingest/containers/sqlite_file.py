@@ -95,7 +95,7 @@ class SqliteFile:
                 os.truncate(path, self._full_size)
             if sidecars:
                 names = ", ".join(item.name for item in sidecars)
-                self.notes.append(f"{names}: read too, the writer had not folded it in")
+                self.notes.append(f"{names}: read too, the writer had not merged it")
         mode = "ro" if immutable else "rw"
         uri = f"file:{quote(str(path.absolute()))}?mode={mode}{immutable}"
         try:
@@ -264,7 +264,7 @@ def refuse_programs(connection: sqlite3.Connection, tables: tuple[str, ...]) -> 
         for kind, sql in rows:
             words = str(sql).upper().split()[:2]
             if kind != "table" or words != ["CREATE", "TABLE"]:
-                raise sqlite3.DatabaseError(f"{table} is no plain table")
+                raise sqlite3.DatabaseError(f"{table} is not a plain table")
         # Not as a function in FROM: in a schema that is not trusted, that is not allowed.
         if any(row[6] for row in connection.execute(f"PRAGMA table_xinfo({table})")):
             raise sqlite3.DatabaseError(f"{table} has computed columns")

@@ -27,7 +27,7 @@ SMALL_ROWS = 1024  # batches of fewer messages are put together, up to
 TOGETHER_ROWS = 4096
 TOGETHER_BYTES = 4 << 20
 LATEST_NS = 2**63 - 1
-ABSURD = "logged at an absurd time, before 1970 or after 2262"
+IMPLAUSIBLE = "logged at an implausible time, before 1970 or after 2262"
 
 Fields = Mapping[str, FieldColumn]
 
@@ -64,7 +64,7 @@ class Account:
 
 @dataclass(frozen=True)
 class LostMessages:
-    """Messages or bytes of a recording that could not be had, and why."""
+    """Messages or bytes of a recording that could not be read, and why."""
 
     topic: str | None  # None: of the file as a whole
     messages: int | None  # None: unknown
@@ -91,8 +91,8 @@ class TopicReading:
     ) -> None:
         self._account = Account(topic.name, topic.type, topic.expected)
         self._wanted, self._reduction = list(dict.fromkeys(wanted)), reduction
-        none = np.zeros(0, np.int64)
-        self._log, self._publish = GrowingArray(none), GrowingArray(none)
+        no_times = np.zeros(0, np.int64)
+        self._log, self._publish = GrowingArray(no_times), GrowingArray(no_times)
         self._fields: dict[str, GrowingColumn] = {}
         self.decodable = False
 
@@ -127,7 +127,7 @@ class TopicReading:
         account = self._account
         sane = (batch.log_time_ns >= 0) & (batch.log_time_ns < LATEST_NS)
         if not sane.all():
-            self._add({ABSURD: int((~sane).sum())})
+            self._add({IMPLAUSIBLE: int((~sane).sum())})
             batch = batch.select(np.flatnonzero(sane))
         decoded = decode(batch)
         self._add(decoded.bad)
@@ -151,9 +151,9 @@ class TopicReading:
         """The account, reconciled: what the container counts beyond what came is a loss too."""
         account = self._account
         self._add(lost)
-        unsaid = account.expected - account.decoded - sum(account.reasons.values())
-        if unsaid > 0:
-            self._add({"counted by the container, but not in it": unsaid})
+        unexplained = account.expected - account.decoded - sum(account.reasons.values())
+        if unexplained > 0:
+            self._add({"counted by the container, but not in it": unexplained})
         return account
 
     def columns(self) -> TopicColumns:

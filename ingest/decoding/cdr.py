@@ -1,7 +1,7 @@
 """Batches of ROS messages to columns: CDR in both byte orders, and ROS 1's serialisation.
 
 The first four bytes of a payload (the encapsulation header) say how the rest is laid out;
-alignment is relative to the byte after them. Of the ways there are, ROS 2 writes plain CDR
+alignment is relative to the byte after them. Of these layouts, ROS 2 writes plain CDR
 ("00 01", little-endian); XCDR2 and parameter lists are refused by name.
 """
 
@@ -40,7 +40,7 @@ class ColumnDecoder:
 
     def __init__(self, message: RosType, leaves: Sequence[Leaf], *, ros1: bool = False) -> None:
         self._message, self._leaves, self._ros1 = message, tuple(leaves), ros1
-        # `name[]` is asked for and `name` compiled: brackets at the end say nothing more.
+        # `name[]` is asked for and `name` compiled: brackets at the end add nothing.
         self._paths = {leaf.path: leaf.path.removesuffix("[]") for leaf in leaves}
         self._plan = compile_plan(message, self._paths.values(), ros1=ros1)
 
@@ -65,7 +65,7 @@ class ColumnDecoder:
                 parts.append(self._decode_rows(batch, chosen, "<" if value else ">", HEADER))
             else:
                 name = _ENCAPSULATIONS.get(value, "an unknown encapsulation")
-                reason = f"serialised as {name}, {value >> 8:02x} {value & 255:02x}: not read"
+                reason = f"serialised as {name}, {value >> 8:02x} {value & 255:02x}: not supported"
                 bad[reason] = len(chosen)
         return self._join(parts, bad)
 
@@ -79,7 +79,7 @@ class ColumnDecoder:
             origin = batch.start[rows] + header
             frame = Frame(batch.buffer, order, origin, batch.stop[rows] - origin, rows, 0)
             try:
-                found = self._plan.run(frame)
+                columns = self._plan.run(frame)
                 left = frame.end - frame.position
                 if (left > (0 if self._ros1 else PADDING)).any():
                     raise BadRows(rows[left > (0 if self._ros1 else PADDING)], TOO_LONG)
@@ -88,7 +88,7 @@ class ColumnDecoder:
                 bad[refused.reason] = bad.get(refused.reason, 0) + len(refused_rows)
                 rows = np.setdiff1d(rows, refused_rows)
                 continue
-            return Decoded(rows, self._named(found), bad)
+            return Decoded(rows, self._named(columns), bad)
         return self._one_by_one(batch, rows, bad)
 
     def _one_by_one(
@@ -116,5 +116,5 @@ class ColumnDecoder:
         }
         return Decoded(rows[back], fields, bad)
 
-    def _named(self, found: Columns) -> dict[str, FieldColumn]:
-        return {path: found[compiled] for path, compiled in self._paths.items()}
+    def _named(self, columns: Columns) -> dict[str, FieldColumn]:
+        return {path: columns[compiled] for path, compiled in self._paths.items()}

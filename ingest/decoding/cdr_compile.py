@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from restock.ingest.decoding.cdr_plan import Plan, Primitives, Repeat, Text
-from restock.ingest.decoding.cdr_run import Item, Run
+from restock.ingest.decoding.cdr_fixed_fields import FixedField, FixedFields
+from restock.ingest.decoding.cdr_plan import CdrPlan, Primitives, Repeat, Text
 from restock.ingest.decoding.definitions import TIMES, RosType
 from restock.ingest.decoding.field_paths import DTYPES, CannotDecode, FieldType
 
@@ -19,27 +19,27 @@ class _Compiler:
     def __init__(self, message: RosType, wanted: Collection[str], ros1: bool) -> None:
         self.message, self.wanted, self.ros1 = message, wanted, ros1
 
-    def plan(self, name: str, prefix: str) -> Plan:
+    def plan(self, name: str, prefix: str) -> CdrPlan:
         """The plan of a message whose fields' paths start with `prefix`."""
-        plan = Plan([], {})
-        run: list[Item] = []
+        plan = CdrPlan([], {})
+        run: list[FixedField] = []
         self._message(name, prefix, plan, run)
         self._close(plan, run)
         return plan
 
-    def _close(self, plan: Plan, run: list[Item]) -> None:
+    def _close(self, plan: CdrPlan, run: list[FixedField]) -> None:
         if run:
-            plan.operations.append(Run(list(run)))
+            plan.operations.append(FixedFields(list(run)))
             run.clear()
 
-    def _message(self, name: str, prefix: str, plan: Plan, run: list[Item]) -> None:
+    def _message(self, name: str, prefix: str, plan: CdrPlan, run: list[FixedField]) -> None:
         fields = self.message.fields_of(name)
-        if not fields and not self.ros1:  # C and C++ know no empty structure: a byte stands in
-            run.append(Item(np.dtype(np.uint8), None, 1, None))
+        if not fields and not self.ros1:  # C and C++ have no empty structure: it holds one byte
+            run.append(FixedField(np.dtype(np.uint8), None, 1, None))
         for part in fields:
             self._field(part, prefix + part.name, plan, run)
 
-    def _field(self, part: FieldType, path: str, plan: Plan, run: list[Item]) -> None:
+    def _field(self, part: FieldType, path: str, plan: CdrPlan, run: list[FixedField]) -> None:
         wanted = self._wanted(path)
         if part.base and part.base != "string":
             dtype = DTYPES[part.base]
@@ -62,15 +62,15 @@ class _Compiler:
         else:
             self._message(str(part.message), path + ".", plan, run)
 
-    def _repeat(self, part: FieldType, path: str, plan: Plan, run: list[Item]) -> None:
+    def _repeat(self, part: FieldType, path: str, plan: CdrPlan, run: list[FixedField]) -> None:
         length = part.many.length if part.many else None
         self._close(plan, run)
         if part.base:
             wanted = self._wanted(path)
-            inner = Plan([Text(wanted, self.ros1)], {})
+            inner = CdrPlan([Text(wanted, self.ros1)], {})
             self._note(inner, wanted, "string", ())
         elif part.message in TIMES:
-            inner, inside = Plan([], {}), list[Item]()
+            inner, inside = CdrPlan([], {}), list[FixedField]()
             self._time(str(part.message), path, "[].", inner, inside)
             self._close(inner, inside)
         else:
@@ -80,41 +80,41 @@ class _Compiler:
         for inner_path, (kind, dims) in inner.paths.items():
             plan.paths[inner_path] = (kind, (length, *dims))
 
-    def _time(self, name: str, path: str, dot: str, plan: Plan, run: list[Item]) -> None:
+    def _time(self, name: str, path: str, dot: str, plan: CdrPlan, run: list[FixedField]) -> None:
         """Its two fields; wanted as nanoseconds of both, or each by its own path, or all."""
         fields = self.message.fields_of(name)
         bases = [field.base for field in fields]
         if len(fields) != 2 or not all(base in ("int32", "uint32") for base in bases):
-            raise CannotDecode(f"{name} is defined otherwise than everywhere")
+            raise CannotDecode(f"{name} is not the standard definition of a time")
         whole = self._wanted(path)
         for part, one in zip(("sec", "nanosec"), fields, strict=True):
             dtype = DTYPES[str(one.base)]
             align = 1 if self.ros1 else 4
-            own = self._wanted(path + dot + one.name)
+            part_path = self._wanted(path + dot + one.name)
             if whole is not None:
-                run.append(Item(dtype, None, align, whole, part, own))
+                run.append(FixedField(dtype, None, align, whole, part, part_path))
             else:
-                run.append(Item(dtype, None, align, own))
-            self._note(plan, own, str(one.base), ())
+                run.append(FixedField(dtype, None, align, part_path))
+            self._note(plan, part_path, str(one.base), ())
         self._note(plan, whole, "time", ())
 
-    def _item(self, dtype: np.dtype[Any], count: int | None, wanted: str | None) -> Item:
-        return Item(dtype, count, 1 if self.ros1 else dtype.itemsize, wanted)
+    def _item(self, dtype: np.dtype[Any], count: int | None, wanted: str | None) -> FixedField:
+        return FixedField(dtype, count, 1 if self.ros1 else dtype.itemsize, wanted)
 
     def _wanted(self, path: str) -> str | None:
         return path if path in self.wanted else None
 
     def _note(
-        self, plan: Plan, wanted: str | None, kind: str, dims: tuple[int | None, ...]
+        self, plan: CdrPlan, wanted: str | None, kind: str, dims: tuple[int | None, ...]
     ) -> None:
         if wanted is not None:
             plan.paths[wanted] = (kind, dims)
 
 
-def compile_plan(message: RosType, wanted: Iterable[str], *, ros1: bool = False) -> Plan:
+def compile_plan(message: RosType, wanted: Iterable[str], *, ros1: bool = False) -> CdrPlan:
     """The plan that reads these leaf paths of a message type (each as `Leaf.path` gives it).
 
     Raises:
-        CannotDecode: the type uses something that cannot be read.
+        CannotDecode: the type uses something unsupported.
     """
     return _Compiler(message, frozenset(wanted), ros1).plan(message.name, "")

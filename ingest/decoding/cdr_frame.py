@@ -20,8 +20,8 @@ Columns: TypeAlias = dict[str, FieldColumn]  # by field path
 
 TOO_SHORT = "mis-sized: it ends before its last field"
 TOO_LONG = "mis-sized: bytes are left after its last field"
-NOT_TEXT = "a text that is not UTF-8"
-UNTERMINATED = "a text without its terminating zero"
+NOT_TEXT = "text that is not valid UTF-8"
+UNTERMINATED = "text without its terminating zero"
 _LOOP_BYTES = 512  # rows longer than this are copied one by one: cheaper than an index per value
 
 
@@ -33,10 +33,10 @@ class BadRows(Exception):
         self.rows, self.reason = rows, reason
 
 
-class Around:
+class TextBuffer:
     """A buffer that holds little but these messages, as one text, made when it is first needed.
 
-    To cut a text from it takes a third of the time that it takes to make and decode bytes.
+    Slicing it takes a third of the time of copying and decoding bytes.
     """
 
     def __init__(self, buffer: NDArray[np.uint8]) -> None:
@@ -45,7 +45,7 @@ class Around:
         self._text: str | None = None
 
     def texts(self, at: I64, stop: I64) -> list[str] | None:
-        """The texts at these places; None where they are not all ASCII, or not to be had so."""
+        """The texts at these places; None where they are not all ASCII, or not in such a buffer."""
         if self._whole is None:
             return None
         if self._text is None:
@@ -61,7 +61,7 @@ class Around:
 class Frame:
     """N messages, or N elements of a sequence in them, being read at the same time."""
 
-    __slots__ = ("around", "buffer", "end", "order", "origin", "position", "rows")
+    __slots__ = ("buffer", "end", "order", "origin", "position", "rows", "text_buffer")
 
     def __init__(
         self,
@@ -71,10 +71,10 @@ class Frame:
         end: I64,
         rows: NDArray[np.intp],
         position: Position,
-        around: Around | None = None,
+        text_buffer: TextBuffer | None = None,
     ) -> None:
         self.buffer = buffer
-        self.around = around or Around(buffer)
+        self.text_buffer = text_buffer or TextBuffer(buffer)
         self.order = order  # "<" or ">"
         self.origin = origin  # (N,) of the message's first byte in the buffer: alignment is from it
         self.end = end  # (N,) of the message, from its origin
@@ -93,10 +93,10 @@ class Frame:
             self.end[rows],
             self.rows[rows],
             position,
-            self.around,
+            self.text_buffer,
         )
 
-    def need(self, stop: Position) -> None:
+    def check_bounds(self, stop: Position) -> None:
         """Refuse the messages that end before `stop`."""
         bad = self.end < stop
         if bad.any():
@@ -106,11 +106,11 @@ class Frame:
         """Advance to a multiple of `size` (a power of two)."""
         self.position = (self.position + (size - 1)) & -size
 
-    def word(self, align: int) -> Position:
+    def read_uint32(self, align: int) -> Position:
         """Read a uint32: one int where all messages have the same."""
         if align > 1:
             self.align(4)
-        self.need(self.position + 4)
+        self.check_bounds(self.position + 4)
         words = gather(self.buffer, self.origin + self.position, np.dtype(self.order + "u4"))
         self.position = self.position + 4
         return uniform(words.astype(np.int64))
@@ -176,12 +176,12 @@ def texts(frame: Frame, at: I64, lengths: Position) -> FieldColumn:
             out[:] = _decode(raw[:1].tolist(), frame, {})[0]
             return out
     stop = at + lengths
-    found = frame.around.texts(at, stop)
-    if found is None:
+    strings = frame.text_buffer.texts(at, stop)
+    if strings is None:
         view = frame.buffer.data
         bounds = zip(at.tolist(), stop.tolist(), strict=True)
-        found = _decode([bytes(view[a:b]) for a, b in bounds], frame, {})
-    out[:] = found
+        strings = _decode([bytes(view[a:b]) for a, b in bounds], frame, {})
+    out[:] = strings
     return out
 
 

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.ingest.decoding.cdr_fixed_fields import FixedFields
 from restock.ingest.decoding.cdr_frame import (
     UNTERMINATED,
     BadRows,
@@ -25,7 +26,6 @@ from restock.ingest.decoding.cdr_frame import (
     texts,
     uniform,
 )
-from restock.ingest.decoding.cdr_run import Run
 from restock.ingest.decoding.columns import FieldColumn, Ragged, join, offsets_of, take
 from restock.ingest.decoding.field_paths import DTYPES
 
@@ -37,7 +37,7 @@ class Operation(Protocol):
 
 
 @dataclass
-class Plan:
+class CdrPlan:
     """The operations of one message type, in the order of its serialisation."""
 
     operations: list[Operation]
@@ -47,7 +47,7 @@ class Plan:
         """The wanted fields of all messages of the frame; its cursor is then past the last field.
 
         Raises:
-            BadRows: messages that end too early, or hold a text that is none.
+            BadRows: messages that end too early, or hold invalid text.
         """
         out: Columns = {}
         for operation in self.operations:
@@ -84,9 +84,9 @@ class Text:
 
     def run(self, frame: Frame, out: Columns) -> None:
         """Step over the strings, or decode them."""
-        length = frame.word(1 if self.ros1 else 4)
+        length = frame.read_uint32(1 if self.ros1 else 4)
         stop = frame.position + length
-        frame.need(stop)
+        frame.check_bounds(stop)
         start = frame.origin + frame.position
         if not self.ros1:
             # Some writers give an empty text no bytes at all, not even its zero.
@@ -110,7 +110,7 @@ class Primitives:
 
     def run(self, frame: Frame, out: Columns) -> None:
         """Step over the sequences, or gather them."""
-        count = frame.word(1 if self.ros1 else 4)
+        count = frame.read_uint32(1 if self.ros1 else 4)
         size = self.dtype.itemsize
         if size > 4 and not self.ros1:
             # An empty sequence takes no padding.
@@ -120,15 +120,15 @@ class Primitives:
             else:
                 frame.position = np.where(count > 0, aligned, frame.position)
         stop = frame.position + count * size
-        frame.need(stop)
+        frame.check_bounds(stop)
         if self.path is not None:
             boolean = self.dtype == np.bool_
             dtype = np.dtype(np.uint8) if boolean else self.dtype.newbyteorder(frame.order)
             at = frame.origin + frame.position
-            found = gather_sequences(frame.buffer, at, count, dtype)
-            if boolean and not isinstance(found.values, Ragged):
-                found = Ragged(found.values != 0, found.offsets)
-            out[self.path] = found
+            sequences = gather_sequences(frame.buffer, at, count, dtype)
+            if boolean and not isinstance(sequences.values, Ragged):
+                sequences = Ragged(sequences.values != 0, sequences.offsets)
+            out[self.path] = sequences
         frame.position = stop
 
 
@@ -136,24 +136,24 @@ class Primitives:
 class Repeat:
     """A sequence or fixed array of messages, or of texts: the inner plan, once per element."""
 
-    inner: Plan
+    inner: CdrPlan
     length: int | None  # of a fixed array
     ros1: bool
 
     @cached_property
-    def _only_run(self) -> Run | None:
+    def _only_fixed(self) -> FixedFields | None:
         operations = self.inner.operations
         only = operations[0] if len(operations) == 1 else None
-        return only if isinstance(only, Run) else None
+        return only if isinstance(only, FixedFields) else None
 
     def run(self, frame: Frame, out: Columns) -> None:
         """All elements of all messages, as far as possible at once."""
-        count = self.length if self.length is not None else frame.word(1 if self.ros1 else 4)
+        count = self.length if self.length is not None else frame.read_uint32(1 if self.ros1 else 4)
         if not self.inner.operations:  # ROS 1: messages without fields take no bytes
             return
         counts = spread(count, len(frame))
         # An element takes at least a byte: refuse counts that cannot be, before allocating.
-        frame.need(frame.position + count)
+        frame.check_bounds(frame.position + count)
         offsets = offsets_of(counts)
         if offsets[-1] == 0:
             elements = self.inner.empty()
@@ -167,7 +167,7 @@ class Repeat:
 
     def _fixed(self, frame: Frame, counts: Any, offsets: Any) -> Columns | None:
         """Elements of one fixed size lie at known places: one gather for all of them."""
-        run = self._only_run
+        run = self._only_fixed
         if run is None:
             return None
         aligned = (frame.position + (run.first_align - 1)) & -run.first_align
@@ -179,13 +179,13 @@ class Repeat:
         if stride is None or not isinstance(phase, int):
             return None
         stop = np.where(counts > 0, aligned + counts * stride, frame.position)
-        frame.need(stop)
+        frame.check_bounds(stop)
         within = np.arange(offsets[-1]) - np.repeat(offsets[:-1], counts)
         at = np.repeat(frame.origin + aligned, counts) + within * stride
-        found: Columns = {}
-        run.take(frame, at, run.layouts[phase], found)
+        elements: Columns = {}
+        run.take(frame, at, run.layouts[phase], elements)
         frame.position = uniform(stop)
-        return found
+        return elements
 
 
 class _Elements:
@@ -196,7 +196,7 @@ class _Elements:
     where the next was thought to start. Messages where it was wrong go on one by one.
     """
 
-    def __init__(self, inner: Plan, frame: Frame, counts: Any, offsets: Any) -> None:
+    def __init__(self, inner: CdrPlan, frame: Frame, counts: Any, offsets: Any) -> None:
         self.inner, self.frame = inner, frame
         self.counts, self.offsets = counts, offsets
         self.position = spread(frame.position, len(frame)).copy()
@@ -234,9 +234,9 @@ class _Elements:
 
     def _guess(self, rows: NDArray[np.intp], left: Any, stride: Any) -> NDArray[np.intp]:
         """Read what is left of these messages by the guess; the rows where it was right."""
-        none = np.zeros(0, np.intp)
+        no_rows = np.zeros(0, np.intp)
         if not rows.size:
-            return none
+            return no_rows
         counts = left[rows]
         starts = offsets_of(counts)
         within = np.arange(starts[-1]) - np.repeat(starts[:-1], counts)
@@ -244,17 +244,17 @@ class _Elements:
         position = self.position[rows][which] + within * stride[rows][which]
         frame = self.frame.select(rows[which], position)
         try:
-            found = self.inner.run(frame)
+            columns = self.inner.run(frame)
         except BadRows:
-            return none
+            return no_rows
         stop = spread(frame.position, len(position))
         right = np.ones(len(position), np.bool_)
         right[:-1] = (stop[:-1] == position[1:]) | (which[:-1] != which[1:])
         whole = np.logical_and.reduceat(right, starts[:-1])
         elements = np.nonzero(whole[which])[0]
         if not elements.size:
-            return none
-        self.parts.append({path: take(column, elements) for path, column in found.items()})
+            return no_rows
+        self.parts.append({path: take(column, elements) for path, column in columns.items()})
         place = self.offsets[rows][which] + (self.counts[rows] - counts)[which] + within
         self.places.append(place[elements])
         good: NDArray[np.intp] = rows[whole]

@@ -60,8 +60,8 @@ class Extra:
 class Storage(Protocol):
     """One open file of messages.
 
-    `counts` is what the container itself says it holds, per channel id; `span_ns` the first and
-    last log time, or None when it holds no message. `damage` is final once everything asked for
+    `counts` are the messages by the container's own count, per channel id; `span_ns` the first and
+    last log time, or None when it holds no message. `damage` is final once everything wanted
     has been read. `notes` are worth saying and lose nothing. `extras` are not read, but named.
     """
 

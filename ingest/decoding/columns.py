@@ -109,11 +109,11 @@ def gather(buffer: NDArray[np.uint8], at: I64, dtype: np.dtype[Any]) -> NDArray[
         return np.zeros(len(at), dtype)
     raw = np.dtype((np.void, size))
     everywhere: NDArray[Any] = np.ndarray((len(buffer) - size + 1,), raw, buffer, strides=(1,))
-    found = everywhere[at]  # numpy moves opaque values as they are: faster than structures
+    values = everywhere[at]  # numpy moves opaque values as they are: faster than structures
     if dtype.subdtype:
         base, shape = dtype.subdtype
-        return found.view(base).reshape(len(at), *shape)
-    return np.ndarray((len(at),), dtype, found)  # `view` first checks every field, slowly
+        return values.view(base).reshape(len(at), *shape)
+    return np.ndarray((len(at),), dtype, values)  # `view` first checks every field, slowly
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class TopicColumns:
         return len(self.log_time_ns)
 
     def times(self, start: int, stop: int) -> TopicColumns:
-        """When messages `start` to `stop` came, without their fields, in memory of their own."""
+        """When messages `start` to `stop` came, without their fields, copied."""
         return TopicColumns(
             self.log_time_ns[start:stop].copy(), self.publish_time_ns[start:stop].copy()
         )

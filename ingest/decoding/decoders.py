@@ -20,15 +20,15 @@ def type_of(channel: Channel, distro: str, payloads: Sample) -> MessageType:
     """The type of a channel's messages; its first ones tell what a definition does not.
 
     Raises:
-        CannotDecode: an encoding or a type that is not read, and why.
+        CannotDecode: an encoding or a type that is not supported, and why.
     """
     if channel.encoding not in READABLE:
-        raise CannotDecode(f"messages encoded as {channel.encoding!r} are not read")
+        raise CannotDecode(f"messages encoded as {channel.encoding!r} are not supported")
     if channel.encoding in ("cdr", "ros1"):
         return message_type(channel, distro)
     if channel.encoding == "protobuf":
         if channel.definition_format != "protobuf":
-            raise CannotDecode("protobuf messages without a protobuf definition are not read")
+            raise CannotDecode("protobuf messages without a protobuf definition are not supported")
         # Imported here: it takes a while, and few recordings need it.
         from restock.ingest.decoding.protobuf_messages import protobuf_type
 
@@ -56,7 +56,7 @@ def decoder_of(channel: Channel, kind: MessageType, leaves: Sequence[Leaf]) -> D
     """What decodes these fields of a channel's messages.
 
     Raises:
-        CannotDecode: the type uses something that cannot be read.
+        CannotDecode: the type uses something unsupported.
     """
     if isinstance(kind, RosType):
         return ColumnDecoder(kind, leaves, ros1=channel.encoding == "ros1")

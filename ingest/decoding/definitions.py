@@ -59,13 +59,13 @@ def _field(name: str, description: Any) -> FieldType:
         (node, rest), length = rest
         fixed = description[0] == Nodetype.ARRAY
         if fixed and not 0 < length <= LONGEST_ARRAY:
-            raise CannotDecode(f"{name} is an array of {length:,}")
+            raise CannotDecode(f"{name} is an array of {length:,}, which is not supported")
         many = Many(length if fixed else None)
     if node == Nodetype.NAME:
         return FieldType(name, None, str(rest), many)
     base = str(rest[0])
     if base != "string" and base not in DTYPES:
-        raise CannotDecode(f"{name} is a {base}, which is not read")
+        raise CannotDecode(f"{name} is a {base}, which is not supported")
     return FieldType(name, base, None, many)
 
 
@@ -87,7 +87,7 @@ def refuse_unknown(distro: str) -> None:
     if distro not in _STORES:
         raise RecordingError(
             f"no type store named {distro!r}",
-            remedy=f"there are {', '.join(sorted(_STORES.keys() - {'empty', 'latest'}))}",
+            remedy=f"choose one of {', '.join(sorted(_STORES.keys() - {'empty', 'latest'}))}",
         )
 
 
@@ -101,20 +101,20 @@ def message_type(channel: Channel, distro: str) -> RosType:
     """The type of a channel's messages.
 
     Raises:
-        CannotDecode: a service or action event, a type that nobody defines, or a definition
+        CannotDecode: a service or action event, an undefined type, or a definition
             that cannot be parsed.
     """
     name = normalize_msgtype(channel.type) if channel.type else ""
-    for part, word in (("/srv/", "service"), ("/action/", "action")):
+    for part, kind in (("/srv/", "service"), ("/action/", "action")):
         if part in name:
-            raise CannotDecode(f"{word} events are not read")
+            raise CannotDecode(f"{kind} events are not supported")
     # An empty definition is that of a message without fields, or was left out by the writer.
     embedded = channel.definition_format in ("ros2msg", "ros2idl", "ros1msg")
     # Loading a distribution takes a quarter of a second: not where a recording says it all.
     types = {} if embedded and channel.definition else distro_types(distro)
     if embedded and (channel.definition or name not in types):
         if len(channel.definition) > LONGEST_DEFINITION:
-            raise CannotDecode(f"its definition has {len(channel.definition):,} bytes")
+            raise CannotDecode(f"its definition of {len(channel.definition):,} bytes is too long")
         return _embedded(name, channel.definition_format, channel.definition, distro)
     if name not in types:
         raise CannotDecode(
@@ -126,9 +126,9 @@ def message_type(channel: Channel, distro: str) -> RosType:
 
 @cache
 def _from_distro(name: str, distro: str) -> RosType:
-    found = RosType(name, distro, distro_types(distro))
-    found.leaves()  # refuses what cannot be read
-    return found
+    kind = RosType(name, distro, distro_types(distro))
+    kind.leaves()  # refuses what is not supported
+    return kind
 
 
 @lru_cache(KEPT)
@@ -140,7 +140,7 @@ def _embedded(name: str, form: str, definition: bytes, distro: str) -> RosType:
         if form != "ros2idl":
             types.update(get_types_from_msg(text, name))
         elif _costly(text):
-            raise CannotDecode("its definition nests brackets, which is not read")
+            raise CannotDecode("its definition nests brackets, which is not supported")
         elif text.startswith(f"{rule}IDL: "):
             for part in text.split(rule)[1:]:
                 types.update(get_types_from_idl(part.split("\n", 1)[1]))
@@ -155,9 +155,9 @@ def _embedded(name: str, form: str, definition: bytes, distro: str) -> RosType:
     if missing:  # some writers leave out the messages inside; their sizes will tell if they differ
         types = {**distro_types(distro), **types}
         source = f"embedded, and {distro}"
-    found = RosType(name, source, types)
-    found.leaves()  # refuses what cannot be read
-    return found
+    kind = RosType(name, source, types)
+    kind.leaves()  # refuses what is not supported
+    return kind
 
 
 def _costly(idl: str) -> bool:

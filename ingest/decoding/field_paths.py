@@ -92,7 +92,7 @@ class MessageType(ABC):
         """The fields of a message of this type's family.
 
         Raises:
-            CannotDecode: it is not defined, or uses something that cannot be read.
+            CannotDecode: it is not defined, or uses something unsupported.
         """
 
     def leaves(self) -> list[Leaf]:
@@ -121,21 +121,21 @@ class MessageType(ABC):
             if count[0] > MOST_FIELDS:
                 raise CannotDecode(f"{self.name} has more than {MOST_FIELDS:,} fields")
             path = prefix + field.name
-            here = (*steps, field)
+            through = (*steps, field)
             if field.base:
-                yield Leaf(path, here, field.base)
+                yield Leaf(path, through, field.base)
             elif field.message in self.times:
-                yield Leaf(path, here, "time")
+                yield Leaf(path, through, "time")
             elif field.message and not (self.recursive and field.message in within):
                 inner = path + ("[]." if field.many else ".")
                 inside = (*within, field.message)
-                yield from self._leaves(field.message, inner, here, inside, count)
+                yield from self._leaves(field.message, inner, through, inside, count)
 
     def leaf(self, path: str) -> Leaf:
         """One field path.
 
         Raises:
-            RecordingError: the type has no such field; says which there are.
+            RecordingError: the type has no such field; names those it has.
         """
         name, steps = self.name, list[FieldType]()
         parts = path.split(".")

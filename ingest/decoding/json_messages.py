@@ -1,6 +1,6 @@
 """JSON messages: their fields by JSON Schema, or by the messages themselves, and their values.
 
-Where the schema says nothing of a place (or there is none), the first messages of the channel do.
+Where the schema does not describe a place (or is missing), the channel's first messages do.
 JSON does not tell 0 from 0.0: seen numbers are float64, except integers that only int64 can hold.
 A message that lacks a wanted field, or has another kind of value there, is counted as undecodable;
 a null is NaN where a number should be.
@@ -47,7 +47,7 @@ Sample = Callable[[], Iterable[bytes]]
 class Node:
     """What is known of the values at one place of the messages."""
 
-    seen: Counter[str] = field(default_factory=Counter)  # JSON Schema's kinds; null is none
+    seen: Counter[str] = field(default_factory=Counter)  # JSON Schema's kinds; null is left out
     members: dict[str, Node] = field(default_factory=dict)  # of objects
     items: Node | None = None  # of arrays
     declared: bool = False  # by the schema: what is seen changes nothing
@@ -67,7 +67,7 @@ class JsonType(MessageType):
     """The type of one channel's JSON messages.
 
     Raises:
-        CannotDecode: its schema is none.
+        CannotDecode: its schema is not valid.
     """
 
     name: str
@@ -99,7 +99,7 @@ def parse(payload: bytes) -> dict[str, Any]:
     """One message.
 
     Raises:
-        Unparsable: not JSON, nested too deeply, too large, or no object.
+        Unparsable: not JSON, nested too deeply, too large, or not an object.
     """
     if len(payload) > LARGEST:
         raise Unparsable(f"JSON of more than {LARGEST:,} bytes")
@@ -116,7 +116,7 @@ def parse(payload: bytes) -> dict[str, Any]:
     except ValueError:
         raise Unparsable("not JSON") from None
     if not isinstance(value, dict):
-        raise Unparsable("JSON that is no object")
+        raise Unparsable("JSON that is not an object")
     return value
 
 
@@ -125,7 +125,7 @@ class _Schema:
 
     def __init__(self, text: bytes) -> None:
         if len(text) > LONGEST_SCHEMA:
-            raise CannotDecode(f"its definition has {len(text):,} bytes")
+            raise CannotDecode(f"its definition of {len(text):,} bytes is too long")
         try:
             self._document = msgspec.json.decode(text)
         except (ValueError, RecursionError) as error:
@@ -162,10 +162,10 @@ class _Schema:
 
     def _at(self, target: str) -> Any:
         """What a reference within the document points to; others say nothing."""
-        found = self._document if target.startswith("#") else None
+        place = self._document if target.startswith("#") else None
         for part in target.split("/")[1:]:
-            found = found.get(part) if isinstance(found, dict) else None
-        return found
+            place = place.get(part) if isinstance(place, dict) else None
+        return place
 
 
 def _complete(node: Node) -> bool:
@@ -203,10 +203,10 @@ def _observe(node: Node, value: Any, depth: int) -> None:
 
 
 class _Fields:
-    """Turns nodes to fields. A place where nothing was seen is no field."""
+    """Turns nodes to fields. A place where nothing was seen gives no field."""
 
-    def __init__(self, found: dict[str, list[FieldType]]) -> None:
-        self._found = found
+    def __init__(self, fields: dict[str, list[FieldType]]) -> None:
+        self._fields = fields
         self._count = 0
 
     def add(self, name: str, node: Node) -> None:
@@ -219,7 +219,7 @@ class _Fields:
             if member and member.isprintable() and "." not in member and "[]" not in member:
                 made = self._field(f"{name}.{member}", member, inner, None)
                 fields += [made] if made else []
-        self._found[name] = fields
+        self._fields[name] = fields
 
     def _field(self, path: str, name: str, node: Node, many: Many | None) -> FieldType | None:
         if node.kind == "array" and node.items and many is None:
@@ -256,10 +256,10 @@ class JsonParser:
 
     def member(self, message: Any, field: FieldType) -> Any:
         if not isinstance(message, dict) or field.name not in message:
-            raise Unparsable(f"without {field.name!r}")
+            raise Unparsable(f"field {field.name!r} is missing")
         value = message[field.name]
         if field.many and not isinstance(value, list):
-            raise Unparsable(f"{field.name!r} is no array")
+            raise Unparsable(f"{field.name!r} is not an array")
         return value
 
     def stamp_ns(self, value: Any) -> int:
@@ -268,7 +268,7 @@ class JsonParser:
                 parts = value[first], value[second]
                 if all(type(part) is int for part in parts):
                     return int(parts[0] * 1_000_000_000 + parts[1])
-        raise Unparsable("a time that is none")
+        raise Unparsable("not a valid time")
 
     def array(self, values: Sequence[Any], leaf: Leaf) -> NDArray[Any]:
         kinds = set(map(type, values))
@@ -280,11 +280,11 @@ class JsonParser:
         elif not (leaf.kind == "bool" and kinds <= {bool}) and not (
             leaf.kind == "int64" and kinds <= {int}
         ):
-            raise Unparsable(f"{leaf.path} is no {leaf.kind}")
+            raise Unparsable(f"{leaf.path} is not a {leaf.kind}")
         try:
             return np.array(values, DTYPES[leaf.kind])
         except OverflowError:
-            raise Unparsable(f"{leaf.path} is beyond {leaf.kind}") from None
+            raise Unparsable(f"{leaf.path} is out of range for {leaf.kind}") from None
 
     def concatenate(self, values: Sequence[Any], leaf: Leaf) -> NDArray[Any]:
         return self.array(list(chain.from_iterable(values)), leaf)

@@ -73,7 +73,7 @@ def _field(field: Any) -> FieldType:
         return FieldType(field.name, None, field.message_type.full_name, many)
     if field.type == FieldDescriptor.TYPE_BYTES:
         if many:
-            raise CannotDecode(f"{field.name} repeats bytes, which is not read")
+            raise CannotDecode(f"{field.name} repeats bytes, which is not supported")
         return FieldType(field.name, "uint8", None, Many(None))
     return FieldType(field.name, _BASES[field.cpp_type], None, many)
 
@@ -83,10 +83,10 @@ def protobuf_type(name: str, definition: bytes) -> ProtobufType:
     """The type of this name in a serialised FileDescriptorSet.
 
     Raises:
-        CannotDecode: no such set, or the type is not in it, or it uses what cannot be read.
+        CannotDecode: no such set, or the type is not in it, or it uses something unsupported.
     """
     if len(definition) > LONGEST_DEFINITION:
-        raise CannotDecode(f"its definition has {len(definition):,} bytes")
+        raise CannotDecode(f"its definition of {len(definition):,} bytes is too long")
     pool = DescriptorPool()
     try:
         files = {file.name: file for file in FileDescriptorSet.FromString(definition).file}
@@ -96,15 +96,15 @@ def protobuf_type(name: str, definition: bytes) -> ProtobufType:
                 pool.Add(files[file])
         pool.FindMessageTypeByName(name)
     except (DecodeError, TypeError, ValueError, CycleError) as error:
-        why = (str(error).splitlines() or ["it is no FileDescriptorSet"])[0]
+        why = (str(error).splitlines() or ["not a FileDescriptorSet"])[0]
         raise CannotDecode(f"its definition cannot be parsed: {why}") from error
     except KeyError:
         raise CannotDecode(
             f"its definition does not define {name or 'a type without a name'}"
         ) from None
-    found = ProtobufType(name, pool)
-    found.leaves()  # refuses what cannot be read
-    return found
+    kind = ProtobufType(name, pool)
+    kind.leaves()  # refuses what is not supported
+    return kind
 
 
 class ProtobufParser:

@@ -25,7 +25,7 @@ BYTES_AT_ONCE = 1 << 20  # of payloads that are parsed, and so objects, at the s
 
 @dataclass(frozen=True)
 class Decoded:
-    """What came of one batch: columns of the good rows, and why the others are none."""
+    """What came of one batch: columns of the good rows, and why the others failed."""
 
     rows: NDArray[np.intp]  # (G,) of the batch
     fields: dict[str, FieldColumn]  # (G, …) each
@@ -143,7 +143,7 @@ def column_of(messages: Sequence[Any], leaf: Leaf, parser: Parser) -> FieldColum
         try:
             stamps = np.array([parser.stamp_ns(value) for value in values], np.int64)
         except OverflowError:
-            raise Unparsable(f"{leaf.path} is beyond any date") from None
+            raise Unparsable(f"{leaf.path} is out of range for a date") from None
         return _wrap(stamps, levels)
     return _wrap(parser.array(values, leaf), levels)
 

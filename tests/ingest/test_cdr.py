@@ -259,8 +259,8 @@ def test_xcdr2_and_parameter_lists_are_refused_by_name() -> None:
     )
     assert found.rows.tolist() == [0]
     assert found.bad == {
-        "serialised as XCDR2, 00 07: not read": 2,
-        "serialised as a parameter list (PL_CDR), 00 03: not read": 1,
+        "serialised as XCDR2, 00 07: not supported": 2,
+        "serialised as a parameter list (PL_CDR), 00 03: not supported": 1,
     }
 
 
@@ -278,7 +278,7 @@ def test_mis_sized_messages_are_counted_and_the_others_kept() -> None:
     }
 
 
-def test_a_text_that_is_none_is_counted() -> None:
+def test_invalid_text_is_counted() -> None:
     message = one("std_msgs/msg/String")
     rows = [
         bytes.fromhex("00010000 02000000 ff00"),
@@ -288,8 +288,8 @@ def test_a_text_that_is_none_is_counted() -> None:
     found = ColumnDecoder(message, message.leaves()).decode(batch(rows))
     assert found.fields["data"].tolist() == ["a"]
     assert found.bad == {
-        "a text that is not UTF-8": 1,
-        "a text without its terminating zero": 1,
+        "text that is not valid UTF-8": 1,
+        "text without its terminating zero": 1,
     }
 
 

@@ -44,11 +44,11 @@ def bag_with(folder: Path, script: str) -> Path:
             "ALTER TABLE messages RENAME TO m; CREATE VIEW messages AS WITH RECURSIVE n(id) AS"
             " (SELECT 1 UNION ALL SELECT id + 1 FROM n) SELECT id, 1 AS topic_id,"
             " id AS timestamp, zeroblob(1000000) AS data FROM n",
-            "messages is no plain table",
+            "messages is not a plain table",
         ),
         (
             "ALTER TABLE topics RENAME TO t; CREATE VIEW topics AS SELECT * FROM t",
-            "topics is no plain table",
+            "topics is not a plain table",
         ),
         (
             "DROP TABLE messages; CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id INTEGER,"

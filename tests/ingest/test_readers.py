@@ -384,7 +384,7 @@ def test_metadata_is_not_believed(tmp_path: Path) -> None:
     with open_recording(bag) as recording:
         assert [file.parent for file in recording.files] == [bag]
         assert any(
-            "secret.db3, which is not there" in loss.reason for loss in recording.lost_messages
+            "secret.db3, which is missing" in loss.reason for loss in recording.lost_messages
         )
     metadata.write_text(text.replace("message_count: 20", "message_count: 21"))
     with open_recording(bag) as recording:
@@ -428,7 +428,7 @@ def test_an_unknown_type_skips_its_topic_by_name(tmp_path: Path) -> None:
         assert [loss.topic for loss in recording.lost_messages] == ["/odom"]
 
 
-def test_absurd_log_times_are_counted_by_name(tmp_path: Path) -> None:
+def test_implausible_log_times_are_counted_by_name(tmp_path: Path) -> None:
     for name, stamps in (
         ("run.mcap", {3: 2**64 - 1, 5: 2**63, 7: 2**63 - 1}),
         ("run.db3", {3: -1, 5: -(2**63), 7: 2**63 - 1}),
@@ -462,8 +462,8 @@ def test_absurd_log_times_are_counted_by_name(tmp_path: Path) -> None:
             assert columns.log_time_ns.tolist() == [START_NS] * 7
             assert (columns.publish_time_ns > 0).all()
             reasons = recording.accounts["/t"].reasons
-            assert reasons == {"logged at an absurd time, before 1970 or after 2262": 3}
-        assert any("absurd stamps" in note for note in describe_recording(file)["notes"])
+            assert reasons == {"logged at an implausible time, before 1970 or after 2262": 3}
+        assert any("implausible stamps" in note for note in describe_recording(file)["notes"])
 
 
 # -- recordings that other people made ------------------------------------------------------
@@ -517,7 +517,7 @@ def test_other_peoples_recordings_are_counted_and_read(name: str) -> None:
 @needs_shared
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_a_bag_that_is_not_cdr_is_refused_by_name(storage: str) -> None:
-    with pytest.raises(RecordingError, match="'wrong_format', and only CDR is read"):
+    with pytest.raises(RecordingError, match="'wrong_format', and only CDR is supported"):
         open_recording(SHARED / "rosbag2-tests" / storage / "wrong_rmw_test")
 
 

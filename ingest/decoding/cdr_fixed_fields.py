@@ -25,8 +25,8 @@ SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
-class Item:
-    """One primitive, or a fixed array of them, in a run."""
+class FixedField:
+    """One primitive, or a fixed array of them, among fields of fixed size."""
 
     dtype: np.dtype[Any]  # "<" is implied
     count: int | None  # of a fixed array
@@ -44,10 +44,10 @@ class _Layout:
     groups: list[tuple[int, dict[Order, np.dtype[Any]]]]  # first byte; byte order -> structure
 
 
-class Run:
+class FixedFields:
     """Consecutive fields of fixed size, gathered as structures."""
 
-    def __init__(self, items: list[Item]) -> None:
+    def __init__(self, items: list[FixedField]) -> None:
         self.items = items
         self.mask = max(item.align for item in items) - 1
         self.layouts = [self._layout(phase) for phase in range(self.mask + 1)]
@@ -56,7 +56,7 @@ class Run:
 
     def _layout(self, phase: int) -> _Layout:
         position = phase
-        groups: list[list[tuple[str, Item, int]]] = []
+        groups: list[list[tuple[str, FixedField, int]]] = []
         last = 0
         for number, item in enumerate(self.items):
             position = (position + item.align - 1) & -item.align
@@ -77,7 +77,7 @@ class Run:
             phase = uniform(position & self.mask)
         if isinstance(phase, int):
             layout = self.layouts[phase]
-            frame.need(position + layout.size)
+            frame.check_bounds(position + layout.size)
             self.take(frame, frame.origin + position, layout, out)
             frame.position = position + layout.size
         else:
@@ -85,7 +85,7 @@ class Run:
 
     def _run_phases(self, frame: Frame, position: Any, phase: Any, out: Columns) -> None:
         stop = position + self.sizes[phase]
-        frame.need(stop)
+        frame.check_bounds(stop)
         parts: list[Columns] = []
         order: list[NDArray[np.intp]] = []
         for value in np.unique(phase):
@@ -103,10 +103,10 @@ class Run:
         """The wanted items at these byte positions; they must fit."""
         times: dict[str, NDArray[np.int64]] = {}
         for first, structures in layout.groups:
-            found = gather(frame.buffer, at + first, structures[frame.order])
-            for name in found.dtype.names or ():
+            structs = gather(frame.buffer, at + first, structures[frame.order])
+            for name in structs.dtype.names or ():
                 item = self.items[int(name)]
-                values = native(found[name])
+                values = native(structs[name])
                 if item.dtype == np.bool_:
                     values = values != 0
                 if item.also is not None:
@@ -124,7 +124,7 @@ class Run:
         return size if (phase + size) & self.mask == phase else None
 
 
-def _structure(group: list[tuple[str, Item, int]]) -> tuple[int, dict[Order, np.dtype[Any]]]:
+def _structure(group: list[tuple[str, FixedField, int]]) -> tuple[int, dict[Order, np.dtype[Any]]]:
     first = group[0][2]
     structures: dict[Order, np.dtype[Any]] = {}
     for order in ORDERS:
