@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from restock.errors import ConfigError
 from restock.train.dqn.checkpoint import generator_state, restore_generator
 from restock.train.dqn.config import JumpStartConfig
-from restock.train.dqn.fitted_q import Fit, chances, cloned_behaviour
+from restock.train.dqn.fitted_q import FittedQConfig, chances, cloned_behaviour
 from restock.train.dqn.network import QNetwork
 from restock.train.feed.batches import Logs
 
@@ -64,9 +64,9 @@ class JumpStart:
             )
         num_envs, observation_size, actions = size
         rows = logs.rows.numpy()
-        fit = Fit(cloning_updates=0) if resume else Fit()
+        fit = FittedQConfig(cloning_updates=0) if resume else FittedQConfig()
         network = cloned_behaviour(
-            rows[:, :observation_size], rows[:, -3].astype(np.int64), actions, fit=fit, seed=seed
+            rows[:, :observation_size], rows[:, -3].astype(np.int64), actions, config=fit, seed=seed
         )
         return cls(config, network, num_envs, seed)
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import ExitCode, RestockError
+from restock.train.dqn.network import clone
 from restock.train.dqn.target import Hard
 from restock.train.evaluation.evaluate import (
     GreedyPolicy,
@@ -23,7 +24,8 @@ from restock.train.evaluation.evaluate import (
     run_episodes,
     score,
 )
-from restock.train.evaluation.ope_run import judge_session
+from restock.train.evaluation.ope import OpeConfig, evaluate_off_policy, measures_of
+from restock.train.evaluation.ope_dataset import load_ope_dataset
 from restock.train.feed.batches import Batch
 from restock.train.feed.probe import Probe
 from restock.train.guard import Fall, falls, roll_back
@@ -79,7 +81,7 @@ def train(
         if session.interval.updates:
             _close_interval(session, "offline", notify)
         if config.evaluation.off_policy:
-            judge_session(session)  # on held-out logs, before it drives
+            _evaluate_off_policy(session)  # on held-out logs, before it drives
         _evaluate(session, notify)
 
     while clock.env_steps < schedule.env_steps and _time_left(session) and not clock.stopped:
@@ -244,6 +246,22 @@ def _close_interval(session: Session, phase: str, notify: Notify) -> None:
     session.events.scalars(clock.env_steps, "train", row)
     session.interval = Interval(env_steps_before=clock.env_steps, wall_s_before=wall_s)
     notify("progress", row)
+
+
+def _evaluate_off_policy(session: Session) -> None:
+    """The policy as it is now, on held-out logs, into the table `off_policy`; none without logs."""
+    if session.logs is None or session.logs.panel is None:
+        return
+    config, learner = session.config, session.learner
+    rows = evaluate_off_policy(
+        clone(learner.policy_network).to("cpu"),
+        load_ope_dataset(session.logs.panel, session.task, seed=config.seed),
+        discount=config.loss.discount,
+        measures=measures_of(session.task),
+        config=OpeConfig(seed=config.seed),
+    )
+    clocks = {"env_steps": session.clock.env_steps, "gradient_steps": learner.gradient_steps}
+    session.run.append("off_policy", [{**clocks, **row} for row in rows])
 
 
 def _evaluate(session: Session, notify: Notify) -> None:

@@ -74,13 +74,13 @@ def run(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
             for name, rows in (("nominal", 90), (HOSTILE, 10))
         ],
     )
-    judged = {"fqe": {"refused": None}, "wdr": {"value": None, "refused": HOSTILE}}
+    estimates = {"fqe": {"refused": None}, "wdr": {"value": None, "refused": HOSTILE}}
     made.append(
         "off_policy",
         [
             filled("off_policy", condition=condition, estimator=name, **values)
             for condition in ("all", "nominal")
-            for name, values in judged.items()
+            for name, values in estimates.items()
         ],
     )
     made.append("ages", [filled("ages", source="logs", unit="days", bucket=b) for b in (-1, 0, 3)])
@@ -228,7 +228,7 @@ def test_every_section_has_its_figures(html: str) -> None:
 
 def test_estimates_from_logs_are_on_the_page_with_what_was_refused(html: str) -> None:
     part = html.split('<section id="learning">')[1].split("</section>")[0]
-    assert "Judged on held-out logs" in part
+    assert "Off-policy evaluation on held-out logs" in part
     assert "0.50 [0.50, 0.50]" in part
     assert "refused: &lt;script&gt;" in part
 

@@ -37,7 +37,7 @@ class Rows:
 
 
 @dataclass(frozen=True)
-class Fit:
+class FittedQConfig:
     """How a model is fitted."""
 
     iterations: int = 240  # the time limit of the warehouse task, in steps
@@ -67,7 +67,7 @@ def fitted_q(
     *,
     discount: float,
     bounds: tuple[float, float] | None = None,
-    fit: Fit = Fit(),
+    config: FittedQConfig = FittedQConfig(),
     seed: int = 0,
 ) -> QNetwork:
     """Fit the values of a policy.
@@ -84,20 +84,20 @@ def fitted_q(
     network = QNetwork(
         rows.observation.shape[1],
         actions,
-        hidden=fit.hidden,
-        layer_norm=fit.layer_norm,
+        hidden=config.hidden,
+        layer_norm=config.layer_norm,
         generator=generator,
     )
     observation, following = map(torch.from_numpy, (rows.observation, rows.next_observation))
     action, reward = torch.from_numpy(rows.action), torch.from_numpy(rows.reward)
     going_on = torch.from_numpy(discount * ~rows.terminated).float()
     policy = torch.from_numpy(next_probability)
-    optimizer = torch.optim.Adam(network.parameters(), lr=fit.learning_rate, fused=True)
-    decay = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.1, fit.iterations)
+    optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, fused=True)
+    decay = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.1, config.iterations)
     before: QNetwork | None = None
-    for _ in range(fit.iterations):
-        for _ in range(fit.updates):
-            some = torch.randint(len(rows), (fit.batch_size,), generator=generator)
+    for _ in range(config.iterations):
+        for _ in range(config.updates):
+            some = torch.randint(len(rows), (config.batch_size,), generator=generator)
             target = reward[some]
             if before is not None:
                 with torch.no_grad():
@@ -117,7 +117,7 @@ def cloned_behaviour(
     action: NDArray[np.int64],
     actions: int,
     *,
-    fit: Fit = Fit(),
+    config: FittedQConfig = FittedQConfig(),
     seed: int = 0,
 ) -> QNetwork:
     """Behaviour cloning: a network whose softmax is the chance of each action in the logs.
@@ -126,13 +126,13 @@ def cloned_behaviour(
     """
     generator = torch.Generator().manual_seed(seed)
     network = QNetwork(
-        observation.shape[1], actions, hidden=fit.hidden, layer_norm=fit.layer_norm,
+        observation.shape[1], actions, hidden=config.hidden, layer_norm=config.layer_norm,
         generator=generator,
     )  # fmt: skip
     seen, taken = torch.from_numpy(observation), torch.from_numpy(action)
-    optimizer = torch.optim.Adam(network.parameters(), lr=fit.learning_rate, fused=True)
-    for _ in range(fit.cloning_updates):
-        some = torch.randint(len(taken), (fit.batch_size,), generator=generator)
+    optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, fused=True)
+    for _ in range(config.cloning_updates):
+        some = torch.randint(len(taken), (config.batch_size,), generator=generator)
         _descend(optimizer, nn.functional.cross_entropy(network(seen[some]), taken[some]))
     return network
 
@@ -158,4 +158,12 @@ def _descend(optimizer: Any, loss: Tensor) -> None:
     optimizer.step()
 
 
-__all__ = ["Fit", "Rows", "chances", "cloned_behaviour", "fitted_q", "soft_greedy", "values"]
+__all__ = [
+    "FittedQConfig",
+    "Rows",
+    "chances",
+    "cloned_behaviour",
+    "fitted_q",
+    "soft_greedy",
+    "values",
+]

@@ -1,159 +1,254 @@
-"""Judging a policy on held-out logs before it drives: from networks and rows to a table.
+"""Off-policy evaluation: what a policy is worth, from logs of others, before it drives itself.
 
-What is judged is the greedy policy made soft: with chance `epsilon` it acts at random. A
-deterministic one agrees with no long episode to its end, and weights would be of nothing.
+What is evaluated is the greedy policy made soft: with probability `epsilon` it acts at random. A
+deterministic one agrees with no long episode to its end, and its weights would all be zero.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
-import msgspec
 import numpy as np
+import pyarrow as pa
+from msgspec import Meta
 from numpy.typing import NDArray
 
-from restock.train.dqn.fitted_q import Fit, chances, cloned_behaviour, fitted_q, soft_greedy, values
+from restock.errors import RunError
+from restock.files import write_table
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.task import Task
+from restock.toml import Checked
+from restock.train.dqn.config import parse_config
+from restock.train.dqn.fitted_q import (
+    FittedQConfig,
+    chances,
+    cloned_behaviour,
+    fitted_q,
+    soft_greedy,
+    values,
+)
 from restock.train.dqn.network import Network, QNetwork
-from restock.train.evaluation.ope_dataset import Evidence, Measure, Steps
-from restock.train.evaluation.ope_estimators import Gate, Logged, estimate
+from restock.train.evaluation.eval_run import load_agent
+from restock.train.evaluation.ope_dataset import (
+    Measure,
+    OpeDataset,
+    OpeSteps,
+    load_ope_dataset,
+    run_panel,
+)
+from restock.train.evaluation.ope_estimators import EssGate, OpeEpisodes, estimate
+from restock.train.run.run import Run
+from restock.train.run.run_tables import TABLES
 
 F64 = NDArray[np.float64]
-EVERY = "all"
+ALL = "all"
+FILE = "off_policy.parquet"  # in RUN/eval
 
 
-class Judging(msgspec.Struct, frozen=True):
-    """How a policy is judged."""
+class OpeConfig(Checked, frozen=True):
+    """How a policy is evaluated on logs.
 
-    epsilon: float = 0.1  # of the greedy policy made soft
-    horizon: int | None = None  # steps that are weighted; None: all
-    ess_share: float = 0.2  # of the episodes, that weights must be worth
+    Raises:
+        ValueError: a value out of its range.
+    """
+
+    epsilon: Annotated[float, Meta(ge=0, le=1)] = 0.1  # of the greedy policy made soft
+    horizon: Annotated[int, Meta(ge=1)] | None = None  # steps that are weighted; None: all
+    ess_share: Annotated[float, Meta(ge=0, le=1)] = 0.2  # of the episodes, that weights must reach
     ess_episodes: float = 5.0  # … and at least so many
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.epsilon <= 1:
-            raise ValueError(f"epsilon must be in [0, 1], got {self.epsilon:g}")
-        if self.horizon is not None and self.horizon < 1:
-            raise ValueError(f"horizon must be at least 1, got {self.horizon}")
-        if not 0 <= self.ess_share <= 1:
-            raise ValueError(f"ess_share must be in [0, 1], got {self.ess_share:g}")
+    model: FittedQConfig = FittedQConfig()
 
 
 @dataclass(frozen=True)
-class _Behaviour:
-    """The chance of each logged action, and how many had to be estimated."""
+class OpeResult:
+    """The rows of `off_policy`, and what is worth saying of the logs."""
 
-    probability: F64  # (N,)
-    estimated: int
+    rows: list[dict[str, Any]]
+    notes: tuple[str, ...]
+    version: str  # of the policy
 
 
-def judge(
+def evaluate_run_off_policy(
+    path: Path,
+    logs: str | None,
+    config: OpeConfig = OpeConfig(),  # noqa: B008  (frozen)
+    progress: Callable[[int], None] | None = None,
+    *,
+    write: bool = True,
+) -> OpeResult:
+    """Evaluate the policy that a run kept, and write `RUN/eval/off_policy.parquet`.
+
+    Args:
+        path: the run.
+        logs: a store, or a panel whose held-out episodes count; default the run's own panel.
+        progress: called with 1 after every measure.
+        write: whether to write the file.
+
+    Raises:
+        RunError: no such run, no policy kept, or no episode that it did not learn from.
+        StoreError, PanelError: no such logs.
+    """
+    run = Run.open(path)
+    trained = parse_config(run.document["config"], where=str(path / "config.json"))
+    if not run.best.exists():
+        raise RunError(
+            "has kept no policy yet: its first evaluation is still to come",
+            where=str(path),
+            remedy=f"go on with `restock train --resume {path}`",
+        )
+    agent = load_agent(run)
+    task = load_profile(trained.profile).task
+    dataset = load_ope_dataset(run_panel(run.document), task, logs, seed=config.seed)
+    rows = evaluate_off_policy(
+        agent.network,
+        dataset,
+        discount=trained.loss.discount,
+        measures=measures_of(task),
+        config=config,
+        progress=progress,
+    )
+    if write:
+        steps = int(agent.version.rpartition("@")[2])
+        clocks = {"env_steps": None, "gradient_steps": steps}
+        table = pa.Table.from_pylist([{**clocks, **row} for row in rows], TABLES["off_policy"])
+        write_table(table, path / "eval" / FILE)
+    return OpeResult(rows, dataset.notes, agent.version)
+
+
+def measures_of(task: Task) -> tuple[Measure, ...]:
+    """What can be measured of a task: where a contact terminates the episode, or there is no goal,
+    logs do not tell an arrival from another end."""
+    arrivals = task.goal == "route" and not task.bump_terminates
+    return ("return", "success") if arrivals else ("return",)
+
+
+def evaluate_off_policy(
     network: Network,
-    evidence: Evidence,
+    dataset: OpeDataset,
     *,
     discount: float,
     measures: tuple[Measure, ...] = ("return", "success"),
-    how: Judging = Judging(),  # noqa: B008  (frozen)
-    fit: Fit = Fit(),  # noqa: B008  (frozen)
+    config: OpeConfig = OpeConfig(),  # noqa: B008  (frozen)
     progress: Callable[[int], None] | None = None,
 ) -> list[dict[str, Any]]:
     """Rows of `off_policy`: measure x condition of the episode x estimator."""
-    found: list[dict[str, Any]] = []
-    gate = Gate(how.ess_share, how.ess_episodes)
-    behaviour = _behaviour(evidence, network.actions, fit, how.seed)
+    results: list[dict[str, Any]] = []
+    gate = EssGate(config.ess_share, config.ess_episodes)
+    probability, estimated = _behaviour_probability(dataset, network.actions, config)
     for measure in measures:
-        model, held = evidence.model.measured(measure), evidence.held.measured(measure)
+        training = dataset.training.measured(measure)
+        evaluation = dataset.evaluation.measured(measure)
         gamma = discount if measure == "return" else 1.0
         q = fitted_q(
-            model.rows,
-            soft_greedy(network, model.rows.next_observation, how.epsilon),
+            training.rows,
+            soft_greedy(network, training.rows.next_observation, config.epsilon),
             discount=gamma,
             bounds=None if measure == "return" else (0.0, 1.0),
-            fit=fit,
-            seed=how.seed,
+            config=config.model,
+            seed=config.seed,
         )
-        kept = ~evidence.held.bumped_before if measure == "success" else slice(None)
-        logged = logged_episodes(network, q, held, behaviour.probability[kept], gamma, how.epsilon)
-        for condition in (EVERY, *sorted(set(held.condition.tolist()))):
-            part = logged if condition == EVERY else logged.of(held.condition == condition)
-            least, reach = gate.measure(part.until(how.horizon))
-            for answer in estimate(
-                part, gate=gate, horizon=how.horizon, rng=np.random.default_rng([how.seed, 12])
-            ):
-                found.append(
-                    {
-                        "measure": measure,
-                        "condition": condition,
-                        "estimator": answer.estimator,
-                        "value": answer.value,
-                        "low": answer.low,
-                        "high": answer.high,
-                        "refused": answer.refused,
-                        "episodes": len(part),
-                        "ess": least,
-                        "ess_steps": reach,
-                        "steps": part.ratio.shape[1],
-                        "horizon": how.horizon,
-                        "epsilon": how.epsilon,
-                        "discount": gamma,
-                        "estimated_share": behaviour.estimated / max(len(evidence.held.rows), 1),
-                    }
-                )
+        kept = ~dataset.evaluation.bumped_before if measure == "success" else slice(None)
+        episodes = padded_episodes(network, q, evaluation, probability[kept], gamma, config.epsilon)
+        for condition in (ALL, *sorted(set(evaluation.condition.tolist()))):
+            part = episodes
+            if condition != ALL:
+                part = episodes.select(evaluation.condition == condition)
+            ess, ess_steps = gate.measure(part.until(config.horizon))
+            shared = {
+                "measure": measure,
+                "condition": condition,
+                "episodes": len(part),
+                "ess": ess,
+                "ess_steps": ess_steps,
+                "steps": part.ratio.shape[1],
+                "horizon": config.horizon,
+                "epsilon": config.epsilon,
+                "discount": gamma,
+                "estimated_share": estimated,
+            }
+            rng = np.random.default_rng([config.seed, 12])
+            results += [
+                {
+                    **shared,
+                    "estimator": answer.estimator,
+                    "value": answer.value,
+                    "low": answer.low,
+                    "high": answer.high,
+                    "refused": answer.refused,
+                }
+                for answer in estimate(part, gate=gate, horizon=config.horizon, rng=rng)
+            ]
         if progress is not None:
             progress(1)
-    return found
+    return results
 
 
-def logged_episodes(
+def padded_episodes(
     network: Network,
     q: QNetwork,
-    held: Steps,
+    steps: OpeSteps,
     probability: F64,
     discount: float,
     epsilon: float,
-) -> Logged:
+) -> OpeEpisodes:
     """Rows by episode (N,) to padded episodes, as policy and model see them."""
-    rows = held.rows
-    here, there = (
+    rows = steps.rows
+    policy, next_policy = (
         soft_greedy(network, observation, epsilon)
         for observation in (rows.observation, rows.next_observation)
     )
-    q_here, q_there = values(q, rows.observation), values(q, rows.next_observation)
+    q_now, q_next = values(q, rows.observation), values(q, rows.next_observation)
     at = np.arange(len(rows))
-    first = np.flatnonzero(np.diff(held.episode, prepend=-1))
+    first = np.flatnonzero(np.diff(steps.episode, prepend=-1))
     lengths = np.diff(np.append(first, len(rows)))
     step = at - np.repeat(first, lengths)
     shape = len(first), int(lengths.max())
 
     def padded(column: NDArray[Any], outside: float = 0.0) -> F64:
         matrix = np.full(shape, outside)
-        matrix[held.episode, step] = column
+        matrix[steps.episode, step] = column
         return matrix
 
-    value = np.where(rows.terminated, 0.0, (there * q_there).sum(axis=1))
-    return Logged(
-        padded(here[at, rows.action] / probability, 1.0),
+    value = np.where(rows.terminated, 0.0, (next_policy * q_next).sum(axis=1))
+    return OpeEpisodes(
+        padded(policy[at, rows.action] / probability, 1.0),
         padded(rows.reward),
-        padded(q_here[at, rows.action]),
+        padded(q_now[at, rows.action]),
         padded(value),
-        (here * q_here).sum(axis=1)[first],
+        (policy * q_now).sum(axis=1)[first],
         discount,
     )
 
 
-def _behaviour(evidence: Evidence, actions: int, fit: Fit, seed: int) -> _Behaviour:
-    """As logged; where the logs do not say, by cloning the behaviour of the model's rows."""
-    held = evidence.held
-    unknown = ~(held.probability > 0)
-    probability = held.probability.copy()
+def _behaviour_probability(
+    dataset: OpeDataset, actions: int, config: OpeConfig
+) -> tuple[F64, float]:
+    """Of each logged action (N,), and the share of rows in which it had to be estimated.
+
+    As logged; where the logs do not say, by cloning the behaviour of the training rows.
+    """
+    steps = dataset.evaluation
+    unknown = ~(steps.probability > 0)
+    probability = steps.probability.copy()
     if unknown.any():
-        rows = evidence.model.rows
-        clone = cloned_behaviour(rows.observation, rows.action, actions, fit=fit, seed=seed)
-        chance = chances(clone, held.rows.observation[unknown])
-        probability[unknown] = chance[np.arange(len(chance)), held.rows.action[unknown]]
-    return _Behaviour(probability, int(unknown.sum()))
+        rows = dataset.training.rows
+        clone = cloned_behaviour(
+            rows.observation, rows.action, actions, config=config.model, seed=config.seed
+        )
+        cloned = chances(clone, steps.rows.observation[unknown])
+        probability[unknown] = cloned[np.arange(len(cloned)), steps.rows.action[unknown]]
+    return probability, int(unknown.sum()) / max(len(steps.rows), 1)
 
 
-__all__ = ["Judging", "judge", "logged_episodes"]
+__all__ = [
+    "OpeConfig",
+    "OpeResult",
+    "evaluate_off_policy",
+    "evaluate_run_off_policy",
+    "measures_of",
+    "padded_episodes",
+]

@@ -1,4 +1,4 @@
-"""What a policy is worth, judged from episodes that other policies drove: before it drives itself.
+"""Estimators of what a policy is worth, from episodes that other policies drove.
 
 Three estimators, each a few lines, over n logged episodes padded to T steps:
 
@@ -30,7 +30,7 @@ _TINY = 1e-300
 
 
 @dataclass(frozen=True)
-class Logged:
+class OpeEpisodes:
     """Logged episodes as the evaluated policy and its model see them. After an episode's end
     `ratio` is 1 and all else 0, as if it stayed where it is and got nothing."""
 
@@ -44,7 +44,7 @@ class Logged:
     def __len__(self) -> int:
         return len(self.ratio)
 
-    def of(self, episodes: NDArray[np.bool_]) -> Logged:
+    def select(self, episodes: NDArray[np.bool_]) -> OpeEpisodes:
         """Some of the episodes."""
         return replace(
             self,
@@ -55,7 +55,7 @@ class Logged:
             start_value=self.start_value[episodes],
         )
 
-    def until(self, horizon: int | None) -> Logged:
+    def until(self, horizon: int | None) -> OpeEpisodes:
         """The first steps alone: importance sampling then knows of no reward after them, and
         doubly robust takes the model's word for it."""
         return replace(
@@ -90,7 +90,7 @@ def relative_weights(ratio: F64) -> F64:
     return np.exp(logs - np.where(np.isfinite(most), most, 0.0))
 
 
-def per_decision(logged: Logged, counts: F64, *, weighted: bool = True) -> F64:
+def per_decision(logged: OpeEpisodes, counts: F64, *, weighted: bool = True) -> F64:
     """(Weighted) per-decision importance sampling; `counts` (B, n) of each episode -> (B,).
 
     Unweighted it is unbiased, and its variance grows with every step; weighted it is consistent.
@@ -98,7 +98,7 @@ def per_decision(logged: Logged, counts: F64, *, weighted: bool = True) -> F64:
     return _weigh(logged.ratio, logged.reward, counts, weighted) @ logged.discounts
 
 
-def doubly_robust(logged: Logged, counts: F64, *, weighted: bool = True) -> F64:
+def doubly_robust(logged: OpeEpisodes, counts: F64, *, weighted: bool = True) -> F64:
     """(Weighted) doubly robust; `counts` (B, n) of each episode -> (B,).
 
     What the model says of the starts, and the weighted sum of where it was wrong on the way:
@@ -109,12 +109,12 @@ def doubly_robust(logged: Logged, counts: F64, *, weighted: bool = True) -> F64:
     return fitted(logged, counts) + correction
 
 
-def fitted(logged: Logged, counts: F64) -> F64:
+def fitted(logged: OpeEpisodes, counts: F64) -> F64:
     """The model's word: the mean value of the starts; `counts` (B, n) -> (B,)."""
     return np.asarray(counts @ logged.start_value / counts.sum(axis=1), np.float64)
 
 
-def observed(logged: Logged, counts: F64) -> F64:
+def observed(logged: OpeEpisodes, counts: F64) -> F64:
     """What the behaviour policies got themselves; `counts` (B, n) -> (B,)."""
     return np.asarray(counts @ (logged.reward @ logged.discounts) / counts.sum(axis=1), np.float64)
 
@@ -135,13 +135,13 @@ def effective_episodes(ratio: F64) -> F64:
 
 
 @dataclass(frozen=True)
-class Gate:
+class EssGate:
     """What importance weights must be worth, at every step, for their estimates to be shown."""
 
     share: float = 0.2  # of the episodes
     episodes: float = 5.0
 
-    def refusal(self, logged: Logged) -> str | None:
+    def refusal(self, logged: OpeEpisodes) -> str | None:
         """Why the estimators that weigh are refused, or None."""
         least, reach = self.measure(logged)
         if reach == logged.ratio.shape[1] and len(logged):
@@ -152,7 +152,7 @@ class Gate:
             f" {reach} of {logged.ratio.shape[1]} steps"
         )
 
-    def measure(self, logged: Logged) -> tuple[float, int]:
+    def measure(self, logged: OpeEpisodes) -> tuple[float, int]:
         """The least effective number of episodes, and for how many first steps it is enough."""
         if not len(logged):
             return 0.0, 0
@@ -163,7 +163,7 @@ class Gate:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class OpeEstimate:
     """One estimator's answer: a value with its interval, or why there is none."""
 
     estimator: str
@@ -174,14 +174,14 @@ class Estimate:
 
 
 def estimate(
-    logged: Logged,
+    logged: OpeEpisodes,
     *,
-    gate: Gate = Gate(),
+    gate: EssGate = EssGate(),
     horizon: int | None = None,
     rng: np.random.Generator,
     resamples: int = 2000,
     confidence: float = 0.95,
-) -> list[Estimate]:
+) -> list[OpeEstimate]:
     """Every estimator, with a percentile bootstrap interval over whole episodes.
 
     The interval holds what other episodes would have changed. The model was fitted on others and
@@ -190,7 +190,7 @@ def estimate(
     near = logged.until(horizon)
     refused = gate.refusal(near)
     counts = cluster_counts(len(logged), resamples, rng)
-    found = []
+    answers = []
     for name, of, estimator in (
         (LOGGED, logged, observed),
         (FQE, logged, fitted),
@@ -198,13 +198,21 @@ def estimate(
         (WDR, near, doubly_robust),
     ):
         if name in (PDWIS, WDR) and refused is not None:
-            found.append(Estimate(name, None, refused=refused))
+            answers.append(OpeEstimate(name, None, refused=refused))
             continue
         value = float(estimator(of, once(len(logged)))[0])
         draws = estimator(of, counts)
         interval = percentiles(draws, confidence) if len(logged) > 1 else (None, None)
-        found.append(Estimate(name, value, *interval))
-    return found
+        answers.append(OpeEstimate(name, value, *interval))
+    return answers
 
 
-__all__ = ["Estimate", "Gate", "Logged", "doubly_robust", "estimate", "fitted", "per_decision"]
+__all__ = [
+    "EssGate",
+    "OpeEpisodes",
+    "OpeEstimate",
+    "doubly_robust",
+    "estimate",
+    "fitted",
+    "per_decision",
+]

@@ -141,7 +141,7 @@ TABLES: dict[str, pa.Schema] = {
         ("logs_agreement", _F),  # of the logs' rows, those that these steps' conditions confirm
         ("logs_unexplained", _F),  # of the variance of their next observations
     ),
-    # One row a measure x condition x estimator: the offline policy judged on held-out logs.
+    # One row a measure x condition x estimator: off-policy evaluation of the offline policy.
     "off_policy": _schema(
         *_CLOCKS,
         ("measure", _S),  # return | success

@@ -88,7 +88,7 @@ def replay_card(facts: Facts) -> dict[str, Any]:
                     *("ess", "horizon", "epsilon", "estimated_share"),
                 )
             }
-            for row in facts.judged
+            for row in facts.off_policy
         ],
         "left_out": dict(panel.header.left_out) if panel is not None else None,
         "imbalance": flattery(facts) or None,
@@ -160,7 +160,7 @@ def as_markdown(card: dict[str, Any]) -> str:
         {"source": "source", "behaviour_policy": "policy", "rows": "rows", "share": "share"},
     )
     if card["off_policy"]:
-        lines += ["", "## Judged on held-out logs, before it drove", ""]
+        lines += ["", "## Off-policy evaluation on held-out logs, before it drove", ""]
         lines += _table(
             [{**row, "value": estimate(row)} for row in card["off_policy"]],
             {"measure": "measure", "estimator": "estimator", "value": "value [95 %]"},

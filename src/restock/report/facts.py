@@ -61,7 +61,7 @@ class Facts:
     rare: Rows = field(default_factory=list)
     recordings: Rows = field(default_factory=list)
     logged: Rows = field(default_factory=list)  # share of logged rows per condition
-    judged: Rows = field(default_factory=list)  # off-policy estimates, over all conditions
+    off_policy: Rows = field(default_factory=list)  # off-policy estimates, over all conditions
     missing: list[str] = field(default_factory=list)  # what could not be read, and why
 
     @property
@@ -103,7 +103,9 @@ def gather(path: Path) -> Facts:
         kept=found["kept"][0] if found["kept"] else None,
         **{name: found[name] for name in LISTS},  # type: ignore[arg-type]
     )
-    facts.judged = [row for row in run.table("off_policy").to_pylist() if row["condition"] == "all"]
+    facts.off_policy = [
+        row for row in run.table("off_policy").to_pylist() if row["condition"] == "all"
+    ]
     if not facts.cells:
         facts.missing.append("`restock eval` has not been run: success is of training only.")
     _add_panel(facts)

@@ -126,11 +126,15 @@ def learning(facts: Facts) -> Section:
         }
     )
     return section(
-        "learning", "How did it learn?", figures=figures, two=True, tables=_judged(facts.judged)
+        "learning",
+        "How did it learn?",
+        figures=figures,
+        two=True,
+        tables=_off_policy(facts.off_policy),
     )
 
 
-def _judged(rows: Rows) -> list[dict[str, Any]]:
+def _off_policy(rows: Rows) -> list[dict[str, Any]]:
     """Off-policy estimates, where a run has them."""
     if not rows:
         return []
@@ -147,7 +151,7 @@ def _judged(rows: Rows) -> list[dict[str, Any]]:
         table(
             shown,
             numbers={"episodes"},
-            title="Judged on held-out logs, before it drove",
+            title="Off-policy evaluation on held-out logs, before it drove",
             caption="Over all conditions; an estimate is refused where the weights leave too few"
             " episodes to say.",
         )

@@ -1,4 +1,4 @@
-"""`restock eval`: a run's policy in the twin, against a baseline, or judged on logs alone."""
+"""`restock eval`: a run's policy in the twin, against a baseline, or off-policy on logs alone."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class EvalCommand:
     return, blocked aisles apart by partly and wholly, and writes RUN/eval/episodes.parquet.
 
     With --baseline it is compared with another run or a saved baseline on the same episodes.
-    With --on-logs nothing drives: the policy is judged on logged episodes that it did not learn
-    from (docs/off-policy.md), into RUN/eval/off_policy.parquet.
+    With --on-logs nothing drives: off-policy evaluation on logged episodes that it did not
+    learn from (docs/off-policy.md), into RUN/eval/off_policy.parquet.
 
     Example: `restock eval runs/a --perturbations none,friction,latency`
     """
@@ -46,9 +46,10 @@ class EvalCommand:
     drive: bool = True
     """--no-drive takes the episodes that RUN/eval/episodes.parquet has."""
     on_logs: str | None = None
-    """Judge it on a store's episodes, or on those that a panel holds out. "own": its own panel."""
+    """Off-policy evaluation on a store's episodes, or on those that a panel holds out. "own": its
+    own panel."""
     epsilon: float = 0.1
-    """With --on-logs: chance of a random action of the policy that is judged, else greedy."""
+    """With --on-logs: probability of a random action of the evaluated policy, else greedy."""
     horizon: int | None = None
     """With --on-logs: how many steps importance weights reach; default all."""
     layouts: str | None = None
@@ -61,7 +62,7 @@ class EvalCommand:
 
     def run(self) -> int:
         if self.on_logs is not None:
-            return self._judge(self.on_logs)
+            return self._evaluate_off_policy(self.on_logs)
         return self._drive()
 
     def _drive(self) -> int:
@@ -135,21 +136,22 @@ class EvalCommand:
         if "saved" in document:
             say(f"baseline saved as {document['saved']}")
 
-    def _judge(self, logs: str) -> int:
-        from restock.cli.learning.eval_tables import show_judged
+    def _evaluate_off_policy(self, logs: str) -> int:
+        from restock.cli.learning.eval_tables import show_off_policy
         from restock.cli.output import progress
         from restock.errors import ConfigError
-        from restock.train.evaluation.ope import Judging
-        from restock.train.evaluation.ope_run import judge_run
+        from restock.train.evaluation.ope import OpeConfig, evaluate_run_off_policy
 
         try:
-            how = Judging(epsilon=self.epsilon, horizon=self.horizon)
+            config = OpeConfig(epsilon=self.epsilon, horizon=self.horizon)
         except ValueError as error:
             raise ConfigError(str(error), where="restock eval") from error
-        own = None if logs == "own" else logs
-        with progress("judging", 2) as advance:
-            judged = judge_run(self.run_path, own, how, advance, write=not self.dry_run)
-        show_judged(self.run_path, judged, how, as_json=self.json)
+        named = None if logs == "own" else logs
+        with progress("off-policy evaluation", 2) as advance:
+            result = evaluate_run_off_policy(
+                self.run_path, named, config, advance, write=not self.dry_run
+            )
+        show_off_policy(self.run_path, result, config, as_json=self.json)
         return 0
 
 

@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from restock.train.evaluation.ope import Judging
-    from restock.train.evaluation.ope_run import Judged
+    from restock.train.evaluation.ope import OpeConfig, OpeResult
 
 
-def show_judged(path: Path, judged: Judged, how: Judging, *, as_json: bool) -> None:
+def show_off_policy(path: Path, result: OpeResult, config: OpeConfig, *, as_json: bool) -> None:
     """A row a measure and condition, its estimators beside; and why weighting is refused."""
     from restock.cli.output import print_json, print_table, say
 
@@ -18,14 +17,14 @@ def show_judged(path: Path, judged: Judged, how: Judging, *, as_json: bool) -> N
         print_json(
             {
                 "run": str(path),
-                "policy": judged.version,
-                "notes": list(judged.notes),
-                "results": judged.rows,
+                "policy": result.version,
+                "notes": list(result.notes),
+                "results": result.rows,
             }
         )
         return
     cells: dict[tuple[str, str], dict[str, Any]] = {}
-    for row in judged.rows:
+    for row in result.rows:
         key = row["measure"], row["condition"]
         shown = cells.setdefault(
             key, {"measure": key[0], "condition": key[1], "episodes": row["episodes"]}
@@ -34,20 +33,20 @@ def show_judged(path: Path, judged: Judged, how: Judging, *, as_json: bool) -> N
         shown["weights worth"] = f"{row['ess']:.1f} episodes"
     print_table(
         list(cells.values()),
-        title=f"{judged.version}, greedy but for {how.epsilon:.0%} chance, judged on logs"
-        " it did not learn from [95 % over episodes]",
+        title=f"{result.version}, greedy but for {config.epsilon:.0%} random actions, off-policy on"
+        " logs it did not learn from [95 % over episodes]",
     )
-    for row in judged.rows:
+    for row in result.rows:
         if row["condition"] == "all" and row["estimator"] == "pdwis" and row["refused"]:
             longest = f"; --horizon {row['ess_steps']} would do" if row["ess_steps"] else ""
             say(f"{row['measure']}: pdwis and wdr are refused: {row['refused']}{longest}")
-    estimated = judged.rows[0]["estimated_share"] if judged.rows else 0.0
+    estimated = result.rows[0]["estimated_share"] if result.rows else 0.0
     if estimated:
         say(
             f"the behaviour's probabilities are estimated (cloned) for {estimated:.0%} of the rows:"
             " the logs do not say them"
         )
-    for note in judged.notes:
+    for note in result.notes:
         say(note)
 
 
@@ -94,4 +93,4 @@ def _regression_row(row: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-__all__ = ["show_judged", "show_regression"]
+__all__ = ["show_off_policy", "show_regression"]

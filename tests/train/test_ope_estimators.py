@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from restock.train.dqn.fitted_q import Fit, Rows, cloned_behaviour, fitted_q, values
+from restock.train.dqn.fitted_q import FittedQConfig, Rows, cloned_behaviour, fitted_q, values
 from restock.train.evaluation.ope_estimators import (
-    Gate,
-    Logged,
+    EssGate,
+    OpeEpisodes,
     doubly_robust,
     effective_episodes,
     estimate,
@@ -66,14 +66,14 @@ TARGET = np.tile([0.2, 0.8], (STATES, 1))
 TRUTH = float((TARGET[0] * CHAIN.q(TARGET)[0]).sum())
 
 
-def logged(episodes: int, seed: int, q: np.ndarray, policy: np.ndarray = TARGET) -> Logged:
+def logged(episodes: int, seed: int, q: np.ndarray, policy: np.ndarray = TARGET) -> OpeEpisodes:
     state, action, reward, following, alive = CHAIN.drive(
         BEHAVIOUR, episodes, np.random.default_rng(seed)
     )
     value = (policy * q).sum(axis=1)
     value[-1] = 0.0
     ratio = np.where(alive, policy[state, action] / BEHAVIOUR[state, action], 1.0)
-    return Logged(
+    return OpeEpisodes(
         ratio,
         np.where(alive, reward, 0.0),
         np.where(alive, q[state, action], 0.0),
@@ -154,7 +154,7 @@ def test_weights_of_the_same_policy_are_all_one() -> None:
     np.testing.assert_allclose(effective_episodes(same.ratio), 40.0)
     plain = observed(same, once(40))
     np.testing.assert_allclose(per_decision(same, once(40)), plain)
-    assert Gate().refusal(same) is None
+    assert EssGate().refusal(same) is None
 
 
 def test_the_gate_refuses_a_policy_far_away_and_says_how_far_they_agree() -> None:
@@ -165,7 +165,7 @@ def test_the_gate_refuses_a_policy_far_away_and_says_how_far_they_agree() -> Non
     for name in ("pdwis", "wdr"):
         assert answers[name].value is None
         assert "of 60 episodes, less than 12.0" in str(answers[name].refused)
-    reach = Gate().measure(away)[1]
+    reach = EssGate().measure(away)[1]
     assert 0 < reach < STEPS
     again = {e.estimator: e for e in _estimates(away, horizon=reach)}
     assert again["pdwis"].value is not None
@@ -191,7 +191,7 @@ def test_weights_do_not_overflow() -> None:
     assert np.isfinite(per_decision(wild, once(10))).all()
 
 
-TABULAR = Fit(iterations=40, updates=20, batch_size=512, hidden=(), layer_norm=False)
+TABULAR = FittedQConfig(iterations=40, updates=20, batch_size=512, hidden=(), layer_norm=False)
 TABULAR = replace(TABULAR, learning_rate=0.03)
 
 
@@ -216,7 +216,7 @@ def rows(episodes: int, seed: int) -> tuple[Rows, np.ndarray]:
 def test_fitted_q_finds_the_exact_values() -> None:
     seen, following = rows(600, 8)
     policy = TARGET.astype(np.float32)
-    network = fitted_q(seen, policy[following], discount=DISCOUNT, fit=TABULAR)
+    network = fitted_q(seen, policy[following], discount=DISCOUNT, config=TABULAR)
     found = values(network, np.eye(STATES, dtype=np.float32))
     np.testing.assert_allclose(found[:-1], CHAIN.q(TARGET)[:-1], atol=0.06)
 
@@ -226,7 +226,7 @@ def test_fitted_q_is_the_same_again_for_the_same_seed() -> None:
     short = replace(TABULAR, iterations=3)
     policy = TARGET.astype(np.float32)[following]
     first, second, other = (
-        values(fitted_q(seen, policy, discount=DISCOUNT, fit=short, seed=seed), seen.observation)
+        values(fitted_q(seen, policy, discount=DISCOUNT, config=short, seed=seed), seen.observation)
         for seed in (1, 1, 2)
     )
     np.testing.assert_array_equal(first, second)
@@ -236,12 +236,12 @@ def test_fitted_q_is_the_same_again_for_the_same_seed() -> None:
 def test_cloning_finds_the_behaviour() -> None:
     seen, _ = rows(600, 10)
     network = cloned_behaviour(
-        seen.observation, seen.action, ACTIONS, fit=replace(TABULAR, cloning_updates=400)
+        seen.observation, seen.action, ACTIONS, config=replace(TABULAR, cloning_updates=400)
     )
     logits = values(network, np.eye(STATES, dtype=np.float32)[:-1])
     chance = np.exp(logits) / np.exp(logits).sum(axis=1, keepdims=True)
     np.testing.assert_allclose(chance, BEHAVIOUR[:-1], atol=0.05)
 
 
-def _estimates(of: Logged, *, resamples: int = 200, horizon: int | None = None):
+def _estimates(of: OpeEpisodes, *, resamples: int = 200, horizon: int | None = None):
     return estimate(of, rng=np.random.default_rng(0), resamples=resamples, horizon=horizon)

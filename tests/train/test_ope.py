@@ -1,9 +1,10 @@
-"""Judging a run on logs: only on episodes it did not learn from, and said where it cannot be."""
+"""Off-policy evaluation of runs: on episodes they did not learn from, or refused."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -22,29 +23,32 @@ from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
 from restock.replay.panel.panel import Panel
 from restock.replay.store.store import Store
+from restock.train import loop
 from restock.train.dqn.config import NetworkConfig
-from restock.train.dqn.fitted_q import Fit, soft_greedy
+from restock.train.dqn.fitted_q import FittedQConfig, soft_greedy
 from restock.train.dqn.network import make_network
-from restock.train.evaluation.ope import Judging, judge
-from restock.train.evaluation.ope_dataset import Steps, find_evidence, read_steps
+from restock.train.evaluation import ope
+from restock.train.evaluation.ope import OpeConfig, evaluate_off_policy
+from restock.train.evaluation.ope_dataset import OpeSteps, load_ope_dataset, read_steps
 
 TASK = load_profile("warehouse_amr").task
 MIXTURE = parse_mixture("[each_condition]\nshare = 'natural'\n[held_out]\nshare = 0.3\n")
 NETWORK = NetworkConfig(hidden=(16,))
-QUICK = Fit(iterations=2, updates=2, batch_size=32, hidden=(8,), cloning_updates=50)
+QUICK = FittedQConfig(iterations=2, updates=2, batch_size=32, hidden=(8,), cloning_updates=50)
+CONFIG = OpeConfig(model=QUICK)
 
 
-def chances(table: pa.Table, chance: float) -> pa.Table:
+def with_probability(table: pa.Table, probability: float) -> pa.Table:
     """The same rows with the action's probability logged."""
     place = table.schema.get_field_index("action_probability")
-    column = pa.array(np.full(len(table), chance, np.float32))
+    column = pa.array(np.full(len(table), probability, np.float32))
     return table.set_column(place, table.schema.field(place), column)
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("judge") / "store"
-    tables = [chances(recording_transitions(1, task=TASK), 0.25)]
+    path = tmp_path_factory.mktemp("ope") / "store"
+    tables = [with_probability(recording_transitions(1, task=TASK), 0.25)]
     return write_store(path, [*tables, recording_transitions(2, task=TASK)], task=TASK)
 
 
@@ -54,23 +58,24 @@ def panel(store: Path) -> Panel:
         return build_panel(opened, MIXTURE, store.parent / "panel")
 
 
-@pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is fitted does not matter here: two updates will do."""
-    monkeypatch.setattr(judge, "__kwdefaults__", {**judge.__kwdefaults__, "fit": QUICK})
+@pytest.fixture
+def quick_models(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is fitted does not matter to the verbs: two updates will do."""
+    for module in (ope, loop):
+        monkeypatch.setattr(module, "OpeConfig", partial(OpeConfig, model=QUICK))
 
 
-def test_no_episode_is_both_fitted_on_and_judged_by(store: Path, panel: Panel) -> None:
+def test_no_episode_is_both_fitted_on_and_evaluated_on(store: Path, panel: Panel) -> None:
     fed = set(panel.meta["episode_id"].to_pylist())
     held = set(pq.read_table(panel.path / "held_out.parquet")["episode_id"].to_pylist())
     for logs in (None, str(store), str(panel.path)):
-        evidence = find_evidence(panel, TASK, logs)
-        assert len(evidence.held.condition) == len(held - fed)
-        assert len(evidence.model.condition) == len(fed)
-        rows = evidence.held.rows
-        seen = {tuple(row) for row in evidence.model.rows.observation[:, :3].tolist()}
+        dataset = load_ope_dataset(panel, TASK, logs)
+        assert len(dataset.evaluation.condition) == len(held - fed)
+        assert len(dataset.training.condition) == len(fed)
+        rows = dataset.evaluation.rows
+        seen = {tuple(row) for row in dataset.training.rows.observation[:, :3].tolist()}
         assert not seen & {tuple(row) for row in rows.observation[:, :3].tolist()}
-    assert "left aside" in find_evidence(panel, TASK, str(store)).notes[0]
+    assert "left aside" in load_ope_dataset(panel, TASK, str(store)).notes[0]
 
 
 def test_what_was_all_learnt_from_is_refused(store: Path, tmp_path: Path) -> None:
@@ -78,19 +83,19 @@ def test_what_was_all_learnt_from_is_refused(store: Path, tmp_path: Path) -> Non
     with Store(store) as opened:
         panel = build_panel(opened, everything, tmp_path / "p")
     with pytest.raises(RunError, match="no episode that the run did not learn from"):
-        find_evidence(panel, TASK, str(store))
+        load_ope_dataset(panel, TASK, str(store))
     other = msgspec.structs.replace(TASK, time_limit_steps=3)
     with pytest.raises(RunError, match="its rows are of task"):
-        find_evidence(panel, other, str(store))
+        load_ope_dataset(panel, other, str(store))
     with pytest.raises(RunError, match="learnt from no panel"):
-        find_evidence(None, TASK)
+        load_ope_dataset(None, TASK)
 
 
-def test_without_a_panel_half_the_episodes_are_judged_by(store: Path) -> None:
-    evidence = find_evidence(None, TASK, str(store))
-    assert len(evidence.held.condition) + len(evidence.model.condition) == 24
-    assert len(evidence.held.condition) > 3
-    assert "no panel" in evidence.notes[0]
+def test_without_a_panel_half_the_episodes_are_evaluated_on(store: Path) -> None:
+    dataset = load_ope_dataset(None, TASK, str(store))
+    assert len(dataset.evaluation.condition) + len(dataset.training.condition) == 24
+    assert len(dataset.evaluation.condition) > 3
+    assert "no panel" in dataset.notes[0]
 
 
 def test_success_is_arriving_before_any_contact(store: Path) -> None:
@@ -123,15 +128,19 @@ def test_success_is_arriving_before_any_contact(store: Path) -> None:
 def test_weights_are_of_logged_probabilities_and_of_cloned_ones_where_there_are_none(
     panel: Panel,
 ) -> None:
-    evidence = find_evidence(panel, TASK)
+    dataset = load_ope_dataset(panel, TASK)
     network = kept_network(NETWORK)
-    rows = judge(network, evidence, discount=0.97, fit=QUICK)
-    unknown = np.isnan(evidence.held.probability)
+    rows = evaluate_off_policy(network, dataset, discount=0.97, config=CONFIG)
+    unknown = np.isnan(dataset.evaluation.probability)
     assert 0 < unknown.mean() < 1
     assert {row["estimated_share"] for row in rows} == {unknown.mean()}
-    logged = _known(evidence.held)
-    rows = judge(
-        network, replace(evidence, held=logged), discount=0.97, measures=("return",), fit=QUICK
+    logged = _known(dataset.evaluation)
+    rows = evaluate_off_policy(
+        network,
+        replace(dataset, evaluation=logged),
+        discount=0.97,
+        measures=("return",),
+        config=CONFIG,
     )
     assert {row["estimated_share"] for row in rows} == {0.0}
     whole = next(r for r in rows if (r["condition"], r["estimator"]) == ("all", "logged"))
@@ -143,23 +152,27 @@ def test_weights_are_of_logged_probabilities_and_of_cloned_ones_where_there_are_
     assert whole["value"] == pytest.approx(total, rel=1e-5)
 
 
-def _known(held: Steps) -> Steps:
-    return replace(held, probability=np.full(len(held.rows), 0.3))
+def _known(steps: OpeSteps) -> OpeSteps:
+    return replace(steps, probability=np.full(len(steps.rows), 0.3))
 
 
-def test_soft_greedy_is_a_distribution_with_its_chance_on_the_best() -> None:
+def test_soft_greedy_is_a_distribution_with_its_probability_on_the_best() -> None:
     network = make_network(NETWORK, 4, 3, torch.Generator().manual_seed(1))
     observation = np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)
-    chance = soft_greedy(network, observation, 0.3)
-    np.testing.assert_allclose(chance.sum(axis=1), 1, rtol=1e-6)
-    np.testing.assert_allclose(chance.max(axis=1), 0.8, rtol=1e-6)
+    probability = soft_greedy(network, observation, 0.3)
+    np.testing.assert_allclose(probability.sum(axis=1), 1, rtol=1e-6)
+    np.testing.assert_allclose(probability.max(axis=1), 0.8, rtol=1e-6)
     with torch.no_grad():
         best = network(torch.from_numpy(observation)).argmax(dim=1).numpy()
-    np.testing.assert_array_equal(chance.argmax(axis=1), best)
+    np.testing.assert_array_equal(probability.argmax(axis=1), best)
 
 
-def test_the_verb_judges_and_says_why_it_refuses(
-    store: Path, panel: Panel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_the_verb_evaluates_and_says_why_it_refuses(
+    store: Path,
+    panel: Panel,
+    tmp_path: Path,
+    quick_models: None,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     run = kept_run(tmp_path / "a", NETWORK, panel)
     argv = ["eval", str(run), "--on-logs", "own"]
@@ -187,16 +200,18 @@ def test_the_verb_judges_and_says_why_it_refuses(
 
 
 def test_a_horizon_gives_an_answer_where_the_whole_was_refused(panel: Panel) -> None:
-    evidence = find_evidence(panel, TASK)
+    dataset = load_ope_dataset(panel, TASK)
     network = kept_network(NETWORK)
-    evidence = replace(evidence, held=_known(evidence.held))
-    how = Judging(epsilon=1.0, horizon=1)
-    rows = judge(network, evidence, discount=0.97, measures=("return",), how=how, fit=QUICK)
+    dataset = replace(dataset, evaluation=_known(dataset.evaluation))
+    config = OpeConfig(epsilon=1.0, horizon=1, model=QUICK)
+    rows = evaluate_off_policy(network, dataset, discount=0.97, measures=("return",), config=config)
     whole = {r["estimator"]: r["value"] for r in rows if r["condition"] == "all"}
     assert all(value is not None for value in whole.values())
 
 
-def test_training_judges_before_it_drives(panel: Panel, tmp_path: Path) -> None:
+def test_training_evaluates_off_policy_before_it_drives(
+    panel: Panel, tmp_path: Path, quick_models: None
+) -> None:
     path = tmp_path / "run"
     argv = ["train", "--panel", str(panel.path), "--out", str(path), "--env-steps", "0"]
     small = ["schedule.offline_updates=3", "network.hidden=[8]", "evaluation.episodes=1"]

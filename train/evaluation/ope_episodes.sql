@@ -1,12 +1,12 @@
--- Rows for judging a policy: those whose ids are in `asked`. What happens before and after a row
--- in its episode is of all its rows, asked for or not. A contact of the last row is not known, and
+-- Rows for off-policy evaluation: those whose ids are in `wanted`. What happens before and after a row
+-- in its episode is of all its rows, wanted or not. A contact of the last row is not known, and
 -- one that the first row tells of was before the episode.
 WITH whole AS (
     SELECT *,
            coalesce(lead(bumped) OVER episode, false) AS bumps,
            coalesce(bool_or(bumped AND step_index > 0) OVER episode_so_far, false) AS bumped_before
     FROM transitions
-    WHERE episode_id IN (SELECT episode_id FROM transitions JOIN asked USING (transition_id))
+    WHERE episode_id IN (SELECT episode_id FROM transitions JOIN wanted USING (transition_id))
     WINDOW episode AS (PARTITION BY episode_id ORDER BY step_index),
            episode_so_far AS (episode ROWS BETWEEN UNBOUNDED PRECEDING AND CURRENT ROW)
 ), named AS (  -- an episode is of the condition that most of its labelled rows have
@@ -16,6 +16,6 @@ WITH whole AS (
     GROUP BY episode_id
 )
 SELECT episode_id, of_condition, observation, action, reward, next_observation, terminated,
-       truncated, action_probability, bumps, bumped_before
-FROM whole JOIN asked USING (transition_id) JOIN named USING (episode_id)
+       action_probability, bumps, bumped_before
+FROM whole JOIN wanted USING (transition_id) JOIN named USING (episode_id)
 ORDER BY recording_id, episode_index, step_index
