@@ -11,6 +11,7 @@ import msgspec
 
 from restock.errors import PanelError, RunError
 from restock.ingest.profile.profile import Profile, load_profile
+from restock.replay.panel.logged_sampler import controller_for
 from restock.replay.panel.panel import Panel
 from restock.replay.sampling.share_controller import PlannedDraws
 from restock.train.dqn.config import TrainConfig, apply_overrides, load_config, parse_config
@@ -18,7 +19,6 @@ from restock.train.dqn.learner import open_device
 from restock.train.dqn.manual_backprop import update_path
 from restock.train.dqn.target import describe
 from restock.train.feed.batches import Logs
-from restock.train.feed.logged_sampler import diet_of
 from restock.train.run.kept_checkpoints import check_earlier, go_back
 from restock.train.run.run import Run, check_free, now_ns, panel_document, software_versions
 from restock.train.session import Session, open_session
@@ -222,14 +222,14 @@ def _logs(panel: Panel, config: TrainConfig) -> Logs:
 def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dict[str, Any]:
     fed = None
     if panel is not None:
-        diet = diet_of(panel, planned_draws(config), config.replay.logs_share)
+        controller = controller_for(panel, planned_draws(config), config.replay.logs_share)
         fed = {
             **panel_document(panel),
             # The mixture worked out for this run's own draws: shares as it begins.
-            "strata": {
-                s.name: share for s, share in zip(panel.strata, diet.shares.tolist(), strict=True)
-            },
-            "logs_share": diet.logs_share,
+            "strata": dict(
+                zip([s.name for s in panel.strata], controller.shares.tolist(), strict=True)
+            ),
+            "logs_share": controller.logs_share,
             "planned_draws": asdict(planned_draws(config)),
         }
     return {

@@ -3,10 +3,11 @@
     dataset = PanelDataset("panel/", batch_size=256, batches=1000, seed=0)
     for batch in DataLoader(dataset, batch_size=None, num_workers=2): ...
 
-Batches are those of the panel's quotas, rows of a stratum in shuffled order before any repeats.
-Every worker draws the same sequence of row numbers, which is cheap, and gathers only its own
-batches of it, which is not. So however many workers there are, the loader gives the same batches in
-the same order, exact in their quotas, and no row comes twice because of them.
+Batches are those that `sampler_for` draws. Every worker draws the same sequence of row numbers,
+which is cheap, and gathers only its own batches of it, which is not. So however many workers there
+are, the loader gives the same batches in the same order, exact in their quotas, and no row comes
+twice because of them. What a loop with a DataLoader cannot tell its dataset, TD errors and
+environment steps, is refused where the mixture asks for it.
 """
 
 from __future__ import annotations
@@ -21,12 +22,14 @@ from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
 from restock.errors import MixtureError
-from restock.replay.mixture.packed_row import F32, Ints
+from restock.replay.panel.logged_sampler import BatchDraw, LoggedSampler, sampler_for
 from restock.replay.panel.panel import Panel
+
+_MOST_WORKERS = 64
 
 
 class PanelDataset(IterableDataset[dict[str, Tensor]]):
-    """Batches of a panel by its quotas; give it to a DataLoader with `batch_size=None`.
+    """Batches of a panel by its mixture; give it to a DataLoader with `batch_size=None`.
 
     Each batch is a dict: `observation`, `next_observation` (B, D) float32, `action` (B,) int64,
     `reward` (the n-step return), `discount` (gamma^n, 0 where terminated), `weight` (B,) float32,
@@ -39,10 +42,12 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
         seed: of the draws.
 
     `set_epoch` makes the next pass another one, as a DistributedSampler's does; without it every
-    pass is the same.
+    pass is the same. Where the mixture has a `max_replays_per_row`, it is of all passes together:
+    pass n goes on where pass n - 1 ended, and none is given twice.
 
     Raises:
-        MixtureError: `batch_size` or `batches` below 1.
+        MixtureError: `batch_size` or `batches` below 1; a mixture whose draws follow TD errors or
+            environment steps; while iterating, rows that were all drawn as often as they may be.
         PanelError: no panel there, or a damaged one.
     """
 
@@ -55,6 +60,10 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
         self.path = panel.path if isinstance(panel, Panel) else Path(panel)
         self.panel = panel if isinstance(panel, Panel) else Panel.open(panel)
         self.batch_size, self.batches, self.seed, self.epoch = batch_size, batches, seed, 0
+        self._limit = self.panel.header.mixture.max_replays_per_row
+        # Passes begun by each worker, in memory that the workers of every pass share.
+        self._begun = torch.zeros(_MOST_WORKERS, dtype=torch.int16).share_memory_()  # type: ignore[no-untyped-call]
+        self._check(self._sampler())
 
     def set_epoch(self, epoch: int) -> None:
         """Which pass comes next; call it before iterating, on the loader's own dataset."""
@@ -62,21 +71,65 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
 
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
         worker = get_worker_info()
-        mine, of = (0, 1) if worker is None else (worker.id, worker.num_workers)
-        sampler = self.panel.sampler(
-            self.batch_size, np.random.default_rng([self.seed, 6, self.epoch])
-        )
-        for number in count() if self.batches is None else range(self.batches):
-            rows, stratum = sampler.draw()
-            if number % of == mine:
-                yield self._gather(rows, stratum, sampler.weights[rows])
+        number, of = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        sampler = self._sampler()
+        if self._limit is not None:
+            self._pass_on(sampler, number)
+        for batch in count() if self.batches is None else range(self.batches):
+            draw = self._draw(sampler)
+            if batch % of == number:
+                yield self._gather(sampler, draw)
 
-    def _gather(self, rows: Ints, stratum: Ints, weight: F32) -> dict[str, Tensor]:
-        panel = self.panel
-        packed = panel.rows[rows]
+    def _sampler(self) -> LoggedSampler:
+        epoch = self.epoch if self._limit is None else 0
+        return sampler_for(self.panel, self.batch_size, seed=(self.seed, 6, epoch))
+
+    def _check(self, sampler: LoggedSampler) -> None:
+        """Raises MixtureError where the mixture asks for what no dataset is told."""
+        follows = "TD errors" if sampler.needs_td else "environment steps"
+        if sampler.needs_td or sampler.controller.strata_move:
+            raise MixtureError(
+                f"the mixture's draws follow {follows}, which a data set is not told",
+                where=str(self.path),
+                remedy="draw with `sampler_for(panel, …)`, which has `update` and `move_to`",
+            )
+
+    def _pass_on(self, sampler: LoggedSampler, number: int) -> None:
+        """Let the draws of the passes before go by: they count towards the limit."""
+        if self.epoch and self.batches is None:
+            raise MixtureError(
+                "an endless pass has no next one where max_replays_per_row is of all passes",
+                where=str(self.path),
+                remedy="give `batches`",
+            )
+        if self.epoch < int(self._begun[number % _MOST_WORKERS]):
+            raise MixtureError(
+                f"pass {self.epoch} was given already, and its rows may be drawn"
+                f" {self._limit:g} times in all",
+                where=str(self.path),
+                remedy=f"go on with set_epoch({self.epoch + 1})",
+            )
+        self._begun[number % _MOST_WORKERS] = self.epoch + 1
+        for _ in range(self.epoch * (self.batches or 0)):
+            self._draw(sampler)
+
+    def _draw(self, sampler: LoggedSampler) -> BatchDraw:
+        draw = sampler.draw()
+        if len(draw.rows) < self.batch_size:
+            raise MixtureError(
+                f"every row of the panel was drawn {self._limit:g} times",
+                where=str(self.path),
+                remedy="draw fewer batches, or mix with a larger max_replays_per_row",
+            )
+        return draw
+
+    def _gather(self, sampler: LoggedSampler, draw: BatchDraw) -> dict[str, Tensor]:
+        packed = np.empty((len(draw.rows), self.panel.rows.shape[1]), np.float32)
+        sampler.gather(draw.rows, packed)
+        ones = np.ones(len(packed), np.float32)
 
         def part(name: str) -> Tensor:
-            return torch.from_numpy(np.ascontiguousarray(packed[:, panel.columns[name]]))
+            return torch.from_numpy(np.ascontiguousarray(packed[:, self.panel.columns[name]]))
 
         return {
             "observation": part("observation"),
@@ -84,9 +137,9 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
             "action": part("action")[:, 0].long(),
             "reward": part("reward")[:, 0],
             "discount": part("discount")[:, 0],
-            "weight": torch.from_numpy(weight),
-            "row": torch.from_numpy(rows.copy()),
-            "stratum": torch.from_numpy(stratum.copy()),
+            "weight": torch.from_numpy(ones if draw.weight is None else draw.weight),
+            "row": torch.from_numpy(draw.rows.copy()),
+            "stratum": torch.from_numpy(draw.strata.copy()),
         }
 
     def __getstate__(self) -> dict[str, object]:

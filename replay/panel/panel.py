@@ -11,7 +11,7 @@ A directory that never changes once it is there:
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -26,7 +26,9 @@ from restock.replay.mixture.packed_row import F32, PACKING_VERSION, Ints, row_co
 from restock.replay.panel.density_ratio import RatioFit
 from restock.replay.panel.seal import AGAIN, FileRecord, packed_by, unseal
 from restock.replay.panel.stores import PinnedStore
-from restock.replay.sampling.sampler import QuotaSampler
+
+if TYPE_CHECKING:
+    from restock.replay.panel.logged_sampler import LoggedSampler
 
 HEADER, ROWS, META, HELD_OUT = "panel.json", "rows.f32", "meta.parquet", "held_out.parquet"
 
@@ -214,18 +216,11 @@ class Panel:
         code = self.stratum_code
         return [np.flatnonzero(code == index) for index in range(len(self.strata))]
 
-    def sampler(
-        self, batch_size: int, rng: np.random.Generator, *, replacement: bool = False
-    ) -> QuotaSampler:
-        """Draws batches of row numbers by the panel's quotas; see `QuotaSampler`."""
-        return QuotaSampler(
-            self.stratum_rows(),
-            [stratum.share for stratum in self.strata],
-            batch_size,
-            rng,
-            weights=self.weights,
-            replacement=replacement,
-        )
+    def sampler(self, batch_size: int, *, seed: int) -> LoggedSampler:
+        """Draws batches as the mixture says, see `sampler_for`."""
+        from restock.replay.panel.logged_sampler import sampler_for
+
+        return sampler_for(self, batch_size, seed=seed)
 
     def tensor(self) -> Any:
         """The packed rows as a memory-mapped torch tensor (n, W): gather with `index_select`."""

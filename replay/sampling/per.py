@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import MixtureError
+from restock.replay.mixture.mixture import Prioritised, Within
 from restock.replay.mixture.packed_row import F32, F64, Bools, Ints
 from restock.replay.sampling.priorities import Lap, Per, Priorities, Rule
-from restock.replay.sampling.sampler import QuotaSampler
+from restock.replay.sampling.sampler import QuotaSampler, Sampler
 
 # Of batches drawn from one state of the priorities. A block draws at most a sixteenth of the rows,
 # so that few come again before what was learnt of them counts; many rows cost more to sum.
@@ -141,3 +142,23 @@ class PrioritySampler(QuotaSampler):
         self.priorities.load_state_dict(state["priorities"])
         weights = state.get("ahead_weights")
         self._ahead_weights = None if weights is None else np.array(weights, np.float32)
+
+
+def sampler_by_rules(
+    within: Sequence[Within],
+    stratum_rows: Sequence[NDArray[Any]],
+    shares: F64,
+    batch_size: int,
+    rng: np.random.Generator,
+    numbers: Prioritised,
+    *,
+    lap_floor: float = 1.0,
+) -> Sampler:
+    """The sampler for strata that are each drawn from by a rule (S,), the same one or not."""
+    again = [rule != "without_replacement" for rule in within]
+    if not any(rule in ("per", "lap") for rule in within):
+        return QuotaSampler(stratum_rows, shares, batch_size, rng, replacement=again)
+    per = Per(numbers.per_alpha, numbers.per_beta, numbers.per_beta_batches, numbers.per_epsilon)
+    named: dict[Within, Rule] = {"per": per, "lap": Lap(numbers.lap_alpha, lap_floor)}
+    rules = [named.get(rule) for rule in within]
+    return PrioritySampler(stratum_rows, shares, batch_size, rng, rule=rules, replacement=again)

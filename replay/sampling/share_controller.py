@@ -37,7 +37,7 @@ class PlannedDraws:
 
 
 @dataclass(frozen=True)
-class FedStratum:
+class SampledStratum:
     """A stratum of a panel, as a diet needs it."""
 
     name: str
@@ -62,7 +62,7 @@ class _Source:
     dro: GroupDro | None = None
 
 
-class Diet:
+class ShareController:
     """Shares in force and draws so far, over the strata of a panel, (S,).
 
     Args:
@@ -81,7 +81,7 @@ class Diet:
     def __init__(
         self,
         mixture: Mixture,
-        strata: Sequence[FedStratum],
+        strata: Sequence[SampledStratum],
         planned: PlannedDraws,
         *,
         logs_share: float | None = None,
@@ -110,14 +110,14 @@ class Diet:
     @classmethod
     def fixed(
         cls, names: Sequence[str], rows: Sequence[int], shares: F64, logs_share: float
-    ) -> Diet:
+    ) -> ShareController:
         """Shares that are simply given, and stay."""
         rules = tuple(
             StratumRule(name=name, share=float(share))
             for name, share in zip(names, shares, strict=True)
         )
         mixture = Mixture(strata=rules, sources=Sources(logs=1.0))
-        fed = [FedStratum(r.name, "logs", r, n, 1) for r, n in zip(rules, rows, strict=True)]
+        fed = [SampledStratum(r.name, "logs", r, n, 1) for r, n in zip(rules, rows, strict=True)]
         return cls(mixture, fed, PlannedDraws(), logs_share=logs_share)
 
     def _source(self, name: str) -> _Source:
@@ -153,6 +153,13 @@ class Diet:
             return parts
         total = max(sum(parts.values()), 1e-12)
         return {name: part * self._share_given / total for name, part in parts.items()}
+
+    @property
+    def strata_move(self) -> bool:
+        """Whether `shares` follow the environment steps."""
+        portions = [s.rule.share for s in self.strata if not isinstance(s.rule.share, str)]
+        parts = list(self.mixture.sources.parts.values())
+        return any(map(knots, portions + (parts if len(parts) > 1 else [])))
 
     @property
     def max_replays(self) -> int | None:

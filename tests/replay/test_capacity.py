@@ -10,7 +10,7 @@ import pytest
 from support.stores import recording_transitions, write_store
 
 from restock import cli
-from restock.replay.panel.capacity import recommend_capacity
+from restock.replay.store.capacity import recommend_capacity
 from restock.replay.store.store import Store
 
 

@@ -20,11 +20,11 @@ from restock.errors import MixtureError, StoreError
 from restock.replay.mixture.mixture import load_mixture, parse_mixture, shipped_mixtures
 from restock.replay.mixture.mixture_schema import FILE, mixture_schema, shipped_schema
 from restock.replay.panel.build import build_panel, open_source
+from restock.replay.panel.logged_sampler import controller_for
 from restock.replay.panel.panel import Panel
 from restock.replay.panel.plan import Plan, plan_panel
 from restock.replay.sampling.share_controller import PlannedDraws
 from restock.replay.store.store import Store
-from restock.train.feed.logged_sampler import diet_of
 
 EVERY = "[each_condition]\nshare = 'natural'\n"
 NO_HOLD = "[held_out]\nby = 'none'\n"
@@ -227,7 +227,7 @@ def test_a_run_draws_from_both_stores_by_their_schedules(
     every = "[adaptive]\nafter_updates = 0\nevery_updates = 1\nstep_size = 0.5\n" + EVERY
     with Store(store_path) as store:
         panel = build_panel(store, parse_mixture(text + every), two_stores / "p")
-    diet = diet_of(panel, PlannedDraws(640, 6400, 0, 1000), None)
+    diet = controller_for(panel, PlannedDraws(640, 6400, 0, 1000), None)
     twin = np.array([stratum.source == "twin" for stratum in panel.strata])
     assert diet.shares[twin].sum() == 0
     assert diet.logs_share == pytest.approx(0.4)

@@ -249,12 +249,14 @@ def test_the_sampler_draws_by_the_panels_quotas(transitions: pa.Table, tmp_path:
         "[planned]\nupdates = 100\n[each_condition]\nshare = 'equal'\n[held_out]\nby = 'none'"
     )
     panel = build_panel(transitions, mixture, tmp_path / "p")
-    sampler = panel.sampler(50, np.random.default_rng(0))
-    rows, strata = sampler.draw()
-    assert np.bincount(strata).tolist() == [10] * 5
-    np.testing.assert_array_equal(panel.stratum_code[rows], strata)
+    sampler = panel.sampler(50, seed=0)
+    batch = sampler.draw()
+    assert np.bincount(batch.strata).tolist() == [10] * 5
+    np.testing.assert_array_equal(panel.stratum_code[batch.rows], batch.strata)
+    np.testing.assert_allclose(panel.weights[batch.rows], batch.weight, rtol=1e-6)
     # Full correction: the mean weight of what is drawn is 1.
-    weights = np.mean([sampler.weights[sampler.draw()[0]].mean() for _ in range(400)])
+    drawn = [sampler.draw().weight for _ in range(400)]
+    weights = np.mean([weight.mean() for weight in drawn if weight is not None])
     assert weights == pytest.approx(1, abs=0.05)
 
 

@@ -17,27 +17,27 @@ from support.toy_twin import TASK as TOY_TASK
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import Prioritised, parse_mixture
 from restock.replay.panel.build import build_panel
+from restock.replay.panel.logged_sampler import LoggedSampler
 from restock.replay.panel.panel import Panel
 from restock.replay.panel.strata import rules_of
 from restock.replay.ring.ring import FreshRing
-from restock.replay.sampling.share_controller import Diet, FedStratum, PlannedDraws
-from restock.replay.sampling.within_stratum import panel_sampler
+from restock.replay.sampling.per import sampler_by_rules
+from restock.replay.sampling.share_controller import PlannedDraws, SampledStratum, ShareController
 from restock.train.feed.batches import Batches, Logs
-from restock.train.feed.logged_sampler import LogDraws
 from restock.train.loop import TrainingInterrupted, train
 from restock.train.session import Session
 
 HALVES = "[[strata]]\nname = 'nominal'\nshare = 0.5\n[[strata]]\nname = 'rare'\nshare = 0.5\n"
 
 
-def diet(text: str, rows: list[int], planned: PlannedDraws, **more: Any) -> Diet:
+def diet(text: str, rows: list[int], planned: PlannedDraws, **more: Any) -> ShareController:
     mixture = parse_mixture(text)
     names = [rule.name for rule in mixture.strata]
     fed = [
-        FedStratum(name, "logs", rule, count, 9)
+        SampledStratum(name, "logs", rule, count, 9)
         for name, rule, count in zip(names, rules_of(mixture, names), rows, strict=True)
     ]
-    return Diet(mixture, fed, planned, **more)
+    return ShareController(mixture, fed, planned, **more)
 
 
 def test_the_cap_is_reckoned_with_the_runs_own_draws() -> None:
@@ -93,8 +93,8 @@ def panel(table: pa.Table, path: Path, text: str) -> Panel:
     return build_panel(table, parse_mixture(whole), path, task=TOY_TASK, conditions=CONDITIONS)
 
 
-def draws_of(panel: Panel, planned: PlannedDraws, batch_size: int = 64) -> LogDraws:
-    return LogDraws(Logs.of_panel(panel, planned), None, batch_size, 0)
+def draws_of(panel: Panel, planned: PlannedDraws, batch_size: int = 64) -> LoggedSampler:
+    return Logs.of_panel(panel, planned).sampler(batch_size, None, 0)
 
 
 @pytest.mark.parametrize("within", ["without_replacement", "uniform", "per", "lap"])
@@ -155,15 +155,15 @@ def test_the_surplus_of_a_stratum_that_is_used_up_goes_to_the_others(
     built = panel(table, tmp_path / "p", text + "[each_condition]\n")
     draws = draws_of(built, PlannedDraws(online=10))  # it says it will draw next to nothing
     place = [stratum.name for stratum in built.strata].index("near_collision")
-    assert draws.diet.shares[place] == 0.5
+    assert draws.controller.shares[place] == 0.5
     limit = 20 * built.strata[place].rows
-    while draws.diet.drawn[place] < limit:
+    while draws.controller.drawn[place] < limit:
         draws.draw(64)
-    assert draws.diet.shares[place] == 0
-    assert draws.diet.shares.sum() == pytest.approx(1)
-    before = draws.diet.drawn[place]
+    assert draws.controller.shares[place] == 0
+    assert draws.controller.shares.sum() == pytest.approx(1)
+    before = draws.controller.drawn[place]
     assert len(draws.draw(64).rows) == 64
-    assert draws.diet.drawn[place] == before == limit
+    assert draws.controller.drawn[place] == before == limit
 
 
 EVERYTHING = """
@@ -197,12 +197,12 @@ def test_draws_go_on_exactly_where_they_were_saved(table: pa.Table, tmp_path: Pa
     built = panel(table, tmp_path / "p", EVERYTHING)
     planned = PlannedDraws(640, 20_000, 0, 1200)
 
-    def some(draws: LogDraws, batches: int, seed: int) -> list[Any]:
+    def some(draws: LoggedSampler, batches: int, seed: int) -> list[Any]:
         rng = np.random.default_rng(seed)
         found: list[Any] = []
         for number in range(batches):
             draws.move_to(number * 10)
-            count = max(round(64 * draws.diet.logs_share), 1)
+            count = max(round(64 * draws.controller.logs_share), 1)
             batch = draws.draw(count)
             draws.update(batch.rows, batch.strata, rng.random(len(batch.rows)) * (1 + batch.strata))
             found.append((batch.rows, batch.strata, batch.weight, batch.quota.copy()))
@@ -229,8 +229,8 @@ def test_weights_follow_the_shares_in_force(table: pa.Table, tmp_path: Path) -> 
     post = np.array([stratum.timing == "post" for stratum in built.strata])
     rows = np.array([stratum.rows for stratum in built.strata])
     for step in range(3):
-        shares = draws.diet.shares
-        weight = draws._own_weights(np.arange(len(built)))
+        shares = draws.controller.shares
+        weight = draws.weights_of(np.arange(len(built)))
         assert weight is not None
         mean = np.bincount(built.stratum_code, weight) / np.maximum(rows, 1)
         assert (shares * mean).sum() == pytest.approx(1, rel=1e-4)
@@ -249,7 +249,7 @@ def test_weights_follow_the_shares_in_force(table: pa.Table, tmp_path: Path) -> 
 
 def test_mixed_rules_keep_exact_quotas_and_their_own_ways() -> None:
     members = [np.arange(0, 50), np.arange(50, 90), np.arange(90, 100)]
-    sampler = panel_sampler(
+    sampler = sampler_by_rules(
         ["without_replacement", "per", "uniform"],
         members,
         np.array([0.5, 0.3, 0.2]),
@@ -312,8 +312,8 @@ def test_the_run_records_the_shares_in_force(whole: tuple[Session, Panel]) -> No
         assert sum(row["share"] for row in mine) == pytest.approx(1)
         assert all(row["replays_max"] <= 40 for row in mine)
     last = shares[-size:]
-    assert live.batches.diet is not None
-    np.testing.assert_allclose([row["share"] for row in last], live.batches.diet.shares)
+    assert live.batches.controller is not None
+    np.testing.assert_allclose([row["share"] for row in last], live.batches.controller.shares)
     assert [row["share"] for row in last] != [row["planned_share"] for row in last]
     assert last[0]["logs_share"] < 0.4 < shares[0]["logs_share"]
     # What was asked for is what was drawn.

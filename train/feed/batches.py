@@ -2,7 +2,7 @@
 
 The half-and-half batch of online learning with logs (RLPD, arXiv:2302.02948) is put together here,
 from two sources that share one packed row layout, by one gather each. How large the half is, and
-what each stratum has of it, is the diet's to say (`restock.replay.sampling.share_controller`).
+what each stratum has of it, the share controller says (`restock.replay.sampling.share_controller`).
 """
 
 from __future__ import annotations
@@ -20,17 +20,22 @@ from torch import Tensor
 
 from restock.errors import MixtureError
 from restock.replay.mixture.packed_row import F32, F64, Ints
+from restock.replay.panel.logged_sampler import (
+    BatchDraw,
+    LoggedSampler,
+    sampler_by_shares,
+    sampler_for,
+)
 from restock.replay.ring.ring import FreshRing
-from restock.replay.sampling.share_controller import Diet, PlannedDraws
+from restock.replay.sampling.share_controller import PlannedDraws, ShareController
 from restock.train.dqn.checkpoint import generator_state, restore_generator
-from restock.train.feed.logged_sampler import Drawing, LogDraws
 
 if TYPE_CHECKING:
     from restock.replay.panel.panel import Panel
 
 _NO_ROWS: Ints = np.empty(0, np.int64)
 _UNPLANNED = PlannedDraws()
-_NOTHING = Drawing(_NO_ROWS, _NO_ROWS, None, np.empty(0))
+_NOTHING = BatchDraw(_NO_ROWS, _NO_ROWS, None, np.empty(0))
 _IN_MEMORY_BYTES = 4 << 30  # larger panels stay memory-mapped
 
 
@@ -125,6 +130,32 @@ class Logs:
     def __len__(self) -> int:
         return len(self.rows)
 
+    def sampler(self, batch_size: int, logs_share: float | None, seed: int) -> LoggedSampler:
+        """What draws from them: by the mixture of their panel, else by their shares.
+
+        Raises:
+            MixtureError: see `sampler_for`.
+        """
+        if self.panel is None:
+            return sampler_by_shares(
+                self.rows.numpy(),
+                self.strata,
+                self.stratum_rows,
+                self.shares,
+                batch_size,
+                seed=seed,
+                logs_share=logs_share or 0.0,
+                weights=self.weights,
+            )
+        return sampler_for(
+            self.panel,
+            batch_size,
+            seed=seed,
+            planned=self.planned,
+            logs_share=logs_share,
+            lap_floor=self.huber_delta,
+        )
+
 
 @dataclass(frozen=True)
 class Batch:
@@ -169,20 +200,20 @@ class Batches:
         self._rng = np.random.default_rng([seed, 1])
         self._fresh = torch.from_numpy(ring.rows)  # shares memory with the ring
         self._buffer = torch.empty((batch_size, ring.rows.shape[1]))
-        self._draws: LogDraws | None = None
+        self._draws: LoggedSampler | None = None
         self._logs_on_device: Tensor | None = None
         self._max_age: int | None = None  # of fresh rows, in environment steps
         if logs is not None:
-            self._draws = LogDraws(logs, logs_share, batch_size, seed)
-            if not self._draws.gathers:
+            self._draws = logs.sampler(batch_size, logs_share, seed)
+            if not self._draws.reads_chunks:
                 self._logs_on_device = logs.rows.to(device)
             if logs.panel is not None:
                 self._max_age = logs.panel.header.mixture.max_age_env_steps
 
     @property
-    def diet(self) -> Diet | None:
+    def controller(self) -> ShareController | None:
         """The shares in force, and what was drawn; None without logs."""
-        return self._draws.diet if self._draws is not None else None
+        return self._draws.controller if self._draws is not None else None
 
     def describe(self) -> list[dict[str, Any]]:
         """Rows for the run's table `shares`; none without logs."""
@@ -199,7 +230,7 @@ class Batches:
         drawn = self._draws.draw(self.batch_size)
         if len(drawn.rows) < self.batch_size:
             raise MixtureError(
-                f"every row of the panel was drawn {self._draws.diet.max_replays} times",
+                f"every row of the panel was drawn {self._draws.controller.max_replays} times",
                 remedy="train on with fewer offline updates, or mix with more draws a row",
             )
         return self._gather(drawn, _NO_ROWS)
@@ -209,7 +240,7 @@ class Batches:
         drawn = _NOTHING
         if self._draws is not None:
             self._draws.move_to(env_steps)
-            if logged := round(self.batch_size * self._draws.diet.logs_share):
+            if logged := round(self.batch_size * self._draws.controller.logs_share):
                 drawn = self._draws.draw(logged)
         slots = _NO_ROWS
         if len(drawn.rows) < self.batch_size:
@@ -218,7 +249,7 @@ class Batches:
 
     def learnt(self, batch: Batch, td: Tensor) -> None:
         """The TD errors (B,) of a batch, once it was learnt from: priorities and shares follow."""
-        if self._draws is not None and self._draws.listens and batch.logged:
+        if self._draws is not None and self._draws.needs_td and batch.logged:
             td_abs = td[: batch.logged].detach().abs().cpu().numpy()
             self._draws.update(batch.log_rows, batch.log_stratum, td_abs)
 
@@ -234,11 +265,11 @@ class Batches:
             )
         return young[self._rng.integers(len(young), size=count)]
 
-    def _gather(self, drawn: Drawing, slots: Ints) -> Batch:
+    def _gather(self, drawn: BatchDraw, slots: Ints) -> Batch:
         logged, size = len(drawn.rows), len(drawn.rows) + len(slots)
         packed = self._buffer[:size]
         on_cpu = self.device.type == "cpu"
-        if logged and self._draws is not None and self._draws.gathers:
+        if logged and self._draws is not None and self._draws.reads_chunks:
             self._draws.gather(drawn.rows, packed[:logged].numpy())
         elif logged and on_cpu:
             index = torch.from_numpy(drawn.rows)

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from restock.errors import ConfigError, MixtureError, PanelError
 from restock.ingest.profile.profile import load_profile
+from restock.replay.panel.logged_sampler import BatchDraw, LoggedSampler
 from restock.replay.panel.panel import Panel
 from restock.train.dqn.loss import Loss
 from restock.train.feed.batch_record import FeedRecord
 from restock.train.feed.batches import Batch, Logs
-from restock.train.feed.logged_sampler import Drawing, LogDraws
 from restock.train.libraries.fresh_meta import FreshMeta
 from restock.train.libraries.info_labels import InfoLabels
 from restock.train.libraries.library_run import NullsForNaN, create_run, episode_row, known
@@ -32,7 +32,7 @@ from restock.train.run.run_tables import TABLES
 
 Ints = NDArray[np.int64]
 _NO_ROWS: Ints = np.empty(0, np.int64)
-NO_LOGS = Drawing(_NO_ROWS, _NO_ROWS, None, np.empty(0))
+NO_LOGS = BatchDraw(_NO_ROWS, _NO_ROWS, None, np.empty(0))
 
 
 class MixedFeed:
@@ -83,7 +83,8 @@ class MixedFeed:
         self.labels = InfoLabels(definition.conditions, num_envs)
         self.num_envs, self.library = num_envs, library
         self.env_steps = self.batches = self.invalid_steps = 0
-        self._draws: LogDraws | None = None
+        self._draws: LoggedSampler | None = None
+        self._untold = False  # of the TD errors of the batch before
         self._phase = "offline"
         self._open = 0  # batches since the last rows were written
         self._episodes: dict[int, dict[str, Any]] = {}
@@ -134,24 +135,31 @@ class MixedFeed:
 
     # -- batches --------------------------------------------------------------------------------
 
-    def draw_logs(self, batch_size: int) -> Drawing:
+    def draw_logs(self, batch_size: int) -> BatchDraw:
         """The logged rows (L,) of a batch, by the mixture; all of it where nothing is fresh.
 
         Raises:
-            MixtureError: nothing is fresh, and the panel's rows were drawn as often as they may be.
+            MixtureError: nothing is fresh, and the panel's rows were drawn as often as they may be;
+                or the draws follow TD errors and those of the last batch were not given.
         """
         if self.logs is None:
             return NO_LOGS
+        if self._untold:
+            raise MixtureError(
+                "the mixture's draws follow TD errors, and this buffer is told none",
+                remedy="for Stable-Baselines3 set `critic`, e.g. to dqn_critic(model); or mix"
+                " without [adaptive], `per` and `lap`",
+            )
         if self._draws is None:
-            self._draws = LogDraws(self.logs, self.logs_share, batch_size, self.seed)
+            self._draws = self.logs.sampler(batch_size, self.logs_share, self.seed)
         count = batch_size
         if len(self.fresh):
             self._draws.move_to(self.env_steps)
-            count = round(batch_size * self._draws.diet.logs_share)
+            count = round(batch_size * self._draws.controller.logs_share)
         drawing = self._draws.draw(count) if count else NO_LOGS
         if not len(self.fresh) and len(drawing.rows) < batch_size:
             raise MixtureError(
-                f"every row of the panel was drawn {self._draws.diet.max_replays} times",
+                f"every row of the panel was drawn {self._draws.controller.max_replays} times",
                 remedy="collect steps, or mix with more draws a row",
             )
         return drawing
@@ -177,7 +185,7 @@ class MixedFeed:
     def drawn(
         self,
         packed: NDArray[np.float32],
-        drawing: Drawing,
+        drawing: BatchDraw,
         slots: Ints,
         *,
         weight: NDArray[np.float32] | None = None,
@@ -189,9 +197,11 @@ class MixedFeed:
         `weight` as applied, `td` (Q - target) and `q` (B,); unknown ones are null in the tables.
         Priorities and adaptive shares follow `td` where it is known.
         """
-        if td is not None and self._draws is not None and self._draws.listens:
-            count = len(drawing.rows)
-            self._draws.update(drawing.rows, drawing.strata, np.abs(td[:count]))
+        if self._draws is not None and self._draws.needs_td and len(drawing.rows):
+            self._untold = td is None
+            if td is not None:
+                td_abs = np.abs(td[: len(drawing.rows)])
+                self._draws.update(drawing.rows, drawing.strata, td_abs)
         phase = "online" if len(slots) else "offline"
         if phase != self._phase:
             self.flush()  # an interval is of one phase

@@ -24,8 +24,8 @@ from tianshou.data import Batch, ReplayBuffer, ReplayBufferManager
 from restock.errors import MixtureError
 from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.packed_row import row_columns, row_width
+from restock.replay.panel.logged_sampler import BatchDraw
 from restock.replay.panel.panel import Panel
-from restock.train.feed.logged_sampler import Drawing
 from restock.train.libraries.mixed_feed import Ints, MixedFeed
 
 TIANSHOU = "tianshou"
@@ -91,7 +91,7 @@ class MixtureVectorReplayBuffer(ReplayBufferManager):
         self.fresh = self.feed.fresh_meta(size * buffer_num)
         self.feed.keep_record(self.fresh)
         self._columns, self._width = row_columns(observation_size), row_width(observation_size)
-        self._sampled: tuple[Drawing, Ints] | None = None
+        self._sampled: tuple[BatchDraw, Ints] | None = None
         if panel is not None:
             self._lay_out(panel, commands)
 

@@ -83,7 +83,7 @@ class AuditCommand:
 
     def _capacity(self) -> int:
         from restock.cli import output
-        from restock.replay.panel.capacity import recommend_capacity
+        from restock.replay.store.capacity import recommend_capacity
         from restock.replay.places import open_place
 
         with open_place(self.store, only_store=True) as connection:

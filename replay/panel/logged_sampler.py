@@ -1,0 +1,338 @@
+"""How a panel is drawn from: by the mixture's shares, rules and limits, whoever trains on it.
+
+    sampler = sampler_for(panel, 256, seed=0)
+    batch = sampler.draw()                           # row numbers, strata, weights
+    sampler.gather(batch.rows, out)                  # (B, W) float32
+    sampler.update(batch.rows, batch.strata, td_abs)  # once it was learnt from
+
+The shares follow the mixture's schedules and its [adaptive] rule, a stratum's rows are drawn by its
+`within`, weights are those of the shares in force, and no row comes more often than
+`max_replays_per_row`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.replay.mixture.mixture import Mixture
+from restock.replay.mixture.packed_row import F32, F64, Ints
+from restock.replay.panel.plan import outcome_column
+from restock.replay.panel.strata import rules_of
+from restock.replay.panel.weights import WeightsInForce
+from restock.replay.sampling.chunked import ChunkedSampler
+from restock.replay.sampling.per import sampler_by_rules
+from restock.replay.sampling.sampler import QuotaSampler, Sampler
+from restock.replay.sampling.share_controller import (
+    PlannedDraws,
+    SampledStratum,
+    ShareController,
+)
+from restock.state import Stateful
+
+if TYPE_CHECKING:
+    from restock.replay.panel.panel import Panel
+
+
+@dataclass(frozen=True)
+class BatchDraw:
+    """The logged rows of one batch."""
+
+    rows: Ints  # (L,) of the panel
+    strata: Ints  # (L,)
+    weight: F32 | None  # (L,) importance weights; None for ones
+    quota: F64  # (S,) the shares they were drawn by
+
+
+class LoggedSampler(Stateful):
+    """Draws of one learner from logged rows. `sampler_for` makes one for a panel.
+
+    `controller` says in which shares; `sampler` draws by them; what would be drawn more often than
+    the mixture's `max_replays_per_row` is replaced by a row of the same stratum that may still be
+    drawn, else by one of another stratum, else by nothing.
+
+    Args:
+        rows: (n, W) the packed rows.
+        weights: importance weights of the rows: (n,), or those that follow the shares; None: ones.
+        rng: of the replacements.
+        needs_td: whether shares or priorities follow the TD errors given to `update`.
+    """
+
+    STATE: ClassVar[tuple[str, ...]] = ("sampler", "controller", "replays", "replaced", "_rng")
+
+    def __init__(
+        self,
+        controller: ShareController,
+        sampler: Sampler,
+        rows: F32,
+        stratum_rows: Sequence[Ints],
+        *,
+        weights: WeightsInForce | F32 | None,
+        rng: np.random.Generator,
+        needs_td: bool = False,
+    ) -> None:
+        self.controller, self.sampler, self.needs_td = controller, sampler, needs_td
+        self._rows, self._stratum_rows, self._weights = rows, list(stratum_rows), weights
+        self.batch_size = sampler.batch_size  # of a draw that names no count
+        if isinstance(weights, WeightsInForce):
+            weights.set_shares(controller.shares)
+        # Draws of each row so far, where there is a limit to them.
+        limit = controller.max_replays
+        self.replays: NDArray[np.int32] | None = None
+        if limit is not None:
+            self.replays = np.zeros(len(rows), np.int32)
+        self._budget: Ints = (limit or 0) * np.array([len(members) for members in stratum_rows])
+        self._swapped = False  # rows of the last batch, for the limit
+        # Rows of each stratum that were replaced, for the limit.
+        self.replaced: Ints = np.zeros(len(controller.shares), np.int64)
+        self._rng = rng
+
+    @property
+    def reads_chunks(self) -> bool:
+        """Whether `gather` must be asked for the rows: they are not in memory."""
+        return isinstance(self.sampler, ChunkedSampler)
+
+    def move_to(self, env_steps: int) -> None:
+        """Before an online batch is drawn: shares with a schedule move with the steps."""
+        if self.controller.at(env_steps):
+            self._follow()
+
+    def draw(self, count: int | None = None) -> BatchDraw:
+        """Rows of a batch: `count`, or fewer where all others have had all their draws."""
+        self.sampler.set_batch_size(self.batch_size if count is None else count)
+        quota = self.controller.shares
+        rows, strata = self.sampler.draw()
+        of_rule = self.sampler.drawn_weights
+        if self.replays is not None and self.controller.max_replays is not None:
+            rows, strata, of_rule = self._hold(rows, strata, of_rule, self.controller.max_replays)
+        self.controller.count(strata)
+        weight = of_rule
+        if (corrected := self.weights_of(rows)) is not None:
+            weight = corrected if of_rule is None else corrected * of_rule
+        if self.replays is not None and self._used_up() and self.controller.give_up():
+            self._follow()
+        return BatchDraw(rows, strata, weight, quota)
+
+    def weights_of(self, rows: Ints) -> F32 | None:
+        """The correction's weights (n,) of rows (n,) under the shares in force; None for ones."""
+        if isinstance(self._weights, WeightsInForce):
+            return self._weights.of(rows)
+        return None if self._weights is None else self._weights[rows]
+
+    def gather(self, rows: Ints, out: F32) -> None:
+        """The packed rows last drawn (L,) into `out` (L, W)."""
+        if (
+            not isinstance(self.sampler, ChunkedSampler)
+            or len(rows) < self.sampler.batch_size
+            or self._swapped
+        ):
+            np.take(self._rows, rows, axis=0, out=out, mode="clip")
+        else:
+            self.sampler.gather(out)
+
+    def update(self, rows: Ints, strata: Ints, td_abs: NDArray[Any]) -> None:
+        """|TD error| (n,) of rows (n,) of these strata (n,) that were just learnt from."""
+        self.sampler.update(rows, td_abs)
+        if self.controller.observe(strata, td_abs):
+            self._follow()
+
+    def _follow(self) -> None:
+        """The sampler and the weights take over the controller's shares."""
+        self.sampler.set_shares(self.controller.shares)
+        if isinstance(self._weights, WeightsInForce):
+            self._weights.set_shares(self.controller.shares)
+
+    restored = _follow
+
+    def _hold(
+        self, rows: Ints, strata: Ints, weight: F32 | None, limit: int
+    ) -> tuple[Ints, Ints, F32 | None]:
+        """Count the draws (L,), and replace those beyond the limit."""
+        replays = self.replays
+        if replays is None:
+            raise RuntimeError("draws are not counted")
+        np.add.at(replays, rows, 1)
+        beyond = np.flatnonzero(replays[rows] > limit)
+        self._swapped = bool(len(beyond))
+        if not len(beyond):
+            return rows, strata, weight
+        rows, strata = rows.copy(), strata.copy()
+        kept = np.ones(len(rows), np.bool_)
+        if weight is not None:
+            weight = weight.copy()
+        for place in beyond.tolist():
+            row, stratum = int(rows[place]), int(strata[place])
+            if replays[row] <= limit:  # another place of this batch gave way
+                continue
+            replays[row] -= 1
+            self.replaced[stratum] += 1
+            replacement = self._replacement(stratum, limit)
+            if replacement is None:
+                kept[place] = False
+                continue
+            rows[place], strata[place] = replacement
+            replays[replacement[0]] += 1
+            if weight is not None:
+                weight[place] = 1.0
+        return rows[kept], strata[kept], None if weight is None else weight[kept]
+
+    def _replacement(self, stratum: int, limit: int) -> tuple[int, int] | None:
+        """A row that may still be drawn, and its stratum: of this one, else by the shares."""
+        replays, shares = self.replays, self.controller.shares
+        if replays is None:
+            return None
+        others = self._rng.permutation(len(shares))
+        by_share = sorted(others.tolist(), key=lambda s: -shares[s] * self._rng.random())
+        for code in [stratum, *by_share]:
+            members = self._stratum_rows[code]
+            free = members[replays[members] < limit]
+            if len(free):
+                return int(free[self._rng.integers(len(free))]), code
+        return None
+
+    def _used_up(self) -> bool:
+        """Whether a stratum that has a share has no row left that may be drawn."""
+        controller, full = self.controller, self.controller.drawn >= self._budget
+        return bool(controller.shares[full].any()) and controller.logs_share > 0
+
+    def describe(self) -> list[dict[str, Any]]:
+        """A row a stratum, for the run's table `shares`."""
+        replays = self.replays
+        rows = self.controller.describe()
+        for index, (row, members) in enumerate(zip(rows, self._stratum_rows, strict=True)):
+            most = None if replays is None else int(replays[members].max(initial=0))
+            row |= {"replays_max": most, "replaced_rows": int(self.replaced[index])}
+        return rows
+
+
+def sampler_for(
+    panel: Panel,
+    batch_size: int,
+    *,
+    seed: int | Sequence[int],
+    planned: PlannedDraws | None = None,
+    logs_share: float | None = None,
+    lap_floor: float = 1.0,
+) -> LoggedSampler:
+    """What draws from a panel as its mixture says.
+
+    Args:
+        batch_size: logged rows of a batch.
+        seed: of the draws.
+        planned: what will be drawn, which `max_replays_per_row` is shared out by; default: what the
+            mixture says under [planned].
+        logs_share: of an online batch, in place of the mixture's.
+        lap_floor: the threshold of the Huber loss, where `within = "lap"`.
+
+    Raises:
+        MixtureError: rows too few for what is planned, where the mixture refuses that; too little
+            memory for a panel that is read in chunks.
+    """
+    header = panel.header
+    mixture, members = header.mixture, panel.stratum_rows()
+    within = [stratum.within for stratum in panel.strata]
+    controller = controller_for(panel, planned or planned_by(mixture), logs_share)
+    seeds = [seed] if isinstance(seed, int) else list(seed)
+    rng = np.random.default_rng([*seeds, 2])
+    sampler: Sampler
+    if mixture.sampling == "chunked":
+        sampler = ChunkedSampler(panel.rows, members, controller.shares, batch_size, rng)
+    else:
+        sampler = sampler_by_rules(
+            within,
+            members,
+            controller.shares,
+            batch_size,
+            rng,
+            mixture.prioritised,
+            lap_floor=lap_floor,
+        )
+    return LoggedSampler(
+        controller,
+        sampler,
+        panel.rows,
+        members,
+        weights=_weights(panel),
+        rng=np.random.default_rng([*seeds, 3]),
+        needs_td=mixture.adaptive is not None or any(rule in ("per", "lap") for rule in within),
+    )
+
+
+def sampler_by_shares(
+    rows: F32,
+    names: Sequence[str],
+    stratum_rows: Sequence[Ints],
+    shares: F64,
+    batch_size: int,
+    *,
+    seed: int,
+    logs_share: float,
+    weights: F32 | None = None,
+) -> LoggedSampler:
+    """The same for rows (n, W) that are no panel's: fixed shares (S,), each stratum in turns."""
+    controller = ShareController.fixed(
+        names, [len(members) for members in stratum_rows], shares, logs_share
+    )
+    return LoggedSampler(
+        controller,
+        QuotaSampler(
+            stratum_rows,
+            controller.shares,
+            batch_size,
+            np.random.default_rng([seed, 2]),
+            replacement=False,
+        ),
+        rows,
+        stratum_rows,
+        weights=weights,
+        rng=np.random.default_rng([seed, 3]),
+    )
+
+
+def planned_by(mixture: Mixture) -> PlannedDraws:
+    """The draws that a mixture was planned for."""
+    online = float(mixture.planned.updates * mixture.planned.batch_size)
+    return PlannedDraws(online=online, end_env_steps=mixture.sources.last_bend)
+
+
+def controller_for(
+    panel: Panel, planned: PlannedDraws, logs_share: float | None = None
+) -> ShareController:
+    """The shares of a learner that draws so much from a panel.
+
+    Raises:
+        MixtureError: see `ShareController`.
+    """
+    mixture, sizes = panel.header.mixture, [len(rows) for rows in panel.stratum_rows()]
+    names = [stratum.name.removeprefix(f"{stratum.source}/") for stratum in panel.strata]
+    strata = [
+        SampledStratum(stratum.name, stratum.source, rule, size, stratum.episodes)
+        for stratum, rule, size in zip(panel.strata, rules_of(mixture, names), sizes, strict=True)
+    ]
+    return ShareController(mixture, strata, planned, logs_share=logs_share)
+
+
+def _weights(panel: Panel) -> WeightsInForce | F32 | None:
+    """The weights of a panel's rows, or None where none is corrected."""
+    strata = panel.strata
+    if all(stratum.correction == "none" for stratum in strata):
+        weights = panel.weights
+        return None if np.all(weights == 1) else weights
+    meta, size = panel.meta, len(strata) // (1 + len(panel.header.others))
+    outcome = None
+    for index, stratum in enumerate(strata[:size]):
+        if (name := outcome_column(stratum.name)) in meta.column_names:
+            outcome = np.zeros((len(panel), size), np.float32) if outcome is None else outcome
+            outcome[:, index] = meta[name].to_numpy()
+    return WeightsInForce(
+        panel.stratum_code,
+        np.asarray(meta["state_code"].to_numpy(), np.int16),
+        strata,
+        1 + len(panel.header.others),
+        panel.header.mixture.correction,
+        outcome,
+    )

@@ -1,0 +1,269 @@
+"""However one draws from a panel, the mixture's rules hold, or it is refused with a remedy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+import torch
+from support.stores import CONDITIONS, recording_transitions
+from torch.utils.data import DataLoader
+
+from restock.errors import MixtureError
+from restock.ingest.profile.profile import load_profile
+from restock.replay.mixture.mixture import parse_mixture
+from restock.replay.panel.build import build_panel
+from restock.replay.panel.iterable import PanelDataset
+from restock.replay.panel.logged_sampler import LoggedSampler, sampler_for
+from restock.replay.panel.panel import Panel
+from restock.replay.ring.ring import FreshRing
+from restock.train.feed.batches import Batches, Logs
+from restock.train.libraries.mixed_feed import MixedFeed
+
+TASK = load_profile("warehouse_amr").task
+BATCH = 40
+EVERY = (
+    "[planned]\nupdates = 1\n[evaluation_split]\nby = 'none'\n[each_condition]\nshare = 'equal'\n"
+)
+EVERY = EVERY.replace("evaluation_split", "held_out")
+MIXTURES = {
+    "in turns": "within = 'without_replacement'\n" + EVERY,
+    "uniform": "within = 'uniform'\n" + EVERY,
+    "limited": "max_replays_per_row = 3\n" + EVERY,
+    "limited, uniform": "max_replays_per_row = 3\nwithin = 'uniform'\n" + EVERY,
+    "once": "max_replays_per_row = 1\nwithin = 'uniform'\n" + EVERY,
+    "per": "within = 'per'\n" + EVERY,
+    "limited lap": "max_replays_per_row = 3\nwithin = 'lap'\n" + EVERY,
+    "chunked": "max_replays_per_row = 3\nsampling = 'chunked'\n" + EVERY,
+    "adaptive": EVERY + "[adaptive]\nstep_size = 2.0\nevery_updates = 1\nafter_updates = 0\n",
+    "scheduled": EVERY + "[[strata]]\nname = 'nominal'\n"
+    "share = {schedule = 'linear', start = 0.8, end = 0.2, to_env_steps = 1000}\n",
+    "quota": EVERY + "[[strata]]\nname = 'wheel_slip'\nshare = 0.25\n",
+}
+FOLLOW_TD = {"per", "limited lap", "adaptive"}
+
+
+@dataclass(frozen=True)
+class Drawn:
+    rows: np.ndarray
+    strata: np.ndarray
+
+
+Way = Callable[[Panel], Iterator[Drawn]]
+ERRS = 3.0  # |TD| of what errs, where the rest has 0.1
+
+
+def learn(sampler: Any, rows: np.ndarray, strata: np.ndarray) -> np.ndarray:
+    """|TD| by stratum and row: stratum 0 errs, and in every stratum the even rows."""
+    return np.where((strata == 0) | (rows % 2 == 0), ERRS, 0.1).astype(np.float32)
+
+
+def by_sampler(make: Callable[[Panel], LoggedSampler]) -> Way:
+    def draw(panel: Panel) -> Iterator[Drawn]:
+        sampler, number = make(panel), 0
+        while True:
+            sampler.move_to(number * 10)
+            batch = sampler.draw()
+            if len(batch.rows) < BATCH:
+                raise MixtureError("no more", remedy="mix with more")
+            packed = np.empty((BATCH, panel.rows.shape[1]), np.float32)
+            sampler.gather(batch.rows, packed)
+            np.testing.assert_array_equal(packed, panel.rows[batch.rows])
+            yield Drawn(batch.rows, batch.strata)
+            sampler.update(batch.rows, batch.strata, learn(sampler, batch.rows, batch.strata))
+            number += 1
+
+    return draw
+
+
+def by_dataset(workers: int) -> Way:
+    def draw(panel: Panel) -> Iterator[Drawn]:
+        limited = panel.header.mixture.max_replays_per_row is not None
+        dataset = PanelDataset(panel, BATCH, batches=8 if limited else 200, seed=0)
+        context = "fork" if workers else None
+        loader = DataLoader(
+            dataset, batch_size=None, num_workers=workers, multiprocessing_context=context
+        )
+        for epoch in range(10**9):
+            dataset.set_epoch(epoch)
+            for batch in loader:
+                yield Drawn(batch["row"].numpy(), batch["stratum"].numpy())
+
+    return draw
+
+
+def by_batches(panel: Panel) -> Iterator[Drawn]:
+    ring = FreshRing(64, 4, panel.observation_size, discount=panel.discount)
+    device = torch.device("cpu")
+    logs = Logs.of_panel(panel)
+    batches = Batches(logs, ring, batch_size=BATCH, logs_share=1.0, seed=0, device=device)
+    for number in range(10**9):
+        batch = batches.draw_online(number * 10)
+        np.testing.assert_array_equal(batch.rows.numpy(), panel.rows[batch.log_rows])
+        yield Drawn(batch.log_rows, batch.log_stratum)
+        td = learn(None, batch.log_rows, batch.log_stratum)
+        batches.learnt(batch, torch.from_numpy(td))
+
+
+def by_library(told: bool) -> Way:
+    def draw(panel: Panel) -> Iterator[Drawn]:
+        feed = MixedFeed(
+            "any",
+            2,
+            panel.observation_size,
+            panel=panel,
+            run=None,
+            logs_share=None,
+            profile="warehouse_amr",
+            seed=0,
+            audit_share=0.0,
+            log_every=10,
+        )
+        feed.keep_record(np.empty(0))
+        for _ in range(10**9):
+            batch = feed.draw_logs(BATCH)
+            yield Drawn(batch.rows, batch.strata)
+            td = learn(None, batch.rows, batch.strata) if told else None
+            feed.drawn(panel.rows[batch.rows], batch, np.empty(0, np.int64), td=td)
+
+    return draw
+
+
+WAYS: dict[str, Way] = {
+    "sampler_for": by_sampler(lambda panel: sampler_for(panel, BATCH, seed=0)),
+    "Panel.sampler": by_sampler(lambda panel: panel.sampler(BATCH, seed=0)),
+    "PanelDataset": by_dataset(0),
+    "PanelDataset, 2 workers": by_dataset(2),
+    "training": by_batches,
+    "a library's buffer": by_library(True),
+    "a library's buffer without TD errors": by_library(False),
+}
+NOT_TOLD = {"PanelDataset", "PanelDataset, 2 workers", "a library's buffer without TD errors"}
+NO_STEPS = {"PanelDataset", "PanelDataset, 2 workers", "a library's buffer"}
+
+
+@pytest.fixture(scope="module")
+def panels(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Panel]:
+    table = pa.concat_tables(
+        [recording_transitions(index, episodes=6, task=TASK) for index in (1, 2)]
+    )
+    made: dict[str, Panel] = {}
+
+    def panel(name: str) -> Panel:
+        if name not in made:
+            mixture = parse_mixture(MIXTURES[name])
+            out = tmp_path_factory.mktemp("panels") / "panel"
+            made[name] = build_panel(table, mixture, out, task=TASK, conditions=CONDITIONS)
+        return made[name]
+
+    return panel
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("name", MIXTURES)
+def test_the_rules_of_the_mixture_hold_or_the_draw_is_refused(
+    panels: Callable[[str], Panel], name: str, way: str
+) -> None:
+    panel = panels(name)
+    limit = panel.header.mixture.max_replays_per_row
+    batches: list[Drawn] = []
+    counted = np.zeros(len(panel), np.int64)
+    refusal = ""
+    try:
+        for batch in WAYS[way](panel):
+            batches.append(batch)
+            np.add.at(counted, batch.rows, 1)
+            np.testing.assert_array_equal(panel.stratum_code[batch.rows], batch.strata)
+            if len(batches) == 200:
+                break
+    except MixtureError as error:
+        # A worker passes the text on alone.
+        refusal = str(error) if error.remedy or "workers" in way else ""
+    if name in FOLLOW_TD and way in NOT_TOLD:
+        assert "follow TD errors" in refusal
+        assert len(batches) <= 1
+        return
+    if name == "scheduled" and way.startswith("PanelDataset"):
+        assert "follow environment steps" in refusal
+        assert not batches
+        return
+    # With a limit the rows end; without one they do not.
+    if limit is not None:
+        assert counted.max() <= limit
+        assert refusal
+        assert len(batches) == int(limit) * len(panel) // BATCH
+        return
+    assert not refusal
+    _check_within(panel, name, batches, counted)
+    _check_shares(panel, name, way, batches)
+
+
+def _check_within(panel: Panel, name: str, batches: list[Drawn], counted: np.ndarray) -> None:
+    """A stratum's rows are drawn by its rule."""
+    for stratum, members in zip(panel.strata, panel.stratum_rows(), strict=True):
+        spread = np.ptp(counted[members])
+        if stratum.within == "without_replacement":
+            assert spread <= 1, stratum.name
+        elif counted[members].mean() > 3:
+            assert spread > 1, stratum.name
+        if stratum.within == "per" and len(members) > 20:
+            even = members % 2 == 0
+            of_even, of_odd = counted[members[even]].mean(), counted[members[~even]].mean()
+            errs_alike = stratum.name == panel.strata[0].name
+            assert errs_alike or of_even > 1.5 * of_odd, stratum.name
+
+
+def _check_shares(panel: Panel, name: str, way: str, batches: list[Drawn]) -> None:
+    """Every batch has the quota of every stratum, the rounding carried on."""
+    size = len(panel.strata)
+    quotas = np.array([np.bincount(batch.strata, minlength=size) for batch in batches])
+    if name == "adaptive":
+        assert quotas[-1, 0] > quotas[0, 0]  # the one that errs
+    elif name == "scheduled":
+        nominal = [stratum.name for stratum in panel.strata].index("nominal")
+        assert quotas[0, nominal] == 32
+        assert quotas[-1, nominal] == (32 if way.startswith("a library") else 8)
+    else:
+        shares = np.array([stratum.share for stratum in panel.strata])
+        owed = np.cumsum(quotas - shares * BATCH, axis=0)
+        assert np.abs(owed).max() < 2
+
+
+def test_a_pass_is_not_given_twice_where_rows_may_not_be(panels: Callable[[str], Panel]) -> None:
+    for workers in (0, 2):
+        dataset = PanelDataset(panels("limited"), BATCH, batches=3, seed=0)
+        context = "fork" if workers else None
+        loader = DataLoader(
+            dataset, batch_size=None, num_workers=workers, multiprocessing_context=context
+        )
+        first = [batch["row"].tolist() for batch in loader]
+        with pytest.raises(MixtureError, match=r"(?s)pass 0 was given already.*set_epoch\(1\)"):
+            list(loader)
+        dataset.set_epoch(1)
+        assert [batch["row"].tolist() for batch in loader] != first
+    endless = PanelDataset(panels("limited"), BATCH, seed=0)
+    endless.set_epoch(1)
+    with pytest.raises(MixtureError, match="an endless pass has no next one"):
+        next(iter(endless))
+
+
+def test_draws_of_a_panel_go_on_where_they_were_saved(panels: Callable[[str], Panel]) -> None:
+    for name in ("limited lap", "chunked", "adaptive"):
+        panel = panels(name)
+        one, other = sampler_for(panel, BATCH, seed=1), sampler_for(panel, BATCH, seed=2)
+
+        def some(sampler: LoggedSampler, batches: int) -> list[list[int]]:
+            found = []
+            for _ in range(batches):
+                batch = sampler.draw()
+                sampler.update(batch.rows, batch.strata, learn(None, batch.rows, batch.strata))
+                found.append(batch.rows.tolist())
+            return found
+
+        some(one, 7)
+        other.load_state_dict(one.state_dict())
+        assert some(one, 20) == some(other, 20)
