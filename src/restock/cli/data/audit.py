@@ -83,8 +83,8 @@ class AuditCommand:
 
     def _capacity(self) -> int:
         from restock.cli import output
-        from restock.replay.store.capacity import recommend_capacity
         from restock.replay.places import open_place
+        from restock.replay.store.capacity import recommend_capacity
 
         with open_place(self.store, only_store=True) as connection:
             found = recommend_capacity(connection)
