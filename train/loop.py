@@ -21,7 +21,6 @@ from restock.train.evaluation.evaluate import (
     GreedyPolicy,
     Score,
     fixed_episodes,
-    run_episodes,
     score,
 )
 from restock.train.evaluation.ope import OpeConfig, evaluate_off_policy, measures_of
@@ -269,14 +268,8 @@ def _evaluate(session: Session, notify: Notify) -> None:
     config, clock, learner = session.config, session.clock, session.learner
     names = list(config.env.conditions)  # also those with a share of 0: never trained on, yet met
     specs = fixed_episodes(names, config.evaluation.episodes, config.evaluation.seed)
-    results = run_episodes(
-        session.evaluation_env,
-        GreedyPolicy(learner.policy_network),
-        specs,
-        control_period_s=session.task.control_period_s,
-        time_limit_steps=session.task.time_limit_steps,
-    )
-    measured = session.evaluation_env.measure(learner)
+    results = session.evaluation_buffer.drive(GreedyPolicy(learner.policy_network), specs)
+    measured = session.evaluation_buffer.measure(learner)
     clocks = {"env_steps": clock.env_steps, "gradient_steps": learner.gradient_steps}
     session.run.append("held_out", [{**clocks, **row} for row in measured])
     clock.evaluated_at = clock.env_steps

@@ -23,7 +23,7 @@ from restock.train.dqn import checkpoint
 from restock.train.dqn.config import TrainConfig
 from restock.train.dqn.learner import Learner
 from restock.train.evaluation.evaluate import Score
-from restock.train.evaluation.evaluation_buffer import HeldOut
+from restock.train.evaluation.evaluation_buffer import EvaluationBuffer
 from restock.train.feed.batch_record import FeedRecord
 from restock.train.feed.batches import Batches, Logs
 from restock.train.feed.collector import Collector, ring_conditions
@@ -74,7 +74,7 @@ class Session:
     config: TrainConfig
     task: Task
     env: Twin
-    evaluation_env: HeldOut
+    evaluation_buffer: EvaluationBuffer
     learner: Learner
     ring: FreshRing
     batches: Batches
@@ -222,7 +222,7 @@ def open_session(
         config=config,
         task=task,
         env=env,
-        evaluation_env=HeldOut(evaluation_env, task, conditions, ring, fidelity),
+        evaluation_buffer=EvaluationBuffer(evaluation_env, task, conditions, ring, fidelity),
         learner=learner,
         ring=ring,
         batches=batches,

@@ -25,7 +25,7 @@ _ORDER: list[Verdict] = ["comparable", "inconclusive", "incomparable"]
 
 
 @dataclass(frozen=True)
-class Limits:
+class ComparabilityLimits:
     """What still counts as the same feed."""
 
     distance: float = 0.02  # total variation between the mixes of the whole run
@@ -79,7 +79,9 @@ def worst(verdicts: Sequence[Verdict]) -> Verdict:
     return max(verdicts, key=_ORDER.index, default="comparable")
 
 
-def check_feeds(first: Feed, second: Feed, limits: Limits, rng: np.random.Generator) -> list[Check]:
+def check_feeds(
+    first: Feed, second: Feed, limits: ComparabilityLimits, rng: np.random.Generator
+) -> list[Check]:
     """All checks of the gate. Both feeds must name the same cells in the same order."""
     checks = []
     totals = [_resampled(feed, limits, rng) for feed in (first, second)]
@@ -104,7 +106,9 @@ def check_feeds(first: Feed, second: Feed, limits: Limits, rng: np.random.Genera
     return checks + _unlabelled(first, second, limits) + _episodes(first, second, limits)
 
 
-def _ratios(cells: Sequence[str], name: str, a: F64, b: F64, limits: Limits) -> list[Check]:
+def _ratios(
+    cells: Sequence[str], name: str, a: F64, b: F64, limits: ComparabilityLimits
+) -> list[Check]:
     after = " after weights" if name.endswith("weights") else ""
     checks = []
     for index, cell in enumerate(cells):
@@ -115,7 +119,7 @@ def _ratios(cells: Sequence[str], name: str, a: F64, b: F64, limits: Limits) -> 
     return checks
 
 
-def _unlabelled(first: Feed, second: Feed, limits: Limits) -> list[Check]:
+def _unlabelled(first: Feed, second: Feed, limits: ComparabilityLimits) -> list[Check]:
     """Rows that nobody could label when they were drawn may be anything: many show nothing."""
     fresh = [name.startswith("fresh/") for name in first.cells]
     shares = []
@@ -130,7 +134,7 @@ def _unlabelled(first: Feed, second: Feed, limits: Limits) -> list[Check]:
     return [Check(name, "whole run", shares[0], shares[1], most, 0.0, most, limits.unlabelled)]
 
 
-def _episodes(first: Feed, second: Feed, limits: Limits) -> list[Check]:
+def _episodes(first: Feed, second: Feed, limits: ComparabilityLimits) -> list[Check]:
     """Episodes that each cell was drawn from: a count, with nothing left to chance in it."""
     checks = []
     totals = [np.bincount(f.cell, f.drawn, len(f.cells)) / f.drawn.sum() for f in (first, second)]
@@ -157,7 +161,9 @@ def _episodes_a_run(feed: Feed, cell: int) -> float:
     return float(np.unique(pairs, axis=1).shape[1] / (int(feed.run.max()) + 1))
 
 
-def _distance(name: str, part: str, a: F64, b: F64, limit: float, limits: Limits) -> Check:
+def _distance(
+    name: str, part: str, a: F64, b: F64, limit: float, limits: ComparabilityLimits
+) -> Check:
     """Total variation distance of mixes (1 + R, C): the figure, then its resamples."""
     values = np.abs(a - b).sum(1) / 2
     value = float(values[0])
@@ -169,7 +175,7 @@ def _distance(name: str, part: str, a: F64, b: F64, limit: float, limits: Limits
     return Check(name, part, None, None, value, max(low, 0.0), high, limit)
 
 
-def _ratio(name: str, a: F64, b: F64, limits: Limits) -> Check:
+def _ratio(name: str, a: F64, b: F64, limits: ComparabilityLimits) -> Check:
     """The larger share over the smaller; a, b (1 + R,): the figure, then its resamples."""
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = np.log(a) - np.log(b)
@@ -188,7 +194,7 @@ def _ratio(name: str, a: F64, b: F64, limits: Limits) -> Check:
     )
 
 
-def _interval(values: F64, limits: Limits) -> tuple[float, float, float, float]:
+def _interval(values: F64, limits: ComparabilityLimits) -> tuple[float, float, float, float]:
     """The interval that shows "the same", and the wider one that must hold for "different".
 
     All checks must pass for the same, but any one of them makes a difference: its interval is
@@ -205,7 +211,7 @@ def _interval(values: F64, limits: Limits) -> tuple[float, float, float, float]:
     return float(low), float(high), centre - reach, centre + reach
 
 
-def _resampled(feed: Feed, limits: Limits, rng: np.random.Generator) -> F64:
+def _resampled(feed: Feed, limits: ComparabilityLimits, rng: np.random.Generator) -> F64:
     """Draws, then weights, by tenth and cell, (1 + R, 2, 10, C): as they were, then resampled.
 
     An episode is resampled as a whole: in all tenths and cells that it was drawn in.
@@ -240,4 +246,4 @@ def _resampled(feed: Feed, limits: Limits, rng: np.random.Generator) -> F64:
     return sums
 
 
-__all__ = ["Check", "Feed", "Limits", "Verdict", "check_feeds", "worst"]
+__all__ = ["Check", "Feed", "ComparabilityLimits", "Verdict", "check_feeds", "worst"]

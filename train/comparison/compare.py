@@ -14,7 +14,13 @@ from typing import Any
 import numpy as np
 
 from restock.train.comparison.arms import ALLOWED, Arm, Difference, Treatment, differences, feeds
-from restock.train.comparison.comparability import Check, Limits, Verdict, check_feeds, worst
+from restock.train.comparison.comparability import (
+    Check,
+    ComparabilityLimits,
+    Verdict,
+    check_feeds,
+    worst,
+)
 from restock.train.comparison.outcomes import outcomes
 
 _SAME_TOTAL = 1.02  # ratio of environment steps, and of updates
@@ -58,7 +64,7 @@ def compare(
     second: Sequence[Path],
     *,
     treatment: Treatment = "algorithm",
-    limits: Limits = Limits(),  # noqa: B008  (frozen)
+    limits: ComparabilityLimits = ComparabilityLimits(),  # noqa: B008  (frozen)
     seed: int = 0,
 ) -> Comparison:
     """Compare the runs of two arms.

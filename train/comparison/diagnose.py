@@ -40,7 +40,7 @@ _LEAST_ALIKE = 50  # … for its look to be known
 
 
 @dataclass(frozen=True)
-class Limits:
+class DiagnosisLimits:
     """From where on a figure is a symptom."""
 
     gap: float = 3.0  # G_k of a condition; O_k where replay has none of it
@@ -93,7 +93,7 @@ class Window:
         """G_k over the median G: how much worse held out this condition is than the others."""
         return symptom.gap / max(self.gap_median, 1e-12) if symptom.gap is not None else None
 
-    def bad(self, limits: Limits) -> dict[str, list[str]]:
+    def bad(self, limits: DiagnosisLimits) -> dict[str, list[str]]:
         """The conditions whose replay is in doubt, with what is wrong, for people."""
         follows = [s.unexplained for s in self.symptoms if s.unexplained is not None]
         least = min(follows, default=0.0)
@@ -118,7 +118,7 @@ class Window:
                 found[symptom.condition] = said
         return found
 
-    def _supply(self, symptom: Symptom, limits: Limits) -> list[str]:
+    def _supply(self, symptom: Symptom, limits: DiagnosisLimits) -> list[str]:
         if symptom.supply is None:  # a run from before it was kept
             return [] if symptom.replay_share else ["is not in replay"]
         if symptom.supply >= limits.supply:
@@ -126,7 +126,7 @@ class Window:
         share, met = symptom.replay_share, symptom.met_share
         return [f"is {share:.2%} of replay and {met:.1%} of what driving meets"]
 
-    def _rows(self, symptom: Symptom, least: float, limits: Limits) -> list[str]:
+    def _rows(self, symptom: Symptom, least: float, limits: DiagnosisLimits) -> list[str]:
         said = []
         if symptom.agreement is not None and symptom.agreement < limits.agreement:
             said.append(
@@ -144,12 +144,12 @@ class Window:
             )
         return said
 
-    def target(self, limits: Limits) -> bool:
+    def target(self, limits: DiagnosisLimits) -> bool:
         """Whether the target is in doubt."""
         clocks = not limits.no_lag <= self.lag < limits.lag or self.clock >= limits.clock
         return clocks or self.gap_median >= limits.gap_everywhere
 
-    def diverged(self, limits: Limits) -> bool:
+    def diverged(self, limits: DiagnosisLimits) -> bool:
         """Whether values are beyond what rewards can add up to, or say nothing of their targets."""
         if not np.isfinite(self.q_abs_max) or self.q_abs_max > self.q_bound:
             return True
@@ -158,7 +158,7 @@ class Window:
             return False
         return self.explained < limits.explained
 
-    def cause(self, limits: Limits) -> Cause:
+    def cause(self, limits: DiagnosisLimits) -> Cause:
         """The rule."""
         if self.diverged(limits):
             return "DIVERGENCE"
@@ -183,7 +183,7 @@ class Diagnosis:
     experiment: str  # what would confirm it
 
 
-def diagnose(runs: Sequence[Run], limits: Limits = Limits()) -> Diagnosis:
+def diagnose(runs: Sequence[Run], limits: DiagnosisLimits = DiagnosisLimits()) -> Diagnosis:
     """Diagnose runs of one method, which differ in their seed.
 
     Raises:
@@ -206,7 +206,7 @@ def diagnose(runs: Sequence[Run], limits: Limits = Limits()) -> Diagnosis:
     )
 
 
-def _of_run(windows: Sequence[Window], figures: Window, limits: Limits) -> Cause:
+def _of_run(windows: Sequence[Window], figures: Window, limits: DiagnosisLimits) -> Cause:
     """What the last windows come to; those that do not agree on the target are not forced."""
     if windows[-1].diverged(limits) and figures.diverged(limits):
         return "DIVERGENCE"
@@ -310,7 +310,7 @@ def _told(explained: float | None) -> str:
     return "" if explained is None else f" {explained:.0%} of the targets' variance explained,"
 
 
-def _evidence(window: Window, limits: Limits) -> list[str]:
+def _evidence(window: Window, limits: DiagnosisLimits) -> list[str]:
     """What a window shows, for people."""
     said = [
         f"after {window.gradient_steps:,} updates: median G {window.gap_median:.2f},"
@@ -322,7 +322,7 @@ def _evidence(window: Window, limits: Limits) -> list[str]:
     return said
 
 
-def _experiment(cause: Cause, windows: Sequence[Window], limits: Limits) -> str:
+def _experiment(cause: Cause, windows: Sequence[Window], limits: DiagnosisLimits) -> str:
     named = dict.fromkeys(name for window in windows for name in window.bad(limits))
     which = ", ".join(named) or "the condition with the largest gap"
     return {
@@ -339,4 +339,4 @@ def _experiment(cause: Cause, windows: Sequence[Window], limits: Limits) -> str:
     }[cause]
 
 
-__all__ = ["Diagnosis", "Limits", "Symptom", "Window", "diagnose", "windows_of"]
+__all__ = ["Diagnosis", "DiagnosisLimits", "Symptom", "Window", "diagnose", "windows_of"]

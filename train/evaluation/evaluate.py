@@ -20,6 +20,9 @@ from restock.train.feed.fresh_perturbations import values_entries
 from restock.train.twin.env.interface import Policy, Twin
 from restock.train.twin.physics.episode import EpisodeSpec
 
+Step = tuple[Any, Any, Any, Any, dict[str, Any]]  # as Gymnasium's `step` returns it
+Stepper = Callable[[NDArray[np.float32], NDArray[np.int64]], Step]
+
 STUCK_WINDOW_S, STUCK_RADIUS_M = 10.0, 0.5
 
 
@@ -89,9 +92,13 @@ def run_episodes(
     *,
     control_period_s: float,
     time_limit_steps: int,
+    step: Stepper | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[EpisodeResult]:
-    """Drive every episode to its end, N at a time; results in the order of `specs`."""
+    """Drive every episode to its end, N at a time; results in the order of `specs`.
+
+    `step` makes a step in place of `env.step`, given the observations (N, D) as well.
+    """
     results: list[EpisodeResult | None] = [None] * len(specs)
     env.set_episodes(specs)
     observation, _ = env.reset()
@@ -105,7 +112,8 @@ def run_episodes(
     left = len(specs)
     while left:
         action, _ = policy.act(env, observation)
-        observation, reward, terminated, truncated, info = env.step(action)
+        made = env.step(action) if step is None else step(observation, action)
+        observation, reward, terminated, truncated, info = made
         after = info["signals"]
         steps += 1
         total += reward
@@ -177,14 +185,8 @@ class Score:
         """Higher mean success over conditions; on a tie, higher return."""
         if other is None:
             return True
-        mine, theirs = (
-            (self.success_mean, self.return_mean),
-            (
-                other.success_mean,
-                other.return_mean,
-            ),
-        )
-        return mine > theirs
+        best = (other.success_mean, other.return_mean)
+        return (self.success_mean, self.return_mean) > best
 
 
 def score(results: Sequence[EpisodeResult]) -> Score:

@@ -119,8 +119,11 @@ class Collector:
         action: NDArray[np.int64],
         probability: NDArray[np.float32],
         policy: NDArray[np.int16] | int = 0,
-    ) -> None:
-        """Send one action per environment, (N,); `policy` is the ring's code of who chose it."""
+    ) -> Any:
+        """Send one action per environment, (N,); `policy` is the ring's code of who chose it.
+
+        Returns what the step returned, which `finish` takes in; None where a thread makes it.
+        """
         envs = np.arange(self.env.num_envs)
         now = self.env.signals
         for name, history in self._history.items():
@@ -133,6 +136,7 @@ class Collector:
             self._future = self._executor.submit(self.env.step, action)
         else:
             self._result = self.env.step(action)
+        return self._result
 
     def finish(self, *, env_steps: int, gradient_steps: int, acting_step: int) -> list[Ended]:
         """Take the step's result into the ring.

@@ -7,10 +7,16 @@ import dataclasses
 import numpy as np
 import pytest
 
-from restock.train.comparison.comparability import Check, Feed, Limits, check_feeds, worst
+from restock.train.comparison.comparability import (
+    Check,
+    ComparabilityLimits,
+    Feed,
+    check_feeds,
+    worst,
+)
 
 CELLS = ["logs/nominal", "logs/wheel_slip", "logs/rare", "fresh/nominal", "fresh/wheel_slip"]
-LIMITS = Limits(resamples=300)
+LIMITS = ComparabilityLimits(resamples=300)
 
 
 def feed(
