@@ -76,8 +76,8 @@ MAY_IMPORT = {
         " train/evaluation train/run train/study train/twin/calibration"
     ),
     "cli/twin": (
-        "cli report replay/store train/twin/calibration train/twin/env train/twin/floors"
-        " train/twin/physics train/twin/recording"
+        "cli report ingest/profile replay/store train/evaluation train/twin/calibration"
+        " train/twin/env train/twin/floors train/twin/physics train/twin/recording"
     ),
 }
 

@@ -32,8 +32,13 @@ from restock.train.twin.floors.floors import (
     split_of,
 )
 from restock.train.twin.floors.layout import OneWay, Warehouse, default_warehouse
-from restock.train.twin.floors.occupancy_map import cells_of, read_map, write_map
-from restock.train.twin.floors.pgm import read_pgm, write_pgm
+from restock.train.twin.floors.occupancy_map import (
+    cells_of,
+    read_map,
+    read_pgm,
+    write_map,
+    write_pgm,
+)
 from restock.train.twin.floors.planner import BlockFinder, Planner
 from restock.train.twin.physics.episode import KINDS, EpisodeSpec, draw_episode
 
@@ -152,13 +157,13 @@ def test_ascii_and_16_bit_greymaps_with_comments_are_read(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("data", "said"),
     [
-        (b"\x89PNG", "is no PGM"),
+        (b"\x89PNG", "is not a PGM"),
         (b"P5\n4 4\n255\nab", "cut short: 2 of 16"),
         (b"P5\n99999 99999\n255\n", "99999 x 99999"),
         (b"P5\n0 4\n255\n", "0 x 4"),
         (b"P5\nfour 4\n255\n", "no width"),
         (b"P5", "no width"),
-        (b"P2\n2 1\n255\n1 x", "no number"),
+        (b"P2\n2 1\n255\n1 x", "not a number"),
         (b"P2\n2 1\n9\n1 10", "outside 0 to 9"),
         (b"P5\n4 4\n255\n" + bytes(16), "no free place"),
     ],

@@ -11,18 +11,20 @@ from numpy.typing import NDArray
 
 from restock.ingest.profile.profile import load_profile
 from restock.train.twin.floors.layout import default_warehouse
-from restock.train.twin.physics.controller import ACCEL_LIMIT
 from restock.train.twin.physics.episode import Episode, EpisodeSpec, no_pallets
-from restock.train.twin.physics.friction import NO_PATCH, PATCHES, friction_at
 from restock.train.twin.physics.model import (
     CASTER_RADIUS_M,
     MOTOR_KV,
     MOTOR_LIMIT_NM,
+    NO_PATCH,
+    PATCHES,
     TRACK_M,
     WHEEL_RADIUS_M,
     build_model,
+    friction_at,
 )
 from restock.train.twin.physics.perturbation import Perturbation
+from restock.train.twin.physics.robot import ACCEL_LIMIT
 from restock.train.twin.physics.simulation import BLOCK_S, Simulation
 
 TASK = load_profile("warehouse_amr").task

@@ -10,9 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from restock.train.twin.recording.bag_writer import Message
-from restock.train.twin.recording.drive import Drive, Lidar, Motion
+from restock.train.twin.recording.drive import Drive, Lidar, Motion, Odometer
 from restock.train.twin.recording.messages import typestore
-from restock.train.twin.recording.odometer import Odometer
 from restock.train.twin.recording.publish import LIDAR_LSB_M, Rates, Robot
 from restock.train.twin.recording.robot_topics import TOPICS
 

@@ -1,31 +1,59 @@
-"""A top-down drawing of the warehouse as pixels; needs no GL."""
+"""Drawings from above, as pixels and PNG: a floor, and an environment on it; they need no GL."""
 
 from __future__ import annotations
 
+import struct
+import zlib
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.train.twin.floors.layout import Warehouse
-from restock.train.twin.physics.friction import PATCHES
-from restock.train.twin.physics.model import FORKLIFT_HALF_M, PALLET_HALF_M, PEOPLE, PERSON_RADIUS_M
+from restock.errors import ConfigError
+from restock.train.twin.floors.layout import HEADINGS, Rect, Warehouse
+from restock.train.twin.physics.model import (
+    FORKLIFT_HALF_M,
+    PALLET_HALF_M,
+    PATCHES,
+    PEOPLE,
+    PERSON_RADIUS_M,
+)
 
 if TYPE_CHECKING:
     from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
-PIXELS_PER_M = 40
+Color = tuple[int, int, int]
+
 FLOOR, RACK, PALLET, PERSON = (238, 238, 236), (92, 108, 132), (176, 130, 80), (45, 110, 200)
 FORKLIFT, ICE, ROUTE, ROBOT, GOAL = (
     *((225, 180, 20), (150, 205, 235), (120, 180, 120)),
     *((240, 130, 30), (30, 150, 60)),
 )
+AISLE, DOCK, ONE_WAY, WALL = (222, 232, 220), (250, 214, 150), (205, 70, 60), (70, 74, 80)
+FLOOR_PIXELS_PER_M, MAP_PIXELS_PER_M = 24, 40
+
+
+def draw_floor(floor: Warehouse) -> NDArray[np.uint8]:
+    """Racks, aisles, docks, goals and one-way rules, (H, W, 3) uint8, north up, a wall around."""
+    canvas = _Canvas(floor, FLOOR_PIXELS_PER_M)
+    for color, areas in (
+        (AISLE, [segment.area for segment in floor.segments]),
+        (DOCK, [dock.area for dock in floor.docks]),
+        (RACK, floor.racks),
+        (GOAL, [Rect(x - 0.06, y - 0.06, x + 0.06, y + 0.06) for x, y in floor.goals.tolist()]),
+    ):
+        for area in areas:
+            canvas.fill(area, color)
+    for rule in floor.one_way:
+        canvas.arrow(*rule.area.center, HEADINGS[rule.heading], ONE_WAY)
+    return canvas.pixels(wall=4)
 
 
 def draw_map(env: WarehouseVectorEnv, index: int) -> NDArray[np.uint8]:
     """One environment now, (H, W, 3) uint8, north up."""
     floor = env.floor_of(index)
-    canvas = _Canvas(floor)
+    canvas = _Canvas(floor, MAP_PIXELS_PER_M)
     sim = env.simulation
     for row in range(PATCHES):
         x, y, half_x, half_y, _ = sim.patches[index, row]
@@ -53,25 +81,41 @@ def draw_map(env: WarehouseVectorEnv, index: int) -> NDArray[np.uint8]:
 
 
 class _Canvas:
-    def __init__(self, warehouse: Warehouse) -> None:
-        height = round(warehouse.depth_m * PIXELS_PER_M)
-        width = round(warehouse.width_m * PIXELS_PER_M)
+    """A floor's pixels, rows from the south."""
+
+    def __init__(self, floor: Warehouse, pixels_per_m: int) -> None:
+        height, width = round(floor.depth_m * pixels_per_m), round(floor.width_m * pixels_per_m)
         self._image = np.empty((height, width, 3), np.uint8)
         self._image[:] = FLOOR
-        self._x = (np.arange(width) + 0.5) / PIXELS_PER_M
-        self._y = (np.arange(height) + 0.5) / PIXELS_PER_M
+        self._scale = pixels_per_m
+        self._x = (np.arange(width) + 0.5) / pixels_per_m
+        self._y = (np.arange(height) + 0.5) / pixels_per_m
+
+    def fill(self, area: Rect, color: Color) -> None:
+        """An axis-aligned box, its edges rounded to whole pixels."""
+        edges = (area.x_min, area.y_min, area.x_max, area.y_max)
+        x0, y0, x1, y1 = (round(edge * self._scale) for edge in edges)
+        self._image[y0:y1, x0:x1] = color
 
     def box(
-        self, x: float, y: float, half_x: float, half_y: float, yaw: float, color: tuple[int, ...]
+        self, x: float, y: float, half_x: float, half_y: float, yaw: float, color: Color
     ) -> None:
         window, dx, dy = self._window(x, y, float(np.hypot(half_x, half_y)))
         cos, sin = np.cos(yaw), np.sin(yaw)
         inside = (np.abs(cos * dx + sin * dy) <= half_x) & (np.abs(cos * dy - sin * dx) <= half_y)
         self._image[window][inside] = color
 
-    def disc(self, x: float, y: float, radius: float, color: tuple[int, ...]) -> None:
+    def disc(self, x: float, y: float, radius: float, color: Color) -> None:
         window, dx, dy = self._window(x, y, radius)
         self._image[window][dx * dx + dy * dy <= radius * radius] = color
+
+    def arrow(self, x: float, y: float, heading: tuple[int, int], color: Color) -> None:
+        """A triangle around a place that points the way."""
+        window, dx, dy = self._window(x, y, 0.4)
+        ahead = heading[0] * dx + heading[1] * dy
+        aside = np.abs(heading[1] * dx - heading[0] * dy)
+        inside = (ahead > -0.35) & (ahead < 0.35) & (aside < (0.35 - ahead) / 2)
+        self._image[window][inside] = color
 
     def _window(
         self, x: float, y: float, reach: float
@@ -80,11 +124,34 @@ class _Canvas:
         rows = slice(*np.searchsorted(self._y, [y - reach, y + reach]))
         return (rows, columns), self._x[None, columns] - x, self._y[rows, None] - y
 
-    def pixels(self) -> NDArray[np.uint8]:
-        return np.ascontiguousarray(self._image[::-1])
+    def pixels(self, wall: int = 0) -> NDArray[np.uint8]:
+        """(H, W, 3), the first row in the north, with so many pixels of wall around."""
+        height, width, _ = self._image.shape
+        framed = np.empty((height + 2 * wall, width + 2 * wall, 3), np.uint8)
+        framed[:] = WALL
+        framed[wall : wall + height, wall : wall + width] = self._image[::-1]
+        return framed
 
 
 def _dense(plan_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """A polyline with three points more in every segment."""
     share = np.arange(4)[None, :, None] / 4
     return (plan_m[:-1, None] * (1 - share) + plan_m[1:, None] * share).reshape(-1, 2)
+
+
+def write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write pixels (H, W, 3). Raises ConfigError where they cannot be written."""
+    height, width = image.shape[:2]
+    rows = np.concatenate([np.zeros((height, 1), np.uint8), image.reshape(height, -1)], axis=1)
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        crc = zlib.crc32(kind + data)
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", crc)
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    data = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header)
+    data += chunk(b"IDAT", zlib.compress(rows.tobytes(), 9)) + chunk(b"IEND", b"")
+    try:
+        path.write_bytes(data)
+    except OSError as error:
+        raise ConfigError(f"cannot be written: {error.strerror}", where=str(path)) from error

@@ -21,12 +21,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from restock.errors import ConfigError
-from restock.toml import toml_value
-from restock.train.twin.floors.corridors import find_crossings, find_goals, find_segments
+from restock.toml import Checked, read_toml, toml_value, typed
+from restock.train.twin.floors.cells import cells_of, find_crossings, find_goals, find_segments
 from restock.train.twin.floors.layout import (
     AisleSegment,
     Axis,
@@ -37,30 +38,29 @@ from restock.train.twin.floors.layout import (
     Warehouse,
     bays,
 )
-from restock.train.twin.floors.occupancy_map import cells_of
 
 Box = tuple[float, float, float, float]
 CELL_M = 0.05  # in which aisles are looked for
 
 
-class _Dock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _NamedBox(Checked, frozen=True):
     name: str
     box_m: Box
 
 
-class _OneWay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _OneWayRule(Checked, frozen=True):
     box_m: Box
     heading: Heading
 
 
-class _Aisle(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    name: str
-    box_m: Box
+class _Aisle(_NamedBox, frozen=True):
     along: Axis
     aisle: int = 0
 
 
-class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class FloorFile(Checked, frozen=True):
+    """The keys of a floor's TOML file; boxes are x0, y0, x1, y1 in metres."""
+
     width_m: float
     depth_m: float
     racks: list[Box]
@@ -69,103 +69,83 @@ class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     crossings: list[Box] | None = None
     map_origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     aisles: list[_Aisle] | None = msgspec.field(default=None, name="aisle")
-    zones: list[_Dock] = msgspec.field(default_factory=list, name="zone")
-    docks: list[_Dock] = msgspec.field(default_factory=list, name="dock")
-    one_way: list[_OneWay] = msgspec.field(default_factory=list)
+    zones: list[_NamedBox] = msgspec.field(default_factory=list, name="zone")
+    docks: list[_NamedBox] = msgspec.field(default_factory=list, name="dock")
+    one_way: list[_OneWayRule] = msgspec.field(default_factory=list)
 
 
 def read_floor(path: Path) -> Warehouse:
     """The floor that a TOML file describes.
 
     Raises:
-        ConfigError: no such file, an unknown or missing key, or numbers that are no floor.
+        ConfigError: no such file, an unknown or missing key, or numbers that do not make a floor.
     """
-    try:
-        said = msgspec.toml.decode(path.read_bytes(), type=_File)
-    except OSError as error:
-        raise ConfigError(
-            f"cannot be read: {error.strerror}", where=str(path), remedy="check the path"
-        ) from error
-    except (msgspec.ValidationError, msgspec.DecodeError) as error:
-        raise ConfigError(
-            str(error).replace("Object ", "").replace("$.", ""),
-            where=str(path),
-            remedy="docs/layouts.md lists the keys of a floor",
-        ) from error
+    remedy = "docs/layouts.md lists the keys of a floor"
+    content = typed(read_toml(path), FloorFile, where=str(path), remedy=remedy)
     bare = Warehouse(
-        width_m=said.width_m,
-        depth_m=said.depth_m,
-        racks=tuple(Rect(*box) for box in said.racks),
+        width_m=content.width_m,
+        depth_m=content.depth_m,
+        racks=tuple(Rect(*box) for box in content.racks),
         segments=(),
-        goals_m=tuple(said.goals or ()) or ((said.width_m / 2, said.depth_m / 2),),
-        cross_zones=tuple((zone.name, Rect(*zone.box_m)) for zone in said.zones),
-        docks=tuple(Dock(dock.name, Rect(*dock.box_m)) for dock in said.docks),
-        one_way=tuple(OneWay(Rect(*rule.box_m), rule.heading) for rule in said.one_way),
-        name=said.name or path.name,
-        map_origin=said.map_origin,
+        goals_m=tuple(content.goals or ()) or ((content.width_m / 2, content.depth_m / 2),),
+        cross_zones=tuple((zone.name, Rect(*zone.box_m)) for zone in content.zones),
+        docks=tuple(Dock(dock.name, Rect(*dock.box_m)) for dock in content.docks),
+        one_way=tuple(OneWay(Rect(*rule.box_m), rule.heading) for rule in content.one_way),
+        name=content.name or path.name,
+        map_origin=content.map_origin,
     )
     free = cells_of(bare, CELL_M)
     segments = (
         find_segments(free, CELL_M)
-        if said.aisles is None
-        else tuple(AisleSegment(a.name, a.aisle, Rect(*a.box_m), a.along) for a in said.aisles)
+        if content.aisles is None
+        else tuple(AisleSegment(a.name, a.aisle, Rect(*a.box_m), a.along) for a in content.aisles)
     )
     crossings = (
         find_crossings(segments, free, CELL_M)
-        if said.crossings is None
-        else tuple(Rect(*box) for box in said.crossings)
+        if content.crossings is None
+        else tuple(Rect(*box) for box in content.crossings)
     )
     goals = (
         bays(segments) + find_goals(free, CELL_M)
-        if said.goals is None
-        else tuple((x, y) for x, y in said.goals)
+        if content.goals is None
+        else tuple((x, y) for x, y in content.goals)
     )
     return replace(bare, segments=segments, crossings=crossings, goals_m=goals)
 
 
 def floor_toml(floor: Warehouse) -> str:
     """A floor as TOML that reads back equal."""
-
-    def box(area: Rect) -> str:
-        return toml_value([float(e) for e in (area.x_min, area.y_min, area.x_max, area.y_max)])
-
-    lines = [
-        f"name = {toml_value(floor.name)}",
-        f"width_m = {float(floor.width_m)!r}",
-        f"depth_m = {float(floor.depth_m)!r}",
-        f"map_origin = {toml_value([float(value) for value in floor.map_origin])}",
-        "racks = [",
-        *(f"  {box(rack)}," for rack in floor.racks),
-        "]",
-        "crossings = [",
-        *(f"  {box(crossing)}," for crossing in floor.crossings),
-        "]",
-        "goals = [",
-        *(f"  {toml_value([float(x), float(y)])}," for x, y in floor.goals_m),
-        "]",
-    ]
+    values = {
+        "name": floor.name,
+        "width_m": float(floor.width_m),
+        "depth_m": float(floor.depth_m),
+        "map_origin": [float(value) for value in floor.map_origin],
+    }
+    lines = [f"{key} = {toml_value(value)}" for key, value in values.items()]
+    for key, rows in (
+        ("racks", map(_box, floor.racks)),
+        ("crossings", map(_box, floor.crossings)),
+        ("goals", ([float(x), float(y)] for x, y in floor.goals_m)),
+    ):
+        lines += [f"{key} = [", *(f"  {toml_value(row)}," for row in rows), "]"]
     if not floor.segments:
         lines.append("aisle = []")
-    for segment in floor.segments:
-        lines += [
-            "",
-            "[[aisle]]",
-            f"name = {toml_value(segment.name)}",
-            f"box_m = {box(segment.area)}",
-        ]
-        lines += [f"along = {toml_value(segment.along)}", f"aisle = {segment.aisle}"]
-    for name, area in floor.cross_zones:
-        lines += ["", "[[zone]]", f"name = {toml_value(name)}", f"box_m = {box(area)}"]
-    for dock in floor.docks:
-        lines += ["", "[[dock]]", f"name = {toml_value(dock.name)}", f"box_m = {box(dock.area)}"]
-    for rule in floor.one_way:
-        lines += [
-            "",
-            "[[one_way]]",
-            f"box_m = {box(rule.area)}",
-            f"heading = {toml_value(rule.heading)}",
-        ]
+    tables: list[tuple[str, dict[str, Any]]] = [
+        *(
+            ("aisle", {"name": s.name, "box_m": _box(s.area), "along": s.along, "aisle": s.aisle})
+            for s in floor.segments
+        ),
+        *(("zone", {"name": name, "box_m": _box(area)}) for name, area in floor.cross_zones),
+        *(("dock", {"name": dock.name, "box_m": _box(dock.area)}) for dock in floor.docks),
+        *(("one_way", {"box_m": _box(r.area), "heading": r.heading}) for r in floor.one_way),
+    ]
+    for name, entries in tables:
+        lines += ["", f"[[{name}]]", *(f"{k} = {toml_value(v)}" for k, v in entries.items())]
     return "\n".join(lines) + "\n"
+
+
+def _box(area: Rect) -> list[float]:
+    return [float(edge) for edge in (area.x_min, area.y_min, area.x_max, area.y_max)]
 
 
 def write_floor(floor: Warehouse, path: Path) -> None:

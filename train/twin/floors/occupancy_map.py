@@ -14,43 +14,50 @@ axes, and `Warehouse.map_origin` the way back.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
-import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 from scipy import ndimage
 
 from restock.errors import ConfigError
-from restock.train.twin.floors.corridors import find_crossings, find_goals, find_segments
+from restock.toml import Checked, typed
+from restock.train.twin.floors.cells import (
+    Cells,
+    cells_of,
+    cover,
+    find_crossings,
+    find_goals,
+    find_segments,
+)
 from restock.train.twin.floors.layout import MAX_RACKS, MAX_SIDE_M, Rect, Warehouse, bays
-from restock.train.twin.floors.pgm import read_pgm, write_pgm
-from restock.train.twin.floors.rectangles import cover
 
 Mode = Literal["trinary", "scale", "raw"]
-Cells = NDArray[np.bool_]
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 ROOM_M = 0.3  # as the planner: a robot's middle comes no nearer to an obstacle
 COARSEST_M = 0.2
+MAX_PIXELS = 64_000_000
+_SPACE = re.compile(rb"(?:\s|#[^\r\n]*[\r\n])*")
+_TOKEN = re.compile(rb"[^\s#]+")
 
 
-class MapFile(msgspec.Struct, frozen=True):
+class MapDescription(Checked, frozen=True, forbid_unknown_fields=False):
     """What a `map.yaml` says. Keys that are not here are of other tools, and left alone."""
 
     image: str
-    resolution: float
+    resolution: Annotated[float, Meta(ge=0.001, le=1)]  # metres a cell
     origin: tuple[float, float, float]
     occupied_thresh: float = 0.65
     free_thresh: float = 0.25
     negate: bool | int = 0
     mode: Mode = "trinary"
 
-    def __post_init__(self) -> None:
-        if not 0.001 <= self.resolution <= 1.0:
-            raise ValueError(f"resolution must be .001 to 1 m a cell, got {self.resolution}")
+    def check(self) -> None:
         if not 0 <= self.free_thresh < self.occupied_thresh <= 1:
             raise ValueError(
                 "free_thresh and occupied_thresh must rise within 0 to 1, got"
@@ -65,21 +72,21 @@ def read_map(path: Path) -> Warehouse:
 
     Raises:
         ConfigError: files that cannot be read, a key that is missing or out of range, an image that
-            is no PGM, or a map without room for the robot.
+            is not a PGM, or a map without room for the robot.
     """
-    described = _described(path)
-    image = path.parent / described.image
-    occupancy = occupancy_of(read_pgm(image), described)
+    description = _read_yaml(path)
+    image = path.parent / description.image
+    occupancy = occupancy_of(read_pgm(image), description)
     return floor_of_cells(
         occupancy == FREE,
-        described.resolution,
-        origin=described.origin,
+        description.resolution,
+        origin=description.origin,
         name=path.name,
         where=str(image),
     )
 
 
-def _described(path: Path) -> MapFile:
+def _read_yaml(path: Path) -> MapDescription:
     try:
         document: Any = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -88,35 +95,33 @@ def _described(path: Path) -> MapFile:
         ) from error
     except (YAMLError, UnicodeDecodeError) as error:
         reason = str(error).splitlines()[0]
-        raise ConfigError(f"is no YAML: {reason}", where=str(path)) from error
-    try:
-        return msgspec.convert(document, MapFile)
-    except msgspec.ValidationError as error:
-        raise ConfigError(
-            str(error).replace("Object ", "").replace("$.", ""),
-            where=str(path),
-            remedy="a map.yaml has image, resolution, origin: [x, y, yaw], and may have mode"
-            f" ({', '.join(get_args(Mode))}), negate, occupied_thresh and free_thresh",
-        ) from error
+        raise ConfigError(f"is not YAML: {reason}", where=str(path)) from error
+    return typed(
+        document,
+        MapDescription,
+        where=str(path),
+        remedy="a map.yaml has image, resolution, origin: [x, y, yaw], and may have mode"
+        f" ({', '.join(get_args(Mode))}), negate, occupied_thresh and free_thresh",
+    )
 
 
-def occupancy_of(pixels: NDArray[np.float64], described: MapFile) -> NDArray[np.int8]:
+def occupancy_of(pixels: NDArray[np.float64], description: MapDescription) -> NDArray[np.int8]:
     """Occupancy (X, Y) in percent, -1 unknown, of pixels (H, W) in [0, 1], north first."""
-    if described.mode == "raw":
+    if description.mode == "raw":
         percent = np.round(pixels * 255)
-        found = np.where(percent <= 100, percent, UNKNOWN)
-        low, high = described.free_thresh * 100, described.occupied_thresh * 100
-        found = np.where((found >= 0) & (found <= low), FREE, found)
-        found = np.where(found >= high, OCCUPIED, found)
+        occupancy = np.where(percent <= 100, percent, UNKNOWN)
+        low, high = description.free_thresh * 100, description.occupied_thresh * 100
+        occupancy = np.where((occupancy >= 0) & (occupancy <= low), FREE, occupancy)
+        occupancy = np.where(occupancy >= high, OCCUPIED, occupancy)
     else:
-        dark = pixels if described.negate else 1 - pixels
+        dark = pixels if description.negate else 1 - pixels
         between: Any = UNKNOWN
-        if described.mode == "scale":
-            span = described.occupied_thresh - described.free_thresh
-            between = np.clip(np.round((dark - described.free_thresh) / span * 98 + 1), 1, 99)
-        found = np.where(dark > described.occupied_thresh, OCCUPIED, between)
-        found = np.where(dark < described.free_thresh, FREE, found)
-    return np.ascontiguousarray(found[::-1].T.astype(np.int8))
+        if description.mode == "scale":
+            span = description.occupied_thresh - description.free_thresh
+            between = np.clip(np.round((dark - description.free_thresh) / span * 98 + 1), 1, 99)
+        occupancy = np.where(dark > description.occupied_thresh, OCCUPIED, between)
+        occupancy = np.where(dark < description.free_thresh, FREE, occupancy)
+    return np.ascontiguousarray(occupancy[::-1].T.astype(np.int8))
 
 
 def floor_of_cells(
@@ -217,18 +222,6 @@ def _holds(cells: Cells, cell_m: float, place: tuple[float, float]) -> bool:
     return bool(cells[i, j])
 
 
-def cells_of(floor: Warehouse, cell_m: float) -> Cells:
-    """The free cells (X, Y) of a floor: those whose middle no rack holds."""
-    x = (np.arange(round(floor.width_m / cell_m)) + 0.5) * cell_m
-    y = (np.arange(round(floor.depth_m / cell_m)) + 0.5) * cell_m
-    free = np.ones((len(x), len(y)), np.bool_)
-    for rack in floor.racks:
-        inside_x = (rack.x_min <= x) & (x <= rack.x_max)
-        inside_y = (rack.y_min <= y) & (y <= rack.y_max)
-        free &= ~(inside_x[:, None] & inside_y[None, :])
-    return free
-
-
 def write_map(floor: Warehouse, path: Path, cell_m: float = 0.05) -> None:
     """Write a floor as `map.yaml` with a PGM beside it, walls as cells around it.
 
@@ -250,3 +243,67 @@ def write_map(floor: Warehouse, path: Path, cell_m: float = 0.05) -> None:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"cannot be written: {error.strerror}", where=str(path)) from error
+
+
+def read_pgm(path: Path) -> NDArray[np.float64]:
+    """Pixels (H, W) in [0, 1], the first row on top.
+
+    Raises:
+        ConfigError: no such file, no PGM, or one that is cut short or absurdly large.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(
+            f"cannot be read: {error.strerror}",
+            where=str(path),
+            remedy="image in map.yaml is a path beside it",
+        ) from error
+    if data[:2] not in (b"P2", b"P5"):
+        raise ConfigError(
+            f"is not a PGM: it begins with {data[:2]!r}",
+            where=str(path),
+            remedy="convert it, such as with `convert map.png map.pgm`",
+        )
+    place, header = 2, []
+    for name in ("width", "height", "largest value"):
+        number, place = _number(data, place, name, path)
+        header.append(number)
+    width, height, largest = header
+    if not (width > 0 and height > 0 and width * height <= MAX_PIXELS and 0 < largest < 65536):
+        raise ConfigError(
+            f"its header says {width} x {height} pixels of 0 to {largest}",
+            where=str(path),
+            remedy=f"at most {MAX_PIXELS:,} pixels of 0 to 65535",
+        )
+    count = width * height
+    if data[:2] == b"P5":
+        kind = np.dtype(np.uint8 if largest < 256 else ">u2")
+        body = data[place + 1 : place + 1 + count * kind.itemsize]
+        values = np.frombuffer(body[: len(body) // kind.itemsize * kind.itemsize], kind)
+    else:
+        text = re.sub(rb"#[^\r\n]*", b"", data[place:])
+        try:
+            values = np.array(text.split()[:count], np.int64)
+        except ValueError as error:
+            raise ConfigError("has a pixel that is not a number", where=str(path)) from error
+    if len(values) < count:
+        raise ConfigError(f"is cut short: {len(values):,} of {count:,} pixels", where=str(path))
+    if values.max() > largest or values.min() < 0:
+        raise ConfigError(f"has a pixel outside 0 to {largest}", where=str(path))
+    shares: NDArray[np.float64] = values.astype(np.float64) / largest
+    return shares.reshape(height, width)
+
+
+def _number(data: bytes, place: int, name: str, path: Path) -> tuple[int, int]:
+    skipped = _SPACE.match(data, place)
+    token = _TOKEN.match(data, skipped.end() if skipped else place)
+    if token is None or not token[0].isdigit() or len(token[0]) > 9:
+        raise ConfigError(f"its header has no {name}", where=str(path))
+    return int(token[0]), token.end()
+
+
+def write_pgm(path: Path, pixels: NDArray[np.uint8]) -> None:
+    """Write pixels (H, W) as P5."""
+    height, width = pixels.shape
+    path.write_bytes(b"P5\n%d %d\n255\n" % (width, height) + pixels.tobytes())

@@ -21,6 +21,9 @@ from restock.train.twin.floors.layout import Warehouse
 F64 = NDArray[np.float64]
 
 FLOOR_FRICTION = 0.8
+PATCHES = 4  # at most, an episode: parts of the floor with a friction of their own
+SLIPPERY_BELOW = 0.3  # friction under which a wheel counts as on a patch
+NO_PATCH = (1e6, 1e6, 0.0, 0.0, 1.0)  # x, y, half x, half y, friction
 WHEEL_RADIUS_M = 0.10
 TRACK_M = 0.44  # between the wheels' contact points
 CASTER_RADIUS_M = 0.04
@@ -255,6 +258,19 @@ def _handles(model: mujoco.MjModel) -> Handles:
         accelerometer=slice(accelerometer, accelerometer + 3),
         bumper=int(model.sensor("bumper").adr[0]),
     )
+
+
+def friction_at(points_m: F64, patches: F64, base: F64) -> F64:
+    """Friction (N, K) under points (N, K, 2), from patches (N, P, 5) and base (N,).
+
+    A patch row is x, y, half x, half y (metres) and its friction coefficient. Where patches overlap
+    the slipperiest counts.
+    """
+    gap = np.abs(points_m[:, :, None, :] - patches[:, None, :, 0:2])  # (N, K, P, 2)
+    inside = (gap <= patches[:, None, :, 2:4]).all(axis=-1)
+    slippery = np.where(inside, patches[:, None, :, 4], np.inf).min(axis=-1)
+    friction: F64 = np.minimum(slippery, base[:, None])
+    return friction
 
 
 def pallet_half_m(yaw_rad: F64) -> F64:

@@ -19,19 +19,21 @@ from numpy.typing import NDArray
 from restock.errors import ConfigError
 from restock.ingest.task.task import Task
 from restock.train.twin.floors.layout import Warehouse
-from restock.train.twin.physics.controller import BaseController
 from restock.train.twin.physics.episode import Episode
-from restock.train.twin.physics.friction import NO_PATCH, PATCHES, SLIPPERY_BELOW, friction_at
 from restock.train.twin.physics.model import (
     FLOOR_FRICTION,
     LIDAR_Z_M,
+    NO_PATCH,
     OBSTACLE_GROUP,
+    PATCHES,
+    SLIPPERY_BELOW,
     TRACK_M,
     build_model,
+    friction_at,
     yaw_of,
 )
 from restock.train.twin.physics.perturbation import Perturbation
-from restock.train.twin.physics.robot_body import RobotBody
+from restock.train.twin.physics.robot import BaseController, RobotBody
 from restock.train.twin.physics.scenery import Scenery, quaternion
 
 F64 = NDArray[np.float64]

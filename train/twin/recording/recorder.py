@@ -25,11 +25,10 @@ from restock.train.twin.physics.model import TRACK_M, WHEEL_RADIUS_M
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 from restock.train.twin.physics.simulation import LIDAR_BEAMS
 from restock.train.twin.recording.bag_writer import Format, recording_sink
-from restock.train.twin.recording.drive import Lidar
+from restock.train.twin.recording.drive import Lidar, Odometer
 from restock.train.twin.recording.drivers import BehaviourPolicies, ExternalPolicy
 from restock.train.twin.recording.fleet import Fleet
 from restock.train.twin.recording.missions import HANDOVER, NATURAL, SCRIPTED, schedule
-from restock.train.twin.recording.odometer import Odometer
 from restock.train.twin.recording.publish import Rates, Robot
 from restock.train.twin.recording.robot_topics import TOPICS
 

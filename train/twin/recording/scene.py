@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.train.twin.physics.friction import NO_PATCH
 from restock.train.twin.physics.model import (
     FORKLIFT_HALF_M,
+    NO_PATCH,
     PALLET_HALF_M,
     PARKED_M,
     PEOPLE,

@@ -33,9 +33,9 @@ class LayoutCommand:
     def run(self) -> int:
         """Print, and write what was asked for."""
         from restock.cli import output
+        from restock.train.twin.env.draw import draw_floor, write_png
         from restock.train.twin.env.floor_report import describe_floor
         from restock.train.twin.floors.floor_file import write_floor
-        from restock.train.twin.floors.floor_picture import draw_floor, write_png
         from restock.train.twin.floors.floors import open_floor
         from restock.train.twin.floors.occupancy_map import write_map
 

@@ -1,7 +1,9 @@
-"""Aisles, crossings and goals of a floor that is known only as free cells.
+"""A floor that is known only as free cells: its aisles, crossings and goals, and its racks.
 
 An aisle segment is a straight, narrow, free corridor between racks or walls on two sides: pallets
-can close it, and the lidar can tell that they do. Both directions are looked at.
+can close it, and the lidar can tell that they do. Both directions are looked at. Racks are blocked
+cells as few rectangles, which may overlap; only cells that border free ones need to be covered:
+what lies behind them no robot meets and no lidar sees.
 """
 
 from __future__ import annotations
@@ -12,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from restock.train.twin.floors.layout import AisleSegment, Axis, Rect
+from restock.train.twin.floors.layout import AisleSegment, Axis, Rect, Warehouse
 
-Cells = NDArray[np.bool_]  # (X, Y), free where True
+Cells = NDArray[np.bool_]  # (X, Y)
+Box = tuple[int, int, int, int]  # first and last (exclusive) column, first and last row
 
 WIDTH_M = (0.7, 2.6)  # of a corridor
 LENGTH_M = 1.8  # a pallet, and room before and behind it
@@ -32,6 +35,18 @@ class _Corridor:
     last: int
     low: int
     high: int
+
+
+def cells_of(floor: Warehouse, cell_m: float) -> Cells:
+    """The free cells (X, Y) of a floor: those whose middle no rack holds."""
+    x = (np.arange(round(floor.width_m / cell_m)) + 0.5) * cell_m
+    y = (np.arange(round(floor.depth_m / cell_m)) + 0.5) * cell_m
+    free = np.ones((len(x), len(y)), np.bool_)
+    for rack in floor.racks:
+        inside_x = (rack.x_min <= x) & (x <= rack.x_max)
+        inside_y = (rack.y_min <= y) & (y <= rack.y_max)
+        free &= ~(inside_x[:, None] & inside_y[None, :])
+    return free
 
 
 def find_segments(free: Cells, cell_m: float) -> tuple[AisleSegment, ...]:
@@ -145,3 +160,52 @@ def find_goals(
         kept = np.linspace(0, len(places) - 1, GOALS).astype(int)
         places = [places[index] for index in kept]
     return tuple(places)
+
+
+def cover(blocked: Cells, limit: int) -> list[Box] | None:
+    """Rectangles of blocked cells (X, Y) over all that border free ones; None: over `limit`.
+
+    Each grows from a cell not yet covered, along one axis first and then along the other, in
+    whichever order covers more.
+    """
+    seen = ndimage.binary_dilation(~blocked, np.ones((3, 3), np.bool_)) & blocked
+    total = np.zeros((blocked.shape[0] + 1, blocked.shape[1] + 1), np.int64)
+    total[1:, 1:] = blocked.cumsum(axis=0).cumsum(axis=1)
+    left = seen.copy()
+    boxes: list[Box] = []
+    for i, j in np.argwhere(seen):
+        if not left[i, j]:
+            continue
+        if len(boxes) == limit:
+            return None
+        grown = [_grow(total, int(i), int(j), order) for order in ((0, 1), (1, 0))]
+        best = max(grown, key=lambda b: int(left[b[0] : b[1], b[2] : b[3]].sum()))
+        left[best[0] : best[1], best[2] : best[3]] = False
+        boxes.append(best)
+    return boxes
+
+
+def _grow(total: NDArray[np.int64], i: int, j: int, order: tuple[int, int]) -> Box:
+    """The rectangle of blocked cells around one, grown along the axes in this order."""
+    box = [i, i + 1, j, j + 1]
+    for axis in order:
+        for side, step in ((2 * axis, -1), (2 * axis + 1, 1)):
+            end = total.shape[axis] - 1
+            # How far: doubling strides, then halving ones, each tried whole.
+            stride = 1
+            while stride:
+                longer = box.copy()
+                longer[side] += step * stride
+                if 0 <= longer[side] <= end and _full(total, longer):
+                    box = longer
+                    stride *= 2
+                else:
+                    stride //= 2
+    return box[0], box[1], box[2], box[3]
+
+
+def _full(total: NDArray[np.int64], box: list[int]) -> bool:
+    """Whether every cell of a rectangle is blocked."""
+    a, b, c, d = box
+    count = total[b, d] - total[a, d] - total[b, c] + total[a, c]
+    return bool(count == (b - a) * (d - c))
