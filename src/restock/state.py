@@ -1,7 +1,8 @@
 """State that a checkpoint keeps, declared by name: what is saved is what is restored.
 
 A class names its attributes in `STATE`; each is an array, a number, a string, None, a list or dict
-of those, a generator, a torch module, or another object with `state_dict` and `load_state_dict`.
+of those, a generator, a torch module, a msgspec struct, or another object with `state_dict` and
+`load_state_dict`.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
+import msgspec
 import numpy as np
 
 
@@ -19,6 +21,8 @@ class Stateful:
     """
 
     STATE: ClassVar[tuple[str, ...]] = ()
+    # Of values whose type the restored object's own does not show: `list[EpisodeSpec]`.
+    STATE_TYPES: ClassVar[Mapping[str, Any]] = {}
 
     def state_dict(self) -> dict[str, Any]:
         """Arrays and JSON values, by the names in `STATE` (without a leading underscore)."""
@@ -27,7 +31,11 @@ class Stateful:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Puts everything where `state_dict` found it."""
         for name in self.STATE:
-            setattr(self, name, restored(getattr(self, name), state[_key(name)]))
+            value, kind = state[_key(name)], self.STATE_TYPES.get(name)
+            if kind is None:
+                setattr(self, name, restored(getattr(self, name), value))
+            else:
+                setattr(self, name, msgspec.convert(value, kind))
         self.restored()
 
     def restored(self) -> None:
@@ -44,6 +52,8 @@ def saved(value: Any) -> Any:
         return value.copy()
     if isinstance(value, np.generic):
         return value.item()
+    if isinstance(value, msgspec.Struct):
+        return msgspec.to_builtins(value)
     if isinstance(value, Mapping):
         return {name: saved(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
