@@ -20,7 +20,7 @@ from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.episodes import Split, split
-from restock.ingest.steps.needs import reductions, wanted_fields
+from restock.ingest.steps.needs import read_topics
 from restock.ingest.steps.steps import Steps, steps_of
 from restock.ingest.store.manifest import definitions, manifest_row, software_version
 from restock.ingest.store.transitions import Provenance, recording_table
@@ -103,7 +103,7 @@ class _Ingest:
         self.ingest_id = uuid.uuid4().hex[:16]
 
     def run(self, store: StoreWriter | None) -> Outcome:
-        profile, columns = self.profile, self._columns()
+        profile, columns = self.profile, read_topics(self.recording, self.profile)
         steps = steps_of(profile, columns)
         # What follows needs to know which topics said anything, and not what: let go of it.
         columns = {name: column.times(0, 1) for name, column in columns.items()}
@@ -146,15 +146,6 @@ class _Ingest:
             self._notes(steps, table),
             at,
         )
-
-    def _columns(self) -> dict[str, Any]:
-        recording = self.recording
-        readable = {n: info for n, info in recording.topics.items() if info.skipped is None}
-        leaves = {
-            topic: recording.fields(topic) for topic in self.profile.topics if topic in readable
-        }
-        wanted = wanted_fields(self.profile, readable, leaves)
-        return recording.read(wanted, reductions(self.profile, readable))
 
     def _messages(self) -> dict[str, int]:
         accounts = self.recording.accounts.values()

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.profile import Frames
-from restock.ingest.steps.transforms import FIELDS, Edges, upward
+from restock.ingest.steps.frames import FIELDS, Edges, upward
 
 FIXED = ("map", "odom", "world")  # best first
 BASES = ("base_link", "base_footprint", "base")

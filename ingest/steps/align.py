@@ -15,7 +15,7 @@ hold reaches across but that of latched topics.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -41,31 +41,37 @@ class Samples:
     stamp_ns: I64  # (N,) ascending
     row: NDArray[np.intp]  # (N,) of the topic's columns
 
-    def hold(self, tick_ns: I64, max_age_s: float | None) -> Held:
+    def hold(self, tick_ns: I64, max_age_s: float | None) -> LatestMessages:
         """At each tick (T,) ascending or not, the latest sample at or before it."""
         at = np.searchsorted(self.stamp_ns, tick_ns, "right") - 1
         known = at >= 0
         if not len(self.stamp_ns):
-            none = np.zeros(len(tick_ns), np.int64)
-            return Held(none.astype(np.intp), none, known, known)
+            zeros = np.zeros(len(tick_ns), np.int64)
+            return LatestMessages(zeros.astype(np.intp), zeros, known, known)
         at = np.maximum(at, 0)
         age = np.where(known, tick_ns - self.stamp_ns[at], 0)
         fresh = known if max_age_s is None else known & (age <= round(max_age_s * NS))
-        return Held(self.row[at], age, known, fresh)
+        return LatestMessages(self.row[at], age, known, fresh)
 
 
 @dataclass(frozen=True)
-class Held:
-    """What a topic said last, at each of T ticks."""
+class LatestMessages:
+    """The latest message of a topic, at each of T ticks."""
 
     row: NDArray[np.intp]  # (T,) of the topic's columns; 0 where nothing is known
     age_ns: I64  # (T,)
     known: NDArray[np.bool_]  # (T,) something had been received
     fresh: NDArray[np.bool_]  # (T,) and not longer ago than its maximum age
 
+    @classmethod
+    def join(cls, parts: Sequence[LatestMessages]) -> LatestMessages:
+        """Those of several clock segments, one after the other."""
+        names = ("row", "age_ns", "known", "fresh")
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
 
 @dataclass(frozen=True)
-class Segment:
+class ClockSegment:
     """A stretch of a recording in which the alignment clock does not jump."""
 
     topics: Mapping[str, Samples]
@@ -89,7 +95,7 @@ def align(
     clock: Clock,
     latched: frozenset[str] = frozenset(),
     transforms: frozenset[str] = frozenset(),
-) -> tuple[list[Segment], ClockReport]:
+) -> tuple[list[ClockSegment], ClockReport]:
     """Every topic on the alignment clock, cut where that clock jumps.
 
     `topics` are in the order of their log time; stamped ones hold the field `header.stamp`.
@@ -104,7 +110,7 @@ def align(
     report = ClockReport(clock.alignment)
     if clock.alignment == "log_time":
         samples = {name: _ordered(c.log_time_ns, np.arange(len(c))) for name, c in topics.items()}
-        return [Segment(samples, 0)], report
+        return [ClockSegment(samples, 0)], report
     delay = {
         name: columns.log_time_ns - np.asarray(columns.fields[STAMP], np.int64)
         for name, columns in topics.items()
@@ -165,7 +171,7 @@ def _segment(
     latched: frozenset[str],
     transforms: frozenset[str],
     report: ClockReport,
-) -> Segment:
+) -> ClockSegment:
     inside = {
         name: np.flatnonzero(np.searchsorted(edges, columns.log_time_ns, "right") == index)
         for name, columns in topics.items()
@@ -194,10 +200,10 @@ def _segment(
             report.off_clock[name] = report.off_clock.get(name, 0) + int(off.sum())
             stamp, rows = stamp[~off], rows[~off]
         samples[name] = _ordered(stamp, rows)
-    return Segment(samples, offset)
+    return ClockSegment(samples, offset)
 
 
-def _carry_latched(segments: list[Segment], latched: frozenset[str]) -> None:
+def _carry_latched(segments: list[ClockSegment], latched: frozenset[str]) -> None:
     """What a latched topic said last still holds at the start of the next segment."""
     for index in range(1, len(segments)):
         topics = dict(segments[index].topics)
@@ -207,7 +213,16 @@ def _carry_latched(segments: list[Segment], latched: frozenset[str]) -> None:
             if len(before.row):
                 stamp = np.concatenate([[start], now.stamp_ns]).astype(np.int64)
                 topics[name] = Samples(stamp, np.concatenate([before.row[-1:], now.row]))
-        segments[index] = Segment(topics, segments[index].offset_ns)
+        segments[index] = ClockSegment(topics, segments[index].offset_ns)
 
 
-__all__ = ["NS", "STAMP", "ClockReport", "Held", "Samples", "Segment", "align", "ticks_of"]
+__all__ = [
+    "NS",
+    "STAMP",
+    "ClockReport",
+    "ClockSegment",
+    "LatestMessages",
+    "Samples",
+    "align",
+    "ticks_of",
+]

@@ -17,7 +17,8 @@ from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, offsets_of
 from restock.ingest.profile.custom_signal import LIST, NUMBER, QUATERNION, CustomSignal, Reduce
 from restock.ingest.profile.signal_paths import Found, PathProblem
-from restock.ingest.steps.align import Samples, Segment
+from restock.ingest.steps.align import LatestMessages
+from restock.ingest.steps.aligned_inputs import AlignedInputs
 from restock.ingest.task.signals import yaw_of
 
 
@@ -190,27 +191,26 @@ class Custom:
         return self.table.take(pa.array(ticks))
 
 
-def custom_signals(
-    signals: Mapping[str, CustomSignal],
-    topics: Mapping[str, TopicColumns],
-    segments: Sequence[Segment],
-    ticks: Sequence[NDArray[np.int64]],
-) -> Custom:
+def custom_signals(aligned: AlignedInputs) -> Custom:
     """Every custom signal at every tick of every segment, causally held; null where it is not."""
-    count = sum(len(stamps) for stamps in ticks)
-    found: dict[str, CustomColumn] = {}
+    columns: dict[str, CustomColumn] = {}
+    count = sum(map(len, aligned.ticks))
     table = pa.table({"tick": np.arange(count)})
-    for name, signal in signals.items():
+    for name, signal in aligned.profile.signals.items():
         array = pa.nulls(count, signal.field(name).type)
-        if signal.topic in topics:
-            column = found[name] = column_of(name, signal, topics[signal.topic])
-            parts = [
-                _at(column, segment.topics[signal.topic], stamps)
-                for segment, stamps in zip(segments, ticks, strict=True)
-            ]
-            array = pa.concat_arrays(parts) if parts else array
+        topic = aligned.inputs.topics.get(signal.topic)
+        if topic is not None:
+            column = columns[name] = column_of(name, signal, topic)
+            latest = latest_samples(aligned, column)
+            array = column.take(latest.row, latest.fresh)
         table = table.append_column(signal.field(name), array)
-    return Custom(table.drop_columns("tick"), found)
+    return Custom(table.drop_columns("tick"), columns)
+
+
+def latest_samples(aligned: AlignedInputs, column: CustomColumn) -> LatestMessages:
+    """The latest message that has a custom signal, at every tick."""
+    signal = column.signal
+    return aligned.latest_of(signal.topic, signal.max_age_s, keep=column.samples)
 
 
 def column_of(name: str, signal: CustomSignal, topic: TopicColumns) -> CustomColumn:
@@ -221,9 +221,3 @@ def column_of(name: str, signal: CustomSignal, topic: TopicColumns) -> CustomCol
     values, texts = fields[_key(name)], fields.get(f"{_key(name)}, no number", np.zeros(0))
     assert isinstance(values, Ragged)
     return CustomColumn(signal, values, [text for text in np.asarray(texts).tolist() if text])
-
-
-def _at(column: CustomColumn, samples: Samples, stamps: NDArray[np.int64]) -> pa.Array:
-    keep = column.samples[samples.row]
-    held = Samples(samples.stamp_ns[keep], samples.row[keep]).hold(stamps, column.signal.max_age_s)
-    return column.take(held.row, held.fresh)

@@ -17,12 +17,117 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.ingest.decoding.columns import Ragged, TopicColumns
 from restock.ingest.profile.profile import Frames
-from restock.ingest.steps.align import Segment
-from restock.ingest.steps.transforms import AXES, PARENT, TURN, Edges, plain
+from restock.ingest.steps.align import ClockSegment, LatestMessages
+from restock.ingest.steps.clocks import STAMP
 
 F64 = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+AXES = ("translation.x", "translation.y", "translation.z")
+TURN = ("rotation.x", "rotation.y", "rotation.z", "rotation.w")
+FIELDS = (
+    "transforms[].header.stamp",
+    "transforms[].header.frame_id",
+    "transforms[].child_frame_id",
+    *(f"transforms[].transform.{part}" for part in (*AXES, *TURN)),
+)
+PARENT = "parent"
+FRAME_ID = "header.frame_id"
+
+
+@dataclass(frozen=True)
+class Edges:
+    """The transforms of a recording, a topic a frame and source, for `align` to put in order."""
+
+    topics: dict[str, TopicColumns]  # "/tf odom" -> the transforms whose child is odom
+    static: frozenset[str]  # of those topics, the ones that never age
+    parents: dict[str, list[str]]  # frame -> every parent it ever has
+    parent_changes: int = 0  # times that a frame is given another parent
+
+    @classmethod
+    def of(cls, frames: Frames, topics: Mapping[str, TopicColumns]) -> Edges:
+        """The transforms in these topics' columns (those of `FIELDS`)."""
+        edges: dict[str, TopicColumns] = {}
+        static, parents, changes = set(), dict[str, list[str]](), 0
+        for topic in (frames.static_topic, frames.topic):
+            if topic not in topics:
+                continue
+            for child, columns in _by_child(topics[topic]).items():
+                name = f"{topic} {child}"
+                edges[name] = columns
+                if topic == frames.static_topic:
+                    static.add(name)
+                parent = columns.fields[PARENT]
+                assert isinstance(parent, np.ndarray)
+                changes += int((parent[1:] != parent[:-1]).sum())
+                known = parents.setdefault(child, [])
+                known += [frame for frame in np.unique(parent).tolist() if frame not in known]
+        return cls(edges, frozenset(static), parents, changes)
+
+    def only(self, frames: set[str]) -> Edges:
+        """Only the transforms that may lead up from these frames."""
+        reached = {up for frame in frames for up in upward(plain(frame), self.parents)}
+        kept = {name: c for name, c in self.topics.items() if name.split(" ", 1)[1] in reached}
+        parents = {frame: up for frame, up in self.parents.items() if frame in reached}
+        return Edges(kept, self.static & kept.keys(), parents, self.parent_changes)
+
+    def missing(self, base: str, fixed: str) -> str | None:
+        """Why no transform of the recording can lead from one frame to the other, or None."""
+        ways = [upward(plain(frame), self.parents) for frame in (base, fixed)]
+        if ways[0] & ways[1]:
+            return None
+        tops = [sorted(way - self.parents.keys()) or sorted(way) for way in ways]
+        have = ", ".join(
+            f"{parent} -> {child}" for child, up in self.parents.items() for parent in up
+        )
+        return (
+            f"no transform joins {', '.join(tops[0])} (above {plain(base)}) to"
+            f" {', '.join(tops[1])}; there are {have or 'none'}"
+        )
+
+
+def plain(frame: str) -> str:
+    """A frame's name as ROS 2 writes it: without the slash that ROS 1 put before it."""
+    return frame.strip("/")
+
+
+def _by_child(topic: TopicColumns) -> dict[str, TopicColumns]:
+    """The transforms of a topic, by the frame that they place."""
+    children = topic.fields["transforms[].child_frame_id"]
+    assert isinstance(children, Ragged)
+    message = np.repeat(np.arange(len(children)), children.lengths)
+    names = np.array([plain(name) for name in np.asarray(children.values).tolist()], object)
+    edges = {}
+    for name in sorted(set(names.tolist())):
+        rows = np.flatnonzero(names == name)
+
+        def column(path: str, rows: Ints = rows) -> NDArray[Any]:
+            values = topic.fields[f"transforms[].{path}"]
+            assert isinstance(values, Ragged)
+            return np.asarray(values.values)[rows]
+
+        parents = [plain(parent) for parent in column("header.frame_id").tolist()]
+        fields: dict[str, Any] = {
+            STAMP: column("header.stamp"),
+            PARENT: np.array([*parents, None], object)[:-1],
+            **{part: column(f"transform.{part}") for part in (*AXES, *TURN)},
+        }
+        edges[name] = TopicColumns(
+            topic.log_time_ns[message[rows]], topic.publish_time_ns[message[rows]], fields
+        )
+    return edges
+
+
+def upward(frame: str, parents: Mapping[str, Sequence[str]]) -> set[str]:
+    """A frame and all that are ever above it."""
+    reached, open_ = set[str](), {frame}
+    while open_:
+        here = open_.pop()
+        reached.add(here)
+        open_ |= set(parents.get(here, ())) - reached
+    return reached
 
 
 @dataclass(frozen=True)
@@ -46,8 +151,8 @@ class Placement:
 
     def fill(self, rows: Any, other: Placement, order: Any) -> None:
         """Take these rows over, in this order, from another one."""
-        for mine, theirs in zip(self._parts(), other._parts(), strict=True):
-            mine[rows] = theirs[order]
+        for to, source in zip(self._parts(), other._parts(), strict=True):
+            to[rows] = source[order]
 
     def _parts(self) -> tuple[NDArray[Any], ...]:
         return self.rotation, self.translation_m, self.stamp_ns, self.problem
@@ -58,10 +163,11 @@ class Placement:
 
 
 @dataclass
-class _Held:
+class _Transform:
     """A frame's transform to its parent at T times."""
 
-    parent: Ints  # (T,) number of the parent frame; -1 is none
+    row: Ints  # (T,) of the edge's columns
+    parent: Ints  # (T,) number of the parent frame; -1 where no transform is known
     fresh: NDArray[np.bool_]
     moving: NDArray[np.bool_]
     stamp_ns: Ints
@@ -75,7 +181,7 @@ class Tree:
 
     frames: Frames
     edges: Edges
-    segments: Sequence[Segment]
+    segments: Sequence[ClockSegment]
     _numbers: dict[str, int] = field(default_factory=dict)  # frame -> its number
 
     def place(self, frame: str, times: Sequence[Ints]) -> Placement:
@@ -84,8 +190,7 @@ class Tree:
         count = sum(map(len, times))
         out = Placement.nowhere(count)
         out.stamp_ns[:] = np.concatenate([*times, np.zeros(0, np.int64)])
-        children = sorted(self.edges.only({frame, self.frames.fixed}).parents)
-        held = {self._number(child): self._hold(child, times) for child in children}
+        held = self._hold_above(frame, times)
         if not held:
             out.problem[:] = self._apart([source], [fixed])
             return out
@@ -97,8 +202,40 @@ class Tree:
             self._fill(out, rows, held, _way(source, parent), _way(fixed, parent))
         return out
 
+    def way(self, frame: str, time: Sequence[Ints]) -> list[tuple[str, str, int, int]]:
+        """The transforms from `frame` to the fixed frame at one time.
+
+        Each by its topic, the frame that it places, its row in `edges.topics["TOPIC FRAME"]` and
+        its stamp (ns).
+        """
+        held = self._hold_above(frame, time)
+        parent = {child: int(one.parent[0]) for child, one in held.items() if one.parent[0] >= 0}
+        up, other = (
+            _way(number, parent) for number in map(self._number, (frame, self.frames.fixed))
+        )
+        top = next(number for number in up if number in other)
+        return [
+            (
+                self.frames.topic if held[child].moving[0] else self.frames.static_topic,
+                self._name(child),
+                int(held[child].row[0]),
+                int(held[child].stamp_ns[0]),
+            )
+            for child in (*up[: up.index(top)], *other[: other.index(top)])
+        ]
+
+    def _hold_above(self, frame: str, times: Sequence[Ints]) -> dict[int, _Transform]:
+        """The transforms of all frames above this one and the fixed one, by their numbers."""
+        children = sorted(self.edges.only({frame, self.frames.fixed}).parents)
+        return {self._number(child): self._hold(child, times) for child in children}
+
     def _fill(
-        self, out: Placement, rows: Ints, held: dict[int, _Held], up: list[int], other: list[int]
+        self,
+        out: Placement,
+        rows: Ints,
+        held: dict[int, _Transform],
+        up: list[int],
+        other: list[int],
     ) -> None:
         """Place the times `rows`, at which the ways to the top are `up` and `other`."""
         meet = next((frame for frame in up if frame in other), None)
@@ -120,7 +257,7 @@ class Tree:
             out.stamp_ns[rows[known]] = newest[known]
 
     def _compose(
-        self, out: Placement, rows: Ints, held: dict[int, _Held], way: list[int]
+        self, out: Placement, rows: Ints, held: dict[int, _Transform], way: list[int]
     ) -> tuple[F64, F64]:
         """The transforms along a way as one: rotation (N, 3, 3) and translation (N, 3)."""
         rotation, translation = np.tile(np.eye(3), (len(rows), 1, 1)), np.zeros((len(rows), 3))
@@ -132,15 +269,15 @@ class Tree:
             names = f"{self._name(int(one.parent[rows[0]]))} -> {self._name(frame)}"
             sane = np.isfinite(step).all(axis=(1, 2)) & np.isfinite(one.translation[rows]).all(1)
             for bad, reason in ((~one.fresh[rows], "stale"), (~sane, "not finite")):
-                blamed = rows[bad & (out.problem[rows] == "")]
-                out.problem[blamed] = f"transform {names}: {reason}"
+                first = rows[bad & (out.problem[rows] == "")]
+                out.problem[first] = f"transform {names}: {reason}"
         return rotation, translation
 
     def _apart(self, up: list[int], other: list[int]) -> str:
         return f"no transform from {self._name(other[-1])} to {self._name(up[-1])} yet"
 
-    def _hold(self, child: str, times: Sequence[Ints]) -> _Held:
-        """A frame's transform at these times: of `/tf` where it has said one, else the static."""
+    def _hold(self, child: str, times: Sequence[Ints]) -> _Transform:
+        """A frame's transform at these times: of `/tf` where there is one, else the static."""
         moving = self._of(f"{self.frames.topic} {child}", times, self.frames.max_age_s)
         still = self._of(f"{self.frames.static_topic} {child}", times, None)
         if moving is None or still is None:
@@ -150,32 +287,30 @@ class Tree:
             return only
         use = moving.parent >= 0
         both = {}
-        for name in ("parent", "fresh", "stamp_ns", "rotation", "translation"):
+        for name in ("row", "parent", "fresh", "stamp_ns", "rotation", "translation"):
             a, b = getattr(moving, name), getattr(still, name)
             both[name] = np.where(use.reshape(-1, *[1] * (a.ndim - 1)), a, b)
-        return _Held(moving=use, **both)
+        return _Transform(moving=use, **both)
 
-    def _of(self, name: str, times: Sequence[Ints], max_age_s: float | None) -> _Held | None:
+    def _of(self, name: str, times: Sequence[Ints], max_age_s: float | None) -> _Transform | None:
         columns = self.edges.topics.get(name)
         if columns is None:
             return None
-        parts = [
-            segment.topics[name].hold(stamps, max_age_s)
-            for segment, stamps in zip(self.segments, times, strict=True)
-        ]
-        row, known, fresh, age = (
-            np.concatenate([getattr(part, key) for part in parts])
-            for key in ("row", "known", "fresh", "age_ns")
+        latest = LatestMessages.join(
+            [
+                segment.topics[name].hold(stamps, max_age_s)
+                for segment, stamps in zip(self.segments, times, strict=True)
+            ]
         )
-        fields = columns.fields
+        row, fields = latest.row, columns.fields
         quaternion = [np.asarray(fields[part])[row] for part in TURN]
-        says = np.array([self._number(name) for name in np.asarray(fields[PARENT]).tolist()])
-        here = np.concatenate(times)
-        return _Held(
-            np.where(known, says[row], -1) if len(says) else np.full(len(row), -1),
-            fresh,
+        parents = np.array([self._number(name) for name in np.asarray(fields[PARENT]).tolist()])
+        return _Transform(
+            row,
+            np.where(latest.known, parents[row], -1) if len(parents) else np.full(len(row), -1),
+            latest.fresh,
             np.zeros(len(row), np.bool_),
-            here - age,
+            np.concatenate(times) - latest.age_ns,
             rotations(*quaternion),
             np.stack([np.asarray(fields[axis])[row] for axis in AXES], axis=1),
         )

@@ -19,10 +19,10 @@ from restock.errors import ConfigError
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, join
 from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.profile import Profile
-from restock.ingest.steps.align import NS, Samples, Segment
+from restock.ingest.steps.align import NS, ClockSegment, Samples
+from restock.ingest.steps.aligned_inputs import AlignedInputs, InputColumns
 from restock.ingest.steps.clocks import median
 from restock.ingest.steps.needs import field_paths
-from restock.ingest.steps.sources import Sources
 from restock.ingest.steps.steps import fill_signals
 from restock.ingest.task.task import nearest_action, observe
 
@@ -126,9 +126,10 @@ class LiveObserver:
         silent = [topic for topic, columns in topics.items() if not len(columns)]
         if silent:
             return self._unknown(stamp_ns, f"nothing received yet on {', '.join(sorted(silent))}")
-        sources = Sources(self.profile, topics)
-        segment = Segment(samples, self.offset_ns)
-        filled = fill_signals(self.profile, sources, [segment], [np.array(ticks, np.int64)], None)
+        inputs = InputColumns(self.profile, topics)
+        segment = ClockSegment(samples, self.offset_ns)
+        at = [np.array(ticks, np.int64)]
+        filled = fill_signals(AlignedInputs(self.profile, inputs, [segment], at))
         last = len(ticks) - 1
         before = last - int(filled.follows[last])
         now, then = (

@@ -1,45 +1,45 @@
-"""What a recording's messages said at one tick: where a row of the store came from.
-
-The same alignment and holds as in an ingest, so these are the messages the row was made of.
-"""
+"""The messages of a recording that one tick was made of: where a row of the store came from."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from restock.errors import RecordingError
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns
 from restock.ingest.profile.profile import Profile
-from restock.ingest.steps.align import NS, STAMP, Segment, align, ticks_of
-from restock.ingest.steps.filling import PROVENANCE_LEAD_S
+from restock.ingest.steps.align import NS
+from restock.ingest.steps.aligned_inputs import AlignedInputs, align_inputs
+from restock.ingest.steps.custom_columns import column_of, latest_samples
+from restock.ingest.steps.frames import AXES, PARENT, TURN
+from restock.ingest.steps.needs import read_topics
 
 
 @dataclass(frozen=True)
-class HeldMessage:
-    """What one input of the profile said at a tick."""
+class MessageAtTick:
+    """A message that a tick was made of, and what it is for."""
 
-    input: str
+    input: str  # of the profile, or `signals.NAME`
     topic: str
     type: str
     log_time_ns: int
     publish_time_ns: int
     stamp_ns: int  # on the alignment clock
-    age_s: float  # at the tick; below 0 where provenance may come a moment later
+    age_s: float  # at the tick; below 0 where it may come a moment later
     max_age_s: float | None  # None: latched
     fields: dict[str, Any]  # by field path
 
 
-def held_messages(
+def messages_at_tick(
     path: str | Path, profile: Profile, *, recording_id: str, tick: int, stamp_ns: int
-) -> list[HeldMessage]:
-    """The latest message of every input at one tick of a recording, by age.
+) -> list[MessageAtTick]:
+    """The messages that one tick of a recording was made of, by age.
+
+    Of each input and custom signal the latest one, and where the pose comes from transforms, each
+    transform on the way.
 
     Args:
         path: the recording.
@@ -49,7 +49,8 @@ def held_messages(
         stamp_ns: of that tick, on the alignment clock.
 
     Raises:
-        RecordingError: it cannot be read, is another recording, or has another tick there.
+        RecordingError: it cannot be read, is another recording, does not fit the profile, or has
+            another tick there.
     """
     with open_recording(path, salvage=True) as recording:
         if recording.recording_id != recording_id:
@@ -58,90 +59,74 @@ def held_messages(
                 where=str(path),
                 remedy="give the recording it was made from; its path then is in the row",
             )
-        topics = recording.read(_wanted(recording, profile))
         types = {name: info.type for name, info in recording.topics.items()}
-    segments, _ = align(topics, profile.clock, _latched(profile, topics))
-    segment = _segment_of(segments, profile, tick, stamp_ns, str(path))
-    found = []
-    for name, source in profile.inputs.items():
-        samples = segment.topics.get(source.topic)
-        if samples is None:
-            continue
-        lead_ns = round(_lead_s(name, profile) * NS)
-        held = samples.hold(np.array([stamp_ns + lead_ns]), source.max_age_s)
-        if not held.known[0]:
-            continue
-        row, columns = int(held.row[0]), topics[source.topic]
-        age_ns = int(held.age_ns[0]) - lead_ns
-        found.append(
-            HeldMessage(
-                input=name,
-                topic=source.topic,
-                type=types[source.topic],
-                log_time_ns=int(columns.log_time_ns[row]),
-                publish_time_ns=int(columns.publish_time_ns[row]),
-                stamp_ns=stamp_ns - age_ns,
-                age_s=age_ns / NS,
-                max_age_s=source.max_age_s,
-                fields={field: _value(column, row) for field, column in columns.fields.items()},
-            )
+        try:
+            topics = read_topics(recording, profile, reduced=False)
+            aligned = align_inputs(profile, topics).at(tick, stamp_ns)
+        except RecordingError as error:
+            raise RecordingError(error.what, where=str(path), remedy=error.remedy) from error
+    if aligned is None:
+        raise RecordingError(
+            f"has no tick {tick} at {stamp_ns} ns by the profile {profile.name!r}",
+            where=str(path),
+            remedy="give the profile that read it with --profile",
         )
-    return sorted(found, key=lambda message: message.age_s)
+    messages = [*_of_inputs(aligned), *_of_transforms(aligned, stamp_ns), *_of_signals(aligned)]
+    named = [
+        MessageAtTick(
+            input=name,
+            topic=topic,
+            type=types[topic],
+            log_time_ns=int(columns.log_time_ns[row]),
+            publish_time_ns=int(columns.publish_time_ns[row]),
+            stamp_ns=stamp_ns - age_ns,
+            age_s=age_ns / NS,
+            max_age_s=max_age_s,
+            fields=fields,
+        )
+        for name, topic, max_age_s, columns, row, age_ns, fields in messages
+    ]
+    return sorted(named, key=lambda message: message.age_s)
 
 
-def _wanted(recording: Recording, profile: Profile) -> dict[str, list[str]]:
-    """topic -> the field paths that the profile's inputs read of it, and its stamp."""
-    readable = {name for name, info in recording.topics.items() if info.skipped is None}
-    wanted: dict[str, list[str]] = {}
-    for _, source in profile.inputs.items():
-        if source.topic not in readable:
+# Input, topic, maximum age, the columns that the message is in and its row there, age, fields.
+_Message = tuple[str, str, float | None, TopicColumns, int, int, dict[str, Any]]
+
+
+def _of_inputs(aligned: AlignedInputs) -> Iterator[_Message]:
+    for name, source in aligned.inputs.by_name.items():
+        latest, columns = aligned.latest(name), aligned.inputs.topics[source.topic]
+        if latest.fresh[0]:
+            row = int(latest.row[0])
+            fields = {path: _value(column, row) for path, column in columns.fields.items()}
+            yield name, source.topic, source.max_age_s, columns, row, int(latest.age_ns[0]), fields
+
+
+def _of_signals(aligned: AlignedInputs) -> Iterator[_Message]:
+    """What each custom signal makes of its message, by its path."""
+    for name, signal in aligned.profile.signals.items():
+        columns = aligned.inputs.topics.get(signal.topic)
+        if columns is None:
             continue
-        has = set(recording.leaves(source.topic))
-        paths = wanted.setdefault(source.topic, [])
-        for key, path in source.fields.items():
-            named = [f"{path}.{axis}" for axis in "xyzw"] if key == "orientation" else [path]
-            paths += [path for path in named if path in has]
-        paths += [STAMP] if STAMP in has else []
-    return {topic: list(dict.fromkeys(paths)) for topic, paths in wanted.items()}
+        column = column_of(name, signal, columns)
+        latest = latest_samples(aligned, column)
+        if latest.fresh[0]:
+            row, age_ns = int(latest.row[0]), int(latest.age_ns[0])
+            value = {signal.path: column.take(latest.row, latest.fresh)[0].as_py()}
+            yield f"signals.{name}", signal.topic, signal.max_age_s, columns, row, age_ns, value
 
 
-def _latched(profile: Profile, topics: Mapping[str, TopicColumns]) -> frozenset[str]:
-    inputs = [source for _, source in profile.inputs.items() if source.topic in topics]
-    aging = {source.topic for source in inputs if source.max_age_s is not None}
-    return frozenset({source.topic for source in inputs} - aging)
-
-
-def _segment_of(
-    segments: list[Segment], profile: Profile, tick: int, stamp_ns: int, where: str
-) -> Segment:
-    """The stretch of the clock that a tick is in."""
-    first = 0
-    for segment in segments:
-        end = max((int(s.stamp_ns[-1]) for s in segment.topics.values() if len(s.row)), default=0)
-        command = segment.topics.get(profile.inputs.command.topic)
-        if command is None:
-            break
-        stamps, _ = ticks_of(command, profile.clock, profile.task.control_period_s, end)
-        if tick < first + len(stamps):
-            if int(stamps[tick - first]) == stamp_ns:
-                return segment
-            break
-        first += len(stamps)
-    raise RecordingError(
-        f"has no tick {tick} at {stamp_ns} ns by the profile {profile.name!r}",
-        where=where,
-        remedy="give the profile that read it with --profile",
-    )
-
-
-def _lead_s(name: str, profile: Profile) -> float:
-    """How much after the tick an input may come: provenance alone, never what the robot knew."""
-    leads = {
-        "behaviour_policy": PROVENANCE_LEAD_S,
-        "perturbation": PROVENANCE_LEAD_S,
-        "true_condition": profile.task.control_period_s / 2,
-    }
-    return leads.get(name, 0.0)
+def _of_transforms(aligned: AlignedInputs, stamp_ns: int) -> Iterator[_Message]:
+    """The transforms from the robot's frame up to the fixed one, where they give the pose."""
+    tree = aligned.tree
+    if tree is None or aligned.inputs.present("pose") is not None:
+        return
+    for topic, frame, row, measured_ns in tree.way(tree.frames.base, aligned.ticks):
+        columns = tree.edges.topics[f"{topic} {frame}"]
+        max_age_s = tree.frames.max_age_s if topic == tree.frames.topic else None
+        names = (PARENT, *AXES, *TURN)
+        fields = {"child": frame} | {name: _value(columns.fields[name], row) for name in names}
+        yield "pose", topic, max_age_s, columns, row, stamp_ns - measured_ns, fields
 
 
 def _value(column: FieldColumn, row: int) -> Any:

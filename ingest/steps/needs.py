@@ -8,19 +8,44 @@ from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
 from restock.errors import RecordingError
+from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import Fields, Reduction
-from restock.ingest.decoding.columns import FieldColumn
+from restock.ingest.decoding.columns import FieldColumn, TopicColumns
 from restock.ingest.profile.custom_signal import CustomSignal
 from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.signal_paths import offer
-from restock.ingest.steps.align import STAMP
 from restock.ingest.steps.clearance import scan_reduction
+from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.custom_columns import custom_reduction
-from restock.ingest.steps.transforms import FIELDS, FRAME_ID
+from restock.ingest.steps.frames import FIELDS, FRAME_ID
 
 if TYPE_CHECKING:
     from restock.ingest.decoding.field_paths import Leaf
+
+
+def read_topics(
+    recording: Recording, profile: Profile, *, reduced: bool = True
+) -> dict[str, TopicColumns]:
+    """The columns that a profile needs of a recording.
+
+    `reduced`: scans as clearance and messages as custom signals alone, which is all that steps
+    are made of; else with all fields as they were recorded.
+
+    Raises:
+        RecordingError: as `wanted_fields`.
+    """
+    readable = {name: info for name, info in recording.topics.items() if info.skipped is None}
+    leaves = {topic: recording.fields(topic) for topic in profile.topics if topic in readable}
+    wanted, made = wanted_fields(profile, readable, leaves), reductions(profile, readable)
+    if reduced:
+        return recording.read(wanted, made)
+    return recording.read(
+        {
+            topic: [*paths, *(made[topic].fields if topic in made else ())]
+            for topic, paths in wanted.items()
+        }
+    )
 
 
 def wanted_fields(

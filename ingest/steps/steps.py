@@ -6,7 +6,7 @@ finite) is kept beside it as a reason, so that everything left out can be counte
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile
-from restock.ingest.steps.align import ClockReport, Segment, align, ticks_of
+from restock.ingest.steps.align import ClockReport
+from restock.ingest.steps.aligned_inputs import AlignedInputs, align_inputs
 from restock.ingest.steps.clocks import TopicClock, topic_clocks
 from restock.ingest.steps.custom_columns import Custom, custom_signals
 from restock.ingest.steps.filling import Filling
-from restock.ingest.steps.frames import Tree
 from restock.ingest.steps.routing import Routing
-from restock.ingest.steps.sources import Sources, frame_notes, place_messages, transforms_of
 from restock.ingest.task.perturbation_columns import Perturbed
 from restock.ingest.task.signals import localised_velocity
 from restock.ingest.task.task import nearest_action
@@ -66,36 +65,15 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
         RecordingError: the alignment clock is `header.stamp` and no topic has one, or a field is
             not what its input needs.
     """
-    sources = Sources(profile, topics)
-    edges = transforms_of(profile, sources)
-    ages = [(source.topic, source.max_age_s) for source in sources.inputs.values()]
-    ages += [(signal.topic, signal.max_age_s) for signal in profile.signals.values()]
-    latched = {topic for topic, age in ages if age is None}
-    latched -= {topic for topic, age in ages if age is not None}
-    segments, report = align(
-        {**topics, **edges.topics},
-        profile.clock,
-        edges.static.union(latched),
-        frozenset(edges.topics),
-    )
-    ticks, between = [], 0
-    for segment in segments:
-        end = max((int(s.stamp_ns[-1]) for s in segment.topics.values() if len(s.row)), default=0)
-        command = segment.topics[profile.inputs.command.topic]
-        stamps, extra = ticks_of(command, profile.clock, profile.task.control_period_s, end)
-        ticks.append(stamps)
-        between += extra
-    tree = Tree(profile.frames, edges, segments) if profile.frames else None
-    if tree is not None:
-        place_messages(sources, tree, segments)
-    filled = fill_signals(profile, sources, segments, ticks, tree)
+    aligned = align_inputs(profile, topics)
+    filled = fill_signals(aligned)
     filling, signals = filled.filling, filled.signals
     action, residual = nearest_action(
         profile.task, signals["command_speed_mps"], signals["command_yaw_rate_radps"]
     )
     policy, version, probability = filling.behaviour()
     perturbed = filling.perturbed()
-    custom = custom_signals(profile.signals, topics, segments, ticks)
+    custom = custom_signals(aligned)
     return Steps(
         signals,
         filling.segment,
@@ -111,11 +89,11 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
         probability,
         filling.truth(),
         perturbed,
-        report,
-        between,
+        aligned.clock,
+        aligned.commands_between,
         custom,
         topic_clocks(topics, profile.clock.jump_s),
-        frame_notes(profile, sources, edges) + custom.notes + perturbed.notes,
+        [*aligned.notes, *custom.notes, *perturbed.notes],
     )
 
 
@@ -129,15 +107,9 @@ class Filled:
     cut: list[str]  # (T,) why it does not follow, or ""
 
 
-def fill_signals(
-    profile: Profile,
-    sources: Sources,
-    segments: Sequence[Segment],
-    ticks: Sequence[Ints],
-    tree: Tree | None,
-) -> Filled:
-    """Every signal at the ticks of each segment, from the messages held at them."""
-    filling = Filling(profile, sources, segments, ticks, tree)
+def fill_signals(aligned: AlignedInputs) -> Filled:
+    """Every signal at every tick, from the latest messages at it."""
+    filling = Filling(aligned)
     signals = filling.fill()
     follows, cut = filling.continuity()
     before = np.arange(len(follows)) - follows  # the tick before, or itself

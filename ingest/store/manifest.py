@@ -13,8 +13,8 @@ import numpy as np
 from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile
+from restock.ingest.steps.aligned_inputs import fallbacks_used
 from restock.ingest.steps.episodes import Split
-from restock.ingest.steps.sources import stand_ins
 from restock.ingest.steps.steps import Steps
 from restock.ingest.store.episode_rows import EpisodeRows
 from restock.ingest.store.transitions import Provenance
@@ -55,7 +55,7 @@ def manifest_row(
     """The row of `recordings`, by `restock.ingest.task.schema`."""
     stamps, span = steps.signals["stamp_ns"], recording.span_ns or (0, 0)
     dropped = sorted(episodes.dropped.items(), key=lambda item: (-item[1], item[0]))
-    instead = stand_ins(profile, columns)
+    fallbacks = fallbacks_used(profile, columns)
     return {
         "recording_id": recording.recording_id,
         "ingest_id": provenance.ingest_id,
@@ -78,7 +78,7 @@ def manifest_row(
         "episode_ends": episodes.ends,
         "drops": [{"reason": reason, "count": count} for reason, count in dropped],
         "topics": topic_rows(recording),
-        "stand_ins": [{"input": name, "instead": how} for name, how in instead.items()],
+        "stand_ins": [{"input": name, "instead": how} for name, how in fallbacks.items()],
         "label_scores": score_rows(scores),
         "clocks": clock_rows(recording, steps),
         "signals": steps.custom.rows(),

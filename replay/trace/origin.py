@@ -16,7 +16,7 @@ import numpy as np
 
 from restock.errors import ConfigError, StoreError
 from restock.ingest.profile.profile import Profile, load_profile
-from restock.ingest.steps.messages_at_tick import HeldMessage, held_messages
+from restock.ingest.steps.messages_at_tick import MessageAtTick, messages_at_tick
 from restock.ingest.task.schema import STEP_BITS
 from restock.ingest.task.task import Task, reward_parts
 from restock.replay.store.store import Store, is_store
@@ -46,7 +46,7 @@ class Origin:
     reward_parts: dict[str, float] | None = None  # what each event of the step was worth
     recording: dict[str, Any] | None = None  # the manifest of the ingest that wrote the row
     topics: list[dict[str, Any]] = field(default_factory=list)  # that the profile reads
-    messages: list[HeldMessage] = field(default_factory=list)  # held at that tick
+    messages: list[MessageAtTick] = field(default_factory=list)  # that its tick was made of
     notes: list[str] = field(default_factory=list)
 
 
@@ -62,7 +62,7 @@ def find_origin(
     Args:
         sources: the stores.
         transition: its id.
-        recording: the recording, to read the messages held at that tick.
+        recording: the recording, to read the messages that its tick was made of.
         profile: the profile that read it, where it is not a shipped one.
 
     Raises:
@@ -176,7 +176,7 @@ def _interpret(origin: Origin, recording: Path | None, name: str | None) -> None
     origin.topics = topics
     origin.recording = {key: value for key, value in manifest.items() if key not in _LEFT_OUT}
     if recording is not None and profile is not None:
-        origin.messages = held_messages(
+        origin.messages = messages_at_tick(
             recording,
             profile,
             recording_id=row["recording_id"],

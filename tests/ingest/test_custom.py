@@ -136,13 +136,13 @@ def test_lists_survive_the_table_where_some_are_null(tmp_path):
 
 
 def test_a_topic_that_is_not_there_gives_nulls_and_is_said():
-    from restock.ingest.steps.sources import stand_ins
+    from restock.ingest.steps.aligned_inputs import fallbacks_used
 
     profile = parse_profile(with_signals(signal("s", "v"), signal("l", "v[]")), where="p")
     topics = Drive().topics()
     steps = steps_of(profile, topics)
     assert steps.custom.table["s"].null_count == steps.custom.table["l"].null_count == len(steps)
-    assert stand_ins(profile, topics)["signals.s"] == "null: no message of /x"
+    assert fallbacks_used(profile, topics)["signals.s"] == "null: no message of /x"
 
 
 def test_the_future_is_not_seen():

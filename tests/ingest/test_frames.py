@@ -14,9 +14,8 @@ from restock.errors import ConfigError, RecordingError
 from restock.ingest.decoding.columns import Ragged, TopicColumns, offsets_of
 from restock.ingest.profile.profile import Clock, Frames, load_profile, parse_profile
 from restock.ingest.steps.align import NS, align
-from restock.ingest.steps.frames import Tree, rotations
+from restock.ingest.steps.frames import FIELDS, Edges, Tree, rotations
 from restock.ingest.steps.steps import steps_of
-from restock.ingest.steps.transforms import FIELDS, Edges
 
 TEXT = (ROOT / "ingest" / "profile" / "profiles" / "warehouse_amr.toml").read_text()
 SAMPLE = ROOT / "sample_logs" / "amr_monday.mcap"

@@ -17,9 +17,8 @@ from support.paths import ROOT
 
 from restock.errors import ConfigError
 from restock.ingest.pipeline import ingest
-from restock.ingest.profile.profile import load_profile
+from restock.ingest.profile.profile import Frames, load_profile
 from restock.ingest.steps.live import LiveObserver
-from restock.ingest.steps.transforms import Frames
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 from restock.train.evaluation.evaluate import GreedyPolicy

@@ -205,7 +205,7 @@ def test_without_imu_and_goal_the_stand_ins_are_used():
 def test_an_optional_topic_without_messages_is_replaced_like_one_that_is_not_there():
     import msgspec
 
-    from restock.ingest.steps.sources import stand_ins
+    from restock.ingest.steps.aligned_inputs import fallbacks_used
 
     topics = Drive().topics()
     empty = without(topics["/bumper"], np.zeros(60, np.bool_))
@@ -214,5 +214,5 @@ def test_an_optional_topic_without_messages_is_replaced_like_one_that_is_not_the
     profile = msgspec.structs.replace(PROFILE, inputs=inputs)
     steps = steps_of(profile, topics | {"/bumper": empty})
     assert set(steps.problem) == {""}
-    assert "bumper" in stand_ins(profile, topics | {"/bumper": empty})
-    assert "bumper" not in stand_ins(profile, topics)
+    assert "bumper" in fallbacks_used(profile, topics | {"/bumper": empty})
+    assert "bumper" not in fallbacks_used(profile, topics)

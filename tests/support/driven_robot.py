@@ -156,6 +156,7 @@ def write_bag(drive: Drive, folder: Path, *, storage: str = "sqlite3") -> Path:
         "/bumper": "std_msgs/msg/Bool",
         "/behaviour_policy": "std_msgs/msg/String",
         "/ground_truth/condition": "std_msgs/msg/String",
+        "/battery": "sensor_msgs/msg/BatteryState",
     }
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     with Writer(folder, version=9, storage_plugin=plugin) as writer:

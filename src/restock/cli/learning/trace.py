@@ -111,7 +111,7 @@ def _print_origin(origin: Origin, with_messages: bool) -> None:
                     "stamp_ns": message.stamp_ns,
                     "age_s": message.age_s,
                     "max_age_s": message.max_age_s,
-                    "held": "; ".join(f"{k} {_short(v)}" for k, v in message.fields.items()),
+                    "fields": "; ".join(f"{k} {_short(v)}" for k, v in message.fields.items()),
                 }
                 for message in origin.messages
             ],
@@ -124,7 +124,7 @@ def _print_origin(origin: Origin, with_messages: bool) -> None:
         output.print_table(origin.topics, columns, title="topics that were read")
         if not with_messages:
             file = origin.transition["source_file"]
-            output.say(f"--recording {file} shows the messages that were held at that tick")
+            output.say(f"--recording {file} shows the messages that it was made of")
 
 
 def _section(title: str, values: dict[str, Any] | None) -> None:

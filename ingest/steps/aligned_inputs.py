@@ -1,0 +1,286 @@
+"""A profile's inputs in a recording: their columns, and the latest message of each at every tick.
+
+Ingest, the observer on a robot and a trace all ask here which message an input has at a tick.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.errors import RecordingError
+from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns
+from restock.ingest.profile.inputs import FALLBACKS, POSE_FALLBACK, Input
+from restock.ingest.profile.profile import Profile
+from restock.ingest.steps.align import (
+    NS,
+    ClockReport,
+    ClockSegment,
+    LatestMessages,
+    Samples,
+    align,
+    ticks_of,
+)
+from restock.ingest.steps.frames import FRAME_ID, Edges, Placement, Tree, plain
+from restock.ingest.task.signals import yaw_of
+
+F64 = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+# A handover is announced on the tick it takes force; its message may arrive a moment later. Used
+# for provenance alone, never for what the robot knew.
+PROVENANCE_LEAD_S = 0.1
+
+
+class InputColumns:
+    """The inputs of a profile that a recording has, and their columns."""
+
+    def __init__(self, profile: Profile, topics: Mapping[str, TopicColumns]) -> None:
+        self.topics = topics
+        self.placed: dict[str, Placement] = {}  # of each message of an input in another frame
+        self.by_name = {
+            name: source
+            for name, source in profile.inputs.items()
+            if source.topic in topics and not (source.optional and not len(topics[source.topic]))
+        }
+
+    def present(self, name: str) -> Input | None:
+        """The input, if the profile names it and the recording has its topic."""
+        return self.by_name.get(name)
+
+    def column(self, name: str, key: str) -> FieldColumn:
+        """A field of an input as it was read."""
+        source = self.by_name[name]
+        return self.topics[source.topic].fields[source.fields[key]]
+
+    def numbers(self, name: str, key: str) -> F64:
+        """A field of an input, one number a message (N,)."""
+        if key == "yaw_rad" and "orientation" in self.by_name[name].fields:
+            return self._yaw(name)
+        column = self.column(name, key)
+        if isinstance(column, Ragged) or column.ndim != 1 or column.dtype.kind not in "biuf":
+            source = self.by_name[name]
+            raise RecordingError(
+                f"{source.fields[key]!r} of {source.topic} is not one number a message",
+                remedy=f"mend `inputs.{name}.fields.{key}` in the profile",
+            )
+        return np.asarray(column, np.float64)
+
+    def texts(self, name: str) -> list[str]:
+        """The text of an input, one a message."""
+        return [str(text) for text in np.asarray(self.column(name, "text"), object)]
+
+    @cached_property
+    def plans(self) -> list[F64]:
+        """Each plan's points (P, 2); P is 0 where the planner found none."""
+        x, y = self.column("plan", "x_m"), self.column("plan", "y_m")
+        points = [
+            np.stack([np.asarray(x[row], np.float64), np.asarray(y[row], np.float64)], axis=-1)
+            for row in range(len(x))
+        ]
+        if "plan" not in self.placed:
+            return points
+        at = self.placed["plan"]
+        return [
+            plan @ at.rotation[row, :2, :2].T + at.translation_m[row, :2]
+            for row, plan in enumerate(points)
+        ]
+
+    @cached_property
+    def goals(self) -> F64:
+        """Each goal (G, 2)."""
+        goals = np.stack([self.numbers("goal", axis) for axis in ("x_m", "y_m")], axis=1)
+        if "goal" not in self.placed:
+            return goals
+        at = self.placed["goal"]
+        return np.asarray(
+            np.einsum("nij,nj->ni", at.rotation[:, :2, :2], goals) + at.translation_m[:, :2]
+        )
+
+    def frames_of(self, name: str) -> list[str]:
+        """The frame that each message of an input is in; empty where messages do not say."""
+        source = self.by_name.get(name)
+        column = None if source is None else self.topics[source.topic].fields.get(FRAME_ID)
+        if column is None:
+            return []
+        return [plain(str(frame)) for frame in np.asarray(column, object)]
+
+    def _yaw(self, name: str) -> F64:
+        """Quaternions (N,) to yaw in (-pi, pi], REP 103: about z, counter-clockwise."""
+        source = self.by_name[name]
+        fields = self.topics[source.topic].fields
+        path = source.fields["orientation"]
+        x, y, z, w = (np.asarray(fields[f"{path}.{axis}"], np.float64) for axis in "xyzw")
+        return yaw_of(x, y, z, w)
+
+
+@dataclass(frozen=True)
+class AlignedInputs:
+    """A profile's inputs on the alignment clock, and the ticks of the control clock on it."""
+
+    profile: Profile
+    inputs: InputColumns
+    segments: Sequence[ClockSegment]
+    ticks: Sequence[Ints]  # of each segment; T together
+    tree: Tree | None = None  # of the frames, where the profile has any
+    clock: ClockReport = field(default_factory=lambda: ClockReport(""))
+    commands_between: int = 0  # commands that got no tick of their own
+    notes: Sequence[str] = ()  # what is odd about the frames
+
+    def at(self, tick: int, stamp_ns: int) -> AlignedInputs | None:
+        """The same inputs at one tick alone, or None where that tick is at another time."""
+        ends = np.cumsum([len(stamps) for stamps in self.ticks])
+        segment = int(np.searchsorted(ends, tick, "right"))
+        stamps = np.concatenate(self.ticks)[tick : tick + 1]
+        if stamps.tolist() != [stamp_ns]:
+            return None
+        ticks = [stamps if index == segment else stamps[:0] for index in range(len(ends))]
+        return replace(self, ticks=ticks)
+
+    def latest(self, name: str) -> LatestMessages:
+        """The latest message of an input at each tick; its age is below 0 where it comes later.
+
+        What the robot knew lies at or before the tick. The command of a fixed rate, and what only
+        says where a row comes from, may come a moment later.
+        """
+        source, lead_ns = self.inputs.by_name[name], round(self._lead_s(name) * NS)
+        latest = self.latest_of(source.topic, source.max_age_s, lead_ns=lead_ns)
+        return replace(latest, age_ns=latest.age_ns - np.where(latest.known, lead_ns, 0))
+
+    def latest_of(
+        self,
+        topic: str,
+        max_age_s: float | None,
+        *,
+        lead_ns: int = 0,
+        keep: Bools | None = None,
+    ) -> LatestMessages:
+        """The latest message of a topic at each tick (or a lead after it); of those to `keep`."""
+        parts = []
+        for segment, stamps in zip(self.segments, self.ticks, strict=True):
+            samples = segment.topics[topic]
+            if keep is not None:
+                chosen = keep[samples.row]
+                samples = Samples(samples.stamp_ns[chosen], samples.row[chosen])
+            parts.append(samples.hold(stamps + lead_ns, max_age_s))
+        return LatestMessages.join(parts)
+
+    def _lead_s(self, name: str) -> float:
+        """How much after a tick an input's message may be measured."""
+        half_s, by_rate = self.profile.task.control_period_s / 2, self.profile.clock.steps == "rate"
+        leads = {
+            # At a fixed rate a command lands anywhere in the interval: the one in force for most
+            # of it is the one in force at its middle. On the command clock it opens the interval.
+            "command": half_s if by_rate else 0.0,
+            "true_condition": half_s,  # the message nearest to the tick
+            "behaviour_policy": PROVENANCE_LEAD_S,
+            "perturbation": PROVENANCE_LEAD_S,
+        }
+        return leads.get(name, 0.0)
+
+
+def align_inputs(profile: Profile, topics: Mapping[str, TopicColumns]) -> AlignedInputs:
+    """The inputs in a recording's columns (those `wanted_fields` asks for) on one clock.
+
+    Raises:
+        RecordingError: the alignment clock is `header.stamp` and no topic has one, or no
+            transform leads to the pose.
+    """
+    inputs = InputColumns(profile, topics)
+    edges = transforms_of(profile, inputs)
+    ages = [(source.topic, source.max_age_s) for source in inputs.by_name.values()]
+    ages += [(signal.topic, signal.max_age_s) for signal in profile.signals.values()]
+    latched = {topic for topic, age in ages if age is None}
+    latched -= {topic for topic, age in ages if age is not None}
+    segments, report = align(
+        {**topics, **edges.topics},
+        profile.clock,
+        edges.static.union(latched),
+        frozenset(edges.topics),
+    )
+    ticks, between = [], 0
+    for segment in segments:
+        end = max((int(s.stamp_ns[-1]) for s in segment.topics.values() if len(s.row)), default=0)
+        command = segment.topics[profile.inputs.command.topic]
+        stamps, extra = ticks_of(command, profile.clock, profile.task.control_period_s, end)
+        ticks.append(stamps)
+        between += extra
+    tree = Tree(profile.frames, edges, segments) if profile.frames else None
+    if tree is not None:
+        place_messages(inputs, tree, segments)
+    notes = frame_notes(profile, inputs, edges)
+    return AlignedInputs(profile, inputs, segments, ticks, tree, report, between, notes)
+
+
+def fallbacks_used(profile: Profile, topics: Mapping[str, TopicColumns]) -> dict[str, str]:
+    """Inputs and signals that this recording does not fill -> what is used instead of each."""
+    absent = {
+        name: FALLBACKS.get(name, POSE_FALLBACK)
+        for name, source in profile.inputs.items()
+        if source.optional and not (source.topic in topics and len(topics[source.topic]))
+    }
+    silent = {
+        f"signals.{name}": f"null: no message of {signal.topic}"
+        for name, signal in profile.signals.items()
+        if not (signal.topic in topics and len(topics[signal.topic]))
+    }
+    return profile.fallbacks | absent | silent
+
+
+def transforms_of(profile: Profile, inputs: InputColumns) -> Edges:
+    """The transforms that the pose, goals and plans need; none where the profile has no frames.
+
+    Raises:
+        RecordingError: the pose is to come from them, and none of them joins its two frames.
+    """
+    frames = profile.frames
+    if frames is None:
+        return Edges({}, frozenset(), {})
+    edges = Edges.of(frames, inputs.topics)
+    if inputs.present("pose") is None and (why := edges.missing(frames.base, frames.fixed)):
+        raise RecordingError(
+            why, remedy="mend `frames` in the profile; see `restock profile check`"
+        )
+    named = {frame for name in ("goal", "plan") for frame in inputs.frames_of(name)}
+    return edges.only({frames.base, frames.fixed, *named})
+
+
+def place_messages(inputs: InputColumns, tree: Tree, segments: Sequence[ClockSegment]) -> None:
+    """Find where in the fixed frame goals and plans are that were given in another one."""
+    fixed = plain(tree.frames.fixed)
+    for name in ("goal", "plan"):
+        frames = np.array([*inputs.frames_of(name), None], object)[:-1]
+        others = sorted(set(frames.tolist()) - {fixed, ""})
+        if not others:
+            continue
+        at = inputs.placed[name] = Placement.nowhere(len(frames))
+        topic = inputs.by_name[name].topic
+        for frame in others:
+            samples = [segment.topics[topic] for segment in segments]
+            inside = [frames[one.row] == frame for one in samples]
+            times = [one.stamp_ns[keep] for one, keep in zip(samples, inside, strict=True)]
+            rows = np.concatenate(
+                [one.row[keep] for one, keep in zip(samples, inside, strict=True)]
+            )
+            # A latched message stands again at the start of later segments: the first counts.
+            at.fill(rows[::-1], tree.place(frame, times), slice(None, None, -1))
+
+
+def frame_notes(profile: Profile, inputs: InputColumns, edges: Edges) -> list[str]:
+    """What is odd about the frames of a recording."""
+    notes = []
+    if edges.parent_changes:
+        notes.append(f"transforms: a frame was given another parent {edges.parent_changes} times")
+    if profile.frames is None:
+        frames = sorted({*inputs.frames_of("goal"), *inputs.frames_of("plan")} - {""})
+        if len(frames) > 1:
+            notes.append(
+                f"goals and plans are in the frames {', '.join(frames)}, and are taken as if in"
+                " one: the profile has no [frames]"
+            )
+    return notes
