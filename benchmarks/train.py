@@ -43,7 +43,8 @@ from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.dqn.learner import Learner
 from restock.train.dqn.manual_backprop import UpdatePath
 from restock.train.feed.batch_record import FeedRecord
-from restock.train.feed.batches import Batches, Coded, Logs
+from restock.train.feed.batches import Batches
+from restock.train.feed.logs import Coded, Logs
 from restock.train.run.run import Run
 
 TARGETS = {"cleanrl": 1.6, "stable_baselines3": 1.9}  # times Restock's update, at least

@@ -77,7 +77,9 @@ def restock(steps: int, seed: int, *, layer_norm: bool) -> Stretch:
         try:
             train(
                 session,
-                stop=lambda: stretch.over(session.clock.env_steps, session.learner.gradient_steps),
+                stop=lambda: stretch.over(
+                    session.progress.env_steps, session.learner.gradient_steps
+                ),
             )
         except TrainingInterrupted:  # as it was asked to be
             pass

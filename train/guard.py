@@ -6,14 +6,16 @@ So every evaluation is compared with the kept one condition by condition.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
-from restock.train.dqn import checkpoint
 from restock.train.dqn.config import GuardConfig
 from restock.train.dqn.learner import Learner
 from restock.train.evaluation.evaluate import Score
+from restock.train.run import checkpoint
 from restock.train.run.run import Run
+from restock.train.session import Session
 
 
 @dataclass(frozen=True)
@@ -29,15 +31,31 @@ def falls(now: Score, best: Score | None, config: GuardConfig) -> list[Fall]:
     """The conditions in which `now` is worse than the kept policy by the margin or more."""
     if best is None or config.margin is None:
         return []
-    asked = config.conditions or tuple(best.success)
+    watched = config.conditions or tuple(best.success)
     return [
         Fall(name, best.success[name], now.success[name])
-        for name in asked
+        for name in watched
         if name in best.success and best.success[name] - now.success[name] >= config.margin - 1e-9
     ]
 
 
-def roll_back(learner: Learner, run: Run) -> None:
+def enforce(session: Session, fallen: Sequence[Fall]) -> str:
+    """A condition was unlearnt: go back to the kept policy, or stop. Returns the action taken."""
+    config, progress = session.config.guard, session.progress
+    goes_back = config.action == "rollback" and progress.rollbacks < config.rollbacks
+    action = "rollback" if goes_back else "stop"
+    rows = [{**session.steps, **asdict(fall), "action": action} for fall in fallen]
+    session.run.append("guard", rows)
+    if goes_back:
+        _roll_back(session.learner, session.run)
+        progress.rollbacks += 1
+    else:
+        progress.stopped = True
+    session.run.flush(everything=False)
+    return action
+
+
+def _roll_back(learner: Learner, run: Run) -> None:
     """Put the kept policy into all networks and forget the optimizer's moments.
 
     The ring, the twin and every generator go on: experience of the worse policy is experience.
@@ -48,4 +66,4 @@ def roll_back(learner: Learner, run: Run) -> None:
     learner.optimizer.state.clear()
 
 
-__all__ = ["Fall", "falls", "roll_back"]
+__all__ = ["Fall", "enforce", "falls"]

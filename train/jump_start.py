@@ -16,11 +16,11 @@ import torch
 from numpy.typing import NDArray
 
 from restock.errors import ConfigError
-from restock.train.dqn.checkpoint import generator_state, restore_generator
 from restock.train.dqn.config import JumpStartConfig
 from restock.train.dqn.fitted_q import FittedQConfig, chances, cloned_behaviour
 from restock.train.dqn.network import QNetwork
-from restock.train.feed.batches import Logs
+from restock.train.feed.logs import Logs
+from restock.train.run.checkpoint import generator_state, restore_generator
 
 POLICIES = ("dqn", "cloned")  # who acts, by its code in the ring
 Ints = NDArray[np.int64]

@@ -8,7 +8,7 @@ arXiv:2412.07762). Read `train` from top to bottom: it is the whole of it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ from restock.train.evaluation.ope import OpeConfig, evaluate_off_policy, measure
 from restock.train.evaluation.ope_dataset import load_ope_dataset
 from restock.train.feed.batches import Batch
 from restock.train.feed.probe import Probe
-from restock.train.guard import Fall, falls, roll_back
+from restock.train.guard import enforce, falls
 from restock.train.session import Interval, Session
 from restock.train.twin.env.interface import epsilon_greedy
 
@@ -41,7 +41,7 @@ class TrainingInterrupted(RestockError):
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TrainResult:
     """How a run ended."""
 
     env_steps: int
@@ -58,7 +58,7 @@ def train(
     *,
     stop: Callable[[], bool] = lambda: False,
     notify: Notify = lambda event, values: None,
-) -> Outcome:
+) -> TrainResult:
     """Run a session to the end of its budget.
 
     Args:
@@ -68,7 +68,7 @@ def train(
     Raises:
         TrainingInterrupted: `stop` said so.
     """
-    config, clock, learner = session.config, session.clock, session.learner
+    config, progress, learner = session.config, session.progress, session.learner
     schedule, epsilon_at = config.schedule, config.epsilon.at
     offline_updates = schedule.offline_updates if session.logs is not None else 0
 
@@ -76,24 +76,24 @@ def train(
     while learner.gradient_steps < offline_updates and _time_left(session):
         _interrupt(session, stop)
         _update(session, session.batches.draw_offline(), "offline", notify)
-    if clock.evaluated_at < 0 and offline_updates:
+    if progress.evaluated_at < 0 and offline_updates:
         if session.interval.updates:
             _close_interval(session, "offline", notify)
         if config.evaluation.off_policy:
             _evaluate_off_policy(session)  # on held-out logs, before it drives
         _evaluate(session, notify)
 
-    while clock.env_steps < schedule.env_steps and _time_left(session) and not clock.stopped:
+    while progress.env_steps < schedule.env_steps and _time_left(session) and not progress.stopped:
         _interrupt(session, stop)
         # 2. Warm-up: the offline policy drives, and nothing is learnt from its rows yet.
-        warm = clock.env_steps >= schedule.warmup_env_steps
-        if clock.online_from is None and warm and len(session.ring) >= config.replay.batch_size:
-            clock.online_from = clock.env_steps
+        warm = progress.env_steps >= schedule.warmup_env_steps
+        if progress.online_from is None and warm and len(session.ring) >= config.replay.batch_size:
+            progress.online_from = progress.env_steps
             _close_interval(session, "warmup", notify)
 
         # 3. Act, epsilon-greedy; the twin steps on its own thread …
         greedy = learner.greedy(session.collector.observation)
-        epsilon = epsilon_at(clock.env_steps)
+        epsilon = epsilon_at(progress.env_steps)
         action, probability = epsilon_greedy(
             greedy, learner.network.actions, epsilon, session.exploration
         )
@@ -105,22 +105,22 @@ def train(
                 probability,
                 session.collector.observation,
                 session.collector.steps,
-                clock.env_steps,
+                progress.env_steps,
             )
         session.collector.start(action, probability, policy)
 
         # 4. … while the learner learns from what the ring held before this step.
         for _ in range(_updates_due(session)):
-            _update(session, session.batches.draw_online(clock.env_steps), "online", notify)
-            clock.online_updates += 1
+            _update(session, session.batches.draw_online(progress.env_steps), "online", notify)
+            progress.online_updates += 1
 
         # 5. The step's transitions go into the ring; ended episodes get their labels.
         ended = session.collector.finish(
-            env_steps=clock.env_steps,
+            env_steps=progress.env_steps,
             gradient_steps=learner.gradient_steps,
             acting_step=acting_step,
         )
-        clock.env_steps += session.env.num_envs
+        progress.env_steps += session.env.num_envs
         for episode in ended:
             session.interval.episodes += 1
             session.interval.successes += episode.success
@@ -128,41 +128,42 @@ def train(
         session.run.append("episodes", session.collector.label())
 
         # 6. Every so often: the fixed episodes, greedily; and a checkpoint.
-        if clock.env_steps - max(clock.evaluated_at, 0) >= config.evaluation.every_env_steps:
+        if progress.env_steps - max(progress.evaluated_at, 0) >= config.evaluation.every_env_steps:
             _evaluate(session, notify)
         if (
-            clock.env_steps - clock.checkpointed_at >= config.record.checkpoint_every_env_steps
-            and clock.env_steps < schedule.env_steps
+            progress.env_steps - progress.checkpointed_at
+            >= config.record.checkpoint_every_env_steps
+            and progress.env_steps < schedule.env_steps
         ):
             session.save()
 
     session.run.append("episodes", session.collector.label(all_of_them=True))
-    if session.interval.updates or clock.env_steps > session.interval.env_steps_before:
-        _close_interval(session, "warmup" if clock.online_from is None else "online", notify)
-    if clock.evaluated_at != clock.env_steps:
+    if session.interval.updates or progress.env_steps > session.interval.env_steps_before:
+        _close_interval(session, "warmup" if progress.online_from is None else "online", notify)
+    if progress.evaluated_at != progress.env_steps:
         _evaluate(session, notify)
     session.save()
-    return Outcome(
-        clock.env_steps,
+    return TrainResult(
+        progress.env_steps,
         learner.gradient_steps,
         session.wall_s,
         session.best,
         session.last,
-        clock.stopped,
-        clock.rollbacks,
+        progress.stopped,
+        progress.rollbacks,
     )
 
 
 def _updates_due(session: Session) -> int:
-    clock = session.clock
-    if clock.online_from is None:
+    progress = session.progress
+    if progress.online_from is None:
         return 0
-    collected = clock.env_steps + session.env.num_envs - clock.online_from
-    return int(collected * session.config.schedule.updates_per_env_step) - clock.online_updates
+    collected = progress.env_steps + session.env.num_envs - progress.online_from
+    return int(collected * session.config.schedule.updates_per_env_step) - progress.online_updates
 
 
 def _update(session: Session, batch: Batch, phase: str, notify: Notify) -> None:
-    """One gradient step, its record, and the target's clock."""
+    """One gradient step, its record, and the target's progress."""
     learner, interval = session.learner, session.interval
     expert, return_to_go = session.log_terms.rows(batch.log_rows)
     loss = learner.update(
@@ -174,7 +175,7 @@ def _update(session: Session, batch: Batch, phase: str, notify: Notify) -> None:
         expert=expert,
     )
     step = learner.gradient_steps
-    session.feed.batch(step, session.clock.env_steps, batch, loss, learner.target.last_sync)
+    session.feed.batch(step, session.progress.env_steps, batch, loss, learner.target.last_sync)
     session.batches.learnt(batch, loss.td)
     interval.updates += 1
     interval.loss += float(loss.value.detach())
@@ -193,37 +194,36 @@ def _update(session: Session, batch: Batch, phase: str, notify: Notify) -> None:
 
 def _conservative_weight(session: Session, phase: str) -> float:
     """The CQL term's weight: constant offline, then linear to its online end."""
-    loss, clock = session.config.loss, session.clock
-    if phase == "offline" or clock.online_from is None:
+    loss, progress = session.config.loss, session.progress
+    if phase == "offline" or progress.online_from is None:
         return loss.conservative
-    part = min((clock.env_steps - clock.online_from) / loss.conservative_steps, 1.0)
+    part = min((progress.env_steps - progress.online_from) / loss.conservative_steps, 1.0)
     return loss.conservative + part * (loss.conservative_online - loss.conservative)
 
 
 def _close_interval(session: Session, phase: str, notify: Notify) -> None:
     """One row of `progress`, with the feed's sums and the probe's measures."""
-    clock, learner, interval = session.clock, session.learner, session.interval
-    clocks = {"env_steps": clock.env_steps, "gradient_steps": learner.gradient_steps}
-    means = session.feed.flush(clock.env_steps, learner.gradient_steps, phase)
+    progress, learner, interval = session.progress, session.learner, session.interval
+    means = session.feed.flush(progress.env_steps, learner.gradient_steps, phase)
     if session.probe is None and phase == "online":
         session.probe = Probe.of_ring(session.ring, session.config.record.probe_rows)
     lag = None
     if session.probe is not None:
         measured, lag = session.probe.measure(learner)
-        session.run.append("probe", [{**clocks, **row} for row in measured])
+        session.run.append("probe", [{**session.steps, **row} for row in measured])
     before_sync = interval.distance_before_sync is not None
     wall_s = session.wall_s
     elapsed_s = max(wall_s - interval.wall_s_before, 1e-9)
-    steps = clock.env_steps - interval.env_steps_before
+    steps = progress.env_steps - interval.env_steps_before
     episodes = interval.episodes
     row = {
-        **clocks,
+        **session.steps,
         **means,
         "wall_s": wall_s,
         "phase": phase,
         "updates": interval.updates,
         "loss": interval.loss / interval.updates if interval.updates else None,
-        "epsilon": session.config.epsilon.at(clock.env_steps) if phase != "offline" else None,
+        "epsilon": session.config.epsilon.at(progress.env_steps) if phase != "offline" else None,
         "target_rule": str(learner.target.rule),
         "target_param_distance": interval.distance_before_sync
         if before_sync
@@ -240,10 +240,10 @@ def _close_interval(session: Session, phase: str, notify: Notify) -> None:
         "updates_per_s": interval.updates / elapsed_s,
     }
     session.run.append("progress", [row])
-    session.run.append("shares", [{**clocks, **row} for row in session.batches.describe()])
+    session.run.append("shares", [{**session.steps, **row} for row in session.batches.describe()])
     session.run.flush(everything=False)
-    session.events.scalars(clock.env_steps, "train", row)
-    session.interval = Interval(env_steps_before=clock.env_steps, wall_s_before=wall_s)
+    session.events.scalars(progress.env_steps, "train", row)
+    session.interval = Interval(env_steps_before=progress.env_steps, wall_s_before=wall_s)
     notify("progress", row)
 
 
@@ -259,20 +259,18 @@ def _evaluate_off_policy(session: Session) -> None:
         measures=measures_of(session.task),
         config=OpeConfig(seed=config.seed),
     )
-    clocks = {"env_steps": session.clock.env_steps, "gradient_steps": learner.gradient_steps}
-    session.run.append("off_policy", [{**clocks, **row} for row in rows])
+    session.run.append("off_policy", [{**session.steps, **row} for row in rows])
 
 
 def _evaluate(session: Session, notify: Notify) -> None:
     """The fixed episodes, greedily; the policy is kept if it is the best so far."""
-    config, clock, learner = session.config, session.clock, session.learner
+    config, progress, learner = session.config, session.progress, session.learner
     names = list(config.env.conditions)  # also those with a share of 0: never trained on, yet met
     specs = fixed_episodes(names, config.evaluation.episodes, config.evaluation.seed)
     results = session.evaluation_buffer.drive(GreedyPolicy(learner.policy_network), specs)
     measured = session.evaluation_buffer.measure(learner)
-    clocks = {"env_steps": clock.env_steps, "gradient_steps": learner.gradient_steps}
-    session.run.append("held_out", [{**clocks, **row} for row in measured])
-    clock.evaluated_at = clock.env_steps
+    session.run.append("evaluation_buffer", [{**session.steps, **row} for row in measured])
+    progress.evaluated_at = progress.env_steps
     session.last = score(results)
     best = session.last.beats(session.best)
     if best:
@@ -280,30 +278,14 @@ def _evaluate(session: Session, notify: Notify) -> None:
         session.save_best(session.last)
     session.run.append(
         "evaluations",
-        [{**clocks, **result.row, "best": best} for result in results],
+        [{**session.steps, **result.row, "best": best} for result in results],
     )
     session.run.flush(everything=False)
     summary = {**session.last.success, "mean": session.last.success_mean}
-    session.events.scalars(clock.env_steps, "evaluation", summary)
-    notify("evaluation", {"env_steps": clock.env_steps, "best": best, **summary})
+    session.events.scalars(progress.env_steps, "evaluation", summary)
+    notify("evaluation", {"env_steps": progress.env_steps, "best": best, **summary})
     if fallen := falls(session.last, session.best, config.guard):
-        _guard(session, fallen, notify)
-
-
-def _guard(session: Session, fallen: list[Fall], notify: Notify) -> None:
-    """A condition was unlearnt: go back to the kept policy, or stop."""
-    guard, clock, learner = session.config.guard, session.clock, session.learner
-    again = guard.action == "rollback" and clock.rollbacks < guard.rollbacks
-    action = "rollback" if again else "stop"
-    clocks = {"env_steps": clock.env_steps, "gradient_steps": learner.gradient_steps}
-    session.run.append("guard", [{**clocks, **asdict(fall), "action": action} for fall in fallen])
-    if again:
-        roll_back(learner, session.run)
-        clock.rollbacks += 1
-    else:
-        clock.stopped = True
-    session.run.flush(everything=False)
-    notify("guard", {"action": action, "falls": fallen})
+        notify("guard", {"action": enforce(session, fallen), "falls": fallen})
 
 
 def _time_left(session: Session) -> bool:
@@ -315,7 +297,7 @@ def _interrupt(session: Session, stop: Callable[[], bool]) -> None:
     if stop():
         session.save()
         raise TrainingInterrupted(
-            f"interrupted after {session.clock.env_steps:,} environment steps and"
+            f"interrupted after {session.progress.env_steps:,} environment steps and"
             f" {session.learner.gradient_steps:,} updates; a checkpoint was written",
             where=str(session.run.path),
             remedy=f"go on with `restock train --resume {session.run.path}`",

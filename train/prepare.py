@@ -18,8 +18,8 @@ from restock.train.dqn.config import TrainConfig, apply_overrides, load_config, 
 from restock.train.dqn.learner import open_device
 from restock.train.dqn.manual_backprop import update_path
 from restock.train.dqn.target import describe
-from restock.train.feed.batches import Logs
-from restock.train.run.kept_checkpoints import check_earlier, go_back
+from restock.train.feed.logs import Logs
+from restock.train.run.checkpoint import check_earlier, go_back
 from restock.train.run.run import Run, check_free, now_ns, panel_document, software_versions
 from restock.train.session import Session, open_session
 from restock.train.twin.env.floor_report import refuse_unfit, sealed

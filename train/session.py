@@ -19,26 +19,25 @@ from restock.errors import RunError
 from restock.ingest.task.conditions import Condition
 from restock.ingest.task.task import Task
 from restock.replay.ring.ring import FreshRing
-from restock.train.dqn import checkpoint
 from restock.train.dqn.config import TrainConfig
 from restock.train.dqn.learner import Learner
 from restock.train.evaluation.evaluate import Score
 from restock.train.evaluation.evaluation_buffer import EvaluationBuffer
 from restock.train.feed.batch_record import FeedRecord
-from restock.train.feed.batches import Batches, Logs
+from restock.train.feed.batches import Batches
 from restock.train.feed.collector import Collector, ring_conditions
 from restock.train.feed.log_fidelity import LogFidelity
-from restock.train.feed.log_terms import LogTerms
+from restock.train.feed.logs import Logs, LogTerms
 from restock.train.feed.probe import Probe
 from restock.train.jump_start import POLICIES, JumpStart
-from restock.train.run.events import Events
-from restock.train.run.kept_checkpoints import earlier, keep
-from restock.train.run.run import Run
+from restock.train.run import checkpoint
+from restock.train.run.checkpoint import earlier, keep
+from restock.train.run.run import Events, Run
 from restock.train.twin.env.interface import Twin
 
 
 @dataclass
-class Clock:
+class Progress:
     """Where the run is. Gradient steps are the learner's."""
 
     env_steps: int = 0
@@ -87,7 +86,7 @@ class Session:
     logs: Logs | None
     log_terms: LogTerms
     jump_start: JumpStart | None
-    clock: Clock = field(default_factory=Clock)
+    progress: Progress = field(default_factory=Progress)
     interval: Interval = field(default_factory=Interval)
     best: Score | None = None
     last: Score | None = None
@@ -96,19 +95,27 @@ class Session:
     @property
     def wall_s(self) -> float:
         """Seconds of training, over all processes of the run."""
-        return self.clock.wall_s + time.monotonic() - self._started
+        return self.progress.wall_s + time.monotonic() - self._started
+
+    @property
+    def steps(self) -> dict[str, int]:
+        """The two clocks of a run, with which every row of its tables begins."""
+        return {
+            "env_steps": self.progress.env_steps,
+            "gradient_steps": self.learner.gradient_steps,
+        }
 
     def save(self) -> None:
         """Write all state to the run's latest checkpoint, and the tables to match it."""
-        keep(self.run.latest, self.clock.checkpointed_at, self.config.record.keep_checkpoints)
-        self.clock.checkpointed_at = self.clock.env_steps
+        keep(self.run.latest, self.progress.checkpointed_at, self.config.record.keep_checkpoints)
+        self.progress.checkpointed_at = self.progress.env_steps
         self.run.flush()
         self.events.flush()
-        clock = asdict(self.clock) | {"wall_s": self.wall_s}
+        progress = asdict(self.progress) | {"wall_s": self.wall_s}
         checkpoint.save(
             self.run.latest,
             {
-                "clock": clock,
+                "progress": progress,
                 "interval": asdict(self.interval),
                 "best": asdict(self.best) if self.best else None,
                 "last": asdict(self.last) if self.last else None,
@@ -128,7 +135,7 @@ class Session:
     def restore(self) -> None:
         """Go on from the run's latest checkpoint."""
         state = self._latest()
-        self.clock = Clock(**state["clock"])
+        self.progress = Progress(**state["progress"])
         self.interval = Interval(**state["interval"])
         self.best = Score(**state["best"]) if state["best"] else None
         self.last = Score(**state["last"]) if state["last"] else None
@@ -166,7 +173,7 @@ class Session:
                 "observation_size": self.learner.network.observation_size,
                 "actions": self.learner.network.actions,
                 "task_hash": self.task.hash,
-                "env_steps": self.clock.env_steps,
+                "env_steps": self.progress.env_steps,
                 "gradient_steps": self.learner.gradient_steps,
                 "score": asdict(results),
             },
@@ -257,6 +264,6 @@ def open_session(
     session.events = Events(
         run.path / "tensorboard",
         enabled=config.record.tensorboard,
-        from_step=session.clock.env_steps if resume else None,
+        from_step=session.progress.env_steps if resume else None,
     )
     return session

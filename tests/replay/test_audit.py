@@ -395,7 +395,7 @@ def test_strata_of_few_episodes_are_found_in_a_panel_and_in_a_run(
         {"source": "logs", "stratum": stratum, "episode": episode, "drawn_rows": count}
         for stratum, episode, count in drawn
     ]
-    pq.write_table(pa.Table.from_pylist(rows), run / "fed_episodes.parquet")
+    pq.write_table(pa.Table.from_pylist(rows), run / "sampled_episodes.parquet")
     with open_place(store_path, beside={"run": run}) as connection:
         (finding,) = run_audits(connection, [AUDITS[name]], chosen, beside=["run"])
     assert [(row["stratum"], row["episodes"]) for row in finding.sample] == [("wheel_slip", 3)]

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from restock.errors import MixtureError, PanelError
 from restock.replay.sampling.chunked import ChunkedSampler
 from restock.replay.sampling.row_file import RowFile
-from restock.train.dqn import checkpoint
+from restock.train.run import checkpoint
 
 WIDTH = 5
 

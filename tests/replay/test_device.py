@@ -13,7 +13,7 @@ from scipy import stats
 from restock.errors import MixtureError
 from restock.replay.sampling.device import DeviceSampler
 from restock.replay.sampling.priorities import Lap, Per, Rule
-from restock.train.dqn import checkpoint
+from restock.train.run import checkpoint
 
 STRATA = [np.arange(0, 400, 2), np.arange(1, 101, 2)]  # 200 and 50 rows
 SHARES = [0.7, 0.3]

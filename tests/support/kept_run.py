@@ -10,9 +10,9 @@ import torch
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
 from restock.replay.panel.panel import Panel
-from restock.train.dqn import checkpoint
 from restock.train.dqn.config import NetworkConfig, TrainConfig
 from restock.train.dqn.network import Network, make_network
+from restock.train.run import checkpoint
 from restock.train.run.run import Run, panel_document
 
 TASK = load_profile("warehouse_amr").task

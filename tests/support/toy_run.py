@@ -12,7 +12,7 @@ import torch
 
 from restock.replay.mixture.packed_row import row_width
 from restock.train.dqn.config import TrainConfig, parse_config
-from restock.train.feed.batches import Coded, Logs
+from restock.train.feed.logs import Coded, Logs
 from restock.train.loop import train
 from restock.train.run.run import Run
 from restock.train.run.run_tables import TABLES

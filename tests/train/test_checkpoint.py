@@ -10,7 +10,7 @@ import torch
 from safetensors.torch import save_file
 
 from restock.errors import RunError
-from restock.train.dqn import checkpoint
+from restock.train.run import checkpoint
 
 
 def test_everything_comes_back_exactly(tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ def make_run(
         clocks = {"env_steps": ENV_STEPS * part // 10, "gradient_steps": updates * part // 10}
         for stratum, share in (("nominal", 1 - slip_share), ("wheel_slip", slip_share)):
             run.append_columns(
-                "fed_episodes",
+                "sampled_episodes",
                 {
                     **clocks,
                     "source": "logs",
@@ -76,7 +76,7 @@ def make_run(
             )
         count = fresh_episodes // 10
         run.append_columns(
-            "fed_episodes",
+            "sampled_episodes",
             {
                 **clocks,
                 "source": "fresh",

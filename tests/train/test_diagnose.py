@@ -45,17 +45,17 @@ def make_run(
             share = (shares or SHARES).get(name, 0.0) if ill else SHARES[name]
             here = gap.get(name, 1.2) if isinstance(gap, Mapping) else gap
             replay_td = 0.2 if share else None
-            held_out = 0.2 * (here if ill else 1.2)
+            unseen = 0.2 * (here if ill else 1.2)
             run.append(
-                "held_out",
+                "evaluation_buffer",
                 [
                     {
                         **clocks,
                         "condition": name,
                         "rows": 200,
                         "rows_met": round(SHARES[name] * 1000),
-                        "td_abs_mean": held_out,
-                        "td_online_abs_mean": held_out * (clock if ill else 1.0),
+                        "td_abs_mean": unseen,
+                        "td_online_abs_mean": unseen * (clock if ill else 1.0),
                         "explained": explained,
                         "q_abs_mean": 1.0,
                         "q_lag": lag if ill else 0.05,

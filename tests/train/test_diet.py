@@ -23,7 +23,8 @@ from restock.replay.panel.strata import rules_of
 from restock.replay.ring.ring import FreshRing
 from restock.replay.sampling.per import sampler_by_rules
 from restock.replay.sampling.share_controller import PlannedDraws, SampledStratum, ShareController
-from restock.train.feed.batches import Batches, Logs
+from restock.train.feed.batches import Batches
+from restock.train.feed.logs import Logs
 from restock.train.loop import TrainingInterrupted, train
 from restock.train.session import Session
 

@@ -20,10 +20,10 @@ from restock.ingest.store.writer import StoreWriter
 from restock.replay.mixture.mixture import load_mixture
 from restock.replay.panel.build import build_panel
 from restock.replay.ring.ring import FreshRing
-from restock.train.dqn import checkpoint
 from restock.train.feed.collector import Collector, ring_conditions
 from restock.train.feed.fresh_log import FreshLog, episode_files
 from restock.train.flush_fresh import flush
+from restock.train.run import checkpoint
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.perturbation import Schedule
 

@@ -46,7 +46,7 @@ def test_dqn_leaves_a_run_that_says_what_it_was_fed(tmp_path: Path) -> None:
     assert known["arguments"]["gamma"] == run.document["config"]["loss"]["discount"]
     updates = run.table("progress")["gradient_steps"][-1].as_py()
     assert updates == 60  # (160 - 40) environment steps, one update every second one
-    fed = run.table("fed_episodes")
+    fed = run.table("sampled_episodes")
     assert pc.sum(fed["drawn_rows"]).as_py() == updates * 16
     assert set(fed["source"].to_pylist()) == {"fresh"}
     evaluated = run.table("evaluations")
@@ -86,7 +86,7 @@ def test_ppo_was_fed_every_step_of_its_rollouts_some_epochs_long(tmp_path: Path)
     # 160 steps are two rollouts of 2 x 30, and 40 steps that were not learnt from.
     assert last["env_steps"][0].as_py() == 160
     assert last["gradient_steps"][0].as_py() == 2 * 3 * 3
-    assert pc.sum(run.table("fed_episodes")["drawn_rows"]).as_py() == 2 * 60 * 3
+    assert pc.sum(run.table("sampled_episodes")["drawn_rows"]).as_py() == 2 * 60 * 3
 
 
 def test_the_clocks_of_dqn_are_the_configs() -> None:

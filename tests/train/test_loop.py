@@ -17,12 +17,11 @@ from support.toy_twin import CELLS, TASK
 
 from restock.errors import ConfigError, RunError
 from restock.ingest.task.conditions import Condition
-from restock.train.dqn import checkpoint
 from restock.train.dqn.learner import Learner
-from restock.train.feed.batches import Logs
-from restock.train.feed.log_terms import LogTerms
+from restock.train.feed.logs import Logs, LogTerms
 from restock.train.loop import TrainingInterrupted, train
-from restock.train.run.kept_checkpoints import earlier, go_back
+from restock.train.run import checkpoint
+from restock.train.run.checkpoint import earlier, go_back
 from restock.train.session import Session
 
 
@@ -111,7 +110,7 @@ def test_killed_after_a_checkpoint_and_resumed_is_bit_exact(
     with pytest.raises(Killed):
         train(live, notify=kill)
     live.close()
-    assert 0 < checkpoint.load(live.run.latest)["clock"]["env_steps"] < live.clock.env_steps
+    assert 0 < checkpoint.load(live.run.latest)["progress"]["env_steps"] < live.progress.env_steps
     again = session(path, config(), resume=True)
     train(again)
     again.close()
@@ -123,7 +122,7 @@ def test_an_earlier_checkpoint_leads_to_the_same_end(undisturbed: Session, tmp_p
     live = run_to_end(path, config())
     kept = earlier(live.run.latest)
     steps = live.config.record.checkpoint_every_env_steps
-    end = live.clock.env_steps
+    end = live.progress.env_steps
     assert list(kept) == [(end - 1) // steps * steps - steps, (end - 1) // steps * steps]
     with pytest.raises(RunError, match="no earlier checkpoint was taken after 7 env"):
         go_back(live.run.latest, 7)
@@ -133,7 +132,7 @@ def test_an_earlier_checkpoint_leads_to_the_same_end(undisturbed: Session, tmp_p
     go_back(live.run.latest, min(kept))
     assert earlier(live.run.latest) == {}
     again = session(path, config(), resume=True)
-    assert again.clock.env_steps == min(kept)
+    assert again.progress.env_steps == min(kept)
     train(again)
     again.close()
     assert_same_run(undisturbed, again)
@@ -169,7 +168,7 @@ def test_a_run_with_a_jump_start_resumes_bit_exact(tmp_path: Path) -> None:
     latest = path / "checkpoints" / "latest.safetensors"
     go_back(latest, min(earlier(latest)))
     again = session(path, config(**JUMP_START), resume=True)
-    assert 0 < again.clock.env_steps < 1000  # while it still drives
+    assert 0 < again.progress.env_steps < 1000  # while it still drives
     train(again)
     again.close()
     assert_same_run(whole, again)
@@ -213,7 +212,7 @@ def test_every_drawn_row_is_counted(undisturbed: Session) -> None:
         stratum = own[row["gradient_steps"], row["source"], row["condition"]]
         for name in ("phase", "drawn_rows", "drawn_share", "effective_share", "td_abs_mean"):
             assert row[name] == pytest.approx(stratum[name]), name
-    fed = pq.read_table(path / "fed_episodes.parquet").to_pylist()
+    fed = pq.read_table(path / "sampled_episodes.parquet").to_pylist()
     assert sum(row["drawn_rows"] for row in fed) == steps * 32
     assert {row["episode"] for row in fed if row["source"] == "logs"} == {"a/0"}
     assert len({row["episode"] for row in fed if row["source"] == "fresh"}) > 50
@@ -228,7 +227,7 @@ def test_every_drawn_row_is_counted(undisturbed: Session) -> None:
 def test_the_critic_is_measured_on_steps_that_no_replay_has(undisturbed: Session) -> None:
     path = undisturbed.run.path
     evaluated = set(pq.read_table(path / "evaluations.parquet")["gradient_steps"].to_pylist())
-    measured = pq.read_table(path / "held_out.parquet").to_pylist()
+    measured = pq.read_table(path / "evaluation_buffer.parquet").to_pylist()
     assert {row["gradient_steps"] for row in measured} == evaluated
     assert {row["condition"] for row in measured} >= {"nominal", "wheel_slip"}
     last = [row for row in measured if row["gradient_steps"] == max(evaluated)]
@@ -319,10 +318,10 @@ def test_warmup_collects_without_learning(tmp_path: Path) -> None:
 
 
 def test_updates_keep_the_asked_ratio(undisturbed: Session) -> None:
-    clock = undisturbed.clock
-    assert clock.online_from == 200
-    assert clock.online_updates == int((clock.env_steps - 200) * 0.25)
-    assert undisturbed.learner.gradient_steps == 60 + clock.online_updates
+    progress = undisturbed.progress
+    assert progress.online_from == 200
+    assert progress.online_updates == int((progress.env_steps - 200) * 0.25)
+    assert undisturbed.learner.gradient_steps == 60 + progress.online_updates
 
 
 def test_a_learner_fits_a_batch_it_sees_again_and_again() -> None:
@@ -383,7 +382,7 @@ def spoilt(live: Session, at: int) -> Any:
     """A `stop` that makes the policy useless once, at an environment step: it stands still."""
 
     def stop() -> bool:
-        if live.clock.env_steps >= at and not getattr(stop, "done", False):
+        if live.progress.env_steps >= at and not getattr(stop, "done", False):
             stop.done = True  # type: ignore[attr-defined]
             for network in (live.learner.network, live.learner.policy_network):
                 with torch.no_grad():

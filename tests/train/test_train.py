@@ -22,8 +22,8 @@ from restock.cli import main
 from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
-from restock.train.dqn import checkpoint
 from restock.train.dqn.config import TrainConfig
+from restock.train.run import checkpoint
 
 TINY = [
     *("--set", "env.num_envs=4", "--set", "schedule.warmup_env_steps=100"),

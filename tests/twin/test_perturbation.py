@@ -24,7 +24,7 @@ from restock.replay.panel.build import build_panel
 from restock.replay.store.audit import load_audits, run_audits
 from restock.replay.store.store import Store
 from restock.train.dqn.config import parse_config
-from restock.train.feed.fresh_perturbations import FreshPerturbations
+from restock.train.feed.fresh_log import FreshPerturbations
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.perturbation import (

@@ -93,7 +93,7 @@ class Arm:
         self.name = name
         self.runs = [Run.open(path) for path in paths]
         for run in self.runs:
-            if not run.table("fed_episodes").num_rows:
+            if not run.table("sampled_episodes").num_rows:
                 raise RunError(
                     "has no record of the episodes it was fed",
                     where=str(run.path),
@@ -139,7 +139,7 @@ class Arm:
         parts = []
         with duckdb.connect() as connection:
             for number, run in enumerate(self.runs):
-                path = str(run.path / "fed_episodes.parquet")
+                path = str(run.path / "sampled_episodes.parquet")
                 table: pa.Table = connection.sql(query, params={"fed": path}).to_arrow_table()
                 runs = pa.array([number] * table.num_rows, pa.int64())
                 parts.append(table.append_column("run", runs))

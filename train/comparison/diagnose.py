@@ -3,7 +3,7 @@
 A critic fails in two ways that a falling loss cannot tell apart. Its *replay* may lack, outnumber
 or misstate a condition: then it is wrong on fresh steps of that condition and right elsewhere. Or
 its *target* may follow too slowly, not at all, or too fast: then it is wrong everywhere, or its two
-networks disagree. The evaluations' own steps (`held_out`), which no replay has, tell which:
+networks disagree. Steps of the evaluations (`evaluation_buffer`), in no replay, tell which:
 
     G_k  |TD| held out / |TD| in replay, in condition k
     O_k  |TD| held out in k / the median condition's
@@ -248,7 +248,7 @@ def windows_of(run: Run) -> list[Window]:
 
     query = files("restock.train.comparison").joinpath("diagnose.sql").read_text(encoding="utf-8")
     with duckdb.connect() as connection:
-        names = ("held_out", "conditions", "strata", "progress")
+        names = ("evaluation_buffer", "conditions", "strata", "progress")
         for name in names:  # one that an older run has not is empty
             connection.register(f"run_{name}", run.table(name))
         rows = connection.sql(query).to_arrow_table().to_pylist()
@@ -264,34 +264,34 @@ def windows_of(run: Run) -> list[Window]:
 
 
 def _window(rows: list[dict[str, Any]], bound: float) -> Window:
-    judged = [row for row in rows if row["held_out_rows"] >= _LEAST_ROWS] or rows
-    middle = median(row["held_out_td"] for row in judged)
+    judged = [row for row in rows if row["evaluation_rows"] >= _LEAST_ROWS] or rows
+    middle = median(row["evaluation_td"] for row in judged)
     symptoms = [
         Symptom(
             row["condition"],
-            row["held_out_td"] / row["replay_td"] if row["replay_td"] else None,
-            row["held_out_td"] / max(middle, 1e-12),
+            row["evaluation_td"] / row["replay_td"] if row["replay_td"] else None,
+            row["evaluation_td"] / max(middle, 1e-12),
             row["replay_share"] or 0.0,
             row["met_share"],
-            row["agreement"] if row["held_out_rows"] >= _LEAST_ALIKE else None,
+            row["agreement"] if row["evaluation_rows"] >= _LEAST_ALIKE else None,
             row["unexplained"],
             row["quota_met"],
         )
         for row in judged
     ]
     gaps = [symptom.gap for symptom in symptoms if symptom.gap is not None]
-    weight = sum(row["held_out_rows"] for row in judged)
+    weight = sum(row["evaluation_rows"] for row in judged)
     known = [row["explained"] for row in judged if row["explained"] is not None]
 
     def mean(name: str) -> float:
-        return float(sum(row[name] * row["held_out_rows"] for row in judged) / weight)
+        return float(sum(row[name] * row["evaluation_rows"] for row in judged) / weight)
 
     return Window(
         gradient_steps=rows[0]["gradient_steps"],
         symptoms=symptoms,
         gap_median=median(gaps) if gaps else 1.0,
-        lag=max(rows[0]["lag"] or 0.0, mean("held_out_lag")),
-        clock=mean("held_out_td_online") / max(mean("held_out_td"), 1e-12),
+        lag=max(rows[0]["lag"] or 0.0, mean("evaluation_lag")),
+        clock=mean("evaluation_td_online") / max(mean("evaluation_td"), 1e-12),
         explained=median(known) if known else None,
         q_abs_max=rows[0]["q_abs_max"],
         q_bound=bound,

@@ -1,9 +1,9 @@
--- What a diagnosis looks at: one row an evaluation (a window) and condition. run_held_out,
+-- What a diagnosis looks at: one row an evaluation (a window) and condition. run_evaluation_buffer,
 -- run_conditions, run_strata and run_progress are the run's tables.
 WITH windows AS (
     SELECT gradient_steps AS until,
            coalesce(lag(gradient_steps) OVER (ORDER BY gradient_steps), 0) AS since
-    FROM (SELECT DISTINCT gradient_steps FROM run_held_out)
+    FROM (SELECT DISTINCT gradient_steps FROM run_evaluation_buffer)
 ), fed AS (  -- of the same condition, logged and fresh together, in the window before
     SELECT gradient_steps, condition, drawn_rows, td_abs_mean FROM run_conditions
     UNION ALL  -- a run from before that table was kept has its strata, which may be conditions
@@ -33,8 +33,8 @@ WITH windows AS (
     GROUP BY ALL
 ), drawn AS (
     SELECT until, sum(replay_rows) AS all_rows FROM replay GROUP BY until
-), held_out AS (  -- runs from before these were kept have none of them
-    SELECT * FROM run_held_out
+), evaluation_buffer AS (  -- runs from before these were kept have none of them
+    SELECT * FROM run_evaluation_buffer
     UNION ALL BY NAME
     SELECT NULL::BIGINT AS rows_met, NULL::DOUBLE AS explained,
            NULL::DOUBLE AS logs_agreement, NULL::DOUBLE AS logs_unexplained
@@ -42,21 +42,21 @@ WITH windows AS (
 )
 SELECT h.gradient_steps AS gradient_steps,
        h.condition AS condition,
-       h.rows AS held_out_rows,
+       h.rows AS evaluation_rows,
        h.rows_met / nullif(sum(h.rows_met) OVER (PARTITION BY h.gradient_steps), 0) AS met_share,
        h.logs_agreement AS agreement,
        h.logs_unexplained AS unexplained,
        h.explained AS explained,
-       h.td_abs_mean AS held_out_td,
-       h.td_online_abs_mean AS held_out_td_online,
-       h.q_lag AS held_out_lag,
+       h.td_abs_mean AS evaluation_td,
+       h.td_online_abs_mean AS evaluation_td_online,
+       h.q_lag AS evaluation_lag,
        coalesce(replay_rows, 0) AS replay_rows,
        coalesce(replay_rows, 0) / nullif(all_rows, 0) AS replay_share,
        replay_td,
        quota.quota_met AS quota_met,
        clock.lag AS lag,
        clock.q_abs_max AS q_abs_max
-FROM held_out h
+FROM evaluation_buffer h
 JOIN clock ON clock.until = h.gradient_steps
 LEFT JOIN drawn ON drawn.until = h.gradient_steps
 LEFT JOIN quota ON quota.until = h.gradient_steps AND quota.condition = h.condition

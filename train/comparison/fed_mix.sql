@@ -1,5 +1,5 @@
 -- What one run's critic was fed, by episode, cell (source/stratum) and tenth of its training.
--- $fed is the run's fed_episodes.parquet.
+-- $fed is the run's sampled_episodes.parquet.
 WITH fed AS (
     SELECT *, max(gradient_steps) OVER () AS whole FROM read_parquet($fed)
 )

@@ -13,11 +13,13 @@ from torch import Tensor
 
 from restock.errors import ConfigError
 from restock.train.dqn.config import LossConfig, TrainConfig
-from restock.train.dqn.flat_parameters import FlatParameters
 from restock.train.dqn.loss import (
     Loss,
+    conservative_gradient,
     conservative_penalty,
+    dqn_gradient,
     dqn_loss,
+    margin_gradient,
     margin_penalty,
     mean_loss,
     munchausen_target,
@@ -25,8 +27,12 @@ from restock.train.dqn.loss import (
     quantile_target,
     td_target,
 )
-from restock.train.dqn.loss_gradient import conservative_gradient, dqn_gradient, margin_gradient
-from restock.train.dqn.manual_backprop import Kernel, UpdatePath, update_path
+from restock.train.dqn.manual_backprop import (
+    FlatParameters,
+    ManualBackprop,
+    UpdatePath,
+    update_path,
+)
 from restock.train.dqn.network import Network, clone, make_network
 from restock.train.dqn.target import TargetUpdate
 
@@ -80,8 +86,10 @@ class Learner:
             [self._flat.values], lr=config.optimizer.learning_rate, fused=True
         )
         self.path = path or update_path(config.network, config.device)
-        self._kernel = Kernel(self.network) if self.path == "kernel" else None
-        self._target_kernel = Kernel(self.target_network) if self.path == "kernel" else None
+        self._backprop = ManualBackprop(self.network) if self.path == "manual" else None
+        self._target_backprop = (
+            ManualBackprop(self.target_network) if self.path == "manual" else None
+        )
         self.gradient_steps = 0
 
     def update(
@@ -105,8 +113,8 @@ class Learner:
             expert: (logged,) bool, whether the margin term applies, or None: to none.
         """
         terms = _Terms(weight, logged, conservative if logged else 0.0, return_to_go, expert)
-        if self._kernel is not None and self._target_kernel is not None:
-            loss = self._by_hand(self._kernel, self._target_kernel, rows, terms)
+        if self._backprop is not None and self._target_backprop is not None:
+            loss = self._by_hand(self._backprop, self._target_backprop, rows, terms)
         else:
             loss = self._by_autograd(rows, terms)
         if self.max_grad_norm is not None:
@@ -154,8 +162,10 @@ class Learner:
         return loss
 
     @torch.no_grad()
-    def _by_hand(self, online: Kernel, slow: Kernel, rows: Tensor, terms: _Terms) -> Loss:
-        """Fill the gradient by the kernel: the plain network, with every term of the loss."""
+    def _by_hand(
+        self, online: ManualBackprop, slow: ManualBackprop, rows: Tensor, terms: _Terms
+    ) -> Loss:
+        """Fill the gradient by hand: the plain network, with every term of the loss."""
         observation, next_observation, action, reward, discount = unpack(
             rows, self.network.observation_size
         )

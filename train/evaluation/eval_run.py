@@ -19,10 +19,10 @@ from restock.errors import ConfigError, RunError
 from restock.files import write_table
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
-from restock.train.dqn import checkpoint
 from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.dqn.network import make_network
 from restock.train.evaluation.evaluate import EpisodeResult, GreedyPolicy, run_episodes
+from restock.train.run import checkpoint
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES
 from restock.train.twin.env.floor_report import refuse_unfit, unfit_kinds

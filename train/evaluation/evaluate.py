@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from restock.stats import wilson
 from restock.train.dqn.learner import greedy_actions
 from restock.train.dqn.network import Network
-from restock.train.feed.fresh_perturbations import values_entries
+from restock.train.feed.fresh_log import values_entries
 from restock.train.twin.env.interface import Policy, Twin
 from restock.train.twin.physics.episode import EpisodeSpec
 

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.replay.ring.ring import FreshRing
-from restock.train.feed.batches import Batch, Coded, Logs
-from restock.train.feed.fresh_perturbations import FreshPerturbations
+from restock.train.feed.batches import Batch
+from restock.train.feed.fresh_log import FreshPerturbations
+from restock.train.feed.logs import Coded, Logs
 
 Columns = dict[str, Any]
 

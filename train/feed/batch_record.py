@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.replay.ring.ring import FreshRing
-from restock.train.dqn.checkpoint import generator_state, restore_generator
 from restock.train.dqn.loss import Loss
 from restock.train.feed.audit_rows import fresh_rows, logged_rows, row_hashes
-from restock.train.feed.batches import Batch, Logs
-from restock.train.feed.drawn import Drawn, as_columns, from_state, to_state
-from restock.train.feed.fresh_perturbations import FreshPerturbations
+from restock.train.feed.batches import Batch
+from restock.train.feed.drawn import BatchRecord, as_columns, from_state, to_state
+from restock.train.feed.fresh_log import FreshPerturbations
+from restock.train.feed.logs import Logs
 from restock.train.feed.sampled_episodes import episode_columns
+from restock.train.run.checkpoint import generator_state, restore_generator
 from restock.train.run.run import Run
 
 UNLABELLED = "unlabelled"
@@ -54,7 +55,7 @@ class FeedRecord:
         )
         self._fresh_strata = [*ring.conditions, UNLABELLED]
         self._drawn: dict[str, int] = {}  # "source/stratum" -> rows since the run began
-        self._kept: list[Drawn] = []
+        self._kept: list[BatchRecord] = []
 
     def batch(self, step: int, env_steps: int, batch: Batch, loss: Loss, last_sync: int) -> None:
         """Keep the batch of gradient step `step` (from 1), and its audit rows if it is chosen.
@@ -63,7 +64,7 @@ class FeedRecord:
         """
         ring, slots = self.ring, batch.slots
         meta = ring.meta
-        kept = Drawn(
+        kept = BatchRecord(
             step=step,
             env_steps=env_steps,
             log_row=batch.log_rows,
@@ -276,7 +277,7 @@ class FeedRecord:
         else:
             names = keys.astype(str)
         self.run.append_columns(
-            "fed_episodes",
+            "sampled_episodes",
             {**clocks, "source": source, **columns, "stratum": named, "episode": names},
         )
 

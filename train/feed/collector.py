@@ -20,8 +20,7 @@ from restock.ingest.task.conditions import NOMINAL, Condition, label, primary
 from restock.ingest.task.signals import STORED_SIGNALS
 from restock.ingest.task.task import Task
 from restock.replay.ring.ring import FreshRing
-from restock.train.feed.fresh_log import FreshLog
-from restock.train.feed.fresh_perturbations import FreshPerturbations, values_entries
+from restock.train.feed.fresh_log import FreshLog, FreshPerturbations, values_entries
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.floors.layout import DEFAULT
 

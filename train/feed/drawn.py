@@ -1,7 +1,7 @@
 """Batches as they were drawn, kept whole until their interval is summed.
 
-The update loop only appends a `Drawn`; joining many into columns, and keeping an open interval in
-a checkpoint, happen outside it.
+The update loop only appends a `BatchRecord`; joining many into columns, and keeping an open
+interval in a checkpoint, happen outside it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
+class BatchRecord:
     """A batch as it was drawn: L rows of logs and F fresh ones, B = L + F."""
 
     step: int
@@ -45,15 +45,15 @@ _ARRAYS = {
 }
 
 
-def _logged(values: NDArray[Any], batch: Drawn) -> NDArray[Any]:
+def _logged(values: NDArray[Any], batch: BatchRecord) -> NDArray[Any]:
     return values[: len(batch.log_row)]
 
 
-def _fresh(values: NDArray[Any], batch: Drawn) -> NDArray[Any]:
+def _fresh(values: NDArray[Any], batch: BatchRecord) -> NDArray[Any]:
     return values[len(batch.log_row) :]
 
 
-def as_columns(kept: Sequence[Drawn], unlabelled: int) -> dict[str, NDArray[Any]]:
+def as_columns(kept: Sequence[BatchRecord], unlabelled: int) -> dict[str, NDArray[Any]]:
     """Batches as columns over all their rows, logs and fresh apart.
 
     `unlabelled` is the stratum of fresh rows whose episode has not ended.
@@ -93,7 +93,7 @@ def as_columns(kept: Sequence[Drawn], unlabelled: int) -> dict[str, NDArray[Any]
     return columns
 
 
-def to_state(kept: Sequence[Drawn]) -> dict[str, Any]:
+def to_state(kept: Sequence[BatchRecord]) -> dict[str, Any]:
     """Joined arrays and JSON values, for a checkpoint."""
     if not kept:
         return {"clocks": []}
@@ -107,7 +107,7 @@ def to_state(kept: Sequence[Drawn]) -> dict[str, Any]:
     }
 
 
-def from_state(state: Mapping[str, Any]) -> list[Drawn]:
+def from_state(state: Mapping[str, Any]) -> list[BatchRecord]:
     """The batches that `to_state` was given."""
     kept = []
     logged = fresh = quotas = 0
@@ -121,6 +121,8 @@ def from_state(state: Mapping[str, Any]) -> list[Drawn]:
         arrays = {name: state[name][places[side]] for name, side in _ARRAYS.items()}
         weight = state["weight"][places["both"]]
         quota = state["quota"][quotas : quotas + size]
-        kept.append(Drawn(step=step, env_steps=env_steps, weight=weight, quota=quota, **arrays))
+        kept.append(
+            BatchRecord(step=step, env_steps=env_steps, weight=weight, quota=quota, **arrays)
+        )
         logged, fresh, quotas = logged + log_rows, fresh + slots, quotas + size
     return kept

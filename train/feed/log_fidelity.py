@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.replay.mixture.packed_row import F64
-from restock.train.feed.batches import Logs
+from restock.train.feed.logs import Logs
 from restock.train.feed.probe import Probe
 
 ROWS = 512  # of each condition, chosen by hash

@@ -21,7 +21,7 @@ from restock.replay.mixture.splitmix import GOLDEN, splitmix64
 from restock.replay.ring.ring import FreshRing
 from restock.train.dqn.learner import Learner
 from restock.train.dqn.target import value_lag
-from restock.train.feed.batches import Logs
+from restock.train.feed.logs import Logs
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""How often each episode was drawn: the rows of the run's table `fed_episodes`.
+"""How often each episode was drawn: the rows of the run's table `sampled_episodes`.
 
 Rows of one episode are drawn together and are alike, so what a critic was fed is only as certain as
 its episodes are many. `restock compare` resamples these.

@@ -25,7 +25,6 @@ from restock.errors import ConfigError, RestockError
 from restock.files import write_text
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
-from restock.train.dqn import checkpoint
 from restock.train.dqn.config import NetworkConfig, TrainConfig, load_config
 from restock.train.dqn.network import QNetwork, make_network
 from restock.train.dqn.target import Hard, describe
@@ -37,6 +36,7 @@ from restock.train.evaluation.evaluate import (
     score,
 )
 from restock.train.prepare import make_twin, resolve_config
+from restock.train.run import checkpoint
 from restock.train.run.run import Run, now_ns, software_versions
 from restock.train.twin.floors.floors import layouts_of_split
 

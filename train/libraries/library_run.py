@@ -11,7 +11,7 @@ import numpy as np
 
 from restock.ingest.profile.profile import Profile
 from restock.replay.panel.panel import Panel
-from restock.train.feed.fresh_perturbations import values_entries
+from restock.train.feed.fresh_log import values_entries
 from restock.train.run.run import Run, now_ns, panel_document, software_versions
 from restock.train.run.run_tables import TABLES
 

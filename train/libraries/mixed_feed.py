@@ -3,7 +3,7 @@
 The library owns the training loop. Its buffer is a subclass (`restock.train.libraries.sb3_buffer`,
 `restock.train.libraries.tianshou_buffer`) that asks this class for rows of the panel, tells it
 every step and every batch, and so leaves a run directory with the same tables as `restock train`
-does: `strata`, `ages`, `policies`, `fed_episodes`, `episodes`, `audit` and `progress`.
+does: `strata`, `ages`, `policies`, `sampled_episodes`, `episodes`, `audit` and `progress`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from restock.replay.panel.logged_sampler import BatchDraw, LoggedSampler
 from restock.replay.panel.panel import Panel
 from restock.train.dqn.loss import Loss
 from restock.train.feed.batch_record import FeedRecord
-from restock.train.feed.batches import Batch, Logs
+from restock.train.feed.batches import Batch
+from restock.train.feed.logs import Logs
 from restock.train.libraries.fresh_meta import FreshMeta
 from restock.train.libraries.info_labels import InfoLabels
 from restock.train.libraries.library_run import NullsForNaN, create_run, episode_row, known

@@ -214,7 +214,7 @@ class _OnPolicyFeed(BaseCallback):
     def _fed(self, rows: list[tuple[str, int, int]]) -> None:
         clocks = {"env_steps": self.num_timesteps, "gradient_steps": max(self.updates, 1)}
         self.run.append(
-            "fed_episodes",
+            "sampled_episodes",
             [
                 {
                     **clocks,

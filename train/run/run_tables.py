@@ -106,7 +106,7 @@ TABLES: dict[str, pa.Schema] = {
         ("p99", _F),
     ),
     # One row an interval x source x stratum x episode: draws, as rows of one episode are alike.
-    "fed_episodes": _schema(
+    "sampled_episodes": _schema(
         *_CLOCKS,
         ("source", _S),
         ("stratum", _S),
@@ -128,7 +128,7 @@ TABLES: dict[str, pa.Schema] = {
         ("probe_hash", _S),
     ),
     # One row an evaluation x condition: the critic on that evaluation's steps, which no replay has.
-    "held_out": _schema(
+    "evaluation_buffer": _schema(
         *_CLOCKS,
         ("condition", _S),
         ("rows", _I),  # that the critic was measured on

@@ -15,7 +15,7 @@ import tyro
 
 if TYPE_CHECKING:
     from restock.train.flush_fresh import Flushed
-    from restock.train.loop import Outcome
+    from restock.train.loop import TrainResult
     from restock.train.prepare import Prepared
 
 
@@ -95,7 +95,7 @@ class TrainCommand:
         return 0
 
 
-def _train(prepared: Prepared, store: Path | None) -> tuple[Outcome, Flushed | None]:
+def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed | None]:
     """Train to the end; then flush what the twin gave, where a store is given."""
     from restock.cli.output import progress, stderr
     from restock.ingest.store.writer import StoreWriter
@@ -114,7 +114,7 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[Outcome, Flushed | N
             progress("training", config.schedule.env_steps) as advance,
             _stop_on_interrupt() as stop,
         ):
-            seen = session.clock.env_steps
+            seen = session.progress.env_steps
             advance(seen)
 
             def notify(event: str, values: dict[str, Any]) -> None:
@@ -178,7 +178,9 @@ def _evaluation_line(values: dict[str, Any], wall_s: float) -> str:
     return f"{wall_s:6.0f} s {values['env_steps']:>9,} steps  success: {cells}{mark}"
 
 
-def _print(prepared: Prepared, outcome: Outcome, flushed: Flushed | None, *, as_json: bool) -> None:
+def _print(
+    prepared: Prepared, outcome: TrainResult, flushed: Flushed | None, *, as_json: bool
+) -> None:
     from dataclasses import asdict
 
     from restock.cli.output import print_json, print_table, say

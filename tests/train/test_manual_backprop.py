@@ -10,15 +10,16 @@ import torch
 from torch import Tensor
 
 from restock.train.dqn.config import parse_config
-from restock.train.dqn.flat_parameters import FlatParameters
 from restock.train.dqn.learner import Learner
 from restock.train.dqn.loss import (
+    conservative_gradient,
     conservative_penalty,
+    dqn_gradient,
     dqn_loss,
+    margin_gradient,
     margin_penalty,
 )
-from restock.train.dqn.loss_gradient import conservative_gradient, dqn_gradient, margin_gradient
-from restock.train.dqn.manual_backprop import Kernel, update_path
+from restock.train.dqn.manual_backprop import FlatParameters, ManualBackprop, update_path
 from restock.train.dqn.network import QNetwork, clone
 
 OBSERVATION, ACTIONS, BATCH = 7, 4, 12
@@ -51,7 +52,7 @@ def test_values_and_gradients_are_autograds(
     by_graph = network(hidden, layer_norm)
     by_hand = clone(by_graph)
     FlatParameters(by_hand, learns=True)
-    kernel = Kernel(by_hand)
+    backprop = ManualBackprop(by_hand)
     packed = normal(batch, 2 * OBSERVATION + 3, seed=1)  # observations are slices of wider rows
     now, after = packed[:, :OBSERVATION], packed[:, OBSERVATION : 2 * OBSERVATION]
     for seed in (2, 3):  # twice: nothing of the first pass is left in the second
@@ -59,8 +60,8 @@ def test_values_and_gradients_are_autograds(
         expected = by_graph(now)
         by_graph.zero_grad()
         expected.backward(gradient)
-        q, next_q = kernel.forward(now, after)
-        kernel.backward(gradient)
+        q, next_q = backprop.forward(now, after)
+        backprop.backward(gradient)
         torch.testing.assert_close(q, expected.detach())
         torch.testing.assert_close(next_q, by_graph(after).detach())
         for name, parameter in by_hand.named_parameters():
@@ -72,17 +73,17 @@ def test_values_and_gradients_are_autograds(
 def test_a_network_that_does_not_learn_is_evaluated_alone() -> None:
     still = clone(network((16, 16), layer_norm=True))
     FlatParameters(still, learns=False)
-    kernel = Kernel(still)
-    (q,) = kernel.forward(normal(3, OBSERVATION, seed=0))
+    backprop = ManualBackprop(still)
+    (q,) = backprop.forward(normal(3, OBSERVATION, seed=0))
     torch.testing.assert_close(q, still(normal(3, OBSERVATION, seed=0)))
     with pytest.raises(RuntimeError, match="does not learn"):
-        kernel.backward(q)
+        backprop.backward(q)
 
 
 @pytest.mark.parametrize("options", [{"dueling": True}, {"quantiles": 4}])
 def test_other_networks_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(TypeError, match="plain"):
-        Kernel(QNetwork(OBSERVATION, ACTIONS, **options))
+        ManualBackprop(QNetwork(OBSERVATION, ACTIONS, **options))
 
 
 def problem() -> tuple[Tensor, Tensor, Tensor]:
@@ -157,7 +158,7 @@ def test_learning_by_hand_is_learning_by_autograd(sections: dict[str, Any]) -> N
         "return_to_go": normal(8, seed=9).float(),
         "expert": torch.arange(8) % 2 == 0 if "margin" in sections.get("loss", {}) else None,
     }
-    by_hand, by_graph = learner("kernel", **sections), learner("autograd", **sections)
+    by_hand, by_graph = learner("manual", **sections), learner("autograd", **sections)
     for step in range(1, 9):
         ours, theirs = (each.update(rows(step), **given) for each in (by_hand, by_graph))  # type: ignore[arg-type]
         torch.testing.assert_close(ours.value, theirs.value.detach())
@@ -174,14 +175,14 @@ def test_the_way_is_chosen_by_the_network_and_the_device() -> None:
     def of(**network: Any) -> str:
         return update_path(parse_config({"network": network}, where="test").network, "cpu")
 
-    assert of() == of(layer_norm=False, hidden=(8,)) == "kernel"
+    assert of() == of(layer_norm=False, hidden=(8,)) == "manual"
     assert of(dueling=True) == of(quantiles=8) == of(ensemble=2) == "autograd"
     assert update_path(parse_config({}, where="test").network, "cuda") == "autograd"
-    assert learner(None).path == "kernel"
+    assert learner(None).path == "manual"
 
 
 def test_a_learner_that_is_restored_learns_on_as_it_would_have() -> None:
-    first = learner("kernel")
+    first = learner("manual")
     for step in range(1, 4):
         first.update(rows(step))
     state = {
@@ -191,7 +192,7 @@ def test_a_learner_that_is_restored_learns_on_as_it_would_have() -> None:
     # Moments are kept a parameter: in shape and order as an optimizer of each would.
     shapes = [parameter.shape for parameter in first.network.parameters()]
     assert [entry["exp_avg"].shape for entry in state["optimizer"].values()] == shapes
-    second = learner("kernel", seed=5)  # type: ignore[arg-type]
+    second = learner("manual", seed=5)  # type: ignore[arg-type]
     second.load_state_dict(state)
     for each in (first, second):
         each.update(rows(9))

@@ -1,0 +1,210 @@
+"""The logged rows of a run, with what the record and the terms of the loss need to know of each."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyarrow as pa
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from restock.errors import ConfigError
+from restock.replay.mixture.packed_row import F32, Ints
+from restock.replay.panel.logged_sampler import LoggedSampler, sampler_by_shares, sampler_for
+from restock.replay.sampling.share_controller import PlannedDraws
+from restock.train.dqn.config import LossConfig
+
+if TYPE_CHECKING:
+    from restock.replay.panel.panel import Panel
+
+_UNPLANNED = PlannedDraws()
+_IN_MEMORY_BYTES = 4 << 30  # larger panels stay memory-mapped
+
+
+@dataclass(frozen=True)
+class Coded:
+    """A column of few distinct values: a code per row into `names`."""
+
+    codes: NDArray[np.int32]  # (n,)
+    names: list[str]
+
+    @classmethod
+    def of(cls, column: pa.ChunkedArray) -> Coded:
+        encoded = column.combine_chunks().dictionary_encode()
+        if isinstance(encoded, pa.ChunkedArray):
+            encoded = encoded.combine_chunks()
+        codes = encoded.indices.fill_null(len(encoded.dictionary))
+        names = [*encoded.dictionary.to_pylist(), "unknown"]
+        return cls(np.asarray(codes, np.int32), names)
+
+    def name(self, row: int) -> str:
+        return str(self.names[self.codes[row]])
+
+    def known(self, row: int) -> str | None:
+        """The same, or None where the column has none."""
+        code = self.codes[row]
+        return str(self.names[code]) if code < len(self.names) - 1 else None
+
+
+@dataclass(frozen=True)
+class Logs:
+    """The logged rows that a run draws from, with what is to be recorded about them."""
+
+    rows: Tensor  # (n, W) float32
+    strata: list[str]
+    timings: list[str]  # pre | post, of each stratum
+    stratum_rows: list[Ints]  # the rows of each stratum
+    shares: NDArray[np.float64]  # (S,)
+    weights: F32 | None  # (n,) importance weights, or None where all are 1
+    as_of_ns: int  # calendar ages are against it
+    transition_id: Ints  # (n,)
+    stamp_ns: Ints  # (n,), when each was logged: measurement stamps may be a simulator's
+    condition: Coded
+    behaviour_policy: Coded
+    behaviour_version: Coded
+    episode: Coded
+
+    perturbation: Coded | None = None  # of the twin; null for hardware
+    panel: Panel | None = None  # where they are from
+    planned: PlannedDraws = _UNPLANNED  # what the run will draw
+    huber_delta: float = 1.0  # of the run's loss: the floor of LAP's priorities
+
+    @classmethod
+    def of_panel(
+        cls,
+        panel: Panel,
+        planned: PlannedDraws = _UNPLANNED,
+        huber_delta: float = 1.0,
+    ) -> Logs:
+        """A panel's rows in memory (memory-mapped where it is larger than 4 GiB)."""
+        rows = np.asarray(panel.rows)
+        if rows.nbytes <= _IN_MEMORY_BYTES and panel.header.mixture.sampling == "memory":
+            rows = np.array(rows)
+        with warnings.catch_warnings():  # a read-only map is fine: nothing writes to it
+            warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
+            tensor = torch.from_numpy(rows)
+        weights = panel.weights
+        meta = panel.meta
+        return cls(
+            rows=tensor,
+            strata=[stratum.name for stratum in panel.strata],
+            timings=[stratum.timing for stratum in panel.strata],
+            stratum_rows=panel.stratum_rows(),
+            shares=np.array([stratum.share for stratum in panel.strata]),
+            weights=None if np.all(weights == 1) else weights,
+            as_of_ns=panel.header.newest_ns,
+            transition_id=np.asarray(meta["transition_id"], np.int64),
+            stamp_ns=np.asarray(meta["logged_ns"], np.int64),
+            condition=Coded.of(meta["condition"]),
+            behaviour_policy=Coded.of(meta["behaviour_policy"]),
+            behaviour_version=Coded.of(meta["behaviour_version"]),
+            episode=Coded.of(meta["episode_id"]),
+            perturbation=Coded.of(
+                meta["perturbation"]
+                if "perturbation" in meta.column_names  # a panel from before has no such column
+                else pa.chunked_array([pa.nulls(len(meta), pa.string())])
+            ),
+            panel=panel,
+            planned=planned,
+            huber_delta=huber_delta,
+        )
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def sampler(self, batch_size: int, logs_share: float | None, seed: int) -> LoggedSampler:
+        """What draws from them: by the mixture of their panel, else by their shares.
+
+        Raises:
+            MixtureError: see `sampler_for`.
+        """
+        if self.panel is None:
+            return sampler_by_shares(
+                self.rows.numpy(),
+                self.strata,
+                self.stratum_rows,
+                self.shares,
+                batch_size,
+                seed=seed,
+                logs_share=logs_share or 0.0,
+                weights=self.weights,
+            )
+        return sampler_for(
+            self.panel,
+            batch_size,
+            seed=seed,
+            planned=self.planned,
+            logs_share=logs_share,
+            lap_floor=self.huber_delta,
+        )
+
+
+@dataclass(frozen=True)
+class LogTerms:
+    """Per row of the panel, on the learner's device; None where no term asks."""
+
+    expert: Tensor | None  # (n,) bool: DQfD's margin applies
+    return_to_go: Tensor | None  # (n,) float32: Cal-QL's floor
+
+    @classmethod
+    def of(cls, loss: LossConfig, logs: Logs | None, device: torch.device) -> LogTerms:
+        """What `loss` asks of these logs.
+
+        Raises:
+            ConfigError: it names a behaviour policy or stratum that they do not have, or there are
+                none.
+            PanelError: Cal-QL without a return-to-go in the panel.
+        """
+        if logs is None:
+            if loss.margin or loss.calibrated:
+                raise ConfigError(
+                    "loss.margin and loss.calibrated are about logged rows, and there are none",
+                    remedy="give --panel, or leave them out",
+                )
+            return cls(None, None)
+        expert = to_go = None
+        if loss.margin:
+            expert = torch.from_numpy(_expert(loss, logs)).to(device)
+        if loss.calibrated:
+            if logs.panel is None:
+                raise ConfigError("loss.calibrated needs logs from a panel")
+            to_go = torch.from_numpy(np.array(logs.panel.return_to_go)).to(device)
+        return cls(expert, to_go)
+
+    def rows(self, log_rows: Ints) -> tuple[Tensor | None, Tensor | None]:
+        """`expert` and `return_to_go` of some rows of the panel."""
+        if self.expert is None and self.return_to_go is None:
+            return None, None
+        index = torch.from_numpy(log_rows)
+        return (
+            None if self.expert is None else self.expert[index.to(self.expert.device)],
+            None
+            if self.return_to_go is None
+            else self.return_to_go[index.to(self.return_to_go.device)],
+        )
+
+
+def _expert(loss: LossConfig, logs: Logs) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """The rows, (n,), of `margin_policies` in `margin_strata`."""
+    policy = logs.behaviour_policy
+    _known("loss.margin_policies", loss.margin_policies, policy.names)
+    _known("loss.margin_strata", loss.margin_strata, logs.strata)
+    chosen = np.isin(policy.codes, [policy.names.index(name) for name in loss.margin_policies])
+    if loss.margin_strata:
+        inside = np.zeros(len(chosen), np.bool_)
+        for name, rows in zip(logs.strata, logs.stratum_rows, strict=True):
+            inside[rows] = name in loss.margin_strata
+        chosen &= inside
+    return chosen
+
+
+def _known(key: str, asked: tuple[str, ...], known: list[str]) -> None:
+    for name in asked:
+        if name not in known:
+            raise ConfigError(
+                f"{key}: the logs have no {name!r}", remedy=f"they have {', '.join(known)}"
+            )
