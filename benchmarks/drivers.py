@@ -9,14 +9,13 @@ partly blocked ones, an operator who manages everywhere, a random driver who doe
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 from collections import defaultdict
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from harness import finish, option_parser
 
 from restock.stats import wilson
 from restock.train.twin.env.operator_policy import Operator
@@ -54,8 +53,8 @@ def drive(
     done: dict[int, tuple[str, bool, bool, float]] = {}
     while len(done) < episodes:
         action, _ = policy.act(env, observation)
-        observation, _, over, cut, info = env.step(action)
-        for index in np.flatnonzero(over | cut):
+        observation, _, terminated, truncated, info = env.step(action)
+        for index in np.flatnonzero(terminated | truncated):
             number = int(info["episode_number"][index])
             if number >= 0:
                 block = str(info["block"][index])
@@ -72,10 +71,7 @@ def drive(
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="20 episodes a cell, not 100")
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--check", action="store_true")
+    parser = option_parser(__doc__, quick="20 episodes a cell, not 100")
     parser.add_argument("--perturbation", choices=sorted(PERTURBATIONS), default="nominal")
     options = parser.parse_args()
     # Blocked aisles are drawn twice as often: half are blocked partly, half wholly.
@@ -100,12 +96,7 @@ def main() -> int:
                     }
                 )
                 print(_line(rows[-1]), file=sys.stderr if options.json else sys.stdout, flush=True)
-    if options.json:
-        print(json.dumps(rows, indent=2))
-    missed = [row for row in rows if not _good(row)]
-    for row in missed:
-        print(f"missed: {_line(row)}", file=sys.stderr)
-    return 1 if options.check and missed else 0
+    return finish(options, rows, [_line(row) for row in rows if not _good(row)], [])
 
 
 def _good(row: dict[str, Any]) -> bool:

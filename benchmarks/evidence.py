@@ -20,6 +20,7 @@ from pathlib import Path
 
 import duckdb
 import numpy as np
+from harness import mean_interval
 
 from restock.cli import main as restock
 from restock.stats import percentiles
@@ -144,14 +145,8 @@ def _rare_episodes(path: Path) -> dict[int, np.ndarray]:
 
 
 def _lead(ahead: np.ndarray) -> str:
-    """The mean of (runs, episodes), and 95 % of it with both drawn anew."""
-    rng = np.random.default_rng(0)
-    runs, episodes = ahead.shape
-    means = [
-        ahead[rng.integers(runs, size=runs)][:, rng.integers(episodes, size=episodes)].mean()
-        for _ in range(RESAMPLES)
-    ]
-    low, high = percentiles(np.array(means))
+    """The mean of (runs, episodes), and 95 % of it with both drawn again."""
+    low, high = mean_interval(ahead, np.random.default_rng(0), RESAMPLES)
     return f"{ahead.mean():+.2f} [{low:+.2f}, {high:+.2f}]"
 
 
@@ -173,7 +168,7 @@ def _weighted(success: dict[str, float], weights: dict[str, int] = RARE) -> floa
 
 
 def _interval(runs: Sequence[dict[str, np.ndarray]], weights: dict[str, int]) -> str:
-    """The mean over runs, and 95 % of its values with runs and episodes drawn anew: all
+    """The mean over runs, and 95 % of its values with runs and episodes drawn again: all
     runs drove the same ones."""
     rng = np.random.default_rng(0)
     cells = {cell: np.stack([run[cell] for run in runs]) for cell in weights}  # (runs, episodes)

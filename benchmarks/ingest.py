@@ -10,7 +10,6 @@ one after the other in every round; their values are compared along the way. The
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import resource
@@ -19,14 +18,16 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import recording_readers as readers
 import robot_log
-from ingest_memory import LIMIT_MB, LONG, LONGER, PLAIN, memory
+import zstandard
+from harness import finish, in_turns, medians, option_parser
 
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
@@ -54,6 +55,21 @@ ROSBAGS_BAG = "rosbags, sqlite3 bag, decoded"
 ROBOT = "turtlebot3"  # the shipped profile that fits the generated log
 MEMORY_MB = 400  # what "a few hundred MB" is taken for
 IMAGES_MB = 50  # by how much images may raise it
+PLAIN, LONG, LONGER = "MCAP, no images", "MCAP, no images, 4x as long", 4
+LIMIT_MB = 768  # of private memory set aside, used or not: beyond it is a MemoryError
+
+# One process' peak: code and pages of mapped files included.
+MEASURE = """
+import json, re, sys, time
+from restock.ingest.pipeline import ingest
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.store.writer import StoreWriter
+outcome = ingest(sys.argv[1], load_profile("turtlebot3"), store=StoreWriter(sys.argv[2]))
+with open("/proc/self/status") as file:  # the system's ru_maxrss would count the parent's, too
+    peak = int(re.search(r"VmHWM:\\s+(\\d+) kB", file.read())[1])
+answer = {"transitions": outcome.manifest["transitions"], "lost_messages": outcome.lost_messages}
+print(json.dumps(answer | {"peak_mb": peak / 1024, "cpu_s": time.process_time()}))
+"""
 
 
 def cpu_s(work: Callable[[], Any]) -> float:
@@ -131,16 +147,12 @@ def measure(
     slow_rounds: int,
 ) -> dict[str, list[float]]:
     """CPU times of each, interleaved; a first round of the quick ones is not counted."""
-    times: dict[str, list[float]] = {name: [] for name in (*quick, *slow)}
-    for number in range(rounds + 1):
-        for name, work in quick.items():
-            spent = cpu_s(work)
-            if number:
-                times[name].append(spent)
-        if 0 < number <= slow_rounds:
-            for name, work in slow.items():
-                times[name].append(cpu_s(work))
-        sys.stderr.write(f"round {number} of {rounds}\n")
+    timed = {name: partial(cpu_s, work) for name, work in quick.items()}
+    timed_slow = {name: partial(cpu_s, work) for name, work in slow.items()}
+    in_turns(timed, 1)
+    times = in_turns(timed | timed_slow, slow_rounds)
+    for name, more in in_turns(timed, rounds - slow_rounds).items():
+        times[name] += more
     return times
 
 
@@ -160,12 +172,66 @@ def two_workers(folder: Path, seconds: float, stores: Stores, rounds: int) -> di
     return {"one_s": one, "two_s": two, "faster": one / two, "load": os.getloadavg()[0]}
 
 
+def limit() -> None:
+    resource.setrlimit(resource.RLIMIT_DATA, (LIMIT_MB << 20, LIMIT_MB << 20))
+
+
+def measured(path: Path, store: Path) -> dict[str, float]:
+    """Peak and CPU time of a process that ingests one recording."""
+    done = subprocess.run(
+        [sys.executable, "-c", MEASURE, str(path), str(store)],
+        stdout=subprocess.PIPE,
+        check=True,
+        preexec_fn=limit,
+    )
+    used: dict[str, float] = json.loads(done.stdout)
+    files = path.rglob("*") if path.is_dir() else [path]
+    used["size_mb"] = sum(file.stat().st_size for file in files if file.is_file()) / 1e6
+    return used
+
+
+def compressed(bag: Path) -> Path:
+    """The bag's storage file compressed as a whole, as rosbag2's file mode does."""
+    for file in list(bag.glob("*.mcap")):
+        with file.open("rb") as source, file.with_name(file.name + ".zstd").open("wb") as sink:
+            zstandard.ZstdCompressor(level=1).copy_stream(source, sink)
+        file.unlink()
+    return bag
+
+
+def memory(folder: Path, seconds: float, image_mb: float) -> dict[str, dict[str, float]]:
+    """Recordings of `seconds` with and without images, in each container, and a longer one."""
+    images = int(image_mb * 1e6 / robot_log.IMAGE_BYTES)
+    zstd_bag = folder / "zstd_bag"
+    used = {}
+    for name, path in (
+        (PLAIN, robot_log.write_mcap(folder / "plain.mcap", seconds)),
+        (LONG, robot_log.write_mcap(folder / "long.mcap", seconds * LONGER)),
+        ("MCAP, images", robot_log.write_mcap(folder / "big.mcap", seconds, images=images)),
+        (
+            "MCAP, images, no chunks",
+            robot_log.write_mcap(folder / "loose.mcap", seconds, images=images, chunked=False),
+        ),
+        ("sqlite3 bag, images", robot_log.write_bag(folder / "big_bag", seconds, images=images)),
+        ("zstd file of an MCAP bag, images", zstd_bag),
+    ):
+        if path == zstd_bag:
+            zstd_bag.mkdir()
+            (folder / "big.mcap").rename(zstd_bag / "zstd_bag_0.mcap")
+            compressed(zstd_bag)
+        used[name] = measured(path, folder / f"store {name}")
+        used[name]["images"] = 0 if name in (PLAIN, LONG) else images
+        if name in ("MCAP, images, no chunks", LONG):
+            path.unlink()
+    return used
+
+
 def targets(
     ratio: dict[str, float], workers: dict[str, float], used: dict[str, dict[str, float]]
 ) -> dict[str, bool]:
     """The targets of the design: what they say, and whether they are met."""
     plain = used[PLAIN]["peak_mb"]
-    heavy = max(found["peak_mb"] for name, found in used.items() if found["images"])
+    heavy = max(one["peak_mb"] for one in used.values() if one["images"])
     return {
         "all topics to columns at most 3.5x the floor": ratio[OURS] <= 3.5,
         "a profile's own fields faster still": ratio[OURS_PROFILE] < ratio[OURS],
@@ -178,36 +244,35 @@ def targets(
         "a whole ingest at most 6x the floor": ratio[INGEST] <= 6,
         "two workers at least 1.7x one": workers["faster"] >= 1.7,
         f"peak memory at most {MEMORY_MB} MB": (
-            max(found["peak_mb"] for found in used.values()) <= MEMORY_MB
+            max(one["peak_mb"] for one in used.values()) <= MEMORY_MB
         ),
         f"images raise peak memory by at most {IMAGES_MB} MB": heavy - plain <= IMAGES_MB,
     }
 
 
-def show(answer: dict[str, Any]) -> None:
-    print(f"{answer['messages']:,} messages, {answer['log_s']:.0f} s, {answer['mcap_mb']:.0f} MB")
+def lines(answer: dict[str, Any]) -> Iterator[str]:
+    """The figures as tables."""
+    yield f"{answer['messages']:,} messages, {answer['log_s']:.0f} s, {answer['mcap_mb']:.0f} MB"
     equal = ", ".join(f"{who} {count}" for who, count in answer["equal_columns"].items())
-    print(f"columns equal: {equal}\n")
-    print("| reader | CPU s | over decompression |\n| --- | ---: | ---: |")
+    yield f"columns equal: {equal}\n"
+    yield "| reader | CPU s | over decompression |\n| --- | ---: | ---: |"
     for name, value in sorted(answer["over_floor"].items(), key=lambda item: item[1]):
-        print(f"| {name} | {answer['cpu_s'][name]:.3f} | {value:.2f} |")
-    print(f"\n| recording ({LIMIT_MB} MB of private memory at most) | MB | peak MB | CPU s |")
-    print("| --- | ---: | ---: | ---: |")
+        yield f"| {name} | {answer['cpu_s'][name]:.3f} | {value:.2f} |"
+    yield f"\n| recording ({LIMIT_MB} MB of private memory at most) | MB | peak MB | CPU s |"
+    yield "| --- | ---: | ---: | ---: |"
     for name, used in answer["memory"].items():
-        print(f"| {name} | {used['size_mb']:.0f} | {used['peak_mb']:.0f} | {used['cpu_s']:.2f} |")
-    print(f"\nan hour more of log: {answer['mb_an_hour']:.0f} MB more at the peak")
+        yield f"| {name} | {used['size_mb']:.0f} | {used['peak_mb']:.0f} | {used['cpu_s']:.2f} |"
+    yield f"\nan hour more of log: {answer['mb_an_hour']:.0f} MB more at the peak"
     workers = answer["workers"]
-    print(f"\nsix recordings: {workers['one_s']:.2f} s by one worker, {workers['two_s']:.2f} s by"
-          f" two: {workers['faster']:.2f}x (load average {workers['load']:.1f})\n")  # fmt: skip
-    for name, met in answer["targets"].items():
-        print(f"{'met   ' if met else 'MISSED'} {name}")
+    yield (
+        f"\nsix recordings: {workers['one_s']:.2f} s by one worker, {workers['two_s']:.2f} s by"
+        f" two: {workers['faster']:.2f}x (load average {workers['load']:.1f})\n"
+    )
+    yield from (f"{'met   ' if met else 'MISSED'} {n}" for n, met in answer["targets"].items())
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="two minutes of log, not twenty")
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--check", action="store_true", help="exit 1 where a target is missed")
+    parser = option_parser(__doc__, quick="two minutes of log, not twenty")
     parser.add_argument("--rounds", type=int, default=5, help="one in three with the slow readers")
     options = parser.parse_args()
     seconds = 120.0 if options.quick else 1200.0
@@ -217,20 +282,19 @@ def main() -> int:
         stores = Stores(folder / "stores")
         stores.folder.mkdir()
         quick, slow, equal = contestants(folder, seconds, stores)
-        times = measure(quick, slow, rounds, slow_rounds)
+        cpu = medians(measure(quick, slow, rounds, slow_rounds))
         workers = two_workers(folder, seconds * 2, stores, 3)
         used = memory(folder, seconds, 256 if options.quick else 2200)
         columns = readers.restock_columns(folder / "log.mcap")
         size_mb = (folder / "log.mcap").stat().st_size / 1e6
-    median = {name: statistics.median(values) for name, values in times.items()}
-    ratio = {name: value / median[FLOOR] for name, value in median.items()}
+    ratio = {name: value / cpu[FLOOR] for name, value in cpu.items()}
     met = targets(ratio, workers, used)
     answer = {
         "messages": sum(len(topic) for topic in columns.values()),
         "log_s": seconds,
         "mcap_mb": size_mb,
         "equal_columns": equal,
-        "cpu_s": median,
+        "cpu_s": cpu,
         "over_floor": ratio,
         "workers": workers,
         "memory": used,
@@ -238,11 +302,7 @@ def main() -> int:
         / ((LONGER - 1) * seconds / 3600),
         "targets": met,
     }
-    if options.json:
-        print(json.dumps(answer, indent=1))
-    else:
-        show(answer)
-    return 0 if all(met.values()) or not options.check else 1
+    return finish(options, answer, [name for name in met if not met[name]], lines(answer))
 
 
 if __name__ == "__main__":

@@ -11,15 +11,14 @@ taken up where they are, so that a table can be made again without training agai
 
 from __future__ import annotations
 
-import argparse
 import contextlib
-import json
 import sys
 from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+from harness import finish, option_parser
 
 from restock.cli import main as restock
 from restock.ingest.store.writer import StoreWriter
@@ -30,7 +29,8 @@ STRATUM = "blocked_aisle"
 # Of the training episodes: none in the stratum, the rest as a run has them by default.
 LACKING = "env.conditions={nominal=0.4, wheel_slip=0.2, near_collision=0.2, blocked_aisle=0}"
 BUFFER, TARGET, DIVERGENCE = {"BUFFER", "BOTH"}, {"TARGET", "BOTH", "DIVERGENCE"}, {"DIVERGENCE"}
-# fault -> what may be said of it, and the settings that plant it
+CAUSES = ["HEALTHY", "BUFFER", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED"]
+# fault -> the causes that are right, and the settings that plant it
 FAULTS: dict[str, tuple[set[str], list[str]]] = {
     "healthy": ({"HEALTHY"}, []),
     "stratum removed": (BUFFER, [LACKING]),
@@ -123,42 +123,33 @@ def _must(arguments: list[str]) -> None:
         raise SystemExit(f"restock {' '.join(arguments)} failed")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
+def main() -> int:
+    parser = option_parser(__doc__)
     parser.add_argument("--out", type=Path, required=True, help="where stores, panels and runs go")
     parser.add_argument("--seeds", type=int, default=3, help="how many")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--faults", default=",".join(FAULTS), help="comma-separated")
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument(
-        "--check", action="store_true", help="exit 1 below 90 %, or if ever opposite"
-    )
-    given = parser.parse_args()
-    given.out.mkdir(parents=True, exist_ok=True)
-    seeds = range(given.first_seed, given.first_seed + given.seeds)
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
     table: dict[str, dict[str, int]] = {}
     right = opposite = total = 0
-    for fault in given.faults.split(","):
+    for fault in options.faults.split(","):
         expected = FAULTS[fault][0]
-        said = [diagnose([run_for(fault, seed, given.out)]).cause for seed in seeds]
-        table[fault] = dict(Counter(said))
-        total += len(said)
-        right += sum(cause in expected or cause == "UNDETERMINED" for cause in said)
+        causes = [diagnose([run_for(fault, seed, options.out)]).cause for seed in seeds]
+        table[fault] = dict(Counter(causes))
+        total += len(causes)
+        right += sum(cause in expected or cause == "UNDETERMINED" for cause in causes)
         wrong = TARGET - BUFFER if expected == BUFFER else BUFFER - TARGET
-        opposite += sum(cause in wrong for cause in said)
-    if given.json:
-        print(json.dumps({"table": table, "right": right, "opposite": opposite, "runs": total}))
-    else:
-        causes = ["HEALTHY", "BUFFER", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED"]
-        print("| planted | " + " | ".join(causes) + " |\n|" + " --- |" * (len(causes) + 1))
-        for fault, counts in table.items():
-            print(f"| {fault} | " + " | ".join(str(counts.get(c, "")) for c in causes) + " |")
-        print(f"\n{right} of {total} named right or UNDETERMINED; {opposite} named the opposite")
-    if given.check and (right < 0.9 * total or opposite):
-        raise SystemExit(1)
+        opposite += sum(cause in wrong for cause in causes)
+    lines = ["| planted | " + " | ".join(CAUSES) + " |\n|" + " --- |" * (len(CAUSES) + 1)]
+    for fault, counts in table.items():
+        lines.append(f"| {fault} | " + " | ".join(str(counts.get(c, "")) for c in CAUSES) + " |")
+    verdict = f"{right} of {total} named right or UNDETERMINED; {opposite} named the opposite"
+    missed = [f"{verdict}; at least 90 %, none opposite"] if right < 0.9 * total or opposite else []
+    answer = {"table": table, "right": right, "opposite": opposite, "runs": total}
+    return finish(options, answer, missed, [*lines, f"\n{verdict}"])
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

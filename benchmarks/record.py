@@ -20,6 +20,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from harness import finish, option_parser
+
 from restock.train.twin.recording.recorder import RecordingPlan, record
 
 MOST_S_PER_MINUTE = 2.0
@@ -57,45 +59,33 @@ def in_own_process(file_format: str, minutes: float) -> dict[str, Any]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="1 and 4 minutes, not 5 and 60")
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--check", action="store_true")
+    parser = option_parser(__doc__, quick="1 and 4 minutes, not 5 and 60")
     parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
-        sys.stdout.write(json.dumps(measure(options.one[0], float(options.one[1]))))
+        print(json.dumps(measure(options.one[0], float(options.one[1]))))
         return 0
     short, long = (1.0, 4.0) if options.quick else (5.0, 60.0)
     rows = [
-        in_own_process("mcap", short),
-        in_own_process("rosbag2", short),
-        in_own_process("mcap", long),
+        in_own_process(file_format, minutes)
+        for file_format, minutes in (("mcap", short), ("rosbag2", short), ("mcap", long))
     ]
-    figures = {
-        "recordings": rows,
-        "memory_growth_mib": rows[2]["peak_mib"] - rows[0]["peak_mib"],
-    }
-    if options.json:
-        sys.stdout.write(json.dumps(figures, indent=1) + "\n")
-    else:
-        for row in rows:
-            print(
-                f"{row['format']:8} {row['minutes']:5.1f} robot-minutes: "
-                f"{row['minutes_per_s']:.2f} a second of work ({row['s_per_minute']:.2f} s each), "
-                f"{row['messages_per_s']:,.0f} messages/s, {row['mb_per_minute']:.2f} MB/minute, "
-                f"peak {row['peak_mib']:.0f} MiB"
-            )
-    misses = [
+    growth_mib = rows[2]["peak_mib"] - rows[0]["peak_mib"]
+    lines = [
+        f"{row['format']:8} {row['minutes']:5.1f} robot-minutes: "
+        f"{row['minutes_per_s']:.2f} a second of work ({row['s_per_minute']:.2f} s each), "
+        f"{row['messages_per_s']:,.0f} messages/s, {row['mb_per_minute']:.2f} MB/minute, "
+        f"peak {row['peak_mib']:.0f} MiB"
+        for row in rows
+    ]
+    missed = [
         f"{row['format']}: {row['s_per_minute']:.2f} s a robot-minute, at most {MOST_S_PER_MINUTE}"
         for row in rows
         if row["s_per_minute"] > MOST_S_PER_MINUTE
     ]
-    if figures["memory_growth_mib"] > MOST_GROWTH_MIB:
-        misses.append(f"memory grew by {figures['memory_growth_mib']:.0f} MiB with the length")
-    for miss in misses:
-        sys.stderr.write(f"missed: {miss}\n")
-    return 1 if options.check and misses else 0
+    if growth_mib > MOST_GROWTH_MIB:
+        missed.append(f"memory grew by {growth_mib:.0f} MiB with the length")
+    return finish(options, {"recordings": rows, "memory_growth_mib": growth_mib}, missed, lines)
 
 
 if __name__ == "__main__":

@@ -12,20 +12,20 @@ target of the design is missed. Libraries that are not installed are left out.
 
 from __future__ import annotations
 
-import argparse
 import gc
-import json
 import os
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import replay_peers
 import torch
+from harness import cpu_us, finish, in_turns, medians, option_parser
 
 from restock.replay.mixture.packed_row import row_width
 from restock.replay.ring.ring import FreshRing
@@ -120,16 +120,12 @@ def strata(count: int) -> list[np.ndarray]:
 
 def measure(contenders: dict[str, Callable[[], None]], rounds: int, draws: int) -> dict[str, float]:
     """Median over rounds of the CPU microseconds of one batch; contenders take turns."""
-    times: dict[str, list[float]] = {name: [] for name in contenders}
-    for _ in range(rounds):
-        for name, draw in contenders.items():
-            few = max(draws // 50, 2) if name == "multinomial" else draws
-            draw()
-            began = time.process_time()
-            for _ in range(few):
-                draw()
-            times[name].append((time.process_time() - began) / few * 1e6)
-    return {name: float(np.median(values)) for name, values in times.items()}
+
+    def timed(name: str) -> float:
+        contenders[name]()
+        return cpu_us(contenders[name], max(draws // 50, 2) if name == "multinomial" else draws)
+
+    return medians(in_turns({name: partial(timed, name) for name in contenders}, rounds))
 
 
 def quota_sampler(stratum_rows: list[np.ndarray], *, replacement: bool = True) -> QuotaSampler:
@@ -214,7 +210,7 @@ def panel_build(count: int) -> dict[str, float]:
     """A panel of `count` rows from an Arrow table, checksummed."""
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
     import pyarrow as pa
-    from conftest import CONDITIONS, recording_transitions
+    from support.stores import CONDITIONS, recording_transitions
 
     from restock.ingest.task.scan import Body
     from restock.ingest.task.task import Task
@@ -305,14 +301,10 @@ def record_share(rounds: int, updates: int) -> dict[str, float]:
             "plain": train_benchmark.Restock(settings, arrays, run=None, logs=True),
             "recorded": train_benchmark.Restock(settings, arrays, run=run, logs=True),
         }
-        times: dict[str, list[float]] = {name: [] for name in contenders}
         for contender in contenders.values():
             contender(updates)
-        for _ in range(rounds):
-            for name, contender in contenders.items():
-                began = time.process_time()
-                contender(updates)
-                times[name].append((time.process_time() - began) / updates * 1e6)
+        timed = {name: partial(_us, run, updates) for name, run in contenders.items()}
+        times = in_turns(timed, rounds)
     plain, recorded = np.array(times["plain"]), np.array(times["recorded"])
     return {
         "update_us": float(np.median(plain)),
@@ -321,9 +313,14 @@ def record_share(rounds: int, updates: int) -> dict[str, float]:
     }
 
 
+def _us(run: Callable[[int], object], updates: int) -> float:
+    """CPU microseconds of one update."""
+    return cpu_us(lambda: run(updates), 1) / updates
+
+
 def fresh_ring(steps: int) -> dict[str, float]:
     """Appending steps of 16 environments, three-step returns, labels at the end of episodes."""
-    found = {}
+    us = {}
     for name, reserved in (("", {}), ("reserved_", {"rare": 10_000})):
         envs, length = 16, 100
         ring = FreshRing(
@@ -354,30 +351,22 @@ def fresh_ring(steps: int) -> dict[str, float]:
             )
             for key in keys[ended]:
                 ring.set_labels(int(key), labels)
-        us = (time.process_time() - began) / steps * 1e6
-        found |= {f"{name}append_us": us, f"{name}append_us_per_env_step": us / envs}
-    return found
+        step_us = (time.process_time() - began) / steps * 1e6
+        us |= {f"{name}append_us": step_us, f"{name}append_us_per_env_step": step_us / envs}
+    return us
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="fewer rows and rounds")
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--check", action="store_true", help="exit 1 where a target is missed")
+    parser = option_parser(__doc__, quick="fewer rows and rounds")
     parser.add_argument("--only", choices=SECTIONS, action="append", help="may be repeated")
-    args = parser.parse_args()
+    options = parser.parse_args()
     torch.set_num_threads(1)
-    result: dict[str, Any] = {}
-    for name in args.only or SECTIONS:
+    figures: dict[str, Any] = {}
+    for name in options.only or SECTIONS:
         print(f"measuring {name} …", file=sys.stderr)
-        result[name] = SECTIONS[name](args.quick)
+        figures[name] = SECTIONS[name](options.quick)
         gc.collect()
-    result["missed"] = missed(result)
-    if args.json:
-        print(json.dumps(result, indent=1))
-    else:
-        show(result)
-    return 1 if args.check and result["missed"] else 0
+    return finish(options, figures, missed(figures), lines(figures))
 
 
 def sampling(quick: bool) -> dict[str, Any]:
@@ -414,40 +403,38 @@ SECTIONS: dict[str, Callable[[bool], dict[str, Any]]] = {
 }
 
 
-def missed(result: dict[str, Any]) -> list[str]:
+def missed(figures: dict[str, Any]) -> list[str]:
     """The targets of the design that these figures miss."""
-    ratios = result["sampling"]["ratios"] if "sampling" in result else {}
-    found = [
+    ratios = figures["sampling"]["ratios"] if "sampling" in figures else {}
+    misses = [
         f"{name}: {ratio:.2f}, at least {TARGETS[name][2]:g}"
         for name, ratio in ratios.items()
         if ratio < TARGETS[name][2]
     ]
-    for part in (result[name] for name in ("sampling", "many_rows") if name in result):
+    for part in (figures[name] for name in ("sampling", "many_rows") if name in figures):
         if (ratio := part["quotas / uniform"]) > QUOTA_TARGET:
             where = f"quotas / uniform at {part['rows']:,} rows"
-            found.append(f"{where}: {ratio:.2f}, at most {QUOTA_TARGET:g}")
-    if "record" in result and (share := result["record"]["share"]) > RECORD_TARGET:
-        found.append(f"record: {share:.1%} of an update, at most {RECORD_TARGET:.0%}")
-    return found
+            misses.append(f"{where}: {ratio:.2f}, at most {QUOTA_TARGET:g}")
+    if "record" in figures and (share := figures["record"]["share"]) > RECORD_TARGET:
+        misses.append(f"record: {share:.1%} of an update, at most {RECORD_TARGET:.0%}")
+    return misses
 
 
-def show(result: dict[str, Any]) -> None:
+def lines(result: dict[str, Any]) -> Iterator[str]:
     """The figures as a table and lines, for people."""
     for section, figures in result.items():
-        if section == "sampling":
-            us = figures["cpu_us_per_batch"]
-            print(f"{figures['rows']:,} rows of {figures['row_floats']} floats, batch {BATCH}")
-            for name, value in us.items():
-                times = value / us["uniform"]
-                print(f"  {name:22} {value:10.1f} us of CPU a batch {times:8.2f} x uniform")
-            for name, why in figures["left_out"].items():
-                print(f"  {name:22} left out: {why}")
-            for name, ratio in figures["ratios"].items():
-                print(f"  {name:38} {ratio:6.2f}  (target {TARGETS[name][2]:g})")
-        elif section != "missed":
+        if section != "sampling":
             line = ", ".join(f"{key} {value:,.4g}" for key, value in figures.items())
-            print(f"{section}: {line}")
-    print("\n".join(f"missed: {line}" for line in result["missed"]) or "all targets met")
+            yield f"{section}: {line}"
+            continue
+        us = figures["cpu_us_per_batch"]
+        yield f"{figures['rows']:,} rows of {figures['row_floats']} floats, batch {BATCH}"
+        for name, value in us.items():
+            times = value / us["uniform"]
+            yield f"  {name:22} {value:10.1f} us of CPU a batch {times:8.2f} x uniform"
+        yield from (f"  {n:22} left out: {why}" for n, why in figures["left_out"].items())
+        for name, ratio in figures["ratios"].items():
+            yield f"  {name:38} {ratio:6.2f}  (target {TARGETS[name][2]:g})"
 
 
 if __name__ == "__main__":

@@ -175,7 +175,7 @@ PRIORITISED = {"tianshou_per": tianshou_per, "torchrl_per": torchrl_per, "cpprb_
 
 
 def uniform(columns: Columns, batch: int) -> dict[str, Draw | str]:
-    """Uniform sampling, of each library; where it cannot be had, why."""
+    """Uniform sampling, of each library; where it is unavailable, why."""
     return _installed(UNIFORM, columns, batch)
 
 
@@ -184,11 +184,11 @@ def prioritised(columns: Columns, batch: int, errors: np.ndarray) -> dict[str, D
     return _installed(PRIORITISED, columns, batch, errors)
 
 
-def _installed(makers: dict[str, Any], *given: Any) -> dict[str, Draw | str]:
+def _installed(makers: dict[str, Any], *arguments: Any) -> dict[str, Draw | str]:
     made: dict[str, Draw | str] = {}
     for name, maker in makers.items():
         try:
-            made[name] = maker(*given)
+            made[name] = maker(*arguments)
         except ImportError as error:
             made[name] = f"not installed: {error.name}"
         except RuntimeError as error:  # TorchRL without its compiled part

@@ -12,17 +12,18 @@ Figures are CPU times. `--check` exits 1 where a target of the design is missed.
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import json
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from harness import finish, in_turns, medians, option_parser
 from train_peers import (
     ACTIONS,
     DISCOUNT,
@@ -152,25 +153,29 @@ def products(batch: int) -> Updates:
     return update
 
 
-def measure(contenders: dict[str, Updates], rounds: int, updates: int) -> dict[str, float]:
-    """Median CPU microseconds an update, the contenders taking turns."""
-    taken: dict[str, list[float]] = {name: [] for name in contenders}
-    for run in contenders.values():
-        run(updates)  # warm
-    for _ in range(rounds):
-        for name, run in contenders.items():
-            began = time.process_time()
-            elsewhere = run(updates)
-            here = time.process_time() - began
-            taken[name].append((here if elsewhere is None else elsewhere) / updates * 1e6)
-    return {name: float(np.median(values)) for name, values in taken.items()}
+def us_of(run: Updates, updates: int) -> float:
+    """CPU microseconds of one update, by its own account where it is made in another process."""
+    began = time.process_time()
+    elsewhere_s = run(updates)
+    here_s = time.process_time() - began
+    return (here_s if elsewhere_s is None else elsewhere_s) / updates * 1e6
+
+
+def lines(answer: dict[str, Any]) -> Iterator[str]:
+    """The figures, for people."""
+    for name, value in answer["us_per_update"].items():
+        yield f"{name:28s} {value:7.0f} us an update"
+    for name, value in answer["ratios"].items():
+        target = f" (target {TARGETS[name]}x)" if name in TARGETS else ""
+        yield f"{name} / restock: {value:.2f}x{target}"
+    yield from (f"{name}: not installed, left out" for name in answer["left_out"])
+    over, share = answer["over_in_place"], answer["record_share"]
+    yield f"restock / in place: {over:.2f}x (target at most {IN_PLACE_TARGET}x)"
+    yield f"record of what was fed: {share:.1%} of an update (target at most {FEED_TARGET:.0%})"
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--check", action="store_true")
+    parser = option_parser(__doc__, quick="fewer rounds and updates")
     parser.add_argument("--batch", type=int, default=128)
     parser.add_argument(
         "--neighbours",
@@ -178,22 +183,22 @@ def main() -> int:
         default=Path(".venv-neighbours/bin/python"),
         help="a Python that has d3rlpy",
     )
-    args = parser.parse_args()
+    options = parser.parse_args()
     torch.set_num_threads(1)
-    arrays = data(np.random.default_rng(0))
-    equal = config(args.batch, network={"layer_norm": False}, loss={"double": False})
-    normed, default = config(args.batch, loss={"double": False}), config(args.batch)
+    batch, arrays = options.batch, data(np.random.default_rng(0))
+    equal = config(batch, network={"layer_norm": False}, loss={"double": False})
+    normed, default = config(batch, loss={"double": False}), config(batch)
     peers = {
-        "cleanrl": cleanrl(args.batch, arrays),
-        "stable_baselines3": stable_baselines3(args.batch, arrays),
-        "tianshou": tianshou(args.batch, arrays),
-        "torchrl": torchrl(args.batch, arrays),
-        "d3rlpy": d3rlpy(args.batch, arrays, args.neighbours),
+        "cleanrl": cleanrl(batch, arrays),
+        "stable_baselines3": stable_baselines3(batch, arrays),
+        "tianshou": tianshou(batch, arrays),
+        "torchrl": torchrl(batch, arrays),
+        "d3rlpy": d3rlpy(batch, arrays, options.neighbours),
     }
     with tempfile.TemporaryDirectory() as folder:
         run = Run.create(Path(folder) / "run", {})
         contenders: dict[str, Updates] = {
-            "products": products(args.batch),
+            "products": products(batch),
             "restock_in_place": in_place(equal, arrays),
             "restock": Restock(equal, arrays),
             "restock_autograd": Restock(equal, arrays, path="autograd"),
@@ -203,9 +208,10 @@ def main() -> int:
             "restock_default": Restock(default, arrays, logs=True),
             "restock_default_recorded": Restock(default, arrays, run=run, logs=True),
         }
-        rounds, updates = (5, 40) if args.quick else (15, 200)
-        us = measure(contenders, rounds, updates)
-    left_out = [name for name, peer in peers.items() if peer is None]
+        rounds, updates = (5, 40) if options.quick else (15, 200)
+        timed = {name: partial(us_of, update, updates) for name, update in contenders.items()}
+        in_turns(timed, 1)  # warm
+        us = medians(in_turns(timed, rounds))
     ratios = {name: us[name] / us["restock"] for name in peers if name in us}
     over = us["restock"] / us["restock_in_place"]
     feed = us["restock_default_recorded"] / us["restock_default"] - 1
@@ -218,34 +224,15 @@ def main() -> int:
         missed.append(f"over the arithmetic in place: {over:.2f}x, target {IN_PLACE_TARGET}x")
     if feed > FEED_TARGET:
         missed.append(f"record: {feed:.1%} of an update, target {FEED_TARGET:.0%}")
-    if args.json:
-        print(
-            json.dumps(
-                {
-                    "batch": args.batch,
-                    "us_per_update": us,
-                    "ratios": ratios,
-                    "over_in_place": over,
-                    "left_out": left_out,
-                    "record_share": feed,
-                    "missed": missed,
-                }
-            )
-        )
-    else:
-        for name, value in us.items():
-            print(f"{name:28s} {value:7.0f} us an update")
-        for name, value in ratios.items():
-            target = f" (target {TARGETS[name]}x)" if name in TARGETS else ""
-            print(f"{name} / restock: {value:.2f}x{target}")
-        for name in left_out:
-            print(f"{name}: not installed, left out")
-        print(f"restock / in place: {over:.2f}x (target at most {IN_PLACE_TARGET}x)")
-        print(f"record of what was fed: {feed:.1%} of an update (target at most {FEED_TARGET:.0%})")
-    if args.check and missed:
-        print("missed: " + "; ".join(missed), file=sys.stderr)
-        return 1
-    return 0
+    answer = {
+        "batch": batch,
+        "us_per_update": us,
+        "ratios": ratios,
+        "over_in_place": over,
+        "left_out": [name for name, peer in peers.items() if peer is None],
+        "record_share": feed,
+    }
+    return finish(options, answer, missed, lines(answer))
 
 
 if __name__ == "__main__":

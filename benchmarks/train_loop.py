@@ -11,8 +11,6 @@ none. Both are timed from the end of the warm-up, in turns, by wall clock and CP
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 import tempfile
 import time
@@ -22,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from harness import finish, option_parser
 
 from restock.train.loop import TrainingInterrupted, train
 from restock.train.prepare import prepare_new
@@ -81,7 +80,7 @@ def restock(steps: int, seed: int, *, layer_norm: bool) -> Stretch:
                     session.progress.env_steps, session.learner.gradient_steps
                 ),
             )
-        except TrainingInterrupted:  # as it was asked to be
+        except TrainingInterrupted:  # by `stop`
             pass
         finally:
             session.close()
@@ -124,17 +123,14 @@ def stable_baselines3(steps: int, seed: int) -> Stretch:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--check", action="store_true")
+    parser = option_parser(__doc__, quick="1,600 steps, once")
     parser.add_argument("--steps", type=int, default=20_000)
-    args = parser.parse_args()
+    options = parser.parse_args()
     torch.set_num_threads(1)
     import restock as package  # registers the environment
 
     del package
-    steps, rounds = (1_600, 1) if args.quick else (args.steps, 3)
+    steps, rounds = (1_600, 1) if options.quick else (options.steps, 3)
     runs: dict[str, list[Stretch]] = {"restock": [], "restock_default": [], "stable_baselines3": []}
     for seed in range(rounds):
         runs["restock"].append(restock(steps, seed, layer_norm=False))
@@ -154,23 +150,17 @@ def main() -> int:
     missed = []
     if ratios["env_steps_per_s"] < TARGET:
         missed.append(f"end to end: {ratios['env_steps_per_s']:.2f}x, target {TARGET}x")
-    if args.json:
-        print(json.dumps({"steps": steps, "rates": rates, "ratios": ratios, "missed": missed}))
-    else:
-        for name, rate in rates.items():
-            print(
-                f"{name:18s} {rate['env_steps_per_s']:7.0f} env steps/s"
-                f" {rate['updates_per_s']:6.0f} updates/s"
-                f" {rate['env_steps_per_cpu_s']:7.0f} env steps/CPU s"
-            )
-        print(
-            f"restock / stable_baselines3: {ratios['env_steps_per_s']:.2f}x by wall clock"
-            f" (target {TARGET}x), {ratios['env_steps_per_cpu_s']:.2f}x by CPU"
-        )
-    if args.check and missed:
-        print("missed: " + "; ".join(missed), file=sys.stderr)
-        return 1
-    return 0
+    lines = [
+        f"{name:18s} {rate['env_steps_per_s']:7.0f} env steps/s"
+        f" {rate['updates_per_s']:6.0f} updates/s"
+        f" {rate['env_steps_per_cpu_s']:7.0f} env steps/CPU s"
+        for name, rate in rates.items()
+    ]
+    lines.append(
+        f"restock / stable_baselines3: {ratios['env_steps_per_s']:.2f}x by wall clock"
+        f" (target {TARGET}x), {ratios['env_steps_per_cpu_s']:.2f}x by CPU"
+    )
+    return finish(options, {"steps": steps, "rates": rates, "ratios": ratios}, missed, lines)
 
 
 if __name__ == "__main__":

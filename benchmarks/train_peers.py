@@ -8,8 +8,11 @@ not (Tianshou, d3rlpy), which is less work.
 
 from __future__ import annotations
 
+import os
 import subprocess
+import sys
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -195,12 +198,11 @@ def torchrl(batch: int, arrays: Arrays) -> Updates | None:
 
 
 def d3rlpy(batch: int, arrays: Arrays, python: Path) -> Updates | None:
-    """In a Python of its own (it asks for an older Gymnasium), which tells its own CPU time."""
+    """In a Python of its own (it needs an older Gymnasium), which runs `d3rlpy_child`."""
     if not python.exists():
         return None
-    script = Path(__file__).with_name("train_d3rlpy.py")
     child = subprocess.Popen(  # ends when its stdin does
-        [str(python), str(script), str(batch)],
+        [str(python), __file__, str(batch)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
@@ -223,3 +225,40 @@ def d3rlpy(batch: int, arrays: Arrays, python: Path) -> Updates | None:
         return float(of.readline())
 
     return update
+
+
+def d3rlpy_child(batch: int) -> None:
+    """d3rlpy's updates, in a Python that has it.
+
+    Reads the path of the rows (.npz) from stdin, says "ready", then for each line `n` makes n
+    updates and prints the CPU seconds they took.
+    """
+    import d3rlpy  # type: ignore[import-not-found]
+
+    answers = os.fdopen(os.dup(1), "w")  # d3rlpy's own lines go to stderr
+    os.dup2(2, 1)
+    torch.set_num_threads(1)
+    with np.load(sys.stdin.readline().strip()) as rows:
+        names = ("observation", "action", "reward", "done")
+        observation, action, reward, done = (rows[name] for name in names)
+    # Next observations are the rows that follow: d3rlpy keeps episodes, not pairs.
+    done[-1] = 1
+    dataset = d3rlpy.dataset.MDPDataset(observation, action[:, 0], reward[:, 0], done[:, 0])
+    algorithm = d3rlpy.algos.DQNConfig(
+        batch_size=batch,
+        gamma=DISCOUNT,
+        learning_rate=LEARNING_RATE,
+        encoder_factory=d3rlpy.models.VectorEncoderFactory([256, 256]),
+        target_update_interval=COPY_EVERY,
+    ).create(device="cpu:0")
+    algorithm.create_impl(observation.shape[1:], int(action.max()) + 1)
+    print("ready", file=answers, flush=True)
+    for line in sys.stdin:
+        began = time.process_time()
+        for _ in range(int(line)):
+            algorithm.update(dataset.sample_transition_batch(batch))
+        print(time.process_time() - began, file=answers, flush=True)
+
+
+if __name__ == "__main__":
+    d3rlpy_child(int(sys.argv[1]))

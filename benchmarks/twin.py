@@ -15,21 +15,26 @@ fast as a SyncVectorEnv of as many.
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import mujoco
 import numpy as np
-from twin_parts import parts
+import pyarrow as pa
+from harness import finish, in_turns, option_parser
 
 import restock  # noqa: F401 - registers the environment
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.conditions import label
+from restock.ingest.task.signals import STORED_SIGNALS
+from restock.train.twin.env import vector_env
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.physics import sensing
 from restock.train.twin.physics.sensing import Sensing
 from restock.train.twin.physics.simulation import LIDAR_BEAMS, Simulation
 
@@ -47,25 +52,16 @@ class Contestant:
 
     def __init__(self, run: Callable[[], object], count: int, pids: tuple[int, ...] = ()) -> None:
         self.run, self.count, self.pids = run, count, pids
-        self._rounds: list[tuple[float, float]] = []
 
-    def round(self, steps: int) -> None:
-        """About `steps` environment steps."""
+    def round(self, steps: int) -> tuple[float, float]:
+        """Microseconds an environment step, of CPU and wall time, over about `steps` of them."""
         repeats = max(steps // self.count, 4)
         cpu, wall = self._cpu_s(), time.perf_counter()
         for _ in range(repeats):
             self.run()
         scale = 1e6 / repeats / self.count
         taken = self._cpu_s() - cpu, time.perf_counter() - wall
-        self._rounds.append((taken[0] * scale, taken[1] * scale))
-
-    @property
-    def cpu_us(self) -> float:
-        return float(np.median([cpu for cpu, _ in self._rounds]))
-
-    @property
-    def wall_us(self) -> float:
-        return float(np.median([wall for _, wall in self._rounds]))
+        return taken[0] * scale, taken[1] * scale
 
     def _cpu_s(self) -> float:
         workers = 0.0
@@ -158,11 +154,127 @@ def one() -> Contestant:
     return Contestant(run, 1)
 
 
+class Stopwatch:
+    """CPU seconds by part; while one part runs, the part that called it stands still."""
+
+    def __init__(self) -> None:
+        self.spent: dict[str, float] = {}
+        self._open: list[str] = []
+        self._since = 0.0
+
+    def timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def run(*given: Any, **named: Any) -> Any:
+            self._turn()
+            self._open.append(name)
+            try:
+                return function(*given, **named)
+            finally:
+                self._turn()
+                self._open.pop()
+
+        return run
+
+    def _turn(self) -> None:
+        now = time.process_time()
+        if self._open:
+            part = self._open[-1]
+            self.spent[part] = self.spent.get(part, 0.0) + now - self._since
+        self._since = now
+
+
+def parts(count: int, steps: int) -> dict[str, float]:
+    """Part -> microseconds of CPU an environment step without the parts within it.
+
+    The parts are functions of the twin, timed from outside, under random actions. "labels" is no
+    part of a step: it is what the conditions cost that training labels every finished episode with.
+    """
+    env = WarehouseVectorEnv(count, seed=1)
+    env.reset(seed=1)
+    watch = Stopwatch()
+    sim = env.simulation
+    for name, owner, method in (
+        ("physics", sim.batch, "rollout"),
+        ("lidar", sim.batch, "ray"),
+        ("lidar", sim, "cast"),
+        ("sensors and their noise", env.sensing, "sense"),
+        ("navigation: plans, blocked aisles", env.navigation, "update"),
+        ("traffic", sim.traffic, "advance"),
+        ("traffic", sim.scenery, "walk"),
+        ("controller and friction", sim, "drive"),
+        ("truth", env.truth, "look"),
+        ("truth", env.truth, "conclude"),
+        ("info", env, "_info_after"),
+        ("autoreset: episodes laid out", env, "_begin"),
+        ("the rest of step", env, "step"),
+    ):
+        setattr(owner, method, watch.timed(name, getattr(owner, method)))
+    swapped = {
+        "observe": "observation",
+        "reward": "reward and termination",
+        "terminated": "reward and termination",
+        "add_motion": "sensors and their noise",
+        "add_route": "route",
+    }
+    before = {name: getattr(vector_env, name) for name in swapped}
+    rng = np.random.default_rng(0)
+    # As in a long run, some episode or other is always about to end.
+    env.steps[:] = rng.integers(env.task.time_limit_steps, size=count)
+    rows = []
+    try:
+        for name, part in swapped.items():
+            setattr(vector_env, name, watch.timed(part, before[name]))
+        for step in range(20 + steps):
+            if step == 20:
+                watch.spent.clear()
+            *_, info = env.step(rng.integers(env.single_action_space.n, size=count))
+            rows.append(info["signals"])
+    finally:
+        for name, function in before.items():
+            setattr(vector_env, name, function)
+    scale = 1e6 / steps / count
+    us = {name: spent * scale for name, spent in watch.spent.items()}
+    us = dict(sorted(us.items(), key=lambda item: -item[1]))
+    us["whole step"] = sum(us.values())
+    us["labels (in training, not in step)"] = _labels(rows, count)
+    return us
+
+
+def _labels(rows: list[sensing.Signals], count: int) -> float:
+    """Microseconds an environment step to label the conditions of these steps."""
+    conditions = load_profile("warehouse_amr").conditions
+    columns: dict[str, Any] = {
+        "episode_index": np.repeat(np.arange(count), len(rows)),
+        "step_index": np.tile(np.arange(len(rows)), count),
+    }
+    for signal in STORED_SIGNALS:
+        stacked = np.stack([row[signal.name] for row in rows], axis=1)  # (N, T, …)
+        flat = stacked.reshape(count * len(rows), *stacked.shape[2:])
+        columns[signal.name] = flat.tolist() if flat.ndim > 1 else flat
+    table = pa.table(columns)
+    label(table, conditions)
+    began = time.process_time()
+    label(table, conditions)
+    return (time.process_time() - began) * 1e6 / table.num_rows
+
+
+def lines(
+    cpu: dict[str, float],
+    wall: dict[str, float],
+    ratios: dict[str, float],
+    shares: dict[int, dict[str, float]],
+) -> Iterator[str]:
+    """The figures as tables."""
+    yield f"{'microseconds an environment step':40s} {'CPU':>8s} {'wall':>8s}"
+    yield from (f"{name:40s} {cpu[name]:8.1f} {wall[name]:8.1f}" for name in cpu)
+    yield from (f"{name:40s} {value:8.2f}" for name, value in ratios.items())
+    for count, table in shares.items():
+        whole = table["whole step"]
+        yield f"\nparts of a step of {count} environments, us of CPU an environment step"
+        yield from (f"{name:40s} {us:8.1f} {us / whole:8.1%}" for name, us in table.items())
+
+
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="a few rounds only")
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--check", action="store_true")
+    parser = option_parser(__doc__, quick="a few rounds only")
     parser.add_argument("--layouts", nargs="*", default=[], help="more floors, by name")
     options = parser.parse_args()
 
@@ -181,19 +293,22 @@ def main() -> int:
         contestants[f"{beams} beams"] = with_beams(beams)
     for name in options.layouts:
         contestants[f"floors: {name}"] = vector(SCALED, layouts=name)
-    for _ in range(3 if options.quick else 12):
-        for contestant in contestants.values():
-            contestant.round(160 if options.quick else 640)
+    steps = 160 if options.quick else 640
+    rounds = {name: partial(contestant.round, steps) for name, contestant in contestants.items()}
+    measured = in_turns(rounds, 3 if options.quick else 12)
     opened.close()
 
-    cost = {name: contestant.cpu_us for name, contestant in contestants.items()}
+    cpu, wall = (
+        {name: float(np.median([one[kind] for one in both])) for name, both in measured.items()}
+        for kind in (0, 1)
+    )
     ratios = {
-        f"vector / physics, {count}": cost[f"vector environment, {count}"]
-        / cost[f"Batch physics, {count}"]
+        f"vector / physics, {count}": cpu[f"vector environment, {count}"]
+        / cpu[f"Batch physics, {count}"]
         for count in COUNTS
     }
     for name in (f"SyncVectorEnv, {PEERS}", f"AsyncVectorEnv, {PEERS}"):
-        ratios[f"{name} / vector"] = cost[name] / cost[f"vector environment, {PEERS}"]
+        ratios[f"{name} / vector"] = cpu[name] / cpu[f"vector environment, {PEERS}"]
     shares = {
         count: parts(count, steps=30 if options.quick else 150) for count in (COUNTS[0], COUNTS[-1])
     }
@@ -205,27 +320,9 @@ def main() -> int:
     sync = ratios[f"SyncVectorEnv, {PEERS} / vector"]
     if sync < TARGET:
         missed.append(f"SyncVectorEnv / vector: {sync:.2f}, target at least {TARGET}")
-    if options.json:
-        figures = {
-            name: {"cpu_us": contestant.cpu_us, "wall_us": contestant.wall_us}
-            for name, contestant in contestants.items()
-        }
-        found = {"us_per_env_step": figures, "ratios": ratios, "parts_us": shares, "missed": missed}
-        print(json.dumps(found, indent=2))
-    else:
-        print(f"{'microseconds an environment step':40s} {'CPU':>8s} {'wall':>8s}")
-        for name, contestant in contestants.items():
-            print(f"{name:40s} {contestant.cpu_us:8.1f} {contestant.wall_us:8.1f}")
-        for name, value in ratios.items():
-            print(f"{name:40s} {value:8.2f}")
-        for count, table in shares.items():
-            whole = table["whole step"]
-            print(f"\nparts of a step of {count} environments, us of CPU an environment step")
-            for name, value in table.items():
-                print(f"{name:40s} {value:8.1f} {value / whole:8.1%}")
-    if missed:
-        print("missed: " + "; ".join(missed), file=sys.stderr)
-    return 1 if options.check and missed else 0
+    figures = {name: {"cpu_us": cpu[name], "wall_us": wall[name]} for name in cpu}
+    answer = {"us_per_env_step": figures, "ratios": ratios, "parts_us": shares}
+    return finish(options, answer, missed, lines(cpu, wall, ratios, shares))
 
 
 if __name__ == "__main__":

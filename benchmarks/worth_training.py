@@ -19,8 +19,6 @@ wheel slip, in blocked aisles and in near collisions, with intervals apart; no c
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -31,6 +29,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from harness import finish, mean_interval, option_parser
 from numpy.typing import NDArray
 
 from restock.cli import main as restock
@@ -82,7 +81,7 @@ def cell_of(episode: Episode) -> str:
 def fixed(per_cell: int) -> list[tuple[EpisodeSpec, str]]:
     """`per_cell` episodes of every cell, the same always; each with its cell."""
     env = WarehouseVectorEnv(1)
-    found: list[tuple[EpisodeSpec, str]] = []
+    episodes: list[tuple[EpisodeSpec, str]] = []
     cells = {"nominal": 1, "wheel_slip": 3, "blocked_aisle": 2, "near_collision": 3}
     for kind in KINDS:
         count: dict[str, int] = {}
@@ -91,10 +90,10 @@ def fixed(per_cell: int) -> list[tuple[EpisodeSpec, str]]:
             spec = EpisodeSpec(kind, seed)
             cell = cell_of(draw_episode(spec, env.warehouse, env.navigation.planners[0]))
             if count.get(cell, 0) < per_cell:
-                found.append((spec, cell))
+                episodes.append((spec, cell))
             count[cell] = count.get(cell, 0) + 1
             seed += 1
-    return found
+    return episodes
 
 
 def train(out: Path, agent: str, seed: int, env_steps: int) -> Path:
@@ -129,13 +128,7 @@ def interval(values: NDArray[np.float64], rng: np.random.Generator) -> tuple[flo
     """95 % of the mean of (runs, episodes) of 0 and 1."""
     if len(values) == 1:
         return wilson(int(values.sum()), values.size)
-    draws = [
-        values[rng.integers(len(values), size=len(values))][
-            :, rng.integers(values.shape[1], size=values.shape[1])
-        ].mean()
-        for _ in range(RESAMPLES)
-    ]
-    return percentiles(np.array(draws))
+    return mean_interval(values, rng, RESAMPLES)
 
 
 def groups(cells: list[str]) -> Iterator[tuple[str, NDArray[np.int64]]]:
@@ -178,16 +171,12 @@ def misses(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
+    parser = option_parser(__doc__)
     parser.add_argument("--out", type=Path, required=True, help="where the runs go")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--env-steps", type=int, default=480_000)
     parser.add_argument("--episodes", type=int, default=300, help="of each cell")
     parser.add_argument("--workers", type=int, default=1, help="runs at a time")
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--check", action="store_true")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(options.workers, mp_context=get_context("spawn")) as pool:
@@ -210,11 +199,7 @@ def main() -> int:
         values[agent] = np.stack([drive(load_agent(Run.open(run)), episodes) for run in mine])
     rows = table(values, [cell for _, cell in episodes])
     pq.write_table(pa.Table.from_pylist(rows), options.out / "worth_training.parquet")
-    print(json.dumps(rows, indent=2) if options.json else markdown(rows))
-    missed = misses(rows)
-    for line in missed:
-        print(f"missed: {line}", file=sys.stderr)
-    return 1 if options.check and missed else 0
+    return finish(options, rows, misses(rows), [markdown(rows)])
 
 
 def table(values: dict[str, NDArray[np.float64]], cells: list[str]) -> list[dict[str, Any]]:

@@ -1,0 +1,86 @@
+"""What the benchmarks share: options, rounds in which contenders take turns, and their targets.
+
+A benchmark measures, and ends with `finish`: `--json` prints its figures instead of lines, what is
+missed goes to stderr in either case, and `--check` exits 1 where a target is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.stats import percentiles
+
+T = TypeVar("T")
+
+
+def option_parser(doc: str | None, quick: str = "") -> argparse.ArgumentParser:
+    """The options that benchmarks share; `quick` says what a small run is, where there is one."""
+    parser = argparse.ArgumentParser(
+        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    if quick:
+        parser.add_argument("--quick", action="store_true", help=quick)
+    parser.add_argument("--json", action="store_true", help="figures as JSON")
+    parser.add_argument("--check", action="store_true", help="exit 1 where a target is missed")
+    return parser
+
+
+def in_turns(contenders: Mapping[str, Callable[[], T]], rounds: int) -> dict[str, list[T]]:
+    """What each contender gives in each round; in turns, so that a busy machine slows all."""
+    measured: dict[str, list[T]] = {name: [] for name in contenders}
+    for number in range(rounds):
+        for name, measure in contenders.items():
+            measured[name].append(measure())
+        print(f"round {number + 1} of {rounds}", file=sys.stderr)
+    return measured
+
+
+def medians(measured: Mapping[str, Sequence[float]]) -> dict[str, float]:
+    """The middle of each contender's rounds."""
+    return {name: float(np.median(values)) for name, values in measured.items()}
+
+
+def cpu_us(run: Callable[[], object], repeats: int) -> float:
+    """CPU microseconds of one call, this process' threads together."""
+    began = time.process_time()
+    for _ in range(repeats):
+        run()
+    return (time.process_time() - began) / repeats * 1e6
+
+
+def mean_interval(
+    values: NDArray[np.float64], rng: np.random.Generator, resamples: int
+) -> tuple[float, float]:
+    """95 % of the mean of (runs, episodes), with both drawn again: all runs drove the same ones."""
+    runs, episodes = values.shape
+    means = [
+        values[rng.integers(runs, size=runs)][:, rng.integers(episodes, size=episodes)].mean()
+        for _ in range(resamples)
+    ]
+    return percentiles(np.array(means))
+
+
+def finish(
+    options: argparse.Namespace,
+    figures: Mapping[str, Any] | Sequence[Any],
+    missed: Sequence[str],
+    lines: Iterable[str],
+) -> int:
+    """Print the figures or these lines, and what is missed; the exit code."""
+    if options.json:
+        whole = {**figures, "missed": missed} if isinstance(figures, Mapping) else figures
+        print(json.dumps(whole, indent=1))
+    else:
+        for line in lines:
+            print(line)
+    for miss in missed:
+        print(f"missed: {miss}", file=sys.stderr)
+    return 1 if options.check and missed else 0
