@@ -29,9 +29,10 @@ from restock.train.twin.calibration.fit_parameters import (
 )
 from restock.train.twin.calibration.fit_scope import cuts, sides, usable
 from restock.train.twin.calibration.fit_uncertainty import uncertainty
-from restock.train.twin.calibration.log_segments import Segments, log_segments
+from restock.train.twin.calibration.logged_steps import logged_steps
 from restock.train.twin.calibration.mismatch import Mismatch, position_gap_m
 from restock.train.twin.calibration.open_loop import replay_segments
+from restock.train.twin.calibration.segments import LoggedSegments, log_segments
 from restock.train.twin.physics.perturbation import (
     RANGES,
     Perturbation,
@@ -77,14 +78,14 @@ def noiseless(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def log(known: Path) -> Iterator[Segments]:
+def log(known: Path) -> Iterator[LoggedSegments]:
     with Store(known) as store:
-        yield log_segments(store, 2.0)
+        yield log_segments(logged_steps(store), 2.0)
 
 
 def test_every_step_of_a_store_is_in_a_segment_or_left_out_with_a_reason(known: Path) -> None:
     with Store(known) as store:
-        found = log_segments(store, 2.0)
+        found = log_segments(logged_steps(store), 2.0)
         rows = store.sql("SELECT count(*) FROM transitions").fetchall()[0][0]
     assert len(found) * found.horizon_steps + sum(found.left_out.values()) == rows
     assert found.signals["pose_x_m"].shape == (len(found), found.horizon_steps + 1)
@@ -95,7 +96,7 @@ def test_every_step_of_a_store_is_in_a_segment_or_left_out_with_a_reason(known: 
 
 def test_segments_are_the_rows_of_the_store(known: Path) -> None:
     with Store(known) as store:
-        found = log_segments(store, 1.0, stride_s=3.0)
+        found = log_segments(logged_steps(store), 1.0, stride_s=3.0)
         first = found.transition_id[-1]
         rows = store.sql(
             "SELECT pose_x_m, command_speed_mps, condition FROM transitions"
@@ -108,7 +109,7 @@ def test_segments_are_the_rows_of_the_store(known: Path) -> None:
 
 def test_the_twin_that_was_recorded_without_noise_repeats_itself(noiseless: Path) -> None:
     with Store(noiseless) as store:
-        found = log_segments(store, 3.0)
+        found = log_segments(logged_steps(store), 3.0)
     free = found.take(~found.signals["bumped"].any(axis=1))
     replayed = replay_segments(free, [NOISELESS, KNOWN])
     same, other = position_gap_m(free, replayed)[:, :, -1]
@@ -118,14 +119,14 @@ def test_the_twin_that_was_recorded_without_noise_repeats_itself(noiseless: Path
     assert np.abs(speed).max() < 0.01
 
 
-def test_a_replay_does_not_depend_on_what_else_is_replayed(log: Segments) -> None:
+def test_a_replay_does_not_depend_on_what_else_is_replayed(log: LoggedSegments) -> None:
     alone = replay_segments(log.take(np.array([1])), [KNOWN])
     among = replay_segments(log, [Perturbation(), KNOWN], nthread=2)
     for name, values in alone.signals.items():
         assert np.array_equal(values[0, 0], among.signals[name][1, 1])
 
 
-def test_between_two_latencies_a_residual_lies_between(log: Segments) -> None:
+def test_between_two_latencies_a_residual_lies_between(log: LoggedSegments) -> None:
     low, middle, high = Mismatch(log.take(np.arange(4)), ("wheel speed",)).of(
         [Perturbation(latency_s=value) for value in (0.11, 0.1125, 0.12)]
     )["wheel speed"]
@@ -166,7 +167,7 @@ def test_known_latency_gain_and_wheels_are_recovered(known: Path, tmp_path: Path
         write_fit(tmp_path / "fitted.toml", [found])
 
 
-def test_friction_under_wheels_that_stand_is_not_told_and_stays(log: Segments) -> None:
+def test_friction_under_wheels_that_stand_is_not_told_and_stays(log: LoggedSegments) -> None:
     some = log.take(np.arange(8))
     standing = replace(
         some,
@@ -210,7 +211,7 @@ def test_a_schedule_of_several_fits_spans_what_all_of_them_told(tmp_path: Path) 
     assert load_schedule(tmp_path / "fleet.toml") == schedule(fits)
 
 
-def test_bumps_and_slippery_patches_are_not_ordinary_driving(log: Segments) -> None:
+def test_bumps_and_slippery_patches_are_not_ordinary_driving(log: LoggedSegments) -> None:
     log.signals["bumped"][:] = False
     log.signals["clearance_m"][:] = 1.0
     log = replace(log, true_condition=np.full(log.true_condition.shape, "nominal", "<U20"))
@@ -226,7 +227,7 @@ def test_bumps_and_slippery_patches_are_not_ordinary_driving(log: Segments) -> N
     }
 
 
-def test_what_is_held_out_is_never_fitted(log: Segments) -> None:
+def test_what_is_held_out_is_never_fitted(log: LoggedSegments) -> None:
     before, after = sides(log, cuts(log, 0.25, seed=0))
     assert before.any()
     assert after.any()

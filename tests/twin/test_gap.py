@@ -31,7 +31,8 @@ from restock.train.twin.calibration.logged_steps import (
     previous_action,
     sector_clearance,
 )
-from restock.train.twin.calibration.one_step import AGREES, agreement, empty_floor, one_step
+from restock.train.twin.calibration.one_step import AGREES, agreement, one_step
+from restock.train.twin.calibration.open_loop import empty_floor
 from restock.train.twin.calibration.path_gap import FLOOR, measured_noise
 from restock.train.twin.calibration.plan_memory import rebuild_plans
 from restock.train.twin.calibration.trust import (

@@ -26,9 +26,10 @@ from restock.train.twin.calibration.fit_result import Estimate, Fit, Gap
 from restock.train.twin.calibration.fit_scope import HELD_OUT, Scope, cuts, scope, sides, usable
 from restock.train.twin.calibration.fit_solver import Problem, Solution, noise, search, solve
 from restock.train.twin.calibration.fit_uncertainty import uncertainty
-from restock.train.twin.calibration.log_segments import Segments, log_segments
+from restock.train.twin.calibration.logged_steps import LoggedSteps, logged_steps
 from restock.train.twin.calibration.mismatch import CHANNELS, Mismatch, position_gap_m
 from restock.train.twin.calibration.open_loop import replay_segments
+from restock.train.twin.calibration.segments import log_segments
 from restock.train.twin.physics.perturbation import Perturbation
 
 F64 = NDArray[np.float64]
@@ -83,7 +84,8 @@ def fit(
             where=str(store.path),
             remedy="name others with --parameters, or use another log",
         )
-    every = log_segments(store, horizon_s, recordings=recordings, task_hash=task_hash)
+    steps = logged_steps(store, task_hash, recordings)
+    every = log_segments(steps, horizon_s)
     if not len(every):
         raise StoreError(
             f"no stretch of {horizon_s:g} s: {every.left_out}", where=str(store.path),
@@ -156,9 +158,7 @@ def fit(
             sorted([*estimates, *kept, *refused], key=lambda item: order.index(item.name))
         ),
         warnings=tuple(warned),
-        held_out=_held_out(
-            store, cut, found, base, perturbation, step_s, nthread, recordings, task_hash, seed, say
-        )
+        held_out=_held_out(steps, cut, found, base, perturbation, step_s, nthread, seed, say)
         if held_out
         else (),
         noise=_noise(mismatch, base, perturbation),
@@ -203,24 +203,23 @@ def _fine(
 
 
 def _held_out(
-    store: Store, cut: dict[str, int], found: Scope, base: Perturbation, fitted: Perturbation,
-    timestep_s: float, nthread: int, recordings: Sequence[str], task_hash: str | None, seed: int,
-    say: Callable[[str], None],
+    steps: LoggedSteps, cut: dict[str, int], found: Scope, base: Perturbation, fitted: Perturbation,
+    timestep_s: float, nthread: int, seed: int, say: Callable[[str], None],
 ) -> tuple[Gap, ...]:  # fmt: skip
     """The gap of position on what the fit has not seen, at 1, 3 and 6 s."""
     gaps = []
     if "position" not in found.channels:
         return ()
     say("replaying what was held out")
-    period_s = store.task(task_hash).control_period_s
+    period_s = steps.task.control_period_s
     for wanted_s in HELD_OUT_S:
         horizon_s = max(round(wanted_s / period_s), 1) * period_s
-        every = log_segments(store, horizon_s, recordings=recordings, task_hash=task_hash)
+        every = log_segments(steps, horizon_s)
         good, _ = usable(every)
         _, after = sides(good, cut) if len(good) else (None, np.zeros(0, np.bool_))
         if not after.any():
             continue
-        held: Segments = good.take(after)
+        held = good.take(after)
         replayed = replay_segments(held, [base, fitted], timestep_s=timestep_s, nthread=nthread)
         end = position_gap_m(held, replayed)[:, :, -1]
         rng = np.random.Generator(np.random.PCG64(seed))

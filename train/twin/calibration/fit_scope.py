@@ -12,8 +12,8 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
 from restock.replay.store.store import Store
 from restock.train.twin.calibration.fit_parameters import PARAMETERS
-from restock.train.twin.calibration.log_segments import BEFORE, POSE, Segments
 from restock.train.twin.calibration.mismatch import CHANNELS
+from restock.train.twin.calibration.segments import BEFORE, POSE, LoggedSegments
 
 TOUCHING_M = 0.05  # nearer to something than this a robot may be touching it
 HELD_OUT = 0.25
@@ -95,7 +95,7 @@ def _pose_is_odometry(store: Store, wanted: str) -> bool:
 _GOAL = "geometry_msgs/msg/PoseStamped"  # a goal's type as often as a localiser's
 
 
-def usable(segments: Segments) -> tuple[Segments, dict[str, int]]:
+def usable(segments: LoggedSegments) -> tuple[LoggedSegments, dict[str, int]]:
     """Segments that ordinary driving explains, and how many were left out, by reason."""
     touched = segments.signals["bumped"].astype(bool).any(axis=1)
     near = ~touched & (segments.signals["clearance_m"] < TOUCHING_M).any(axis=1)
@@ -116,7 +116,7 @@ def usable(segments: Segments) -> tuple[Segments, dict[str, int]]:
     return segments.take(~np.any(list(reasons.values()), axis=0)), left
 
 
-def cuts(segments: Segments, share: float, seed: int) -> dict[str, int]:
+def cuts(segments: LoggedSegments, share: float, seed: int) -> dict[str, int]:
     """From which stamp on each recording is held out, in ns.
 
     Of four recordings or more, whole ones; else the last part of each.
@@ -137,7 +137,9 @@ def cuts(segments: Segments, share: float, seed: int) -> dict[str, int]:
     return found
 
 
-def sides(segments: Segments, cut: dict[str, int]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def sides(
+    segments: LoggedSegments, cut: dict[str, int]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which segments (S,) lie wholly before the cut of their recording, and which after it."""
     at = np.array([cut[str(name)] for name in segments.recording_id], np.int64)
     stamps = segments.signals["stamp_ns"]

@@ -124,7 +124,7 @@ def measure_gap(
         tell(f"driving segments of {horizon:g} s again")
         paths.append(
             path_gap(
-                store, steps, horizon, twins, noise,
+                steps, horizon, twins, noise,
                 most=plan.most, seed=plan.seed, timestep_s=plan.timestep_s, nthread=plan.nthread,
             )
         )  # fmt: skip

@@ -1,22 +1,26 @@
 """A store's steps for comparing them with the twin: each row, and the step that came after it.
 
-A row holds its signals at t; those at t + 1 are the next row's, or, at an episode's end, those of
-the step that only ends it, which the store keeps in its files' metadata.
+The store is the interface: one row a step, sensed as training senses it, so what is compared with
+a twin (and a latency that is fitted) counts from the observation at a tick, as in training. A row
+holds its signals at t; those at t + 1 are the next row's, or, at an episode's end, those of the
+step that only ends it, which the store keeps in its files' metadata.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from importlib.resources import files
 from typing import Any
 
+import duckdb
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from restock.errors import StoreError
+from restock.errors import ConfigError, StoreError
 from restock.ingest.store.episode_rows import episode_ends
 from restock.ingest.store.writer import TRANSITIONS
 from restock.ingest.task.schema import SIGNAL_COLUMNS
@@ -28,10 +32,11 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
+Strings = NDArray[np.str_]
 
 NOMINAL = "nominal"
+COMMAND = ("command_speed_mps", "command_yaw_rate_radps")
 SIGNALS = tuple(column.name for column in SIGNAL_COLUMNS)
-_FIRST_SECTOR = "clearance_"
 
 
 @dataclass(frozen=True)
@@ -40,70 +45,129 @@ class LoggedSteps:
 
     task: Task
     now: dict[str, NDArray[Any]]  # the stored signals at t, (N,) each
-    after: dict[str, NDArray[Any]]  # those at t + 1; of no meaning where not `followed`
-    followed: Bools  # (N,) the step at t + 1 is known
     transition_id: Ints  # (N,)
-    episode_id: NDArray[np.str_]  # (N,)
-    begins: Bools  # (N,) the row before belongs to another episode, or is not there
+    recording_id: Strings  # (N,)
+    episode_id: Strings  # (N,)
+    step_index: Ints  # (N,) in its episode
+    begins: Bools  # (N,) the row before is not the step before: another episode, or steps between
+    condition: Strings  # (N,) the label
+    true_condition: Strings  # (N,) of a simulator; "" where not known
+    conditions: dict[str, Bools]  # name -> (N,) it holds; `nominal` where none does
     action: Ints  # (N,)
     reward: F64  # (N,)
     progress_m: F64  # (N,)
-    conditions: dict[str, Bools]  # name -> (N,) it holds; `nominal` where none does
+    ending: Ints  # (E,) rows whose successor only ends their episode
+    ends: dict[str, NDArray[Any]]  # the signals of those successors, (E,) each
 
     def __len__(self) -> int:
         return len(self.transition_id)
 
-    def find(self, transition_id: Ints) -> Ints:
-        """The rows of these ids, which must be here."""
-        order = np.argsort(self.transition_id, kind="stable")
-        found: Ints = order[np.searchsorted(self.transition_id, transition_id, sorter=order)]
-        return found
+    @cached_property
+    def followed(self) -> Bools:
+        """Whether the step at t + 1 is known, (N,)."""
+        followed = np.append(~self.begins[1:], False)
+        followed[self.ending] = True
+        return followed
+
+    @cached_property
+    def after(self) -> dict[str, NDArray[Any]]:
+        """The signals at t + 1, (N,) each; of no meaning where not `followed`."""
+        after = {name: np.append(column[1:], column[:1]) for name, column in self.now.items()}
+        for name, column in self.ends.items():
+            after[name][self.ending] = column
+        return after
+
+    @cached_property
+    def first(self) -> Ints:
+        """The row (N,) with which each row's stretch of consecutive steps begins."""
+        first: Ints = np.maximum.accumulate(np.where(self.begins, np.arange(len(self)), 0))
+        return first
+
+    def commands(self, rows: Ints, before: int, count: int) -> F64:
+        """Speeds (m/s) and yaw rates (rad/s) commanded from `before` steps before `rows` (n,) on.
+
+        (n, before + count, 2). Before a stretch begins: stop.
+        """
+        steps = rows[:, None] + np.arange(-before, count)
+        commands = np.stack([self.now[name] for name in COMMAND], axis=-1)
+        given = commands[np.maximum(steps, 0)]
+        return np.where((steps >= self.first[rows][:, None])[..., None], given, 0.0)
 
 
-def logged_steps(store: Store, task_hash: str | None = None) -> LoggedSteps:
-    """All rows of a store's task.
+def logged_steps(
+    store: Store, task_hash: str | None = None, recordings: Sequence[str] = ()
+) -> LoggedSteps:
+    """The rows of a task of a store, of these recordings (all, if none is named).
 
     Raises:
-        StoreError: the store has none, or rows of several tasks and no `task_hash`.
+        ConfigError: no such recording.
+        StoreError: no rows, rows of several tasks and no `task_hash`, or columns are missing.
     """
     task = store.task(task_hash)
+    recordings_of(store, recordings, task_hash)
     sql = (files("restock.train.twin.calibration") / "logged_steps.sql").read_text(encoding="utf-8")
-    table = store.connection.sql(sql, params={"task": task_hash or task.hash}).to_arrow_table()
+    parameters = {"task_hash": task_hash or task.hash, "recordings": list(recordings)}
+    try:
+        table = store.connection.sql(
+            sql.format(signals=", ".join(SIGNALS)), params=parameters
+        ).to_arrow_table()
+    except duckdb.BinderException as error:
+        raise StoreError(
+            f"lacks a column: {str(error).splitlines()[0]}",
+            where=str(store.path),
+            remedy="ingest the recordings again with this version",
+        ) from error
     if not len(table):
-        raise StoreError("it holds no transitions", where=str(store.path))
-    now = {name: _numbers(table[name]) for name in SIGNALS}
-    episode = table["episode_id"].to_numpy().astype(str)
-    step = _numbers(table["step_index"])
-    same = (episode[1:] == episode[:-1]) & (step[1:] == step[:-1] + 1)
-    after = {name: np.append(column[1:], column[:1]) for name, column in now.items()}
-    followed = np.append(same, False)
-    row_of = {
-        (name, number): row
-        for row, (name, number) in enumerate(zip(episode.tolist(), step.tolist(), strict=True))
-        if not followed[row]
-    }
-    for recording, ends in _ends(store):
-        columns = {name: _numbers(ends[name]) for name in ("episode_index", "step_index", *SIGNALS)}
-        for end in range(len(ends)):
-            name = f"{recording}/{columns['episode_index'][end]}"
-            row = row_of.get((name, int(columns["step_index"][end]) - 1))
-            if row is not None:
-                followed[row] = True
-                for signal in SIGNALS:
-                    after[signal][row] = columns[signal][end]
+        raise StoreError(
+            "no transitions" + (f" of {', '.join(recordings)}" if recordings else ""),
+            where=str(store.path),
+            remedy="ingest recordings into it",
+        )
+    episode, step = _text(table["episode_id"]), _numbers(table["step_index"]).astype(np.int64)
+    consecutive = (episode[1:] == episode[:-1]) & (step[1:] == step[:-1] + 1)
+    begins = ~np.append(False, consecutive)
+    ending, ends = _ends(store, recordings, episode, step, np.append(begins[1:], True))
     return LoggedSteps(
         task=task,
-        now=now,
-        after=after,
-        followed=followed,
+        now={name: _numbers(table[name]) for name in SIGNALS},
         transition_id=_numbers(table["transition_id"]),
+        recording_id=_text(table["recording_id"]),
         episode_id=episode,
-        begins=~np.append(False, same),
+        step_index=step,
+        begins=begins,
+        condition=_text(table["condition"]),
+        true_condition=_text(table["true_condition"]),
+        conditions=_conditions(table["conditions"].to_pylist()),
         action=_numbers(table["action"]).astype(np.int64),
         reward=_numbers(table["reward"]),
         progress_m=_numbers(table["progress_m"]),
-        conditions=_conditions(table["conditions"].to_pylist()),
+        ending=ending,
+        ends=ends,
     )
+
+
+def recordings_of(store: Store, wanted: Sequence[str], task_hash: str | None) -> list[str]:
+    """The ids of the store's recordings of a task, or those of them that are wanted.
+
+    Raises:
+        ConfigError: one that is wanted is not there.
+        StoreError: no rows, or rows of several tasks and no `task_hash`.
+    """
+    task_hash = task_hash or store.task().hash
+    store.task(task_hash)
+    rows = store.connection.execute(
+        "SELECT DISTINCT recording_id FROM transitions WHERE task_hash = ? ORDER BY recording_id",
+        [task_hash],
+    ).fetchall()
+    known = [str(row[0]) for row in rows]
+    for name in wanted:
+        if name not in known:
+            raise ConfigError(
+                f"no recording {name!r} of task {task_hash}",
+                where=str(store.path),
+                remedy='restock sql STORE "FROM recordings" lists them',
+            )
+    return list(wanted) or known
 
 
 def observations(store: Store, transition_id: Ints, size: int) -> tuple[F32, F32]:
@@ -124,7 +188,7 @@ def sector_clearance(task: Task, observation: F32) -> F64:
     Those beyond the task's range read as its range: an observation does not tell them apart.
     """
     first = next(
-        place for place, name in enumerate(task.observation_names) if name.startswith(_FIRST_SECTOR)
+        place for place, name in enumerate(task.observation_names) if name.startswith("clearance_")
     )
     seen = observation[:, first : first + task.sectors].astype(np.float64)
     return np.asarray(seen**2 * task.range_max_m, np.float64)
@@ -146,28 +210,45 @@ def rows_of(columns: Columns, rows: NDArray[Any]) -> dict[str, NDArray[Any]]:
 def _conditions(held: Sequence[Sequence[str] | None]) -> dict[str, Bools]:
     lists = [names or () for names in held]
     known = sorted({name for names in lists for name in names})
-    found = {name: np.array([name in names for names in lists], np.bool_) for name in known}
-    return {NOMINAL: np.array([not names for names in lists], np.bool_), **found}
+    holds = {name: np.array([name in names for names in lists], np.bool_) for name in known}
+    return {NOMINAL: np.array([not names for names in lists], np.bool_), **holds}
 
 
-def _ends(store: Store) -> list[tuple[str, pa.Table]]:
-    """(recording, the steps that only end its episodes) of every file that carries them."""
-    found = []
-    root = store.path.table(TRANSITIONS)
+def _ends(
+    store: Store, recordings: Sequence[str], episode: Strings, step: Ints, last: Bools
+) -> tuple[Ints, dict[str, NDArray[Any]]]:
+    """Of the `last` rows (N,) of stretches those that an episode's end follows, and these ends."""
+    row_of = {(str(episode[row]), int(step[row])): row for row in np.flatnonzero(last).tolist()}
+    rows, parts, root = [], [], store.path.table(TRANSITIONS)
     for file in store.files["stored_transitions"]:
-        schema = pq.read_schema(
-            f"{TRANSITIONS}/{file.removeprefix(f'{root}/')}", filesystem=store.path.files
-        )
+        inside = file.removeprefix(f"{root}/")
+        recording = inside.split("/")[0]
+        if recordings and recording not in recordings:
+            continue
+        schema = pq.read_schema(f"{TRANSITIONS}/{inside}", filesystem=store.path.files)
         ends = episode_ends(schema.empty_table())
-        if ends is not None:
-            found.append((file.removeprefix(f"{root}/").split("/")[0], ends))
-    return found
+        if ends is None:
+            continue
+        numbers = zip(
+            ends["episode_index"].to_pylist(), ends["step_index"].to_pylist(), strict=True
+        )
+        found = [row_of.get((f"{recording}/{index}", at - 1), -1) for index, at in numbers]
+        known = np.array(found, np.int64) >= 0
+        rows += [row for row in found if row >= 0]
+        parts.append({name: _numbers(ends[name])[known] for name in SIGNALS})
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in SIGNALS if parts}
+    return np.array(rows, np.int64), columns
 
 
 def _numbers(column: pa.ChunkedArray) -> NDArray[Any]:
     """float32 as float64: what is computed from it is computed as ingest does."""
     values: NDArray[Any] = column.combine_chunks().to_numpy(zero_copy_only=False)
     return values.astype(np.float64) if values.dtype == np.float32 else values.copy()
+
+
+def _text(column: pa.ChunkedArray) -> Strings:
+    """Text; empty where null."""
+    return np.asarray(column.fill_null("").to_numpy(zero_copy_only=False)).astype(np.str_)
 
 
 def _vectors(column: pa.ChunkedArray, size: int) -> F32:

@@ -1,5 +1,17 @@
--- Every row of one task, in the order it was driven.
-SELECT * EXCLUDE (observation, next_observation)
+-- One row a step of a task, in the order it was driven; `{signals}` are the stored signals.
+SELECT
+    transition_id,
+    recording_id,
+    episode_id,
+    step_index,
+    condition,
+    true_condition,
+    conditions,
+    action,
+    reward,
+    progress_m,
+    {signals}
 FROM transitions
-WHERE task_hash = $task
-ORDER BY recording_id, episode_index, step_index;
+WHERE task_hash = $task_hash
+    AND (len($recordings::VARCHAR[]) = 0 OR list_contains($recordings::VARCHAR[], recording_id))
+ORDER BY recording_id, episode_index, step_index

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.ingest.task.signals import wrap_angle
-from restock.train.twin.calibration.log_segments import Segments
 from restock.train.twin.calibration.open_loop import Replayed, replay_segments
+from restock.train.twin.calibration.segments import LoggedSegments
 from restock.train.twin.physics.perturbation import Perturbation
 
 F64 = NDArray[np.float64]
@@ -43,7 +43,7 @@ class Mismatch:
 
     def __init__(
         self,
-        segments: Segments,
+        segments: LoggedSegments,
         channels: Sequence[str] = tuple(CHANNELS),
         *,
         timestep_s: float = 0.01,
@@ -107,7 +107,7 @@ class Mismatch:
             self._known[twin] = {name: found[name][index] for name in self.channels}
 
 
-def residuals(segments: Segments, replayed: Replayed) -> dict[str, F64]:
+def residuals(segments: LoggedSegments, replayed: Replayed) -> dict[str, F64]:
     """Every channel's residuals, (P, S, R) each; 0 where the log says nothing."""
     predicted, logged = replayed.signals, segments.signals
     found = {
@@ -135,7 +135,7 @@ def residuals(segments: Segments, replayed: Replayed) -> dict[str, F64]:
     return found
 
 
-def position_gap_m(segments: Segments, replayed: Replayed) -> F64:
+def position_gap_m(segments: LoggedSegments, replayed: Replayed) -> F64:
     """How far the twin is from the logged position, (P, S, K + 1), from a common first pose."""
     gap: F64 = np.hypot(
         replayed.signals["pose_x_m"] - segments.signals["pose_x_m"],

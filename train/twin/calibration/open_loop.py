@@ -1,15 +1,15 @@
-"""Open-loop replay: logged commands driven again in the twin, beside what the robot did.
+"""Open loop: logged commands driven again in the twin, which is told nothing else on the way.
 
-The commands of each segment are driven in the twin's physics, which is told nothing on the way.
-The W steps before a segment begin with the logged motion, and are driven only so that ramps and
-late commands are under way when the K steps begin. Then the twin's pose is put on the logged pose,
-and the two go their ways.
+`drive` puts robots into logged states and drives logged commands from there, one control period or
+many. `replay` drives segments of a log with it: the W steps before a segment begin with the logged
+motion, and are driven only so that ramps and late commands are under way when the K steps begin.
+Then the twin's pose is put on the logged pose, and the two go their ways.
 
-The floor is empty. Obstacles of a log are not known, racks of another floor are not there, and a
-pose that localisation has 3 cm wrong must not become a collision: what is asked is how the robot
-moves, and steps with contact are told by the signal `bumped`. Nor are slippery patches known.
-Without obstacles the motion does not depend on where it begins, so all segments are driven from one
-place and laid onto the map.
+Without a floor map the floor is empty. Obstacles of a log are not known, racks of another floor are
+not there, and a pose that localisation has 3 cm wrong must not become a collision: the question is
+how the robot moves, and steps with contact are marked by the signal `bumped`. Nor are slippery
+patches known. Without obstacles the motion does not depend on where it begins, so robots are driven
+in the middle of an empty hall, and their paths laid onto the map.
 """
 
 from __future__ import annotations
@@ -20,22 +20,194 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.ingest.task.signals import localised_velocity, wrap_angle
+from restock.ingest.task.signals import Columns, localised_velocity, wrap_angle
 from restock.ingest.task.task import Task
-from restock.train.twin.calibration.log_segments import MOTION, POSE, Segments
+from restock.train.twin.calibration.logged_steps import rows_of
+from restock.train.twin.calibration.segments import MOTION, POSE, LoggedSegments
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.physics.episode import Episode, EpisodeSpec
 from restock.train.twin.physics.model import TRACK_M, WHEEL_RADIUS_M, body_velocity, wheel_commands
 from restock.train.twin.physics.perturbation import Perturbation
-from restock.train.twin.physics.simulation import Simulation
+from restock.train.twin.physics.sensing import Sensing
+from restock.train.twin.physics.simulation import BLOCK_S, Simulation
 
 F64 = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
 
-PREDICTED = (*POSE, *MOTION)  # what the twin says of each step
-_SLIDING = "sliding_mps"
+PREDICTED = (*POSE, *MOTION)  # signals that a replay predicts
 ROBOTS = 512  # simulated at a time
-SLIPS_MPS = 0.2  # wheels and localisation this far apart: the floor's word is taken
-_SIDE_M = 60.0  # of the floor; who comes near its wall is put back in its middle
+SLIP_MPS = 0.2  # wheels and localisation this far apart: ground speed is the localised one
+EMPTY_M = 60.0  # the side of an empty floor; who comes near its wall is put back in its middle
+_SENSED = ("wheel_speed_mps", "wheel_yaw_rate_radps", "gyro_yaw_rate_radps", "accel_x_mps2")
+
+
+@dataclass(frozen=True)
+class Start:
+    """The states in which S robots begin, and the commands that they are given from there.
+
+    `motion` are the logged wheel speed and yaw rate, gyroscope, localised speed and lateral speed,
+    (S,) each. Without `past` the base controllers begin as if always commanded what their wheels
+    do; with it they begin as those commands leave them.
+    """
+
+    pose: F64  # (S, 3) x, y and heading
+    motion: Columns
+    command: F64  # (S, K, 2) speed m/s and yaw rate rad/s
+    past: F64 | None = None  # (S, P, 2) the commands of the periods before
+
+    def take(self, which: Ints) -> Start:
+        past = None if self.past is None else self.past[which]
+        return Start(self.pose[which], rows_of(self.motion, which), self.command[which], past)
+
+
+@dataclass(frozen=True)
+class Driven:
+    """What P twins did from S starts, without sensor noise: at the start and after each period."""
+
+    pose: F64  # (P, S, K + 1, 3) x, y and heading
+    signals: dict[str, F64]  # of wheels, gyroscope and accelerometer, (P, S, K + 1) each
+    sliding_mps: F64  # (P, S, K + 1) of the faster sliding wheel over the floor, along the robot
+    bumped: Bools  # (P, S) in the last period
+    sector_clearance_m: F64  # (P, S, sectors) at the end; none on an empty floor
+    blown_up: Bools  # (P, S) the physics broke: the rest says nothing
+
+
+def drive(
+    task: Task,
+    start: Start,
+    perturbations: Sequence[Perturbation],
+    *,
+    warehouse: Warehouse | None = None,
+    timestep_s: float = 0.01,
+    nthread: int = 1,
+) -> Driven:
+    """Drive every start's commands under every perturbation: P x S robots.
+
+    The perturbations' own `timestep_s` and sensor noise are not used. The result does not depend
+    on `nthread`, nor on which other starts and perturbations are driven.
+
+    Raises:
+        ConfigError: a timestep that does not divide .1 s, or a control period that the twin
+            cannot keep (no multiple of .1 s).
+    """
+    shape = (len(perturbations), len(start.pose))
+    jobs, periods = shape[0] * shape[1], start.command.shape[1]
+    sectors = 0 if warehouse is None else task.sectors
+    pose = np.zeros((jobs, periods + 1, 3))
+    signals = {name: np.zeros((jobs, periods + 1)) for name in _SENSED}
+    sliding = np.zeros((jobs, periods + 1))
+    bumped, blown_up = np.zeros((2, jobs), np.bool_)
+    clearance = np.zeros((jobs, sectors))
+    simulation: Simulation | None = None
+    for begin in range(0, jobs, ROBOTS):
+        ids = np.arange(begin, min(begin + ROBOTS, jobs))
+        if simulation is None or simulation.num_envs != len(ids):
+            floor = warehouse or empty_floor()
+            simulation = Simulation(len(ids), task, floor, timestep_s, nthread)
+        which, number = np.divmod(ids, shape[1])
+        twins, part = [perturbations[index] for index in which], start.take(number)
+        offset = _place(simulation, part, twins, endless=warehouse is None)
+        bias = np.array([twin.gyro_bias_radps for twin in twins])
+        for step in range(periods + 1):
+            if step:
+                simulation.drive(part.command[:, step - 1])
+                blown_up[ids] |= simulation.blown_up
+            pose[ids, step] = simulation.pose()
+            pose[ids, step, :2] += offset
+            velocity = simulation.qvel
+            speed, turn = body_velocity(velocity[:, 6], velocity[:, 7])
+            sensed = (speed, turn, velocity[:, 5] + bias, simulation.accel[:, 0])
+            for name, values in zip(_SENSED, sensed, strict=True):
+                signals[name][ids, step] = values
+            sliding[ids, step] = _sliding(simulation, pose[ids, step, 2])
+            if warehouse is None:
+                offset += _recentre(simulation)
+        bumped[ids] = simulation.bumped
+        if sectors:
+            clearance[ids] = see_sectors(simulation)
+    return Driven(
+        pose=pose.reshape(*shape, -1, 3),
+        signals={name: values.reshape(*shape, -1) for name, values in signals.items()},
+        sliding_mps=sliding.reshape(*shape, -1),
+        bumped=bumped.reshape(shape),
+        sector_clearance_m=clearance.reshape(*shape, sectors),
+        blown_up=blown_up.reshape(shape),
+    )
+
+
+def empty_floor() -> Warehouse:
+    """A floor without racks."""
+    middle = (EMPTY_M / 2, EMPTY_M / 2)
+    return Warehouse(EMPTY_M, EMPTY_M, racks=(), segments=(), goals_m=(middle,), name="empty")
+
+
+def see_sectors(simulation: Simulation) -> F64:
+    """The sector clearances (N, sectors) that robots sense now, without noise."""
+    sensing = Sensing(simulation, simulation.task)  # its noise is zero until an episode is drawn
+    ids = np.arange(simulation.num_envs)
+    return np.asarray(sensing.sense(ids, np.zeros(len(ids), np.int64))["sector_clearance_m"])
+
+
+def _place(
+    simulation: Simulation, start: Start, perturbations: Sequence[Perturbation], *, endless: bool
+) -> F64:
+    """Put every robot where its log was, moving as it did; returns map less simulation (N, 2).
+
+    On an `endless` floor robots start in its middle.
+    """
+    middle = np.full(2, EMPTY_M / 2)
+    offset = start.pose[:, :2] - middle if endless else np.zeros((len(start.pose), 2))
+    motion = start.motion
+    for env, perturbation in enumerate(perturbations):
+        x, y = middle if endless else start.pose[env, :2]
+        plan = np.array([[x, y], [x, y]])
+        episode = Episode(
+            EpisodeSpec("nominal", 0), (x, y, start.pose[env, 2]), goal=(x, y), plan_m=plan
+        )
+        simulation.reset(env, episode, perturbation)
+    wheels = np.asarray(motion["wheel_speed_mps"])
+    localised = np.asarray(motion["localised_speed_mps"])
+    slips = np.abs(wheels - localised) > SLIP_MPS
+    forward = np.where(slips, localised, wheels * simulation.body.radius_m / WHEEL_RADIUS_M)
+    lateral = np.asarray(motion["localised_lateral_mps"])
+    lateral = np.where(np.abs(lateral) > SLIP_MPS, lateral, 0.0)
+    cos, sin = np.cos(start.pose[:, 2]), np.sin(start.pose[:, 2])
+    simulation.qvel[:, 0] = cos * forward - sin * lateral
+    simulation.qvel[:, 1] = sin * forward + cos * lateral
+    bias = np.array([twin.gyro_bias_radps for twin in perturbations])
+    simulation.qvel[:, 5] = motion["gyro_yaw_rate_radps"] - bias
+    turn = motion["wheel_yaw_rate_radps"]
+    simulation.qvel[:, 6], simulation.qvel[:, 7] = wheel_commands(wheels, turn)
+    controller = simulation.controller
+    if start.past is None:
+        command = np.stack([wheels, turn], axis=-1) / controller.gain[:, None]
+        controller.commands[:], controller.set_point[:] = command[:, None], command
+        return offset
+    for step in range(start.past.shape[1]):  # its ramp and its late commands, as they are now
+        controller.command(start.past[:, step])
+        for block in range(simulation.blocks):
+            controller.wheel_speeds(block * BLOCK_S)
+    return offset
+
+
+def _recentre(simulation: Simulation) -> F64:
+    """Put robots near the wall of an empty floor back in its middle; returns how far (N, 2)."""
+    from_middle = simulation.qpos[:, :2] - EMPTY_M / 2
+    away = np.where(np.abs(from_middle) > EMPTY_M / 4, from_middle, 0.0)
+    simulation.qpos[:, :2] -= away
+    return np.asarray(away)
+
+
+def _sliding(simulation: Simulation, yaw_rad: F64) -> F64:
+    """How fast a wheel's rim moves over the floor, (N,) m/s, the larger of the two wheels."""
+    velocity = simulation.qvel
+    forward = np.cos(yaw_rad) * velocity[:, 0] + np.sin(yaw_rad) * velocity[:, 1]
+    turn = velocity[:, 5] * (TRACK_M / 2)
+    ground = np.stack([forward - turn, forward + turn], axis=-1)
+    rim = velocity[:, 6:8] * simulation.body.radius_m[:, None]
+    faster: F64 = np.abs(rim - ground).max(axis=1)
+    return faster
 
 
 @dataclass(frozen=True)
@@ -50,7 +222,7 @@ class Replayed:
     timestep_s: float
     signals: dict[str, F64]
     sliding_mps: F64  # (P, S, K + 1) of the faster sliding wheel over the floor, along the robot
-    blown_up: NDArray[np.bool_]  # (P, S) the physics broke: the segment says nothing
+    blown_up: Bools  # (P, S) the physics broke: the segment says nothing
 
     @property
     def pose(self) -> F64:
@@ -59,138 +231,56 @@ class Replayed:
 
 
 def replay_segments(
-    segments: Segments,
+    segments: LoggedSegments,
     perturbations: Sequence[Perturbation],
     *,
     timestep_s: float = 0.01,
     nthread: int = 1,
 ) -> Replayed:
-    """Drive every segment's commands under every perturbation: P x S robots on an empty floor.
-
-    The perturbations' own `timestep_s` and sensor noise are not looked at. The result does not
-    depend on `nthread`, nor on which other segments and perturbations are asked for.
+    """Drive every segment's commands under every perturbation, on an empty floor, as `drive` does.
 
     Raises:
-        ConfigError: a timestep that does not divide .1 s, or a control period that the twin
-            cannot keep (no multiple of .1 s).
+        ConfigError: as `drive`.
     """
-    jobs = len(perturbations) * len(segments)
-    signals = {
-        name: np.zeros((jobs, segments.horizon_steps + 1)) for name in (*PREDICTED, _SLIDING)
-    }
-    blown_up = np.zeros(jobs, np.bool_)
-    simulation: Simulation | None = None
-    for begin in range(0, jobs, ROBOTS):
-        ids = np.arange(begin, min(begin + ROBOTS, jobs))
-        if simulation is None or simulation.num_envs != len(ids):
-            simulation = _simulation(len(ids), segments.task, timestep_s, nthread)
-        which, segment = np.divmod(ids, len(segments))
-        part = segments.take(segment)
-        for env, number in enumerate(which):
-            _place(simulation, env, perturbations[number], part)
-        moved, blown_up[ids] = _drive(simulation, part)
-        for name, values in moved.items():
-            signals[name][ids] = values
-    shape = (len(perturbations), len(segments))
-    shaped = {name: values.reshape(*shape, -1) for name, values in signals.items()}
+    moving = ~segments.still
+    motion = {name: np.where(moving, values, 0.0) for name, values in segments.before.items()}
+    motion["localised_lateral_mps"] = np.zeros(len(segments))  # the warm-up is long enough for it
+    start = Start(np.zeros((len(segments), 3)), motion, segments.command)
+    driven = drive(segments.task, start, perturbations, timestep_s=timestep_s, nthread=nthread)
+    warmup = segments.warmup_steps
+    signals = {name: values[..., warmup:] for name, values in driven.signals.items()}
+    forward, lateral = _localised(
+        driven.pose, segments.task.control_period_s, signals["wheel_speed_mps"]
+    )
+    signals["localised_speed_mps"], signals["localised_lateral_mps"] = forward, lateral
+    laid = lay(driven.pose[:, :, warmup:], segments.pose[:, 0])
+    laid[..., 2] = wrap_angle(laid[..., 2])
     return Replayed(
         perturbations=tuple(perturbations),
         timestep_s=timestep_s,
-        sliding_mps=shaped.pop(_SLIDING),
-        signals=shaped,
-        blown_up=blown_up.reshape(shape),
+        sliding_mps=driven.sliding_mps[..., warmup:],
+        signals={**{name: laid[..., i] for i, name in enumerate(POSE)}, **signals},
+        blown_up=driven.blown_up,
     )
-
-
-def _simulation(robots: int, task: Task, timestep_s: float, nthread: int) -> Simulation:
-    middle = (_SIDE_M / 2, _SIDE_M / 2)
-    floor = Warehouse(_SIDE_M, _SIDE_M, racks=(), segments=(), goals_m=(middle,), name="empty")
-    return Simulation(robots, task, floor, timestep_s, nthread)
-
-
-def _place(simulation: Simulation, env: int, perturbation: Perturbation, part: Segments) -> None:
-    """Put robot `env` at the beginning of the warm-up of segment `env` of `part`, in motion."""
-    start = (_SIDE_M / 2, _SIDE_M / 2, 0.0)
-    spec = EpisodeSpec("nominal", 0, perturbation)
-    episode = Episode(spec, start, goal=start[:2], plan_m=np.array([start[:2], start[:2]]))
-    simulation.reset(env, episode, perturbation)
-    if part.still[env]:
-        return
-    speed, turn, gyro, localised = part.before[env]
-    rolling = abs(speed - localised) < SLIPS_MPS
-    forward = speed * simulation.body.radius_m[env] / WHEEL_RADIUS_M if rolling else localised
-    simulation.qvel[env, 0], simulation.qvel[env, 5] = forward, gyro
-    simulation.qvel[env, 6:8] = wheel_commands(speed, turn)
-    # What was commanded earlier is not in the segment: as if it had been what the wheels do.
-    asked = np.array([speed, turn]) / simulation.controller.gain[env]
-    simulation.controller.commands[env] = simulation.controller.set_point[env] = asked
-
-
-def _drive(simulation: Simulation, part: Segments) -> tuple[dict[str, F64], NDArray[np.bool_]]:
-    """Predicted signals (N, K + 1) of N robots already placed, and whose physics broke (N,)."""
-    num, warmup = len(part), part.warmup_steps
-    pose = np.zeros((num, warmup + part.horizon_steps + 1, 3))
-    motion = {name: np.zeros((num, part.horizon_steps + 1)) for name in (*MOTION, _SLIDING)}
-    blown_up = np.zeros(num, np.bool_)
-    shifted = np.zeros((num, 2))
-    for step in range(pose.shape[1]):
-        if step:
-            simulation.drive(part.command[:, step - 1])
-            blown_up |= simulation.blown_up
-        pose[:, step] = simulation.pose()
-        pose[:, step, :2] += shifted
-        from_middle = simulation.qpos[:, :2] - _SIDE_M / 2
-        away = np.where(np.abs(from_middle) > _SIDE_M / 4, from_middle, 0.0)
-        shifted += away
-        simulation.qpos[:, :2] -= away
-        if step >= warmup:
-            velocity, at = simulation.qvel, step - warmup
-            speed, turn = body_velocity(velocity[:, 6], velocity[:, 7])
-            motion["wheel_speed_mps"][:, at], motion["wheel_yaw_rate_radps"][:, at] = speed, turn
-            motion["gyro_yaw_rate_radps"][:, at] = velocity[:, 5]
-            motion["accel_x_mps2"][:, at] = simulation.accel[:, 0]
-            motion[_SLIDING][:, at] = _sliding(simulation, pose[:, step, 2])
-    forward, lateral = _localised(pose, part.task.control_period_s, motion["wheel_speed_mps"])
-    motion["localised_speed_mps"], motion["localised_lateral_mps"] = forward, lateral
-    laid = _lay(pose[:, warmup:], part.pose[:, 0])
-    return {**{name: laid[..., i] for i, name in enumerate(POSE)}, **motion}, blown_up
-
-
-def _sliding(simulation: Simulation, yaw_rad: F64) -> F64:
-    """How fast a wheel's rim moves over the floor, (N,) m/s, the larger of the two wheels."""
-    velocity = simulation.qvel
-    forward = np.cos(yaw_rad) * velocity[:, 0] + np.sin(yaw_rad) * velocity[:, 1]
-    turn = velocity[:, 5] * (TRACK_M / 2)
-    ground = np.stack([forward - turn, forward + turn], axis=-1)
-    rim = velocity[:, 6:8] * simulation.body.radius_m[:, None]
-    faster: F64 = np.abs(rim - ground).max(axis=1)
-    return faster
 
 
 def _localised(pose: F64, period_s: float, wheel_speed: F64) -> tuple[F64, F64]:
-    """Speeds from poses (N, W + K + 1, 3) a period apart, as ingest has them; (N, K + 1) each.
+    """Speeds from poses (..., W + K + 1, 3) a period apart, as ingest has them; (..., K + 1) each.
 
     Without a warm-up no pose is before the first, and the wheels say its speed.
     """
-    steps = wheel_speed.shape[1]
-    stamp = np.broadcast_to(np.arange(pose.shape[1]) * round(period_s * 1e9), pose.shape[:2])
+    stamp = np.broadcast_to(np.arange(pose.shape[-2]) * round(period_s * 1e9), pose.shape[:-1])
     columns = {name: pose[..., i] for i, name in enumerate(POSE)} | {"pose_stamp_ns": stamp}
-    at = np.arange(pose.shape[1] - steps, pose.shape[1])
-    now = {name: values[:, at] for name, values in columns.items()}
-    before = {name: values[:, np.maximum(at - 1, 0)] for name, values in columns.items()}
+    at = np.arange(pose.shape[-2] - wheel_speed.shape[-1], pose.shape[-2])
+    now = {name: values[..., at] for name, values in columns.items()}
+    before = {name: values[..., np.maximum(at - 1, 0)] for name, values in columns.items()}
     return localised_velocity({**now, "wheel_speed_mps": wheel_speed}, before)
 
 
-def _lay(pose: F64, onto: F64) -> F64:
-    """Poses (N, K + 1, 3) moved as one so that each first is `onto` (N, 3)."""
-    turn = onto[:, 2] - pose[:, 0, 2]
-    cos, sin = np.cos(turn)[:, None], np.sin(turn)[:, None]
-    x, y = pose[..., 0] - pose[:, :1, 0], pose[..., 1] - pose[:, :1, 1]
-    return np.stack(
-        [
-            onto[:, :1] + cos * x - sin * y,
-            onto[:, 1:2] + sin * x + cos * y,
-            wrap_angle(pose[..., 2] + turn[:, None]),
-        ],
-        axis=-1,
-    )
+def lay(pose: F64, onto: F64) -> F64:
+    """Poses (..., S, K + 1, 3) moved as one so that each first is `onto` (S, 3)."""
+    turn = onto[:, 2] - pose[..., 0, 2]
+    cos, sin = np.cos(turn)[..., None], np.sin(turn)[..., None]
+    x, y = pose[..., 0] - pose[..., :1, 0], pose[..., 1] - pose[..., :1, 1]
+    moved = (onto[:, :1] + cos * x - sin * y, onto[:, 1:2] + sin * x + cos * y)
+    return np.stack([*moved, pose[..., 2] + turn[..., None]], axis=-1)

@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.ingest.task.signals import wrap_angle
-from restock.replay.store.store import Store
-from restock.train.twin.calibration.log_segments import Segments, log_segments
 from restock.train.twin.calibration.logged_steps import NOMINAL, LoggedSteps
-from restock.train.twin.calibration.open_loop import replay_segments
+from restock.train.twin.calibration.open_loop import lay, replay_segments
+from restock.train.twin.calibration.segments import LoggedSegments, log_segments
 from restock.train.twin.physics.model import body_velocity
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.sensing import DRIFT_TIME_S
@@ -63,7 +62,6 @@ class PathGap:
 
 
 def path_gap(
-    store: Store,
     steps: LoggedSteps,
     horizon_s: float,
     twins: Mapping[str, Perturbation],
@@ -81,11 +79,10 @@ def path_gap(
 
     Raises:
         ConfigError: a horizon that is not some control periods.
-        StoreError: as `segments`.
     """
     period = steps.task.control_period_s
     stride_s = max(round(horizon_s / 2 / period), 1) * period
-    cut = log_segments(store, horizon_s, stride_s=stride_s, task_hash=steps.task.hash)
+    cut = log_segments(steps, horizon_s, stride_s=stride_s)
     holds = _holds(steps, cut)
     chosen = _choose(holds, most, np.random.default_rng([seed, cut.horizon_steps]))
     used = np.flatnonzero(np.any(list(chosen.values()), axis=0))
@@ -147,9 +144,8 @@ def _spread(values: F64) -> float:
     return float(1.4826 * np.median(np.abs(values - np.median(values))))
 
 
-def _holds(steps: LoggedSteps, cut: Segments) -> dict[str, Bools]:
-    first = steps.find(cut.transition_id)
-    rows = first[:, None] + np.arange(cut.horizon_steps)
+def _holds(steps: LoggedSteps, cut: LoggedSegments) -> dict[str, Bools]:
+    rows = cut.row[:, None] + np.arange(cut.horizon_steps)
     held = {n: mask[rows].any(axis=1) for n, mask in steps.conditions.items() if n != NOMINAL}
     return {NOMINAL: steps.conditions[NOMINAL][rows].all(axis=1), **held}
 
@@ -166,7 +162,7 @@ def _choose(holds: Mapping[str, Bools], most: int, rng: np.random.Generator) -> 
 
 
 def _gaps(
-    part: Segments,
+    part: LoggedSegments,
     twins: Mapping[str, Perturbation],
     noise: Noise,
     rng: np.random.Generator,
@@ -178,9 +174,8 @@ def _gaps(
     logged = {name: part.signals[name] for name in SIGNALS}
     fresh = part.pose_fresh[:, -1]
     found = {}
-    for index, (name, twin) in enumerate(twins.items()):
+    for index, name in enumerate(twins):
         signals = {signal: replayed.signals[signal][index] for signal in SIGNALS}
-        signals["gyro_yaw_rate_radps"] = signals["gyro_yaw_rate_radps"] + twin.gyro_bias_radps
         found[name] = _gap(replayed.pose[index], signals, part.pose, logged, fresh)
         for values in found[name].values():
             values[replayed.blown_up[index]] = np.nan
@@ -190,7 +185,7 @@ def _gaps(
     path = replayed.pose[last]
     sensed = path + _pose_noise(path.shape, noise, part.task.control_period_s, rng)
     seen = _sense(truth, sensed, path, noise, part.task.control_period_s, rng)
-    found[FLOOR] = _gap(_lay(path, sensed[:, 0]), truth, sensed, seen, fresh)
+    found[FLOOR] = _gap(lay(path, sensed[:, 0]), truth, sensed, seen, fresh)
     return found
 
 
@@ -208,7 +203,7 @@ def _gap(
     return found
 
 
-def _dead_reckon(part: Segments) -> F64:
+def _dead_reckon(part: LoggedSegments) -> F64:
     """Poses (S, K + 1, 3) from the logged wheel odometry and the first logged pose."""
     period = part.task.control_period_s
     speed, rate = part.signals["wheel_speed_mps"], part.signals["wheel_yaw_rate_radps"]
@@ -262,17 +257,3 @@ def _sense(
         "accel_x_mps2": rng.standard_normal(shape) * noise.accel_mps2,
     }
     return {name: values + added[name] for name, values in truth.items()}
-
-
-def _lay(pose: F64, onto: F64) -> F64:
-    """Paths (S, K + 1, 3) moved as one so that each first pose is `onto` (S, 3)."""
-    turn = (onto[:, 2] - pose[:, 0, 2])[:, None]
-    x, y = pose[..., 0] - pose[:, :1, 0], pose[..., 1] - pose[:, :1, 1]
-    return np.stack(
-        [
-            onto[:, :1] + np.cos(turn) * x - np.sin(turn) * y,
-            onto[:, 1:2] + np.sin(turn) * x + np.cos(turn) * y,
-            pose[..., 2] + turn,
-        ],
-        axis=-1,
-    )

@@ -66,7 +66,7 @@ class FitCommand:
         from restock.errors import ConfigError, ExitCode
         from restock.replay.store.store import Store
         from restock.train.twin.calibration.fit_files import write_fit
-        from restock.train.twin.calibration.log_segments import recordings_of
+        from restock.train.twin.calibration.logged_steps import recordings_of
 
         if self.out is not None and self.out.exists():
             raise ConfigError("is there already", where=str(self.out), remedy="name another --out")

@@ -1,0 +1,130 @@
+"""One reader of logged steps and one driver of logged commands, for the fit and for the gap."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from support.paths import ROOT, SHARED
+
+from restock.ingest.pipeline import ingest
+from restock.ingest.profile.profile import Profile, load_profile
+from restock.ingest.store.writer import StoreWriter
+from restock.replay.store.store import Store
+from restock.train.twin.calibration.logged_steps import LoggedSteps, logged_steps
+from restock.train.twin.calibration.open_loop import Start, drive, replay_segments
+from restock.train.twin.calibration.segments import POSE, log_segments
+from restock.train.twin.floors.layout import default_warehouse
+from restock.train.twin.physics.perturbation import Perturbation
+
+LATE = Perturbation(name="late", latency_s=0.15, wheel_radius_scale=0.96, gyro_bias_radps=0.01)
+
+
+def slower(profile: Profile) -> Profile:
+    """Steps .3 s apart, at a steady rate instead of one a command."""
+    task = msgspec.structs.replace(profile.task, control_period_s=0.3)
+    clock = msgspec.structs.replace(profile.clock, steps="rate")
+    return msgspec.structs.replace(profile, task=task, clock=clock)
+
+
+LOGS = {
+    "sample log": (ROOT / "sample_logs" / "amr_monday.mcap", load_profile("warehouse_amr")),
+    "steady rate": (
+        ROOT / "sample_logs" / "amr_monday.mcap",
+        slower(load_profile("warehouse_amr")),
+    ),
+    "turtlebot3": (SHARED / "turtlebot3-sim-humble", load_profile("turtlebot3")),
+}
+
+
+@pytest.fixture(scope="module", params=LOGS)
+def store(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    log, profile = LOGS[request.param]
+    if not log.exists():
+        pytest.skip(f"{log} is not here")
+    folder = tmp_path_factory.mktemp("logged")
+    ingest(log, profile, store=StoreWriter(folder))
+    return folder
+
+
+@pytest.fixture
+def steps(store: Path) -> Iterator[LoggedSteps]:
+    with Store(store) as opened:
+        yield logged_steps(opened)
+
+
+def start_of(steps: LoggedSteps, rows: np.ndarray, count: int) -> Start:
+    """What a drive of `count` periods from these rows begins with."""
+    now = {name: column[rows] for name, column in steps.now.items()}
+    pose = np.stack([now[name] for name in POSE], axis=-1)
+    return Start(pose, now, steps.commands(rows, 0, count), past=steps.commands(rows, 5, 0))
+
+
+def test_the_fit_and_the_gap_read_the_same_rows(store: Path, steps: LoggedSteps) -> None:
+    cut = log_segments(steps, 1.2)
+    rows = cut.row[:, None] + np.arange(cut.horizon_steps)
+    with Store(store) as opened:
+        table = opened.connection.sql(
+            "SELECT transition_id, pose_x_m, wheel_speed_mps, command_speed_mps, condition"
+            " FROM transitions ORDER BY recording_id, episode_index, step_index"
+        ).fetchnumpy()
+    assert len(cut) > 5
+    assert np.array_equal(table["transition_id"], steps.transition_id)
+    assert np.array_equal(table["transition_id"][rows[:, 0]], cut.transition_id)
+    assert np.array_equal(table["condition"][rows].astype(str), cut.condition)
+    for name in ("pose_x_m", "wheel_speed_mps"):
+        stored = np.asarray(table[name], np.float64)
+        assert np.array_equal(stored, steps.now[name])
+        assert np.array_equal(stored[rows], cut.signals[name][:, :-1])
+        # What the gap takes for the next step is what ends the fit's segment.
+        assert np.array_equal(steps.after[name][rows[:, -1]], cut.signals[name][:, -1])
+    commanded = np.asarray(table["command_speed_mps"], np.float64)
+    assert np.array_equal(commanded[rows], cut.command[:, cut.warmup_steps :, 0])
+    assert np.array_equal(steps.commands(cut.row, 0, cut.horizon_steps)[..., 0], commanded[rows])
+    assert steps.followed[rows].all()
+
+
+@pytest.mark.parametrize("mapped", [True, False])
+def test_one_step_is_the_first_of_a_longer_drive(steps: LoggedSteps, mapped: bool) -> None:
+    rows = log_segments(steps, 1.2).row[::3]
+    warehouse = default_warehouse() if mapped else None
+    one, many = (
+        drive(steps.task, start_of(steps, rows, count), [Perturbation(), LATE], warehouse=warehouse)
+        for count in (1, 4)
+    )
+    assert one.pose.shape == (2, len(rows), 2, 3)
+    assert np.array_equal(one.pose, many.pose[:, :, :2])
+    for name, values in one.signals.items():
+        assert np.array_equal(values, many.signals[name][..., :2]), name
+    assert np.array_equal(one.sliding_mps, many.sliding_mps[..., :2])
+    assert one.sector_clearance_m.shape[-1] == (steps.task.sectors if mapped else 0)
+
+
+def test_an_empty_floor_has_no_middle_and_no_end(steps: LoggedSteps) -> None:
+    """Robots are driven where there is room, and reported where they were put."""
+    rows = log_segments(steps, 1.2).row[:2]
+    near = start_of(steps, rows, 5)
+    shift = np.array([1e4, -2e4, 0.0])
+    far = Start(near.pose + shift, near.motion, near.command, near.past)
+    here, there = (drive(steps.task, start, [LATE]) for start in (near, far))
+    np.testing.assert_allclose(there.pose - shift, here.pose, atol=1e-9)
+
+
+def test_a_replay_is_a_drive_whose_warm_up_is_laid_onto_the_log(steps: LoggedSteps) -> None:
+    cut = log_segments(steps, 1.2)
+    cut = cut.take(np.arange(min(len(cut), 8)))
+    replayed = replay_segments(cut, [Perturbation(), LATE])
+    moving = ~cut.still
+    motion = {name: np.where(moving, values, 0.0) for name, values in cut.before.items()}
+    motion["localised_lateral_mps"] = np.zeros(len(cut))
+    start = Start(np.zeros((len(cut), 3)), motion, cut.command)
+    driven = drive(cut.task, start, [Perturbation(), LATE])
+    for name, values in driven.signals.items():
+        assert np.array_equal(values[..., cut.warmup_steps :], replayed.signals[name]), name
+    assert all(np.array_equal(pose[:, 0, :2], cut.pose[:, 0, :2]) for pose in replayed.pose)
+    moved = np.linalg.norm(np.diff(driven.pose[..., :2], axis=2), axis=-1)[..., cut.warmup_steps :]
+    again = np.linalg.norm(np.diff(replayed.pose[..., :2], axis=2), axis=-1)
+    np.testing.assert_allclose(again, moved, atol=1e-9)

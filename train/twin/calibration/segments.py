@@ -1,0 +1,167 @@
+"""Segments of a log: stretches of consecutive steps, as they were commanded and sensed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.errors import ConfigError
+from restock.ingest.task.task import Task
+from restock.train.twin.calibration.logged_steps import COMMAND, LoggedSteps, rows_of
+
+F64 = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+WARMUP_S = 1.0  # longer than any latency, and than a stop on friction .2
+STILL_MPS = 0.02  # slower than this a robot stands
+EVEN = 0.25  # of a control period: how far a tick or a pose may be from where it should be
+
+POSE = ("pose_x_m", "pose_y_m", "pose_yaw_rad")
+MOTION = (
+    *("wheel_speed_mps", "wheel_yaw_rate_radps", "gyro_yaw_rate_radps", "accel_x_mps2"),
+    *("localised_speed_mps", "localised_lateral_mps"),
+)
+BEFORE = (
+    *("wheel_speed_mps", "wheel_yaw_rate_radps", "gyro_yaw_rate_radps"),
+    "localised_speed_mps",
+)
+LOGGED = ("stamp_ns", "pose_stamp_ns", *POSE, *MOTION, *COMMAND, "bumped", "clearance_m")
+
+
+@dataclass(frozen=True)
+class LoggedSegments:
+    """S segments of K steps as they were logged, with the W steps before each.
+
+    `signals` are the stored signals by name, (S, K + 1): at the K ticks and at the end of the
+    last. `left_out` counts the steps that begin no segment although they are of the store, by
+    reason.
+    """
+
+    task: Task
+    horizon_steps: int  # K
+    warmup_steps: int  # W
+    row: Ints  # (S,) of the first of the K steps, in the `LoggedSteps`
+    transition_id: Ints  # (S,) likewise
+    recording_id: NDArray[np.str_]  # (S,)
+    episode_id: NDArray[np.str_]  # (S,)
+    condition: NDArray[np.str_]  # (S, K) the label of each step
+    true_condition: NDArray[np.str_]  # (S, K) of a simulator; "" where not known
+    command: F64  # (S, W + K, 2) speed m/s and yaw rate rad/s; stop where nothing was before
+    still: NDArray[np.bool_]  # (S,) the robot stood before the first of the W steps
+    before: dict[str, F64]  # the signals of `BEFORE` as the W steps begin, (S,) each
+    signals: dict[str, NDArray[Any]]  # (S, K + 1) each
+    pose_fresh: NDArray[np.bool_]  # (S, K + 1) the pose was measured at its tick
+    left_out: dict[str, int] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.transition_id)
+
+    @property
+    def pose(self) -> F64:
+        """Logged x, y and heading, (S, K + 1, 3)."""
+        return np.stack([self.signals[name] for name in POSE], axis=-1)
+
+    def take(self, which: NDArray[Any]) -> LoggedSegments:
+        """The segments of an index or mask (S,), `left_out` as it was."""
+        arrays = {
+            name: value[which]
+            for name, value in vars(self).items()
+            if isinstance(value, np.ndarray)
+        }
+        before, signals = rows_of(self.before, which), rows_of(self.signals, which)
+        return replace(self, before=before, signals=signals, **arrays)
+
+
+def log_segments(
+    steps: LoggedSteps,
+    horizon_s: float,
+    *,
+    stride_s: float | None = None,
+    warmup_s: float = WARMUP_S,
+) -> LoggedSegments:
+    """Cut logged episodes into segments of `horizon_s`.
+
+    A segment begins every `stride_s` (default: the horizon, so that none overlap) where its steps
+    and those of the warm-up (rounded up to whole steps) are all there, evenly in time, and its
+    first pose is fresh. At an episode's start the steps before are not needed if the robot stood
+    still. A pose is fresh if its age is the recording's usual one, within a quarter of a control
+    period.
+
+    Raises:
+        ConfigError: a horizon or stride that is not some control periods.
+    """
+    task, rows = steps.task, steps.now
+    horizon = _periods(task, horizon_s, "horizon_s")
+    stride = horizon if stride_s is None else _periods(task, stride_s, "stride_s")
+    warmup = int(np.ceil(warmup_s / task.control_period_s - 1e-9))
+    period_ns = round(task.control_period_s * 1e9)
+    fresh = _fresh(steps, period_ns)
+
+    first = np.flatnonzero(steps.begins)
+    ends = np.append(first[1:], len(steps))
+    left: Counter[str] = Counter()
+    starts = [np.zeros(0, np.int64)]
+    for begin, end in zip(first, ends, strict=True):
+        wheels = np.hypot(rows["wheel_speed_mps"][begin], rows["wheel_yaw_rate_radps"][begin])
+        lead = 0 if steps.step_index[begin] == 0 and wheels < STILL_MPS else warmup
+        at = np.arange(begin + lead, end - horizon, stride)
+        if not len(at):
+            left["too short a stretch"] += int(end - begin)
+            continue
+        left["warm-up"] += lead
+        left["end of a stretch"] += max(int(end - begin) - lead - len(at) * stride, 0)
+        starts.append(at)
+    at = np.concatenate(starts)
+
+    index = at[:, None] + np.arange(horizon + 1)
+    due = rows["stamp_ns"][at][:, None] + np.arange(horizon + 1) * period_ns
+    even = (np.abs(rows["stamp_ns"][index] - due) <= EVEN * period_ns).all(axis=1)
+    left["ticks not a control period apart"] += int((~even).sum()) * stride
+    stale = even & ~fresh[at]
+    left["no fresh pose to begin with"] += int(stale.sum()) * stride
+    keep = even & ~stale
+    at, index = at[keep], index[keep]
+
+    lead_row = np.maximum(at - warmup, steps.first[at])
+    return LoggedSegments(
+        task=task,
+        horizon_steps=horizon,
+        warmup_steps=warmup,
+        row=at,
+        transition_id=steps.transition_id[at],
+        recording_id=steps.recording_id[at],
+        episode_id=steps.episode_id[at],
+        condition=steps.condition[index[:, :-1]],
+        true_condition=steps.true_condition[index[:, :-1]],
+        command=steps.commands(at, warmup, horizon),
+        still=at - warmup < steps.first[at],
+        before={name: rows[name][lead_row] for name in BEFORE},
+        signals={name: rows[name][index] for name in LOGGED},
+        pose_fresh=fresh[index],
+        left_out={reason: count for reason, count in left.items() if count},
+    )
+
+
+def _fresh(steps: LoggedSteps, period_ns: int) -> NDArray[np.bool_]:
+    """Which rows' poses are as old as their recording's usually are."""
+    age = steps.now["stamp_ns"] - steps.now["pose_stamp_ns"]
+    fresh = np.zeros(len(age), np.bool_)
+    for recording in np.unique(steps.recording_id):
+        rows = steps.recording_id == recording
+        fresh[rows] = np.abs(age[rows] - np.median(age[rows])) <= EVEN * period_ns
+    return fresh
+
+
+def _periods(task: Task, seconds: float, name: str) -> int:
+    count = round(seconds / task.control_period_s)
+    if count < 1 or abs(count * task.control_period_s - seconds) > 1e-6:
+        raise ConfigError(
+            f"{name} must be a multiple of the control period of {task.control_period_s} s,"
+            f" got {seconds}",
+            where="segments",
+        )
+    return count
