@@ -24,7 +24,7 @@ from harness import mean_interval
 
 from restock.cli import main as restock
 from restock.stats import percentiles
-from restock.train.study.study import Plan, load_study
+from restock.train.study.study import StudyPlan, load_study
 
 HERE = Path(__file__).parent / "evidence"
 NATURAL = "nominal=.88,wheel_slip=.04,blocked_aisle=.04,near_collision=.04"
@@ -58,7 +58,7 @@ def main() -> int:
         shutil.copy(file, options.out / file.name)
     study, out = options.out / "study.toml", options.out / "study"
     code = restock(["study", str(study), "--out", str(out), "--workers", str(options.workers)])
-    plan = Plan(load_study(study), study.parent, out)
+    plan = StudyPlan(load_study(study), study.parent, out)
     print(f"\n{ends(plan)}\n\n{curves(plan)}\n\n{leads(plan)}")
     return code
 
@@ -71,7 +71,7 @@ def _record(recording: Path, seed: int) -> None:
     subprocess.run(command, check=True)
 
 
-def ends(plan: Plan) -> str:
+def ends(plan: StudyPlan) -> str:
     """Success of each arm in each cell on the study's episodes, with 95 % intervals."""
     lines = [
         f"| | {' | '.join(CELLS)} | rare conditions |",
@@ -87,7 +87,7 @@ def ends(plan: Plan) -> str:
     return "\n".join(lines)
 
 
-def curves(plan: Plan) -> str:
+def curves(plan: StudyPlan) -> str:
     """Success in the rare conditions at each periodic evaluation, the mean over seeds."""
     found: dict[str, dict[int, float]] = {}
     for arm in plan.study.arms:
@@ -113,7 +113,7 @@ def curves(plan: Plan) -> str:
     return "\n".join(lines)
 
 
-def leads(plan: Plan) -> str:
+def leads(plan: StudyPlan) -> str:
     """How far each arm is ahead of the baseline in the rare conditions, paired, by steps."""
     base = [_rare_episodes(path) for path in plan.runs(plan.study.base)]
     if not all(base):

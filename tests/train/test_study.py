@@ -12,7 +12,7 @@ from restock.errors import ConfigError
 from restock.train.comparison.arms import Difference
 from restock.train.comparison.compare import Comparison
 from restock.train.study import study_run
-from restock.train.study.study import Plan, load_study
+from restock.train.study.study import StudyPlan, load_study
 
 SMALL = """
 treatment = "algorithm"
@@ -113,7 +113,7 @@ def test_each_comparison_is_judged_by_its_own_treatment(
     arm = '\n[[arms]]\nname = "again"\nbaseline = "dueling"\ntreatment = "method"'
     (tmp_path / "s.toml").write_text(SMALL + arm)
     out = tmp_path / "out"
-    plan = Plan(load_study(tmp_path / "s.toml"), tmp_path, out)
+    plan = StudyPlan(load_study(tmp_path / "s.toml"), tmp_path, out)
     for job in plan.jobs:  # all were trained and evaluated before
         job.path.mkdir(parents=True)
         job.done.write_text(plan.fingerprint(job))
@@ -149,7 +149,7 @@ def test_each_comparison_is_judged_by_its_own_treatment(
 def test_panels_of_mixtures_are_the_studys_own(tmp_path: Path) -> None:
     arms = '[[arms]]\nname = "a"\nmixture = "uniform"\n[[arms]]\nname = "b"\npanel = "p"\n'
     (tmp_path / "s.toml").write_text(f'store = "../s"\n{arms}')
-    plan = Plan(load_study(tmp_path / "s.toml"), tmp_path, tmp_path / "o")
+    plan = StudyPlan(load_study(tmp_path / "s.toml"), tmp_path, tmp_path / "o")
     a, b = plan.study.arms
     assert plan.panel(a) == tmp_path / "o" / "panels" / "a"
     assert plan.panel(b) == tmp_path / "p"
@@ -163,10 +163,10 @@ def test_panels_of_mixtures_are_the_studys_own(tmp_path: Path) -> None:
         ('[[arms]]\nname = "a"\n[[arms]]\nname = "a"', "each with its own name"),
         ('[[arms]]\nname = "../a"\n[[arms]]\nname = "b"', "must be letters"),
         ('[[arms]]\nname = "a"\nmixture = "u"\n[[arms]]\nname = "b"', "and the study no store"),
-        ('baseline = "c"\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "is none of the arms"),
+        ('baseline = "c"\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "is not one of the arms"),
         (
             '[[arms]]\nname = "a"\n[[arms]]\nname = "b"\nbaseline = "c"',
-            "'c' is none of the arms",
+            "'c' is not one of the arms",
         ),
         ('[[arms]]\nname = "a"\n[[arms]]\nname = "b"\nbaseline = "b"', "'b' is its own baseline"),
         (
@@ -176,7 +176,7 @@ def test_panels_of_mixtures_are_the_studys_own(tmp_path: Path) -> None:
         ('[[arms]]\nname = "a"\n[[arms]]\nname = "b"\ntreatment = "luck"', "Invalid enum value"),
         ('seeds = [1, 1]\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "each once"),
         ('[settings]\nseed = 3\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "must not set seed"),
-        ('worker = 2\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "unknown field `worker`"),
+        ('worker = 2\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "unknown key `worker`"),
         ("arms = [", "is not TOML"),
     ],
 )

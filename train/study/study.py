@@ -1,22 +1,23 @@
-"""A study as its TOML file asks for it: arms x seeds, and what each arm is compared with."""
+"""A study: arms x seeds as its TOML file asks for, what there is to do, and the page it ends in."""
 
 from __future__ import annotations
 
 import json
-import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 
-from restock.errors import ConfigError
+from restock.toml import Checked, read_toml, typed
 from restock.train.comparison.arms import Treatment
+from restock.train.comparison.compare import Comparison
 from restock.train.dqn.config import as_overrides
 from restock.train.libraries.library_arm import Library
 
 
-class ArmConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ArmConfig(Checked, frozen=True):
     """One method: a panel (or a mixture of the study's store, or none) and settings."""
 
     name: str
@@ -28,19 +29,19 @@ class ArmConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     treatment: Treatment | None = None  # of its comparison; None: the study's
     baseline: str | None = None  # the arm it is compared with; None: the study's
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
         if not self.name or not all(c.isalnum() or c in "._-" for c in self.name):
-            raise ValueError(f"arms.name must be letters, digits, . _ or -, got {self.name!r}")
+            raise ValueError(f"name must be letters, digits, . _ or -, got {self.name!r}")
         if self.mixture is not None and self.panel is not None:
-            raise ValueError(f"arm {self.name!r} names a mixture and a panel: choose one")
+            raise ValueError("panel must not be given beside mixture: choose one")
         if self.library is None and self.arguments:
-            raise ValueError(f"arm {self.name!r} has arguments, and no library to take them")
+            raise ValueError("arguments: there is no library to take them")
         if self.library is not None and (self.mixture is not None or self.panel is not None):
-            raise ValueError(f"arm {self.name!r} is a library's, which learns from no logs here")
+            raise ValueError("library: it learns from no logs here, give no mixture or panel")
 
 
-class StudyEvaluation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    episodes: int = 40  # per kind
+class StudyEvaluation(Checked, frozen=True):
+    episodes: Annotated[int, msgspec.Meta(ge=1)] = 40  # per kind
     perturbations: tuple[str, ...] = ("none",)
     seed: int = 10_000
 
@@ -54,7 +55,7 @@ class Pair:
     treatment: Treatment
 
 
-class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Study(Checked, frozen=True):
     """The whole file."""
 
     arms: tuple[ArmConfig, ...]
@@ -66,13 +67,13 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     settings: dict[str, Any] = msgspec.field(default_factory=dict)  # of every arm
     evaluation: StudyEvaluation = StudyEvaluation()
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
         names = [arm.name for arm in self.arms]
         if len(names) < 2 or len(set(names)) != len(names):
             raise ValueError(f"arms must be two or more, each with its own name, got {names}")
         for baseline in (self.baseline, *(arm.baseline for arm in self.arms)):
             if baseline is not None and baseline not in names:
-                raise ValueError(f"baseline {baseline!r} is none of the arms {names}")
+                raise ValueError(f"baseline {baseline!r} is not one of the arms {names}")
         for arm in self.arms:
             if arm.baseline == arm.name:
                 raise ValueError(f"arm {arm.name!r} is its own baseline")
@@ -116,25 +117,14 @@ def load_study(path: Path) -> Study:
     """A study from a TOML file.
 
     Raises:
-        ConfigError: no such file, no TOML, an unknown key or a value that cannot be; names the key.
+        ConfigError: no such file, no TOML, an unknown key or an invalid value; names the key.
     """
-    try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-        return msgspec.convert(document, Study)
-    except OSError as error:
-        raise ConfigError(f"cannot be read: {error.strerror}", where=str(path)) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"is not TOML: {error}", where=str(path)) from error
-    except msgspec.ValidationError as error:
-        raise ConfigError(
-            str(error).replace("Object ", ""),
-            where=str(path),
-            remedy="docs/study.md lists every key with its meaning",
-        ) from error
+    remedy = "docs/study.md lists every key with its meaning"
+    return typed(read_toml(path), Study, where=str(path), remedy=remedy)
 
 
 @dataclass(frozen=True)
-class Job:
+class StudyJob:
     """One run of a study."""
 
     arm: ArmConfig
@@ -148,7 +138,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Plan:
+class StudyPlan:
     """What there is to do."""
 
     study: Study
@@ -156,10 +146,10 @@ class Plan:
     out: Path
 
     @property
-    def jobs(self) -> list[Job]:
+    def jobs(self) -> list[StudyJob]:
         """Seeds first: a study that is cut has fewer seeds of all arms, not fewer arms."""
         return [
-            Job(arm, seed, self.out / "runs" / f"{arm.name}-{seed}")
+            StudyJob(arm, seed, self.out / "runs" / f"{arm.name}-{seed}")
             for seed in self.study.seeds
             for arm in self.study.arms
         ]
@@ -178,7 +168,7 @@ class Plan:
         """`key=value` of a run."""
         return [*as_overrides(self.study.settings), *as_overrides(arm.settings), f"seed={seed}"]
 
-    def fingerprint(self, job: Job) -> str:
+    def fingerprint(self, job: StudyJob) -> str:
         """What a finished run was asked for, as JSON: another question makes another run."""
         panel = self.panel(job.arm)
         asked = {
@@ -191,4 +181,89 @@ class Plan:
         return json.dumps(asked, indent=1) + "\n"
 
 
-__all__ = ["ArmConfig", "Job", "Pair", "Plan", "Study", "StudyEvaluation", "load_study"]
+def findings(plan: StudyPlan, comparisons: Sequence[Comparison]) -> dict[str, Any]:
+    """The study and every comparison, as JSON values."""
+    return {
+        "doc": plan.study.doc,
+        "seeds": list(plan.study.seeds),
+        "runs": {arm.name: [str(path) for path in plan.runs(arm)] for arm in plan.study.arms},
+        "comparisons": [
+            {"arm": pair.arm.name, "baseline": pair.baseline.name, **comparison.as_json()}
+            for pair, comparison in zip(plan.study.pairs, comparisons, strict=True)
+        ],
+    }
+
+
+def as_markdown(study: dict[str, Any]) -> str:
+    """The same for people."""
+    lines = [f"# Study: {', '.join(study['runs'])}", ""]
+    lines += [study["doc"], ""] if study["doc"] else []
+    lines += [
+        f"Seeds of each arm: {', '.join(map(str, study['seeds']))}. All are evaluated on the same"
+        " episodes. Intervals are 95 %, over seeds and episodes; bold where they exclude 0.",
+    ]
+    for comparison in study["comparisons"]:
+        baseline, treatment = comparison["baseline"], comparison["treatment"]
+        lines += ["", f"## {comparison['arm']} against {baseline}", ""]
+        lines += [f"Compared: the {treatment}.", ""]
+        if treatment == "method":
+            lines += [_held(comparison), ""]
+        if comparison["verdict"] != "comparable":
+            lines += [_refusal(comparison)]
+            continue
+        lines += [
+            f"| perturbation | condition | {baseline} | {comparison['arm']} | difference |"
+            " P(higher return) |",
+            "| --- | --- | --- | --- | --- | --- |",
+        ]
+        for row in comparison["outcomes"]:
+            low, high = row["difference_low"], row["difference_high"]
+            apart = "**" if low > 0 or high < 0 else ""
+            lines.append(
+                f"| {row['perturbation']} | {row['condition']} | {row['success'][0]:.2f}"
+                f" | {row['success'][1]:.2f} | {apart}{row['difference']:+.2f}"
+                f" [{low:+.2f}, {high:+.2f}]{apart} | {row['improvement']:.2f} |"
+            )
+    return "\n".join(lines) + "\n"
+
+
+def _refusal(comparison: dict[str, Any]) -> str:
+    """Why the gate let no outcomes through."""
+    if comparison["refused"]:
+        return (
+            f"Not compared: they differ in {', '.join(comparison['refused'])}, which"
+            f' treatment = "{comparison["treatment"]}" does not allow.'
+        )
+    verdict = comparison["verdict"]
+    names = [check["name"] for check in comparison["checks"] if check["verdict"] == verdict]
+    return f"Not compared: {verdict} in {', '.join(dict.fromkeys(names))}."
+
+
+def _held(comparison: dict[str, Any]) -> str:
+    """What a comparison of methods holds fixed, and what it does not."""
+    kinds = ("feed", "target", "algorithm")
+    differ: dict[str, list[str]] = {kind: [] for kind in kinds}
+    for difference in comparison["differences"]:
+        name = difference["setting"]
+        if name.startswith("library.arguments."):  # its own: one name for all of them
+            name = "library.arguments"
+        if name not in differ.get(difference["kind"], [name]):
+            differ[difference["kind"]].append(name)
+    words = {"feed": "replay", "target": "the target rule", "algorithm": "the algorithm"}
+    free = [f"{words[kind]} ({', '.join(names)})" for kind, names in differ.items() if names]
+    same = [words[kind] for kind in kinds[:2] if not differ[kind]]
+    fixed = ", ".join(["the environment and its conditions", "environment steps", *same])
+    return f"Held fixed: {fixed} and the evaluation. Not held: {'; '.join(free) or 'nothing'}."
+
+
+__all__ = [
+    "ArmConfig",
+    "Pair",
+    "Study",
+    "StudyEvaluation",
+    "StudyJob",
+    "StudyPlan",
+    "as_markdown",
+    "findings",
+    "load_study",
+]

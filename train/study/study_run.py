@@ -22,14 +22,14 @@ from restock.errors import RestockError, RunError
 from restock.files import write_text
 from restock.train.comparison.compare import Comparison, compare
 from restock.train.libraries.library_arm import DONE, Library, LibraryArm, check_installed, resolve
-from restock.train.study.study import ArmConfig, Job, Plan
+from restock.train.study.study import ArmConfig, StudyJob, StudyPlan
 
 Say = Callable[[str], None]
 Engine = Literal["processes", "ray"]
 
 
 def run_study(
-    plan: Plan,
+    plan: StudyPlan,
     *,
     workers: int = 1,
     engine: Engine = "processes",
@@ -37,7 +37,7 @@ def run_study(
 ) -> list[Comparison]:
     """Do what is not done yet, then compare every arm with its baseline, in the order of the arms.
 
-    `engine` "ray" gives each run to a Ray cluster: see `restock.train.study.study_on_ray`.
+    `engine` "ray" gives each run to a Ray cluster.
 
     Raises:
         RunError: a run failed (its log says why), or was made by another version of the study.
@@ -59,9 +59,7 @@ def run_study(
     todo = [job for job in plan.jobs if not job.done.exists()]
     say(f"{len(plan.jobs) - len(todo)} of {len(plan.jobs)} runs are there already")
     if engine == "ray":
-        from restock.train.study.study_on_ray import run_on_ray
-
-        run_on_ray(plan, todo, workers=workers, say=say)
+        _run_on_ray(plan, todo, workers, say)
     else:
         _run_here(plan, todo, workers, say)
     return [
@@ -70,7 +68,7 @@ def run_study(
     ]
 
 
-def _run_here(plan: Plan, todo: Sequence[Job], workers: int, say: Say) -> None:
+def _run_here(plan: StudyPlan, todo: Sequence[StudyJob], workers: int, say: Say) -> None:
     with ThreadPoolExecutor(max_workers=workers) as pool:
         futures = [pool.submit(run_job, plan, job, say) for job in todo]
         try:
@@ -81,7 +79,51 @@ def _run_here(plan: Plan, todo: Sequence[Job], workers: int, say: Say) -> None:
                 future.cancel()
 
 
-def _build(plan: Plan, arm: ArmConfig, say: Say) -> None:
+def _run_on_ray(plan: StudyPlan, jobs: Sequence[StudyJob], workers: int, say: Say) -> None:
+    """Train and evaluate every run; the first failure is raised when all others have ended."""
+    from restock.ingest.on_ray import cluster
+
+    with cluster(workers) as ray:
+        task = ray.remote(_ray_task).options(num_cpus=1, max_retries=0)
+        running = {task.remote(plan, job, str(Path.cwd())): job for job in jobs}
+        failed: RestockError | None = None
+        while running:
+            (ended, *_), _ = ray.wait(list(running), num_returns=1)
+            job = running.pop(ended)
+            try:
+                error = ray.get(ended)
+            except ray.exceptions.RayError as died:
+                error = RunError(
+                    f"the process that made it died ({type(died).__name__})",
+                    where=str(job.path),
+                    remedy="run the study again: what is done is kept",
+                )
+            if error is None:
+                say(f"{job.path.name}: trained and evaluated")
+            else:
+                failed = failed or error
+        if failed is not None:
+            raise failed
+
+
+def _ray_task(plan: StudyPlan, job: StudyJob, folder: str) -> RestockError | None:
+    """One run, on whatever machine."""
+    try:
+        os.chdir(folder)
+    except OSError:
+        return RunError(
+            f"the machine that was to make it has no folder {folder}",
+            where=str(job.path),
+            remedy="put the study where every machine of the cluster sees it",
+        )
+    try:
+        run_job(plan, job, lambda line: None)
+    except RestockError as error:
+        return error
+    return None
+
+
+def _build(plan: StudyPlan, arm: ArmConfig, say: Say) -> None:
     """An arm's panel, if it is a mixture that has not been packed yet."""
     out = plan.panel(arm)
     if out is None or out.exists() or arm.mixture is None or plan.study.store is None:
@@ -96,39 +138,41 @@ def _build(plan: Plan, arm: ArmConfig, say: Say) -> None:
     _restock(["mix", store, "--mixture", name, "--out", str(out)], plan.out / "logs" / "mix.log")
 
 
-def run_job(plan: Plan, job: Job, say: Say) -> None:
+def run_job(plan: StudyPlan, job: StudyJob, say: Say) -> None:
     """Train and evaluate one run; taken up from its checkpoint if it has one."""
     log = plan.out / "logs" / f"{job.path.name}.log"
     if job.arm.library is not None:
         _train_library(plan, job, job.arm.library, log, say)
     else:
         _train(plan, job, log, say)
-    asked = plan.study.evaluation
-    perturbations = ",".join(asked.perturbations)
+    evaluation = plan.study.evaluation
+    perturbations = ",".join(evaluation.perturbations)
     say(f"{job.path.name}: evaluating")
     _restock(
         [
             *("eval", str(job.path), "--policies", "agent", "--perturbations", perturbations),
-            *("--episodes", str(asked.episodes), "--seed", str(asked.seed)),
+            *("--episodes", str(evaluation.episodes), "--seed", str(evaluation.seed)),
         ],
         log,
     )
     write_text(job.done, plan.fingerprint(job))
 
 
-def _train_library(plan: Plan, job: Job, library: Library, log: Path, say: Say) -> None:
-    """Another library keeps no checkpoint to go on from: a run that was cut begins anew."""
+def _train_library(plan: StudyPlan, job: StudyJob, library: Library, log: Path, say: Say) -> None:
+    """Another library keeps no checkpoint to go on from: a run that was cut begins again."""
     if (job.path / DONE).exists():
         return
     if job.path.exists():
         shutil.rmtree(job.path)
     settings = tuple(plan.settings(job.arm, job.seed))
-    asked = LibraryArm(str(job.path), library, settings, job.arm.arguments)
+    library_arm = LibraryArm(str(job.path), library, settings, job.arm.arguments)
     say(f"{job.path.name}: training with {library}")
-    _command("restock.train.libraries.library_arm", [msgspec.json.encode(asked).decode()], log)
+    _command(
+        "restock.train.libraries.library_arm", [msgspec.json.encode(library_arm).decode()], log
+    )
 
 
-def _train(plan: Plan, job: Job, log: Path, say: Say) -> None:
+def _train(plan: StudyPlan, job: StudyJob, log: Path, say: Say) -> None:
     panel = plan.panel(job.arm)
     checkpoint = job.path / "checkpoints" / "latest.safetensors"
     if (job.path / "config.json").exists() and not checkpoint.exists():

@@ -41,13 +41,12 @@ class StudyCommand:
         from restock.cli.output import plain, print_json, print_table, say
         from restock.errors import ConfigError, ExitCode
         from restock.files import write_text
-        from restock.train.study.study import Plan, load_study
-        from restock.train.study.study_page import as_markdown, findings
+        from restock.train.study.study import StudyPlan, as_markdown, findings, load_study
         from restock.train.study.study_run import run_study
 
         if self.workers < 1:
             raise ConfigError(f"must be at least 1, got {self.workers}", where="--workers")
-        plan = Plan(load_study(self.study), self.study.parent, self.out)
+        plan = StudyPlan(load_study(self.study), self.study.parent, self.out)
         if self.dry_run:
             against = {
                 pair.arm.name: f"{pair.baseline.name} ({pair.treatment})"
