@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from restock.errors import StoreError
 from restock.ingest.store.location import Location
-from restock.replay.panel.panel import HEADER, HELD_OUT, META, Panel
+from restock.replay.panel.panel import EVALUATION_SPLIT, HEADER, META, Panel
 from restock.replay.store.store import Store, is_store, read_parquet
 
 RUN_CONFIG = "config.json"
@@ -71,7 +71,7 @@ def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> bool
     if (path / HEADER).is_file():
         panel = Panel.open(path)
         read_parquet(connection, "rows", [path / META], schema=schema)
-        read_parquet(connection, "held_out", [path / HELD_OUT], schema=schema)
+        read_parquet(connection, "evaluation_split", [path / EVALUATION_SPLIT], schema=schema)
         strata = pa.Table.from_pylist([msgspec.structs.asdict(s) for s in panel.strata])
         _keep(connection, schema, "strata", strata)
         return True

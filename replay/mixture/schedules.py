@@ -9,62 +9,59 @@ from __future__ import annotations
 import itertools
 import math
 from bisect import bisect_right
-from typing import Literal
+from typing import Annotated, Literal
 
-import msgspec
+from msgspec import Meta
+
+from restock.toml import Checked
+
+Fraction = Annotated[float, Meta(ge=0, le=1)]
+EnvSteps = Annotated[int, Meta(ge=0)]
 
 
-class Linear(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="schedule", tag="linear"
-):
+class Linear(Checked, frozen=True, tag_field="schedule", tag="linear"):
     """From `start` to `end` in a straight line."""
 
-    start: float
-    end: float
-    to_env_steps: int  # where it ends
-    from_env_steps: int = 0  # where it begins
+    start: Fraction
+    end: Fraction
+    to_env_steps: EnvSteps  # where it ends
+    from_env_steps: EnvSteps = 0  # where it begins
 
-    def __post_init__(self) -> None:
-        _check_ramp(self.start, self.end, self.from_env_steps, self.to_env_steps)
+    def check(self) -> None:
+        _check_span(self)
 
     def at(self, env_steps: float) -> float:
         return self.start + (self.end - self.start) * _part(self, env_steps)
 
 
-class Cosine(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="schedule", tag="cosine"
-):
+class Cosine(Checked, frozen=True, tag_field="schedule", tag="cosine"):
     """From `start` to `end` along half a cosine: slow at both ends."""
 
-    start: float
-    end: float
-    to_env_steps: int
-    from_env_steps: int = 0
+    start: Fraction
+    end: Fraction
+    to_env_steps: EnvSteps
+    from_env_steps: EnvSteps = 0
 
-    def __post_init__(self) -> None:
-        _check_ramp(self.start, self.end, self.from_env_steps, self.to_env_steps)
+    def check(self) -> None:
+        _check_span(self)
 
     def at(self, env_steps: float) -> float:
         part = (1.0 - math.cos(math.pi * _part(self, env_steps))) / 2.0
         return self.start + (self.end - self.start) * part
 
 
-class Piecewise(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="schedule", tag="piecewise"
-):
+class Piecewise(Checked, frozen=True, tag_field="schedule", tag="piecewise"):
     """Through points `[env_steps, share]`, in order: joined by lines, or held until the next."""
 
-    points: tuple[tuple[int, float], ...]
+    points: tuple[tuple[EnvSteps, Fraction], ...]
     between: Literal["line", "hold"] = "line"
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
         steps = [step for step, _ in self.points]
-        if not steps or steps[0] < 0 or any(b <= a for a, b in itertools.pairwise(steps)):
+        if not steps or any(b <= a for a, b in itertools.pairwise(steps)):
             raise ValueError(
                 f"a piecewise schedule needs points [env_steps, share] in rising order, got {steps}"
             )
-        for _, share in self.points:
-            _check_share(share)
 
     def at(self, env_steps: float) -> float:
         after = bisect_right([step for step, _ in self.points], env_steps)
@@ -78,7 +75,7 @@ class Piecewise(
 
 
 Schedule = Linear | Cosine | Piecewise
-Portion = float | Schedule
+Portion = Fraction | Schedule
 
 
 def value_at(portion: Portion, env_steps: float) -> float:
@@ -112,15 +109,9 @@ def _part(ramp: Linear | Cosine, env_steps: float) -> float:
     return min(max((env_steps - ramp.from_env_steps) / length, 0.0), 1.0)
 
 
-def _check_ramp(start: float, end: float, begin: int, finish: int) -> None:
-    _check_share(start)
-    _check_share(end)
-    if not 0 <= begin < finish:
+def _check_span(ramp: Linear | Cosine) -> None:
+    if ramp.from_env_steps >= ramp.to_env_steps:
         raise ValueError(
-            f"a schedule needs 0 <= from_env_steps < to_env_steps, got {begin} and {finish}"
+            "a schedule needs from_env_steps < to_env_steps,"
+            f" got {ramp.from_env_steps} and {ramp.to_env_steps}"
         )
-
-
-def _check_share(share: float) -> None:
-    if not 0 <= share <= 1:
-        raise ValueError(f"a scheduled share must be in [0, 1], got {share:g}")

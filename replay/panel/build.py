@@ -24,8 +24,8 @@ from restock.ingest.task.conditions import NOMINAL, Condition, labels_version, s
 from restock.ingest.task.task import Task
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.packed_row import PACKING_VERSION
-from restock.replay.panel.pack import Packer, packing_code
-from restock.replay.panel.panel import HEADER, HELD_OUT, META, ROWS, Header, Panel, Stratum
+from restock.replay.panel.pack import Packer
+from restock.replay.panel.panel import EVALUATION_SPLIT, HEADER, META, ROWS, Header, Panel, Stratum
 from restock.replay.panel.plan import Plan, plan_panel
 from restock.replay.panel.scratch import Steps
 from restock.replay.panel.seal import FileRecord, seal
@@ -152,7 +152,7 @@ def write_panel(
         )
         packer = Packer(source.connection, plan, steps, scratch)
         size = packer.write_rows(partial / ROWS, advance)
-        packer.write_meta(partial / META, partial / HELD_OUT)
+        packer.write_meta(partial / META, partial / EVALUATION_SPLIT)
         identity = panel_id(source, plan, packer.digest())
         shutil.rmtree(scratch)
         header = _header(source, plan, identity, task_json, size, partial)
@@ -259,9 +259,9 @@ def _chance(task_json: str) -> float:
 
 
 def panel_id(source: Source, plan: Plan, digest: str) -> str:
-    """What names a panel: store versions, mixture, task, rows (by `digest`), packing code."""
+    """What names a panel: store versions, mixture, task, rows (by `digest`), packing version."""
     versions = [source.version, *(store.version for store in source.others)]
-    named = [packing_code(), versions, plan.mixture, plan.task_hash, digest]
+    named = [PACKING_VERSION, versions, plan.mixture, plan.task_hash, digest]
     return hashlib.blake2b(msgspec.json.encode(named), digest_size=8).hexdigest()
 
 
@@ -286,7 +286,6 @@ def _header(
         discount=plan.mixture.discount,
         n_step=plan.mixture.n_step,
         packing_version=PACKING_VERSION,
-        packing_code=packing_code(),
         restock_version=__version__,
         newest_ns=plan.newest_ns,
         logs_share=plan.logs_share,
@@ -300,5 +299,5 @@ def _header(
         mixture=plan.mixture,
         others=[msgspec.structs.replace(o, path=_address(o.path)) for o in plan.others],
         ratios=list(plan.ratios),
-        files={name: FileRecord.of(partial / name) for name in (ROWS, META, HELD_OUT)},
+        files={name: FileRecord.of(partial / name) for name in (ROWS, META, EVALUATION_SPLIT)},
     )

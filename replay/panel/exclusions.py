@@ -10,9 +10,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from restock.errors import MixtureError
-from restock.replay.mixture.mixture import HeldOut, Mixture
-from restock.replay.mixture.packed_row import Bools, Ints
-from restock.replay.mixture.splitmix import GOLDEN, splitmix64
+from restock.replay.mixture.mixture import EvaluationSplit, Mixture
+from restock.replay.mixture.packed_row import GOLDEN, Bools, Ints, splitmix64
 from restock.replay.panel.candidates import bools, codes
 from restock.replay.panel.strata import NO_STRATUM, Stratum
 
@@ -33,7 +32,7 @@ class LeftOut:
         self.gone |= rows
 
 
-def leave_out(table: pa.Table, mixture: Mixture, held_out: Bools) -> LeftOut:
+def leave_out(table: pa.Table, mixture: Mixture, evaluation_split: Bools) -> LeftOut:
     """What no stratum gets, whatever it asks for. `table` is of `read_candidates`.
 
     Raises:
@@ -53,7 +52,7 @@ def leave_out(table: pa.Table, mixture: Mixture, held_out: Bools) -> LeftOut:
     if mixture.max_versions_behind is not None:
         behind = versions_behind(table)
         out.add("of an old version of its policy", behind > mixture.max_versions_behind)
-    out.add("held out", held_out)
+    out.add("evaluation split", evaluation_split)
     bare = ~bools(table, "labelled") & ~out.gone
     if bare.any() and mixture.unlabelled == "refuse":
         raise MixtureError(
@@ -147,7 +146,7 @@ def versions_behind(table: pa.Table) -> Ints:
     return behind[row_pair]
 
 
-def hold_out(table: pa.Table, rule: HeldOut, seed: int) -> Bools:
+def split_for_evaluation(table: pa.Table, rule: EvaluationSplit, seed: int) -> Bools:
     """Which rows are held out, (N,): whole episodes, whole recordings, or the latest episodes.
 
     Raises:
@@ -170,7 +169,7 @@ def hold_out(table: pa.Table, rule: HeldOut, seed: int) -> Bools:
         raise MixtureError(
             f"one {rule.by if rule.by == 'recording' else 'episode'} cannot be split"
             " into a panel and held-out data",
-            remedy='ingest more, or set [held_out] by = "none" in a mixture of your own',
+            remedy='ingest more, or set [evaluation_split] by = "none" in a mixture of your own',
         )
     wanted = rule.share * len(table)
     # At least one group, never all, and no more than needed.

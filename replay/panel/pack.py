@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -35,15 +34,14 @@ FINITE = (
     ' + reward)"'
 )
 _TEXT = pa.dictionary(pa.int32(), pa.string())
-_HELD_OUT = ("transition_id", "recording_id", "episode_id", "step_index", "logged_ns", "condition")
-
-
-def packing_code() -> str:
-    """A hash of the code that packs rows: part of a panel's id, 12 hex digits."""
-    digest = hashlib.blake2b(digest_size=6)
-    for name in ("mixture/packed_row.py", "mixture/n_step.py", "panel/pack.py", "panel/scratch.py"):
-        digest.update((files("restock.replay") / name).read_bytes())
-    return digest.hexdigest()
+_SPLIT_COLUMNS = (
+    "transition_id",
+    "recording_id",
+    "episode_id",
+    "step_index",
+    "logged_ns",
+    "condition",
+)
 
 
 class Packer:
@@ -156,7 +154,7 @@ class Packer:
             )
         return len(target) + len(ends)
 
-    def write_meta(self, meta: Path, held_out: Path) -> None:
+    def write_meta(self, meta: Path, evaluation_split: Path) -> None:
         """Write what stands beside the rows, and the rows that are held out, in the same order."""
         names = pa.array([line.stratum for line in self.plan.strata], pa.string())
         to_go = None
@@ -167,15 +165,18 @@ class Packer:
             BATCH_ROWS
         )
         begin = at = 0
-        with _Table(meta) as kept, _Table(held_out) as left:
+        with _Table(meta) as kept, _Table(evaluation_split) as left:
             for batch in reader:
                 end = begin + len(batch)
                 ids = batch.column("transition_id").to_numpy()
                 if not np.array_equal(ids, self.steps.ids[begin:end]):
                     raise PanelError("the source changed while it was read", where=str(meta.parent))
                 table = _encoded(pa.Table.from_batches([batch]))
-                held = table.select(_HELD_OUT).filter(pa.array(self.plan.held_out[begin:end]))
-                split_by = pa.repeat(self.mixture.held_out.by, len(held))  # for the audit `leakage`
+                held = table.select(_SPLIT_COLUMNS).filter(
+                    pa.array(self.plan.evaluation_split[begin:end])
+                )
+                # For the audit `leakage`.
+                split_by = pa.repeat(self.mixture.evaluation_split.by, len(held))
                 left.write(held.append_column("split_by", split_by))
                 code = self.plan.stratum[begin:end]
                 rows = np.flatnonzero(code != NO_STRATUM)

@@ -5,7 +5,7 @@ A directory that never changes once it is there:
     panel.json       what it was made from, its strata, sizes and checksums
     rows.f32         packed float32 rows, little-endian, as `replay.layout` says
     meta.parquet     one row beside each packed row: ids, condition, behaviour policy, weight, …
-    held_out.parquet the transitions that were kept out, by whole episodes
+    evaluation_split.parquet the transitions that were kept out, by whole episodes
 """
 
 from __future__ import annotations
@@ -30,7 +30,12 @@ from restock.replay.panel.stores import PinnedStore
 if TYPE_CHECKING:
     from restock.replay.panel.logged_sampler import LoggedSampler
 
-HEADER, ROWS, META, HELD_OUT = "panel.json", "rows.f32", "meta.parquet", "held_out.parquet"
+HEADER, ROWS, META, EVALUATION_SPLIT = (
+    "panel.json",
+    "rows.f32",
+    "meta.parquet",
+    "evaluation_split.parquet",
+)
 
 
 class Stratum(msgspec.Struct, frozen=True):
@@ -68,7 +73,6 @@ class Header(msgspec.Struct, frozen=True):
     discount: float
     n_step: int
     packing_version: int
-    packing_code: str  # a hash of the code that packed it
     restock_version: str
     newest_ns: int  # when its newest row was logged: ages of rows are against it, from logged_ns
     logs_share: float  # of a batch
@@ -111,7 +115,8 @@ class Panel:
         content = (path / HEADER).read_bytes()
         if (version := packed_by(content)) not in (PACKING_VERSION, None):
             raise PanelError(
-                f"packed by version {version} of the packing, this is {PACKING_VERSION}",
+                f"was packed by another version of Restock (packing {version}, not"
+                f" {PACKING_VERSION})",
                 where=str(path),
                 remedy=AGAIN,
             )

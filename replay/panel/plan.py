@@ -22,7 +22,12 @@ from restock.replay.mixture.packed_row import F32, Bools, Ints
 from restock.replay.mixture.schedules import mean_over
 from restock.replay.panel.candidates import META_COLUMNS, bools, codes, one_task, read_candidates
 from restock.replay.panel.density_ratio import RatioFit
-from restock.replay.panel.exclusions import LeftOut, hold_out, leave_out, leave_out_of_strata
+from restock.replay.panel.exclusions import (
+    LeftOut,
+    leave_out,
+    leave_out_of_strata,
+    split_for_evaluation,
+)
 from restock.replay.panel.source_plan import SourcePlan, SourceRows, StratumPlan, plan_source
 from restock.replay.panel.stores import PinnedStore
 from restock.replay.panel.strata import NO_STRATUM, Stratum, assign, resolve_strata
@@ -41,7 +46,7 @@ class Plan:
     stratum: NDArray[np.int16]  # (N,) of each row; -1 where it is not in the panel
     weight: F32  # (n,) of the panel's rows
     beside: dict[str, NDArray[Any]]  # (n,) each: what new shares need for new weights
-    held_out: Bools  # (N,)
+    evaluation_split: Bools  # (N,)
     strata: tuple[StratumPlan, ...]
     logs_share: float  # of a batch, all stores together; the mean over a schedule
     logs_share_wanted: float  # the same, had all strata rows enough
@@ -99,8 +104,8 @@ def plan_panel(
                 member[:, index] |= ~bools(table, "labelled")
                 state[:, index] |= ~bools(table, "labelled")
     stratum, state_code = assign(member, strata), assign(state, strata, only_pre=True)
-    held_out = hold_out(table, mixture.held_out, mixture.seed)
-    out = leave_out(table, mixture, held_out)
+    evaluation_split = split_for_evaluation(table, mixture.evaluation_split, mixture.seed)
+    out = leave_out(table, mixture, evaluation_split)
     for other in others:
         if other.repeated_rows:
             out.reasons[f"of {other.name!r}, in a store before it too"] = other.repeated_rows
@@ -108,7 +113,9 @@ def plan_panel(
     stratum[out.gone] = NO_STRATUM
     given = _sources(mixture, table, stratum, state_code)
     worked_out = [plan_source(connection, mixture, strata, source) for source in given]
-    return _joined(mixture, strata, table, task_hash, held_out, out, given, worked_out, others)
+    return _joined(
+        mixture, strata, table, task_hash, evaluation_split, out, given, worked_out, others
+    )
 
 
 def _sources(
@@ -140,7 +147,7 @@ def _joined(
     strata: Sequence[Stratum],
     table: pa.Table,
     task_hash: str,
-    held_out: Bools,
+    evaluation_split: Bools,
     out: LeftOut,
     given: Sequence[SourceRows],
     worked_out: Sequence[SourcePlan],
@@ -192,7 +199,7 @@ def _joined(
         stratum=code,
         weight=weight[chosen],
         beside={"state_code": state[chosen]} | {k: v[chosen] for k, v in outcome.items()},
-        held_out=held_out,
+        evaluation_split=evaluation_split,
         strata=tuple(lines),
         logs_share=float(filled.sum()),
         logs_share_wanted=sum(source.part for source in given),

@@ -11,8 +11,7 @@ import duckdb
 import msgspec
 
 from restock.errors import StoreError
-from restock.replay.mixture.mixture import Mixture
-from restock.replay.mixture.sources import OtherStore
+from restock.replay.mixture.mixture import Mixture, OtherStore
 from restock.replay.panel.candidates import STORE_COLUMN
 from restock.replay.store.store import Store, parquet_view
 

@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import MixtureError
-from restock.replay.mixture.mixture import Mixture, Shortfall, StratumRule
+from restock.replay.mixture.mixture import Mixture, Shortfall, SourceShares, StratumRule
 from restock.replay.mixture.packed_row import F64, Ints
 from restock.replay.mixture.schedules import knots, mean_over, value_at
 from restock.replay.mixture.shares import wanted_shares, within_limits
-from restock.replay.mixture.sources import Sources
 from restock.replay.sampling.adaptive import GroupDro
 
 REFRESH_BATCHES = 64  # shares with a schedule are worked out anew after so many
@@ -116,7 +115,7 @@ class ShareController:
             StratumRule(name=name, share=float(share))
             for name, share in zip(names, shares, strict=True)
         )
-        mixture = Mixture(strata=rules, sources=Sources(logs=1.0))
+        mixture = Mixture(strata=rules, sources=SourceShares(logs=1.0))
         fed = [SampledStratum(r.name, "logs", r, n, 1) for r, n in zip(rules, rows, strict=True)]
         return cls(mixture, fed, PlannedDraws(), logs_share=logs_share)
 

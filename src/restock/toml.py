@@ -109,6 +109,8 @@ def _ranges(kind: type) -> dict[str, inspect.Type]:
 def _ranged(kind: inspect.Type) -> bool:
     if isinstance(kind, inspect.UnionType):
         return any(map(_ranged, kind.types))
+    if isinstance(kind, inspect.TupleType):
+        return any(map(_ranged, kind.item_types))
     item = _item(kind)
     return bool(_bounds(kind)) or (item is not None and _ranged(item))
 
@@ -129,6 +131,10 @@ def _check(name: str, kind: inspect.Type, value: Any) -> None:
         fitting += [k for k in kind.types if _item(k) and not isinstance(value, int | float | str)]
         for option in fitting:
             _check(name, option, value)
+        return
+    if isinstance(kind, inspect.TupleType):
+        for index, (one_kind, one) in enumerate(zip(kind.item_types, value, strict=True)):
+            _check(f"{name}[{index}]", one_kind, one)
         return
     item = _item(kind)
     if item is not None:
@@ -202,6 +208,8 @@ def _walk(kind: inspect.Type, value: Any, path: str) -> tuple[dict[str, float], 
         found = _walk(fields[name], value[name], rest) if name in fields else None
         return found and (found[0], found[1], _join(name, found[2]))
     item = _item(kind)
+    if isinstance(kind, inspect.TupleType):
+        item = kind.item_types[int(step[1:-1])]
     if item is None or not isinstance(value, Mapping | list | tuple):
         return None
     if step == "[...]":

@@ -54,7 +54,9 @@ def filled(table: str, **values: object) -> dict[str, object]:
 def run(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run directory as training and `restock eval` leave it, over the synthetic store."""
     root = tmp_path_factory.mktemp("reported")
-    mixture = parse_mixture("[each_condition]\nshare = 'natural'\n[held_out]\nby = 'none'\n")
+    mixture = parse_mixture(
+        "[each_condition]\nshare = 'natural'\n[evaluation_split]\nby = 'none'\n"
+    )
     with Store(store_path) as store:
         panel = build_panel(store, mixture, root / "panel", task=TASK)
     config = {"target": {"rule": "hard", "every": 500}, "replay": {"ring_capacity": 4096}}

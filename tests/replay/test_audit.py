@@ -308,7 +308,7 @@ def panels(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[s
     folder, made = tmp_path_factory.mktemp("panels"), {}
     with Store(store_path) as store:
         for by in ("episode", "recording", "time"):
-            text = f"held_out = {{by = '{by}'}}\nplanned = {{updates = 50}}"
+            text = f"evaluation_split = {{by = '{by}'}}\nplanned = {{updates = 50}}"
             mixture = parse_mixture(f"{text}\n[each_condition]\nshare = 'equal'")
             made[by] = build_panel(store, mixture, folder / by).path
     return made
@@ -350,7 +350,10 @@ def test_what_leaks_from_held_out_data_is_found(
     store_path: Path, panels: dict[str, Path], by: str, leak: str, spoilt: str
 ) -> None:
     assert beside_panel(store_path, panels[by], "leakage").status == "pass"
-    spoil = f"CREATE OR REPLACE VIEW panel.held_out AS SELECT *, '{by}' AS split_by FROM ({spoilt})"
+    spoil = (
+        "CREATE OR REPLACE VIEW panel.evaluation_split AS"
+        f" SELECT *, '{by}' AS split_by FROM ({spoilt})"
+    )
     finding = beside_panel(store_path, panels[by], "leakage", spoil)
     assert finding.status == "fail"
     assert leak in {row["leak"] for row in finding.sample}
@@ -364,7 +367,7 @@ def test_a_copy_of_a_held_out_step_is_a_leak(tmp_path: Path) -> None:
     copy = replaced(copy, "transition_id", (np.int64(7) << 25) + np.arange(len(one)))
     copy = replaced(copy, "ingest_id", ["copy"] * len(one))
     path = write_store(tmp_path / "store", [one, copy])
-    mixture = parse_mixture("[each_condition]\n[held_out]\nby = 'recording'\nshare = 0.4")
+    mixture = parse_mixture("[each_condition]\n[evaluation_split]\nby = 'recording'\nshare = 0.4")
     with Store(path) as store:
         panel = build_panel(store, mixture, tmp_path / "p")
     finding = beside_panel(path, panel.path, "leakage")

@@ -57,7 +57,8 @@ def panel_of(store: Path, out: Path, n_step: int, where: str = "") -> Panel:
     from restock.replay.store.store import Store
 
     mixture = parse_mixture(
-        f'n_step = {n_step}\n{where}[each_condition]\nshare = "natural"\n[held_out]\nby = "none"\n'
+        f'n_step = {n_step}\n{where}[each_condition]\nshare = "natural"\n'
+        '[evaluation_split]\nby = "none"\n'
     )
     with Store(store) as opened:
         return build_panel(opened, mixture, out)

@@ -21,11 +21,13 @@ from restock.replay.mixture.mixture import (
     Adaptive,
     CorrectionRule,
     EachCondition,
-    HeldOut,
+    EvaluationSplit,
     Mixture,
+    OtherStore,
     PlannedUse,
     Prioritised,
     Safety,
+    SourceShares,
     StratumRule,
     load_mixture,
     parse_mixture,
@@ -33,7 +35,6 @@ from restock.replay.mixture.mixture import (
 )
 from restock.replay.mixture.schedules import Cosine, Linear, Piecewise
 from restock.replay.mixture.shares import plan_shares, scaled_within, wanted_shares
-from restock.replay.mixture.sources import OtherStore, Sources
 from restock.replay.panel.build import build_panel, open_source
 from restock.replay.panel.plan import Plan, plan_panel
 from restock.replay.panel.strata import Stratum, assign, resolve_strata
@@ -108,8 +109,10 @@ def test_what_a_mixture_may_not_say_is_refused_with_its_place(text: str, message
 
 def test_an_unknown_key_is_named_with_its_path(tmp_path: Path) -> None:
     (tmp_path / "m.toml").write_text("[[strata]]\nname = 'nominal'\nshair = 0.3\n")
-    with pytest.raises(ConfigError, match=r"(?s)m\.toml.*shair.*strata\[0\]|strata\[\.\.\.\]"):
+    with pytest.raises(ConfigError, match=r"m\.toml: unknown key `strata\[0\]\.shair`"):
         load_mixture(tmp_path / "m.toml")
+    with pytest.raises(ConfigError, match=r"`held_out`\n.*now called `evaluation_split`"):
+        parse_mixture("[held_out]\nby = 'none'\n" + EVERY)
     with pytest.raises(ConfigError, match="coverage, missions, uniform"):
         load_mixture("coverag")
 
@@ -218,7 +221,9 @@ def test_rows_of_no_stratum_are_refused_unless_dropped(transitions: pa.Table) ->
 
 def test_old_and_refused_rows_are_left_out_and_counted(transitions: pa.Table) -> None:
     # The three recordings begin an hour apart.
-    text = "max_age_days = 0.05\nwhere = 'action <> 4'\n" + EVERY + "[held_out]\nby = 'none'\n"
+    text = (
+        "max_age_days = 0.05\nwhere = 'action <> 4'\n" + EVERY + "[evaluation_split]\nby = 'none'\n"
+    )
     plan = planned(transitions, text)
     kept = plan.rows.take(pa.array(plan.panel_rows))
     assert set(kept["recording_id"].to_pylist()) == {f"{2:016x}", f"{3:016x}"}
@@ -231,7 +236,7 @@ def test_priority_decides_overlap(transitions: pa.Table) -> None:
     def count(priority: int) -> int:
         plan = planned(
             transitions,
-            "unlisted = 'drop'\n[held_out]\nby = 'none'\n[[strata]]\nname = 'fast'\n"
+            "unlisted = 'drop'\n[evaluation_split]\nby = 'none'\n[[strata]]\nname = 'fast'\n"
             f"where = 'command_speed_mps > 0'\npriority = {priority}\n" + EVERY,
         )
         return next(line.rows for line in plan.strata if line.stratum == "fast")
@@ -388,7 +393,7 @@ def test_the_same_store_and_mixture_give_the_same_bytes(
         build_panel(transitions, load_mixture("coverage"), tmp_path / name, task=TASK)
         for name in "ab"
     ]
-    for name in ("rows.f32", "meta.parquet", "held_out.parquet", "panel.json"):
+    for name in ("rows.f32", "meta.parquet", "evaluation_split.parquet", "panel.json"):
         contents = [(panel.path / name).read_bytes() for panel in panels]
         assert contents[0] == contents[1], name
 
@@ -396,7 +401,15 @@ def test_the_same_store_and_mixture_give_the_same_bytes(
 def test_the_page_explains_every_key() -> None:
     page = (ROOT / "docs" / "mixture.md").read_text(encoding="utf-8")
     structs = (
-        *(Mixture, StratumRule, EachCondition, PlannedUse, HeldOut, Sources, CorrectionRule),
+        *(
+            Mixture,
+            StratumRule,
+            EachCondition,
+            PlannedUse,
+            EvaluationSplit,
+            SourceShares,
+            CorrectionRule,
+        ),
         *(OtherStore, Safety, Prioritised, Adaptive, Linear, Cosine, Piecewise),
     )
     for struct in structs:

@@ -17,8 +17,14 @@ from support.stores import CONDITIONS, TASK, recording_transitions, write_store
 
 from restock import cli
 from restock.errors import MixtureError, StoreError
-from restock.replay.mixture.mixture import load_mixture, parse_mixture, shipped_mixtures
-from restock.replay.mixture.mixture_schema import FILE, mixture_schema, shipped_schema
+from restock.replay.mixture.mixture import (
+    SCHEMA_FILE,
+    load_mixture,
+    mixture_schema,
+    parse_mixture,
+    shipped_mixtures,
+    shipped_schema,
+)
 from restock.replay.panel.build import build_panel, open_source
 from restock.replay.panel.logged_sampler import controller_for
 from restock.replay.panel.panel import Panel
@@ -27,7 +33,7 @@ from restock.replay.sampling.share_controller import PlannedDraws
 from restock.replay.store.store import Store
 
 EVERY = "[each_condition]\nshare = 'natural'\n"
-NO_HOLD = "[held_out]\nby = 'none'\n"
+NO_HOLD = "[evaluation_split]\nby = 'none'\n"
 
 
 def planned(transitions: pa.Table, text: str) -> Plan:
@@ -172,7 +178,7 @@ name = "twin"
 path = "other"
 version = 1
 share = 0.2
-[held_out]
+[evaluation_split]
 by = "none"
 """
 
@@ -253,7 +259,7 @@ def test_a_missing_other_store_is_named(store_path: Path, tmp_path: Path) -> Non
 
 
 def test_the_schema_is_what_the_structs_say(capsys: pytest.CaptureFixture[str]) -> None:
-    remedy = "write it with `python -m restock.replay.mixture.mixture_schema`"
+    remedy = "write it with `python -m restock.replay.mixture.mixture`"
     assert shipped_schema() == mixture_schema(), remedy
     assert cli.main(["mix", "--schema"]) == 0
     assert capsys.readouterr().out == shipped_schema()
@@ -265,7 +271,7 @@ def test_shipped_mixtures_are_valid_by_the_schema(name: str) -> None:
     text = (folder / f"{name}.toml").read_text(encoding="utf-8")
     jsonschema.validate(tomllib.loads(text), json.loads(shipped_schema()))
     load_mixture(name)
-    assert (folder / FILE).is_file()
+    assert (folder / SCHEMA_FILE).is_file()
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import signal
@@ -15,7 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.stores import TASK, manifest, recording_transitions, write_store
+from support.stores import CONDITIONS, TASK, manifest, recording_transitions, write_store
 
 from restock import cli
 from restock.errors import MixtureError, PanelError, StoreError
@@ -23,14 +24,17 @@ from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.task import Task
 from restock.replay.mixture.mixture import Mixture, load_mixture, parse_mixture
 from restock.replay.mixture.n_step import n_step_horizon, n_step_return
+from restock.replay.mixture.packed_row import PACKING_VERSION
 from restock.replay.panel import build, pack, scratch
+from restock.replay.panel import panel as panel_module
 from restock.replay.panel.build import build_panel
 from restock.replay.panel.panel import ROWS, Panel
 from restock.replay.store.store import Store
 
 
 def uniform(**changes: object) -> Mixture:
-    text = f"[each_condition]\nshare = 'natural'\n[held_out]\nby = '{changes.pop('by', 'none')}'\n"
+    split = f"[evaluation_split]\nby = '{changes.pop('by', 'none')}'\n"
+    text = f"[each_condition]\nshare = 'natural'\n{split}"
     top = "".join(f"{name} = {json.dumps(value)}\n" for name, value in changes.items())
     return parse_mixture(top + text)
 
@@ -156,7 +160,7 @@ def test_small_stretches_and_batches_pack_the_same_bytes(
     np.testing.assert_array_equal(at_once.rows, by_parts.rows)
     assert at_once.meta.to_pylist() == by_parts.meta.to_pylist()
     assert at_once.id == by_parts.id
-    held = [pq.read_table(panel.path / "held_out.parquet") for panel in (at_once, by_parts)]
+    held = [pq.read_table(panel.path / "evaluation_split.parquet") for panel in (at_once, by_parts)]
     assert held[0].to_pylist() == held[1].to_pylist()
 
 
@@ -246,7 +250,8 @@ def test_strata_are_those_of_the_labels_by_priority(transitions: pa.Table, tmp_p
 
 def test_the_sampler_draws_by_the_panels_quotas(transitions: pa.Table, tmp_path: Path) -> None:
     mixture = parse_mixture(
-        "[planned]\nupdates = 100\n[each_condition]\nshare = 'equal'\n[held_out]\nby = 'none'"
+        "[planned]\nupdates = 100\n[each_condition]\nshare = 'equal'\n"
+        "[evaluation_split]\nby = 'none'"
     )
     panel = build_panel(transitions, mixture, tmp_path / "p")
     sampler = panel.sampler(50, seed=0)
@@ -265,7 +270,7 @@ def test_held_out_data_shares_no_episode_with_the_panel(
     transitions: pa.Table, tmp_path: Path, by: str
 ) -> None:
     panel = build_panel(transitions, uniform(by=by), tmp_path / "p")
-    held = pq.read_table(panel.path / "held_out.parquet")
+    held = pq.read_table(panel.path / "evaluation_split.parquet")
     assert 0 < len(held) < 0.5 * len(transitions)
     assert len(held) + len(panel) == len(transitions)
     column = "recording_id" if by == "recording" else "episode_id"
@@ -382,13 +387,43 @@ def test_an_edited_header_is_refused(transitions: pa.Table, tmp_path: Path) -> N
         Panel.open(panel.path)
 
 
-def test_the_id_names_the_code_that_packed(
+GOLDEN = """
+n_step = 3
+return_to_go = true
+evaluation_split = {by = "episode", share = 0.2}
+[correction]
+pre = "full"
+[each_condition]
+share = "equal"
+"""
+
+
+def test_packing_gives_the_bytes_of_its_version(transitions: pa.Table, tmp_path: Path) -> None:
+    """Whoever changes what is packed raises PACKING_VERSION, and then the values here."""
+    panel = build_panel(
+        transitions, parse_mixture(GOLDEN), tmp_path / "p", task=TASK, conditions=CONDITIONS
+    )
+    digest = hashlib.blake2b(digest_size=16)
+    for table in (panel.meta, pq.read_table(panel.path / "evaluation_split.parquet")):
+        digest.update(json.dumps(table.to_pydict()).encode())
+    packed = [PACKING_VERSION, panel.header.files[ROWS].blake2b, digest.hexdigest()]
+    assert packed == [3, "f5f5c26201791175a1edbe9a9867b33b", "58c0acf20463f43fa85692940e7c619f"]
+    assert panel.header.packing_version == PACKING_VERSION
+
+
+def test_the_id_names_the_version_of_the_packing(
     transitions: pa.Table, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = build_panel(transitions, uniform(), tmp_path / "a")
-    assert first.header.packing_code == pack.packing_code()
-    monkeypatch.setattr(build, "packing_code", lambda: "0" * 12)
-    assert build_panel(transitions, uniform(), tmp_path / "b").id != first.id
+    assert build_panel(transitions, uniform(), tmp_path / "b").id == first.id
+    for module in (build, panel_module):
+        monkeypatch.setattr(module, "PACKING_VERSION", PACKING_VERSION + 1)
+    assert build_panel(transitions, uniform(), tmp_path / "c").id != first.id
+    with pytest.raises(
+        PanelError, match=r"another version of Restock.*packing 3, not 4"
+    ) as refused:
+        Panel.open(first.path)
+    assert "make it again" in str(refused.value)
 
 
 def test_damage_is_found(transitions: pa.Table, tmp_path: Path) -> None:

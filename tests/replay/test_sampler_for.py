@@ -30,7 +30,6 @@ BATCH = 40
 EVERY = (
     "[planned]\nupdates = 1\n[evaluation_split]\nby = 'none'\n[each_condition]\nshare = 'equal'\n"
 )
-EVERY = EVERY.replace("evaluation_split", "held_out")
 MIXTURES = {
     "in turns": "within = 'without_replacement'\n" + EVERY,
     "uniform": "within = 'uniform'\n" + EVERY,

@@ -31,7 +31,9 @@ from restock.replay.store.store import Store
 from restock.replay.trace.trace import TracePlaces, audited_rows, trace_row
 
 RECORDING = ROOT / "sample_logs" / "amr_tuesday"
-MIXTURE = parse_mixture("n_step = 3\n[each_condition]\nshare = 'natural'\n[held_out]\nby = 'none'")
+MIXTURE = parse_mixture(
+    "n_step = 3\n[each_condition]\nshare = 'natural'\n[evaluation_split]\nby = 'none'"
+)
 
 
 @dataclass

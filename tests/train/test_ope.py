@@ -32,7 +32,7 @@ from restock.train.evaluation.ope import OpeConfig, evaluate_off_policy
 from restock.train.evaluation.ope_dataset import OpeSteps, load_ope_dataset, read_steps
 
 TASK = load_profile("warehouse_amr").task
-MIXTURE = parse_mixture("[each_condition]\nshare = 'natural'\n[held_out]\nshare = 0.3\n")
+MIXTURE = parse_mixture("[each_condition]\nshare = 'natural'\n[evaluation_split]\nshare = 0.3\n")
 NETWORK = NetworkConfig(hidden=(16,))
 QUICK = FittedQConfig(iterations=2, updates=2, batch_size=32, hidden=(8,), cloning_updates=50)
 CONFIG = OpeConfig(model=QUICK)
@@ -67,7 +67,7 @@ def quick_models(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_no_episode_is_both_fitted_on_and_evaluated_on(store: Path, panel: Panel) -> None:
     fed = set(panel.meta["episode_id"].to_pylist())
-    held = set(pq.read_table(panel.path / "held_out.parquet")["episode_id"].to_pylist())
+    held = set(pq.read_table(panel.path / "evaluation_split.parquet")["episode_id"].to_pylist())
     for logs in (None, str(store), str(panel.path)):
         dataset = load_ope_dataset(panel, TASK, logs)
         assert len(dataset.evaluation.condition) == len(held - fed)
@@ -79,7 +79,9 @@ def test_no_episode_is_both_fitted_on_and_evaluated_on(store: Path, panel: Panel
 
 
 def test_what_was_all_learnt_from_is_refused(store: Path, tmp_path: Path) -> None:
-    everything = parse_mixture("[each_condition]\nshare = 'natural'\n[held_out]\nby = 'none'\n")
+    everything = parse_mixture(
+        "[each_condition]\nshare = 'natural'\n[evaluation_split]\nby = 'none'\n"
+    )
     with Store(store) as opened:
         panel = build_panel(opened, everything, tmp_path / "p")
     with pytest.raises(RunError, match="no episode that the run did not learn from"):

@@ -34,7 +34,7 @@ TINY = [
 ]
 
 
-MIXTURE = parse_mixture("[each_condition]\nshare = 'natural'\n[held_out]\nby = 'none'\n")
+MIXTURE = parse_mixture("[each_condition]\nshare = 'natural'\n[evaluation_split]\nby = 'none'\n")
 
 
 @pytest.fixture(scope="module")

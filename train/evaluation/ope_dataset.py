@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from restock.errors import RunError, StoreError
 from restock.ingest.store.location import Location
 from restock.ingest.task.task import Task
-from restock.replay.panel.panel import HEADER, HELD_OUT, Panel
+from restock.replay.panel.panel import EVALUATION_SPLIT, HEADER, Panel
 from restock.replay.store.store import Store, passed_in
 from restock.train.dqn.fitted_q import Rows
 
@@ -115,7 +115,8 @@ def load_ope_dataset(
             raise RunError(
                 "holds no episode that the run did not learn from",
                 where=logs or (str(trained.path) if trained is not None else None),
-                remedy="mix with [held_out] share above 0, or name other logs with --on-logs",
+                remedy="mix with [evaluation_split] share above 0, or name other logs with"
+                " --on-logs",
             )
         if (count := len(training_ids)) > MODEL_ROWS:
             notes.append(f"models are of {MODEL_ROWS:,} of {count:,} rows, chosen at random")
@@ -142,7 +143,9 @@ def _open(logs: str | None, trained: Panel | None, task: Task) -> tuple[Store, I
         folder = location.folder
         panel = Panel.open(folder) if folder is not None and (folder / HEADER).is_file() else None
     if panel is not None:
-        ids = pq.read_table(panel.path / HELD_OUT, columns=["transition_id"])["transition_id"]
+        ids = pq.read_table(panel.path / EVALUATION_SPLIT, columns=["transition_id"])[
+            "transition_id"
+        ]
         store, tasks = _store_of(panel), {panel.task_hash}
     else:
         store = Store(location)

@@ -9,24 +9,24 @@ WITH fed AS (
 ), held AS (
     SELECT transitions.transition_id, stamp_ns, action, hash(observation) AS seen, episode_id
     FROM transitions
-    SEMI JOIN panel.held_out USING (transition_id)
+    SEMI JOIN panel.evaluation_split USING (transition_id)
 ), ends AS (
     SELECT min(ended_ns) AS first_ns
-    FROM (SELECT max(logged_ns) AS ended_ns FROM panel.held_out GROUP BY episode_id)
+    FROM (SELECT max(logged_ns) AS ended_ns FROM panel.evaluation_split GROUP BY episode_id)
 )
 SELECT 'the same episode' AS leak, episode_id, count(*) AS rows
 FROM panel.rows
-SEMI JOIN panel.held_out USING (episode_id)
+SEMI JOIN panel.evaluation_split USING (episode_id)
 GROUP BY episode_id
 UNION ALL
 SELECT 'a recording that is held out', episode_id, count(*)
 FROM panel.rows
-SEMI JOIN (FROM panel.held_out WHERE split_by = 'recording') USING (recording_id)
+SEMI JOIN (FROM panel.evaluation_split WHERE split_by = 'recording') USING (recording_id)
 GROUP BY episode_id
 UNION ALL
 SELECT 'later than what is held out', episode_id, count(*)
 FROM panel.rows
-WHERE 'time' IN (SELECT split_by FROM panel.held_out)
+WHERE 'time' IN (SELECT split_by FROM panel.evaluation_split)
 GROUP BY episode_id
 HAVING max(logged_ns) > (SELECT first_ns FROM ends)
 UNION ALL

@@ -53,8 +53,7 @@ class MixCommand:
     def run(self) -> None:
         """Plan, and unless it is a dry run, pack."""
         from restock.cli import output
-        from restock.replay.mixture.mixture import load_mixture
-        from restock.replay.mixture.mixture_schema import shipped_schema
+        from restock.replay.mixture.mixture import load_mixture, shipped_schema
         from restock.replay.panel.build import open_source, write_panel
         from restock.replay.panel.plan import plan_panel
         from restock.replay.store.store import Store
