@@ -77,9 +77,3 @@ class PanelError(RestockError):
 
 class RunError(RestockError):
     """A run directory that is missing, incomplete, or already there."""
-
-
-class ComparisonRefused(RestockError):
-    """Two runs that were fed differently."""
-
-    exit_code = ExitCode.FAILED

@@ -50,7 +50,7 @@ MAY_IMPORT = {
         "dqn feed run twin/env twin/floors twin/physics replay/panel replay/ring replay/store"
         " ingest/profile ingest/store ingest/task"
     ),
-    "train/comparison": "train dqn run",
+    "train/comparison": "train dqn evaluation run",
     "train/libraries": (
         "train dqn evaluation feed run twin/floors twin/physics replay/mixture replay/panel"
         " replay/ring replay/store ingest/profile ingest/task"

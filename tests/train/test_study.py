@@ -177,10 +177,14 @@ def test_panels_of_mixtures_are_the_studys_own(tmp_path: Path) -> None:
         ('seeds = [1, 1]\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "each once"),
         ('[settings]\nseed = 3\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "must not set seed"),
         ('worker = 2\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "unknown key `worker`"),
+        (
+            '[evaluation]\nepisodes = 0\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"',
+            "evaluation.episodes must be at least 1, got 0",
+        ),
         ("arms = [", "is not TOML"),
     ],
 )
-def test_what_is_no_study_is_refused(tmp_path: Path, text: str, said: str) -> None:
+def test_an_invalid_study_is_refused(tmp_path: Path, text: str, said: str) -> None:
     (tmp_path / "s.toml").write_text(text)
     with pytest.raises(ConfigError, match=said):
         load_study(tmp_path / "s.toml")

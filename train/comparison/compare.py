@@ -2,17 +2,26 @@
 
 A comparison of methods that were fed differently measures the feed. It is refused, with what
 differs, unless the feed is what is compared (`treatment="mixture"`).
+
+Outcomes are differences with intervals, paired by episode. Runs (seeds) are resampled within each
+arm and episodes jointly for both (the pairing), so that an interval holds both what another seed
+and what other episodes would have changed. The probability of improvement and the interquartile
+mean are those of arXiv:2108.13264.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
 
+from restock.errors import RunError
+from restock.stats import difference_of_arms, iqm, probability_of_improvement
 from restock.train.comparison.arms import ALLOWED, Arm, Difference, Treatment, differences, feeds
 from restock.train.comparison.comparability import (
     Check,
@@ -21,8 +30,10 @@ from restock.train.comparison.comparability import (
     check_feeds,
     worst,
 )
-from restock.train.comparison.outcomes import outcomes
+from restock.train.evaluation.regression import agent_episodes
+from restock.train.run.run import Run
 
+Cell = tuple[str, str]  # perturbation, condition (with the kind of block)
 _SAME_TOTAL = 1.02  # ratio of environment steps, and of updates
 
 
@@ -42,7 +53,7 @@ class Comparison:
     @property
     def gate(self) -> list[Check]:
         """The checks that the verdict is made of: of the feed too, unless it is the treatment."""
-        return _asked(self.treatment, self.totals, self.checks)
+        return _deciding(self.treatment, self.totals, self.checks)
 
     def as_json(self) -> dict[str, Any]:
         """All of it."""
@@ -74,18 +85,18 @@ def compare(
     """
     arms = Arm("first", first), Arm("second", second)
     rng = np.random.default_rng(seed)
-    found = [d for d in differences(arms[0].runs[0], arms[1].runs[0]) if d.kind != "free"]
+    differing = [d for d in differences(arms[0].runs[0], arms[1].runs[0]) if d.kind != "free"]
     allowed = ALLOWED[treatment] | {"software"}
-    refused = [difference for difference in found if difference.kind not in allowed]
+    refused = [difference for difference in differing if difference.kind not in allowed]
     totals = [_total(name, *(arm.totals[name] for arm in arms)) for name in arms[0].totals]
     checks = check_feeds(*feeds(*arms), limits, rng)
-    asked = _asked(treatment, totals, checks)
-    verdict = "incomparable" if refused else worst([check.verdict for check in asked])
-    source, rows = outcomes(*arms, rng) if verdict == "comparable" else (None, [])
-    return Comparison(treatment, verdict, found, refused, totals, checks, source, rows)
+    deciding = _deciding(treatment, totals, checks)
+    verdict = "incomparable" if refused else worst([check.verdict for check in deciding])
+    source, rows = _outcomes(*arms, rng) if verdict == "comparable" else (None, [])
+    return Comparison(treatment, verdict, differing, refused, totals, checks, source, rows)
 
 
-def _asked(treatment: Treatment, totals: list[Check], checks: list[Check]) -> list[Check]:
+def _deciding(treatment: Treatment, totals: list[Check], checks: list[Check]) -> list[Check]:
     if treatment == "method":  # an update of one method is not one of another
         return [check for check in totals if check.name == "env steps"]
     return totals + ([] if treatment == "mixture" else checks)
@@ -95,6 +106,90 @@ def _total(name: str, first: float, second: float) -> Check:
     ratio = max(first, second) / max(min(first, second), 1.0)
     shown = name.replace("_", " ").replace("gradient steps", "updates")
     return Check(shown, "whole run", first, second, ratio, ratio, ratio, _SAME_TOTAL)
+
+
+def _outcomes(
+    first: Arm, second: Arm, rng: np.random.Generator
+) -> tuple[str, list[dict[str, Any]]]:
+    """Where the episodes are from, and one row a perturbation and condition that both arms drove.
+
+    Raises:
+        RunError: a run has no evaluation, or the arms share no episode.
+    """
+    arms = [[agent_episodes(run) for run in arm.runs] for arm in (first, second)]
+    source = "restock eval" if all(e is not None for arm in arms for e in arm) else "training"
+    if source == "training":
+        arms = [[_last_evaluation(run) for run in arm.runs] for arm in (first, second)]
+    scores = [_scores([e for e in arm if e is not None]) for arm in arms]
+    rows = []
+    for cell in scores[0]:
+        seeds = sorted(scores[0][cell].keys() & scores[1].get(cell, {}).keys())
+        if seeds:
+            a, b = (np.stack([score[cell][seed] for seed in seeds], 1) for score in scores)
+            rows.append(_outcome(cell, a, b, rng))
+    if not rows:
+        raise RunError(
+            f"was evaluated on none of the episodes of {first.runs[0].path}",
+            where=str(second.runs[0].path),
+            remedy="run `restock eval` on both with the same --seed",
+        )
+    return source, rows
+
+
+def _outcome(
+    cell: Cell,
+    a: NDArray[np.float64],  # (runs, episodes, 2) success and return
+    b: NDArray[np.float64],
+    rng: np.random.Generator,
+) -> dict[str, Any]:
+    difference = difference_of_arms(a[..., 0], b[..., 0], rng=rng)
+    # Episode by episode, over all pairs of runs.
+    better = [
+        probability_of_improvement(b[:, index, 1], a[:, index, 1]) for index in range(a.shape[1])
+    ]
+    return {
+        "perturbation": cell[0],
+        "condition": cell[1],
+        "episodes": a.shape[1],
+        "runs": [len(a), len(b)],
+        "success": [float(a[..., 0].mean()), float(b[..., 0].mean())],
+        "difference": difference.value,
+        "difference_low": difference.low,
+        "difference_high": difference.high,
+        "return_iqm": [iqm(a[..., 1]), iqm(b[..., 1])],
+        "improvement": float(np.mean(better)),
+    }
+
+
+def _scores(tables: Iterable[pa.Table]) -> dict[Cell, dict[int, NDArray[np.float64]]]:
+    """Cell -> episode seed -> (runs, 2) success and return; episodes that every run drove."""
+    runs: list[dict[Cell, dict[int, tuple[float, float]]]] = []
+    for table in tables:
+        cells: dict[Cell, dict[int, tuple[float, float]]] = {}
+        for row in table.to_pylist():
+            block = f" ({row['block']})" if row["block"] in ("partial", "full") else ""
+            cell = (row.get("perturbation", "none"), row["condition"] + block)
+            result = float(row["success"]), float(row["return"])
+            cells.setdefault(cell, {})[int(row["episode_seed"])] = result
+        runs.append(cells)
+    shared: dict[Cell, dict[int, NDArray[np.float64]]] = {}
+    for cell, episodes in runs[0].items():
+        for seed in episodes:
+            if all(seed in run.get(cell, {}) for run in runs):
+                values = np.array([run[cell][seed] for run in runs], np.float64)
+                shared.setdefault(cell, {})[seed] = values
+    return shared
+
+
+def _last_evaluation(run: Run) -> pa.Table:
+    """The last periodic evaluation in training."""
+    table = run.table("evaluations")
+    if not len(table):
+        raise RunError(
+            "has no evaluation", where=str(run.path), remedy=f"run `restock eval {run.path}`"
+        )
+    last = pa.compute.max(table["gradient_steps"])
+    return table.filter(pa.compute.equal(table["gradient_steps"], last))
 
 
 __all__ = ["Comparison", "compare"]

@@ -188,12 +188,19 @@ def _refused(cell: tuple[str, str], theirs: _Episodes, ours: _Episodes) -> dict[
     }
 
 
-def _agent(run: Run) -> pa.Table:
+def agent_episodes(run: Run) -> pa.Table | None:
+    """What `restock eval` wrote of the run's own policy; None where it did not drive."""
     path = run.path / "eval" / "episodes.parquet"
-    if path.is_file():
-        table = pq.read_table(path, schema=EVAL_EPISODES)
-        if len(own := table.filter(pa.compute.equal(table["policy"], "agent"))):
-            return own
+    if not path.is_file():
+        return None
+    table = pq.read_table(path, schema=EVAL_EPISODES)
+    agent = table.filter(pa.compute.equal(table["policy"], "agent"))
+    return agent if len(agent) else None
+
+
+def _agent(run: Run) -> pa.Table:
+    if (episodes := agent_episodes(run)) is not None:
+        return episodes
     raise RunError(
         "has no evaluation of its own policy",
         where=str(run.path),
