@@ -123,7 +123,7 @@ class Session:
                 "batches": self.batches.state_dict(),
                 "ring": self.ring.state_dict(),
                 "collector": self.collector.state_dict(),
-                "env": self.env.get_state(),
+                "env": self.env.state_dict(),
                 "feed": self.feed.state_dict(),
                 "probe": self.probe.state_dict() if self.probe else None,
                 "jump_start": self.jump_start.state_dict() if self.jump_start else None,
@@ -142,7 +142,7 @@ class Session:
         self.learner.load_state_dict(state["learner"])
         self.batches.load_state_dict(state["batches"])
         self.ring.load_state_dict(state["ring"])
-        self.env.set_state(state["env"])
+        self.env.load_state_dict(state["env"])
         self.collector.load_state_dict(state["collector"])
         self.feed.load_state_dict(state["feed"])
         self.probe = Probe.from_state(state["probe"]) if state["probe"] else None

@@ -129,7 +129,7 @@ class ToyTwin:
             self._begin(place)
         return self._observe(), reward, success.copy(), truncated, info
 
-    def get_state(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         return {
             "cell": self.cell.copy(),
             "steps": self.steps.copy(),
@@ -140,7 +140,7 @@ class ToyTwin:
             "specs": [[spec.condition, spec.seed] for spec in self._specs],
         }
 
-    def set_state(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
         self.cell[:], self.steps[:] = state["cell"], state["steps"]
         self.wheel[:], self.moved[:] = state["wheel"], state["moved"]
         self._draws.bit_generator.state = state["draws"]

@@ -154,7 +154,7 @@ def test_the_same_episodes_are_flushed_once(collecting: Collecting, tmp_path: Pa
 def test_what_is_kept_goes_on_exactly_from_a_checkpoint(tmp_path: Path) -> None:
     def state(made: Collecting) -> dict[str, Any]:
         return {
-            "env": made.env.get_state(),
+            "env": made.env.state_dict(),
             "ring": made.ring.state_dict(),
             "collector": made.collector.state_dict(),
         }
@@ -170,7 +170,7 @@ def test_what_is_kept_goes_on_exactly_from_a_checkpoint(tmp_path: Path) -> None:
     for _ in range(LONGEST + 9):
         second.rng.integers(0, 9, ENVS), second.rng.uniform(0.1, 1.0, ENVS)
     saved = checkpoint.load(tmp_path / "checkpoint")
-    second.env.set_state(saved["env"])
+    second.env.load_state_dict(saved["env"])
     second.ring.load_state_dict(saved["ring"])
     second.collector.load_state_dict(saved["collector"])
     second.steps = LONGEST + 9

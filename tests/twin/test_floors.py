@@ -323,15 +323,15 @@ def test_state_continues_on_several_floors_and_is_refused_on_others() -> None:
     actions = rng.integers(10, size=(30, 6))
     for action in actions:
         env.step(action)
-    state = env.get_state()
+    state = env.state_dict()
     expected = [env.step(action)[0] for action in actions]
     fresh = WarehouseVectorEnv(6, layouts="generated:train:4", seed=9)
     fresh.reset()
-    fresh.set_state(state)
+    fresh.load_state_dict(state)
     for action, seen in zip(actions, expected, strict=True):
         np.testing.assert_array_equal(fresh.step(action)[0], seen)
     with pytest.raises(RunError, match="other floors"):
-        WarehouseVectorEnv(6, layouts="generated:test:4").set_state(state)
+        WarehouseVectorEnv(6, layouts="generated:test:4").load_state_dict(state)
 
 
 def test_episodes_are_drawn_on_all_floors_and_info_names_them() -> None:

@@ -139,7 +139,7 @@ def test_stale_sensors_go_on_bit_for_bit_from_a_saved_state() -> None:
     env.reset(seed=3)
     env.step(np.array([1, 1]))
     other.reset(seed=9)
-    other.set_state(env.get_state())
+    other.load_state_dict(env.state_dict())
     for _ in range(3):
         np.testing.assert_array_equal(
             env.step(np.array([1, 2]))[0], other.step(np.array([1, 2]))[0]

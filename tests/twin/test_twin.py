@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from restock.errors import ConfigError, RunError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.signals import SIGNALS
 from restock.ingest.task.task import observe, reward, terminated
+from restock.train.dqn import checkpoint
 from restock.train.twin.env.policies import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.episode import KINDS, EpisodeSpec
@@ -100,28 +100,28 @@ def test_an_episode_is_the_same_in_any_place_and_company() -> None:
         np.testing.assert_array_equal(one[0], many[2])
 
 
-def test_state_continues_bit_for_bit_through_json_and_a_fresh_environment(
-    env: WarehouseVectorEnv,
+def test_state_continues_bit_for_bit_through_a_file_and_in_a_fresh_environment(
+    env: WarehouseVectorEnv, tmp_path: Path
 ) -> None:
     env.reset(seed=2)
     env.simulation.apply(0, Perturbation(payload_kg=10.0))  # restored by the episode's own
     env.reset(seed=2)
     roll(env, 260, 0)  # across episode ends
-    state = env.get_state()
-    state = {"arrays": state["arrays"], "json": json.loads(json.dumps(state["json"]))}
+    checkpoint.save(tmp_path / "state", env.state_dict())
+    state = checkpoint.load(tmp_path / "state")
     expected = np.array(roll(env, 40, 1))
-    env.set_state(state)
+    env.load_state_dict(state)
     np.testing.assert_array_equal(np.array(roll(env, 40, 1)), expected)
     fresh = WarehouseVectorEnv(8, seed=77)
     fresh.reset()
-    fresh.set_state(state)
+    fresh.load_state_dict(state)
     np.testing.assert_array_equal(np.array(roll(fresh, 40, 1)), expected)
 
 
 def test_a_state_of_another_environment_is_refused(env: WarehouseVectorEnv) -> None:
     env.reset(seed=2)
     with pytest.raises(RunError, match="8 environments"):
-        WarehouseVectorEnv(2).set_state(env.get_state())
+        WarehouseVectorEnv(2).load_state_dict(env.state_dict())
 
 
 def test_autoreset_keeps_the_final_observation(env: WarehouseVectorEnv) -> None:
@@ -305,9 +305,9 @@ def test_a_schedule_draws_a_perturbation_for_every_episode(tmp_path: Path) -> No
     again = WarehouseVectorEnv(8, perturbation=schedule)
     again.reset(seed=4)
     assert again.specs == made.specs
-    state = made.get_state()
+    state = made.state_dict()
     expected = np.array(roll(made, 10, 0))
-    made.set_state(state)
+    made.load_state_dict(state)
     np.testing.assert_array_equal(np.array(roll(made, 10, 0)), expected)
     path.write_text("[ranges]\npayload_kg = [0, 500]\n")
     with pytest.raises(ConfigError, match=r"payload_kg must rise within \[0.0, 150.0\]"):

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from restock.errors import ConfigError
 from restock.ingest.task.scan import Body
+from restock.train.twin.env.draw import draw_map
 from restock.train.twin.floors.layout import Rect, Warehouse
 from restock.train.twin.physics.model import (
     FORKLIFT_HALF_M,
@@ -90,14 +91,35 @@ STAGE = """
 """
 
 
-def check_view(view: str | None) -> None:
-    """Raises ConfigError where there is no such camera."""
-    if view is not None and view not in get_args(View):
-        raise ConfigError(
-            f"there is no camera {view!r}",
-            where="the twin",
-            remedy=f"give {', '.join(get_args(View))}, or none for the drawn map",
-        )
+class Renderer:
+    """Frames of environments: by a camera, which is made when first needed, or as drawn maps.
+
+    Raises:
+        ConfigError: there is no such camera.
+    """
+
+    def __init__(self, view: View | None) -> None:
+        if view is not None and view not in get_args(View):
+            raise ConfigError(
+                f"there is no camera {view!r}",
+                where="the twin",
+                remedy=f"give {', '.join(get_args(View))}, or none for the drawn map",
+            )
+        self._view = view
+        self._camera: Camera | None = None
+
+    def frames(self, env: WarehouseVectorEnv) -> tuple[NDArray[np.uint8], ...]:
+        """One of each environment now, (H, W, 3) uint8."""
+        if self._view is not None and self._camera is None:
+            self._camera = Camera(self._view)
+        frame = draw_map if self._camera is None else self._camera.frame
+        return tuple(frame(env, index) for index in range(env.num_envs))
+
+    def close(self) -> None:
+        """Give the camera's context back."""
+        if self._camera is not None:
+            self._camera.close()
+            self._camera = None
 
 
 class Camera:
@@ -330,4 +352,4 @@ def _route(plan_m: NDArray[np.float64]) -> Iterator[Part]:
             yield _BOX, middle, (long / 2, 0.03, 0.004), float(np.arctan2(dy, dx)), PLAN
 
 
-__all__ = ["Camera", "View", "check_view"]
+__all__ = ["Camera", "Renderer", "View"]

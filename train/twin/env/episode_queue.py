@@ -1,29 +1,44 @@
-"""Which episode each of N environments begins next: fixed ones in their order, then drawn ones."""
+"""Which episode each of N environments begins next, and on which floor.
+
+Fixed episodes come in their order, then drawn ones.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 
 from restock.errors import ConfigError
+from restock.state import Stateful
+from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.physics.episode import KINDS, EpisodeSpec
 from restock.train.twin.physics.perturbation import Schedule
 
 
-class EpisodeQueue:
+class EpisodeQueue(Stateful):
     """An environment's n-th drawn episode is the same whatever the others do.
 
     `conditions` are shares per kind of episode; a schedule draws each a perturbation.
 
     Raises:
-        ConfigError: an unknown condition, or shares that are no shares.
+        ConfigError: an unknown condition, or shares that are not numbers of at least 0.
     """
 
+    STATE = ("seed", "conditions", "drawn", "fixed", "next_fixed")
+    STATE_TYPES: ClassVar[Mapping[str, Any]] = {"fixed": list[EpisodeSpec]}
+
     def __init__(
-        self, num_envs: int, conditions: Mapping[str, float], schedule: Schedule | None, seed: int
+        self,
+        num_envs: int,
+        floors: Sequence[Warehouse],
+        conditions: Mapping[str, float],
+        schedule: Schedule | None,
+        seed: int,
     ) -> None:
         self.seed, self.schedule = seed, schedule
+        self._floors = {floor.name: index for index, floor in enumerate(floors)}
         self.drawn = np.zeros(num_envs, np.int64)  # episodes so far, per environment
         self.fixed: list[EpisodeSpec] = []
         self.next_fixed = 0
@@ -43,6 +58,10 @@ class EpisodeQueue:
         self.conditions = {k: float(conditions[k]) for k in KINDS if k in conditions}
         self._cumulative = np.cumsum(shares) / total
 
+    def restored(self) -> None:
+        """What the shares add up to follows from them."""
+        self.set_conditions(self.conditions)
+
     def set_fixed(self, specs: Iterable[EpisodeSpec]) -> None:
         """These next, in order, whichever environment asks."""
         self.fixed, self.next_fixed = list(specs), 0
@@ -59,3 +78,22 @@ class EpisodeQueue:
         rng = np.random.default_rng([seed, 1])
         perturbation = self.schedule.draw(rng) if self.schedule else None
         return EpisodeSpec(KINDS[int(kind)], seed, perturbation), -1
+
+    def floor_of(self, spec: EpisodeSpec) -> int:
+        """Which floor an episode is on: by name, or by its seed.
+
+        Raises:
+            ConfigError: it names none of the environment's.
+        """
+        if spec.layout is None:
+            if len(self._floors) == 1:
+                return 0
+            return int(np.random.default_rng([spec.seed, 2]).integers(len(self._floors)))
+        if spec.layout not in self._floors:
+            raise ConfigError(
+                f"an episode asks for layout {spec.layout!r}, which is none of the environment's"
+                f" {len(self._floors)}",
+                where=f"episode {spec.condition}/{spec.seed}",
+                remedy="make the environment with that layout",
+            )
+        return self._floors[spec.layout]

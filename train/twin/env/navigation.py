@@ -6,12 +6,14 @@ blocked. What it found it remembers for the rest of the episode.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from restock.ingest.task.task import Task
+from restock.state import Stateful
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.planner import PLAN_POINTS, BlockFinder, Closure, Planner, planners
 from restock.train.twin.physics.episode import Episode
@@ -23,8 +25,11 @@ STRAYED_M = 0.6
 LOOK_M = 1.9  # something this near ahead makes the finder look at the scan
 
 
-class Navigation:
+class Navigation(Stateful):
     """Plans and goals of N robots, each on one of `floors`."""
+
+    STATE = ("plans_m", "plan_number", "closures", "finder")
+    STATE_TYPES: ClassVar[Mapping[str, Any]] = {"closures": list[list[Closure]]}
 
     def __init__(self, floors: Sequence[Warehouse], num_envs: int, task: Task) -> None:
         self.task = task

@@ -30,26 +30,27 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
+import msgspec
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from restock.errors import ConfigError
+from restock.errors import ConfigError, RunError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task, observe, reached_goal, reward, terminated
+from restock.state import Stateful
 from restock.train.twin.env.action_face import Face, action_face
-from restock.train.twin.env.camera import Camera, View, check_view
-from restock.train.twin.env.draw import draw_map
+from restock.train.twin.env.camera import Renderer, View
 from restock.train.twin.env.episode_queue import EpisodeQueue
 from restock.train.twin.env.floor_report import refuse_unfit
 from restock.train.twin.env.interface import DEFAULT_CONDITIONS
 from restock.train.twin.env.navigation import Navigation
-from restock.train.twin.floors.floors import open_floors
-from restock.train.twin.floors.layout import DEFAULT, Warehouse, default_warehouse
+from restock.train.twin.floors.floors import floors_of
+from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.physics.episode import Episode, EpisodeSpec, draw_episode
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 from restock.train.twin.physics.sensing import Sensing, Signals, add_motion, add_route
@@ -59,8 +60,16 @@ from restock.train.twin.physics.truth import Truth
 OBSERVATION_LIMIT = 20.0  # no sensor of this robot gives more; holds the space's bounds
 
 
-class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]):
+class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]], Stateful):
     """N warehouses. See the module for what `info` holds."""
+
+    # What changes while episodes run; the rest (layout, noise, ways of traffic) follows from specs.
+    STATE = (
+        *("specs", "observation", "signals", "previous_action", "steps", "bumps", "episode_number"),
+        *("episode_seed", "episode_condition", "block", "perturbation_name", "episodes_begun"),
+        *("blown_up", "queue", "simulation", "sensing", "truth", "navigation"),
+    )
+    STATE_TYPES: ClassVar[Mapping[str, Any]] = {"specs": list[EpisodeSpec]}
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium declares it
         "render_modes": ["rgb_array"],
@@ -105,15 +114,14 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         if num_envs < 1:
             raise ConfigError(f"num_envs must be 1 or more, got {num_envs}", where="the twin")
         self.num_envs = num_envs
-        check_view(camera)
-        self.render_mode, self.view = render_mode, camera
-        self._camera: Camera | None = None
+        self.render_mode, self._renderer = render_mode, Renderer(camera)
         self.task = task or load_profile("warehouse_amr").task
-        self.floors = _floors(warehouse, layouts)
+        if warehouse is not None and layouts != DEFAULT:
+            raise ConfigError("give a warehouse or layouts, not both", where="the twin")
+        self.floors = floors_of(layouts) if warehouse is None else (warehouse,)
         self._layout_names = np.array([floor.name for floor in self.floors])
         self._floor_objects = np.empty(len(self.floors), object)
         self._floor_objects[:] = self.floors
-        self._floor_index = {floor.name: index for index, floor in enumerate(self.floors)}
         self.layout = np.zeros(num_envs, np.int64)  # of the running episodes, among the floors
         schedule = perturbation if isinstance(perturbation, Schedule) else None
         base = perturbation.base if isinstance(perturbation, Schedule) else perturbation
@@ -122,7 +130,9 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             raise ConfigError("autoreset is SameStep or Disabled", where="the twin")
         self.metadata = {**type(self).metadata, "autoreset_mode": self.autoreset_mode}
-        self.queue = EpisodeQueue(num_envs, conditions or DEFAULT_CONDITIONS, schedule, seed)
+        self.queue = EpisodeQueue(
+            num_envs, self.floors, conditions or DEFAULT_CONDITIONS, schedule, seed
+        )
         refuse_unfit(self.floors, [kind for kind, share in self.queue.conditions.items() if share])
 
         limit = np.full(self.task.observation_size, OBSERVATION_LIMIT, np.float32)
@@ -171,21 +181,6 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         for index in np.unique(self.layout):
             yield np.flatnonzero(self.layout == index), self.floors[index]
 
-    def _floor_for(self, spec: EpisodeSpec) -> int:
-        """Which floor an episode is on: by name, or by its seed."""
-        if spec.layout is None:
-            if len(self.floors) == 1:
-                return 0
-            return int(np.random.default_rng([spec.seed, 2]).integers(len(self.floors)))
-        if spec.layout not in self._floor_index:
-            raise ConfigError(
-                f"an episode asks for layout {spec.layout!r}, which is none of the environment's"
-                f" {len(self.floors)}",
-                where=f"episode {spec.condition}/{spec.seed}",
-                remedy="make the environment with that layout",
-            )
-        return self._floor_index[spec.layout]
-
     # -- episodes -------------------------------------------------------------------------------
 
     def set_conditions(self, conditions: Mapping[str, float]) -> None:
@@ -225,7 +220,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
                 where=f"episode {spec.condition}/{spec.seed}",
                 remedy="make the environment with that perturbation",
             )
-        floor = self._floor_for(spec)
+        floor = self.queue.floor_of(spec)
         episode = draw_episode(spec, self.floors[floor], self.navigation.planners[floor])
         self.episodes[env], self.specs[env] = episode, spec
         self.layout[env] = floor
@@ -349,21 +344,13 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         """A frame of every environment, (H, W, 3) uint8 each; the top-down map needs no GL.
 
         Raises:
-            ConfigError: a camera was asked for, and there is no EGL.
+            ConfigError: it is a camera's, and there is no EGL.
         """
-        if self.render_mode is None:
-            return None
-        if self.view is not None:
-            if self._camera is None:
-                self._camera = Camera(self.view)
-            return tuple(self._camera.frame(self, env) for env in range(self.num_envs))
-        return tuple(draw_map(self, env) for env in range(self.num_envs))
+        return None if self.render_mode is None else self._renderer.frames(self)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Give the camera's context back; Gymnasium's `close` calls it."""
-        if self._camera is not None:
-            self._camera.close()
-            self._camera = None
+        self._renderer.close()
 
     # -- recorders ------------------------------------------------------------------------------
 
@@ -380,38 +367,37 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
 
     # -- state ----------------------------------------------------------------------------------
 
-    def get_state(self) -> dict[str, Any]:
-        """Everything a bit-exact continuation needs: {"arrays": {name: array}, "json": {...}}."""
-        from restock.train.twin.env.env_state import get_state
+    def state_dict(self) -> dict[str, Any]:
+        """Everything a bit-exact continuation needs, and what it must be continued on."""
+        floors = [[floor.name, floor.hash] for floor in self.floors]
+        return {"task_hash": self.task.hash, "floors": floors, **super().state_dict()}
 
-        return get_state(self)
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state of an environment that was made with the same arguments.
 
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Continue from a state of `get_state` of an environment made with the same arguments."""
-        from restock.train.twin.env.env_state import set_state
-
-        set_state(self, state)
-
-
-def _floors(
-    warehouse: Warehouse | None, layouts: str | Sequence[Warehouse]
-) -> tuple[Warehouse, ...]:
-    """The floors of an environment. Raises ConfigError for none, or two of one name."""
-    if warehouse is not None:
-        if layouts != DEFAULT:
-            raise ConfigError("give a warehouse or layouts, not both", where="the twin")
-        return (warehouse,)
-    if layouts == DEFAULT:
-        return (default_warehouse(),)
-    floors = open_floors(layouts) if isinstance(layouts, str) else tuple(layouts)
-    names = [floor.name for floor in floors]
-    if not floors or len(set(names)) < len(names):
-        raise ConfigError(
-            f"layout names must be unique, got {names}" if floors else "there must be a layout",
-            where="the twin",
-            remedy="give floors that differ in their name",
-        )
-    return floors
+        Raises:
+            RunError: it was of another number of environments, another task, or other floors.
+        """
+        specs = msgspec.convert(state["specs"], list[EpisodeSpec])
+        if len(specs) != self.num_envs or state["task_hash"] != self.task.hash:
+            raise RunError(
+                f"the saved state is of {len(specs)} environments and task {state['task_hash']},"
+                f" this one of {self.num_envs} and task {self.task.hash}",
+                where="state of the twin",
+                remedy="make the environment as it was made when the state was saved",
+            )
+        floors = [[floor.name, floor.hash] for floor in self.floors]
+        if state["floors"] != floors:
+            changed = [floor[0] for floor in state["floors"] if floor not in floors]
+            raise RunError(
+                f"the saved state is of other floors: {', '.join(changed) or 'fewer'}"
+                f" of {len(state['floors'])} is none of this one's {len(floors)}",
+                where="state of the twin",
+                remedy="make the environment with the layouts of then; a file may have changed",
+            )
+        for env, spec in enumerate(specs):
+            self._lay_out(env, spec)
+        super().load_state_dict(state)
 
 
 def _bounded(observation: NDArray[np.float32]) -> NDArray[np.float32]:

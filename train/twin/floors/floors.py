@@ -14,7 +14,7 @@ Every seed belongs to one split, by a hash of it: no floor is ever in two of the
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from hashlib import blake2b
@@ -181,6 +181,19 @@ def open_floors(text: str) -> tuple[Warehouse, ...]:
     if twice:
         raise ConfigError(f"{', '.join(twice)} given twice", where=f"layouts {text!r}")
     return tuple(found)
+
+
+def floors_of(layouts: str | Sequence[Warehouse]) -> tuple[Warehouse, ...]:
+    """Floors as they are, or as `open_floors` reads them. Raises ConfigError where names repeat."""
+    floors = open_floors(layouts) if isinstance(layouts, str) else tuple(layouts)
+    names = [floor.name for floor in floors]
+    if not floors or len(set(names)) < len(names):
+        raise ConfigError(
+            f"layout names must be unique, got {names}" if floors else "there must be a layout",
+            where="the twin",
+            remedy="give floors that differ in their name",
+        )
+    return floors
 
 
 def layouts_of_split(text: str, split: Split) -> str:

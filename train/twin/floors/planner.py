@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import csgraph
 
+from restock.state import Stateful
 from restock.train.twin.floors.layout import HEADINGS, Warehouse
 
 F64 = NDArray[np.float64]
@@ -287,7 +288,7 @@ def _resample(way: F64) -> F64:
 
 
 @dataclass
-class BlockFinder:
+class BlockFinder(Stateful):
     """Finds wholly blocked aisles from the lidar, over time. State for N robots.
 
     Within the aisle segment ahead, lidar returns that are neither rack nor wall are gathered up
@@ -295,6 +296,8 @@ class BlockFinder:
     for `persistence` steps at the same place, the aisle is blocked there. Robots may be on several
     floors: `floor` (N,) says on which of `warehouses` each is.
     """
+
+    STATE = ("seen", "place")
 
     warehouses: Warehouse | Sequence[Warehouse]
     num: int

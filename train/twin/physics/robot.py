@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.state import Stateful
 from restock.train.twin.physics.model import (
     CHASSIS_KG,
     TRACK_M,
@@ -28,8 +29,10 @@ ACCEL_LIMIT = np.array([4.0, 10.0])  # m/s2 and rad/s2
 _HISTORY = 5  # commands kept: enough for the longest latency at the shortest period
 
 
-class BaseController:
+class BaseController(Stateful):
     """The controllers of N robots. A command reaches its controller `latency_s` late."""
+
+    STATE = ("commands", "set_point")
 
     def __init__(self, num_envs: int, period_s: float, timestep_s: float, substeps: int) -> None:
         self._period_s, self._timestep_s, self._substeps = period_s, timestep_s, substeps

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.state import Stateful
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.physics.episode import Episode
 from restock.train.twin.physics.model import (
@@ -27,8 +28,10 @@ F64 = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
 
-class Scenery:
+class Scenery(Stateful):
     """The scenery of N warehouses. Arrays lead with the environment."""
+
+    STATE = ("walked", "traffic")
 
     def __init__(
         self,
@@ -98,6 +101,10 @@ class Scenery:
     def stand_still(self, ids: Ids) -> None:
         """Nothing moves in `ids` during the coming block."""
         self.moves[ids] = self._position[ids].reshape(len(ids), 1, self.moves.shape[2])
+
+    def restored(self) -> None:
+        """Bodies stand where the restored physics has them."""
+        self.stand_still(np.arange(len(self.moves)))
 
     def _show_traffic(self, ids: Ids) -> None:
         if len(ids):

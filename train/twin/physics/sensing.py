@@ -18,6 +18,7 @@ from restock.ingest.task.route import view_route
 from restock.ingest.task.scan import SectorMap
 from restock.ingest.task.signals import localised_velocity, wrap_angle
 from restock.ingest.task.task import Task, clearance_ahead
+from restock.state import Stateful
 from restock.train.twin.physics.model import body_velocity
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.simulation import Simulation
@@ -31,8 +32,10 @@ DRIFT_TIME_S = 3.0
 _SCALARS = 9  # x, y, yaw, drift x, drift y, left, right, gyro, accel
 
 
-class Sensing:
+class Sensing(Stateful):
     """The sensors of N robots."""
+
+    STATE = ("ranges_m", "pose", "pose_stamp_ns", "true_clearance_m")
 
     def __init__(self, simulation: Simulation, task: Task) -> None:
         self.simulation, self.task = simulation, task

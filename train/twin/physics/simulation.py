@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from restock.errors import ConfigError
 from restock.ingest.task.task import Task
+from restock.state import Stateful
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.physics.episode import Episode
 from restock.train.twin.physics.model import (
@@ -64,8 +65,23 @@ class BodyState:
     set_point: F64  # (N, 2) speed and yaw rate asked of the wheels now
 
 
-class Simulation:
-    """N robots in N warehouses. Arrays lead with the environment."""
+class Simulation(Stateful):
+    """N robots in N warehouses. Arrays lead with the environment.
+
+    To restore a state, every environment must have been reset to the same episode.
+    """
+
+    # The scenery comes after the physics: it is shown where that has it.
+    STATE = (
+        "time_s",
+        "bumped",
+        "slipped",
+        "accel",
+        "blown_up",
+        "controller",
+        "_physics",
+        "scenery",
+    )
 
     def __init__(
         self,
@@ -274,32 +290,15 @@ class Simulation:
 
     # -- state ----------------------------------------------------------------------------------
 
-    _ARRAYS = ("time_s", "bumped", "slipped", "accel", "blown_up")
-    _CONTROLLER = ("commands", "set_point")
-    _TRAFFIC = (
-        *("state", "travelled_m", "waited_s", "position_m", "heading_rad"),
-        "attentive",
-    )
+    @property
+    def _physics(self) -> NDArray[Any]:
+        """The batch's own state, (N, …)."""
+        state: NDArray[Any] = self.batch.state
+        return state
 
-    def get_state(self) -> dict[str, NDArray[Any]]:
-        """Everything that changes during an episode, as arrays."""
-        state = {name: getattr(self, name).copy() for name in self._ARRAYS}
-        state |= {name: getattr(self.controller, name).copy() for name in self._CONTROLLER}
-        state |= {f"traffic_{name}": getattr(self.traffic, name).copy() for name in self._TRAFFIC}
-        state["walked"] = self.scenery.walked.copy()
-        return state | {"physics": self.batch.state.copy()}
-
-    def set_state(self, state: dict[str, NDArray[Any]]) -> None:
-        """Undo to a state of `get_state`; layouts must have been reset to the same episodes."""
-        for name in self._ARRAYS:
-            setattr(self, name, state[name].copy())
-        for name in self._CONTROLLER:
-            setattr(self.controller, name, state[name].copy())
-        for name in self._TRAFFIC:
-            setattr(self.traffic, name, state[f"traffic_{name}"].copy())
-        self.batch.state[:] = state["physics"]
-        self.scenery.walked = state["walked"].copy()
-        self.scenery.stand_still(np.arange(self.num_envs))
+    @_physics.setter
+    def _physics(self, state: NDArray[Any]) -> None:
+        self.batch.state[:] = state
 
 
 def _batch(physics: Physics) -> Any:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.state import Stateful
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.physics.model import FORKLIFTS, PARKED_M, PEOPLE, PERSON_RADIUS_M
 
@@ -131,8 +132,11 @@ def _free_m(warehouse: Warehouse, place: F64, direction: F64, half_width_m: floa
     return 6.0
 
 
-class Traffic:
+class Traffic(Stateful):
     """The agents of N environments: positions over time. All arrays are (N, AGENTS, ...)."""
+
+    # What changes on the way; ways and triggers are those of the episodes.
+    STATE = ("state", "travelled_m", "waited_s", "position_m", "heading_rad", "attentive")
 
     def __init__(self, num_envs: int, body_half_m: tuple[float, float]) -> None:
         shape = (num_envs, AGENTS)

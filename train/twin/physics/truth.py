@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from restock.ingest.task.route import view_route
 from restock.ingest.task.task import Task
+from restock.state import Stateful
 from restock.train.twin.physics.model import pallet_half_m
 
 F64 = NDArray[np.float64]
@@ -28,8 +29,10 @@ REACH_M = BLOCK_AHEAD_M[-1] + 1.5  # a pallet farther off than this is not just 
 BODY_MARGIN_M = 0.2  # how far beside the plan a pallet is still in the way
 
 
-class Truth:
+class Truth(Stateful):
     """Keeps what the true condition needs to remember, for N environments."""
+
+    STATE = ("aftermath_s", "blocked")
 
     def __init__(self, task: Task, num_envs: int) -> None:
         self._period_s = task.control_period_s
