@@ -1,1 +1,45 @@
-"""Train: the twin, the learner, and the record of what it was fed."""
+"""A DQN on logs and in the twin: train it, evaluate it, compare and diagnose runs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from restock.public import lazy
+
+if TYPE_CHECKING:
+    from restock.train.comparison.compare import compare as compare
+    from restock.train.comparison.diagnose import diagnose as diagnose
+    from restock.train.dqn.config import TrainConfig as TrainConfig
+    from restock.train.evaluation.eval_run import evaluate as evaluate
+    from restock.train.evaluation.ope import OpeConfig as OpeConfig
+    from restock.train.evaluation.ope import evaluate_run_off_policy as evaluate_run_off_policy
+    from restock.train.evaluation.regression import compare_with_baseline as compare_with_baseline
+    from restock.train.evaluation.regression import regressed as regressed
+    from restock.train.libraries.sb3_buffer import MixtureReplayBuffer as MixtureReplayBuffer
+    from restock.train.libraries.sb3_buffer import dqn_critic as dqn_critic
+    from restock.train.libraries.tianshou_buffer import (
+        MixtureVectorReplayBuffer as MixtureVectorReplayBuffer,
+    )
+    from restock.train.prepare import train as train
+    from restock.train.run.run import Run as Run
+    from restock.train.study.study import StudyPlan as StudyPlan
+    from restock.train.study.study import load_study as load_study
+    from restock.train.study.study_run import run_study as run_study
+else:
+    __getattr__, __dir__, __all__ = lazy(
+        __name__,
+        {
+            "restock.train.comparison.compare": ["compare"],
+            "restock.train.comparison.diagnose": ["diagnose"],
+            "restock.train.dqn.config": ["TrainConfig"],
+            "restock.train.evaluation.eval_run": ["evaluate"],
+            "restock.train.evaluation.ope": ["OpeConfig", "evaluate_run_off_policy"],
+            "restock.train.evaluation.regression": ["compare_with_baseline", "regressed"],
+            "restock.train.libraries.sb3_buffer": ["MixtureReplayBuffer", "dqn_critic"],
+            "restock.train.libraries.tianshou_buffer": ["MixtureVectorReplayBuffer"],
+            "restock.train.prepare": ["train"],
+            "restock.train.run.run": ["Run"],
+            "restock.train.study.study": ["StudyPlan", "load_study"],
+            "restock.train.study.study_run": ["run_study"],
+        },
+    )

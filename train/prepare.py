@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,13 @@ from restock.ingest.profile.profile import Profile, load_profile
 from restock.replay.panel.logged_sampler import controller_for
 from restock.replay.panel.panel import Panel
 from restock.replay.sampling.share_controller import PlannedDraws
+from restock.train import loop
 from restock.train.dqn.config import TrainConfig, apply_overrides, load_config, parse_config
 from restock.train.dqn.learner import open_device
 from restock.train.dqn.manual_backprop import update_path
 from restock.train.dqn.target import describe
 from restock.train.feed.logs import Logs
+from restock.train.loop import Notify, TrainResult
 from restock.train.run.checkpoint import check_earlier, go_back
 from restock.train.run.run import Run, check_free, now_ns, panel_document, software_versions
 from restock.train.session import Session, open_session
@@ -81,10 +83,48 @@ class Prepared:
         )
 
 
+def train(
+    config: TrainConfig | Path | str | None = None,
+    *,
+    panel: Path | str | None = None,
+    out: Path | str,
+    settings: Sequence[str] = (),
+    stop: Callable[[], bool] = lambda: False,
+    notify: Notify = lambda event, values: None,
+) -> TrainResult:
+    """Train a new run to the end of its budget, as `restock train`; the run is the folder `out`.
+
+    Args:
+        config: a config, the path of its TOML file, or None for the defaults.
+        panel: the folder of a panel; None: online only.
+        settings: `key.path=value`, over the config.
+        stop: asked between steps; True ends the run with a checkpoint.
+        notify: told of every row of `progress` and every evaluation.
+
+    Raises:
+        RunError: `out` is there already.
+        ConfigError: a config that cannot be used, or no such device.
+        PanelError: a panel made for another task or discount than the twin's.
+        TrainingInterrupted: `stop` returned True.
+    """
+    panel_path = None if panel is None else Path(panel)
+    prepared = prepare_new(
+        Path(out), panel_path, Path(config) if isinstance(config, str) else config, settings
+    )
+    session = prepared.open()
+    try:
+        return loop.train(session, stop=stop, notify=notify)
+    finally:
+        session.close()
+
+
 def prepare_new(
-    out: Path, panel_path: Path | None, config_path: Path | None, overrides: Sequence[str] = ()
+    out: Path,
+    panel_path: Path | None,
+    config: TrainConfig | Path | None,
+    overrides: Sequence[str] = (),
 ) -> Prepared:
-    """A new run, checked.
+    """A new run, checked; `config` may be the path of a TOML file, None for the defaults.
 
     Raises:
         RunError: `out` is there already.
@@ -92,7 +132,11 @@ def prepare_new(
         PanelError: a panel made for another task or discount than the twin's.
     """
     check_free(out)
-    config = load_config(config_path, overrides)
+    if isinstance(config, TrainConfig):
+        document = apply_overrides(msgspec.to_builtins(config), overrides)
+        config = parse_config(document, where="TrainConfig")
+    else:
+        config = load_config(config, overrides)
     open_device(config.device)
     for layouts in {config.env.layouts, _evaluation_layouts(config)}:
         # What is wrong with one is said before anything is written. Evaluation drives all kinds

@@ -11,7 +11,7 @@ Without ROS, on a recording, against the commands that it holds:
 
     python docs/examples/ros2_policy.py policy.onnx sample_logs/amr_tuesday
 
-The observation is made by `restock.ingest.steps.live`, from the very functions that read the logs
+The observation is made by `restock.ingest.LiveObserver`, from the very functions that read the logs
 the policy learnt from. What cannot be acted on (a topic that is silent or stale) is a stop.
 """
 
@@ -28,8 +28,7 @@ from typing import Any
 import numpy as np
 import onnxruntime
 
-from restock.ingest.profile.profile import load_profile
-from restock.ingest.steps.live import LiveObserver
+from restock.ingest import LiveObserver, load_profile
 
 STOP = 0  # action 0 of every task
 

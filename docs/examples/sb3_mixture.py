@@ -12,7 +12,7 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.env_util import make_vec_env
 
 import restock  # noqa: F401 - registers restock/Warehouse-v0
-from restock.train.libraries.sb3_buffer import MixtureReplayBuffer, dqn_critic
+from restock.train import MixtureReplayBuffer, dqn_critic
 
 
 def main(panel: str, run: str, updates: int = 2000, steps: int = 20_000, seed: int = 0) -> dict:

@@ -17,7 +17,7 @@ from tianshou.trainer import OffPolicyTrainerParams
 from tianshou.utils.net.common import Net
 
 import restock  # noqa: F401 - registers restock/Warehouse-v0
-from restock.train.libraries.tianshou_buffer import MixtureVectorReplayBuffer
+from restock.train import MixtureVectorReplayBuffer
 
 
 def main(

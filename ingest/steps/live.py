@@ -88,7 +88,7 @@ class LiveObserver:
 
     @property
     def offset_ns(self) -> int:
-        """Log time less the alignment clock, as `restock.ingest.steps.align` finds it: of the topic
+        """Log time less the alignment clock, as ingest finds it: of the topic
         that comes with the least delay, the median."""
         medians = [median(np.array(delays, np.int64)) for delays in self._delays.values()]
         return min(medians, default=0)

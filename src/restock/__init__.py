@@ -1,15 +1,20 @@
-"""Restock: robot logs to coverage-labelled transitions, replay mixtures, and a DQN in a twin.
+"""Robot logs to coverage-labelled transitions, replay mixtures, and a DQN in a twin.
 
-Importing `restock` is cheap; `torch`, `mujoco` and `duckdb` load with the room that needs them.
+The rooms `restock.ingest`, `restock.replay`, `restock.train` and `restock.twin` hold the public
+names, docs/api.md lists them; `restock.report` writes the pages about a run. Importing any of
+them is cheap; `torch`, `mujoco` and `duckdb` load with what needs them.
 The Gymnasium environment `restock/Warehouse-v0` is registered here, by name only.
 """
 
 from __future__ import annotations
 
+import importlib
 from importlib.metadata import PackageNotFoundError, version
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import gymnasium
+
+from restock.errors import RestockError
 
 try:
     __version__ = version("restock")
@@ -17,9 +22,16 @@ except PackageNotFoundError:  # running from a source tree that was never instal
     __version__ = "0.0.0+unknown"
 
 if TYPE_CHECKING:
+    from types import ModuleType
+
+    from restock import ingest as ingest
+    from restock import replay as replay
+    from restock import report as report
+    from restock import train as train
+    from restock import twin as twin
     from restock.replay.store.store import Store
 
-__all__ = ["__version__", "open"]
+__all__ = ["RestockError", "__version__", "open"]
 
 gymnasium.register(
     id="restock/Warehouse-v0",
@@ -35,5 +47,10 @@ def open(store: str) -> Store:
     return Store(store)
 
 
-def __getattr__(name: str) -> Any:
-    raise AttributeError(f"module 'restock' has no attribute {name!r}")
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> ModuleType:
+        # `import restock` is enough to write `restock.twin.EpisodeSpec`.
+        if name in ("ingest", "replay", "report", "train", "twin"):
+            return importlib.import_module(f"restock.{name}")
+        raise AttributeError(f"module 'restock' has no attribute {name!r}")

@@ -18,7 +18,7 @@ from support.paths import ROOT
 
 MOST_MODULES = 15
 ROOMS = ["ingest", "replay", "train", "report", "cli"]
-SHARED = {"errors", "files", "state", "stats", "toml"}
+SHARED = {"errors", "files", "public", "state", "stats", "toml"}
 MAY_IMPORT = {
     "ingest": "containers profile steps store task",
     "ingest/decoding": "",
@@ -135,6 +135,8 @@ def edges(folder: str) -> dict[str, str]:
     """Other folders that a folder imports from, each with an example."""
     found = {}
     for path in FOLDERS[folder]:
+        if path.relative_to(home(folder)).with_suffix("").as_posix() in FRONT_DOOR:
+            continue
         for name in imports(path):
             other = name if name in FOLDERS else name.rpartition("/")[0] or name
             if other not in (folder, "__version__") and name not in SHARED:

@@ -18,11 +18,13 @@ import torch
 from support.paths import ROOT
 from support.stores import recording_transitions
 
+import restock
 from restock.cli import main
+from restock.errors import RestockError
 from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
-from restock.train.dqn.config import TrainConfig
+from restock.train.dqn.config import ScheduleConfig, TrainConfig
 from restock.train.run import checkpoint
 
 TINY = [
@@ -194,6 +196,29 @@ def test_eval_drives_everyone_through_the_same_episodes(
         assert 0 <= row["success_low"] <= row["success"] <= row["success_high"] <= 1
     nominal = [r for r in rows if r["policy"] == "planner" and r["condition"] == "nominal"]
     assert any(row["success"] for row in nominal)
+
+
+def test_from_python_a_run_is_trained_and_evaluated_as_by_the_commands(
+    trained: Path, panel: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = [word for word in TINY if word != "--set"]
+    config = TrainConfig(schedule=ScheduleConfig(env_steps=400))
+    outcome = restock.train.train(config, panel=panel, out=tmp_path / "a", settings=settings)
+    assert outcome.env_steps == 400
+    documents = [json.loads((run / "config.json").read_text()) for run in (tmp_path / "a", trained)]
+    assert documents[0]["config"] == documents[1]["config"]
+    assert documents[0]["panel"]["id"] == documents[1]["panel"]["id"]
+    with pytest.raises(RestockError, match="is there already"):
+        restock.train.train(config, out=str(tmp_path / "a"))
+
+    rows = restock.train.evaluate(tmp_path / "a", policies=["agent", "planner"], episodes=1)
+    argv = ["eval", str(tmp_path / "a"), "--policies", "agent,planner", "--episodes", "1"]
+    assert main([*argv, "--perturbations", "none", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["results"] == json.loads(json.dumps(rows))
+
+    compared = restock.train.compare_with_baseline(tmp_path / "a", str(tmp_path / "a"))
+    assert {row["difference"] for row in compared} == {0.0}
+    assert not restock.train.regressed(compared)
 
 
 @pytest.mark.parametrize(

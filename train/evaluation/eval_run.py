@@ -21,7 +21,12 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
 from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.dqn.network import make_network
-from restock.train.evaluation.evaluate import EpisodeResult, GreedyPolicy, run_episodes
+from restock.train.evaluation.evaluate import (
+    EpisodeResult,
+    GreedyPolicy,
+    run_episodes,
+    summary_rows,
+)
 from restock.train.run import checkpoint
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES
@@ -135,7 +140,42 @@ def _is_path(flag: str, name: str) -> bool:
     return name.endswith(".toml")
 
 
-def evaluate(plan: Plan, progress: Callable[[int], None] | None = None) -> Results:
+def evaluate(
+    run: Path | str,
+    *,
+    policies: Sequence[str] = POLICIES,
+    perturbations: Sequence[str] = (CLEAN,),
+    episodes: int = 20,
+    first_seed: int = FIRST_SEED,
+    layouts: str | None = None,
+) -> list[dict[str, Any]]:
+    """Drive a run's kept policy and its references through the same episodes, as `restock eval`.
+
+    Returns a row per policy, perturbation and condition: success with its 95 % Wilson interval,
+    bumps, time and return. The episodes are kept in the run's `eval/episodes.parquet`.
+
+    Args:
+        policies: agent (the run's best), planner, random, `onnx:FILE` or `run:DIRECTORY`.
+        perturbations: none, friction, latency, payload, wheels, sensors, or a TOML file.
+        episodes: of each kind.
+        layouts: floors to drive on; None: the run's own, of training floors the test split.
+
+    Raises:
+        RunError: no such run, or it kept no policy yet.
+        ConfigError: no such policy or perturbation, or no floor with room for any episode.
+    """
+    plan = plan_evaluation(
+        Path(run),
+        policies=policies,
+        perturbations=perturbations,
+        episodes=episodes,
+        first_seed=first_seed,
+        layouts=layouts,
+    )
+    return summary_rows(drive_evaluation(plan))
+
+
+def drive_evaluation(plan: Plan, progress: Callable[[int], None] | None = None) -> Results:
     """Drive all episodes, and write them to the run's `eval/episodes.parquet`."""
     from restock.train.twin.env.interface import DEFAULT_CONDITIONS
     from restock.train.twin.env.vector_env import WarehouseVectorEnv

@@ -133,6 +133,25 @@ def regression(
     return rows
 
 
+def compare_with_baseline(
+    run: Path | str, baseline: str, *, margin: float = 0.05, seed: int = 0
+) -> list[dict[str, Any]]:
+    """A run beside a baseline on the same episodes, as `restock eval --baseline`.
+
+    Returns a row a perturbation and condition, with the difference in success, its 95 % interval
+    and a verdict. `regressed` says whether one of them should stop a pipeline.
+
+    Args:
+        run: an evaluated run.
+        baseline: a run, a file, or the name that it was saved under.
+        margin: a success lower by more than this, and surely lower, is worse.
+
+    Raises:
+        RunError: one of them was not evaluated, or is not there.
+    """
+    return regression(of_baseline(baseline), of_run(Path(run)), margin=margin, seed=seed)
+
+
 def regressed(rows: Sequence[dict[str, Any]]) -> bool:
     """Whether a pipeline should stop: something is worse, or could not be compared."""
     return any(row["verdict"] in ("worse", "refused") for row in rows)
@@ -218,4 +237,12 @@ def _cells(table: pa.Table) -> dict[tuple[str, str], _Episodes]:
     return cells
 
 
-__all__ = ["Evaluated", "of_baseline", "of_run", "regressed", "regression", "save_baseline"]
+__all__ = [
+    "Evaluated",
+    "compare_with_baseline",
+    "of_baseline",
+    "of_run",
+    "regressed",
+    "regression",
+    "save_baseline",
+]

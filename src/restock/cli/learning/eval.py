@@ -68,7 +68,7 @@ class EvalCommand:
     def _drive(self) -> int:
         from restock.cli.output import print_json, progress, say
         from restock.errors import ConfigError, ExitCode
-        from restock.train.evaluation.eval_run import evaluate, plan_evaluation, settings
+        from restock.train.evaluation.eval_run import drive_evaluation, plan_evaluation, settings
         from restock.train.evaluation.evaluate import summary_rows
         from restock.train.evaluation.regression import of_baseline, of_run, regressed, regression
         from restock.train.evaluation.regression import save_baseline as save
@@ -97,7 +97,7 @@ class EvalCommand:
             for kind, floors in plan.left_out.items():
                 say(f"left out: {kind}, no room for it on {', '.join(floors)}")
             with progress("driving", plan.total) as advance:
-                rows = summary_rows(evaluate(plan, advance))
+                rows = summary_rows(drive_evaluation(plan, advance))
             document = {**settings(plan), "results": rows}
         compared = None
         if baseline is not None:

@@ -1,0 +1,110 @@
+"""Public names: cheap to import, never shadowed, listed in docs/api.md, and all that docs teach."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from support.paths import ROOT
+
+from restock.public import FACES, imported, rewrite
+
+PAGES = [*sorted((ROOT / "docs").rglob("*.md")), ROOT / "README.md"]
+EXAMPLES = sorted((ROOT / "docs" / "examples").glob("*.py"))
+ROOMS = [face for face in FACES if face != "restock"]
+ROOM_FOLDERS = ("ingest", "replay", "train")
+# What a path may begin with, and the names that may follow.
+KNOWN = {face: set(importlib.import_module(face).__all__) for face in FACES}
+KNOWN["restock"] |= {"ingest", "replay", "report", "train", "twin", "errors", "public"}
+KNOWN["restock.report"] = {"build_report", "write_card", "write_gap_page"}
+
+
+def python(code: str) -> str:
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def test_importing_the_rooms_loads_none_of_the_heavy_libraries() -> None:
+    heavy = "{'torch', 'mujoco', 'duckdb', 'pyarrow', 'altair', 'msgspec', 'tyro'}"
+    names = ", ".join(FACES)
+    assert python(f"import sys, {names}; print({heavy} & set(sys.modules))") == "set()"
+
+
+@pytest.mark.parametrize("face", ROOMS)
+def test_a_name_is_what_type_checkers_see(face: str) -> None:
+    module = importlib.import_module(face)
+    seen = imported(face)
+    assert sorted(name for names in seen.values() for name in names) == module.__all__
+    for home, names in seen.items():
+        for name in names:
+            value = getattr(module, name)
+            assert value is getattr(importlib.import_module(home), name)
+            assert value.__module__ == home, f"{name} is defined in {value.__module__}"
+            assert value.__doc__
+            assert name in dir(module)
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        module.nothing  # noqa: B018
+
+
+def test_no_module_takes_the_place_of_a_name_however_late_it_is_imported() -> None:
+    everything = [
+        ".".join(["restock", *path.relative_to(ROOT / room).with_suffix("").parts])
+        for room, folder in (("src/restock", "src/restock"), *((".", r) for r in ROOM_FOLDERS))
+        for path in sorted((ROOT / folder).rglob("*.py"))
+        if path.name not in ("__init__.py", "__main__.py")
+    ]
+    assert len(everything) > 200
+    code = f"""
+        import importlib
+        for name in {everything!r}:
+            importlib.import_module(name)
+        for face in {ROOMS!r}:
+            module = importlib.import_module(face)
+            for name in module.__all__:
+                print(face, name, getattr(module, name).__class__.__name__ == "module")
+    """
+    lines = python(textwrap.dedent(code)).splitlines()
+    assert len(lines) > 40
+    assert not [line for line in lines if line.endswith("True")]
+
+
+def test_the_page_of_names_is_current() -> None:
+    page = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    assert rewrite(page) == page, "run: python -m restock.public docs/api.md"
+    assert "docs/api.md" in (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("path", [*PAGES, *EXAMPLES], ids=lambda path: path.name)
+def test_docs_teach_public_names_only(path: Path) -> None:
+    text = re.sub(r"<!--.*?-->", "", path.read_text(encoding="utf-8"))
+    for found in re.finditer(r"\brestock((?:\.[A-Za-z_]\w*)+)", text):
+        assert public(found[1][1:].split(".")), found[0]
+    for block in blocks(path, text):
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("restock"):
+                assert {alias.name for alias in node.names} <= KNOWN[node.module or ""]
+
+
+def public(parts: list[str]) -> bool:
+    """`ingest`, `ingest.load_profile`, `replay.Panel.open`; `restock.json` is a file."""
+    if parts[0] not in KNOWN["restock"]:
+        return parts[-1] in ("html", "json", "toml")
+    return len(parts) == 1 or parts[0] == "errors" or parts[1] in KNOWN[f"restock.{parts[0]}"]
+
+
+def blocks(path: Path, text: str) -> Iterator[str]:
+    """The Python in a file: all of it, or the blocks of a page (those of shells do not import)."""
+    if path.suffix == ".py":
+        yield text
+        return
+    yield from re.findall(r"```python\n(.*?)```", text, re.S)
+    for block in re.findall(r"(?:^(?:    .*)?\n)+", text, re.M):
+        if re.match(r"\s*(import|from) ", block):
+            yield textwrap.dedent(block)
