@@ -22,11 +22,16 @@ from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.episodes import Split, split
 from restock.ingest.steps.needs import read_topics
 from restock.ingest.steps.steps import Steps, steps_of
-from restock.ingest.store.manifest import definitions, manifest_row, software_version
+from restock.ingest.store.manifest import (
+    definitions,
+    manifest_row,
+    recorded_facts,
+    software_version,
+)
 from restock.ingest.store.transitions import Provenance, recording_table
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.conditions import NOMINAL
-from restock.ingest.task.label_scores import LabelScore, score
+from restock.ingest.task.label_scores import LabelScore, label_scores
 from restock.ingest.task.schema import recording_schema
 
 Status = Literal["written", "unchanged", "dry run"]
@@ -118,14 +123,11 @@ class _Ingest:
             self.recording.recording_id, self.ingest_id, self.path, software_version()
         )
         table, rows = recording_table(profile, steps, episodes, provenance)
-        named = np.array(table["condition"].to_pylist(), object)
-        first = {name: int((named == name).sum()) for name in (*rows.labels, NOMINAL)}
-        scores = score(
-            {name: named == name for name in rows.labels}, table["true_condition"].to_pylist()
-        )
-        manifest = manifest_row(
-            self.recording, profile, provenance, columns, steps, episodes, rows, scores
-        )
+        named = Counter(table["condition"].to_pylist())
+        first = {name: named[name] for name in (*rows.labels, NOMINAL)}
+        scores = label_scores(table, rows.labels)
+        facts = recorded_facts(self.recording, profile, columns, steps, episodes, rows)
+        manifest = manifest_row(profile, provenance, table, scores, episodes.dropped, **facts)
         at = (
             store.write(pa.Table.from_pylist([manifest], recording_schema()), table)
             if store

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import datetime as dt
 import uuid
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,9 +20,10 @@ import pyarrow as pa
 from restock.errors import ConfigError, StoreError
 from restock.ingest.store.episode_rows import episode_ends
 from restock.ingest.store.manifest import conditions_json, score_rows
+from restock.ingest.store.transitions import column_array, names_of
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.conditions import NOMINAL, Condition, label, labels_version, primary
-from restock.ingest.task.label_scores import LabelScore, score
+from restock.ingest.task.label_scores import LabelScore, label_scores
 from restock.ingest.task.schema import recording_schema
 
 
@@ -45,7 +47,7 @@ def relabel_store(
     *,
     dry_run: bool = False,
 ) -> tuple[list[Relabelled], int | None]:
-    """Label every recording anew whose labels are not of the conditions it should have.
+    """Label every recording again whose labels are not of the conditions it should have.
 
     `conditions_of` gives the conditions for the profile (by name) that read a recording. Returns
     what became of each, and the version of `transitions` (None where nothing was written).
@@ -63,18 +65,18 @@ def relabel_store(
         else:
             stale.append(row)
 
-    def anew() -> Iterator[tuple[pa.Table, pa.Table]]:
+    def relabelled() -> Iterator[tuple[pa.Table, pa.Table]]:
         for row in stale:
             manifest, rows, outcome = _one(store, row, conditions_of(row["profile"]))
             outcomes.append(outcome)
             yield manifest, rows
 
     if dry_run or not stale:
-        for _ in anew():
+        for _ in relabelled():
             pass
         return outcomes, None
     replaced = {row["recording_id"]: row["ingest_id"] for row in stale}
-    return outcomes, store.write_all(anew(), instead_of=replaced)
+    return outcomes, store.write_all(relabelled(), instead_of=replaced)
 
 
 def _one(
@@ -101,23 +103,22 @@ def _one(
         ) from error
     labels = {name: holds[: len(rows)] for name, holds in found.items()}
     named = primary(labels, conditions) or [NOMINAL] * len(rows)
-    was = rows["condition"].to_pylist()
+    before = rows["condition"].to_pylist()
     version = labels_version(conditions)
     ingest_id = uuid.uuid4().hex[:16]
     new = {
         "condition": named,
-        "conditions": [[n for n, holds in labels.items() if holds[i]] for i in range(len(rows))],
-        "labels_version": [version] * len(rows),
-        "ingest_id": [ingest_id] * len(rows),
+        "conditions": names_of(labels, np.arange(len(rows))),
+        "labels_version": version,
+        "ingest_id": ingest_id,
     }
     metadata = rows.schema.metadata
     for name, values in new.items():
         index = rows.schema.get_field_index(name)
-        kind = rows.schema.field(index)
-        rows = rows.set_column(index, kind, pa.array(values, kind.type))
+        field = rows.schema.field(index)
+        rows = rows.set_column(index, field, column_array(values, field.type, len(rows)))
     rows = rows.replace_schema_metadata(metadata)
-    names = np.array(named, object)
-    scores = score({name: names == name for name in labels}, rows["true_condition"].to_pylist())
+    scores = label_scores(rows, labels)
     manifest = row | {
         "ingest_id": ingest_id,
         "ingested_at": dt.datetime.now(dt.UTC),
@@ -130,17 +131,12 @@ def _one(
         row["source_file"],
         row["labels_version"],
         version,
-        sum(a != b for a, b in zip(was, named, strict=True)),
-        _counts(named),
-        _counts(was),
+        sum(a != b for a, b in zip(before, named, strict=True)),
+        dict(sorted(Counter(named).items())),
+        dict(sorted(Counter(before).items())),
         scores,
     )
     return pa.Table.from_pylist([manifest], recording_schema()), rows, outcome
-
-
-def _counts(names: Sequence[str]) -> dict[str, int]:
-    found, counts = np.unique(np.array(names, str), return_counts=True)
-    return dict(zip(found.tolist(), counts.tolist(), strict=True))
 
 
 def open_for_relabel(path: Path | str) -> StoreWriter:

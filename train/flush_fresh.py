@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime as dt
 import hashlib
 import json
 import uuid
@@ -11,25 +10,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from restock.errors import RunError
 from restock.ingest.profile.profile import Profile
-from restock.ingest.store.episode_rows import ENDS, EpisodeRows, packed
-from restock.ingest.store.manifest import conditions_json, definitions, score_rows, software_version
+from restock.ingest.store.episode_rows import EpisodeRows
+from restock.ingest.store.manifest import definitions, manifest_row, software_version
+from restock.ingest.store.transitions import Provenance, TransitionValues, transition_table
 from restock.ingest.store.writer import StoreWriter
-from restock.ingest.task.conditions import NOMINAL, primary
-from restock.ingest.task.label_scores import score
+from restock.ingest.task.label_scores import label_scores
 from restock.ingest.task.perturbation_columns import Perturbed
-from restock.ingest.task.schema import (
-    SIGNAL_COLUMNS,
-    STEP_BITS,
-    recording_schema,
-    transition_schema,
-)
+from restock.ingest.task.schema import SIGNAL_COLUMNS, recording_schema
 from restock.train.feed.fresh_log import read_episodes
 from restock.train.jump_start import POLICIES
 from restock.train.run.run import now_ns
@@ -71,10 +64,11 @@ def flush(run: Path, store: StoreWriter, profile: Profile, dropped_steps: int = 
     for row in store.live(recording_id).to_pylist():
         if all(row[name] == value for name, value in definitions(profile).items()):
             return Flushed(recording_id, "unchanged", len(episodes), count, None)
-    ingest_id = uuid.uuid4().hex
-    laid_out = _lay_out(episodes, profile)
-    table = _rows(laid_out, episodes, profile, run, recording_id, ingest_id)
-    manifest = _manifest(laid_out, table, profile, run, dropped_steps)
+    provenance = Provenance(recording_id, uuid.uuid4().hex[:16], str(run), software_version())
+    rows = _lay_out(episodes, profile)
+    values = _values(rows, episodes, profile, run.name)
+    table = transition_table(profile, rows, values, provenance)
+    manifest = _manifest(rows, table, profile, provenance, dropped_steps)
     version = store.write(pa.Table.from_pylist([manifest], recording_schema()), table)
     return Flushed(recording_id, "written", len(episodes), len(table), version)
 
@@ -111,68 +105,31 @@ def _lay_out(episodes: Sequence[Mapping[str, Any]], profile: Profile) -> Episode
     return EpisodeRows(tick, number, step, is_end, signals, labels, pa.table({}))
 
 
-def _rows(
-    rows: EpisodeRows,
-    episodes: Sequence[Mapping[str, Any]],
-    profile: Profile,
-    run: Path,
-    recording_id: str,
-    ingest_id: str,
-) -> pa.Table:
-    """One row a transition, by `restock.ingest.task.schema`."""
+def _values(
+    rows: EpisodeRows, episodes: Sequence[Mapping[str, Any]], profile: Profile, run: str
+) -> TransitionValues:
+    """What was kept of each step, end to end."""
     begin = rows.starts
-    if len(rows.tick) >> STEP_BITS:
-        raise RunError(
-            f"its {len(rows.tick):,} steps are more than the {1 << STEP_BITS:,} of a recording",
-            where=str(run),
-        )
+    number = rows.episode[begin]
+    version = [f"{run}@{int(episode['version'])}" for episode in episodes]
 
-    def each(name: str) -> Any:
+    def each(name: str) -> NDArray[Any]:
         return np.concatenate([episode[name] for episode in episodes])
 
-    observation = np.concatenate([episode["observation"] for episode in episodes])
-    ends = rows.is_end[begin + 1]
-    for_good = np.array([bool(episode["terminated"]) for episode in episodes])[rows.episode[begin]]
-    version = [f"{run.name}@{int(episode['version'])}" for episode in episodes]
-    named = primary(rows.labels, profile.conditions) or [NOMINAL] * len(rows.tick)
-    perturbed, values = _perturbed(episodes).columns(rows.episode[begin])
-    now = {name: column[begin] for name, column in rows.signals.items()}
-    number = int(recording_id, 16) >> (64 - (63 - STEP_BITS))
-    columns: dict[str, Any] = {
-        "transition_id": (number << STEP_BITS) + rows.tick[begin],
-        "recording_id": recording_id,
-        "episode_id": [f"{recording_id}/{episode}" for episode in rows.episode[begin]],
-        "episode_index": rows.episode[begin],
-        "step_index": rows.step[begin],
-        "observation": observation[begin],
-        "action": each("action"),
-        "reward": each("reward"),
-        "next_observation": observation[begin + 1],
-        "terminated": ends & for_good,
-        "truncated": ends & ~for_good,
-        "condition": [named[row] for row in begin],
-        "conditions": [[name for name, holds in rows.labels.items() if holds[r]] for r in begin],
-        "true_condition": each("truth").tolist(),
-        "perturbation": perturbed,
-        "perturbation_values": values,
-        "zone": _zones(rows, episodes, profile)[begin].tolist(),
-        "behaviour_policy": _policies(episodes),
-        "behaviour_version": [version[episode] for episode in rows.episode[begin]],
-        "action_probability": each("probability"),
-        "action_residual": np.zeros(len(begin), np.float32),  # the action is the command
-        "progress_m": each("progress_m"),
-        **{column.name: now[column.name] for column in SIGNAL_COLUMNS},
-        "ingest_id": ingest_id,
-        "source_file": str(run),
-        "profile_hash": profile.hash,
-        "task_hash": profile.task.hash,
-        "labels_version": profile.labels_version,
-        "restock_version": software_version(),
-    }
-    schema = transition_schema(profile.task.observation_size)
-    arrays = [_array(columns[field.name], field.type, len(begin)) for field in schema]
-    table = pa.Table.from_arrays(arrays, schema=schema)
-    return table.replace_schema_metadata({ENDS: packed(rows.ends_table())})
+    return TransitionValues(
+        observation=each("observation"),
+        action=each("action"),
+        reward=each("reward"),
+        progress_m=each("progress_m"),
+        residual=np.zeros(len(begin)),  # the action is the command
+        terminates=np.array([bool(episode["terminated"]) for episode in episodes])[number],
+        zone=_zones(rows, episodes, profile)[begin].tolist(),
+        truth=each("truth").tolist(),
+        policy=_policies(episodes),
+        policy_version=[version[episode] for episode in number],
+        probability=each("probability"),
+        perturbation=_perturbed(episodes).columns(number),
+    )
 
 
 def _policies(episodes: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -188,71 +145,43 @@ def _zones(
     names = profile.zone_of(rows.signals["pose_x_m"], rows.signals["pose_y_m"])
     zones = np.array(names, object)
     for number, episode in enumerate(episodes):
-        if (said := episode.get("zones")) is not None:
-            zones[rows.episode == number] = said
+        if (of_layout := episode.get("zones")) is not None:
+            zones[rows.episode == number] = of_layout
     return zones
 
 
 def _perturbed(episodes: Sequence[Mapping[str, Any]]) -> Perturbed:
     """What was in force in each episode; those that an older run kept do not know."""
-    said = [
+    known = [
         (str(episode["perturbation"]), json.loads(episode["perturbation_values"]))
         if "perturbation" in episode
         else None
         for episode in episodes
     ]
-    return Perturbed(said, np.arange(len(said), dtype=np.int64))
-
-
-def _array(values: Any, kind: pa.DataType, count: int) -> pa.Array:
-    if isinstance(values, pa.Array):
-        return values
-    if isinstance(values, str):
-        return pa.repeat(pa.scalar(values, kind), count)
-    if pa.types.is_fixed_size_list(kind):
-        flat = pa.array(np.ascontiguousarray(values, np.float32).reshape(-1))
-        return pa.FixedSizeListArray.from_arrays(flat, type=kind)
-    if isinstance(values, np.ndarray):
-        return pa.array(values).cast(kind, safe=False)
-    return pa.array(values, kind)
+    return Perturbed(known, np.arange(len(known), dtype=np.int64))
 
 
 def _manifest(
-    rows: EpisodeRows, table: pa.Table, profile: Profile, run: Path, dropped_steps: int
+    rows: EpisodeRows, table: pa.Table, profile: Profile, provenance: Provenance, dropped_steps: int
 ) -> dict[str, Any]:
     """The row of `recordings`. Log time is such that the last step was just now."""
     stamps = rows.signals["stamp_ns"]
-    condition = np.array(table["condition"].to_pylist(), object)
-    scores = score(
-        {name: condition == name for name in rows.labels}, table["true_condition"].to_pylist()
+    return manifest_row(
+        profile,
+        provenance,
+        table,
+        label_scores(table, rows.labels),
+        {"physics blew up": dropped_steps} if dropped_steps else {},
+        format=FORMAT,
+        integrity="verified",
+        duration_s=float(stamps[-1] - stamps[0]) * 1e-9,
+        start_stamp_ns=int(stamps[0]),
+        end_stamp_ns=int(stamps[-1]),
+        clock="simulated",
+        clock_offset_ns=now_ns() - int(stamps[-1]),
+        clock_jumps=0,
+        ticks=len(rows.tick) + dropped_steps,
+        steps=len(rows.tick),
+        episodes=int(rows.is_end.sum()),
+        episode_ends=int(rows.is_end.sum()),
     )
-    dropped = [{"reason": "physics blew up", "count": dropped_steps}] if dropped_steps else []
-    return {
-        "recording_id": table["recording_id"][0].as_py(),
-        "ingest_id": table["ingest_id"][0].as_py(),
-        "ingested_at": dt.datetime.now(dt.UTC),
-        "source_file": str(run),
-        "format": FORMAT,
-        "integrity": "verified",
-        "duration_s": float(stamps[-1] - stamps[0]) * 1e-9,
-        "start_stamp_ns": int(stamps[0]),
-        "end_stamp_ns": int(stamps[-1]),
-        "clock": "simulated",
-        "clock_offset_ns": now_ns() - int(stamps[-1]),
-        "clock_jumps": 0,
-        "profile": profile.name,
-        **definitions(profile),
-        "ticks": len(rows.tick) + dropped_steps,
-        "steps": len(rows.tick),
-        "episodes": int(rows.is_end.sum()),
-        "transitions": len(table),
-        "episode_ends": int(rows.is_end.sum()),
-        "drops": dropped,
-        "topics": [],
-        "stand_ins": [],
-        "label_scores": score_rows(scores),
-        "clocks": [],
-        "signals": [],
-        "task_json": msgspec.json.encode(profile.task).decode(),
-        "conditions_json": conditions_json(profile.conditions),
-    }

@@ -9,6 +9,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import pyarrow as pa
 
 from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import TopicColumns
@@ -43,24 +44,51 @@ def definitions(profile: Profile) -> dict[str, str]:
 
 
 def manifest_row(
-    recording: Recording,
     profile: Profile,
     provenance: Provenance,
+    table: pa.Table,
+    scores: Sequence[LabelScore],
+    dropped: Mapping[str, int],
+    **recorded: Any,
+) -> dict[str, Any]:
+    """The row of `recordings` for these transitions, by `restock.ingest.task.schema`.
+
+    `dropped` are ticks in no episode by reason; `recorded` is what only who made the steps knows:
+    format, clock and counts.
+    """
+    drops = sorted(dropped.items(), key=lambda item: (-item[1], item[0]))
+    return {
+        "recording_id": provenance.recording_id,
+        "ingest_id": provenance.ingest_id,
+        "ingested_at": dt.datetime.now(dt.UTC),
+        "source_file": provenance.source_file,
+        "profile": profile.name,
+        **definitions(profile),
+        "transitions": len(table),
+        "drops": [{"reason": reason, "count": count} for reason, count in drops],
+        "topics": [],
+        "stand_ins": [],
+        "label_scores": score_rows(scores),
+        "clocks": [],
+        "signals": [],
+        "task_json": msgspec.json.encode(profile.task).decode(),
+        "conditions_json": conditions_json(profile.conditions),
+        **recorded,
+    }
+
+
+def recorded_facts(
+    recording: Recording,
+    profile: Profile,
     columns: Mapping[str, TopicColumns],
     steps: Steps,
     episodes: Split,
     rows: EpisodeRows,
-    scores: Sequence[LabelScore],
 ) -> dict[str, Any]:
-    """The row of `recordings`, by `restock.ingest.task.schema`."""
+    """What `manifest_row` needs to be told of a recording."""
     stamps, span = steps.signals["stamp_ns"], recording.span_ns or (0, 0)
-    dropped = sorted(episodes.dropped.items(), key=lambda item: (-item[1], item[0]))
     fallbacks = fallbacks_used(profile, columns)
     return {
-        "recording_id": recording.recording_id,
-        "ingest_id": provenance.ingest_id,
-        "ingested_at": dt.datetime.now(dt.UTC),
-        "source_file": provenance.source_file,
         "format": recording.format,
         "integrity": recording.integrity,
         "duration_s": (span[1] - span[0]) * 1e-9,
@@ -69,21 +97,14 @@ def manifest_row(
         "clock": steps.clock.alignment,
         "clock_offset_ns": steps.clock.offset_ns,
         "clock_jumps": steps.clock.jumps,
-        "profile": profile.name,
-        **definitions(profile),
         "ticks": len(steps),
         "steps": len(np.unique(rows.tick)),
         "episodes": len(episodes.episodes),
-        "transitions": episodes.transitions,
         "episode_ends": episodes.ends,
-        "drops": [{"reason": reason, "count": count} for reason, count in dropped],
         "topics": topic_rows(recording),
         "stand_ins": [{"input": name, "instead": how} for name, how in fallbacks.items()],
-        "label_scores": score_rows(scores),
         "clocks": clock_rows(recording, steps),
         "signals": steps.custom.rows(),
-        "task_json": msgspec.json.encode(profile.task).decode(),
-        "conditions_json": conditions_json(profile.conditions),
     }
 
 

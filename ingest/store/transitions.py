@@ -1,4 +1,4 @@
-"""Episodes to transition rows: observation, action, reward, what came next, labels, provenance."""
+"""Transition rows of a store: of the episodes of a recording, and of the twin's."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.episodes import Split
 from restock.ingest.steps.steps import Steps
 from restock.ingest.store.episode_rows import ENDS, EpisodeRows, episode_rows, groups, packed
-from restock.ingest.task.conditions import primary
+from restock.ingest.task.conditions import NOMINAL, primary
 from restock.ingest.task.schema import SIGNAL_COLUMNS, STEP_BITS, transition_schema
 from restock.ingest.task.task import observe, reward
 
@@ -32,6 +32,24 @@ class Provenance:
     ingest_id: str
     source_file: str
     restock_version: str
+
+
+@dataclass(frozen=True)
+class TransitionValues:
+    """What rows hold of N transitions, beside the signals and labels of their R steps."""
+
+    observation: NDArray[np.float32]  # (R, D) at every step, those that only end an episode too
+    action: Ints  # (N,)
+    reward: NDArray[np.float32]  # (N,)
+    progress_m: NDArray[np.floating]  # (N,)
+    residual: NDArray[np.floating]  # (N,) from the command to the action
+    terminates: Bools  # (N,) whether the episode that it is in terminates
+    zone: Sequence[str]  # (N,)
+    truth: Sequence[str | None]  # (N,) true condition
+    policy: Sequence[str]  # (N,)
+    policy_version: Sequence[str | None]  # (N,)
+    probability: Sequence[float | None] | NDArray[np.floating]  # (N,) of the action
+    perturbation: tuple[pa.Array, pa.Array]  # (N,) its name and its values
 
 
 def recording_table(
@@ -63,73 +81,92 @@ def transitions(
     rows: EpisodeRows,
     provenance: Provenance,
 ) -> pa.Table:
-    """One row a transition, by `restock.ingest.task.schema`.
+    """One row a transition of a recording.
 
     Raises:
-        RecordingError: the recording has more steps than a transition id can number.
+        RecordingError: as `transition_table`.
     """
     task, begin = profile.task, rows.starts
     tick = rows.tick[begin]
-    if len(steps) >> STEP_BITS:
-        raise RecordingError(
-            f"{len(steps):,} steps are more than the {1 << STEP_BITS:,} a recording may have",
-            remedy="split the recording",
-        )
     previous_tick = rows.tick - steps.follows[rows.tick]
     previous_action = np.where(steps.follows[rows.tick], steps.action[previous_tick], 0)
     before = {name: column[previous_tick] for name, column in steps.signals.items()}
-    observation = observe(task, rows.signals, before, previous_action)  # (R, D)
     now = {name: column[begin] for name, column in rows.signals.items()}
     after = {name: column[begin + 1] for name, column in rows.signals.items()}
-    progress = steps.routing.progress_m(task, steps.routing.plan[tick], now, after)
-    rewards = reward(task, now, after, progress, steps.action[tick], previous_action[begin])
+    progress_m = steps.routing.progress_m(task, steps.routing.plan[tick], now, after)
+    terminates = np.array([episode.terminated for episode in episodes.episodes], np.bool_)
+    values = TransitionValues(
+        observation=observe(task, rows.signals, before, previous_action),
+        action=steps.action[tick],
+        reward=reward(task, now, after, progress_m, steps.action[tick], previous_action[begin]),
+        progress_m=progress_m,
+        residual=steps.residual[tick],
+        terminates=terminates[rows.episode[begin]],
+        zone=profile.zone_of(now["pose_x_m"], now["pose_y_m"]),
+        truth=[steps.truth[index] for index in tick],
+        policy=[steps.policy[index] for index in tick],
+        policy_version=[steps.policy_version[index] for index in tick],
+        probability=[steps.probability[index] for index in tick],
+        perturbation=steps.perturbed.columns(tick),
+    )
+    return transition_table(profile, rows, values, provenance)
 
+
+def transition_table(
+    profile: Profile, rows: EpisodeRows, values: TransitionValues, provenance: Provenance
+) -> pa.Table:
+    """Rows of the store, by `restock.ingest.task.schema`: of a recording or of the twin.
+
+    Raises:
+        RecordingError: there are more steps than a transition id can number.
+    """
+    begin = rows.starts
+    tick, count = rows.tick[begin], len(begin)
+    if (most := int(rows.tick.max(initial=-1)) + 1) >> STEP_BITS:
+        raise RecordingError(
+            f"{most:,} steps are more than the {1 << STEP_BITS:,} a recording may have",
+            where=provenance.source_file,
+            remedy="split the recording",
+        )
     last = rows.is_end[begin + 1]
-    terminates = np.array([e.terminated for e in episodes.episodes], np.bool_)
-    for_good = terminates[rows.episode[begin]] if len(terminates) else last
-    named = primary(rows.labels, profile.conditions) or ["nominal"] * len(rows.tick)
+    named = primary(rows.labels, profile.conditions) or [NOMINAL] * len(rows.tick)
     number = int(provenance.recording_id, 16) >> (64 - (63 - STEP_BITS))
-    count = len(begin)
-
-    def each(values: Sequence[Any]) -> list[Any]:
-        return [values[index] for index in tick]
-
-    names, values = steps.perturbed.columns(tick)
     columns: dict[str, Any] = {
         "transition_id": (number << STEP_BITS) + tick,
-        "recording_id": [provenance.recording_id] * count,
+        "recording_id": provenance.recording_id,
         "episode_id": [f"{provenance.recording_id}/{e}" for e in rows.episode[begin]],
         "episode_index": rows.episode[begin],
         "step_index": rows.step[begin],
-        "observation": _vectors(observation[begin]),
-        "action": steps.action[tick],
-        "reward": rewards,
-        "next_observation": _vectors(observation[begin + 1]),
-        "terminated": last & for_good,
-        "truncated": last & ~for_good,
+        "observation": _vectors(values.observation[begin]),
+        "action": values.action,
+        "reward": values.reward,
+        "next_observation": _vectors(values.observation[begin + 1]),
+        "terminated": last & values.terminates,
+        "truncated": last & ~values.terminates,
         "condition": [named[row] for row in begin],
-        "conditions": _names(rows.labels, begin),
-        "true_condition": each(steps.truth),
-        "perturbation": names,
-        "perturbation_values": values,
-        "zone": profile.zone_of(now["pose_x_m"], now["pose_y_m"]),
-        "behaviour_policy": each(steps.policy),
-        "behaviour_version": each(steps.policy_version),
-        "action_probability": each(steps.probability),
-        "action_residual": steps.residual[tick],
-        "progress_m": progress,
-        **{column.name: now[column.name] for column in SIGNAL_COLUMNS},
-        "ingest_id": [provenance.ingest_id] * count,
-        "source_file": [provenance.source_file] * count,
-        "profile_hash": [profile.hash] * count,
-        "task_hash": [task.hash] * count,
-        "labels_version": [profile.labels_version] * count,
-        "restock_version": [provenance.restock_version] * count,
+        "conditions": names_of(rows.labels, begin),
+        "true_condition": values.truth,
+        "perturbation": values.perturbation[0],
+        "perturbation_values": values.perturbation[1],
+        "zone": values.zone,
+        "behaviour_policy": values.policy,
+        "behaviour_version": values.policy_version,
+        "action_probability": values.probability,
+        "action_residual": values.residual,
+        "progress_m": values.progress_m,
+        **{column.name: rows.signals[column.name][begin] for column in SIGNAL_COLUMNS},
+        "ingest_id": provenance.ingest_id,
+        "source_file": provenance.source_file,
+        "profile_hash": profile.hash,
+        "task_hash": profile.task.hash,
+        "labels_version": profile.labels_version,
+        "restock_version": provenance.restock_version,
     }
-    own = rows.custom.take(pa.array(begin))
-    columns |= dict(zip(own.column_names, own.columns, strict=True))
-    schema = transition_schema(task.observation_size, list(own.schema))
-    table = pa.table([_typed(columns[field.name], field.type) for field in schema], schema=schema)
+    custom = rows.custom.take(pa.array(begin))
+    columns |= dict(zip(custom.column_names, custom.columns, strict=True))
+    schema = transition_schema(profile.task.observation_size, list(custom.schema))
+    arrays = [column_array(columns[field.name], field.type, count) for field in schema]
+    table = pa.table(arrays, schema=schema)
     return table.replace_schema_metadata({ENDS: packed(rows.ends_table())})
 
 
@@ -141,7 +178,10 @@ def _vectors(rows: NDArray[np.float32]) -> pa.Array:
     return pa.FixedSizeListArray.from_arrays(flat, type=kind)
 
 
-def _typed(values: Any, kind: pa.DataType) -> pa.Array:
+def column_array(values: Any, kind: pa.DataType, count: int) -> pa.Array:
+    """Values as a column of this type; a text stands in each of `count` rows."""
+    if isinstance(values, str):
+        return pa.repeat(pa.scalar(values, kind), count)
     if isinstance(values, pa.Array | pa.ChunkedArray):
         return values if values.type == kind else values.cast(kind)
     if isinstance(values, np.ndarray):
@@ -149,7 +189,7 @@ def _typed(values: Any, kind: pa.DataType) -> pa.Array:
     return pa.array(values, kind)
 
 
-def _names(labels: Mapping[str, Bools], rows: Ints) -> pa.Array:
+def names_of(labels: Mapping[str, Bools], rows: Ints) -> pa.Array:
     """The labels that hold in each of these rows, in their order, as a list array."""
     table = np.zeros((len(rows), len(labels)), np.bool_)
     for column, holds in zip(table.T, labels.values(), strict=True):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 GOOD = 0.8  # both, for a label to be trusted
@@ -46,10 +47,12 @@ def score(labels: Mapping[str, NDArray[Any]], truth: Sequence[str | None]) -> li
     known = np.array([text is not None for text in truth], np.bool_)
     if not known.any():
         return []
-    said = [set() if text is None else {part.strip() for part in text.split(",")} for text in truth]
+    named = [
+        set() if text is None else {part.strip() for part in text.split(",")} for text in truth
+    ]
     scores = []
     for name, given in labels.items():
-        true = np.array([name in names for names in said], np.bool_)
+        true = np.array([name in names for names in named], np.bool_)
         labelled, support = int((given & known).sum()), int(true.sum())
         both = int((given & true & known).sum())
         if labelled or support:
@@ -64,3 +67,9 @@ def score(labels: Mapping[str, NDArray[Any]], truth: Sequence[str | None]) -> li
                 )
             )
     return scores
+
+
+def label_scores(rows: pa.Table, names: Iterable[str]) -> list[LabelScore]:
+    """How well the one condition of each transition agrees with the true one, for these labels."""
+    named = np.array(rows["condition"].to_pylist(), object)
+    return score({name: named == name for name in names}, rows["true_condition"].to_pylist())

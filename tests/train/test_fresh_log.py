@@ -9,14 +9,19 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import pyarrow as pa
 import pytest
+from support.paths import ROOT
 
 import restock
 from restock.cli import main
 from restock.errors import RunError
+from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import Profile, load_profile
 from restock.ingest.store.episode_rows import episode_ends
+from restock.ingest.store.manifest import definitions
 from restock.ingest.store.writer import StoreWriter
+from restock.ingest.task.schema import SIGNAL_COLUMNS, STEP_BITS
 from restock.replay.mixture.mixture import load_mixture
 from restock.replay.panel.build import build_panel
 from restock.replay.ring.ring import FreshRing
@@ -120,6 +125,74 @@ def test_a_flushed_run_is_a_recording_like_any_other(
     assert [row["step_index"] for row in last] == [LONGEST - 1] * 2 * ENVS
     stamps = np.array([row["stamp_ns"] for row in rows])
     assert (np.diff(stamps) > 0).all()
+
+
+def test_rows_are_those_that_ingest_makes_of_the_same_steps(tmp_path: Path) -> None:
+    """The steps of a recording, given back as episodes of the twin: layout and meaning agree."""
+    profile, writer = load_profile("warehouse_amr"), StoreWriter(tmp_path / "store")
+    ingested = ingest(ROOT / "sample_logs" / "amr_tuesday", profile, store=writer).manifest
+    logged = writer.rows(ingested["recording_id"], ingested["ingest_id"])
+    checkpoint.save(tmp_path / "run" / "fresh" / "000000.episodes", episodes_of(logged, profile))
+    flush(tmp_path / "run", writer, profile)
+    (manifest,) = (row for row in writer.live().to_pylist() if row["format"] == "twin")
+    flushed = writer.rows(manifest["recording_id"], manifest["ingest_id"])
+    assert flushed.schema.equals(logged.schema)
+    assert manifest.keys() == writer.live(ingested["recording_id"]).to_pylist()[0].keys()
+    counts = ("transitions", "episodes", "label_scores", *definitions(profile))
+    assert [manifest[name] for name in counts] == [ingested[name] for name in counts]
+    both = [episode_ends(rows) for rows in (logged, flushed)]
+    assert both[0] is not None
+    assert both[1] is not None
+    shifted = {"stamp_ns", "pose_stamp_ns"}  # episodes are laid out one after the other
+    for before, after in ((logged, flushed), both):
+        for name in before.column_names:
+            if name not in shifted | DIFFERENT:
+                assert after[name].equals(before[name]), name
+    # A transition's id is its recording's number and its tick; episodes share no ticks here.
+    ticks = flushed["transition_id"].to_numpy() & ((1 << STEP_BITS) - 1)
+    assert ticks.tolist() == (np.arange(len(ticks)) + flushed["episode_index"].to_numpy()).tolist()
+    assert set(flushed["recording_id"].to_pylist()) == {manifest["recording_id"]}
+    for name, text in definitions(profile).items():
+        assert set(flushed[name].to_pylist()) == {text}
+
+
+# What differs between a recording and the twin's episodes by what it means: who and where from.
+DIFFERENT = {"transition_id", "recording_id", "episode_id", "ingest_id", "source_file"}
+DIFFERENT |= {"behaviour_policy", "behaviour_version", "perturbation", "perturbation_values"}
+DIFFERENT |= {"action_residual"}
+
+
+def episodes_of(rows: pa.Table, profile: Profile) -> dict[str, dict[str, Any]]:
+    """A recording's rows as the twin's episodes are kept."""
+    ends = episode_ends(rows)
+    assert ends is not None
+    names = [column.name for column in SIGNAL_COLUMNS]
+    observation = np.array(rows["observation"].to_pylist(), np.float32)
+    final = np.array(rows["next_observation"].to_pylist(), np.float32)
+    conditions = [condition.name for condition in profile.conditions]
+    episodes: dict[str, dict[str, Any]] = {}
+    for number in range(len(ends)):
+        inside = np.flatnonzero(rows["episode_index"].to_numpy() == number)
+        part = rows.take(pa.array(inside))
+        signals = pa.concat_tables(
+            [part.select(names), ends.slice(number, 1).select(names)], promote_options="permissive"
+        )
+        named = [set(held) for held in part["conditions"].to_pylist()] + [set()]
+        episodes[f"{number:06d}"] = {
+            "count": len(part),
+            "terminated": part["terminated"][-1].as_py(),
+            "version": 0,
+            "zones": np.array([*part["zone"].to_pylist(), "elsewhere"]),
+            "observation": np.concatenate([observation[inside], final[inside[-1:]]]),
+            "action": part["action"].to_numpy(),
+            "probability": part["action_probability"].to_numpy(),
+            "reward": part["reward"].to_numpy(),
+            "progress_m": part["progress_m"].to_numpy(),
+            "truth": np.array(part["true_condition"].to_pylist(), "<U32"),
+            "signals": {name: signals[name].to_numpy() for name in names},
+            "labels": {name: np.array([name in held for held in named]) for name in conditions},
+        }
+    return episodes
 
 
 def test_a_panel_can_be_mixed_from_it(collecting: Collecting, tmp_path: Path) -> None:
