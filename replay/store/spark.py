@@ -1,4 +1,4 @@
-"""A store through Spark's API: the same Delta tables, the same views.
+"""A store through Spark's API: the same Delta tables, and views.sql in Spark's SQL.
 
 Works with any session that reads Delta: a Spark cluster with the Delta package, or Sail (`pip
 install 'restock[spark]'`), which speaks Spark's protocol without a JVM.
@@ -6,6 +6,7 @@ install 'restock[spark]'`), which speaks Spark's protocol without a JVM.
 
 from __future__ import annotations
 
+import re
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,40 @@ from restock.ingest.store.location import Location
 from restock.ingest.store.writer import RECORDINGS, TRANSITIONS
 from restock.replay.store.store import is_store
 
+# The view that no rule translates: DuckDB adds the columns that rows of an older store lack.
+_BY_HAND = {
+    "transitions": """
+CREATE OR REPLACE TEMPORARY VIEW transitions AS
+SELECT stored_transitions.*, stamp_ns + coalesce(clock_offset_ns, 0) AS logged_ns
+FROM stored_transitions
+JOIN (SELECT ingest_id AS of_ingest, clock_offset_ns FROM stored_recordings) AS offsets
+    ON stored_transitions.ingest_id = offsets.of_ingest"""
+}
+
+# What Spark calls by another name, as patterns of the text of views.sql.
+_RULES = (
+    (r"CREATE OR REPLACE VIEW", "CREATE OR REPLACE TEMPORARY VIEW"),
+    (r"\bunnest\(", "explode("),
+    (r"\blist_sort\(", "sort_array("),
+    (r"\blist_distinct\(", "array_distinct("),
+    (r"\blist\(DISTINCT ", "collect_set("),
+    (r"\blist\(", "collect_list("),
+    (r"\barg_min\(", "min_by("),
+    (r"\bjson_extract_string\(", "get_json_object("),
+    (r"\bquantile_cont\(", "percentile("),
+    (r"\bquantile_disc\((\w+), ([\d.]+)\)", r"percentile_disc(\2) WITHIN GROUP (ORDER BY \1)"),
+    (r"\bepoch_ns\(now\(\)\)", "unix_micros(now()) * 1000"),
+    (r"\bmake_timestamp_ns\((\w+\(\w+\))\)", r"timestamp_micros(CAST(\1 DIV 1000 AS BIGINT))"),
+    (r"\[\]", "CAST(array() AS ARRAY<STRING>)"),
+    (r"\blist_extract\(", "element_at("),
+    (r"\brange\(len\((\w+)\)\)", r"sequence(0, size(\1) - 1)"),
+    (r'\[\["DOUBLE"\]\]', "array<array<double>>"),
+    (r"\[\{(.*)\}\]", r"array<struct<\1>>"),
+    (r'"(\w+)": "(\w+)"', r"\1: \2"),
+    (r"\bVARCHAR\b", "STRING"),
+    (r"(\w+) IS DISTINCT FROM (\w+\(\w+\) OVER \([^)]*\))", r"NOT (\1 <=> \2)"),
+    (r"\bANTI JOIN", "LEFT ANTI JOIN"),
+)
 _LATER = {
     "perturbation": "CAST(NULL AS STRING) AS perturbation",
     "perturbation_values": "CAST(NULL AS MAP<STRING, DOUBLE>) AS perturbation_values",
@@ -30,7 +65,7 @@ def install_views(session: SparkSession | Any, store: str | Path, *, scheme: str
     """Give a session the views of a store: transitions, episodes, coverage, missing_cells, …
 
     They are temporary views over the store's newest version, and stay at it where the session
-    plans a query anew; call it again after an ingest.
+    plans a query again; call it again after an ingest.
 
     Args:
         session: a Spark session, of Spark Connect or classic.
@@ -60,9 +95,12 @@ def install_views(session: SparkSession | Any, store: str | Path, *, scheme: str
 
 
 def statements() -> Iterator[str]:
-    """The statements of spark.sql, in their order, without comments."""
-    text = (files("restock.replay.store") / "spark.sql").read_text(encoding="utf-8")
-    lines = [line for line in text.splitlines() if not line.startswith("--")]
-    for statement in "\n".join(lines).split(";\n"):
+    """The statements of views.sql in Spark's SQL, in their order, without comments."""
+    text = (files("restock.replay.store") / "views.sql").read_text(encoding="utf-8")
+    text = re.sub(r" *--.*", "", text)
+    for pattern, spark in _RULES:
+        text = re.sub(pattern, spark, text)
+    for statement in text.split(";\n"):
         if statement.strip():
-            yield statement.strip().removesuffix(";")
+            name = statement.partition(" VIEW ")[2].split()[0]
+            yield _BY_HAND.get(name) or statement.strip()

@@ -1,10 +1,12 @@
 -- The views of a store, over stored_transitions and stored_recordings (its Parquet as it lies).
 -- Every column is documented in columns.toml (those of `transitions` in ingest/schema.py), and a
--- test holds that.
+-- test holds that. `spark.py` translates these statements into Spark's SQL, by its table of rules and
+-- of the few that no rule translates.
 
 -- A recording's manifest row is committed before its transitions: an ingest that was cut between
 -- the two is in stored_recordings and in no view.
 CREATE OR REPLACE VIEW recordings AS
+SELECT *
 FROM stored_recordings
 WHERE ingest_id IN (SELECT ingest_id FROM stored_transitions);
 
@@ -27,27 +29,41 @@ CREATE OR REPLACE VIEW actions AS
 SELECT
     task_hash,
     action,
-    (commands[action + 1] ->> 0)::DOUBLE AS speed_mps,
-    (commands[action + 1] ->> 1)::DOUBLE AS yaw_rate_radps
+    list_extract(list_extract(commands, action + 1), 1) AS speed_mps,
+    list_extract(list_extract(commands, action + 1), 2) AS yaw_rate_radps
 FROM (
-    SELECT DISTINCT task_hash, (task_json::JSON -> 'actions')::JSON[] AS commands FROM recordings
-), LATERAL (SELECT unnest(range(len(commands)))::SMALLINT AS action);
+    SELECT task_hash, commands, CAST(position AS SMALLINT) AS action
+    FROM (
+        SELECT task_hash, commands, unnest(range(len(commands))) AS position
+        FROM (
+            SELECT DISTINCT
+                task_hash,
+                from_json(json_extract_string(task_json, '$.actions'), '[["DOUBLE"]]') AS commands
+            FROM recordings
+        )
+    )
+);
 
 -- The conditions that labelled the store, of the newest ingest, and nominal: none of them holds.
 CREATE OR REPLACE VIEW conditions AS
 SELECT
-    spec ->> 'name' AS condition,
-    spec ->> 'timing' AS timing,
-    (spec ->> 'priority')::INTEGER AS priority,
-    spec ->> 'sql' AS sql,
+    spec.name AS condition,
+    spec.timing AS timing,
+    spec.priority AS priority,
+    spec.sql AS sql,
     labels_version
 FROM (
-    SELECT labels_version, unnest(conditions_json::JSON::JSON[]) AS spec
-    FROM (FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1)
+    SELECT
+        labels_version,
+        unnest(from_json(
+            conditions_json,
+            '[{"name": "VARCHAR", "timing": "VARCHAR", "priority": "INTEGER", "sql": "VARCHAR"}]'
+        )) AS spec
+    FROM (SELECT * FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1)
 )
 UNION ALL
 SELECT 'nominal', 'pre', 1000, 'none of the others', labels_version
-FROM (FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1);
+FROM (SELECT * FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1);
 
 CREATE OR REPLACE VIEW episodes AS
 SELECT
@@ -71,29 +87,28 @@ SELECT
         THEN bool_or(terminated AND reward > goal_reward / 2)
     END AS success,
     sum(progress_m) AS progress_m,
-    count(*) FILTER (bumped) AS bumped_steps,
+    count(*) FILTER (WHERE bumped) AS bumped_steps,
     min(clearance_m) AS clearance_min_m,
     list_sort(list_distinct(flatten(list(conditions)))) AS conditions,
     list_sort(list(DISTINCT behaviour_policy)) AS behaviour_policies,
     arg_min(behaviour_policy, step_index) AS first_policy,
-    count(*) FILTER (handover) AS handovers,
+    count(*) FILTER (WHERE handover) AS handovers,
     list_sort(list(DISTINCT zone)) AS zones
 FROM (
     SELECT
-        transitions.*,
-        behaviour_policy IS DISTINCT FROM lag(behaviour_policy, 1, behaviour_policy) OVER (
-            PARTITION BY transitions.episode_id ORDER BY transitions.step_index
-        ) AS handover,
-        goal_reward,
-        has_goal
+        *,
+        row_number() OVER (PARTITION BY episode_id ORDER BY step_index) > 1
+        AND behaviour_policy IS DISTINCT FROM lag(behaviour_policy) OVER (
+            PARTITION BY episode_id ORDER BY step_index
+        ) AS handover
     FROM transitions
     LEFT JOIN (
         SELECT DISTINCT
-            task_hash,
-            (task_json::JSON -> 'rewards' ->> 'goal')::DOUBLE AS goal_reward,
-            task_json::JSON ->> 'goal' = 'route' AS has_goal
+            task_hash AS of_task,
+            CAST(json_extract_string(task_json, '$.rewards.goal') AS DOUBLE) AS goal_reward,
+            json_extract_string(task_json, '$.goal') = 'route' AS has_goal
         FROM recordings
-    ) AS tasks USING (task_hash)
+    ) AS tasks ON transitions.task_hash = tasks.of_task
 )
 GROUP BY recording_id, episode_id;
 
@@ -108,13 +123,13 @@ SELECT
     count(*) / sum(count(*)) OVER () AS share,
     count(DISTINCT episode_id) AS episodes,
     avg(reward) AS reward_mean,
-    avg(terminated::INTEGER) AS terminal_fraction,
-    (count(DISTINCT episode_id) FILTER (success))
-        / nullif(count(DISTINCT episode_id) FILTER (success IS NOT NULL), 0) AS success_share
+    avg(CAST(terminated AS INTEGER)) AS terminal_fraction,
+    (count(DISTINCT episode_id) FILTER (WHERE success))
+        / nullif(count(DISTINCT episode_id) FILTER (WHERE success IS NOT NULL), 0) AS success_share
 FROM transitions
 JOIN (SELECT episode_id, success FROM episodes) USING (episode_id)
-GROUP BY ALL
-ORDER BY ALL;
+GROUP BY condition, action, zone, behaviour_policy
+ORDER BY condition, action, zone, behaviour_policy;
 
 -- One line a condition, those never seen included.
 CREATE OR REPLACE VIEW coverage_by_condition AS
@@ -127,17 +142,17 @@ WITH seen AS (
         count(DISTINCT zone) AS zones,
         list_sort(list(DISTINCT behaviour_policy)) AS behaviour_policies,
         avg(reward) AS reward_mean,
-        avg(terminated::INTEGER) AS terminal_fraction
+        avg(CAST(terminated AS INTEGER)) AS terminal_fraction
     FROM transitions
     GROUP BY condition
 ), by_episode AS (
     SELECT
         condition,
         count(*) AS episodes,
-        sum(n) ^ 2 / sum(n ^ 2) AS effective_episodes,
-        avg(success::INTEGER) AS success_share,
+        sum(n) * sum(n) / sum(n * n) AS effective_episodes,
+        avg(CAST(success AS INTEGER)) AS success_share,
         avg(return) AS return_mean
-    FROM (SELECT condition, episode_id, count(*) AS n FROM transitions GROUP BY ALL)
+    FROM (SELECT condition, episode_id, count(*) AS n FROM transitions GROUP BY condition, episode_id)
     JOIN episodes USING (episode_id)
     GROUP BY condition
 )
@@ -171,8 +186,8 @@ SELECT
     count(DISTINCT recording_id) AS recordings,
     list_sort(list(DISTINCT condition)) AS conditions,
     avg(reward) AS reward_mean,
-    (count(DISTINCT episode_id) FILTER (success))
-        / nullif(count(DISTINCT episode_id) FILTER (success IS NOT NULL), 0) AS success_share
+    (count(DISTINCT episode_id) FILTER (WHERE success))
+        / nullif(count(DISTINCT episode_id) FILTER (WHERE success IS NOT NULL), 0) AS success_share
 FROM transitions
 JOIN (SELECT episode_id, success FROM episodes) USING (episode_id)
 GROUP BY perturbation
@@ -214,10 +229,10 @@ SELECT
     min(reward) AS reward_min,
     quantile_cont(reward, 0.5) AS reward_median,
     max(reward) AS reward_max,
-    avg((reward > 0)::INTEGER) AS positive_share,
-    avg((reward < -0.5)::INTEGER) AS penalty_share,
-    avg(terminated::INTEGER) AS terminal_fraction,
-    avg(truncated::INTEGER) AS truncated_fraction
+    avg(CAST(reward > 0 AS INTEGER)) AS positive_share,
+    avg(CAST(reward < -0.5 AS INTEGER)) AS penalty_share,
+    avg(CAST(terminated AS INTEGER)) AS terminal_fraction,
+    avg(CAST(truncated AS INTEGER)) AS truncated_fraction
 FROM transitions
 GROUP BY condition
 ORDER BY rows DESC, condition;
@@ -249,7 +264,7 @@ FROM held AS a
 JOIN held AS b ON a.transition_id = b.transition_id AND a.condition <> b.condition
 JOIN counts ON counts.condition = a.condition
 GROUP BY a.condition, b.condition
-ORDER BY ALL;
+ORDER BY condition, other;
 
 -- Definitions in use: more than one line means that rows were made or labelled in different ways.
 CREATE OR REPLACE VIEW versions AS
@@ -261,14 +276,14 @@ SELECT
     count(*) AS rows,
     count(DISTINCT recording_id) AS recordings
 FROM transitions
-GROUP BY ALL
+GROUP BY task_hash, labels_version, profile_hash, restock_version
 ORDER BY rows DESC;
 
 -- What an ingest left out, and why.
 CREATE OR REPLACE VIEW drops AS
 SELECT recording_id, source_file, dropped.reason AS reason, dropped.count AS count
 FROM (SELECT recording_id, source_file, unnest(drops) AS dropped FROM recordings)
-ORDER BY ALL;
+ORDER BY recording_id, source_file, reason, count;
 
 -- How good the labels are, where the recording knew the true condition.
 CREATE OR REPLACE VIEW label_scores AS
@@ -280,7 +295,7 @@ SELECT
     score.labelled AS labelled,
     score.support AS support
 FROM (SELECT recording_id, unnest(label_scores) AS score FROM recordings)
-ORDER BY ALL;
+ORDER BY recording_id, condition;
 
 -- Topics of each recording: expected against decoded messages.
 CREATE OR REPLACE VIEW topics AS
@@ -293,4 +308,4 @@ SELECT
     topic.skipped AS skipped,
     topic.reason AS reason
 FROM (SELECT recording_id, unnest(topics) AS topic FROM recordings)
-ORDER BY ALL;
+ORDER BY recording_id, topic;
