@@ -133,6 +133,8 @@ def _check(name: str, kind: inspect.Type, value: Any) -> None:
             _check(name, option, value)
         return
     if isinstance(kind, inspect.TupleType):
+        if len(value) != len(kind.item_types):
+            raise ValueError(f"{name} must have {len(kind.item_types)} values, got {len(value)}")
         for index, (one_kind, one) in enumerate(zip(kind.item_types, value, strict=True)):
             _check(f"{name}[{index}]", one_kind, one)
         return
@@ -205,7 +207,9 @@ def _walk(kind: inspect.Type, value: Any, path: str) -> tuple[dict[str, float], 
     if isinstance(kind, inspect.StructType | inspect.TypedDictType | inspect.DataclassType):
         fields = {field.encode_name: field.type for field in kind.fields}
         name = step[1:]
-        found = _walk(fields[name], value[name], rest) if name in fields else None
+        if name not in fields or not isinstance(value, Mapping) or name not in value:
+            return None
+        found = _walk(fields[name], value[name], rest)
         return found and (found[0], found[1], _join(name, found[2]))
     item = _item(kind)
     if isinstance(kind, inspect.TupleType):
@@ -217,7 +221,9 @@ def _walk(kind: inspect.Type, value: Any, path: str) -> tuple[dict[str, float], 
             if isinstance(one, int | float | Mapping | list) and (found := _walk(item, one, rest)):
                 return found[0], found[1], _join(str(name), found[2])
         return None
-    found = _walk(item, value[int(step[1:-1])], rest)
+    index = int(step[1:-1])
+    # `[...]` may stand for another item of the map, one that is longer.
+    found = _walk(item, value[index], rest) if index < len(value) else None
     return found and (found[0], found[1], _join(step, found[2]))
 
 

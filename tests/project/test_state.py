@@ -7,8 +7,13 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
-from restock.state import Stateful
+from restock.state import Stateful, restored, saved
 
 
 class Point(msgspec.Struct, frozen=True):
@@ -54,3 +59,83 @@ def test_what_is_saved_is_what_is_restored() -> None:
     assert second.points == first.points
     assert second.total == 5
     assert second.rng.random() == first.rng.random()
+
+
+json_values = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**53), 2**53)
+    | st.floats(allow_nan=False)
+    | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+@given(json_values)
+def test_a_plain_value_comes_back_equal_and_of_its_kind(value: Any) -> None:
+    again = restored(value, json.loads(json.dumps(saved(value))))
+    assert again == value
+    assert type(again) is type(value)
+
+
+@given(hnp.arrays(hnp.scalar_dtypes(), hnp.array_shapes(min_dims=0, min_side=0)))
+def test_an_array_comes_back_with_its_type_and_shape(array: np.ndarray[Any, Any]) -> None:
+    state = saved(array)
+    assert not np.shares_memory(state, array)
+    again = restored(np.empty(0, array.dtype), state)
+    assert again.dtype == array.dtype
+    np.testing.assert_array_equal(again, array)
+    assert not np.shares_memory(again, state)
+
+
+@pytest.mark.parametrize("value", [np.float32(1.5), np.int64(3), np.bool_(True)])
+def test_a_number_of_numpy_is_saved_as_json_has_it(value: Any) -> None:
+    assert json.loads(json.dumps(saved(value))) == value
+
+
+@pytest.mark.parametrize("bits", [np.random.PCG64, np.random.SFC64])
+def test_a_generator_goes_on_where_it_was(bits: Any) -> None:
+    generator, other = np.random.Generator(bits(1)), np.random.Generator(bits(2))
+    assert restored(other, saved(generator)) is other
+    assert other.random() == generator.random()
+
+
+def test_a_network_is_restored_in_place() -> None:
+    first, second = torch.nn.Linear(2, 1), torch.nn.Linear(2, 1)
+    assert restored(second, saved(first)) is second
+    assert torch.equal(first.weight, second.weight)
+
+
+def test_a_list_or_mapping_of_another_length_is_taken_as_it_was_saved() -> None:
+    assert restored([], [1, [2, 3]]) == [1, [2, 3]]
+    assert restored({"a": 1}, {"b": 2, "c": 3}) == {"b": 2, "c": 3}
+    assert restored((0, np.zeros(1)), [4, [2.5]])[1].dtype == np.float64
+    assert restored((0, 1), [4, 5]) == (4, 5)
+    assert restored(None, 4) == 4
+    assert restored(4, None) is None
+    assert restored(0.5, 1) == 1.0
+    assert isinstance(restored(0.5, 1), float)
+
+
+def test_a_state_that_lacks_a_name_is_refused() -> None:
+    state = Outer().state_dict()
+    del state["inner"]
+    with pytest.raises(KeyError, match="inner"):
+        Outer().load_state_dict(state)
+
+
+def test_objects_in_lists_and_mappings_are_restored_in_place() -> None:
+    class Many(Stateful):
+        STATE = ("by_name", "in_turn")
+
+        def __init__(self) -> None:
+            self.by_name = {"a": Inner()}
+            self.in_turn = [Inner(), Inner()]
+
+    first, second = Many(), Many()
+    first.by_name["a"].count, first.in_turn[1].count = 3, 4
+    kept = second.by_name["a"], *second.in_turn
+    second.load_state_dict(json.loads(json.dumps(first.state_dict())))
+    assert [inner.count for inner in kept] == [3, 0, 4]
+    assert (second.by_name["a"], *second.in_turn) == kept

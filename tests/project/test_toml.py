@@ -1,0 +1,194 @@
+"""Typed TOML: values read back equal; a key or a value that does not fit is named."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec import Meta
+
+from restock.errors import ConfigError
+from restock.toml import Checked, read_toml, toml_value, typed
+from restock.train.dqn.config import apply_overrides, as_overrides
+
+plain = st.recursive(
+    st.booleans()
+    | st.integers(-(2**63), 2**63 - 1)
+    | st.floats(allow_nan=False)
+    | st.text(st.characters(codec="utf-8")),
+    lambda inner: (
+        st.lists(inner) | st.dictionaries(st.text("abc_1", min_size=1), inner, max_size=3)
+    ),
+    max_leaves=8,
+)
+
+
+@given(plain)
+def test_a_value_reads_back_equal(value: Any) -> None:
+    assert tomllib.loads(f"key = {toml_value(value)}")["key"] == value
+
+
+def test_what_is_no_number_reads_back_so() -> None:
+    assert math.isnan(tomllib.loads(f"key = {toml_value(math.nan)}")["key"])
+
+
+def test_a_setting_keeps_letters_beyond_16_bits() -> None:
+    settings = {"env": {"layouts": "halls/\U0001f4e6.toml"}}
+    assert apply_overrides({}, as_overrides(settings)) == settings
+
+
+Share = Annotated[float, Meta(ge=0, lt=1)]
+Count = Annotated[int, Meta(ge=1)]
+
+
+class Inner(Checked, frozen=True):
+    share: Share = 0.5
+    parts: tuple[Share, ...] = ()
+
+
+class Config(Checked, frozen=True):
+    share: Share = 0.5
+    count: Count = 1
+    positive: Annotated[float, Meta(gt=0)] = 1.0
+    most: Annotated[float, Meta(le=1)] = 1.0
+    low: Annotated[float, Meta(gt=-1, le=1)] = 0.0
+    list_of: list[Share] = msgspec.field(default_factory=list)
+    tuple_of: tuple[Share, ...] = ()
+    pair: tuple[Share, Count] = (0.0, 1)
+    table: dict[str, Share] = msgspec.field(default_factory=dict)
+    lists: dict[str, tuple[Share, ...]] = msgspec.field(default_factory=dict)
+    maybe: Share | None = None
+    either: Literal["auto"] | Share = "auto"
+    several: float | list[Share] | dict[str, Share] = 0.0
+    inner: Inner = Inner()
+    inners: tuple[Inner, ...] = ()
+    by_name: dict[str, Inner] = msgspec.field(default_factory=dict)
+    free: str = ""
+
+    def check(self) -> None:
+        if self.count > 1 and self.free:
+            raise ValueError("count must be 1 where free is given")
+
+
+# What is wrong, and how both a file and Python say so.
+REFUSED: list[tuple[dict[str, Any], str]] = [
+    ({"share": 1.0}, "share must be in [0, 1), got 1.0"),
+    ({"share": -0.5}, "share must be in [0, 1), got -0.5"),
+    ({"share": math.nan}, "share must be in [0, 1), got nan"),
+    ({"count": 0}, "count must be at least 1, got 0"),
+    ({"positive": 0.0}, "positive must be above 0, got 0.0"),
+    ({"most": 1.5}, "most must be at most 1, got 1.5"),
+    ({"low": -1.0}, "low must be in (-1, 1], got -1.0"),
+    ({"list_of": [0.1, 7.0]}, "list_of[1] must be in [0, 1), got 7.0"),
+    ({"tuple_of": [7.0]}, "tuple_of[0] must be in [0, 1), got 7.0"),
+    ({"pair": [0.5, 0]}, "pair[1] must be at least 1, got 0"),
+    ({"table": {"a": 0.1, "b": 2.0}}, "table.b must be in [0, 1), got 2.0"),
+    ({"lists": {"a": [0.1], "b": [0.1, 3.0]}}, "lists.b[1] must be in [0, 1), got 3.0"),
+    ({"maybe": 2.0}, "maybe must be in [0, 1), got 2.0"),
+    ({"either": 2.0}, "either must be in [0, 1), got 2.0"),
+    ({"several": [0.1, 3.0]}, "several[1] must be in [0, 1), got 3.0"),
+    ({"several": {"a": 3.0}}, "several.a must be in [0, 1), got 3.0"),
+    ({"count": 2, "free": "x"}, "count must be 1 where free is given"),
+]
+IN_FILES: list[tuple[dict[str, Any], str]] = [
+    ({"inner": {"share": 3.0}}, "inner.share must be in [0, 1), got 3.0"),
+    ({"inners": [{}, {"parts": [0.1, 2.0]}]}, "inners[1].parts[1] must be in [0, 1), got 2.0"),
+    ({"by_name": {"a": {}, "b": {"share": 3.0}}}, "by_name.b.share must be in [0, 1), got 3.0"),
+    ({"nothing": 1}, "unknown key `nothing`"),
+    ({"inners": [{"nothing": 1}]}, "unknown key `inners[0].nothing`"),
+    ({"share": "x"}, "`share`: Expected `float`, got `str`"),
+    ({"share": True}, "`share`: Expected `float`, got `bool`"),
+    ({"either": "no"}, "`either`: Invalid enum value 'no'"),
+]
+
+
+@pytest.mark.parametrize(("values", "message"), REFUSED, ids=lambda value: str(value)[:40])
+def test_a_file_and_python_refuse_a_value_in_the_same_words(
+    values: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError) as in_python:  # noqa: PT011
+        Config(**values)
+    assert str(in_python.value) == message
+    with pytest.raises(ConfigError) as in_a_file:
+        typed(values, Config, where="config.toml")
+    assert str(in_a_file.value) == f"config.toml: {message}"
+
+
+@pytest.mark.parametrize(("values", "message"), IN_FILES, ids=lambda value: str(value)[:40])
+def test_a_file_names_the_key_where_it_stands(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        typed(values, Config, where="config.toml", remedy="see the docs")
+    assert str(refused.value) == f"config.toml: {message}\n  see the docs"
+    assert refused.value.where == "config.toml"
+
+
+def test_errors_name_keys_below_a_prefix() -> None:
+    for values, message in (
+        ({"share": 3.0}, "env.share must be in [0, 1), got 3.0"),
+        ({"nothing": 1}, "unknown key `env.nothing`"),
+    ):
+        with pytest.raises(ConfigError) as refused:
+            typed(values, Config, where="--set", prefix="env")
+        assert str(refused.value) == f"--set: {message}"
+
+
+def test_a_missing_key_is_named() -> None:
+    class Needs(Checked, frozen=True):
+        name: str
+
+    with pytest.raises(ConfigError, match="missing key `name`"):
+        typed({}, Needs, where="config.toml")
+
+
+def test_a_pair_of_another_length_is_refused_in_python_too() -> None:
+    with pytest.raises(ValueError, match="pair must have 2 values, got 1"):
+        Config(pair=(0.5,))  # type: ignore[arg-type]
+
+
+def test_a_renamed_key_is_refused_with_its_new_name() -> None:
+    renamed = {"portion": "share", "inner.portion": "inner.share"}
+    for values, old, new in (
+        ({"portion": 0.1}, "portion", "share"),
+        ({"inner": {"portion": 0.1}}, "inner.portion", "inner.share"),
+    ):
+        with pytest.raises(ConfigError) as refused:
+            typed(values, Config, where="config.toml", renamed=renamed)
+        assert refused.value.what == f"unknown key `{old}`"
+        assert refused.value.remedy == f"it is now called `{new}`: rename it"
+    assert typed({"share": 0.1}, Config, where="config.toml", renamed=renamed).share == 0.1
+
+
+@given(st.floats(allow_nan=False), st.integers(-3, 3))
+def test_what_a_file_accepts_python_accepts(share: float, count: int) -> None:
+    def made(how: Any) -> Config | None:
+        try:
+            config: Config = how()
+        except (ValueError, ConfigError):
+            return None
+        return config
+
+    values = {"share": share, "count": count, "list_of": [share], "inner": {"share": share}}
+    in_a_file = made(lambda: typed(values, Config, where="config.toml"))
+    in_python = made(lambda: Config(share, count, list_of=[share], inner=Inner(share)))
+    assert in_a_file == in_python
+    assert (in_a_file is None) == (not 0 <= share < 1 or count < 1)
+    if in_a_file is not None:
+        assert typed(msgspec.to_builtins(in_a_file), Config, where="again") == in_a_file
+
+
+def test_a_file_that_cannot_be_read_says_why(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"cannot be read: No such file(.|\n)*check the path"):
+        read_toml(tmp_path / "none.toml")
+    (tmp_path / "bad.toml").write_text("a = [1", encoding="utf-8")
+    (tmp_path / "latin.toml").write_bytes(b"a = '\xe9'")
+    for name in ("bad.toml", "latin.toml"):
+        with pytest.raises(ConfigError, match="is not TOML"):
+            read_toml(tmp_path / name)
+    (tmp_path / "good.toml").write_text("a = 1\n[b]\nc = 'x'", encoding="utf-8")
+    assert read_toml(tmp_path / "good.toml") == {"a": 1, "b": {"c": "x"}}
