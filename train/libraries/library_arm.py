@@ -35,9 +35,10 @@ from restock.train.evaluation.evaluate import (
     run_episodes,
     score,
 )
+from restock.train.libraries.mixed_feed import create_run
 from restock.train.prepare import make_twin, resolve_config
 from restock.train.run import checkpoint
-from restock.train.run.run import Run, now_ns, software_versions
+from restock.train.run.run import Run
 from restock.train.twin.floors.floors import layouts_of_split
 
 Library = Literal["sb3-dqn", "sb3-ppo"]
@@ -58,10 +59,10 @@ class LibraryArm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def check_installed() -> None:
     """Raises ConfigError where Stable-Baselines3 is not installed."""
     try:
-        found = importlib.util.find_spec("stable_baselines3") is not None
+        installed = importlib.util.find_spec("stable_baselines3") is not None
     except ValueError:  # a module that was blocked
-        found = False
-    if not found:
+        installed = False
+    if not installed:
         raise ConfigError(
             "an arm trains with Stable-Baselines3, which is not installed",
             remedy="pip install stable-baselines3",
@@ -76,11 +77,11 @@ def resolve(settings: tuple[str, ...], library: Library) -> TrainConfig:
     """
     config = load_config(None, settings)
     plain = NetworkConfig(hidden=config.network.hidden, layer_norm=False)
-    asked = msgspec.structs.replace(config.network, layer_norm=False)
+    without_norm = msgspec.structs.replace(config.network, layer_norm=False)
     refused = [
         name
         for name, bad in (
-            ("network", asked != plain),
+            ("network", without_norm != plain),
             ("loss.munchausen", config.loss.munchausen > 0),
             ("replay.ring_reserved", config.replay.ring_reserved > 0),
             ("schedule.seconds", config.schedule.seconds is not None),
@@ -157,16 +158,16 @@ class Evaluations:
             control_period_s=self.task.control_period_s,
             time_limit_steps=self.task.time_limit_steps,
         )
-        self.at, found = env_steps, score(results)
+        self.at, evaluated = env_steps, score(results)
         clocks = {"env_steps": env_steps, "gradient_steps": gradient_steps}
-        if best := found.beats(self.best):
-            self.best = found
+        if best := evaluated.beats(self.best):
+            self.best = evaluated
             state = {
                 "network": dict(network.state_dict()),
                 "observation_size": network.observation_size,
                 "actions": network.actions,
                 "task_hash": self.task.hash,
-                "score": asdict(found),
+                "score": asdict(evaluated),
             }
             checkpoint.save(self.run.best, state | clocks)
         self.run.append("evaluations", [{**clocks, **r.row, "best": best} for r in results])
@@ -181,40 +182,32 @@ def train_library(arm: LibraryArm) -> None:
         RunError: there is something at `arm.out` already.
     """
     check_installed()
-    from importlib.metadata import version
-
     from restock.train.libraries import sb3_drive
 
     config = resolve(arm.settings, arm.library)
     profile = load_profile(config.profile)
     on_policy = arm.library == "sb3-ppo"
     arguments = (ppo_arguments if on_policy else dqn_arguments)(config) | arm.arguments
-    known = {"name": DISTRIBUTION, "version": version(DISTRIBUTION), "algorithm": arm.library}
+    known = {"name": DISTRIBUTION, "algorithm": arm.library}
     if on_policy:  # what its settings say of these is not in force
         known |= {"replay": "none: each rollout is learnt from, then forgotten", "target": "none"}
     elif arm.arguments:  # its own words may have changed replay, exploration or target
         known |= {"replay": f"changed by {arm.arguments}", "target": f"changed by {arm.arguments}"}
-    run = Run.create(
+    run = create_run(
         Path(arm.out),
-        {
-            "created_ns": now_ns(),
-            "library": known | {"arguments": arguments},
-            "config": msgspec.to_builtins(config),
-            "panel": None,
-            "target": {"rule": "none"} if on_policy else describe(config.target),
-            "task_hash": profile.task.hash,
-            "labels_version": profile.labels_version,
-            "profile": {"name": profile.name, "hash": profile.hash},
-            "seeds": {"run": config.seed, "evaluation": config.evaluation.seed},
-            "versions": software_versions() | {DISTRIBUTION: version(DISTRIBUTION)},
-        },
+        known | {"arguments": arguments},
+        profile,
+        None,
+        msgspec.to_builtins(config),
+        target={"rule": "none"} if on_policy else describe(config.target),
+        seeds={"run": config.seed, "evaluation": config.evaluation.seed},
     )
     began = time.monotonic()
     evaluations = Evaluations(run, config, profile.task)
     drive = sb3_drive.ppo if on_policy else sb3_drive.dqn
     env_steps, updates = drive(config, arguments, run, evaluations)
-    told = {"env_steps": env_steps, "updates": updates, "wall_s": time.monotonic() - began}
-    write_text(run.path / DONE, json.dumps(told, indent=1) + "\n")
+    ended = {"env_steps": env_steps, "updates": updates, "wall_s": time.monotonic() - began}
+    write_text(run.path / DONE, json.dumps(ended, indent=1) + "\n")
 
 
 def as_network(config: TrainConfig, task: Task, linears: list[Any]) -> QNetwork:
@@ -223,11 +216,11 @@ def as_network(config: TrainConfig, task: Task, linears: list[Any]) -> QNetwork:
 
     network = make_network(config.network, task.observation_size, len(task.actions))
     assert isinstance(network, QNetwork)  # an ensemble was refused
-    ours = [module for module in network.modules() if isinstance(module, torch.nn.Linear)]
+    layers = [module for module in network.modules() if isinstance(module, torch.nn.Linear)]
     with torch.no_grad():
-        for mine, theirs in zip(ours, linears, strict=True):
-            mine.weight.copy_(theirs.weight)
-            mine.bias.copy_(theirs.bias)
+        for layer, given in zip(layers, linears, strict=True):
+            layer.weight.copy_(given.weight)
+            layer.bias.copy_(given.bias)
     return network.eval()
 
 

@@ -9,7 +9,8 @@ does: `strata`, `ages`, `policies`, `sampled_episodes`, `episodes`, `audit` and 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -18,20 +19,21 @@ import torch
 from numpy.typing import NDArray
 
 from restock.errors import ConfigError, MixtureError, PanelError
-from restock.ingest.profile.profile import load_profile
+from restock.ingest.profile.profile import Profile, load_profile
 from restock.replay.panel.logged_sampler import BatchDraw, LoggedSampler
 from restock.replay.panel.panel import Panel
 from restock.train.dqn.loss import Loss
 from restock.train.feed.batch_record import FeedRecord
 from restock.train.feed.batches import Batch
+from restock.train.feed.fresh_log import values_entries
 from restock.train.feed.logs import Logs
-from restock.train.libraries.fresh_meta import FreshMeta
-from restock.train.libraries.info_labels import InfoLabels
-from restock.train.libraries.library_run import NullsForNaN, create_run, episode_row, known
-from restock.train.run.run import Run
+from restock.train.libraries.fresh_meta import FreshMeta, InfoLabels
+from restock.train.run.run import Run, now_ns, panel_document, software_versions
 from restock.train.run.run_tables import TABLES
 
 Ints = NDArray[np.int64]
+# Of an episode that ended, by the info of its last step.
+_INFO = ("episode_seed", "perturbation", "block", "success", "bumps")
 _NO_ROWS: Ints = np.empty(0, np.int64)
 NO_LOGS = BatchDraw(_NO_ROWS, _NO_ROWS, None, np.empty(0))
 
@@ -98,7 +100,9 @@ class MixedFeed:
                 "audit_share": audit_share,
                 "num_envs": num_envs,
             }
-            self.run = create_run(Path(run), library, definition, self.panel, settings)
+            self.run = create_run(
+                Path(run), {"name": library}, definition, self.panel, settings, seeds={"run": seed}
+            )
         self.record: FeedRecord | None = None
         self.fresh: Any = None
 
@@ -269,5 +273,84 @@ def _check(panel: Panel, task_hash: str, profile: str, observation_size: int) ->
             f"its rows are of task {panel.task_hash} ({panel.observation_size} entries an"
             f" observation), the environment's ({profile}) is {task_hash} ({observation_size})",
             where=str(panel.path),
-            remedy=f"ingest the logs with `--profile {profile}` and mix anew",
+            remedy=f"ingest the logs with `--profile {profile}` and mix again",
         )
+
+
+def create_run(
+    path: Path,
+    library: Mapping[str, Any],
+    profile: Profile,
+    panel: Panel | None,
+    config: Any,
+    *,
+    seeds: Mapping[str, int],
+    **more: Any,
+) -> Run:
+    """Make the run of a library by its distribution's `name`: its `config.json` says all of this.
+
+    Raises RunError when something is at `path` already.
+    """
+    name = library["name"]
+    mixed = None
+    if panel is not None:
+        strata = {stratum.name: stratum.share for stratum in panel.strata}
+        mixed = {**panel_document(panel), "strata": strata}
+    return Run.create(
+        path,
+        {
+            "created_ns": now_ns(),
+            "library": {"version": version(name), **library},
+            "config": config,
+            "panel": mixed,
+            **more,
+            "task_hash": profile.task.hash,
+            "labels_version": profile.labels_version,
+            "profile": {"name": profile.name, "hash": profile.hash},
+            "seeds": seeds,
+            "versions": software_versions() | {name: version(name)},
+        },
+    )
+
+
+class NullsForNaN:
+    """A run whose NaNs are nulls: what a library keeps to itself is not known here."""
+
+    def __init__(self, run: Run) -> None:
+        self.run = run
+
+    def append(self, table: str, rows: Sequence[Mapping[str, Any]]) -> None:
+        self.run.append(table, [{k: known(v) for k, v in row.items()} for row in rows])
+
+    def append_columns(self, table: str, columns: Mapping[str, Any]) -> None:
+        self.run.append_columns(table, {k: column(v) for k, v in columns.items()})
+
+
+def column(values: Any) -> Any:
+    """A column, or one value for all rows, without NaNs."""
+    if isinstance(values, np.ndarray) and values.dtype.kind == "f" and np.isnan(values).any():
+        return [known(value) for value in values.tolist()]
+    return known(values)
+
+
+def known(value: Any) -> Any:
+    """A value, or None for NaN."""
+    return None if isinstance(value, float) and value != value else value
+
+
+def episode_row(env: int, key: int, info: Mapping[str, Any]) -> dict[str, Any]:
+    """A row of `episodes`, as far as the last step's info tells."""
+    columns = set(TABLES["episodes"].names)
+    row = {"env": env, "episode": key, "conditions": []}
+    row |= {name: _plain(info[name]) for name in _INFO if name in info}
+    if "episode_condition" in info:
+        row["true_condition"] = _plain(info["episode_condition"])
+    if "perturbation_values" in info:
+        row["perturbation_values"] = values_entries(str(_plain(info["perturbation_values"])))
+    if "episode_steps" in info:
+        row["steps"] = _plain(info["episode_steps"])
+    return {name: value for name, value in row.items() if name in columns}
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if hasattr(value, "item") else value

@@ -22,9 +22,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.train.dqn.config import TrainConfig
-from restock.train.libraries.info_labels import InfoLabels
+from restock.train.libraries.fresh_meta import InfoLabels
 from restock.train.libraries.library_arm import Evaluations, as_network
-from restock.train.libraries.library_run import NullsForNaN, episode_row
+from restock.train.libraries.mixed_feed import NullsForNaN, episode_row
 from restock.train.libraries.sb3_buffer import MixtureReplayBuffer, dqn_critic
 from restock.train.run.run import Run
 from restock.train.run.run_tables import TABLES
