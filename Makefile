@@ -11,7 +11,7 @@ help:
 	@echo "make test         the tests (make test-slow: the slow ones too)"
 	@echo "make neighbours   a Python with d3rlpy and lerobot, for the tests that read exports with them"
 	@echo "make lint         ruff and mypy"
-	@echo "make sample-logs  record sample_logs/ anew from its seed"
+	@echo "make sample-logs  record sample_logs/ again from its seed"
 
 # The stamp files make each target install only what it needs, once per change of pyproject.toml.
 $(VENV)/.runtime: pyproject.toml

@@ -16,7 +16,7 @@ from restock.errors import ExitCode, RestockError
 
 # verb -> what it does, in the order of the work
 VERBS = {
-    "record": "drive the simulated stand-in and write what a real robot would log",
+    "record": "drive a simulated robot and write what a real one would log",
     "info": "what is in these recordings?",
     "profile": "propose a profile for an unknown robot, or check one against a recording",
     "ingest": "recordings -> labelled Parquet transitions in a store",
@@ -49,8 +49,8 @@ def usage() -> str:
     verbs = "\n".join(f"  {name:<{width}}  {summary}" for name, summary in VERBS.items())
     return f"""usage: restock VERB [--help] …
 
-Turns robot logs into labelled transitions, shows in SQL what is missing, mixes a replay diet
-that keeps the rare conditions stocked, and fine-tunes a DQN in a MuJoCo twin.
+Turns robot logs into labelled transitions, shows in SQL what is missing, mixes replay batches
+with quotas for rare conditions, and fine-tunes a DQN in a MuJoCo twin.
 
 {verbs}
 
