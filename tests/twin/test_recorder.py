@@ -92,11 +92,11 @@ def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["--conditions", "icy=1"], "'icy' is no kind of mission"),
-        (["--conditions", "nominal=lots"], "'lots' is no share"),
+        (["--conditions", "icy=1"], "'icy' is unknown"),
+        (["--conditions", "nominal=lots"], "'lots' is not a number"),
         (["--conditions", "nominal=0"], "no condition has a share above 0"),
-        (["--rates", "lidar=5"], "no rate named 'lidar'"),
-        (["--rates", "scan=7"], "'7' is no rate"),
+        (["--rates", "lidar=5"], "'lidar' is unknown"),
+        (["--rates", "scan=7"], "scan must be 5 or 10, got 7"),
         (["--missions", "0"], "missions must be above 0"),
         (["--minutes", "1", "--missions", "1"], "exclude each other"),
         (["--seed", "-1"], "seed must be 0 or more"),

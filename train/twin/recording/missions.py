@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,27 +89,10 @@ def parse_shares(text: str) -> dict[str, float]:
     Raises:
         ConfigError: no such condition, no number, or nothing above 0.
     """
-    shares: dict[str, float] = {}
-    for part in filter(None, (part.strip() for part in text.split(","))):
-        name, _, number = part.partition("=")
-        if name not in KINDS or name in shares:
-            what = "given twice" if name in shares else "is no kind of mission"
-            raise ConfigError(
-                f"{name!r} {what}",
-                where="--conditions",
-                remedy=f"give shares of {', '.join(KINDS)}",
-            )
-        try:
-            share = float(number)
-        except ValueError:
-            share = -1.0
+    shares = parse_numbers(text, "--conditions", KINDS)
+    for name, share in shares.items():
         if not 0 <= share < float("inf"):
-            raise ConfigError(
-                f"{number!r} is no share",
-                where=f"--conditions {name}",
-                remedy="such as nominal=0.8",
-            )
-        shares[name] = share
+            raise ConfigError(f"must be at least 0, got {share}", where=f"--conditions {name}")
     if not sum(shares.values()) > 0:
         raise ConfigError(
             "no condition has a share above 0", where="--conditions", remedy="such as nominal=1"
@@ -117,4 +100,27 @@ def parse_shares(text: str) -> dict[str, float]:
     return shares
 
 
-__all__ = ["FLEET", "NATURAL", "Mission", "parse_shares", "schedule"]
+def parse_numbers(text: str, flag: str, names: Sequence[str]) -> dict[str, float]:
+    """`name=number,name=number` as a flag has it.
+
+    Raises:
+        ConfigError: a name that is none of `names` or is given twice, or a value that is not a
+            number.
+    """
+    numbers: dict[str, float] = {}
+    for part in filter(None, (part.strip() for part in text.split(","))):
+        name, _, number = part.partition("=")
+        if name not in names or name in numbers:
+            raise ConfigError(
+                f"{name!r} is {'given twice' if name in numbers else 'unknown'}",
+                where=flag,
+                remedy=f"give numbers for {', '.join(names)}",
+            )
+        try:
+            numbers[name] = float(number)
+        except ValueError as error:
+            raise ConfigError(f"{number!r} is not a number", where=f"{flag} {name}") from error
+    return numbers
+
+
+__all__ = ["FLEET", "NATURAL", "Mission", "parse_numbers", "parse_shares", "schedule"]

@@ -15,12 +15,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from restock.ingest.task.signals import wrap_angle
+from restock.toml import Checked
 from restock.train.twin.recording import robot_topics as topics
 from restock.train.twin.recording.bag_writer import Message
 from restock.train.twin.recording.drive import Drive, Lidar, Odometer
@@ -76,20 +78,26 @@ DELAYS = {
 MOST_NETWORK_MS = 3.0
 
 
-@dataclass(frozen=True)
-class Rates:
+Hertz = Annotated[float, Meta(gt=0, le=200)]
+
+
+class Rates(Checked, frozen=True):
     """Messages a second of each periodic topic. Commands come once a control tick."""
 
-    odom: float = 50.0
-    imu: float = 50.0
-    joint_states: float = 20.0
+    odom: Hertz = 50.0
+    imu: Hertz = 50.0
+    joint_states: Hertz = 20.0
     scan: float = 10.0
-    amcl_pose: float = 10.0
-    tf: float = 20.0
-    bumper: float = 10.0
-    diagnostics: float = 1.0
-    plan: float = 1.0  # and whenever it changes
-    traffic: float = 2.0  # while anyone moves
+    amcl_pose: Hertz = 10.0
+    tf: Hertz = 20.0
+    bumper: Hertz = 10.0
+    diagnostics: Hertz = 1.0
+    plan: Hertz = 1.0  # and whenever it changes
+    traffic: Hertz = 2.0  # while anyone moves
+
+    def check(self) -> None:
+        if self.scan not in (5, 10):
+            raise ValueError(f"scan must be 5 or 10, got {self.scan:g}")
 
 
 @dataclass

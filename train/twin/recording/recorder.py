@@ -10,16 +10,18 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from restock.errors import ConfigError
+from restock.toml import typed
 from restock.train.twin.env.interface import Policy
+from restock.train.twin.floors.cells import cells_of
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.physics.model import TRACK_M, WHEEL_RADIUS_M
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
@@ -28,7 +30,13 @@ from restock.train.twin.recording.bag_writer import Format, recording_sink
 from restock.train.twin.recording.drive import Lidar, Odometer
 from restock.train.twin.recording.drivers import BehaviourPolicies, ExternalPolicy
 from restock.train.twin.recording.fleet import Fleet
-from restock.train.twin.recording.missions import HANDOVER, NATURAL, SCRIPTED, schedule
+from restock.train.twin.recording.missions import (
+    HANDOVER,
+    NATURAL,
+    SCRIPTED,
+    parse_numbers,
+    schedule,
+)
 from restock.train.twin.recording.publish import Rates, Robot
 from restock.train.twin.recording.robot_topics import TOPICS
 
@@ -111,7 +119,7 @@ class RecordingPlan:
             "conditions": dict(self.conditions),
             "policy": self.policy,
             "epsilon": self.epsilon,
-            "rates_hz": {item.name: getattr(self.rates, item.name) for item in fields(Rates)},
+            "rates_hz": msgspec.structs.asdict(self.rates),
             "hardware": self.hardware.name,
             "layouts": self.layouts,
             "topics": [topic.name for topic in TOPICS],
@@ -198,8 +206,9 @@ def record(
         for driven in fleet.drive(islice(missions, plan.missions), drivers):
             if driven.floor is not floor:  # the map comes once, and again on another floor
                 floor = driven.floor
-                cells = _occupied(floor, MAP_CELL_M)
-                static = robot.static(start_ns, cells, MAP_CELL_M, (-MAP_CELL_M, -MAP_CELL_M))
+                racks = ~cells_of(floor, MAP_CELL_M).T
+                occupied = np.pad(racks, 1, constant_values=True)  # one cell of wall around
+                static = robot.static(start_ns, occupied, MAP_CELL_M, (-MAP_CELL_M, -MAP_CELL_M))
                 sink.write(static)
                 summary.topics.update(message.topic for message in static)
             start_ns += 50_000_000  # after the latched messages, or the pause
@@ -228,29 +237,10 @@ def parse_rates(text: str) -> Rates:
     """`odom=20,scan=5` to rates; topics left out keep their default.
 
     Raises:
-        ConfigError: no such topic, or no rate it can have.
+        ConfigError: no such topic, or a rate that it cannot have.
     """
-    given: dict[str, float] = {}
-    for part in filter(None, (part.strip() for part in text.split(","))):
-        name, _, number = part.partition("=")
-        if name not in {item.name for item in fields(Rates)}:
-            raise ConfigError(
-                f"no rate named {name!r}",
-                where="--rates",
-                remedy=f"give {', '.join(item.name for item in fields(Rates))}",
-            )
-        try:
-            given[name] = float(number)
-        except ValueError:
-            given[name] = 0.0
-        allowed = given[name] in (5, 10) if name == "scan" else 0 < given[name] <= 200
-        if not allowed:
-            raise ConfigError(
-                f"{number!r} is no rate in Hz",
-                where=f"--rates {name}",
-                remedy="5 or 10" if name == "scan" else "above 0, at most 200",
-            )
-    return replace(Rates(), **given)
+    rates = parse_numbers(text, "--rates", [field.name for field in msgspec.structs.fields(Rates)])
+    return typed(rates, Rates, where="--rates")
 
 
 def _robot(plan: RecordingPlan, fleet: Fleet) -> Robot:
@@ -264,17 +254,3 @@ def _robot(plan: RecordingPlan, fleet: Fleet) -> Robot:
     )
     rng = np.random.Generator(np.random.PCG64([plan.seed, 0x726F62]))
     return Robot(rng, lidar, plan.rates, Odometer(WHEEL_RADIUS_M, TRACK_M))
-
-
-def _occupied(warehouse: Warehouse, cell_m: float) -> NDArray[np.bool_]:
-    """The known map as cells, (rows of y, columns of x): the racks, and one cell of wall around."""
-    x = (np.arange(round(warehouse.width_m / cell_m)) + 0.5) * cell_m
-    y = (np.arange(round(warehouse.depth_m / cell_m)) + 0.5) * cell_m
-    cells = np.zeros((len(y), len(x)), np.bool_)
-    for rack in warehouse.racks:
-        inside_y, inside_x = (
-            (rack.y_min <= y) & (y <= rack.y_max),
-            (rack.x_min <= x) & (x <= rack.x_max),
-        )
-        cells |= inside_y[:, None] & inside_x[None, :]
-    return np.pad(cells, 1, constant_values=True)
