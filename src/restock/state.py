@@ -1,8 +1,8 @@
 """State that a checkpoint keeps, declared by name: what is saved is what is restored.
 
 A class names its attributes in `STATE`; each is an array, a number, a string, None, a list or dict
-of those, a generator, a torch module, a msgspec struct, or another object with `state_dict` and
-`load_state_dict`.
+of those, a generator, a tensor, a torch module, a msgspec struct, or another object with
+`state_dict` and `load_state_dict`.
 """
 
 from __future__ import annotations
@@ -17,19 +17,24 @@ import numpy as np
 class Stateful:
     """Saves and restores what `STATE` names.
 
-    `restored` is for what follows from the state and is not part of it.
+    `restored` is for what follows from the state and is not part of it. What `SAME` names is saved
+    too, and a state in which it is not as it is here is refused.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ()
+    SAME: ClassVar[tuple[str, ...]] = ()
     # Of values whose type the restored object's own does not show: `list[EpisodeSpec]`.
     STATE_TYPES: ClassVar[Mapping[str, Any]] = {}
 
     def state_dict(self) -> dict[str, Any]:
         """Arrays and JSON values, by the names in `STATE` (without a leading underscore)."""
-        return {_key(name): saved(getattr(self, name)) for name in self.STATE}
+        return {_key(name): saved(getattr(self, name)) for name in (*self.SAME, *self.STATE)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts everything where `state_dict` found it."""
+        """Puts everything where `state_dict` found it. Raises `mismatch` for another's state."""
+        for name in self.SAME:
+            if not _alike(saved(getattr(self, name)), state.get(_key(name))):
+                raise self.mismatch(_key(name), state.get(_key(name)))
         for name in self.STATE:
             value, kind = state[_key(name)], self.STATE_TYPES.get(name)
             if kind is None:
@@ -41,6 +46,10 @@ class Stateful:
     def restored(self) -> None:
         """Called after `load_state_dict`."""
 
+    def mismatch(self, name: str, value: Any) -> Exception:
+        """What is raised where a saved state has another `value` of a name in `SAME`."""
+        return ValueError(f"the saved state is of another {type(self).__name__}: {name} {value}")
+
 
 def saved(value: Any) -> Any:
     """A value as arrays and JSON values, sharing no memory with it."""
@@ -48,6 +57,10 @@ def saved(value: Any) -> Any:
         return value.bit_generator.state
     if hasattr(value, "state_dict"):
         return dict(value.state_dict())
+    if hasattr(value, "detach"):  # a tensor
+        return value.detach().cpu().clone()
+    if hasattr(value, "get_state"):  # torch's generator
+        return value.get_state().clone()
     if isinstance(value, np.ndarray):
         return value.copy()
     if isinstance(value, np.generic):
@@ -69,6 +82,13 @@ def restored(current: Any, state: Any) -> Any:
     if hasattr(current, "load_state_dict"):
         current.load_state_dict(state)
         return current
+    if state is None:
+        return None
+    if hasattr(current, "detach"):
+        return state.to(current.device, current.dtype, copy=True)
+    if hasattr(current, "get_state"):
+        current.set_state(state.cpu())
+        return current
     if isinstance(current, np.ndarray):
         return np.array(state, current.dtype)
     if isinstance(current, dict) and current.keys() == state.keys():
@@ -76,9 +96,15 @@ def restored(current: Any, state: Any) -> Any:
     if isinstance(current, list | tuple) and len(current) == len(state):
         pairs = zip(current, state, strict=True)
         return type(current)(restored(item, one) for item, one in pairs)
-    if isinstance(current, bool | int | float) and state is not None:
+    if isinstance(current, bool | int | float):
         return type(current)(state)
     return saved(state)
+
+
+def _alike(one: Any, other: Any) -> bool:
+    if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
+        return other is not None and np.array_equal(one, other)
+    return bool(one == other)
 
 
 def _key(name: str) -> str:

@@ -139,3 +139,41 @@ def test_objects_in_lists_and_mappings_are_restored_in_place() -> None:
     second.load_state_dict(json.loads(json.dumps(first.state_dict())))
     assert [inner.count for inner in kept] == [3, 0, 4]
     assert (second.by_name["a"], *second.in_turn) == kept
+
+
+def test_a_state_of_another_shape_is_refused() -> None:
+    class Shaped(Stateful):
+        SAME = ("shape", "sizes")
+        STATE = ("values",)
+
+        def __init__(self, *sizes: int) -> None:
+            self.shape, self.sizes = len(sizes), np.array(sizes)
+            self.values: np.ndarray[Any, Any] | None = np.zeros(3)
+
+    one = Shaped(1, 2)
+    one.values = None
+    other = Shaped(1, 2)
+    other.load_state_dict(one.state_dict())
+    assert other.values is None
+    other.load_state_dict(Shaped(1, 2).state_dict())
+    np.testing.assert_array_equal(other.values, np.zeros(3))
+    with pytest.raises(ValueError, match=r"another Shaped: sizes \[1 3\]"):
+        other.load_state_dict(Shaped(1, 3).state_dict())
+    with pytest.raises(ValueError, match=r"another Shaped: shape 3"):
+        other.load_state_dict(Shaped(1, 2, 3).state_dict())
+    with pytest.raises(ValueError, match=r"another Shaped: shape None"):
+        other.load_state_dict({"values": None})
+
+
+def test_tensors_and_their_generators_go_on() -> None:
+    tensor, generator = torch.arange(3), torch.Generator().manual_seed(1)
+    state = saved(tensor), saved(generator)
+    expected = torch.rand(2, generator=generator)
+    tensor += 1
+    other = torch.Generator().manual_seed(2)
+    assert restored(other, state[1]) is other
+    assert torch.equal(torch.rand(2, generator=other), expected)
+    again = restored(torch.zeros(0, dtype=torch.int64), state[0])
+    assert again.tolist() == [0, 1, 2]
+    again += 1
+    assert state[0].tolist() == [0, 1, 2]
