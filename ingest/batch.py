@@ -1,22 +1,38 @@
-"""Several recordings: one after the other, in several processes, or on a Ray cluster."""
+"""Several recordings: one after the other, in several processes, or on a Ray cluster.
+
+A process that dies (killed, or out of memory) costs the recording it had at hand, by name; the
+others go on, and another process takes its place. Processes are forked from a server that has
+imported what they need once: forking this process, with its threads, would not be safe. It imports
+that while this process does, so nothing here is imported before it is needed.
+"""
 
 from __future__ import annotations
 
+import multiprocessing
+import os
 import signal
+import threading
 import traceback
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from multiprocessing import forkserver
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import ForkServerContext, SpawnContext
+from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Generic, Literal, TypeVar, Union
 
 from restock.errors import RecordingError, RestockError
-from restock.ingest.pipeline import Outcome, ingest
-from restock.ingest.profile.profile import Profile
-from restock.ingest.store.writer import StoreWriter
-from restock.ingest.workers import side_by_side
 
-Result = tuple[Path, "Outcome | RestockError"]
+if TYPE_CHECKING:
+    from restock.ingest.pipeline import IngestResult
+    from restock.ingest.profile.profile import Profile
+
+Result = tuple[Path, Union["IngestResult", RestockError]]
 Engine = Literal["processes", "ray"]
+T = TypeVar("T")
+PATIENCE_S = 10  # for a worker that was told to stop, before it is killed
 AGAIN = "run it again: what is in the store already is left alone"
 
 
@@ -32,6 +48,9 @@ class Job:
 
     def run(self, path: Path) -> Result:
         """Ingest one recording. What goes wrong with it is an answer, too: the others go on."""
+        from restock.ingest.pipeline import ingest
+        from restock.ingest.store.writer import StoreWriter
+
         try:
             return path, ingest(
                 path,
@@ -91,3 +110,116 @@ def _died(path: Path, code: int) -> Result:
         where=str(path),
         remedy=f"where memory ran out, take fewer --workers; {AGAIN}",
     )
+
+
+@dataclass
+class _Worker(Generic[T]):
+    process: BaseProcess
+    pipe: Connection
+    at_hand: int | None = None  # place of its recording
+
+
+def side_by_side(
+    work: Callable[[Path], T],
+    paths: Sequence[Path],
+    workers: int,
+    *,
+    died: Callable[[Path, int], T],
+) -> Iterator[T]:
+    """What `work` gives for each path, in their order; `died(path, exit code)` where it died.
+
+    The largest recordings are begun first, so that no process is left alone with one at the end.
+    When the caller stops early, or Ctrl-C does, no work goes on.
+    """
+    ahead = deque(sorted(range(len(paths)), key=lambda place: -_size(paths[place])))
+    pool: list[_Worker[T]] = []
+    done: dict[int, T] = {}
+    context = _context()
+
+    def begin(worker: _Worker[T]) -> None:
+        """Hand it its next recording, or let it go."""
+        worker.at_hand = ahead.popleft() if ahead else None
+        if worker.at_hand is None:
+            worker.pipe.close()
+            pool.remove(worker)
+        else:
+            worker.pipe.send(paths[worker.at_hand])
+
+    def hire() -> None:
+        ours, theirs = context.Pipe()
+        process = context.Process(target=_serve, args=(theirs, work), daemon=True)
+        process.start()
+        theirs.close()
+        pool.append(_Worker(process, ours))
+        begin(pool[-1])
+
+    try:
+        for place in range(len(paths)):
+            while place not in done:
+                while ahead and len(pool) < workers:
+                    hire()
+                ready = wait([worker.pipe for worker in pool])
+                for worker in [worker for worker in pool if worker.pipe in ready]:
+                    assert worker.at_hand is not None
+                    try:
+                        done[worker.at_hand] = worker.pipe.recv()
+                    except (EOFError, ConnectionError):
+                        worker.process.join()
+                        path, code = paths[worker.at_hand], worker.process.exitcode or 0
+                        done[worker.at_hand] = died(path, code)
+                        worker.pipe.close()
+                        pool.remove(worker)
+                    else:
+                        begin(worker)
+            yield done.pop(place)
+    finally:
+        for worker in pool:
+            worker.process.terminate()
+        for worker in pool:
+            worker.process.join(PATIENCE_S)
+            worker.process.kill()
+
+
+def warm_up() -> None:
+    """Let the server of processes import what they need, while this process does."""
+    if isinstance(_context(), ForkServerContext):
+        forkserver.ensure_running()
+
+
+def _serve(pipe: Connection, work: Callable[[Path], T]) -> None:
+    """A worker: one recording after the other, until there is none, or nobody to answer to."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the parent decides
+    signal.signal(signal.SIGTERM, _stop)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+    try:
+        while True:
+            pipe.send(work(pipe.recv()))
+    except (EOFError, KeyboardInterrupt):
+        pipe.close()
+
+
+def _stop(*_: object) -> None:
+    """Stop as Ctrl-C would: between two steps of the work, which then cleans up."""
+    raise KeyboardInterrupt
+
+
+def _end_with(parent: int) -> None:
+    """End when the parent has: nobody would tell of what this process does."""
+    wait([parent])
+    os._exit(1)
+
+
+def _context() -> ForkServerContext | SpawnContext:
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["restock.ingest.batch", "restock.ingest.pipeline"])
+    return context
+
+
+def _size(path: Path) -> int:
+    """Bytes of a recording, a folder's files together; 0 where it is gone."""
+    files = path.rglob("*") if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files if file.is_file())

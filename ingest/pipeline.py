@@ -30,15 +30,14 @@ from restock.ingest.store.manifest import (
 )
 from restock.ingest.store.transitions import Provenance, recording_table
 from restock.ingest.store.writer import StoreWriter
-from restock.ingest.task.conditions import NOMINAL
-from restock.ingest.task.label_scores import LabelScore, label_scores
+from restock.ingest.task.conditions import NOMINAL, LabelScore, label_scores
 from restock.ingest.task.schema import recording_schema
 
 Status = Literal["written", "unchanged", "dry run"]
 
 
 @dataclass(frozen=True)
-class Outcome:
+class IngestResult:
     """What became of one recording: the counts of its manifest, and what else is worth saying."""
 
     path: str
@@ -67,7 +66,7 @@ def ingest(
     force: bool = False,
     salvage: bool = False,
     typestore: str | None = None,
-) -> Outcome:
+) -> IngestResult:
     """Read one recording and put its transitions in the store (None: a dry run).
 
     A recording that is in the store as this profile, these conditions and this software would
@@ -82,7 +81,7 @@ def ingest(
         if store is not None and not force:
             same = _unchanged(store, recording, profile)
             if same is not None:
-                return Outcome(str(path), "unchanged", same)
+                return IngestResult(str(path), "unchanged", same)
         try:
             return _Ingest(str(path), recording, profile).run(store)
         except RecordingError as error:
@@ -107,7 +106,7 @@ class _Ingest:
         self.path, self.recording, self.profile = path, recording, profile
         self.ingest_id = uuid.uuid4().hex[:16]
 
-    def run(self, store: StoreWriter | None) -> Outcome:
+    def run(self, store: StoreWriter | None) -> IngestResult:
         profile, columns = self.profile, read_topics(self.recording, self.profile)
         steps = steps_of(profile, columns)
         # What follows needs to know which topics said anything, and not what: let go of it.
@@ -135,7 +134,7 @@ class _Ingest:
         )
         counts = {name: int(holds[rows.starts].sum()) for name, holds in rows.labels.items()}
         counts[NOMINAL] = first[NOMINAL]
-        return Outcome(
+        return IngestResult(
             self.path,
             "written" if store else "dry run",
             manifest,

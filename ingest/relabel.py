@@ -22,8 +22,15 @@ from restock.ingest.store.episode_rows import episode_ends
 from restock.ingest.store.manifest import conditions_json, score_rows
 from restock.ingest.store.transitions import column_array, names_of
 from restock.ingest.store.writer import StoreWriter
-from restock.ingest.task.conditions import NOMINAL, Condition, label, labels_version, primary
-from restock.ingest.task.label_scores import LabelScore, label_scores
+from restock.ingest.task.conditions import (
+    NOMINAL,
+    Condition,
+    LabelScore,
+    label,
+    label_scores,
+    labels_version,
+    primary,
+)
 from restock.ingest.task.schema import recording_schema
 
 

@@ -11,15 +11,16 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import duckdb
-import msgspec
 import pyarrow as pa
+from msgspec import Meta
 
 from restock.errors import StoreError
 from restock.ingest.profile.signal_paths import PathProblem, SignalPath
 from restock.ingest.task.schema import COLUMNS
+from restock.toml import Checked
 
 if TYPE_CHECKING:
     from restock.ingest.decoding.field_paths import Leaf
@@ -32,21 +33,23 @@ _TAKEN = {"logged_ns", "row_"} | {column.name for column in COLUMNS}
 QUATERNION = ("x", "y", "z", "w")
 
 
-class CustomSignal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class CustomSignal(Checked, frozen=True):
     """One `[signals.NAME]` of a profile."""
 
     topic: str
     type: str
     path: str  # see `restock.ingest.profile.signal_paths`
     unit: str  # "V", "m", "1", …
-    max_age_s: float | None = None  # None: latched, held until the next message
+    max_age_s: Annotated[float, Meta(gt=0)] | None = (
+        None  # None: latched, held until the next message
+    )
     reduce: Reduce | None = None  # a list to one number; a quaternion to its yaw
     values: dict[str, float] | None = None  # what a text, bool or number stands for
     scale: float = 1.0  # stored = found * scale + offset
     offset: float = 0.0
     doc: str = ""
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
         try:
             path = SignalPath.read(self.path)
         except PathProblem as problem:
@@ -63,8 +66,6 @@ class CustomSignal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"path {self.path!r} gives one value: there is nothing to reduce")
         if not self.unit:
             raise ValueError('unit is empty: say "1" for what has none')
-        if self.max_age_s is not None and not self.max_age_s > 0:
-            raise ValueError(f"max_age_s must be above 0, got {self.max_age_s}")
 
     @property
     def read(self) -> SignalPath:

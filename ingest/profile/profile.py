@@ -10,37 +10,89 @@ one of yours.
 from __future__ import annotations
 
 import hashlib
-import re
-import tomllib
+from collections.abc import Iterator
 from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from restock.errors import ConfigError
 from restock.ingest.profile.custom_signal import CustomSignal, name_problem
-from restock.ingest.profile.inputs import (
-    FALLBACKS,
-    INPUT_FIELDS,
-    POSE_FALLBACK,
-    ROUTE_FALLBACK,
-    Input,
-    Inputs,
-    check_input,
-)
-from restock.ingest.task.condition_files import with_files
-from restock.ingest.task.conditions import Condition, label, labels_version, shipped
+from restock.ingest.task.conditions import Condition, label, labels_version, shipped, with_files
 from restock.ingest.task.schema import steps_schema
 from restock.ingest.task.task import Task
+from restock.toml import Checked, parse_toml, read_toml, typed
 
 ELSEWHERE = "elsewhere"
 
 
-class Clock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+# What each input must and may say of a message: signal-side name -> whether it is required.
+# `orientation` is a quaternion's path and becomes a yaw.
+INPUT_FIELDS: dict[str, dict[str, bool]] = {
+    "command": {"speed_mps": True, "yaw_rate_radps": True},
+    "pose": {"x_m": True, "y_m": True, "orientation": False, "yaw_rad": False},
+    "wheels": {"speed_mps": True, "yaw_rate_radps": True},
+    "imu": {"yaw_rate_radps": True, "accel_x_mps2": True},
+    "scan": {"ranges_m": True, "angle_min_rad": True, "angle_increment_rad": True},
+    "goal": {"x_m": True, "y_m": True},
+    "plan": {"x_m": True, "y_m": True},
+    "bumper": {"pressed": True},
+    "behaviour_policy": {"text": True},
+    "true_condition": {"text": True},
+    "perturbation": {"text": True},
+}
+
+# What stands in for an input that a profile leaves out, or marks optional and a recording lacks.
+FALLBACKS: dict[str, str] = {
+    "scan": "no lidar: every bearing counts as free up to range_max_m",
+    "imu": "gyro yaw rate taken from the wheels, acceleration 0",
+    "bumper": "never pressed",
+    "behaviour_policy": "the profile's behaviour_policy",
+    "true_condition": "unknown: labels are not scored",
+    "perturbation": "unknown: null, as of hardware",
+}
+POSE_FALLBACK = "from transforms, by [frames]"
+ROUTE_FALLBACK = "none: the task has no goal, progress is forward displacement"
+
+
+class Input(Checked, frozen=True):
+    """One topic, and which of its fields fill what."""
+
+    topic: str
+    type: str
+    fields: dict[str, str]
+    max_age_s: float | None = None  # None: latched, held until the next message
+    optional: bool = False
+
+
+class Inputs(Checked, frozen=True):
+    """The `[inputs]` of a profile."""
+
+    command: Input
+    wheels: Input
+    pose: Input | None = None
+    scan: Input | None = None
+    imu: Input | None = None
+    goal: Input | None = None
+    plan: Input | None = None
+    bumper: Input | None = None
+    behaviour_policy: Input | None = None
+    true_condition: Input | None = None
+    perturbation: Input | None = None
+
+    def items(self) -> Iterator[tuple[str, Input]]:
+        for name in self.__struct_fields__:
+            source = getattr(self, name)
+            if source is not None:
+                yield name, source
+
+
+class Clock(Checked, frozen=True):
     """The `[clock]` of a profile: what time is, and when the steps are."""
 
     alignment: Literal["header.stamp", "log_time"] = "header.stamp"
@@ -49,7 +101,7 @@ class Clock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     jump_s: float = 1.0  # a change of (log time - stamp) that means the clock was set
 
 
-class Episodes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Episodes(Checked, frozen=True):
     """The `[episodes]` of a profile: what cuts one, beside goals, gaps and clock jumps."""
 
     max_pose_jump_m: float = 1.0  # between two steps: the robot was carried, or relocalised
@@ -57,35 +109,33 @@ class Episodes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     plan_goal_tolerance_m: float = 0.5  # a plan that ends further from the goal is for another
 
 
-class Frames(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Frames(Checked, frozen=True):
     """The `[frames]` of a profile: poses are of `base` in `fixed`."""
 
     fixed: str = "map"
     base: str = "base_link"
-    max_age_s: float = 0.5  # of a transform of `topic`, at the step
+    max_age_s: Annotated[float, Meta(gt=0)] = 0.5  # of a transform of `topic`, at the step
     topic: str = "/tf"
     static_topic: str = "/tf_static"
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
         if self.fixed.strip("/") == self.base.strip("/"):
             raise ValueError(f"fixed and base are the same frame: {self.base!r}")
-        if not self.max_age_s > 0:
-            raise ValueError(f"max_age_s must be above 0, got {self.max_age_s}")
 
 
-class Zone(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Zone(Checked, frozen=True):
     """A named rectangle of the map: `box_m = [x0, y0, x1, y1]`."""
 
     name: str
     box_m: tuple[float, float, float, float]
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
         x0, y0, x1, y1 = self.box_m
         if not (x0 < x1 and y0 < y1):
             raise ValueError(f"box_m must be [x0, y0, x1, y1] with x0 < x1 and y0 < y1: {self}")
 
 
-class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Profile(Checked, frozen=True):
     """One kind of robot. Read with `load_profile`."""
 
     name: str
@@ -177,23 +227,21 @@ def load_profile(name_or_path: str | Path) -> Profile:
             where=where,
             remedy=f"did you mean {near[0]!r}?" if near else f"shipped are: {', '.join(names)}",
         )
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot be read as UTF-8 text: {error}", where=where) from error
-    return parse_profile(text, where=where, folder=path.parent)
+    return _typed(read_toml(path), where=where, folder=path.parent)
 
 
 def parse_profile(text: str, *, where: str, folder: Path | None = None) -> Profile:
     """A profile from its TOML text; `where` names it in errors, `.sql` files lie in `folder`."""
-    try:
-        said = with_files(tomllib.loads(text), folder, where)
-        _convert_signals(said.get("signals"), where)
-        profile = msgspec.convert(said, Profile)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"is not TOML: {error}", where=where) from error
-    except msgspec.ValidationError as error:
-        raise ConfigError(_explain(str(error)), where=where) from error
+    return _typed(parse_toml(text, where=where), where=where, folder=folder)
+
+
+def _typed(document: dict[str, Any], *, where: str, folder: Path | None) -> Profile:
+    document = with_files(document, folder, where)
+    signals = document.get("signals")
+    # Each by itself first: msgspec's paths leave out the keys of a table of tables.
+    for name, table in signals.items() if isinstance(signals, dict) else ():
+        typed(table, CustomSignal, where=where, prefix=f"signals.{name}")
+    profile = typed(document, Profile, where=where)
     _check(profile, where)
     return profile
 
@@ -212,7 +260,7 @@ def _check(profile: Profile, where: str) -> None:
     if doubled := sorted({name for name in names if names.count(name) > 1}):
         raise ConfigError(f"`conditions`: {', '.join(doubled)} given twice", where=where)
     for name, source in profile.inputs.items():
-        check_input(name, source, where, framed=profile.frames is not None)
+        _check_input(name, source, where, framed=profile.frames is not None)
     if profile.inputs.pose is None and profile.frames is None:
         raise ConfigError(
             "`inputs.pose` is missing, and there is no `frames`",
@@ -226,23 +274,38 @@ def _check(profile: Profile, where: str) -> None:
                 where=where,
                 remedy=f'name the topic of the {name}, or set task.goal = "none"',
             )
-    _check_signals(profile, where)
-    _check_conditions(profile, where)
-
-
-def _convert_signals(said: Any, where: str) -> None:
-    """Each signal by itself first: msgspec's paths leave out the keys of a table of tables."""
-    for name, table in said.items() if isinstance(said, dict) else ():
-        try:
-            msgspec.convert(table, CustomSignal)
-        except msgspec.ValidationError as error:
-            raise ConfigError(_explain(str(error), f"signals.{name}"), where=where) from error
-
-
-def _check_signals(profile: Profile, where: str) -> None:
     for name in profile.signals:
         if problem := name_problem(name):
             raise ConfigError(f"`signals.{name}`: {problem}", where=where)
+    _check_conditions(profile, where)
+
+
+def _check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
+    """That an input says what it must; `framed` where transforms can stand in for its pose.
+
+    Raises:
+        ConfigError: it does not; names the key.
+    """
+    known = INPUT_FIELDS[name]
+    unknown = sorted(source.fields.keys() - known.keys())
+    missing = sorted(
+        key for key, required in known.items() if required and key not in source.fields
+    )
+    if name == "pose" and not source.fields.keys() & {"orientation", "yaw_rad"}:
+        missing.append("orientation")
+    if unknown or missing:
+        problems = [f"unknown {key!r}" for key in unknown] + [f"missing {key!r}" for key in missing]
+        raise ConfigError(
+            f"`inputs.{name}.fields`: {', '.join(problems)}",
+            where=where,
+            remedy=f"{name} takes {', '.join(known)}",
+        )
+    if source.optional and name not in FALLBACKS and not (name == "pose" and framed):
+        raise ConfigError(
+            f"`inputs.{name}.optional`: nothing can stand in for {name}",
+            where=where,
+            remedy=f"optional may be {', '.join(FALLBACKS)}, and pose where there is [frames]",
+        )
 
 
 def _check_conditions(profile: Profile, where: str) -> None:
@@ -258,33 +321,3 @@ def _check_conditions(profile: Profile, where: str) -> None:
                 where=where,
                 remedy=error.remedy,
             ) from error
-
-
-def _explain(message: str, under: str = "") -> str:
-    """msgspec's message with the key as TOML writes it: `task.body.foo`, not `$.task.body`."""
-    said, _, path = message.partition(" - at `$")
-    path = ".".join(part for part in (under, path.rstrip("`").lstrip(".")) if part)
-    unknown = re.fullmatch(r"Object contains unknown field `(.*)`", said)
-    if unknown:
-        return f"unknown key `{'.'.join(part for part in (path, unknown[1]) if part)}`"
-    missing = re.fullmatch(r"Object missing required field `(.*)`", said)
-    if missing:
-        return f"missing key `{'.'.join(part for part in (path, missing[1]) if part)}`"
-    return f"`{path}`: {said}" if path else said
-
-
-__all__ = [
-    "ELSEWHERE",
-    "FALLBACKS",
-    "INPUT_FIELDS",
-    "Clock",
-    "Episodes",
-    "Frames",
-    "Input",
-    "Inputs",
-    "Profile",
-    "Zone",
-    "load_profile",
-    "parse_profile",
-    "shipped_profiles",
-]

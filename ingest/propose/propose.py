@@ -14,9 +14,8 @@ import numpy as np
 
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
-from restock.ingest.profile.inputs import FALLBACKS
+from restock.ingest.profile.profile import FALLBACKS
 from restock.ingest.propose.candidates import candidates
-from restock.ingest.propose.frame_guess import transform_frames
 from restock.ingest.propose.roles import (
     KINDS,
     LATCHED,
@@ -26,6 +25,7 @@ from restock.ingest.propose.roles import (
     Kind,
     Roles,
     topics_for,
+    transform_frames,
 )
 from restock.ingest.steps.clocks import odd as odd_clock
 from restock.ingest.steps.clocks import topic_clock

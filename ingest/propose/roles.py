@@ -1,10 +1,13 @@
-"""What a topic may be for, by its type and name: the message types that can fill each input."""
+"""What a topic and a frame may be for: guesses by message types and names."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
+from restock.ingest.profile.profile import Frames
+from restock.ingest.steps.frames import FIELDS, Edges, upward
 
 _TWIST = {"speed_mps": "linear.x", "yaw_rate_radps": "angular.z"}
 _POSE = {"x_m": "position.x", "y_m": "position.y", "orientation": "orientation"}
@@ -91,14 +94,10 @@ KINDS: dict[str, tuple[Kind, ...]] = {
 }
 REQUIRED = ("command", "wheels", "pose")
 MOTION = "nav_msgs/msg/Odometry"
-SPENT = (
-    "goal",
-    "plan",
-    "behaviour_policy",
-    "true_condition",
-    "perturbation",
-)  # nothing else is in them
+FIXED_FRAMES = ("map", "odom", "world")  # best first
+BASE_FRAMES = ("base_link", "base_footprint", "base")
 LATCHED = ("goal", "plan", "behaviour_policy", "perturbation")
+SPENT = (*LATCHED, "true_condition")  # nothing else is in their topics
 
 Roles = dict[str, list[tuple[TopicInfo, Kind]]]  # input -> …, best first
 
@@ -107,11 +106,69 @@ def topics_for(
     topics: dict[str, TopicInfo], kinds: tuple[Kind, ...]
 ) -> list[tuple[TopicInfo, Kind]]:
     """The topics that may fill an input, best first: by kind, by name, by messages."""
-    found = []
+    fitting = []
     for rank, kind in enumerate(kinds):
         for topic in topics.values():
             named = [place for place, word in enumerate(kind.words) if word in topic.name.lower()]
             if topic.type == kind.type and (named or not kind.must):
                 order = (rank, min(named, default=len(kind.words)), -topic.expected, topic.name)
-                found.append((order, topic, kind))
-    return [(topic, kind) for _, topic, kind in sorted(found, key=lambda item: item[0])]
+                fitting.append((order, topic, kind))
+    return [(topic, kind) for _, topic, kind in sorted(fitting, key=lambda item: item[0])]
+
+
+@dataclass(frozen=True)
+class FrameGuess:
+    """Two frames that transforms join, and all that there are."""
+
+    fixed: str
+    base: str
+    chain: str
+    localised: bool  # it leads to a map
+
+    def lines(self, *, used: bool) -> list[str]:
+        """The `[frames]` of a profile, commented out where it is not `used`."""
+        mark = "" if used else "# "
+        why = "poses from /tf and /tf_static" if used else "instead of inputs.pose, from /tf"
+        return [
+            f"{mark}[frames]  # {why}: {self.chain}",
+            f'{mark}fixed = "{self.fixed}"',
+            f'{mark}base = "{self.base}"',
+            f"{mark}max_age_s = 0.5",
+            "",
+        ]
+
+
+def transform_frames(recording: Recording) -> FrameGuess | None:
+    """The map's and the robot's frame, or None where no transforms join any such two."""
+    usual = Frames()
+    wanted = {
+        name: list(FIELDS)
+        for name in (usual.topic, usual.static_topic)
+        if name in recording.topics and set(FIELDS) <= set(recording.leaves(name))
+    }
+    if not wanted:
+        return None
+    edges = Edges.of(usual, recording.read(wanted))
+    frames = {frame for child, up in edges.parents.items() for frame in (child, *up)}
+    for fixed in _named(FIXED_FRAMES, frames):
+        for base in _named(BASE_FRAMES, frames):
+            if fixed in upward(base, edges.parents):
+                chain = " -> ".join(_chain(base, fixed, edges))
+                return FrameGuess(fixed, base, chain, fixed.split("/")[-1] == "map")
+    return None
+
+
+def _named(words: tuple[str, ...], frames: set[str]) -> list[str]:
+    """The frames of these names, a robot's prefix before them or not; best first."""
+    return [name for word in words for name in sorted(frames) if name.split("/")[-1] == word]
+
+
+def _chain(base: str, fixed: str, edges: Edges) -> list[str]:
+    """The frames from the fixed one down to the base."""
+    way = [base]
+    while way[-1] != fixed:
+        ups = [up for up in edges.parents[way[-1]] if fixed in upward(up, edges.parents)]
+        if not ups or ups[0] in way:
+            break
+        way.append(ups[0])
+    return way[::-1]

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from restock.errors import RecordingError
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns
-from restock.ingest.profile.inputs import FALLBACKS, POSE_FALLBACK, Input
-from restock.ingest.profile.profile import Profile
+from restock.ingest.profile.profile import FALLBACKS, POSE_FALLBACK, Input, Profile
 from restock.ingest.steps.align import (
     NS,
     ClockReport,

@@ -12,8 +12,7 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, TopicColumns
 from restock.ingest.profile.custom_signal import CustomSignal
-from restock.ingest.profile.inputs import Input
-from restock.ingest.profile.profile import Profile
+from restock.ingest.profile.profile import Input, Profile
 from restock.ingest.profile.signal_paths import offer
 from restock.ingest.steps.clearance import scan_reduction
 from restock.ingest.steps.clocks import STAMP

@@ -10,16 +10,18 @@ says what it may look at:
 
 The difference matters to replay: boosting a `post` stratum resamples the outcome of an action and
 biases what the critic learns, unless it is corrected for. What else a condition may not say is in
-`restock.ingest.task.condition_sql`.
+`restock.ingest.task.condition_sql`. Where a simulator says the truth, labels are scored against it.
 """
 
 from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.resources import files
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import duckdb
 import msgspec
@@ -29,12 +31,15 @@ from numpy.typing import NDArray
 
 from restock.errors import ConfigError
 from restock.ingest.task.condition_sql import SANDBOX, refusal, select_of
+from restock.toml import Checked
 
 Timing = Literal["pre", "post"]
 NOMINAL = "nominal"
+LARGEST_BYTES = 100_000  # of a condition's file
+GOOD = 0.8  # precision and recall, for a label to be trusted
 
 
-class Condition(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Condition(Checked, frozen=True):
     """A named label. Lower priority numbers win where a row needs one condition."""
 
     name: str
@@ -43,7 +48,7 @@ class Condition(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     priority: int = 50
     doc: str = ""
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", self.name) or self.name == NOMINAL:
             raise ValueError(
                 f"name must be letters, digits and _, and not {NOMINAL!r}: {self.name!r}"
@@ -53,25 +58,25 @@ class Condition(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def shipped() -> dict[str, Condition]:
     """The conditions that come with Restock, by name: `ingest/task/conditions/*.sql`."""
     folder = files("restock.ingest.task") / "conditions"
-    found = {}
+    conditions = {}
     for entry in sorted(folder.iterdir(), key=lambda item: item.name):
         if entry.name.endswith(".sql"):
             name = entry.name.removesuffix(".sql")
             text = entry.read_text(encoding="utf-8")
-            found[name] = msgspec.convert({"name": name, **settings_of(text)}, Condition)
-    return found
+            conditions[name] = msgspec.convert({"name": name, **settings_of(text)}, Condition)
+    return conditions
 
 
 def settings_of(text: str) -> dict[str, str | int]:
     """What a .sql file says: `sql`, and of its comments `timing`, `priority` and `doc`."""
     comments = [line[2:].strip() for line in text.splitlines() if line.startswith("--")]
-    told = ("timing: ", "priority: ")
+    keys = ("timing: ", "priority: ")
     settings: dict[str, str | int] = {}
     for line in comments:
-        if line.startswith(told):
+        if line.startswith(keys):
             key, value = line.split(": ", 1)
             settings[key] = int(value) if value.lstrip("-").isdigit() else value
-    doc = " ".join(line for line in comments if not line.startswith(told))
+    doc = " ".join(line for line in comments if not line.startswith(keys))
     sql = "\n".join(line for line in text.splitlines() if not line.startswith("--")).strip()
     return {"sql": sql, "doc": doc, **settings}
 
@@ -143,13 +148,110 @@ def _first_line(error: Exception) -> str:
     return str(error).splitlines()[0]
 
 
-__all__ = [
-    "NOMINAL",
-    "Condition",
-    "Timing",
-    "label",
-    "labels_version",
-    "primary",
-    "settings_of",
-    "shipped",
-]
+def with_files(document: dict[str, Any], folder: Path | None, where: str) -> dict[str, Any]:
+    """A profile's TOML with the text of each `[[condition]] file = "…"` in place of its name.
+
+    A file may say `-- timing: pre` and `-- priority: 45` in comments, as the shipped ones do;
+    what the TOML says goes first. Its name must stay in the profile's folder: profiles are
+    passed between strangers.
+
+    Raises:
+        ConfigError: no such file, or one that lies elsewhere; names the key.
+    """
+    conditions = document.get("condition")
+    if not isinstance(conditions, list):
+        return document
+    read = [
+        _read(entry, f"condition[{place}]", folder, where)
+        if isinstance(entry, dict) and "file" in entry
+        else entry
+        for place, entry in enumerate(conditions)
+    ]
+    return document | {"condition": read}
+
+
+def _read(entry: dict[str, Any], key: str, folder: Path | None, where: str) -> dict[str, Any]:
+    name = entry["file"]
+
+    def refused(what: str, remedy: str | None = None) -> ConfigError:
+        return ConfigError(f"`{key}.file` {what}", where=where, remedy=remedy)
+
+    if "sql" in entry:
+        raise refused("stands beside `sql`: give one of them")
+    if not isinstance(name, str) or not name.endswith(".sql"):
+        raise refused(f"must name a .sql file, got {name!r}")
+    if folder is None:
+        raise refused("needs a profile that is a file: it is looked for beside it")
+    path = (folder / name).resolve()
+    if Path(name).is_absolute() or not path.is_relative_to(folder.resolve()):
+        raise refused(f"leads out of the profile's folder: {name}", "put it beside the profile")
+    try:
+        if path.stat().st_size > LARGEST_BYTES:
+            raise refused(f"is larger than {LARGEST_BYTES:,} bytes: {name}")
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise refused(f"cannot be read: {name}: {error}") from error
+    stem = {"name": path.stem} if path.stem.isidentifier() else {}
+    return stem | settings_of(text) | {k: value for k, value in entry.items() if k != "file"}
+
+
+@dataclass(frozen=True)
+class LabelScore:
+    """One label against the truth, over the transitions whose truth is known."""
+
+    condition: str
+    precision: float | None  # None: the label was never given
+    recall: float | None  # None: it was never true
+    labelled: int  # transitions that got the label
+    support: int  # transitions where it is true
+    known: int  # transitions whose truth is known
+
+    @property
+    def shortfall(self) -> str:
+        """By how much it falls short of .8, and from how many rows; "" where it does not."""
+        short = [
+            f"{name} {GOOD - value:.2f} short of {GOOD}"
+            for name, value in (("precision", self.precision), ("recall", self.recall))
+            if value is not None and value < GOOD
+        ]
+        if not short:
+            return ""
+        rate = self.support / max(self.known, 1)
+        return f"{', '.join(short)}; true in {rate:.1%} of steps"
+
+
+def score(labels: Mapping[str, NDArray[Any]], truth: Sequence[str | None]) -> list[LabelScore]:
+    """Labels (N,) by name against the true condition of each transition (N).
+
+    A truth may name several conditions, separated by commas. A label that no truth ever names
+    and that was never given is left out; nothing is scored where no truth is known.
+    """
+    known = np.array([text is not None for text in truth], np.bool_)
+    if not known.any():
+        return []
+    named = [
+        set() if text is None else {part.strip() for part in text.split(",")} for text in truth
+    ]
+    scores = []
+    for name, given in labels.items():
+        true = np.array([name in names for names in named], np.bool_)
+        labelled, support = int((given & known).sum()), int(true.sum())
+        both = int((given & true & known).sum())
+        if labelled or support:
+            scores.append(
+                LabelScore(
+                    name,
+                    both / labelled if labelled else None,
+                    both / support if support else None,
+                    labelled,
+                    support,
+                    int(known.sum()),
+                )
+            )
+    return scores
+
+
+def label_scores(rows: pa.Table, names: Iterable[str]) -> list[LabelScore]:
+    """How well the one condition of each transition agrees with the true one, for these labels."""
+    named = np.array(rows["condition"].to_pylist(), object)
+    return score({name: named == name for name in names}, rows["true_condition"].to_pylist())

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.toml import Checked
 
-class Body(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+
+class Body(Checked, frozen=True):
     """The robot's rectangular outline and where its lidar sits, in the base frame (x forward)."""
 
     length_m: float

@@ -9,14 +9,16 @@ makes an observation sees `after`; reward and termination are what happened in [
 from __future__ import annotations
 
 import hashlib
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from restock.ingest.task.scan import Body
 from restock.ingest.task.signals import Columns
+from restock.toml import Checked
 
 F32 = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -27,7 +29,7 @@ Ints = NDArray[np.int64]
 TASK_CODE_VERSION = 1
 
 
-class Rewards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Rewards(Checked, frozen=True):
     """What each event of a step is worth."""
 
     progress_per_m: float = 1.0  # along the plan in force at t, clipped to +-1 m a step
@@ -42,14 +44,14 @@ class Rewards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bump: float = -1.0  # the bumper was pressed
 
 
-class Task(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Task(Checked, frozen=True):
     """The definition of the task for one kind of robot: the `[task]` table of a profile."""
 
     body: Body
     actions: tuple[tuple[float, float], ...]  # (speed m/s, yaw rate rad/s); action 0 must be stop
     goal: Literal["route", "none"] = "route"
-    control_period_s: float = 0.2
-    sectors: int = 36
+    control_period_s: Annotated[float, Meta(gt=0)] = 0.2
+    sectors: Annotated[int, Meta(ge=4)] = 36  # even
     range_min_m: float = 0.05
     range_max_m: float = 4.0
     near_m: float = 1.0  # along the plan, of the near waypoint
@@ -59,13 +61,11 @@ class Task(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bump_terminates: bool = False
     rewards: Rewards = Rewards()
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
         if not self.actions or self.actions[0] != (0.0, 0.0):
             raise ValueError("actions must start with the stop action [0, 0]")
-        if self.control_period_s <= 0:
-            raise ValueError(f"control_period_s must be above 0, got {self.control_period_s}")
-        if self.sectors < 4 or self.sectors % 2:
-            raise ValueError(f"sectors must be even and at least 4, got {self.sectors}")
+        if self.sectors % 2:
+            raise ValueError(f"sectors must be even, got {self.sectors}")
 
     @property
     def observation_names(self) -> list[str]:

@@ -46,12 +46,25 @@ def read_toml(path: Path, *, remedy: str | None = "check the path") -> dict[str,
         ConfigError: the file cannot be read, or is not TOML in UTF-8.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
     except OSError as error:
         what = f"cannot be read: {error.strerror}"
         raise ConfigError(what, where=str(path), remedy=remedy) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
         raise ConfigError(f"is not TOML: {error}", where=str(path)) from error
+    return parse_toml(text, where=str(path))
+
+
+def parse_toml(text: str, *, where: str) -> dict[str, Any]:
+    """The values of a TOML text; `where` names it in errors.
+
+    Raises:
+        ConfigError: it is not TOML.
+    """
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"is not TOML: {error}", where=where) from error
 
 
 def typed(
@@ -244,4 +257,4 @@ def _join(*parts: str) -> str:
     return text
 
 
-__all__ = ["Checked", "read_toml", "toml_value", "typed"]
+__all__ = ["Checked", "parse_toml", "read_toml", "toml_value", "typed"]

@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from restock.errors import ConfigError
-from restock.ingest.task.conditions import Condition, label, labels_version, primary, shipped
-from restock.ingest.task.label_scores import score
+from restock.ingest.task.conditions import Condition, label, labels_version, primary, score, shipped
 from restock.ingest.task.schema import SIGNAL_COLUMNS
 
 SHIPPED = list(shipped().values())

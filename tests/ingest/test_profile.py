@@ -48,7 +48,9 @@ def test_zones_are_looked_up_in_order():
         ("length_m = 0.70", "length = 0.7", "unknown key `task.body.length`"),
         ("[clock]", "[klock]", "unknown key `klock`"),
         ('topic = "/scan"', "topic = 3", "`inputs.scan.topic`: Expected `str`, got `int`"),
-        ("sectors = 36", "sectors = 3", "sectors must be even and at least 4, got 3"),
+        ("sectors = 36", "sectors = 3", "task.sectors must be at least 4, got 3"),
+        ("sectors = 36", "sectors = 5", "task.sectors must be even, got 5"),
+        ("control_period_s = 0.2", "control_period_s = 0", "task.control_period_s must be above 0"),
         ("  [0.0, 0.0],", "  [0.1, 0.0],", "actions must start with the stop action [0, 0]"),
         ('"recovery"', '"recvery"', "no condition named 'recvery'"),
         ('"recovery"', '"recovery", "recovery"', "recovery given twice"),
@@ -100,7 +102,7 @@ def test_a_name_that_is_nearly_one(tmp_path):
 def test_a_file_that_is_not_text(tmp_path):
     file = tmp_path / "p.toml"
     file.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ConfigError, match="cannot be read as UTF-8"):
+    with pytest.raises(ConfigError, match="is not TOML: 'utf-8' codec"):
         load_profile(file)
 
 

@@ -16,9 +16,8 @@ import pytest
 from support.driven_robot import Drive, write_bag
 
 from restock.cli import main
-from restock.ingest.batch import Job, ingest_all
+from restock.ingest.batch import Job, ingest_all, side_by_side
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.workers import side_by_side
 from restock.replay.store.store import Store, is_store
 
 
@@ -94,16 +93,16 @@ def test_the_command_names_it_and_exits_3(bags, tmp_path, monkeypatch, capsys):
     ],
 )
 def test_what_nobody_foresaw_costs_its_recording_only(bags, tmp_path, monkeypatch, error, said):
-    from restock.ingest import batch
+    from restock.ingest import pipeline
 
-    ingest = batch.ingest
+    ingest = pipeline.ingest
 
     def failing(path, *args, **kwargs):
         if path.name == "drive1":
             raise error
         return ingest(path, *args, **kwargs)
 
-    monkeypatch.setattr(batch, "ingest", failing)
+    monkeypatch.setattr(pipeline, "ingest", failing)
     job = Job(load_profile("warehouse_amr"), tmp_path / "s")
     results = dict(ingest_all(sorted(bags.iterdir()), job))
     assert said in str(results.pop(bags / "drive1"))

@@ -12,7 +12,7 @@ import tyro
 from restock.errors import ConfigError, ExitCode, RecordingError, RestockError
 
 if TYPE_CHECKING:
-    from restock.ingest.pipeline import Outcome
+    from restock.ingest.pipeline import IngestResult
 
 
 @dataclass
@@ -53,7 +53,7 @@ class IngestCommand:
 
     def run(self) -> int:
         """Ingest each recording; the exit code for them all."""
-        from restock.ingest.workers import warm_up
+        from restock.ingest.batch import warm_up
 
         if self.workers > 1 and self.engine == "processes":
             warm_up()
@@ -110,9 +110,9 @@ class IngestCommand:
         return list(found), failures
 
 
-def as_json(outcome: Outcome) -> dict[str, Any]:
+def as_json(outcome: IngestResult) -> dict[str, Any]:
     """An outcome as `--json` prints it."""
-    from restock.ingest.task.label_scores import GOOD
+    from restock.ingest.task.conditions import GOOD
 
     row = {
         key: value
@@ -138,7 +138,7 @@ def as_json(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def show(outcome: Outcome) -> None:
+def show(outcome: IngestResult) -> None:
     """One recording's counts, as tables on stdout."""
     from restock.cli import output
     from restock.ingest.store.manifest import UNUSED
