@@ -1,0 +1,96 @@
+"""The contract of every library's buffer: logs by quota and fresh rows, with a record of which."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+import pytest
+from support.library_buffers import TrainedBuffer, trained_sb3, trained_tianshou
+
+from restock import cli
+from restock.replay.store.store import Store
+
+
+@pytest.fixture(scope="module", params=[trained_sb3, trained_tianshou], ids=["sb3", "tianshou"])
+def trained(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> TrainedBuffer:
+    return request.param(tmp_path_factory.mktemp("library"))
+
+
+def test_dqn_trains_first_on_logs_then_on_both(trained: TrainedBuffer) -> None:
+    feed, tables, size = trained.feed, trained.tables, trained.batch_size
+    assert feed.env_steps == trained.env_steps == {"tianshou": 504}.get(trained.library, 520)
+    assert feed.batches == trained.updates > 2 * trained.offline_updates
+    offline = [row for row in tables["strata"] if row["phase"] == "offline"]
+    assert {row["source"] for row in offline} == {"logs"}
+    assert sum(row["drawn_rows"] for row in offline) == trained.offline_updates * size
+    logs, fresh = (
+        sum(row["drawn_rows"] for row in tables["strata"] if row["source"] == source)
+        for source in ("logs", "fresh")
+    )
+    online = feed.batches - trained.offline_updates
+    assert fresh == online * size // 2
+    assert logs == trained.offline_updates * size + online * size // 2
+    assert logs + fresh == size * feed.batches
+    assert sum(row["updates"] for row in tables["progress"]) == feed.batches
+
+
+def test_the_quotas_are_met_exactly(trained: TrainedBuffer) -> None:
+    drawn: dict[str, int] = {}
+    for row in trained.tables["strata"]:
+        if row["source"] == "logs":
+            drawn[row["stratum"]] = drawn.get(row["stratum"], 0) + row["drawn_rows"]
+    total = sum(drawn.values())
+    for stratum in trained.panel.strata:
+        assert abs(drawn[stratum.name] - stratum.share * total) < 2  # the rounding, twice
+    assert drawn["wheel_slip"] == pytest.approx(0.25 * total, abs=2)
+
+
+def test_audit_rows_lead_back_to_their_transitions(trained: TrainedBuffer) -> None:
+    audit, panel = trained.tables["audit"], trained.panel
+    assert {row["source"] for row in audit} == {"logs", "fresh"}
+    assert all(np.isfinite(row["td"]) for row in audit)  # Tianshou hands its TD errors back
+    if trained.library == "stable-baselines3":
+        assert all(np.isfinite(row["q"]) for row in audit)
+    place = {int(t): i for i, t in enumerate(panel.meta["transition_id"].to_pylist())}
+    with Store(trained.store) as opened:
+        conditions = dict(opened.sql("SELECT transition_id, condition FROM transitions").fetchall())
+    for row in audit:
+        if row["source"] == "logs":
+            at = place[row["transition_id"]]
+            packed = np.array(panel.rows[at])
+            assert row["row_hash"] == hashlib.blake2b(packed.tobytes(), digest_size=8).hexdigest()
+            assert row["condition"] == conditions[row["transition_id"]]
+            assert row["condition"] == panel.meta["condition"][at].as_py()
+            assert row["weight"] == pytest.approx(float(panel.weights[at]), rel=1e-5)
+            assert row["age_days"] >= 0
+        else:
+            assert 0 <= row["age_env_steps"] < trained.env_steps
+            assert row["behaviour_policy"] == trained.library
+            assert row["weight"] == 1
+
+
+def test_td_errors_by_condition_are_recorded(trained: TrainedBuffer) -> None:
+    rows = [row for row in trained.tables["strata"] if row["drawn_rows"]]
+    assert all(row["td_abs_mean"] > 0 for row in rows)
+
+
+def test_ended_episodes_are_labelled(trained: TrainedBuffer) -> None:
+    ended, fresh = trained.tables["episodes"], trained.feed.fresh
+    assert len(ended) >= 2  # two environments, 250 steps each, 240 at most an episode
+    for row in ended:
+        slots = trained.slots_of(row["episode"])
+        assert len(slots) == row["steps"]
+        codes = fresh.condition(slots)
+        assert (codes >= 0).all()
+        conditions = {fresh.conditions[code] for code in codes} - {"nominal"}
+        assert conditions <= set(row["conditions"])
+    assert trained.feed.labels.unlabelled_episodes == 0
+
+
+def test_the_run_can_be_queried(trained: TrainedBuffer, capsys: pytest.CaptureFixture[str]) -> None:
+    query = "SELECT source, sum(drawn_rows)::INT AS rows FROM strata GROUP BY ALL ORDER BY ALL"
+    assert cli.main(["sql", str(trained.run), query]) == 0
+    assert "logs" in capsys.readouterr().out
