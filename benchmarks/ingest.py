@@ -228,25 +228,23 @@ def memory(folder: Path, seconds: float, image_mb: float) -> dict[str, dict[str,
 
 def targets(
     ratio: dict[str, float], workers: dict[str, float], used: dict[str, dict[str, float]]
-) -> dict[str, bool]:
-    """The targets of the design: what they say, and whether they are met."""
-    plain = used[PLAIN]["peak_mb"]
-    heavy = max(one["peak_mb"] for one in used.values() if one["images"])
+) -> dict[str, tuple[float, bool]]:
+    """The targets of the design: what they say, what was measured, and whether that meets them."""
+    peak = max(one["peak_mb"] for one in used.values())
+    images = max(one["peak_mb"] for one in used.values() if one["images"]) - used[PLAIN]["peak_mb"]
+    ours, diagnostics = ratio[OURS], ratio[DIAGNOSTICS] / ratio[RERUN_DIAGNOSTICS]
+    rerun, columns, walked = (ratio[name] / ours for name in (RERUN, ROSBAGS_COLUMNS, OURS_WALKED))
     return {
-        "all topics to columns at most 3.5x the floor": ratio[OURS] <= 3.5,
-        "a profile's own fields faster still": ratio[OURS_PROFILE] < ratio[OURS],
-        "at least 1.7x faster than rerun-sdk": ratio[RERUN] >= 1.7 * ratio[OURS],
-        "nested diagnostics no slower than rerun-sdk": (
-            ratio[DIAGNOSTICS] <= ratio[RERUN_DIAGNOSTICS]
-        ),
-        "at least 20x rosbags to columns": ratio[ROSBAGS_COLUMNS] >= 20 * ratio[OURS],
-        "no index at most 1.3x indexed": ratio[OURS_WALKED] <= 1.3 * ratio[OURS],
-        "a whole ingest at most 6x the floor": ratio[INGEST] <= 6,
-        "two workers at least 1.7x one": workers["faster"] >= 1.7,
-        f"peak memory at most {MEMORY_MB} MB": (
-            max(one["peak_mb"] for one in used.values()) <= MEMORY_MB
-        ),
-        f"images raise peak memory by at most {IMAGES_MB} MB": heavy - plain <= IMAGES_MB,
+        "all topics to columns at most 3.5x the floor": (ours, ours <= 3.5),
+        "a profile's own fields faster still": (ratio[OURS_PROFILE], ratio[OURS_PROFILE] < ours),
+        "at least 1.7x faster than rerun-sdk": (rerun, rerun >= 1.7),
+        "nested diagnostics no slower than rerun-sdk": (diagnostics, diagnostics <= 1),
+        "at least 20x rosbags to columns": (columns, columns >= 20),
+        "no index at most 1.3x indexed": (walked, walked <= 1.3),
+        "a whole ingest at most 6x the floor": (ratio[INGEST], ratio[INGEST] <= 6),
+        "two workers at least 1.7x one": (workers["faster"], workers["faster"] >= 1.7),
+        f"peak memory at most {MEMORY_MB} MB": (peak, peak <= MEMORY_MB),
+        f"images raise peak memory by at most {IMAGES_MB} MB": (images, images <= IMAGES_MB),
     }
 
 
@@ -288,7 +286,7 @@ def main() -> int:
         columns = readers.restock_columns(folder / "log.mcap")
         size_mb = (folder / "log.mcap").stat().st_size / 1e6
     ratio = {name: value / cpu[FLOOR] for name, value in cpu.items()}
-    met = targets(ratio, workers, used)
+    goals = targets(ratio, workers, used)
     answer = {
         "messages": sum(len(topic) for topic in columns.values()),
         "log_s": seconds,
@@ -300,9 +298,10 @@ def main() -> int:
         "memory": used,
         "mb_an_hour": (used[LONG]["peak_mb"] - used[PLAIN]["peak_mb"])
         / ((LONGER - 1) * seconds / 3600),
-        "targets": met,
+        "targets": {name: met for name, (_, met) in goals.items()},
     }
-    return finish(options, answer, [name for name in met if not met[name]], lines(answer))
+    missed = [f"{name}: {value:.2f}" for name, (value, met) in goals.items() if not met]
+    return finish(options, answer, missed, lines(answer))
 
 
 if __name__ == "__main__":
