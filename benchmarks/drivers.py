@@ -10,14 +10,14 @@ partly blocked ones, an operator who manages everywhere, a random driver who doe
 from __future__ import annotations
 
 import sys
-from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
 from harness import finish, option_parser
 
 from restock.stats import wilson
+from restock.train.evaluation.evaluate import EpisodeResult, run_episodes
+from restock.train.twin.env.interface import Policy
 from restock.train.twin.env.operator_policy import Operator
 from restock.train.twin.env.policies import BehaviourPolicy, Handover, PlannerFollower, RandomPolicy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
@@ -44,30 +44,27 @@ TARGETS = {  # (driver, condition): lowest and highest success that will do
 
 
 def drive(
-    policy: BehaviourPolicy, kind: str, episodes: int, perturbation: str
-) -> dict[str, list[Any]]:
-    """(success, bumped, seconds) of each episode, by condition and kind of block."""
-    env = WarehouseVectorEnv(min(episodes, 32), perturbation=PERTURBATIONS[perturbation])
-    env.set_episodes([EpisodeSpec(kind, FIRST_SEED + index) for index in range(episodes)])
-    observation, _ = env.reset(seed=0)
-    done: dict[int, tuple[str, bool, bool, float]] = {}
-    while len(done) < episodes:
-        action, _ = policy.act(env, observation)
-        observation, _, terminated, truncated, info = env.step(action)
-        for index in np.flatnonzero(terminated | truncated):
-            number = int(info["episode_number"][index])
-            if number >= 0:
-                block = str(info["block"][index])
-                done[number] = (
-                    kind if block == "none" else f"{kind} {block}",
-                    bool(info["success"][index]),
-                    bool(info["bumps"][index] > 0),
-                    float(info["episode_steps"][index]) * env.task.control_period_s,
-                )
-    cells = defaultdict(list)
-    for name, *result in done.values():
-        cells[name].append(result)
-    return cells
+    policy: Policy, specs: Sequence[EpisodeSpec], perturbation: str = "nominal"
+) -> list[EpisodeResult]:
+    """How each of these episodes went."""
+    count = min(len(specs), 64)
+    env = WarehouseVectorEnv(count, nthread=0, perturbation=PERTURBATIONS[perturbation])
+    return run_episodes(
+        env,
+        policy,
+        specs,
+        control_period_s=env.task.control_period_s,
+        time_limit_steps=env.task.time_limit_steps,
+    )
+
+
+def cells(results: Sequence[EpisodeResult]) -> dict[str, list[EpisodeResult]]:
+    """By condition and kind of block."""
+    by_cell: dict[str, list[EpisodeResult]] = {}
+    for one in results:
+        name = one.condition if one.block == "none" else f"{one.condition} {one.block}"
+        by_cell.setdefault(name, []).append(one)
+    return dict(sorted(by_cell.items()))
 
 
 def main() -> int:
@@ -80,19 +77,20 @@ def main() -> int:
     for name, make in DRIVERS.items():
         for kind in KINDS:
             count = 2 * episodes if kind == "blocked_aisle" else episodes
-            for cell, results in sorted(drive(make(), kind, count, options.perturbation).items()):
-                success = [result[0] for result in results]
-                low, high = wilson(sum(success), len(success))
+            specs = [EpisodeSpec(kind, FIRST_SEED + index) for index in range(count)]
+            for cell, results in cells(drive(make(), specs, options.perturbation)).items():
+                success = sum(one.success for one in results)
+                low, high = wilson(success, len(results))
                 rows.append(
                     {
                         "driver": name,
                         "condition": cell,
-                        "episodes": len(success),
-                        "success": float(np.mean(success)),
+                        "episodes": len(results),
+                        "success": success / len(results),
                         "low": low,
                         "high": high,
-                        "bumped": float(np.mean([result[1] for result in results])),
-                        "seconds": float(np.mean([result[2] for result in results])),
+                        "bumped": sum(one.bumps > 0 for one in results) / len(results),
+                        "seconds": sum(one.time_s for one in results) / len(results),
                     }
                 )
                 print(_line(rows[-1]), file=sys.stderr if options.json else sys.stdout, flush=True)

@@ -29,13 +29,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from drivers import drive
 from harness import finish, mean_interval, option_parser
 from numpy.typing import NDArray
 
 from restock.cli import main as restock
 from restock.stats import percentiles, wilson
 from restock.train.evaluation.eval_run import load_agent
-from restock.train.evaluation.evaluate import run_episodes
 from restock.train.run.run import Run
 from restock.train.twin.env.interface import Policy
 from restock.train.twin.env.operator_policy import Operator
@@ -111,16 +111,9 @@ def train(out: Path, agent: str, seed: int, env_steps: int) -> Path:
     return path
 
 
-def drive(policy: Policy, episodes: list[tuple[EpisodeSpec, str]]) -> NDArray[np.float64]:
+def outcomes(policy: Policy, episodes: list[tuple[EpisodeSpec, str]]) -> NDArray[np.float64]:
     """(E, 3): success, whether anything was touched, seconds."""
-    env = WarehouseVectorEnv(64, nthread=0)
-    results = run_episodes(
-        env,
-        policy,
-        [spec for spec, _ in episodes],
-        control_period_s=env.task.control_period_s,
-        time_limit_steps=env.task.time_limit_steps,
-    )
+    results = drive(policy, [spec for spec, _ in episodes])
     return np.array([(r.success, r.bumps > 0, r.time_s) for r in results], np.float64)
 
 
@@ -193,10 +186,10 @@ def main() -> int:
         ("planner", PlannerFollower()),
         ("operator", Operator()),
     ):
-        values[name] = drive(policy, episodes)[None]
+        values[name] = outcomes(policy, episodes)[None]
     for agent in AGENTS:
-        mine = [runs[agent, seed] for seed in range(options.seeds)]
-        values[agent] = np.stack([drive(load_agent(Run.open(run)), episodes) for run in mine])
+        trained = [runs[agent, seed] for seed in range(options.seeds)]
+        values[agent] = np.stack([outcomes(load_agent(Run.open(run)), episodes) for run in trained])
     rows = table(values, [cell for _, cell in episodes])
     pq.write_table(pa.Table.from_pylist(rows), options.out / "worth_training.parquet")
     return finish(options, rows, misses(rows), [markdown(rows)])
@@ -255,10 +248,10 @@ def markdown(rows: list[dict[str, Any]]) -> str:
         "| " + " | ".join("---" for _ in range(len(drivers) + 1)) + " |",
     ]
     for cell in dict.fromkeys(row["cell"] for row in rows):
-        mine = {row["driver"]: row for row in rows if row["cell"] == cell}
+        by_driver = {row["driver"]: row for row in rows if row["cell"] == cell}
         texts = [
             f"{m['success']:.2f} [{m['low']:.2f}, {m['high']:.2f}], {m['touched']:.2f}"
-            for m in (mine[driver] for driver in drivers)
+            for m in (by_driver[driver] for driver in drivers)
         ]
         lines.append("| " + " | ".join([cell.replace("_", " "), *texts]) + " |")
     return "\n".join(lines)
