@@ -20,7 +20,7 @@ from pathlib import Path
 
 import duckdb
 import numpy as np
-from harness import mean_interval
+from harness import markdown, mean_interval
 
 from restock.cli import main as restock
 from restock.stats import percentiles
@@ -73,23 +73,18 @@ def _record(recording: Path, seed: int) -> None:
 
 def ends(plan: StudyPlan) -> str:
     """Success of each arm in each cell on the study's episodes, with 95 % intervals."""
-    lines = [
-        f"| | {' | '.join(CELLS)} | rare conditions |",
-        "| --- |" + " --- |" * (len(CELLS) + 1),
-    ]
+    weights: list[dict[str, int]] = [{cell: 1} for cell in CELLS] + [RARE]
+    rows = []
     for arm in plan.study.arms:
         runs = [_successes(path / "eval" / "episodes.parquet") for path in plan.runs(arm)]
-        if not all(runs):
-            continue
-        weights: list[dict[str, int]] = [{cell: 1} for cell in CELLS] + [RARE]
-        said = " | ".join(_interval(runs, cells) for cells in weights)
-        lines.append(f"| `{arm.name}` | {said} |")
-    return "\n".join(lines)
+        if all(runs):
+            rows.append([f"`{arm.name}`", *(_interval(runs, cells) for cells in weights)])
+    return markdown(["", *CELLS, "rare conditions"], rows)
 
 
 def curves(plan: StudyPlan) -> str:
     """Success in the rare conditions at each periodic evaluation, the mean over seeds."""
-    found: dict[str, dict[int, float]] = {}
+    by_arm: dict[str, dict[int, float]] = {}
     for arm in plan.study.arms:
         by_step: dict[int, list[float]] = {}
         for path in plan.runs(arm):
@@ -101,16 +96,11 @@ def curves(plan: StudyPlan) -> str:
                 params=[str(path / "evaluations.parquet")],
             ).fetchall()
             for step in {row[0] for row in rows}:
-                here = {cell: success for at, cell, success in rows if at == step}
-                by_step.setdefault(step, []).append(_weighted(here))
-        found[arm.name] = {step: float(np.mean(values)) for step, values in by_step.items()}
-    steps = sorted({step for curve in found.values() for step in curve if step % 1000 == 0})
-    lines = [f"| steps | {' | '.join(f'{step:,}' for step in steps)} |"]
-    lines += ["| --- |" + " --- |" * len(steps)]
-    for name, curve in found.items():
-        cells = (f"{curve[step]:.2f}" if step in curve else "" for step in steps)
-        lines.append(f"| `{name}` | {' | '.join(cells)} |")
-    return "\n".join(lines)
+                cells = {cell: success for at, cell, success in rows if at == step}
+                by_step.setdefault(step, []).append(_weighted(cells))
+        by_arm[arm.name] = {step: float(np.mean(values)) for step, values in by_step.items()}
+    steps = sorted({step for curve in by_arm.values() for step in curve if step % 1000 == 0})
+    return _by_steps(steps, {name: _formatted(curve) for name, curve in by_arm.items()})
 
 
 def leads(plan: StudyPlan) -> str:
@@ -119,19 +109,27 @@ def leads(plan: StudyPlan) -> str:
     if not all(base):
         return ""
     steps = sorted(set.intersection(*map(set, base)))
-    lines = [f"| steps | {' | '.join(f'{step:,}' for step in steps)} |"]
-    lines.append("| --- |" + " --- |" * len(steps))
+    by_arm: dict[str, dict[int, str]] = {}
     for arm in plan.study.arms:
-        own = [_rare_episodes(path) for path in plan.runs(arm)]
-        there = [step for step in steps if all(step in run for run in own)]
-        if arm == plan.study.base or len(there) < 2:
+        runs = [_rare_episodes(path) for path in plan.runs(arm)]
+        evaluated = [step for step in steps if all(step in run for run in runs)]
+        if arm == plan.study.base or len(evaluated) < 2:
             continue
-        said = dict.fromkeys(steps, "")
-        for step in there:
-            pairs = zip(own, base, strict=True)
-            said[step] = _lead(np.array([mine[step] - other[step] for mine, other in pairs]))
-        lines.append(f"| `{arm.name}` | {' | '.join(said.values())} |")
-    return "\n".join(lines)
+        pairs = list(zip(runs, base, strict=True))
+        by_arm[arm.name] = {
+            step: _lead(np.array([run[step] - other[step] for run, other in pairs]))
+            for step in evaluated
+        }
+    return _by_steps(steps, by_arm)
+
+
+def _formatted(curve: dict[int, float]) -> dict[int, str]:
+    return {step: f"{success:.2f}" for step, success in curve.items()}
+
+
+def _by_steps(steps: list[int], by_arm: dict[str, dict[int, str]]) -> str:
+    rows = [[f"`{name}`", *(at.get(step, "") for step in steps)] for name, at in by_arm.items()]
+    return markdown(["steps", *(f"{step:,}" for step in steps)], rows)
 
 
 def _rare_episodes(path: Path) -> dict[int, np.ndarray]:

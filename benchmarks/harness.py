@@ -68,6 +68,12 @@ def mean_interval(
     return percentiles(np.array(means))
 
 
+def markdown(header: Sequence[object], rows: Iterable[Sequence[object]]) -> str:
+    """A table as the docs have it."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
+
+
 def finish(
     options: argparse.Namespace,
     figures: Mapping[str, Any] | Sequence[Any],

@@ -27,7 +27,7 @@ import numpy as np
 import recording_readers as readers
 import robot_log
 import zstandard
-from harness import finish, in_turns, medians, option_parser
+from harness import finish, in_turns, markdown, medians, option_parser
 
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
@@ -253,13 +253,21 @@ def lines(answer: dict[str, Any]) -> Iterator[str]:
     yield f"{answer['messages']:,} messages, {answer['log_s']:.0f} s, {answer['mcap_mb']:.0f} MB"
     equal = ", ".join(f"{who} {count}" for who, count in answer["equal_columns"].items())
     yield f"columns equal: {equal}\n"
-    yield "| reader | CPU s | over decompression |\n| --- | ---: | ---: |"
-    for name, value in sorted(answer["over_floor"].items(), key=lambda item: item[1]):
-        yield f"| {name} | {answer['cpu_s'][name]:.3f} | {value:.2f} |"
-    yield f"\n| recording ({LIMIT_MB} MB of private memory at most) | MB | peak MB | CPU s |"
-    yield "| --- | ---: | ---: | ---: |"
-    for name, used in answer["memory"].items():
-        yield f"| {name} | {used['size_mb']:.0f} | {used['peak_mb']:.0f} | {used['cpu_s']:.2f} |"
+    yield markdown(
+        ["reader", "CPU s", "over decompression"],
+        [
+            [name, f"{answer['cpu_s'][name]:.3f}", f"{value:.2f}"]
+            for name, value in sorted(answer["over_floor"].items(), key=lambda item: item[1])
+        ],
+    )
+    yield ""
+    yield markdown(
+        [f"recording ({LIMIT_MB} MB of private memory at most)", "MB", "peak MB", "CPU s"],
+        [
+            [name, f"{one['size_mb']:.0f}", f"{one['peak_mb']:.0f}", f"{one['cpu_s']:.2f}"]
+            for name, one in answer["memory"].items()
+        ],
+    )
     yield f"\nan hour more of log: {answer['mb_an_hour']:.0f} MB more at the peak"
     workers = answer["workers"]
     yield (

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from harness import finish, option_parser
+from harness import finish, markdown, option_parser
 
 from restock.cli import main as restock
 from restock.ingest.store.writer import StoreWriter
@@ -63,20 +63,20 @@ def plant(clean: Path, faulty: Path, fault: str) -> None:
         rows = source.rows(row["recording_id"], row["ingest_id"])
         labels = rows["conditions"].to_pylist()
         names = np.array(rows["condition"].to_pylist(), object)
-        mine = np.array([STRATUM in held for held in labels]) | (names == STRATUM)
+        inside = np.array([STRATUM in some for some in labels]) | (names == STRATUM)
         if fault == "stratum removed":
-            rows = rows.filter(pa.array(~mine))
+            rows = rows.filter(pa.array(~inside))
         elif fault == "stratum stale":
             order = np.arange(len(rows))
-            order[mine] = rng.permutation(order[mine])
+            order[inside] = rng.permutation(order[inside])
             for column in ("next_observation", "reward", "terminated"):
                 at = rows.schema.get_field_index(column)
                 rows = rows.set_column(at, rows.schema.field(at), rows[column].take(order))
         elif fault == "stratum mislabelled":
             nominal = np.flatnonzero(names == "nominal")
-            chosen = rng.choice(nominal, min(int(mine.sum()), len(nominal)), replace=False)
-            names[mine], names[chosen] = "nominal", STRATUM
-            labels = [[n for n in held if n != STRATUM] for held in labels]
+            chosen = rng.choice(nominal, min(int(inside.sum()), len(nominal)), replace=False)
+            names[inside], names[chosen] = "nominal", STRATUM
+            labels = [[n for n in some if n != STRATUM] for some in labels]
             for index in chosen:
                 labels[index] = [STRATUM]
             for column, values in (("condition", names.tolist()), ("conditions", labels)):
@@ -105,7 +105,7 @@ def panel_for(fault: str, out: Path) -> Path:
 
 
 def run_for(fault: str, seed: int, out: Path) -> Run:
-    """One run with the fault, trained if it is not there."""
+    """One run with the fault, trained where it is missing."""
     path = out / "runs" / f"{fault.replace(' ', '_')}-{seed}"
     if not (path / "done").exists():
         panel = panel_for(fault if fault.startswith("stratum") else "healthy", out)
@@ -142,13 +142,11 @@ def main() -> int:
         right += sum(cause in expected or cause == "UNDETERMINED" for cause in causes)
         wrong = TARGET - BUFFER if expected == BUFFER else BUFFER - TARGET
         opposite += sum(cause in wrong for cause in causes)
-    lines = ["| planted | " + " | ".join(CAUSES) + " |\n|" + " --- |" * (len(CAUSES) + 1)]
-    for fault, counts in table.items():
-        lines.append(f"| {fault} | " + " | ".join(str(counts.get(c, "")) for c in CAUSES) + " |")
+    rows = [[fault, *(counts.get(c, "") for c in CAUSES)] for fault, counts in table.items()]
     verdict = f"{right} of {total} named right or UNDETERMINED; {opposite} named the opposite"
     missed = [f"{verdict}; at least 90 %, none opposite"] if right < 0.9 * total or opposite else []
     answer = {"table": table, "right": right, "opposite": opposite, "runs": total}
-    return finish(options, answer, missed, [*lines, f"\n{verdict}"])
+    return finish(options, answer, missed, [markdown(["planted", *CAUSES], rows), f"\n{verdict}"])
 
 
 if __name__ == "__main__":

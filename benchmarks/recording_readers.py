@@ -31,7 +31,7 @@ CHUNK_HEAD = 9 + 8 + 8 + 8 + 4 + 4 + 8  # bytes before a chunk's records, but fo
 
 
 def decompress_only(path: Path) -> Callable[[], None]:
-    """Reads each chunk's bytes and decompresses them; where they are is found beforehand."""
+    """Reads each chunk's bytes and decompresses them; their places are looked up beforehand."""
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
@@ -73,10 +73,10 @@ def restock_diagnostics(path: Path) -> None:
 
 def rerun_columns(path: Path, topic: str | None = None) -> dict[str, list[pa.RecordBatch]]:
     only = {"include_topic_regex": [f"^{topic}$"]} if topic else {}
-    found: dict[str, list[pa.RecordBatch]] = {}
+    batches: dict[str, list[pa.RecordBatch]] = {}
     for chunk in McapReader(path, decoders=["ros2_reflection"], **only).stream():
-        found.setdefault(str(chunk.entity_path), []).append(chunk.to_record_batch())
-    return found
+        batches.setdefault(str(chunk.entity_path), []).append(chunk.to_record_batch())
+    return batches
 
 
 def rosbags_decode(bag: Path) -> None:
@@ -88,7 +88,7 @@ def rosbags_decode(bag: Path) -> None:
 def rosbags_columns(path: Path) -> dict[str, dict[str, FieldColumn]]:
     """rosbags' decoder, message by message, and its values laid out in the same columns."""
     with open_recording(path) as recording:
-        found: dict[str, dict[str, FieldColumn]] = {}
+        columns: dict[str, dict[str, FieldColumn]] = {}
         for topic in recording.topics:
             (stream,) = recording._streams[topic]
             kind: Any = message_type(stream.channel, "humble")
@@ -97,8 +97,8 @@ def rosbags_columns(path: Path) -> dict[str, dict[str, FieldColumn]]:
                 decoder.decode(batch).fields
                 for _, batch in stream.storage.batches([stream.channel.id])
             ]
-            found[topic] = {leaf: join([part[leaf] for part in parts]) for leaf in parts[0]}
-        return found
+            columns[topic] = {leaf: join([part[leaf] for part in parts]) for leaf in parts[0]}
+        return columns
 
 
 def mcap_ros2(path: Path) -> None:
@@ -119,30 +119,30 @@ def mcap_alone(path: Path) -> None:
 
 def check_values(path: Path, bag: Path) -> dict[str, int]:
     """How many columns equal Restock's of the MCAP, by whom; ends where one does not."""
-    mine = restock_columns(path)
+    of_mcap = restock_columns(path)
     compared = {"restock, of the sqlite3 bag": 0, "rosbags": 0, "rerun-sdk": 0}
     of_bag = restock_columns(bag)
-    theirs = rosbags_columns(path)
+    rosbags = rosbags_columns(path)
     rerun = rerun_columns(path)
     with open_recording(path) as recording:
         leaves = {
             topic: message_type(recording._streams[topic][0].channel, "humble").leaves()
             for topic in recording.topics
         }
-    for topic, columns in mine.items():
+    for topic, columns in of_mcap.items():
         parts = pa.Table.from_batches(rerun[topic])
         order = np.argsort(parts["message_log_time"].cast(pa.int64()).to_numpy(), kind="stable")
         (name,) = (name for name in parts.column_names if name.endswith(":message"))
         messages = parts[name].combine_chunks().values  # one struct a message
         for leaf in leaves[topic]:
-            mine_now = columns.fields[leaf.path]
+            ours = columns.fields[leaf.path]
             others = {
                 "restock, of the sqlite3 bag": of_bag[topic].fields[leaf.path],
-                "rosbags": theirs[topic][leaf.path],
+                "rosbags": rosbags[topic][leaf.path],
                 "rerun-sdk": take(arrow_column(messages, leaf), order),
             }
             for who, column in others.items():
-                if not equal(mine_now, column):
+                if not equal(ours, column):
                     raise SystemExit(f"{topic} {leaf.path}: not what {who} reads")
                 compared[who] += 1
     return compared

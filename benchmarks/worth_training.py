@@ -30,7 +30,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from drivers import drive
-from harness import finish, mean_interval, option_parser
+from harness import finish, markdown, mean_interval, option_parser
 from numpy.typing import NDArray
 
 from restock.cli import main as restock
@@ -192,7 +192,7 @@ def main() -> int:
         values[agent] = np.stack([outcomes(load_agent(Run.open(run)), episodes) for run in trained])
     rows = table(values, [cell for _, cell in episodes])
     pq.write_table(pa.Table.from_pylist(rows), options.out / "worth_training.parquet")
-    return finish(options, rows, misses(rows), [markdown(rows)])
+    return finish(options, rows, misses(rows), [as_markdown(rows)])
 
 
 def table(values: dict[str, NDArray[np.float64]], cells: list[str]) -> list[dict[str, Any]]:
@@ -240,21 +240,19 @@ def table(values: dict[str, NDArray[np.float64]], cells: list[str]) -> list[dict
     return rows
 
 
-def markdown(rows: list[dict[str, Any]]) -> str:
+def as_markdown(rows: list[dict[str, Any]]) -> str:
     """The table of the docs: success with its interval, and the share that touched something."""
     drivers = list(dict.fromkeys(row["driver"] for row in rows))
-    lines = [
-        "| " + " | ".join(["success [95 %], touched", *drivers]) + " |",
-        "| " + " | ".join("---" for _ in range(len(drivers) + 1)) + " |",
-    ]
-    for cell in dict.fromkeys(row["cell"] for row in rows):
-        by_driver = {row["driver"]: row for row in rows if row["cell"] == cell}
-        texts = [
-            f"{m['success']:.2f} [{m['low']:.2f}, {m['high']:.2f}], {m['touched']:.2f}"
-            for m in (by_driver[driver] for driver in drivers)
-        ]
-        lines.append("| " + " | ".join([cell.replace("_", " "), *texts]) + " |")
-    return "\n".join(lines)
+    at = {(row["driver"], row["cell"]): row for row in rows}
+    texts = {
+        key: f"{m['success']:.2f} [{m['low']:.2f}, {m['high']:.2f}], {m['touched']:.2f}"
+        for key, m in at.items()
+    }
+    cells = dict.fromkeys(row["cell"] for row in rows)
+    return markdown(
+        ["success [95 %], touched", *drivers],
+        [[cell.replace("_", " "), *(texts[name, cell] for name in drivers)] for cell in cells],
+    )
 
 
 if __name__ == "__main__":
