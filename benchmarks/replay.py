@@ -23,9 +23,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import replay_peers
+import replay_contenders as contenders
 import torch
 from harness import cpu_us, finish, in_turns, medians, option_parser
+from replay_contenders import (
+    ACTIONS,
+    BATCH,
+    OBSERVATION,
+    SHARES,
+    MultinomialDraw,
+    OnDevice,
+    Packed,
+    Prioritised,
+    in_memory,
+    quota_sampler,
+    strata,
+)
 
 from restock.replay.mixture.packed_row import row_width
 from restock.replay.ring.ring import FreshRing
@@ -33,11 +46,8 @@ from restock.replay.sampling.chunked import ChunkedSampler
 from restock.replay.sampling.device import DeviceSampler
 from restock.replay.sampling.per import PrioritySampler
 from restock.replay.sampling.priorities import Lap, Per
-from restock.replay.sampling.sampler import QuotaSampler, Sampler, uniform_sampler
+from restock.replay.sampling.sampler import uniform_sampler
 
-OBSERVATION, ACTIONS, BATCH = 93, 9, 256
-SHARES = np.array([0.4, 0.2, 0.15, 0.1, 0.08, 0.04, 0.027, 0.003])  # of a batch
-NATURAL = np.array([0.88, 0.05, 0.03, 0.02, 0.01, 0.005, 0.004, 0.001])  # of the rows
 MANY_WIDTH = 16  # floats in a row, of ten million
 RECORD_TARGET = 0.06
 QUOTA_TARGET = 1.2
@@ -46,76 +56,6 @@ TARGETS = {  # name -> (slower, faster, at least so many times)
     "tianshou / uniform": ("tianshou", "uniform", 3.0),
     "tianshou_per / per": ("tianshou_per", "per", 2.0),
 }
-
-
-class Packed:
-    """Packed rows and a sampler: one draw and one gather into a batch that is there already."""
-
-    def __init__(self, rows: torch.Tensor, sampler: Sampler) -> None:
-        self.rows, self.sampler = rows, sampler
-        self.batch = torch.empty(BATCH, rows.shape[1])
-
-    def __call__(self) -> None:
-        drawn, _ = self.sampler.draw()
-        torch.index_select(self.rows, 0, torch.from_numpy(drawn), out=self.batch)
-
-
-class Prioritised(Packed):
-    """The same with weights, and the update of the priorities of what was drawn."""
-
-    def __init__(self, rows: torch.Tensor, sampler: Sampler, errors: np.ndarray) -> None:
-        super().__init__(rows, sampler)
-        sampler.update(np.arange(len(rows)), errors)
-        self.errors = errors[:BATCH]
-
-    def __call__(self) -> None:
-        drawn, _ = self.sampler.draw()
-        torch.index_select(self.rows, 0, torch.from_numpy(drawn), out=self.batch)
-        if (weights := self.sampler.drawn_weights) is not None:
-            torch.from_numpy(weights)
-        self.sampler.update(drawn, self.errors)
-
-
-class OnDevice:
-    """Drawn and gathered by torch alone, as on a GPU; here on the CPU."""
-
-    def __init__(self, rows: torch.Tensor, sampler: DeviceSampler) -> None:
-        self.rows, self.sampler = rows, sampler
-        self.batch = torch.empty(BATCH, rows.shape[1])
-
-    def __call__(self) -> None:
-        drawn, _ = self.sampler.draw()
-        torch.index_select(self.rows, 0, drawn, out=self.batch)
-
-
-class MultinomialDraw(Packed):
-    """The usual way to draw by weights: a probability for every row."""
-
-    def __init__(self, rows: torch.Tensor, stratum_rows: list[np.ndarray]) -> None:
-        super().__init__(rows, uniform_sampler(len(rows), BATCH, np.random.default_rng(0)))
-        self.weight = torch.empty(len(rows))
-        for members, share in zip(stratum_rows, SHARES, strict=True):
-            self.weight[members] = float(share / len(members))
-
-    def __call__(self) -> None:
-        drawn = torch.multinomial(self.weight, BATCH, replacement=True)
-        torch.index_select(self.rows, 0, drawn, out=self.batch)
-
-
-def in_memory(count: int, width: int) -> torch.Tensor:
-    """Random rows, in memory as numpy allocates it: with huge pages where the system has them."""
-    rows = np.empty((count, width), np.float32)
-    rng = np.random.default_rng(0)
-    for begin in range(0, count, 65_536):
-        part = rows[begin : begin + 65_536]
-        rng.standard_normal(dtype=np.float32, out=part)
-    return torch.from_numpy(rows)
-
-
-def strata(count: int) -> list[np.ndarray]:
-    """Row numbers of eight strata of natural sizes, scattered."""
-    code = np.random.default_rng(1).choice(len(NATURAL), count, p=NATURAL)
-    return [np.flatnonzero(code == index) for index in range(len(NATURAL))]
 
 
 def measure(contenders: dict[str, Callable[[], None]], rounds: int, draws: int) -> dict[str, float]:
@@ -128,19 +68,14 @@ def measure(contenders: dict[str, Callable[[], None]], rounds: int, draws: int) 
     return medians(in_turns({name: partial(timed, name) for name in contenders}, rounds))
 
 
-def quota_sampler(stratum_rows: list[np.ndarray], *, replacement: bool = True) -> QuotaSampler:
-    rng = np.random.default_rng(0)
-    return QuotaSampler(stratum_rows, SHARES, BATCH, rng, replacement=replacement)
-
-
-def million(count: int, rounds: int, draws: int) -> tuple[dict[str, float], dict[str, str]]:
-    """CPU microseconds of a batch: uniform and by quota, then by priority; and who is left out."""
+def sampling(quick: bool) -> dict[str, Any]:
+    """Batches from a million rows beside the other libraries': uniform, by quota, by priority."""
+    count = 200_000 if quick else 1_000_000
     rows = in_memory(count, row_width(OBSERVATION))
     stratum_rows = strata(count)
-    columns = replay_peers.Columns(rows.numpy(), OBSERVATION, ACTIONS)
+    columns = contenders.Columns(rows.numpy(), OBSERVATION, ACTIONS)
     device = DeviceSampler(stratum_rows, SHARES, BATCH, seed=0, device="cpu")
-    peers = replay_peers.uniform(columns, BATCH)
-    left_out = {name: why for name, why in peers.items() if isinstance(why, str)}
+    peers, left_out = installed(contenders.uniform(columns, BATCH))
     us = measure(
         {
             "uniform": Packed(rows, uniform_sampler(count, BATCH, np.random.default_rng(0))),
@@ -148,10 +83,9 @@ def million(count: int, rounds: int, draws: int) -> tuple[dict[str, float], dict
             "quotas_in_turns": Packed(rows, quota_sampler(stratum_rows, replacement=False)),
             "quotas_by_torch": OnDevice(rows, device),
             "multinomial": MultinomialDraw(rows, stratum_rows),
-            **{name: draw for name, draw in peers.items() if callable(draw)},
+            **peers,
         },
-        rounds,
-        draws,
+        *_turns(quick),
     )
     del peers
     gc.collect()  # the peers' copies of the rows: those for PER come next
@@ -162,19 +96,37 @@ def million(count: int, rounds: int, draws: int) -> tuple[dict[str, float], dict
         return Prioritised(rows, PrioritySampler(parts, shares, BATCH, rng, rule=rule), errors)
 
     everything = [np.arange(count)]
-    peers = replay_peers.prioritised(columns, BATCH, errors)
-    left_out |= {name: why for name, why in peers.items() if isinstance(why, str)}
+    peers, more_left_out = installed(contenders.prioritised(columns, BATCH, errors))
     us |= measure(
         {
             "per": by_priority(Per(), everything, [1.0]),
             "lap": by_priority(Lap(), everything, [1.0]),
             "per_within_quotas": by_priority(Per(), stratum_rows, SHARES),
-            **{name: draw for name, draw in peers.items() if callable(draw)},
+            **peers,
         },
-        rounds,
-        draws,
+        *_turns(quick),
     )
-    return us, left_out
+    return {
+        "rows": count,
+        "batch": BATCH,
+        "row_floats": row_width(OBSERVATION),
+        "cpu_us_per_batch": us,
+        "left_out": left_out | more_left_out,
+        "ratios": {
+            name: us[slower] / us[faster]
+            for name, (slower, faster, _) in TARGETS.items()
+            if slower in us
+        },
+        "quotas / uniform": us["quotas"] / us["uniform"],
+    }
+
+
+def installed(
+    peers: dict[str, Callable[[], None] | str],
+) -> tuple[dict[str, Callable[[], None]], dict[str, str]]:
+    """The other libraries' draws, and why some are left out."""
+    draws = {name: draw for name, draw in peers.items() if callable(draw)}
+    return draws, {name: why for name, why in peers.items() if isinstance(why, str)}
 
 
 def ten_million(count: int, rounds: int, draws: int) -> dict[str, float]:
@@ -182,8 +134,7 @@ def ten_million(count: int, rounds: int, draws: int) -> dict[str, float]:
     stratum_rows = strata(count)
     began = time.process_time()
     sampler = quota_sampler(stratum_rows)
-    index_s = time.process_time() - began
-    began = time.process_time()
+    index_s, began = time.process_time() - began, time.process_time()
     in_turns = quota_sampler(stratum_rows, replacement=False)
     shuffled_index_s = time.process_time() - began
     rows = in_memory(count, MANY_WIDTH)
@@ -367,25 +318,6 @@ def main() -> int:
         figures[name] = SECTIONS[name](options.quick)
         gc.collect()
     return finish(options, figures, missed(figures), lines(figures))
-
-
-def sampling(quick: bool) -> dict[str, Any]:
-    """Batches from a million rows beside the other libraries'."""
-    count = 200_000 if quick else 1_000_000
-    us, left_out = million(count, *_turns(quick))
-    return {
-        "rows": count,
-        "batch": BATCH,
-        "row_floats": row_width(OBSERVATION),
-        "cpu_us_per_batch": us,
-        "left_out": left_out,
-        "ratios": {
-            name: us[slower] / us[faster]
-            for name, (slower, faster, _) in TARGETS.items()
-            if slower in us
-        },
-        "quotas / uniform": us["quotas"] / us["uniform"],
-    }
 
 
 def _turns(quick: bool) -> tuple[int, int]:

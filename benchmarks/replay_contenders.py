@@ -1,8 +1,8 @@
-"""Other libraries' replay buffers over the same rows, for `benchmarks/replay.py`.
+"""The contenders of `benchmarks/replay.py`: Restock's samplers and other libraries' buffers.
 
-Each is filled once, and then gives a batch as its own learner takes it: Stable-Baselines3 and
-TorchRL as tensors, Tianshou and cpprb as arrays (their learners convert them later, which is not
-counted here). A library that is not installed is left out.
+The others are filled once, and then give a batch as their own learners take it: Stable-Baselines3
+and TorchRL as tensors, Tianshou and cpprb as arrays (their learners convert them later, which is
+not counted here). A library that is not installed is left out.
 """
 
 from __future__ import annotations
@@ -12,9 +12,90 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import torch
+
+from restock.replay.sampling.device import DeviceSampler
+from restock.replay.sampling.sampler import QuotaSampler, Sampler, uniform_sampler
 
 Draw = Callable[[], None]
 ALPHA, BETA = 0.6, 0.4
+OBSERVATION, ACTIONS, BATCH = 93, 9, 256
+SHARES = np.array([0.4, 0.2, 0.15, 0.1, 0.08, 0.04, 0.027, 0.003])  # of a batch
+NATURAL = np.array([0.88, 0.05, 0.03, 0.02, 0.01, 0.005, 0.004, 0.001])  # of the rows
+
+
+class Packed:
+    """Packed rows and a sampler: one draw and one gather into a batch that exists already."""
+
+    def __init__(self, rows: torch.Tensor, sampler: Sampler) -> None:
+        self.rows, self.sampler = rows, sampler
+        self.batch = torch.empty(BATCH, rows.shape[1])
+
+    def __call__(self) -> None:
+        self.gather(torch.from_numpy(self.sampler.draw()[0]))
+
+    def gather(self, index: torch.Tensor) -> None:
+        torch.index_select(self.rows, 0, index, out=self.batch)
+
+
+class Prioritised(Packed):
+    """The same with weights, and the update of the priorities of what was drawn."""
+
+    def __init__(self, rows: torch.Tensor, sampler: Sampler, errors: np.ndarray) -> None:
+        super().__init__(rows, sampler)
+        sampler.update(np.arange(len(rows)), errors)
+        self.errors = errors[:BATCH]
+
+    def __call__(self) -> None:
+        index, _ = self.sampler.draw()
+        self.gather(torch.from_numpy(index))
+        if (weights := self.sampler.drawn_weights) is not None:
+            torch.from_numpy(weights)
+        self.sampler.update(index, self.errors)
+
+
+class OnDevice(Packed):
+    """Drawn and gathered by torch alone, as on a GPU; here on the CPU."""
+
+    def __init__(self, rows: torch.Tensor, device_sampler: DeviceSampler) -> None:
+        super().__init__(rows, uniform_sampler(len(rows), BATCH, np.random.default_rng(0)))
+        self.device_sampler = device_sampler
+
+    def __call__(self) -> None:
+        self.gather(self.device_sampler.draw()[0])
+
+
+class MultinomialDraw(Packed):
+    """The usual way to draw by weights: a probability for every row."""
+
+    def __init__(self, rows: torch.Tensor, stratum_rows: list[np.ndarray]) -> None:
+        super().__init__(rows, uniform_sampler(len(rows), BATCH, np.random.default_rng(0)))
+        self.weight = torch.empty(len(rows))
+        for members, share in zip(stratum_rows, SHARES, strict=True):
+            self.weight[members] = float(share / len(members))
+
+    def __call__(self) -> None:
+        self.gather(torch.multinomial(self.weight, BATCH, replacement=True))
+
+
+def in_memory(count: int, width: int) -> torch.Tensor:
+    """Random rows, in memory as numpy allocates it: with huge pages where the system has them."""
+    rows = np.empty((count, width), np.float32)
+    rng = np.random.default_rng(0)
+    for begin in range(0, count, 65_536):
+        rng.standard_normal(dtype=np.float32, out=rows[begin : begin + 65_536])
+    return torch.from_numpy(rows)
+
+
+def strata(count: int) -> list[np.ndarray]:
+    """Row numbers of eight strata of natural sizes, scattered."""
+    code = np.random.default_rng(1).choice(len(NATURAL), count, p=NATURAL)
+    return [np.flatnonzero(code == index) for index in range(len(NATURAL))]
+
+
+def quota_sampler(stratum_rows: list[np.ndarray], *, replacement: bool = True) -> QuotaSampler:
+    rng = np.random.default_rng(0)
+    return QuotaSampler(stratum_rows, SHARES, BATCH, rng, replacement=replacement)
 
 
 class Columns:
@@ -83,7 +164,6 @@ def tianshou_per(columns: Columns, batch: int, errors: np.ndarray) -> Draw:
 
 
 def _torchrl(columns: Columns, batch: int, sampler: Any) -> Any:
-    import torch
     from tensordict import TensorDict
     from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
@@ -114,7 +194,6 @@ def torchrl(columns: Columns, batch: int) -> Draw:
 
 
 def torchrl_per(columns: Columns, batch: int, errors: np.ndarray) -> Draw:
-    import torch
     from torchrl.data import PrioritizedSampler
 
     buffer = _torchrl(columns, batch, PrioritizedSampler(columns.count, alpha=ALPHA, beta=BETA))
