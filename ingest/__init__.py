@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from restock.public import lazy
 
 if TYPE_CHECKING:
-    from restock.ingest.batch import Job as Job
+    from restock.ingest.batch import IngestJob as IngestJob
     from restock.ingest.batch import ingest_all as ingest_all
     from restock.ingest.containers.discover import recordings_in as recordings_in
     from restock.ingest.containers.open_recording import open_recording as open_recording
@@ -24,7 +24,7 @@ else:
     __getattr__, __dir__, __all__ = lazy(
         __name__,
         {
-            "restock.ingest.batch": ["Job", "ingest_all"],
+            "restock.ingest.batch": ["IngestJob", "ingest_all"],
             "restock.ingest.containers.discover": ["recordings_in"],
             "restock.ingest.containers.open_recording": ["open_recording"],
             "restock.ingest.containers.recording": ["Recording"],

@@ -37,7 +37,7 @@ AGAIN = "run it again: what is in the store already is left alone"
 
 
 @dataclass(frozen=True)
-class Job:
+class IngestJob:
     """What to do with every recording. `store` None is a dry run."""
 
     profile: Profile
@@ -75,7 +75,7 @@ class Job:
 
 
 def ingest_all(
-    paths: Sequence[Path], job: Job, *, workers: int = 1, engine: Engine = "processes"
+    paths: Sequence[Path], job: IngestJob, *, workers: int = 1, engine: Engine = "processes"
 ) -> Iterator[Result]:
     """Each recording's outcome or error, in the order of `paths`.
 

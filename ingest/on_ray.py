@@ -19,13 +19,13 @@ from restock.errors import ConfigError, RecordingError
 from restock.ingest.batch import AGAIN, Result, out_of_memory
 
 if TYPE_CHECKING:
-    from restock.ingest.batch import Job
+    from restock.ingest.batch import IngestJob
 
 CONNECT_S = 5
 ENVIRONMENT = "AWS_"  # what the tasks are given of this process's environment
 
 
-def run_on_ray(job: Job, paths: Sequence[Path], *, workers: int = 1) -> Iterator[Result]:
+def run_on_ray(job: IngestJob, paths: Sequence[Path], *, workers: int = 1) -> Iterator[Result]:
     """Each recording's outcome or error, in the order of `paths`.
 
     Raises:
@@ -102,7 +102,7 @@ def _expect(address: str | None) -> None:
         ) from error
 
 
-def _task(job: Job, path: Path, folder: str, environment: dict[str, str]) -> Result:
+def _task(job: IngestJob, path: Path, folder: str, environment: dict[str, str]) -> Result:
     """One recording, on whatever machine."""
     os.environ.update(environment)
     try:

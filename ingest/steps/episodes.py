@@ -24,7 +24,7 @@ Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Episode:
+class EpisodeSpan:
     """Ticks `first` to `last`, both included; the last one only ends it."""
 
     first: int
@@ -41,7 +41,7 @@ class Split:
     ticks = transitions + episode ends that are not shared + dropped.
     """
 
-    episodes: list[Episode]
+    episodes: list[EpisodeSpan]
     dropped: dict[str, int]
 
     @property
@@ -86,7 +86,7 @@ class _Walk:
         self.task, self.steps, self.over, self.over_old = task, steps, over, over_old
         self.goal = steps.routing.goal.tolist()
         self.order = steps.routing.order.tolist()
-        self.episodes: list[Episode] = []
+        self.episodes: list[EpisodeSpan] = []
         self.dropped: Counter[str] = Counter()
         self.first: int | None = None  # of the open episode
         self.done_with: tuple[int, int] | None = None  # the goal that was reached, and its order
@@ -147,5 +147,5 @@ class _Walk:
         if last == self.first:
             self.dropped["a single step between two cuts"] += 1
         else:
-            self.episodes.append(Episode(self.first, last, terminated, ended_by, shared))
+            self.episodes.append(EpisodeSpan(self.first, last, terminated, ended_by, shared))
         self.first = None

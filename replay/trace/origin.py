@@ -29,7 +29,7 @@ _LEFT_OUT = ("task_json", "conditions_json", "topics", "label_scores")  # of a m
 
 
 @dataclass(frozen=True)
-class Source:
+class StoreVersion:
     """A store to look in, at a version (None: the newest)."""
 
     path: str
@@ -51,7 +51,7 @@ class Origin:
 
 
 def find_origin(
-    sources: Sequence[Source],
+    sources: Sequence[StoreVersion],
     transition: int,
     *,
     recording: Path | None = None,
@@ -88,9 +88,9 @@ def find_origin(
     )
 
 
-def _look_up(source: Source, transition: int) -> Origin | None:
+def _look_up(source: StoreVersion, transition: int) -> Origin | None:
     """The row at that version, or as it is now where that version can no longer be read."""
-    now = _read(Source(source.path), transition)
+    now = _read(StoreVersion(source.path), transition)
     if source.version is None:
         return now
     then = _read(source, transition)
@@ -106,7 +106,7 @@ def _look_up(source: Source, transition: int) -> Origin | None:
     return then
 
 
-def _read(source: Source, transition: int) -> Origin | None:
+def _read(source: StoreVersion, transition: int) -> Origin | None:
     """A row with what stands around it; None where that version, or its files, are gone."""
     try:
         with Store(source.path, version=source.version) as store:

@@ -19,7 +19,7 @@ from restock.errors import PanelError, RunError, StoreError
 from restock.replay.panel.panel import HEADER, Panel
 from restock.replay.places import RUN_CONFIG
 from restock.replay.store.store import is_store
-from restock.replay.trace.origin import Origin, Source, find_origin, rows_of, sql_file
+from restock.replay.trace.origin import Origin, StoreVersion, find_origin, rows_of, sql_file
 
 
 @dataclass
@@ -65,7 +65,7 @@ def trace_row(place: str | Path, row: str, where: TracePlaces | None = None) -> 
         _of_panel(found, Panel.open(path), _number(row, path, "row number of the panel"), where)
     elif is_store(str(place)):
         number = _number(row, path, "transition id")
-        found.origin = _origin([Source(str(place))], number, where)
+        found.origin = _origin([StoreVersion(str(place))], number, where)
     else:
         raise StoreError(
             "neither a run, a panel nor a store" if path.exists() else "nothing is there",
@@ -132,8 +132,8 @@ def _of_panel(found: Trace, panel: Panel, number: int, where: TracePlaces) -> No
             "the panel was made from a table in memory: there is no store to look in"
         )
         return
-    sources = [Source(where.store or header.store, header.store_version)]
-    sources += [Source(other.path, other.version) for other in header.others]
+    sources = [StoreVersion(where.store or header.store, header.store_version)]
+    sources += [StoreVersion(other.path, other.version) for other in header.others]
     found.origin = _origin(sources, int(meta["transition_id"]), where)
     stored = np.float32(found.origin.transition["observation"])
     same = np.array_equal(packed[panel.columns["observation"]], stored)
@@ -142,7 +142,7 @@ def _of_panel(found: Trace, panel: Panel, number: int, where: TracePlaces) -> No
         found.notes.append("the observation in the store is not the one that was packed")
 
 
-def _origin(sources: list[Source], transition: int, where: TracePlaces) -> Origin:
+def _origin(sources: list[StoreVersion], transition: int, where: TracePlaces) -> Origin:
     return find_origin(sources, transition, recording=where.recording, profile=where.profile)
 
 

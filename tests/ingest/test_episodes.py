@@ -11,7 +11,7 @@ from support.driven_robot import START_NS, Drive, columns, without
 
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.steps.episodes import Episode, Split, split
+from restock.ingest.steps.episodes import EpisodeSpan, Split, split
 from restock.ingest.steps.steps import steps_of
 
 PROFILE = load_profile("warehouse_amr")
@@ -28,14 +28,14 @@ def episodes_of(topics: dict[str, TopicColumns], **task: object) -> Split:
 
 def test_the_end_of_a_recording_truncates():
     assert episodes_of(Drive().topics()) == Split(
-        [Episode(0, 29, False, "end of the recording", False)], {}
+        [EpisodeSpan(0, 29, False, "end of the recording", False)], {}
     )
 
 
 def test_reaching_the_goal_terminates_and_what_follows_is_no_episode():
     found = episodes_of(Drive(goals=[(0.0, 3.0, 1.0)]).topics())
     # x = 1 + .5 t comes within .4 m of 3 at t = 3.2 s, tick 16.
-    assert found.episodes == [Episode(0, 16, True, "goal", False)]
+    assert found.episodes == [EpisodeSpan(0, 16, True, "goal", False)]
     assert found.dropped == {"goal already reached": 13}
 
 
@@ -43,8 +43,8 @@ def test_a_goal_reached_on_the_tick_of_the_next_goal_still_terminates():
     """The mission layer sends the next goal at once: judge the tick by the goal before it."""
     found = episodes_of(Drive(goals=[(0.0, 3.0, 1.0), (3.2, 11.0, 1.0)]).topics())
     assert found.episodes == [
-        Episode(0, 16, True, "goal", True),
-        Episode(16, 29, False, "end of the recording", False),
+        EpisodeSpan(0, 16, True, "goal", True),
+        EpisodeSpan(16, 29, False, "end of the recording", False),
     ]
 
 
@@ -58,8 +58,8 @@ def test_the_same_goal_ordered_again_after_it_was_reached_is_a_new_episode():
 def test_a_new_goal_truncates_and_shares_the_tick():
     found = episodes_of(Drive(goals=[(0.0, 11.0, 1.0), (2.0, 10.0, 1.0)]).topics())
     assert found.episodes == [
-        Episode(0, 10, False, "new goal", True),
-        Episode(10, 29, False, "end of the recording", False),
+        EpisodeSpan(0, 10, False, "new goal", True),
+        EpisodeSpan(10, 29, False, "end of the recording", False),
     ]
     assert found.transitions == 29
 
@@ -68,7 +68,7 @@ def test_a_lost_plan_ends_the_episode_and_the_tick_is_counted():
     topics = Drive(goals=[(0.0, 11.0, 1.0), (2.0, 11.0, 9.0)]).topics()
     topics["/plan"] = without(topics["/plan"], np.array([True, False]))
     found = episodes_of(topics)
-    assert found.episodes == [Episode(0, 10, False, "no route", True)]
+    assert found.episodes == [EpisodeSpan(0, 10, False, "no route", True)]
     assert found.dropped == {"plan: for another goal": 20}
 
 
@@ -90,7 +90,7 @@ def test_a_bump_terminates_where_the_task_says_so():
     topics["/bumper"] = columns(time, {"data": pressed}, stamped=False)
     assert len(episodes_of(topics).episodes) == 1
     found = episodes_of(topics, bump_terminates=True)
-    assert found.episodes[0] == Episode(0, 11, True, "bump", False)
+    assert found.episodes[0] == EpisodeSpan(0, 11, True, "bump", False)
     assert found.episodes[1].first == 12
 
 

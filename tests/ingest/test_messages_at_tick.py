@@ -16,7 +16,7 @@ from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import Profile, parse_profile
-from restock.ingest.propose.propose import propose
+from restock.ingest.propose.propose import propose_profile
 from restock.ingest.steps.frames import rotations
 from restock.ingest.steps.messages_at_tick import MessageAtTick, messages_at_tick
 from restock.ingest.store.writer import StoreWriter
@@ -82,7 +82,7 @@ def test_a_row_of_a_turtlebot_was_made_of_the_messages_at_its_tick(
     steps: str, framed: bool, tmp_path: Path
 ) -> None:
     with open_recording(TURTLEBOT) as recording:
-        text = propose(recording, "turtlebot").toml
+        text = propose_profile(recording, "turtlebot").toml
     text = re.sub('steps = "[a-z]+"', f'steps = "{steps}"', text)
     if framed:
         text = re.sub(r"\[inputs.pose\][^[]*", "", text)

@@ -14,7 +14,7 @@ from support.paths import ROOT
 
 from restock.cli import main
 from restock.errors import ConfigError
-from restock.ingest.batch import Job, ingest_all
+from restock.ingest.batch import IngestJob, ingest_all
 from restock.ingest.on_ray import run_on_ray
 from restock.ingest.profile.profile import load_profile
 from restock.replay.store.store import Store
@@ -42,7 +42,7 @@ def cluster() -> Iterator[None]:
         ray.shutdown()
 
 
-class _Broken(Job):
+class _Broken(IngestJob):
     def run(self, path):
         if path.name == "drive1":
             os.kill(os.getpid(), signal.SIGKILL)
@@ -61,7 +61,7 @@ def test_the_store_and_the_answers_are_those_of_one_process(bags, tmp_path, clus
     paths = [Path("drive0"), Path("cut.mcap"), Path("drive1"), Path("drive2")]
     found = {}
     for engine in ("processes", "ray"):
-        job = Job(load_profile("warehouse_amr"), tmp_path / engine)
+        job = IngestJob(load_profile("warehouse_amr"), tmp_path / engine)
         found[engine] = list(ingest_all(paths, job, engine=engine))
     for (path, ours), (same, theirs) in zip(*found.values(), strict=True):
         assert path == same
@@ -91,7 +91,7 @@ def test_the_command(bags, tmp_path, cluster, capsys):
 def test_without_ray_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ConfigError, match=r"pip install 'restock\[ray\]'"):
-        list(run_on_ray(Job(load_profile("warehouse_amr"), None), [Path("x.mcap")]))
+        list(run_on_ray(IngestJob(load_profile("warehouse_amr"), None), [Path("x.mcap")]))
 
 
 def test_a_cluster_that_is_not_there_is_said_so(monkeypatch):
@@ -99,4 +99,4 @@ def test_a_cluster_that_is_not_there_is_said_so(monkeypatch):
     monkeypatch.setattr(ray, "is_initialized", lambda: False)
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
     with pytest.raises(ConfigError, match=r"no Ray cluster at 127\.0\.0\.1:1: .*refused"):
-        list(run_on_ray(Job(load_profile("warehouse_amr"), None), [Path("x.mcap")]))
+        list(run_on_ray(IngestJob(load_profile("warehouse_amr"), None), [Path("x.mcap")]))

@@ -16,7 +16,7 @@ import pytest
 from support.driven_robot import Drive, write_bag
 
 from restock.cli import main
-from restock.ingest.batch import Job, ingest_all, side_by_side
+from restock.ingest.batch import IngestJob, ingest_all, side_by_side
 from restock.ingest.profile.profile import load_profile
 from restock.replay.store.store import Store, is_store
 
@@ -53,7 +53,7 @@ def test_a_caller_that_stops_early_stops_the_work() -> None:
     assert multiprocessing.active_children() == []
 
 
-class _Broken(Job):
+class _Broken(IngestJob):
     """A job that fails in another way for each recording."""
 
     def run(self, path):
@@ -75,7 +75,7 @@ def test_a_killed_worker_costs_its_recording_only(bags, tmp_path):
 
 
 def test_the_command_names_it_and_exits_3(bags, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("restock.ingest.batch.Job", _Broken)
+    monkeypatch.setattr("restock.ingest.batch.IngestJob", _Broken)
     code = main(["ingest", str(bags), "--store", str(tmp_path / "s"), "--workers", "2", "--json"])
     out, err = capsys.readouterr()
     said = {Path(one["path"]).name: one["status"] for one in json.loads(out)["recordings"]}
@@ -103,7 +103,7 @@ def test_what_nobody_foresaw_costs_its_recording_only(bags, tmp_path, monkeypatc
         return ingest(path, *args, **kwargs)
 
     monkeypatch.setattr(pipeline, "ingest", failing)
-    job = Job(load_profile("warehouse_amr"), tmp_path / "s")
+    job = IngestJob(load_profile("warehouse_amr"), tmp_path / "s")
     results = dict(ingest_all(sorted(bags.iterdir()), job))
     assert said in str(results.pop(bags / "drive1"))
     assert {result.status for result in results.values()} == {"written"}

@@ -58,7 +58,7 @@ class IngestCommand:
         if self.workers > 1 and self.engine == "processes":
             warm_up()
         from restock.cli import output
-        from restock.ingest.batch import Job, ingest_all
+        from restock.ingest.batch import IngestJob, ingest_all
         from restock.ingest.profile.profile import load_profile
         from restock.ingest.store.writer import StoreWriter
 
@@ -72,7 +72,7 @@ class IngestCommand:
         store = None if self.dry_run else self.store
         if store is not None:
             StoreWriter(store).reach()  # or say now why not, and not once a recording
-        job = Job(profile, store, self.force, self.salvage, self.typestore)
+        job = IngestJob(profile, store, self.force, self.salvage, self.typestore)
         paths, failures = self._recordings()
         outcomes: list[dict[str, Any]] = []
         lossy = False
