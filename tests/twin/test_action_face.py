@@ -106,7 +106,7 @@ def test_a_command_that_is_no_number_is_refused() -> None:
 
 
 def test_an_unknown_face_is_refused() -> None:
-    with pytest.raises(ConfigError, match="no action space 'velocity'"):
+    with pytest.raises(ConfigError, match="unknown action space 'velocity'"):
         WarehouseVectorEnv(1, action="velocity")
 
 

@@ -341,7 +341,7 @@ def test_episodes_are_drawn_on_all_floors_and_info_names_them() -> None:
     for index in range(64):
         floor: Warehouse = info["floor"][index]
         assert floor.name == info["layout"][index] == env.floor_of(index).name
-    with pytest.raises(ConfigError, match="is none of the environment's 4"):
+    with pytest.raises(ConfigError, match="is not among the environment's 4"):
         _drive(env, [EpisodeSpec("nominal", 1, layout="default")] * 64, 0)
 
 

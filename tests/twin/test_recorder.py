@@ -100,7 +100,7 @@ def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[
         (["--missions", "0"], "missions must be above 0"),
         (["--minutes", "1", "--missions", "1"], "exclude each other"),
         (["--seed", "-1"], "seed must be 0 or more"),
-        (["--policy", "fred"], "there is no policy 'fred'"),
+        (["--policy", "fred"], "unknown policy 'fred'"),
         (["--policy", "onnx:nowhere.onnx"], "nowhere.onnx: no such file"),
         (["--policy", "random", "--epsilon", ".1"], "same probability already"),
         (["--epsilon", "2"], "must be in [0, 1], got 2.0"),

@@ -341,7 +341,7 @@ def test_bad_arguments_say_what_to_do(arguments: dict[str, Any], message: str) -
 
 
 def test_an_unknown_kind_of_episode_is_refused() -> None:
-    with pytest.raises(ConfigError, match="no such kind of episode: 'fog'"):
+    with pytest.raises(ConfigError, match="unknown kind of episode: 'fog'"):
         EpisodeSpec("fog", 1)
 
 

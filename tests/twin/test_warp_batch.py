@@ -79,5 +79,5 @@ def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPat
 
 
 def test_physics_that_is_not_there_is_refused() -> None:
-    with pytest.raises(ConfigError, match="there is no physics 'bullet'"):
+    with pytest.raises(ConfigError, match="unknown physics 'bullet'"):
         WarehouseVectorEnv(1, physics="bullet")  # type: ignore[arg-type]

@@ -1,13 +1,13 @@
 """The two faces of the task's actions: an index into its table, or any command within its reach.
 
-There is one task. On the continuous face the base gets the very command that was asked for, while
+There is one task. On the continuous face the base gets the very command of the action, while
 the observation's previous action and the reward's change of action are those of the nearest action
 of the table: what `restock ingest` does to the continuous commands of a log.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
@@ -21,19 +21,6 @@ F64 = NDArray[np.float64]
 Face = Literal["discrete", "continuous"]
 
 
-class ActionFace(Protocol):
-    """How actions are given."""
-
-    @property
-    def space(self) -> gymnasium.Space[Any]:
-        """One environment's action space."""
-        ...
-
-    def read(self, actions: NDArray[Any]) -> tuple[Ints, F64, dict[str, NDArray[Any]]]:
-        """Task actions (N,), commands (N, 2) in m/s and rad/s, and what to add to `info`."""
-        ...
-
-
 class DiscreteFace:
     """`actions` (N,) index the task's actions."""
 
@@ -43,6 +30,7 @@ class DiscreteFace:
         self.space = gymnasium.spaces.Discrete(len(task.actions))
 
     def read(self, actions: NDArray[Any]) -> tuple[Ints, F64, dict[str, NDArray[Any]]]:
+        """Task actions (N,), commands (N, 2) in m/s and rad/s, and what to add to `info`."""
         action = np.asarray(actions, np.int64).reshape(self._num_envs)
         return action, self._table[action], {}
 
@@ -60,26 +48,26 @@ class ContinuousFace:
         self.space = gymnasium.spaces.Box(table.min(axis=0), table.max(axis=0), dtype=np.float32)
 
     def read(self, actions: NDArray[Any]) -> tuple[Ints, F64, dict[str, NDArray[Any]]]:
-        """Raises ConfigError for an action that is no number."""
-        given = np.asarray(actions, np.float64).reshape(self._num_envs, 2)
-        if not np.isfinite(given).all():
-            row = int(np.flatnonzero(~np.isfinite(given).all(axis=1))[0])
+        """As for the discrete face. Raises ConfigError for an action that is not finite."""
+        requested = np.asarray(actions, np.float64).reshape(self._num_envs, 2)
+        if not np.isfinite(requested).all():
+            row = int(np.flatnonzero(~np.isfinite(requested).all(axis=1))[0])
             raise ConfigError(
-                f"an action must be two finite numbers, got {given[row].tolist()}",
+                f"an action must be two finite numbers, got {requested[row].tolist()}",
                 where=f"environment {row} of the twin",
                 remedy="the policy that chose it has diverged, or its output is not scaled",
             )
-        command = np.clip(given, self.space.low, self.space.high)
+        command = np.clip(requested, self.space.low, self.space.high)
         action, residual = nearest_action(self._task, command[:, 0], command[:, 1])
         return action, command, {"action": action, "action_residual": residual}
 
 
-def action_face(face: Face, task: Task, num_envs: int) -> ActionFace:
+def action_face(face: Face, task: Task, num_envs: int) -> DiscreteFace | ContinuousFace:
     """The face by name. Raises ConfigError for another name."""
     if face == "discrete":
         return DiscreteFace(task, num_envs)
     if face == "continuous":
         return ContinuousFace(task, num_envs)
     raise ConfigError(
-        f"no action space {face!r}", where="the twin", remedy="discrete, or continuous"
+        f"unknown action space {face!r}", where="the twin", remedy="discrete, or continuous"
     )

@@ -95,13 +95,13 @@ class Renderer:
     """Frames of environments: by a camera, which is made when first needed, or as drawn maps.
 
     Raises:
-        ConfigError: there is no such camera.
+        ConfigError: an unknown camera.
     """
 
     def __init__(self, view: View | None) -> None:
         if view is not None and view not in get_args(View):
             raise ConfigError(
-                f"there is no camera {view!r}",
+                f"unknown camera {view!r}",
                 where="the twin",
                 remedy=f"give {', '.join(get_args(View))}, or none for the drawn map",
             )
@@ -126,7 +126,7 @@ class Camera:
     """One camera and the GL context behind it; frames of any floor and environment.
 
     Raises:
-        ConfigError: there is no EGL here.
+        ConfigError: EGL is unavailable.
     """
 
     def __init__(self, view: View, *, width: int = WIDTH_PX, height: int = HEIGHT_PX) -> None:
@@ -220,9 +220,9 @@ def _egl_context(width: int, height: int) -> Any:
         context = GLContext(width, height)
         context.make_current()
     except Exception as error:  # whatever a driver or a missing library throws
-        why = str(error).splitlines()[0] if str(error) else type(error).__name__
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ConfigError(
-            f"there is no EGL to render with: {why}",
+            f"EGL is unavailable: {reason}",
             where="camera",
             remedy="install libegl1 libegl-mesa0 libgl1-mesa-dri libgbm1 (Debian's names), or leave"
             " `camera` out: the drawn map needs no GL",

@@ -91,7 +91,7 @@ class EpisodeQueue(Stateful):
             return int(np.random.default_rng([spec.seed, 2]).integers(len(self._floors)))
         if spec.layout not in self._floors:
             raise ConfigError(
-                f"an episode asks for layout {spec.layout!r}, which is none of the environment's"
+                f"an episode asks for layout {spec.layout!r}, which is not among the environment's"
                 f" {len(self._floors)}",
                 where=f"episode {spec.condition}/{spec.seed}",
                 remedy="make the environment with that layout",

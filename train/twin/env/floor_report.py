@@ -56,12 +56,12 @@ def refuse_unfit(floors: Iterable[Warehouse], kinds: Iterable[str]) -> None:
 
 def unfit_kinds(floors: Iterable[Warehouse]) -> dict[str, list[str]]:
     """The kinds of episodes that some floor has no room for, and the names of those floors."""
-    found: dict[str, list[str]] = {}
+    unfit: dict[str, list[str]] = {}
     for floor in floors:
         for kind in KINDS:
             if kind not in fitting_kinds(floor):
-                found.setdefault(kind, []).append(floor.name)
-    return found
+                unfit.setdefault(kind, []).append(floor.name)
+    return unfit
 
 
 def sealed(floors: Iterable[Warehouse]) -> list[str]:

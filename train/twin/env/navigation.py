@@ -1,7 +1,7 @@
-"""Navigation of N robots: whose plan is in force, and when it is made anew.
+"""Navigation of N robots: whose plan is in force, and when it is made again.
 
-A plan is made anew when the robot strays from it, or when its lidar has found an aisle wholly
-blocked. What it found it remembers for the rest of the episode.
+A plan is made again when the robot strays from it, or when its lidar shows an aisle to be wholly
+blocked, which is remembered for the rest of the episode.
 """
 
 from __future__ import annotations
@@ -101,9 +101,9 @@ class Navigation(Stateful):
             axis=-1,
         )
         heading = np.sign(toward[ids])
-        found = self.finder.update(ids, pose, hits, valid, heading, along_y[ids])
+        blocks = self.finder.update(ids, pose, hits, valid, heading, along_y[ids])
         changed = set()
-        for env, closure in found:
+        for env, closure in blocks:
             if closure not in self.closures[env]:
                 self.closures[env].append(closure)
                 changed.add(env)

@@ -41,7 +41,8 @@ from numpy.typing import NDArray
 
 from restock.errors import ConfigError, RunError
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.task.task import Task, observe, reached_goal, reward, terminated
+from restock.ingest.task.task import Task, observe, reached_goal, reward
+from restock.ingest.task.task import terminated as is_terminated
 from restock.state import Stateful
 from restock.train.twin.env.action_face import Face, action_face
 from restock.train.twin.env.camera import Renderer, View
@@ -107,8 +108,8 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         `render()` draws a top-down map, or with a `camera` ("chase", "overhead") renders over EGL.
 
         Raises:
-            ConfigError: an unknown condition, shares that are no shares, a floor without room for
-                a condition's episodes, no environments, an action space that is not there, or an
+            ConfigError: an unknown condition, shares below 0, a floor without room for
+                a condition's episodes, no environments, an unknown action space, or an
                 autoreset mode other than SAME_STEP and DISABLED.
         """
         if num_envs < 1:
@@ -128,7 +129,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         self.perturbation = base or Perturbation()
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
-            raise ConfigError("autoreset is SameStep or Disabled", where="the twin")
+            raise ConfigError("autoreset must be SameStep or Disabled", where="the twin")
         self.metadata = {**type(self).metadata, "autoreset_mode": self.autoreset_mode}
         self.queue = EpisodeQueue(
             num_envs, self.floors, conditions or DEFAULT_CONDITIONS, schedule, seed
@@ -278,28 +279,28 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         offset = add_route(task, after, plans, goals)
         progress = now["route_remaining_m"] - after["route_remaining_m"]
         earned = reward(task, now, after, progress, action, self.previous_action)
-        over = terminated(task, after)
+        terminated = is_terminated(task, after)
         invalid = sim.blown_up
         self.bumps += sim.bumped
         changed = self.navigation.update(after, offset, self.sensing)
         if len(changed):  # a new plan counts from t + 1 on: it never makes progress jump
             self._see_new_plans(after, changed)
 
-        over &= ~invalid
-        cut = ((self.steps >= task.time_limit_steps) & ~over) | invalid
+        terminated &= ~invalid
+        truncated = ((self.steps >= task.time_limit_steps) & ~terminated) | invalid
         observed = _bounded(observe(task, after, now, action))
-        info = self._info_after(after, progress, over, invalid) | chosen
+        info = self._info_after(after, progress, terminated, invalid) | chosen
         if invalid.any():
             self.blown_up += int(invalid.sum())
             earned = np.where(invalid, np.float32(0), earned)
             observed[invalid] = self.observation[invalid]
         self.observation, self.signals, self.previous_action = observed, after, action.copy()
-        done = over | cut
+        done = terminated | truncated
         if done.any() and self.autoreset_mode is AutoresetMode.SAME_STEP:
             info["final_obs"], info["_final_obs"] = observed.copy(), done.copy()
             self.signals = {name: column.copy() for name, column in after.items()}
             self._begin(np.flatnonzero(done))
-        return self.observation.copy(), earned, over, cut, info
+        return self.observation.copy(), earned, terminated, truncated, info
 
     def _see_new_plans(self, after: Signals, ids: NDArray[np.int64]) -> None:
         rows: Signals = {name: column[ids] for name, column in after.items()}
@@ -327,7 +328,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         self,
         after: Signals,
         progress_m: NDArray[np.float64],
-        over: NDArray[np.bool_],
+        ended: NDArray[np.bool_],
         invalid: NDArray[np.bool_],
     ) -> dict[str, Any]:
         sim = self.simulation
@@ -336,7 +337,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
             "signals": after,
             "progress_m": progress_m,
             "true_condition": condition,
-            "success": over & reached_goal(self.task, after) & (self.bumps == 0),
+            "success": ended & reached_goal(self.task, after) & (self.bumps == 0),
             "invalid": invalid.copy(),
         }
 
@@ -344,7 +345,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         """A frame of every environment, (H, W, 3) uint8 each; the top-down map needs no GL.
 
         Raises:
-            ConfigError: it is a camera's, and there is no EGL.
+            ConfigError: it is a camera's, and EGL is unavailable.
         """
         return None if self.render_mode is None else self._renderer.frames(self)
 
@@ -390,8 +391,8 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         if state["floors"] != floors:
             changed = [floor[0] for floor in state["floors"] if floor not in floors]
             raise RunError(
-                f"the saved state is of other floors: {', '.join(changed) or 'fewer'}"
-                f" of {len(state['floors'])} is none of this one's {len(floors)}",
+                f"the saved state is of other floors: {', '.join(changed) or 'fewer'} of"
+                f" {len(state['floors'])} floors, not among this one's {len(floors)}",
                 where="state of the twin",
                 remedy="make the environment with the layouts of then; a file may have changed",
             )

@@ -51,12 +51,12 @@ def cells_of(floor: Warehouse, cell_m: float) -> Cells:
 
 def find_segments(free: Cells, cell_m: float) -> tuple[AisleSegment, ...]:
     """The aisle segments of a floor's free cells, from the south-west, longest aisles kept."""
-    found: list[tuple[Axis, _Corridor]] = [("x", c) for c in _corridors(free, cell_m)]
-    found += [("y", c) for c in _corridors(free.T, cell_m)]
-    found.sort(key=lambda item: item[1].first - item[1].last)
+    corridors: list[tuple[Axis, _Corridor]] = [("x", c) for c in _corridors(free, cell_m)]
+    corridors += [("y", c) for c in _corridors(free.T, cell_m)]
+    corridors.sort(key=lambda item: item[1].first - item[1].last)
     taken = np.zeros_like(free)
     kept: list[tuple[Rect, Axis]] = []
-    for along, corridor in found:
+    for along, corridor in corridors:
         cells = taken if along == "x" else taken.T
         inside = cells[corridor.first : corridor.last, corridor.low : corridor.high]
         if inside.any():
@@ -77,13 +77,13 @@ def _corridors(free: Cells, cell_m: float) -> list[_Corridor]:
     low, high = WIDTH_M[0] / cell_m - 1e-6, WIDTH_M[1] / cell_m + 1e-6
     wander = EDGE_M / cell_m + 1e-6
     open_: list[tuple[_Corridor, int, int]] = []  # with the widest sides seen
-    found: list[_Corridor] = []
+    closed: list[_Corridor] = []
 
     def close(corridor: _Corridor) -> None:
         length = corridor.last - corridor.first
         long_enough = max(LENGTH_M / cell_m, 1.2 * (corridor.high - corridor.low)) - 1e-6
         if length >= long_enough and corridor.high - corridor.low >= low:
-            found.append(corridor)
+            closed.append(corridor)
 
     for column in range(free.shape[0]):
         edges = np.flatnonzero(np.diff(np.concatenate([[False], free[column], [False]])))
@@ -113,14 +113,14 @@ def _corridors(free: Cells, cell_m: float) -> list[_Corridor]:
         open_ = going + [(_Corridor(column, column + 1, a, b), a, b) for a, b in runs]
     for corridor, _, _ in open_:
         close(corridor)
-    return found
+    return closed
 
 
 def find_crossings(
     segments: tuple[AisleSegment, ...], free: Cells, cell_m: float
 ) -> tuple[Rect, ...]:
     """Free places off the ends of the aisle segments, where others come from the side."""
-    found: dict[Rect, None] = {}
+    crossings: dict[Rect, None] = {}
     for segment in segments:
         turned = segment.along == "y"
         area = segment.lengthwise
@@ -138,8 +138,8 @@ def find_crossings(
                 continue
             ends = sorted((at - min(step, 0), at - min(step, 0) + reach * step))
             box = Rect(*(round(e * cell_m, 6) for e in (ends[0], low, ends[1], high)))
-            found[box.transposed if turned else box] = None
-    return tuple(found)
+            crossings[box.transposed if turned else box] = None
+    return tuple(crossings)
 
 
 def find_goals(

@@ -57,9 +57,9 @@ class Recipe:
     rack_deep_m: Range = (0.8, 1.4)
     aisles: tuple[int, int] = (3, 5)
     cross_aisles: tuple[int, int] = (3, 4)
-    one_way: float = 0.4  # chance that a floor's inner aisles are one-way, in turns
-    gap: float = 0.1  # chance that a rack is missing
-    turned: float = 0.5  # chance that aisles run north and south
+    one_way: float = 0.4  # probability that a floor's inner aisles are one-way, in turns
+    gap: float = 0.1  # probability that a rack is missing
+    turned: float = 0.5  # probability that aisles run north and south
     docks: tuple[int, int] = (2, 4)
 
 
@@ -173,14 +173,14 @@ def open_floors(text: str) -> tuple[Warehouse, ...]:
     """The floors that a user names; see the module.
 
     Raises:
-        ConfigError: no such floor, or a file that is none; says which and what to write.
+        ConfigError: no such floor, or a file that is not a floor; says which and what to write.
     """
-    found = [floor for part in text.split(",") for floor in _open(part.strip())]
-    names = [floor.name for floor in found]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise ConfigError(f"{', '.join(twice)} given twice", where=f"layouts {text!r}")
-    return tuple(found)
+    floors = [floor for part in text.split(",") for floor in _open(part.strip())]
+    names = [floor.name for floor in floors]
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise ConfigError(f"{', '.join(repeated)} is named twice", where=f"layouts {text!r}")
+    return tuple(floors)
 
 
 def floors_of(layouts: str | Sequence[Warehouse]) -> tuple[Warehouse, ...]:
@@ -207,7 +207,7 @@ def layouts_of_split(text: str, split: Split) -> str:
 
 
 def open_floor(text: str) -> Warehouse:
-    """One floor. Raises ConfigError where `text` names none, or several."""
+    """One floor. Raises ConfigError where `text` names several, or one that does not exist."""
     floors = open_floors(text)
     if len(floors) > 1:
         raise ConfigError(
@@ -247,7 +247,7 @@ def _seeds(text: str, rest: str) -> list[int]:
         size = int(last) if last.isdecimal() and len(last) < 6 else (0 if last else FLOORS)
         if not 1 <= size <= MAX_FLOORS:
             raise ConfigError(
-                f"{last!r} is no number of floors",
+                f"{last!r} is not a number of floors",
                 where=f"layouts {text!r}",
                 remedy=f"1 to {MAX_FLOORS}, such as generated:{first}:{FLOORS}",
             )

@@ -148,7 +148,7 @@ class Warehouse:
             inside = -1e-9 <= box.x_min < box.x_max <= self.width_m + 1e-9
             if not inside or not -1e-9 <= box.y_min < box.y_max <= self.depth_m + 1e-9:
                 raise ConfigError(
-                    f"{what} {_box(box)} is no box within 0 to {self.width_m:g} m by 0 to"
+                    f"{what} {_box(box)} is not a box within 0 to {self.width_m:g} m by 0 to"
                     f" {self.depth_m:g} m",
                     where=where,
                     remedy="give a box as x0, y0, x1, y1 with x0 < x1 and y0 < y1, in metres",
@@ -189,8 +189,8 @@ class Warehouse:
         """The index of the aisle segment each point lies in, (N,); -1 for none."""
         if not self.segments:
             return np.full(np.shape(x_m), -1, np.int64)
-        found = _inside(self.segment_edges, x_m, y_m)
-        return np.where(found.any(axis=1), found.argmax(axis=1), -1).astype(np.int64)
+        inside = _inside(self.segment_edges, x_m, y_m)
+        return np.where(inside.any(axis=1), inside.argmax(axis=1), -1).astype(np.int64)
 
     @cached_property
     def segment_edges(self) -> F64:
@@ -240,7 +240,7 @@ def strip_warehouse(
 ) -> Warehouse:
     """Racks in a grid: aisles (south, north) and cross-aisles (west, east) are the free strips.
 
-    `open_racks` are left out: floor to walk on. An aisle segment beside such a place is no segment.
+    `open_racks` are left out: floor to walk on. There is no aisle segment beside such a place.
     """
     for what, strips, end in (
         ("aisles", aisle_y_m, depth_m),
@@ -292,13 +292,13 @@ def strip_warehouse(
 
 def bays(segments: tuple[AisleSegment, ...]) -> tuple[tuple[float, float], ...]:
     """The goals along aisle segments, in their middle."""
-    found: list[tuple[float, float]] = []
+    places_m: list[tuple[float, float]] = []
     for segment in segments:
         area = segment.lengthwise
-        places = np.arange(area.x_min + 0.45, area.x_max - 0.2, BAY_M).tolist()
+        along = np.arange(area.x_min + 0.45, area.x_max - 0.2, BAY_M).tolist()
         middle = area.center[1]
-        found += [(at, middle) if segment.along == "x" else (middle, at) for at in places]
-    return tuple(found)
+        places_m += [(at, middle) if segment.along == "x" else (middle, at) for at in along]
+    return tuple(places_m)
 
 
 def default_warehouse() -> Warehouse:

@@ -249,7 +249,7 @@ def read_pgm(path: Path) -> NDArray[np.float64]:
     """Pixels (H, W) in [0, 1], the first row on top.
 
     Raises:
-        ConfigError: no such file, no PGM, or one that is cut short or absurdly large.
+        ConfigError: no such file, one that is not a PGM, or one that is cut short or too large.
     """
     try:
         data = path.read_bytes()

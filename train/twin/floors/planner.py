@@ -1,7 +1,7 @@
 """The robot's navigation stack: plans on the known aisle map, and what the lidar adds to it.
 
 It knows the racks and the walls. Pallets, people and wet floors it does not: a wholly blocked
-aisle is found from the lidar (`find_blocks`) and then closed on the grid, and the plan made anew.
+aisle is found from the lidar (`BlockFinder`) and then closed on the grid, and the plan made again.
 Plans are shortest paths on a .1 m grid whose cells cost more near racks, one Dijkstra tree per
 goal and set of closures, cached; a plan is read off the tree, smoothed and resampled. One-way rules
 are directed edges; a robot that they shut in behind a block leaves against them.
@@ -132,11 +132,11 @@ class Planner:
         i, j = divmod(cell, self.shape[1])
         low_i, low_j = max(i - 8, 0), max(j - 8, 0)
         window = distance.reshape(self.shape)[low_i : i + 9, low_j : j + 9]
-        found = np.argwhere(np.isfinite(window))
-        if not len(found):
+        cells = np.argwhere(np.isfinite(window))
+        if not len(cells):
             return -1
-        gap = ((found + np.array([low_i - i, low_j - j])) ** 2).sum(axis=1)
-        best = found[np.argmin(gap)]
+        gap = ((cells + np.array([low_i - i, low_j - j])) ** 2).sum(axis=1)
+        best = cells[np.argmin(gap)]
         return int((low_i + best[0]) * self.shape[1] + low_j + best[1])
 
     def _tree(self, goal_cell: int, closures: tuple[Closure, ...]) -> tuple[F64, NDArray[np.int32]]:
@@ -309,8 +309,8 @@ class BlockFinder(Stateful):
         self.seen = np.zeros(self.num, np.int64)  # steps in a row
         self.place = np.full((self.num, 2), -1, np.int64)  # of the last sighting: a closure
         self.floor = np.zeros(self.num, np.int64)
-        given = self.warehouses
-        self.floors = (given,) if isinstance(given, Warehouse) else tuple(given)
+        floors = self.warehouses
+        self.floors = (floors,) if isinstance(floors, Warehouse) else tuple(floors)
 
     def reset(self, ids: NDArray[np.int64]) -> None:
         self.seen[ids] = 0
@@ -325,7 +325,7 @@ class BlockFinder(Stateful):
         heading: F64,
         along_y: NDArray[np.bool_] | None = None,
     ) -> list[tuple[int, Closure]]:
-        """Look at one scan of each robot in `ids`; returns (robot, closure) for blocks found.
+        """Look at one scan of each robot in `ids`; returns (robot, closure) of each block.
 
         `pose` (n, 3) is localised, `hits_m` (n, B, 2) are the returns in the map frame, `valid`
         (n, B) which of them are returns, `heading` (n,) the sign of the way along x, or along y
@@ -364,9 +364,9 @@ class BlockFinder(Stateful):
         same = (place[:, 0] == self.place[ids, 0]) & (np.abs(step - self.place[ids, 1]) <= 1)
         self.seen[ids] = np.where(shut, np.where(same, self.seen[ids] + 1, 1), 0)
         self.place[ids] = np.where(shut[:, None], place, -1)
-        found = np.flatnonzero(self.seen[ids] >= self.persistence)
-        self.seen[ids[found]] = 0
-        return [(int(ids[k]), (int(place[k, 0]), int(place[k, 1]))) for k in found]
+        blocked = np.flatnonzero(self.seen[ids] >= self.persistence)
+        self.seen[ids[blocked]] = 0
+        return [(int(ids[k]), (int(place[k, 0]), int(place[k, 1]))) for k in blocked]
 
     def _segments_ahead(
         self,
@@ -391,9 +391,9 @@ class BlockFinder(Stateful):
             if not len(warehouse.segments):
                 continue
             for at_x, at_y in ((then_x[on], then_y[on]), (x[on], y[on])):
-                found = warehouse.segment_of(at_x, at_y)
-                fits = (found >= 0) & (warehouse.segment_along_y[found] == turned[on])
-                segment[on] = np.where(fits, found, segment[on])
+                inside = warehouse.segment_of(at_x, at_y)
+                fits = (inside >= 0) & (warehouse.segment_along_y[inside] == turned[on])
+                segment[on] = np.where(fits, inside, segment[on])
             edges[on] = warehouse.segment_edges[segment[on]]
         edges = np.where(turned[:, None], edges[:, [1, 0, 3, 2]], edges)
         return segment, edges

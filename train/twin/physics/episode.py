@@ -49,7 +49,7 @@ class EpisodeSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         if self.condition not in KINDS:
             raise ConfigError(
-                f"no such kind of episode: {self.condition!r}", remedy=f"one of {', '.join(KINDS)}"
+                f"unknown kind of episode: {self.condition!r}", remedy=f"one of {', '.join(KINDS)}"
             )
 
 

@@ -82,7 +82,7 @@ class Schedule(Checked, frozen=True):
         for field, (low, high) in self.ranges.items():
             if field not in RANGES or field == "timestep_s":
                 known = ", ".join(name for name in RANGES if name != "timestep_s")
-                raise ValueError(f"no such range: {field!r}; the fields are {known}")
+                raise ValueError(f"unknown range {field!r}; the fields are {known}")
             least, most = RANGES[field]
             if not least <= low <= high <= most:
                 raise ValueError(

@@ -72,9 +72,9 @@ class BaseController(Stateful):
         under_old = begin + _limit(old - begin, reach * np.minimum(count, switch))
         turned = begin + _limit(old - begin, reach * switch)
         under_new = turned + _limit(new - turned, reach * np.maximum(count - switch, 0))
-        asked = np.where(count <= switch, under_old, under_new)
-        self.set_point = asked[:, -1].copy()
-        left, right = wheel_commands(asked[..., 0], asked[..., 1])
+        ramp = np.where(count <= switch, under_old, under_new)
+        self.set_point = ramp[:, -1].copy()
+        left, right = wheel_commands(ramp[..., 0], ramp[..., 1])
         speeds: F64 = np.stack([left, right], axis=-1) * self.gain[:, None, None]
         speeds[..., 0] *= self.left_gain[:, None]
         return speeds

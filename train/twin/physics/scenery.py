@@ -1,6 +1,6 @@
 """What stands and moves around the robots: boxes of the one model, written into its batch.
 
-Racks and walls are geoms, placed anew where an episode is on another floor; pallets, people and
+Racks and walls are geoms, placed again where an episode is on another floor; pallets, people and
 forklifts are mocap bodies.
 """
 

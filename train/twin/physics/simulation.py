@@ -62,7 +62,7 @@ class BodyState:
     wheel_speed_radps: F64  # (N, 2)
     accel_mps2: F64  # (N, 3) of the accelerometer, mean since the call before
     bumped: NDArray[np.bool_]  # (N,) at any substep since the call before
-    set_point: F64  # (N, 2) speed and yaw rate asked of the wheels now
+    set_point: F64  # (N, 2) speed and yaw rate that the wheels are to reach now
 
 
 class Simulation(Stateful):
@@ -308,9 +308,7 @@ def _batch(physics: Physics) -> Any:
         from restock.train.twin.physics.warp_batch import WarpBatch
 
         return WarpBatch
-    raise ConfigError(
-        f"there is no physics {physics!r}", where="the twin", remedy="use mujoco or warp"
-    )
+    raise ConfigError(f"unknown physics {physics!r}", where="the twin", remedy="use mujoco or warp")
 
 
 def _check_times(task: Task, timestep_s: float, substeps: int, blocks: int) -> None:
@@ -322,7 +320,7 @@ def _check_times(task: Task, timestep_s: float, substeps: int, blocks: int) -> N
         )
     if abs(blocks * BLOCK_S - task.control_period_s) > 1e-9 or blocks < 1:
         raise ConfigError(
-            f"control_period_s = {task.control_period_s} is no multiple of {BLOCK_S} s",
+            f"control_period_s = {task.control_period_s} is not a multiple of {BLOCK_S} s",
             where="task",
             remedy="the twin drives in blocks of .1 s",
         )

@@ -26,7 +26,7 @@ YIELD_M = 0.5
 PASSING_M = 0.6  # from a plan to the side of who stands by it: half the robot and a margin
 STANDING_M = 0.15  # how near an inattentive one comes to a robot that stands or backs off
 RETREAT_M = 2.0  # how far off the robot a retreat ends
-DRIVEN_AT_MPS = 0.15  # closing speed by which a robot is said to drive at someone
+DRIVEN_AT_MPS = 0.15  # closing speed from which on a robot counts as driving at someone
 WAIT_S = 2.0
 HIDDEN, WAITING, WALKING, RETREATING = 0, 1, 2, 3
 

@@ -98,9 +98,9 @@ class WarpBatch(Batch):  # type: ignore[misc]  # MuJoCo has no types
                     remedy='use physics="mujoco"',
                 )
             # Derived ones that Warp lacks it does not use.
-            mine = {name for name in MODEL_FIELDS if self.expanded(name) is not None} & there
-            if mine != self._own:
-                self._own = frozenset(mine)
+            expanded = {name for name in MODEL_FIELDS if self.expanded(name) is not None} & there
+            if expanded != self._own:
+                self._own = frozenset(expanded)
                 self._model_there = self._put_model()
             self._stale = False
         for name in self._own:
@@ -134,33 +134,33 @@ class WarpBatch(Batch):  # type: ignore[misc]  # MuJoCo has no types
         with wp.ScopedDevice(self.device):
             self._send_model()
             self._send_state()
-            asked: list[tuple[Any, Any]] = []  # where to, and all substeps' values
+            inputs: list[tuple[Any, Any]] = []  # where to, and all substeps' values
             if control is not None:
                 width = nu + (3 * self.model.nmocap if control_spec & _MOCAP else 0)
                 whole = np.broadcast_to(control, (self.nsim, nstep, width))
                 steps = np.ascontiguousarray(whole.swapaxes(0, 1), np.float32)
-                asked.append((data.ctrl, wp.array(steps[..., :nu].copy(), dtype=float)))
+                inputs.append((data.ctrl, wp.array(steps[..., :nu].copy(), dtype=float)))
                 if control_spec & _MOCAP:
                     places = steps[..., nu:].reshape(nstep, self.nsim, self.model.nmocap, 3)
-                    asked.append((data.mocap_pos, wp.array(places.copy(), dtype=wp.vec3)))
+                    inputs.append((data.mocap_pos, wp.array(places.copy(), dtype=wp.vec3)))
             records = {}
             for name in (*record, "nefc"):
                 source = getattr(data, name)
                 kept = wp.empty((nstep, *source.shape), dtype=source.dtype)
                 records[name] = source, kept
             for step in range(nstep):
-                for target, values in asked:
+                for target, values in inputs:
                     wp.copy(target, values[step])
                 self._mjw.step(self._model_there, data)
                 for source, kept in records.values():
                     wp.copy(kept[step], source)
-            found = {name: kept.numpy().swapaxes(0, 1) for name, (_, kept) in records.items()}
+            recorded = {name: kept.numpy().swapaxes(0, 1) for name, (_, kept) in records.items()}
             for name in _MOVED:
                 here = self.bind(name)
                 here[...] = getattr(data, name).numpy().reshape(here.shape)
         self.bind("time")[...] += nstep * self.model.opt.timestep
-        self._warn((found["nefc"] > CONSTRAINTS).any(axis=1))
-        return {name: found[name].astype(np.float64) for name in record}
+        self._warn((recorded["nefc"] > CONSTRAINTS).any(axis=1))
+        return {name: recorded[name].astype(np.float64) for name in record}
 
     def _warn(self, bad: NDArray[np.bool_]) -> None:
         for name in ("qpos", "qvel"):

@@ -40,7 +40,7 @@ class Driven:
     reward: NDArray[np.float32]  # (T,)
     success: bool
     block: str
-    terminated: bool  # at its last step; else it was cut there
+    terminated: bool  # at its last step; else it was truncated there
     floor: Warehouse
 
 
@@ -138,15 +138,15 @@ class Fleet:
     ) -> None:
         """Give each of these robots its next mission; one without any drives on unrecorded."""
         env = self.env
-        given = [next(missions, None) for _ in robots]
+        entries = [next(missions, None) for _ in robots]
         idle = EpisodeSpec("nominal", 0)
-        env.set_episodes([idle if entry is None else entry[1].spec for entry in given])
+        env.set_episodes([idle if entry is None else entry[1].spec for entry in entries])
         mask = np.zeros(env.num_envs, np.bool_)
         mask[robots] = True
         env.reset(options={"reset_mask": mask})
         still = np.zeros((env.num_envs, 3))
         standing = env.simulation.body_state(still, np.zeros(env.num_envs, np.bool_))
-        for robot, entry in zip(robots.tolist(), given, strict=True):
+        for robot, entry in zip(robots.tolist(), entries, strict=True):
             if entry is None:
                 self._logs[robot] = None
                 continue

@@ -115,7 +115,7 @@ class Robot:
         """All messages of one mission that starts at `start_ns`, in the order of log time."""
         self._start_ns = start_ns
         reckoned = self.odometer.dead_reckoning(drive.motion)  # (M, 3), at the motion's times
-        found = [
+        messages = [
             *self._announcements(drive),
             *self._odometry(drive, reckoned),
             *self._inertial(drive),
@@ -129,8 +129,8 @@ class Robot:
         ]
         self.odometer.carry_on(drive.motion, reckoned)
         self.driven_s += float(drive.tick_s[-1])
-        found.sort(key=lambda message: message.log_ns)  # stable: ties keep the order above
-        return found
+        messages.sort(key=lambda message: message.log_ns)  # stable: ties keep the order above
+        return messages
 
     def static(
         self,
@@ -149,9 +149,7 @@ class Robot:
 
     def _announcements(self, drive: Drive) -> list[Message]:
         """The goal, the plans (on change and about once a second), and who drives."""
-        found = self._send(
-            "/goal_pose", np.zeros(1), [topics.goal(self._stamp(0.0), *drive.goal_m)]
-        )
+        sent = self._send("/goal_pose", np.zeros(1), [topics.goal(self._stamp(0.0), *drive.goal_m)])
         end_s = float(drive.tick_s[-1])
         starts = [float(drive.tick_s[tick]) for tick, _ in drive.plans]
         for start_s, until_s, (_, points) in zip(
@@ -161,14 +159,14 @@ class Robot:
             until_s = max(until_s - TICK_TOLERANCE_S, start_s + TICK_TOLERANCE_S)
             times = np.arange(start_s, until_s, 1 / self.rates.plan)
             messages = [topics.plan(self._stamp(time), points) for time in times.tolist()]
-            found += self._send("/plan", times, messages)
+            sent += self._send("/plan", times, messages)
         changed = [
             tick
             for tick, policy in enumerate(drive.policy)
             if tick == 0 or policy != drive.policy[tick - 1]
         ]
         texts = [topics.behaviour_policy(*drive.policy[tick]) for tick in changed]
-        return found + self._send("/behaviour_policy", drive.tick_s[changed], texts)
+        return sent + self._send("/behaviour_policy", drive.tick_s[changed], texts)
 
     def _odometry(self, drive: Drive, reckoned: F64) -> list[Message]:
         times, tick = self._sample(drive, self.rates.odom)
@@ -240,7 +238,7 @@ class Robot:
         data = topics.localised_poses(
             self._stamps(measured_s), _f32(x), _f32(y), _f32(wrap_angle(yaw))
         )
-        found = self._send("/amcl_pose", times, data)
+        poses = self._send("/amcl_pose", times, data)
 
         tf_s, _ = self._sample(drive, self.rates.tf)
         newest = np.clip(np.searchsorted(times, tf_s, "right") - 1, 0, None)
@@ -248,7 +246,7 @@ class Robot:
         correction = _between(base_then, np.stack([x, y, yaw], axis=-1))[newest]
         odom_to_base = drive.motion.at(reckoned, tf_s)
         data = topics.transforms(self._stamps(tf_s), _pose(correction), _pose(odom_to_base))
-        return found + self._send("/tf", tf_s, data)
+        return poses + self._send("/tf", tf_s, data)
 
     def _bumper(self, drive: Drive) -> list[Message]:
         """Polled; sent when it changes, at its rate, and at every poll while it is pressed."""

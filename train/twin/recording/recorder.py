@@ -183,7 +183,7 @@ def record(
         external = ExternalPolicy(policy, epsilon=plan.epsilon or 0.0, seed=plan.seed)
     elif plan.policy not in SCRIPTED:
         raise ConfigError(
-            f"there is no policy {plan.policy!r}",
+            f"unknown policy {plan.policy!r}",
             where="recording",
             remedy=f"give {', '.join(SCRIPTED)}, or a policy that was loaded",
         )

@@ -113,7 +113,7 @@ def mission_markers(stamp_ns: int, scene: Scene, goal_m: tuple[float, float]) ->
 
 def traffic_markers(stamp_ns: I64, places: F64) -> list[bytes]:
     """People and forklifts at (n, A, 3) places, one message a row."""
-    found: list[bytes] = [b""] * len(places)
+    messages: list[bytes] = [b""] * len(places)
     shown = on_floor(places)
     for seen in {tuple(row) for row in shown.tolist()}:
         rows = np.flatnonzero((shown == seen).all(axis=1))
@@ -131,8 +131,8 @@ def traffic_markers(stamp_ns: I64, places: F64) -> list[bytes]:
                 f"{at}.pose.orientation.w": np.cos(yaw / 2),
             }
         for row, data in zip(rows.tolist(), layout.pack(columns, len(rows)), strict=True):
-            found[row] = data
-    return found
+            messages[row] = data
+    return messages
 
 
 def on_floor(places: F64) -> NDArray[np.bool_]:

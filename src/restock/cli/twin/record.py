@@ -142,7 +142,7 @@ def load_policy(name: str) -> Policy | None:
     policy = eval_run.load_policy(name, load_profile("warehouse_amr").task)
     if policy is None:
         raise ConfigError(
-            f"there is no policy {name!r}",
+            f"unknown policy {name!r}",
             where="--policy",
             remedy=f"give {', '.join(SCRIPTED)}, run:DIRECTORY or onnx:FILE",
         )
