@@ -19,17 +19,24 @@ def write_table(table: pa.Table, path: Path) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def write_text(path: Path, text: str) -> None:
-    """Replace a text file in one step."""
-    write_bytes(path, text.encode("utf-8"))
+def write_text(path: Path, text: str, *, exclusive: bool = False) -> None:
+    """Replace a text file in one step; as `write_bytes`."""
+    write_bytes(path, text.encode("utf-8"), exclusive=exclusive)
 
 
-def write_bytes(path: Path, content: bytes) -> None:
-    """Replace a file in one step."""
+def write_bytes(path: Path, content: bytes, *, exclusive: bool = False) -> None:
+    """Replace a file in one step.
+
+    Raises:
+        FileExistsError: `exclusive`, and there is something at `path` already.
+    """
     temporary = _temporary(path)
     try:
         temporary.write_bytes(content)
-        temporary.replace(path)
+        if exclusive:
+            os.link(temporary, path)
+        else:
+            temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from dataclasses import asdict
 from html.parser import HTMLParser
 from itertools import pairwise
 from pathlib import Path
 
+import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -26,9 +26,7 @@ from restock.report.feed import flattery
 from restock.stats import ConfidenceInterval
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES, TABLES
-from restock.train.twin.calibration.gap import Gap
-from restock.train.twin.calibration.gap_files import write_gap
-from restock.train.twin.calibration.trust import Limits, Verdict
+from restock.train.twin.calibration.twin_gap import TrustLimits, TwinGap, Verdict, write_gap
 
 HOSTILE = "<script>alert(1)</script>"
 
@@ -240,8 +238,12 @@ def test_a_measured_gap_is_a_section(run: Path, tmp_path: Path) -> None:
     position |= {"source": "nominal", "segments": 40, "episodes": 9}
     position |= {f"{q}{end}": 0.5 for q in ("median", "p90") for end in ("", "_low", "_high")}
     far = ConfidenceInterval(0.5, 0.4, 0.6)
-    gap = Gap(
-        about={"limits": asdict(Limits()), "store_version": 7, "twins": {"nominal": {}}},
+    gap = TwinGap(
+        about={
+            "limits": msgspec.structs.asdict(TrustLimits()),
+            "store_version": 7,
+            "twins": {"nominal": {}},
+        },
         paths=[position],
         observations=[],
         rewards=[],

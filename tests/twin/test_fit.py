@@ -18,21 +18,30 @@ from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
-from restock.train.twin.calibration.fit import Estimate, Fit, _fine, fit
-from restock.train.twin.calibration.fit_estimates import untold
-from restock.train.twin.calibration.fit_files import schedule, write_fit
+from restock.train.twin.calibration.fit import FitConfig, _least_squares, fit
 from restock.train.twin.calibration.fit_parameters import (
     DEFAULT,
     PARAMETERS,
     Coordinates,
     parse_parameters,
 )
-from restock.train.twin.calibration.fit_scope import cuts, sides, usable
-from restock.train.twin.calibration.fit_uncertainty import uncertainty
+from restock.train.twin.calibration.fit_solver import ReplayResiduals, position_gap_m
+from restock.train.twin.calibration.fit_uncertainty import measure_uncertainty, unidentified
+from restock.train.twin.calibration.fitted_twin import (
+    FittedTwin,
+    ParameterEstimate,
+    fleet_schedule,
+    write_fit,
+)
 from restock.train.twin.calibration.logged_steps import logged_steps
-from restock.train.twin.calibration.mismatch import Mismatch, position_gap_m
 from restock.train.twin.calibration.open_loop import replay_segments
-from restock.train.twin.calibration.segments import LoggedSegments, log_segments
+from restock.train.twin.calibration.segments import (
+    LoggedSegments,
+    held_out_from,
+    log_segments,
+    ordinary_driving,
+    split_at,
+)
 from restock.train.twin.physics.perturbation import (
     RANGES,
     Perturbation,
@@ -127,16 +136,16 @@ def test_a_replay_does_not_depend_on_what_else_is_replayed(log: LoggedSegments) 
 
 
 def test_between_two_latencies_a_residual_lies_between(log: LoggedSegments) -> None:
-    low, middle, high = Mismatch(log.take(np.arange(4)), ("wheel speed",)).of(
+    low, middle, high = ReplayResiduals(log.take(np.arange(4)), ("wheel speed",)).of(
         [Perturbation(latency_s=value) for value in (0.11, 0.1125, 0.12)]
     )["wheel speed"]
     assert np.abs(high - low).max() > 0.01
     assert middle == pytest.approx(0.75 * low + 0.25 * high)
 
 
-def recovered(store: Path, names: tuple[str, ...], **options: object) -> Fit:
+def recovered(store: Path, names: tuple[str, ...], **options: object) -> FittedTwin:
     with Store(store) as opened:
-        return fit(opened, parameters=names, base=options.pop("base", None), **options)  # type: ignore[arg-type]
+        return fit(opened, FitConfig(parameters=names, **options))  # type: ignore[arg-type]
 
 
 def test_known_latency_gain_and_wheels_are_recovered(known: Path, tmp_path: Path) -> None:
@@ -147,7 +156,7 @@ def test_known_latency_gain_and_wheels_are_recovered(known: Path, tmp_path: Path
         base=base,
         horizon_s=2.0,
         search_points=4,
-        most_segments=12,
+        max_segments=12,
     )
     for item in found.estimates:
         true = getattr(KNOWN, item.name)
@@ -167,7 +176,7 @@ def test_known_latency_gain_and_wheels_are_recovered(known: Path, tmp_path: Path
         write_fit(tmp_path / "fitted.toml", [found])
 
 
-def test_friction_under_wheels_that_stand_is_not_told_and_stays(log: LoggedSegments) -> None:
+def test_friction_under_wheels_that_stand_is_not_identified_and_stays(log: LoggedSegments) -> None:
     some = log.take(np.arange(8))
     standing = replace(
         some,
@@ -175,40 +184,41 @@ def test_friction_under_wheels_that_stand_is_not_told_and_stays(log: LoggedSegme
         still=np.ones(8, np.bool_),
         signals={name: np.zeros_like(values) for name, values in some.signals.items()},
     )
-    mismatch = Mismatch(standing)
+    residuals = ReplayResiduals(standing)
     coordinates = Coordinates(("friction_scale",), Perturbation(), log.task)
-    solution = _fine(mismatch, coordinates, np.array([0.5]), lambda text: None)
-    told = untold(mismatch, solution, uncertainty(solution, standing.episode_id, seed=0))
-    assert told is not None
-    assert not told.fitted
-    assert told.value == 1.0
-    assert told.note == "0.05 to 2 explain the log as well (wheels slide in 0.0% of the steps)"
+    solution = _least_squares(residuals, coordinates, np.array([0.5]), lambda text: None)
+    uncertainty = measure_uncertainty(solution, standing.episode_id, seed=0)
+    lost = unidentified(residuals, solution, uncertainty)
+    assert lost is not None
+    assert not lost.fitted
+    assert lost.value == 1.0
+    assert lost.note == "0.05 to 2 explain the log as well (wheels slide in 0.0% of the steps)"
 
 
-def test_a_schedule_of_several_fits_spans_what_all_of_them_told(tmp_path: Path) -> None:
-    def one(gain: float, friction: bool) -> Fit:
+def test_a_schedule_of_several_fits_spans_what_all_of_them_identified(tmp_path: Path) -> None:
+    def one(gain: float, friction: bool) -> FittedTwin:
         perturbation = Perturbation(name="one", gain=gain, friction_scale=0.5)
-        return Fit(
+        return FittedTwin(
             perturbation=perturbation,
             base=Perturbation(),
             timestep_s=0.01,
             recordings=("r",),
             estimates=(
-                Estimate("gain", "", gain, gain - 0.01, gain + 0.01, True),
-                Estimate("friction_scale", "", 0.5, 0.4, 0.6, friction),
+                ParameterEstimate("gain", "", gain, gain - 0.01, gain + 0.01, True),
+                ParameterEstimate("friction_scale", "", 0.5, 0.4, 0.6, friction),
             ),
             warnings=(),
             held_out=(),
             noise={},
             segments=9,
             clusters=9,
-            condition=1.0,
+            condition_number=1.0,
         )
 
     fits = [one(0.9, True), one(0.96, False)]
-    assert schedule(fits).ranges == {"gain": (0.9, 0.96)}
+    assert fleet_schedule(fits).ranges == {"gain": (0.9, 0.96)}
     write_fit(tmp_path / "fleet.toml", fits)
-    assert load_schedule(tmp_path / "fleet.toml") == schedule(fits)
+    assert load_schedule(tmp_path / "fleet.toml") == fleet_schedule(fits)
 
 
 def test_bumps_and_slippery_patches_are_not_ordinary_driving(log: LoggedSegments) -> None:
@@ -218,7 +228,7 @@ def test_bumps_and_slippery_patches_are_not_ordinary_driving(log: LoggedSegments
     log.signals["bumped"][0, 3] = True
     log.signals["clearance_m"][1, 0] = 0.01
     log.true_condition[2, 1] = "wheel_slip"
-    kept, left = usable(log)
+    kept, left = ordinary_driving(log)
     assert len(kept) == len(log) - 3
     assert left == {
         "bumped into something": 1,
@@ -228,7 +238,7 @@ def test_bumps_and_slippery_patches_are_not_ordinary_driving(log: LoggedSegments
 
 
 def test_what_is_held_out_is_never_fitted(log: LoggedSegments) -> None:
-    before, after = sides(log, cuts(log, 0.25, seed=0))
+    before, after = split_at(log, held_out_from(log, 0.25, seed=0))
     assert before.any()
     assert after.any()
     assert not (before & after).any()
@@ -249,15 +259,19 @@ def test_points_and_perturbations_are_the_same_thing() -> None:
 def test_what_cannot_be_fitted_is_named(known: Path) -> None:
     with pytest.raises(ConfigError, match="'grip' cannot be fitted"):
         parse_parameters("gain,grip")
+    with pytest.raises(ValueError, match="'grip' cannot be fitted"):
+        FitConfig(parameters=("gain", "grip"))
+    with pytest.raises(ValueError, match=r"held_out must be in \[0, 1\), got 1"):
+        FitConfig(held_out=1.0)
     with Store(known) as store:
         with pytest.raises(ConfigError, match="no recording 'nobody'"):
-            fit(store, recordings=["nobody"])
+            fit(store, FitConfig(recordings=("nobody",)))
         with pytest.raises(StoreError, match=r"fewer than 8 \(of \d+: \d+ held out"):
-            fit(store, parameters=["gain"], horizon_s=10.0)
+            fit(store, FitConfig(parameters=("gain",), horizon_s=10.0))
         with pytest.raises(StoreError, match="no stretch of 60 s"):
-            fit(store, parameters=["gain"], horizon_s=60.0)
+            fit(store, FitConfig(parameters=("gain",), horizon_s=60.0))
         with pytest.raises(ConfigError, match="must be a multiple of the control period"):
-            fit(store, parameters=["gain"], horizon_s=0.35)
+            fit(store, FitConfig(parameters=("gain",), horizon_s=0.35))
 
 
 def test_a_task_that_the_store_lacks_is_refused_recording_by_recording_too(
@@ -287,9 +301,9 @@ def test_another_robot_is_asked_only_for_what_it_shares_with_the_twin(tmp_path: 
     ingest(bag, load_profile("turtlebot3"), store=StoreWriter(tmp_path / "store"))
     with Store(tmp_path / "store") as store:
         with pytest.raises(ConfigError, match="is not the twin's: its mass and its contacts"):
-            fit(store, parameters=["payload_kg"])
+            fit(store, FitConfig(parameters=("payload_kg",)))
         with pytest.raises(ConfigError, match="the log's pose is the wheels' odometry"):
-            fit(store, parameters=["wheel_radius_scale"])
+            fit(store, FitConfig(parameters=("wheel_radius_scale",)))
 
 
 @pytest.mark.slow
@@ -320,7 +334,7 @@ def test_all_of_a_known_robot_is_recovered(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_friction_that_a_dry_log_does_not_tell_is_not_fitted_at_an_end_of_its_range(
+def test_friction_that_a_dry_log_does_not_identify_is_not_fitted_at_an_end_of_its_range(
     tmp_path: Path,
 ) -> None:
     """The search once stopped at twice the floor's friction there, and called that fitted."""

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from support.paths import SHARED
 
 from restock import cli
-from restock.errors import ConfigError, RunError
+from restock.errors import RunError
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
@@ -23,25 +23,26 @@ from restock.stats import (
     NOT_KNOWN,
     ConfidenceInterval,
 )
-from restock.train.twin.calibration.gap import AFTER, BEFORE, Gap, GapPlan, measure_gap
-from restock.train.twin.calibration.gap_files import read_gap, write_gap
+from restock.train.twin.calibration.gap import AFTER, BEFORE, GapConfig, measure_gap
 from restock.train.twin.calibration.logged_steps import (
     logged_steps,
     observations,
     previous_action,
     sector_clearance,
 )
-from restock.train.twin.calibration.one_step import AGREES, agreement, one_step
+from restock.train.twin.calibration.one_step import AGREES, agreement, one_step, rebuild_plans
 from restock.train.twin.calibration.open_loop import empty_floor
 from restock.train.twin.calibration.path_gap import FLOOR, measured_noise
-from restock.train.twin.calibration.plan_memory import rebuild_plans
-from restock.train.twin.calibration.trust import (
+from restock.train.twin.calibration.twin_gap import (
     TRUSTED,
     UNDECIDED,
     UNKNOWN,
     UNTRUSTED,
-    Limits,
-    judge,
+    TrustLimits,
+    TwinGap,
+    read_gap,
+    trust_verdict,
+    write_gap,
 )
 from restock.train.twin.floors.layout import default_warehouse
 from restock.train.twin.physics.perturbation import Perturbation
@@ -52,7 +53,7 @@ TRUE = Perturbation(
     name="true", payload_kg=30.0, wheel_radius_scale=0.96, latency_s=0.15, gain=0.97
 )
 TURTLEBOT = SHARED / "turtlebot3-sim-humble"
-PLAN = GapPlan(most=24, limits=Limits(segments=10, episodes=3))
+CONFIG = GapConfig(max_segments=24, limits=TrustLimits(segments=10, episodes=3))
 
 
 @pytest.fixture(scope="module")
@@ -67,12 +68,12 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def gap(stored: Path) -> Gap:
+def gap(stored: Path) -> TwinGap:
     with Store(stored) as store:
-        return measure_gap(store, TRUE, PLAN)
+        return measure_gap(store, TRUE, CONFIG)
 
 
-def position(gap: Gap, condition: str, source: str, horizon_s: float) -> dict[str, Any]:
+def position(gap: TwinGap, condition: str, source: str, horizon_s: float) -> dict[str, Any]:
     (row,) = [
         row
         for row in gap.paths
@@ -83,7 +84,9 @@ def position(gap: Gap, condition: str, source: str, horizon_s: float) -> dict[st
 
 
 @pytest.mark.parametrize("horizon_s", [3.0, 6.0])
-def test_the_true_parameters_close_the_gap_to_near_the_floor(gap: Gap, horizon_s: float) -> None:
+def test_the_true_parameters_close_the_gap_to_near_the_floor(
+    gap: TwinGap, horizon_s: float
+) -> None:
     before, after, floor = (
         position(gap, "nominal", source, horizon_s)["median"] for source in (BEFORE, AFTER, FLOOR)
     )
@@ -93,7 +96,7 @@ def test_the_true_parameters_close_the_gap_to_near_the_floor(gap: Gap, horizon_s
     assert after < odometry  # whose wheels are not as large as it takes them to be
 
 
-def test_a_slippery_floor_is_named_and_a_dry_one_is_not(gap: Gap) -> None:
+def test_a_slippery_floor_is_named_and_a_dry_one_is_not(gap: TwinGap) -> None:
     said = {found.condition: found for found in gap.verdicts}
     assert said["wheel_slip"].verdict == UNTRUSTED
     assert "metres" in said["wheel_slip"].reasons[0] or " m " in said["wheel_slip"].reasons[0]
@@ -102,7 +105,7 @@ def test_a_slippery_floor_is_named_and_a_dry_one_is_not(gap: Gap) -> None:
     assert any("patches" in line for line in gap.not_done)
 
 
-def test_one_step_gaps_fall_with_the_true_parameters(gap: Gap) -> None:
+def test_one_step_gaps_fall_with_the_true_parameters(gap: TwinGap) -> None:
     def of(component: str, source: str) -> float:
         return next(
             float(row["mean_gap"])
@@ -122,7 +125,7 @@ def test_one_step_gaps_fall_with_the_true_parameters(gap: Gap) -> None:
     assert whole[AFTER] < whole[BEFORE]
 
 
-def test_the_lidar_is_compared_where_the_floor_is_the_twins(gap: Gap, stored: Path) -> None:
+def test_the_lidar_is_compared_where_the_floor_is_the_twins(gap: TwinGap, stored: Path) -> None:
     sectors = [row for row in gap.observations if row["component"].startswith("clearance_")]
     assert sectors
     with Store(stored) as store:
@@ -177,7 +180,7 @@ def test_logged_rewards_are_the_sum_of_their_terms(stored: Path) -> None:
     np.testing.assert_allclose(sum(found.logged.terms.values()), found.logged.reward, atol=1e-3)
 
 
-def test_a_gap_is_read_back_as_written_and_is_a_page(gap: Gap, tmp_path: Path) -> None:
+def test_a_gap_is_read_back_as_written_and_is_a_page(gap: TwinGap, tmp_path: Path) -> None:
     write_gap(gap, tmp_path / "gap")
     again = read_gap(tmp_path / "gap")
     assert again.verdicts == gap.verdicts
@@ -195,9 +198,9 @@ def test_a_gap_is_read_back_as_written_and_is_a_page(gap: Gap, tmp_path: Path) -
         read_gap(tmp_path / "other")
 
 
-def test_the_same_seed_measures_the_same(gap: Gap, stored: Path) -> None:
+def test_the_same_seed_measures_the_same(gap: TwinGap, stored: Path) -> None:
     with Store(stored) as store:
-        again = measure_gap(store, TRUE, replace(PLAN, nthread=2))
+        again = measure_gap(store, TRUE, msgspec.structs.replace(CONFIG, nthread=2))
     assert again.paths == gap.paths
     assert again.rewards == gap.rewards
 
@@ -216,7 +219,7 @@ def test_the_command_line(stored: Path, tmp_path: Path, capsys: pytest.CaptureFi
     assert document["about"]["twins"]["calibrated"]["wheel_radius_scale"] == 0.96
     assert (tmp_path / "gap" / "index.html").is_file()
     assert run(stored, "--horizons", "soon") == 2
-    assert "no seconds" in capsys.readouterr().err
+    assert "not a list of seconds" in capsys.readouterr().err
     assert run(stored, "--horizons", "1") == 2
     assert "not driven" in capsys.readouterr().err
 
@@ -260,9 +263,9 @@ FINE, WORSE = ConfidenceInterval(0.3, 0.2, 0.4), ConfidenceInterval(1.5, 1.2, 1.
 def test_the_rule(
     position_p90: ConfidenceInterval, reward: ConfidenceInterval, segments: int, verdict: str
 ) -> None:
-    found = judge(
+    found = trust_verdict(
         "wheel_slip",
-        limits=Limits(),
+        limits=TrustLimits(),
         segments=segments,
         episodes=10,
         position_p90=position_p90,
@@ -275,11 +278,11 @@ def test_the_rule(
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: GapPlan(horizons_s=()),
-        lambda: GapPlan(horizons_s=(1.0,)),
-        lambda: GapPlan(most=0),
+        lambda: GapConfig(horizons_s=()),
+        lambda: GapConfig(horizons_s=(1.0,)),
+        lambda: GapConfig(max_segments=0),
     ],
 )
-def test_plans_that_cannot_be(make: Callable[[], GapPlan]) -> None:
-    with pytest.raises(ConfigError):
+def test_gaps_that_cannot_be_measured_are_refused(make: Callable[[], GapConfig]) -> None:
+    with pytest.raises(ValueError, match=r"is not driven|must be at least 1"):
         make()

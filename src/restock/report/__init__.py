@@ -18,7 +18,7 @@ from restock.report.card import as_markdown, replay_card
 from restock.report.facts import gather
 from restock.report.page import page
 from restock.report.twin_gap import gap_page
-from restock.train.twin.calibration.gap_files import read_gap
+from restock.train.twin.calibration.twin_gap import read_gap
 
 
 def build_report(run: Path, out: Path | None = None) -> Path:

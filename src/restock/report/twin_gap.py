@@ -14,9 +14,17 @@ from restock.report import charts
 from restock.report.blocks import Section, section, table
 from restock.report.charts import words
 from restock.report.facts import Facts
-from restock.train.twin.calibration.gap import AFTER, BEFORE, Gap
-from restock.train.twin.calibration.gap_files import DOCUMENT, FOLDER, read_gap
-from restock.train.twin.calibration.trust import TRUSTED, UNDECIDED, UNKNOWN, UNTRUSTED
+from restock.train.twin.calibration.gap import AFTER, BEFORE
+from restock.train.twin.calibration.twin_gap import (
+    DOCUMENT,
+    FOLDER,
+    TRUSTED,
+    UNDECIDED,
+    UNKNOWN,
+    UNTRUSTED,
+    TwinGap,
+    read_gap,
+)
 
 COLOURS = {
     "nominal twin": "#b45309",
@@ -38,7 +46,7 @@ def source_name(source: str) -> str:
     return f"{source} twin" if source in (BEFORE, AFTER) else source
 
 
-def find_gap(facts: Facts) -> Gap | None:
+def find_gap(facts: Facts) -> TwinGap | None:
     """The gap measured for a run: RUN/gap, or the gap folder of the store its panel is from."""
     places = [facts.run / FOLDER]
     if facts.panel is not None and "://" not in str(facts.panel.header.store):
@@ -66,7 +74,7 @@ def run_section(facts: Facts) -> Section | None:
     return found
 
 
-def gap_page(gap: Gap) -> dict[str, Any]:
+def gap_page(gap: TwinGap) -> dict[str, Any]:
     """Everything the page's template asks for, of a gap alone."""
     about = gap.about
     return {
@@ -85,7 +93,7 @@ def gap_page(gap: Gap) -> dict[str, Any]:
     }
 
 
-def headline(gap: Gap) -> str:
+def headline(gap: TwinGap) -> str:
     """One sentence: where not to trust the twin."""
     names = ", ".join(words(name) for name in gap.untrusted)
     if names:
@@ -97,7 +105,7 @@ def headline(gap: Gap) -> str:
     return "No condition is shown to be beyond the limits; not all are shown to be within"
 
 
-def gap_section(gap: Gap) -> Section:
+def gap_section(gap: TwinGap) -> Section:
     """Pose gaps by horizon and condition, the verdicts and what could not be done."""
     limits = gap.about["limits"]
     shown = [
@@ -167,7 +175,7 @@ def _positions(rows: list[dict[str, Any]]) -> str:
     return charts.svg(layered.facet(column=alt.Column("horizon:N", sort=horizons)))
 
 
-def _steps_section(gap: Gap) -> Section:
+def _steps_section(gap: TwinGap) -> Section:
     """One step: reward by term, and observation by component."""
     sources = list(gap.about["twins"])
     rewards = [
@@ -216,7 +224,7 @@ def _steps_section(gap: Gap) -> Section:
     )
 
 
-def _signals_section(gap: Gap) -> Section:
+def _signals_section(gap: TwinGap) -> Section:
     sources = list(dict.fromkeys(row["source"] for row in gap.paths))
     rows = []
     for row in gap.paths:
@@ -244,7 +252,7 @@ def _signals_section(gap: Gap) -> Section:
     )
 
 
-def _grouped(gap: Gap) -> list[dict[str, Any]]:
+def _grouped(gap: TwinGap) -> list[dict[str, Any]]:
     """Observation gaps in nominal driving, lidar sectors averaged."""
     sums: dict[str, dict[str, list[float]]] = {}
     for row in gap.observations:
@@ -260,7 +268,7 @@ def _grouped(gap: Gap) -> list[dict[str, Any]]:
     ]
 
 
-def _any(gap: Gap, condition: str, term: str) -> bool:
+def _any(gap: TwinGap, condition: str, term: str) -> bool:
     return any(
         row["mean_gap"]
         for row in gap.rewards

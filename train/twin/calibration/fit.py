@@ -1,197 +1,251 @@
 """Calibration: the effective parameters under which the twin does what a log's robot did.
 
 Commands of the log are driven open loop and the motion is compared
-(`restock.train.twin.calibration.open_loop`, `restock.train.twin.calibration.mismatch`). The search
-is coarse in one batch over the whole ranges, then least squares. A parameter that the log does not
-tell stays as it was, with the reason. Values are effective: they hold for the timestep at which
-they were fitted, which is the one training uses.
+(`restock.train.twin.calibration.open_loop`, `restock.train.twin.calibration.fit_solver`). The
+search is coarse in one batch over the whole ranges, then least squares. A parameter that the log
+does not identify stays as it was, with the reason. Values are effective: they hold for the timestep
+at which they were fitted, which is the one training uses.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from restock.errors import ConfigError, StoreError
 from restock.replay.store.store import Store
 from restock.stats import bootstrap, median
-from restock.train.twin.calibration.fit_estimates import estimate, untold, warnings
-from restock.train.twin.calibration.fit_parameters import DEFAULT, PARAMETERS, Coordinates
-from restock.train.twin.calibration.fit_result import Estimate, Fit, Gap
-from restock.train.twin.calibration.fit_scope import HELD_OUT, Scope, cuts, scope, sides, usable
-from restock.train.twin.calibration.fit_solver import Problem, Solution, noise, search, solve
-from restock.train.twin.calibration.fit_uncertainty import uncertainty
+from restock.toml import Checked
+from restock.train.twin.calibration.fit_parameters import (
+    CHANNELS,
+    DEFAULT,
+    PARAMETERS,
+    Coordinates,
+    FitScope,
+    fit_scope,
+)
+from restock.train.twin.calibration.fit_solver import (
+    FitProblem,
+    FitSolution,
+    ReplayResiduals,
+    channel_noise,
+    position_gap_m,
+    search,
+    solve,
+)
+from restock.train.twin.calibration.fit_uncertainty import (
+    Uncertainty,
+    estimate,
+    fit_warnings,
+    measure_uncertainty,
+    unidentified,
+)
+from restock.train.twin.calibration.fitted_twin import FittedTwin, HeldOutGap, ParameterEstimate
 from restock.train.twin.calibration.logged_steps import LoggedSteps, logged_steps
-from restock.train.twin.calibration.mismatch import CHANNELS, Mismatch, position_gap_m
 from restock.train.twin.calibration.open_loop import replay_segments
-from restock.train.twin.calibration.segments import log_segments
+from restock.train.twin.calibration.segments import (
+    LoggedSegments,
+    held_out_from,
+    log_segments,
+    ordinary_driving,
+    split_at,
+)
 from restock.train.twin.physics.perturbation import Perturbation
 
 F64 = NDArray[np.float64]
+Report = Callable[[str], None]
 
-HORIZON_S = 3.0
-FEWEST = 8  # segments
-SMALL = 16  # segments of the coarse search
-HELD_OUT_S = (1.0, 3.0, 6.0)
+FEWEST_SEGMENTS = 8
+COARSE_SEGMENTS = 16
+HELD_OUT_HORIZONS_S = (1.0, 3.0, 6.0)
+
+
+class FitConfig(Checked, frozen=True):
+    """How a twin is fitted. The same values give the same result.
+
+    `base` holds what is not fitted, and is what "before" means.
+    """
+
+    parameters: tuple[str, ...] = DEFAULT
+    base: Perturbation = Perturbation()
+    recordings: tuple[str, ...] = ()  # of the store; none: all
+    task_hash: str | None = None  # whose rows, where the store has several tasks
+    timestep_s: Annotated[float, Meta(gt=0)] | None = None  # None: the base's
+    horizon_s: Annotated[float, Meta(gt=0)] = 3.0  # of the segments that are fitted
+    held_out: Annotated[float, Meta(ge=0, lt=1)] = 0.25  # share of the log, to measure the gap on
+    search_points: Annotated[int, Meta(ge=0)] = 64  # of the coarse search
+    max_segments: Annotated[int, Meta(ge=1)] = 200  # of more than these, as many are drawn
+    seed: Annotated[int, Meta(ge=0)] = 0
+    nthread: Annotated[int, Meta(ge=1)] = 1
+    name: str = "fitted"
+
+    def check(self) -> None:
+        """Raises ValueError where a parameter cannot be fitted."""
+        for name in self.parameters:
+            if name not in PARAMETERS:
+                raise ValueError(f"{name!r} cannot be fitted: name some of {', '.join(PARAMETERS)}")
+
+    @property
+    def step_s(self) -> float:
+        """The physics timestep of the fit."""
+        return self.base.timestep_s if self.timestep_s is None else self.timestep_s
+
+
+@dataclass(frozen=True)
+class _FitData:
+    """The log of a fit: the segments to fit, and the rest to measure on."""
+
+    steps: LoggedSteps
+    recordings: tuple[str, ...]  # that any segment is of
+    segments: LoggedSegments  # to fit
+    held_out_from_ns: dict[str, int]  # by recording
+    left_out: dict[str, int]  # segments or steps, by reason
 
 
 def fit(
-    store: Store,
-    *,
-    parameters: Sequence[str] = DEFAULT,
-    base: Perturbation | None = None,
-    recordings: Sequence[str] = (),
-    task_hash: str | None = None,
-    timestep_s: float | None = None,
-    horizon_s: float = HORIZON_S,
-    held_out: float = HELD_OUT,
-    search_points: int = 64,
-    most_segments: int = 200,
-    seed: int = 0,
-    nthread: int = 1,
-    name: str = "fitted",
-    on_progress: Callable[[str], None] | None = None,
-) -> Fit:
-    """Fit `parameters` to the recordings of a store (all, if none is named).
-
-    `base` holds what is not fitted, and is what "before" means. `held_out` is the share of the
-    log that is kept from the fit, to measure the gap on. Of more than `most_segments`, as many are
-    drawn. The same arguments give the same result.
+    store: Store, config: FitConfig | None = None, *, on_progress: Report | None = None
+) -> FittedTwin:
+    """Fit a twin to the recordings of a store.
 
     Raises:
-        ConfigError: no such parameter or recording, or none that this log could tell.
+        ConfigError: no such recording, or the log identifies none of the parameters.
         StoreError: no rows, rows of several tasks, or too few segments of ordinary driving.
     """
     begun = time.perf_counter()
-    say = on_progress or (lambda text: None)
-    base = base or Perturbation()
-    step_s = base.timestep_s if timestep_s is None else timestep_s
-    for parameter in parameters:
-        if parameter not in PARAMETERS:
-            raise ConfigError(f"{parameter!r} cannot be fitted", where="parameters",
-                              remedy=f"name some of {', '.join(PARAMETERS)}")  # fmt: skip
-    task = store.task(task_hash)
-    found = scope(store, task, parameters, recordings)
-    if not found.names:
-        raise ConfigError(
-            "none of these parameters can be told by this log: "
-            + "; ".join(f"{key}: {why}" for key, why in found.refused.items()),
-            where=str(store.path),
-            remedy="name others with --parameters, or use another log",
-        )
-    steps = logged_steps(store, task_hash, recordings)
-    every = log_segments(steps, horizon_s)
-    if not len(every):
-        raise StoreError(
-            f"no stretch of {horizon_s:g} s: {every.left_out}", where=str(store.path),
-            remedy="give a shorter horizon, or ingest more driving",
-        )  # fmt: skip
-    cut = cuts(every, held_out, seed)
-    good, left = usable(every)
-    before, _ = sides(good, cut)
-    chosen = np.flatnonzero(before)
-    if len(chosen) < FEWEST:
-        counts = {"held out": len(good) - len(chosen), **left}
-        raise StoreError(
-            f"{len(chosen)} segments of {horizon_s:g} s to fit, fewer than {FEWEST} (of"
-            f" {len(every)}: {', '.join(f'{count} {why}' for why, count in counts.items())})",
-            where=str(store.path),
-            remedy="ingest more driving, or give a shorter horizon",
-        )
-    rng = np.random.Generator(np.random.PCG64(seed))
-    if len(chosen) > most_segments:
-        left["more than are used"] = len(chosen) - most_segments
-        chosen = np.sort(rng.permutation(chosen)[:most_segments])
-    used = good.take(chosen)
-    left |= {f"steps: {reason}": count for reason, count in every.left_out.items()}
-
-    mismatch = Mismatch(used, found.channels, timestep_s=step_s, nthread=nthread)
-    small = Mismatch(
-        used.take(rng.permutation(len(used))[:SMALL]),
-        found.channels,
-        timestep_s=step_s,
-        nthread=nthread,
+    config, report = config or FitConfig(), on_progress or (lambda text: None)
+    rng = np.random.Generator(np.random.PCG64(config.seed))
+    scope = _scope(store, config)
+    data = _fit_data(store, config, rng)
+    few = data.segments.take(rng.permutation(len(data.segments))[:COARSE_SEGMENTS])
+    coarse, fine = (
+        ReplayResiduals(segments, scope.channels, timestep_s=config.step_s, nthread=config.nthread)
+        for segments in (few, data.segments)
     )
-    coordinates = Coordinates(found.names, base, task)
-    z = _coarse(small, coordinates, search_points, seed, say)
-    kept: list[Estimate] = []
-    while True:
-        solution = _fine(mismatch, coordinates, z, say)
-        known = uncertainty(solution, used.episode_id, seed)
-        lost = untold(mismatch, solution, known)
-        if lost is None:
-            break
-        say(f"{lost.name} is not told by this log")
-        kept.append(lost)
-        at = coordinates.names.index(lost.name)
-        coordinates, z = coordinates.without(lost.name), np.delete(solution.z, at)
-        if not len(coordinates):
-            raise ConfigError(
-                f"this log does not tell {lost.name}: {lost.note}",
-                where=str(store.path),
-                remedy="log more driving with changes of speed and direction",
-            )
+    coordinates = Coordinates(scope.names, config.base, data.steps.task)
+    start = _search(coarse, coordinates, config, report)
+    solution, uncertainty, dropped = _identify(fine, coordinates, start, config, store, report)
     perturbation = msgspec.structs.replace(
-        coordinates.perturbation(solution.z), name=name, timestep_s=step_s
+        solution.coordinates.perturbation(solution.z), name=config.name, timestep_s=config.step_s
     )
-    estimates = [estimate(solution, known, index) for index in range(len(coordinates))]
-    warned = list(found.notes)
-    warned += [f"{key} is not fitted: {why}" for key, why in found.refused.items()]
-    warned += [f"{item.name} is not fitted: {item.note}" for item in kept]
-    warned += warnings(solution, known)
-    refused = [
-        Estimate(key, PARAMETERS[key].unit, getattr(base, key), None, None, False, why)
-        for key, why in found.refused.items()
-    ]
-    order = list(parameters)
-    return Fit(
+    return FittedTwin(
         perturbation=perturbation,
-        base=base,
-        timestep_s=step_s,
-        recordings=tuple(str(item) for item in np.unique(every.recording_id)),
-        estimates=tuple(
-            sorted([*estimates, *kept, *refused], key=lambda item: order.index(item.name))
+        base=config.base,
+        timestep_s=config.step_s,
+        recordings=data.recordings,
+        estimates=_estimates(config, scope, solution, uncertainty, dropped),
+        warnings=(
+            *scope.notes,
+            *(f"{name} is not fitted: {reason}" for name, reason in scope.refused.items()),
+            *(f"{item.name} is not fitted: {item.note}" for item in dropped),
+            *fit_warnings(solution, uncertainty),
         ),
-        warnings=tuple(warned),
-        held_out=_held_out(steps, cut, found, base, perturbation, step_s, nthread, seed, say)
-        if held_out
-        else (),
-        noise=_noise(mismatch, base, perturbation),
-        segments=len(used),
-        clusters=known.clusters,
-        condition=known.condition,
-        left_out=left,
-        replays=mismatch.replays + small.replays,
+        held_out=_held_out_gaps(data, scope, config, perturbation, report),
+        noise=_deviations(fine, config.base, perturbation),
+        segments=len(data.segments),
+        clusters=uncertainty.clusters,
+        condition_number=uncertainty.condition_number,
+        left_out=data.left_out,
+        replays=fine.replays + coarse.replays,
         work_s=time.perf_counter() - begun,
     )
 
 
-def _coarse(
-    small: Mismatch, coordinates: Coordinates, points: int, seed: int, say: Callable[[str], None]
+def _scope(store: Store, config: FitConfig) -> FitScope:
+    """What of the parameters the log can identify at all; ConfigError where that is nothing."""
+    task = store.task(config.task_hash)
+    scope = fit_scope(store, task, config.parameters, config.recordings)
+    if not scope.names:
+        raise ConfigError(
+            "this log can identify none of these parameters: "
+            + "; ".join(f"{name}: {reason}" for name, reason in scope.refused.items()),
+            where=str(store.path),
+            remedy="name others with --parameters, or use another log",
+        )
+    return scope
+
+
+def _fit_data(store: Store, config: FitConfig, rng: np.random.Generator) -> _FitData:
+    """Segments of ordinary driving to fit, at most `max_segments`, and what is held out."""
+    steps = logged_steps(store, config.task_hash, config.recordings)
+    segments = log_segments(steps, config.horizon_s)
+    if not len(segments):
+        raise StoreError(
+            f"no stretch of {config.horizon_s:g} s: {segments.left_out}", where=str(store.path),
+            remedy="give a shorter horizon, or ingest more driving",
+        )  # fmt: skip
+    stamps = held_out_from(segments, config.held_out, config.seed)
+    ordinary, left_out = ordinary_driving(segments)
+    chosen = np.flatnonzero(split_at(ordinary, stamps)[0])
+    if len(chosen) < FEWEST_SEGMENTS:
+        counts = {"held out": len(ordinary) - len(chosen), **left_out}
+        raise StoreError(
+            f"{len(chosen)} segments of {config.horizon_s:g} s to fit, fewer than"
+            f" {FEWEST_SEGMENTS} (of {len(segments)}:"
+            f" {', '.join(f'{count} {reason}' for reason, count in counts.items())})",
+            where=str(store.path),
+            remedy="ingest more driving, or give a shorter horizon",
+        )
+    if len(chosen) > config.max_segments:
+        left_out["more than are used"] = len(chosen) - config.max_segments
+        chosen = np.sort(rng.permutation(chosen)[: config.max_segments])
+    left_out |= {f"steps: {reason}": count for reason, count in segments.left_out.items()}
+    recordings = tuple(str(name) for name in np.unique(segments.recording_id))
+    return _FitData(steps, recordings, ordinary.take(chosen), stamps, left_out)
+
+
+def _search(
+    residuals: ReplayResiduals, coordinates: Coordinates, config: FitConfig, report: Report
 ) -> F64:
     """The best point (n,) of a search over the whole ranges, on few segments."""
-    say(f"searching {points} points on {len(small.segments)} segments")
-    problem = Problem(small, coordinates, {name: CHANNELS[name][1] for name in small.channels})
-    starts = search(problem, points, best=3, seed=seed)
+    report(f"searching {config.search_points} points on {len(residuals.segments)} segments")
+    scale = {name: CHANNELS[name][1] for name in residuals.channels}
+    problem = FitProblem(residuals, coordinates, scale)
+    starts = search(problem, config.search_points, best=3, seed=config.seed)
     ends = [solve(problem, start, iterations=6) for start in starts]
     return min(ends, key=lambda end: end[1])[0]
 
 
-def _fine(
-    mismatch: Mismatch, coordinates: Coordinates, z: F64, say: Callable[[str], None]
-) -> Solution:
+def _identify(
+    residuals: ReplayResiduals, coordinates: Coordinates, start: F64, config: FitConfig,
+    store: Store, report: Report,
+) -> tuple[FitSolution, Uncertainty, list[ParameterEstimate]]:  # fmt: skip
+    """Least squares, again without each parameter that turns out not to be identified."""
+    dropped: list[ParameterEstimate] = []
+    while True:
+        solution = _least_squares(residuals, coordinates, start, report)
+        uncertainty = measure_uncertainty(solution, residuals.segments.episode_id, config.seed)
+        lost = unidentified(residuals, solution, uncertainty)
+        if lost is None:
+            return solution, uncertainty, dropped
+        report(f"this log does not identify {lost.name}")
+        dropped.append(lost)
+        start = np.delete(solution.z, coordinates.names.index(lost.name))
+        coordinates = coordinates.without(lost.name)
+        if not len(coordinates):
+            raise ConfigError(
+                f"this log does not identify {lost.name}: {lost.note}",
+                where=str(store.path),
+                remedy="log more driving with changes of speed and direction",
+            )
+
+
+def _least_squares(
+    residuals: ReplayResiduals, coordinates: Coordinates, z: F64, report: Report
+) -> FitSolution:
     """Least squares on all segments: twice, for the noise is known only after the first."""
     for iterations in (10, 15):
-        scale = noise(mismatch.of([coordinates.perturbation(z)]))
-        problem = Problem(mismatch, coordinates, scale)
+        scale = channel_noise(residuals.of([coordinates.perturbation(z)]))
+        problem = FitProblem(residuals, coordinates, scale)
         z, value, converged = solve(problem, z, iterations)
-        say(f"least squares on {len(mismatch.segments)} segments: cost {value:.1f}")
-    return Solution(
+        report(f"least squares on {len(residuals.segments)} segments: cost {value:.1f}")
+    return FitSolution(
         coordinates=coordinates,
         z=z,
         residual=problem.residual(z[:, None])[:, 0],
@@ -202,44 +256,57 @@ def _fine(
     )
 
 
-def _held_out(
-    steps: LoggedSteps, cut: dict[str, int], found: Scope, base: Perturbation, fitted: Perturbation,
-    timestep_s: float, nthread: int, seed: int, say: Callable[[str], None],
-) -> tuple[Gap, ...]:  # fmt: skip
+def _estimates(
+    config: FitConfig, scope: FitScope, solution: FitSolution, uncertainty: Uncertainty,
+    dropped: list[ParameterEstimate],
+) -> tuple[ParameterEstimate, ...]:  # fmt: skip
+    """Of every parameter, in the order in which they were named."""
+    fitted = [estimate(solution, uncertainty, index) for index in range(len(solution.z))]
+    refused = [
+        ParameterEstimate(
+            name, PARAMETERS[name].unit, getattr(config.base, name), None, None, False, reason
+        )
+        for name, reason in scope.refused.items()
+    ]
+    order = config.parameters.index
+    return tuple(sorted([*fitted, *dropped, *refused], key=lambda item: order(item.name)))
+
+
+def _held_out_gaps(
+    data: _FitData, scope: FitScope, config: FitConfig, fitted: Perturbation, report: Report
+) -> tuple[HeldOutGap, ...]:
     """The gap of position on what the fit has not seen, at 1, 3 and 6 s."""
-    gaps = []
-    if "position" not in found.channels:
+    if "position" not in scope.channels or not config.held_out:
         return ()
-    say("replaying what was held out")
-    period_s = steps.task.control_period_s
-    for wanted_s in HELD_OUT_S:
+    report("replaying what was held out")
+    gaps, period_s = [], data.steps.task.control_period_s
+    for wanted_s in HELD_OUT_HORIZONS_S:
         horizon_s = max(round(wanted_s / period_s), 1) * period_s
-        every = log_segments(steps, horizon_s)
-        good, _ = usable(every)
-        _, after = sides(good, cut) if len(good) else (None, np.zeros(0, np.bool_))
-        if not after.any():
+        ordinary, _ = ordinary_driving(log_segments(data.steps, horizon_s))
+        held_out = ordinary.take(split_at(ordinary, data.held_out_from_ns)[1])
+        if not len(held_out):
             continue
-        held = good.take(after)
-        replayed = replay_segments(held, [base, fitted], timestep_s=timestep_s, nthread=nthread)
-        end = position_gap_m(held, replayed)[:, :, -1]
-        rng = np.random.Generator(np.random.PCG64(seed))
-        interval = bootstrap([end[1]], median, rng=rng, resamples=1000)
-        before, now = (median(item) for item in end)
-        gaps.append(Gap(round(horizon_s, 6), len(held), before, now, *interval))
+        replayed = replay_segments(
+            held_out, [config.base, fitted], timestep_s=config.step_s, nthread=config.nthread
+        )
+        before, after = position_gap_m(held_out, replayed)[:, :, -1]
+        rng = np.random.Generator(np.random.PCG64(config.seed))
+        interval = bootstrap([after], median, rng=rng, resamples=1000)
+        gaps.append(
+            HeldOutGap(round(horizon_s, 6), len(held_out), median(before), median(after), *interval)
+        )
     return tuple(gaps)
 
 
-def _noise(mismatch: Mismatch, base: Perturbation, fitted: Perturbation) -> dict[str, Any]:
+def _deviations(
+    residuals: ReplayResiduals, base: Perturbation, fitted: Perturbation
+) -> dict[str, dict[str, Any]]:
     """Median deviations of each channel before and after."""
-    found = mismatch.of([base, fitted])
     return {
         name: {
             "unit": CHANNELS[name][0],
-            "before": float(np.median(np.abs(found[name][0]))),
-            "after": float(np.median(np.abs(found[name][1]))),
+            "before": float(np.median(np.abs(values[0]))),
+            "after": float(np.median(np.abs(values[1]))),
         }
-        for name in mismatch.channels
+        for name, values in residuals.of([base, fitted]).items()
     }
-
-
-__all__ = ["Estimate", "Fit", "Gap", "fit"]

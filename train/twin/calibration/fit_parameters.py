@@ -1,4 +1,4 @@
-"""What can be fitted: each parameter's range, the step it is varied by, and when it is known."""
+"""What can be fitted: parameters and their ranges, and which of them a log can identify."""
 
 from __future__ import annotations
 
@@ -10,10 +10,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import ConfigError
+from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
+from restock.replay.store.store import Store
 from restock.train.twin.physics.perturbation import RANGES, Perturbation
 
 F64 = NDArray[np.float64]
+
+# Channel -> (unit, noise to begin with). What the log's noise is comes from the residuals later.
+CHANNELS: dict[str, tuple[str, float]] = {
+    "wheel speed": ("m/s", 0.02),
+    "wheel yaw rate": ("rad/s", 0.04),
+    "gyro": ("rad/s", 0.04),
+    "position": ("m", 0.04),
+    "heading": ("rad", 0.02),
+}
+_ODOMETRY = "nav_msgs/msg/Odometry"
+_GOAL = "geometry_msgs/msg/PoseStamped"  # a goal's type as often as a localiser's
+_POSE_TYPES = (
+    "PoseWithCovarianceStamped",
+    "PoseStamped",
+    "TFMessage",
+    "Pose",
+    "PoseWithCovariance",
+)
 
 
 @dataclass(frozen=True)
@@ -23,7 +43,7 @@ class Parameter:
     name: str
     unit: str
     step: float  # of a difference quotient; of a `ratio` the relative step
-    known: float  # a 95 % interval of more than +- this (of a ratio: its logarithm) says too little
+    useful: float  # a 95 % interval wider than +- this (of a ratio: its logarithm) says too little
     doc: str
     ratio: bool = False  # searched by its logarithm
     default: bool = True
@@ -47,7 +67,9 @@ PARAMETERS: dict[str, Parameter] = {
         Parameter(
             *("payload_kg", "kg", 2.0, 20.0, "load: seen while speeds change"), own_body=True
         ),
-        Parameter("wheel_radius_scale", "", 0.004, 0.02, "way over ground, by the wheels' way"),
+        Parameter(
+            "wheel_radius_scale", "", 0.004, 0.02, "distance over ground, by the wheels' distance"
+        ),
         Parameter("track_scale", "", 0.004, 0.02, "turn over ground, by the wheels' turn"),
         Parameter("latency_s", "s", 0.01, 0.03, "from an observation to the wheels' set point"),
         Parameter("gain", "", 0.005, 0.02, "wheel speed, by the commanded one"),
@@ -58,7 +80,7 @@ DEFAULT = tuple(item.name for item in PARAMETERS.values() if item.default)
 
 
 def parse_parameters(text: str) -> tuple[str, ...]:
-    """`latency_s,gain` to names. Raises ConfigError where one is none of `PARAMETERS`."""
+    """`latency_s,gain` to names. Raises ConfigError where one is not in `PARAMETERS`."""
     names = tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
     unknown = [name for name in names if name not in PARAMETERS]
     if unknown or not names:
@@ -96,9 +118,9 @@ class Coordinates:
         return np.array([item.step for item in self.parameters]) / self._span
 
     @property
-    def known(self) -> F64:
-        """Half widths of intervals beyond which a parameter is not known, (n,) in z."""
-        return np.array([item.known for item in self.parameters]) / self._span
+    def useful(self) -> F64:
+        """Half widths of intervals beyond which they say too little, (n,) in z."""
+        return np.array([item.useful for item in self.parameters]) / self._span
 
     def values(self, z: F64) -> F64:
         """Parameters (..., n) at points (..., n)."""
@@ -107,15 +129,15 @@ class Coordinates:
 
     def point(self, perturbation: Perturbation) -> F64:
         """Where a perturbation is, (n,), moved into the cube."""
-        found = np.array([getattr(perturbation, name) for name in self.names], np.float64)
-        inner = np.where(self._ratio, np.log(np.where(self._ratio, found, 1.0)), found)
+        values = np.array([getattr(perturbation, name) for name in self.names], np.float64)
+        inner = np.where(self._ratio, np.log(np.where(self._ratio, values, 1.0)), values)
         return np.clip((inner - self._low) / self._span, 0.0, 1.0)
 
     def perturbation(self, z: F64) -> Perturbation:
         """The perturbation at a point (n,)."""
         # Rounded so that equal points are equal, and ends of ranges are within them.
-        found = dict(zip(self.names, (round(float(v), 9) for v in self.values(z)), strict=True))
-        return msgspec.structs.replace(self.base, **found)
+        values = dict(zip(self.names, (round(float(v), 9) for v in self.values(z)), strict=True))
+        return msgspec.structs.replace(self.base, **values)
 
     def drivable(self, z: F64, timestep_s: float) -> F64:
         """The point (n,) with the nearest latency that is some physics steps."""
@@ -129,8 +151,77 @@ class Coordinates:
     def without(self, name: str) -> Coordinates:
         """The same with one parameter fewer; it stays as in `base`."""
         made = object.__new__(Coordinates)
-        keep = [index for index, own in enumerate(self.names) if own != name]
+        keep = [index for index, other in enumerate(self.names) if other != name]
         made.names, made.base = tuple(self.names[i] for i in keep), self.base
         made.parameters = [self.parameters[i] for i in keep]
         made._ratio, made._low, made._span = self._ratio[keep], self._low[keep], self._span[keep]
         return made
+
+
+@dataclass(frozen=True)
+class FitScope:
+    """Parameters and channels that a log says something about, and why not the others."""
+
+    names: tuple[str, ...]
+    channels: tuple[str, ...]
+    refused: dict[str, str]  # parameter -> why it cannot be fitted
+    notes: tuple[str, ...]
+
+
+def fit_scope(
+    store: Store, task: Task, names: Sequence[str], recordings: Sequence[str]
+) -> FitScope:
+    """What of `names` the recordings (all, if none is named) can say anything about."""
+    refused: dict[str, str] = {}
+    notes: list[str] = []
+    channels = list(CHANNELS)
+    twin = load_profile("warehouse_amr").task.body
+    if (task.body.length_m, task.body.width_m) != (twin.length_m, twin.width_m):
+        body = f"{task.body.length_m:g} x {task.body.width_m:g} m"
+        why = f"the log's robot ({body}) is not the twin's: its mass and its contacts differ"
+        refused |= {name: why for name in names if PARAMETERS[name].own_body}
+        notes.append(
+            f"the log's robot is {body}, the twin's {twin.length_m:g} x {twin.width_m:g} m with"
+            " other wheels, mass and ramps: fitted values are ratios of commanded, wheel and ground"
+            " motion, no dimensions of that robot"
+        )
+    wanted = _recording_filter(recordings)
+    fallbacks = {row[0] for row in store.sql(
+        f"SELECT DISTINCT unnest(stand_ins).input FROM recordings {wanted}"
+    ).fetchall()}  # fmt: skip
+    if "imu" in fallbacks:
+        channels.remove("gyro")
+        notes.append("no IMU: yaw rate is known from headings alone")
+        if "gyro_bias_radps" in names:
+            refused["gyro_bias_radps"] = "the log has no gyroscope"
+    if _pose_is_odometry(store, wanted):
+        channels = [name for name in channels if name not in ("position", "heading")]
+        why = "the log's pose is the wheels' odometry: nothing measures the motion over ground"
+        refused |= {name: why for name in names if name in ("wheel_radius_scale", "friction_scale")}
+        notes.append("the pose is odometry: positions and headings are not compared in the fit")
+        if "gyro" not in channels and "track_scale" in names:
+            refused["track_scale"] = (
+                "neither gyroscope nor localisation measures the turn over ground"
+            )
+    kept = tuple(name for name in names if name not in refused)
+    return FitScope(kept, tuple(channels), refused, tuple(notes))
+
+
+def _recording_filter(recordings: Sequence[str]) -> str:
+    quoted = ", ".join("'" + name.replace("'", "''") + "'" for name in recordings)
+    return f"WHERE recording_id IN ({quoted})" if recordings else ""
+
+
+def _pose_is_odometry(store: Store, wanted: str) -> bool:
+    """Whether, in all recordings, odometry was read and no topic that a localiser publishes."""
+    types = [
+        {str(kind) for (kind,) in store.sql(
+            "SELECT DISTINCT type FROM topics WHERE decoded > 0 AND recording_id ="
+            f" '{recording}'"
+        ).fetchall()}
+        for (recording,) in store.sql(f"SELECT recording_id FROM recordings {wanted}").fetchall()
+    ]  # fmt: skip
+    return all(
+        _ODOMETRY in kinds and not any(kind.endswith(_POSE_TYPES) for kind in kinds - {_GOAL})
+        for kinds in types
+    )

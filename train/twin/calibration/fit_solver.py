@@ -1,24 +1,37 @@
-"""The search for parameters: coarse in one batch, then `mujoco.minimize.least_squares`.
+"""The search for parameters: residuals of replays, a coarse search, and least squares over them.
 
-Residuals are counted in units of their channel's noise and beyond some of them by their size, not
-its square (soft L1), so that a wheel over a cable does not move the fit.
+Residuals are what separates replays from their log, by channel. Position and heading are compared
+after each predicted path was laid onto the logged one as a rigid piece (by the mean heading and the
+mean position of the segment's fresh poses): a localiser's error at a segment's first pose would
+otherwise turn and shift the whole path. The twin's commands take effect at a physics step, so a
+replay knows latencies only in multiples of the timestep; between two of them residuals are
+interpolated, which makes the fit smooth.
+
+The search is coarse in one batch, then `mujoco.minimize.least_squares`. Residuals are counted in
+units of their channel's noise and beyond some of them by their size, not its square (soft L1), so
+that a wheel over a cable does not move the fit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from mujoco import minimize
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from restock.train.twin.calibration.fit_parameters import Coordinates
-from restock.train.twin.calibration.mismatch import Mismatch
+from restock.ingest.task.signals import wrap_angle
+from restock.train.twin.calibration.fit_parameters import CHANNELS, Coordinates
+from restock.train.twin.calibration.open_loop import Replayed, replay_segments
+from restock.train.twin.calibration.segments import LoggedSegments
+from restock.train.twin.physics.perturbation import Perturbation
 
 F64 = NDArray[np.float64]
 
+_KEPT = 512  # replays of single perturbations that are kept
 ENOUGH = 0.02  # of the cost: what a parameter costs a fifth of its standard deviation away
 FREE = 0.01  # of the regulariser, where the Hessian's diagonal is about 1
 SOFT = 2.0  # noises from which on a residual counts by its size
@@ -30,6 +43,116 @@ LEAST = {
     "position": 0.002,
     "heading": 0.001,
 }
+
+
+class ReplayResiduals:
+    """Residuals (prediction less log) of any perturbation on one set of segments.
+
+    Args:
+        channels: of `CHANNELS`, those the recording can be trusted in.
+    """
+
+    def __init__(
+        self,
+        segments: LoggedSegments,
+        channels: Sequence[str] = tuple(CHANNELS),
+        *,
+        timestep_s: float = 0.01,
+        nthread: int = 1,
+    ) -> None:
+        self.segments, self.channels = segments, tuple(channels)
+        self.timestep_s, self.nthread = timestep_s, nthread
+        self.replays = 0  # perturbations driven so far
+        self._known: dict[Perturbation, dict[str, F64]] = {}
+
+    def of(self, perturbations: Sequence[Perturbation]) -> dict[str, F64]:
+        """Residuals by channel, (P, S, R) each: R is K + 1, for a position twice that."""
+        parts = [self._between(perturbation) for perturbation in perturbations]
+        self._drive([twin for pair in parts for twin, weight in pair if weight])
+        residuals = {
+            channel: np.stack(
+                [
+                    sum((w * self._known[twin][channel] for twin, w in pair if w), 0.0)
+                    for pair in parts
+                ]
+            )
+            for channel in self.channels
+        }
+        if "gyro" in residuals:
+            bias = np.array([perturbation.gyro_bias_radps for perturbation in perturbations])
+            residuals["gyro"] = residuals["gyro"] + bias[:, None, None]
+        return residuals
+
+    def _between(self, perturbation: Perturbation) -> list[tuple[Perturbation, float]]:
+        """The replays that make up a perturbation, and their weights."""
+        ticks = perturbation.latency_s / self.timestep_s
+        low = int(np.floor(ticks + 1e-6))
+        above = max(ticks - low, 0.0)
+        pair = [(low, 1 - above), (low + 1, above if above > 1e-6 else 0.0)]
+        return [
+            (
+                msgspec.structs.replace(
+                    perturbation,
+                    name="",
+                    gyro_bias_radps=0.0,
+                    latency_s=min(tick * self.timestep_s, 0.5),
+                ),
+                weight,
+            )
+            for tick, weight in pair
+        ]
+
+    def _drive(self, twins: Sequence[Perturbation]) -> None:
+        new = [twin for twin in dict.fromkeys(twins) if twin not in self._known]
+        if len(self._known) + len(new) > _KEPT:
+            self._known.clear()
+            new = list(dict.fromkeys(twins))
+        if not new:
+            return
+        replayed = replay_segments(
+            self.segments, new, timestep_s=self.timestep_s, nthread=self.nthread
+        )
+        self.replays += len(new)
+        residuals = channel_residuals(self.segments, replayed)
+        for index, twin in enumerate(new):
+            self._known[twin] = {name: residuals[name][index] for name in self.channels}
+
+
+def channel_residuals(segments: LoggedSegments, replayed: Replayed) -> dict[str, F64]:
+    """Every channel's residuals, (P, S, R) each; 0 where the log says nothing."""
+    predicted, logged = replayed.signals, segments.signals
+    residuals = {
+        channel: predicted[name] - logged[name]
+        for channel, name in (
+            ("wheel speed", "wheel_speed_mps"),
+            ("wheel yaw rate", "wheel_yaw_rate_radps"),
+            ("gyro", "gyro_yaw_rate_radps"),
+        )
+    }
+    weight = segments.pose_fresh / segments.pose_fresh.sum(axis=1, keepdims=True)  # (S, K + 1)
+    pose, goal = replayed.pose, segments.pose
+    off = wrap_angle(pose[..., 2] - goal[..., 2])  # (P, S, K + 1)
+    turn = (off * weight).sum(axis=-1, keepdims=True)
+    residuals["heading"] = np.where(segments.pose_fresh, wrap_angle(off - turn), 0.0)
+    cos, sin = np.cos(-turn), np.sin(-turn)
+    x, y = pose[..., 0] - goal[:, :1, 0], pose[..., 1] - goal[:, :1, 1]
+    to = goal[..., :2] - goal[:, :1, :2]
+    parts = []
+    for value, aim in ((cos * x - sin * y, to[..., 0]), (sin * x + cos * y, to[..., 1])):
+        gap = value - aim
+        gap = gap - (gap * weight).sum(axis=-1, keepdims=True)
+        parts.append(np.where(segments.pose_fresh, gap, 0.0))
+    residuals["position"] = np.concatenate(parts, axis=-1)
+    return residuals
+
+
+def position_gap_m(segments: LoggedSegments, replayed: Replayed) -> F64:
+    """How far the twin is from the logged position, (P, S, K + 1), from a common first pose."""
+    gap: F64 = np.hypot(
+        replayed.signals["pose_x_m"] - segments.signals["pose_x_m"],
+        replayed.signals["pose_y_m"] - segments.signals["pose_y_m"],
+    )
+    return gap
 
 
 class SoftL1(minimize.Norm):  # type: ignore[misc]  # mujoco has no types
@@ -47,18 +170,16 @@ class SoftL1(minimize.Norm):  # type: ignore[misc]  # mujoco has no types
 
 def cost(r: F64) -> F64:
     """Soft L1 of residuals (R, ...), summed over the first axis."""
-    found: F64 = SOFT**2 * (np.sqrt(1 + (r / SOFT) ** 2) - 1).sum(axis=0)
-    return found
+    return np.asarray(SOFT**2 * (np.sqrt(1 + (r / SOFT) ** 2) - 1).sum(axis=0))
 
 
 def weights(r: F64) -> F64:
     """Of each residual: the derivative of the norm is weight times residual."""
-    found: F64 = 1 / np.sqrt(1 + (r / SOFT) ** 2)
-    return found
+    return np.asarray(1 / np.sqrt(1 + (r / SOFT) ** 2))
 
 
 @dataclass(frozen=True)
-class Solution:
+class FitSolution:
     """Where the search ended, with what uncertainty and warnings are made of."""
 
     coordinates: Coordinates
@@ -70,25 +191,25 @@ class Solution:
     converged: bool
 
 
-class Problem:
+class FitProblem:
     """Residuals and their derivatives as functions of a point, for the solver."""
 
     def __init__(
-        self, mismatch: Mismatch, coordinates: Coordinates, scale: Mapping[str, float]
+        self, residuals: ReplayResiduals, coordinates: Coordinates, scale: Mapping[str, float]
     ) -> None:
-        self.mismatch, self.coordinates, self.scale = mismatch, coordinates, dict(scale)
+        self.residuals, self.coordinates, self.scale = residuals, coordinates, dict(scale)
 
     def residual(self, z: F64) -> F64:
         """Residuals (R, k) in units of noise, at points (n, k)."""
-        found = self.mismatch.of([self.coordinates.perturbation(point) for point in z.T])
-        parts = [found[name] / self.scale[name] for name in self.mismatch.channels]
+        residuals = self.residuals.of([self.coordinates.perturbation(point) for point in z.T])
+        parts = [residuals[name] / self.scale[name] for name in self.residuals.channels]
         return np.concatenate([part.reshape(z.shape[1], -1) for part in parts], axis=1).T
 
     @property
     def segment(self) -> NDArray[np.int64]:
         """The segment (R,) of each residual."""
-        steps, num = self.mismatch.segments.horizon_steps + 1, len(self.mismatch.segments)
-        widths = [2 * steps if name == "position" else steps for name in self.mismatch.channels]
+        steps, num = self.residuals.segments.horizon_steps + 1, len(self.residuals.segments)
+        widths = [2 * steps if name == "position" else steps for name in self.residuals.channels]
         return np.concatenate([np.repeat(np.arange(num), width) for width in widths])
 
     def jacobian(self, z: F64, residual: F64) -> F64:
@@ -100,7 +221,7 @@ class Problem:
         """
         del residual  # it is between two latencies; this is at one
         size, steps = len(self.coordinates), self.coordinates.steps
-        at = self.coordinates.drivable(z.reshape(-1), self.mismatch.timestep_s)
+        at = self.coordinates.drivable(z.reshape(-1), self.residuals.timestep_s)
         # Of the latency, to the side on which z lies: residuals are interpolated there.
         forward = (at + steps <= 1.0) & (z.reshape(-1) >= at - 1e-9)
         forward |= at - steps < 0.0
@@ -111,27 +232,28 @@ class Problem:
             if item.own_body and steps[index] <= at[index] <= 1.0 - steps[index]
         ]
         moves = [np.zeros((size, 1)), np.diag(step), -np.diag(step)[:, both]]
-        found = self.residual(at[:, None] + np.hstack(moves))
-        slope: F64 = (found[:, 1 : size + 1] - found[:, :1]) / step
-        back = (found[:, :1] - found[:, size + 1 :]) / step[both]
+        at_moves = self.residual(at[:, None] + np.hstack(moves))
+        slope: F64 = (at_moves[:, 1 : size + 1] - at_moves[:, :1]) / step
+        back = (at_moves[:, :1] - at_moves[:, size + 1 :]) / step[both]
         ahead = slope[:, both]
         smaller = np.where(np.abs(ahead) < np.abs(back), ahead, back)
         slope[:, both] = np.where(ahead * back > 0, smaller, 0.0)
         return slope
 
 
-def search(problem: Problem, points: int, best: int, seed: int) -> F64:
+def search(problem: FitProblem, points: int, best: int, seed: int) -> F64:
     """The best (best, n) of the base and `points` points of a Sobol sequence."""
     sampler = qmc.Sobol(len(problem.coordinates), scramble=True, rng=seed)
-    found = sampler.random(points) if points else np.zeros((0, len(problem.coordinates)))
+    drawn = sampler.random(points) if points else np.zeros((0, len(problem.coordinates)))
     start = problem.coordinates.point(problem.coordinates.base)
-    timestep_s = problem.mismatch.timestep_s
-    trial = np.array([problem.coordinates.drivable(z, timestep_s) for z in (start, *found)])
-    value = np.concatenate([cost(problem.residual(part.T)) for part in _batches(trial, 16)])
+    timestep_s = problem.residuals.timestep_s
+    trial = np.array([problem.coordinates.drivable(z, timestep_s) for z in (start, *drawn)])
+    batches = [trial[begin : begin + 16] for begin in range(0, len(trial), 16)]
+    value = np.concatenate([cost(problem.residual(batch.T)) for batch in batches])
     return trial[np.argsort(value, kind="stable")[:best]]
 
 
-def solve(problem: Problem, start: F64, iterations: int) -> tuple[F64, float, bool]:
+def solve(problem: FitProblem, start: F64, iterations: int) -> tuple[F64, float, bool]:
     """The least-squares solution (n,) from a start (n,), its cost, and whether it converged."""
     size = len(problem.coordinates)
     steps: list[minimize.IterLog] = []
@@ -143,7 +265,7 @@ def solve(problem: Problem, start: F64, iterations: int) -> tuple[F64, float, bo
             raise _GoodEnough
 
     try:
-        found, steps[:] = minimize.least_squares(
+        solution, steps[:] = minimize.least_squares(
             start,
             problem.residual,
             bounds=[np.zeros(size), np.ones(size)],
@@ -159,23 +281,23 @@ def solve(problem: Problem, start: F64, iterations: int) -> tuple[F64, float, bo
             iter_callback=watch,
         )
     except _GoodEnough:
-        found = steps[-1].candidate.reshape(start.shape)
-        return found, float(steps[-1].objective), True
-    return found, float(steps[-1].objective), len(steps) <= iterations
+        solution = steps[-1].candidate.reshape(start.shape)
+        return solution, float(steps[-1].objective), True
+    return solution, float(steps[-1].objective), len(steps) <= iterations
 
 
 class _GoodEnough(Exception):
     """A step gained less than what a log can tell: the one way out of the solver."""
 
 
-def noise(found: Mapping[str, F64], position_parts: int = 2) -> dict[str, float]:
+def channel_noise(residuals: Mapping[str, F64], position_parts: int = 2) -> dict[str, float]:
     """Each channel's noise from residuals (1, S, R) at a solution.
 
     The median deviation, times what the correlation of neighbouring steps takes away: n residuals
     with correlation c say as much as n (1 - c) / (1 + c) without.
     """
     scale = {}
-    for name, residual in found.items():
+    for name, residual in residuals.items():
         rows = residual[0]
         runs = (
             np.concatenate(np.split(rows, position_parts, axis=1)) if name == "position" else rows
@@ -187,7 +309,3 @@ def noise(found: Mapping[str, F64], position_parts: int = 2) -> dict[str, float]
         together = min(max(together, 0.0), 0.95)
         scale[name] = spread * float(np.sqrt((1 + together) / (1 - together)))
     return scale
-
-
-def _batches(points: F64, size: int) -> list[F64]:
-    return [points[begin : begin + size] for begin in range(0, len(points), size)]

@@ -1,110 +1,91 @@
 """The gap between the twin and a store's logs, per condition, before and after calibration.
 
 Paths: logged commands driven again open loop (`path_gap`). Steps: one control period from each
-logged state, through the task's own observation and reward (`one_step`). Verdicts: `trust`.
-What a store's signals do not allow is said in `Gap.not_done`.
+logged state, through the task's own observation and reward (`one_step`). Each statistic is a row
+with its interval over episodes; verdicts are made of them (`twin_gap`). What a store's signals do
+not allow is listed in `TwinGap.not_done`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
-from restock.errors import ConfigError, StoreError
+from restock.errors import StoreError
 from restock.replay.store.store import Store
-from restock.stats import NOT_KNOWN, ConfidenceInterval
-from restock.train.twin.calibration.gap_rows import (
-    Rows,
-    estimate,
-    observation_rows,
-    path_rows,
-    reward_rows,
-)
+from restock.stats import NOT_KNOWN, ConfidenceInterval, clustered_quantiles, clustered_ratio
+from restock.toml import Checked
 from restock.train.twin.calibration.logged_steps import NOMINAL, LoggedSteps, logged_steps
-from restock.train.twin.calibration.one_step import AGREES, OneStep, agreement, one_step
-from restock.train.twin.calibration.path_gap import PathGap, measured_noise, path_gap
-from restock.train.twin.calibration.plan_memory import PlanMemory, rebuild_plans
-from restock.train.twin.calibration.trust import UNTRUSTED, Limits, Verdict, judge
+from restock.train.twin.calibration.one_step import (
+    AGREES,
+    OneStep,
+    agreement,
+    one_step,
+    rebuild_plans,
+)
+from restock.train.twin.calibration.path_gap import (
+    QUANTITIES,
+    PathGap,
+    measured_noise,
+    path_gap,
+)
+from restock.train.twin.calibration.twin_gap import (
+    Rows,
+    TrustLimits,
+    TwinGap,
+    Verdict,
+    trust_verdict,
+)
 from restock.train.twin.floors.layout import Warehouse, default_warehouse
 from restock.train.twin.physics.perturbation import Perturbation
 
-BEFORE, AFTER = "nominal", "calibrated"
-HORIZONS_S = (1.0, 3.0, 6.0)
-_LOOKED_AT = 200  # nominal rows whose lidar says whether the floor is the twin's
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+BEFORE, AFTER, PERSISTENCE = "nominal", "calibrated", "persistence"
+_FLOOR_ROWS = 200  # nominal rows whose lidar says whether the floor is the twin's
 
 
-@dataclass(frozen=True)
-class GapPlan:
+class GapConfig(Checked, frozen=True):
     """How the gap is measured."""
 
-    horizons_s: tuple[float, ...] = HORIZONS_S
-    most: int = 400  # segments a condition and horizon; steps: five times as many
-    limits: Limits = field(default_factory=Limits)
-    seed: int = 0
-    timestep_s: float = 0.01
-    nthread: int = 1
+    horizons_s: tuple[Annotated[float, Meta(gt=0)], ...] = (1.0, 3.0, 6.0)
+    max_segments: Annotated[int, Meta(ge=1)] = 400  # a condition and horizon; steps: 5 times that
+    limits: TrustLimits = TrustLimits()
+    seed: Annotated[int, Meta(ge=0)] = 0
+    timestep_s: Annotated[float, Meta(gt=0)] = 0.01
+    nthread: Annotated[int, Meta(ge=1)] = 1
 
-    def __post_init__(self) -> None:
-        if not self.horizons_s or min(self.horizons_s) <= 0:
-            raise ConfigError("horizons must be above 0 s", where="gap")
+    def check(self) -> None:
+        """Raises ValueError where trust is judged at a horizon that is not driven."""
         if self.limits.horizon_s not in self.horizons_s:
-            raise ConfigError(
-                f"the horizon that trust is judged at, {self.limits.horizon_s:g} s, is not driven",
-                where="gap",
-                remedy="make it one of the horizons",
+            raise ValueError(
+                f"the horizon that trust is judged at, {self.limits.horizon_s:g} s, is not driven:"
+                " make it one of the horizons"
             )
-        if self.most < 1:
-            raise ConfigError(f"most must be 1 or more, got {self.most}", where="gap")
-
-
-@dataclass(frozen=True)
-class Gap:
-    """What was measured. Rows are plain values; statistics carry 95 % intervals over episodes."""
-
-    about: dict[str, Any]  # store, version, task, twins, noise, counts
-    paths: Rows  # condition, horizon_s, quantity, unit, source, segments, episodes, median, p90 …
-    observations: Rows  # condition, component, source, steps, mean_gap, low, high
-    rewards: Rows  # condition, term, source, steps, mean_gap, low, high, bias, spread
-    verdicts: tuple[Verdict, ...]
-    not_done: tuple[str, ...]
-
-    @property
-    def untrusted(self) -> list[str]:
-        """The conditions in which the twin should not be trusted."""
-        return [found.condition for found in self.verdicts if found.verdict == UNTRUSTED]
-
-    def document(self) -> dict[str, Any]:
-        """As JSON has it."""
-        return {
-            "about": self.about,
-            "untrusted": self.untrusted,
-            "verdicts": [asdict(found) for found in self.verdicts],
-            "not_done": list(self.not_done),
-            "paths": self.paths,
-            "observations": self.observations,
-            "rewards": self.rewards,
-        }
 
 
 def measure_gap(
     store: Store,
     calibrated: Perturbation | None = None,
-    plan: GapPlan | None = None,
+    config: GapConfig | None = None,
     *,
     warehouse: Warehouse | None = None,
     task_hash: str | None = None,
     notes: tuple[str, ...] = (),
-    tell: Callable[[str], None] = lambda _: None,
-) -> Gap:
+    on_progress: Callable[[str], None] | None = None,
+) -> TwinGap:
     """Measure the gap of the nominal twin, and of a calibrated one beside it.
 
     `warehouse` is the floor that the log may have been driven on (default: the twin's own); what
-    the lidar sees is compared only where the two agree. `notes` are said beside what was not done.
+    the lidar sees is compared only where the two agree. `notes` are listed beside what was not
+    done.
 
     Raises:
         ConfigError: a horizon that is not some control periods, or a control period that the twin
@@ -112,70 +93,79 @@ def measure_gap(
         StoreError: no rows, rows of several tasks and no `task_hash`, or no row that is followed
             by another.
     """
-    plan, warehouse = plan or GapPlan(), warehouse or default_warehouse()
+    config, warehouse = config or GapConfig(), warehouse or default_warehouse()
+    report = on_progress or (lambda text: None)
     twins = {BEFORE: Perturbation()} | ({AFTER: calibrated} if calibrated is not None else {})
-    best = list(twins)[-1]
+    judged = list(twins)[-1]
     steps = logged_steps(store, task_hash)
     if not steps.followed.any():
         raise StoreError("no step is followed by another", where=str(store.path))
-    noise = measured_noise(steps, twins[best])
+    noise = measured_noise(steps, twins[judged])
     paths = []
-    for horizon in plan.horizons_s:
-        tell(f"driving segments of {horizon:g} s again")
+    for horizon in config.horizons_s:
+        report(f"driving segments of {horizon:g} s again")
         paths.append(
             path_gap(
                 steps, horizon, twins, noise,
-                most=plan.most, seed=plan.seed, timestep_s=plan.timestep_s, nthread=plan.nthread,
+                max_segments=config.max_segments, seed=config.seed,
+                timestep_s=config.timestep_s, nthread=config.nthread,
             )
         )  # fmt: skip
-    tell("one step from each logged state")
-    rng = np.random.default_rng([plan.seed, 2])
-    differs = _floor_differs(store, steps, warehouse, rng)
+    report("one step from each logged state")
+    rng = np.random.default_rng([config.seed, 2])
+    difference = _floor_difference(store, steps, warehouse, rng)
     plans = rebuild_plans(steps)
-    rows, chosen = _steps_to_compare(steps, 5 * plan.most, rng)
+    rows, chosen = _steps_to_compare(steps, 5 * config.max_segments, rng)
     stepped = one_step(
         store, steps, plans, rows, twins,
-        warehouse=None if differs > AGREES else warehouse,
-        timestep_s=plan.timestep_s, nthread=plan.nthread,
+        warehouse=None if difference > AGREES else warehouse,
+        timestep_s=config.timestep_s, nthread=config.nthread,
     )  # fmt: skip
-    moved = path_rows(paths, rng)
-    observed = observation_rows(steps, stepped, chosen, rng)
-    earned, ratios = reward_rows(steps, stepped, chosen, rng)
+    path_rows = list(_path_rows(paths, rng))
+    observation_rows = list(_observation_rows(steps, stepped, chosen, rng))
+    reward_rows, ratios = _reward_rows(steps, stepped, chosen, rng)
     about = {
         "store": str(store.path),
         "store_version": store.version,
         "task_hash": steps.task.hash,
         "rows": len(steps),
         "episodes": len(np.unique(steps.episode_id)),
-        "judged": best,
+        "judged": judged,
         "twins": {name: msgspec.to_builtins(twin) for name, twin in twins.items()},
         "noise": asdict(noise),
-        "limits": asdict(plan.limits),
+        "limits": msgspec.structs.asdict(config.limits),
         "floor": warehouse.name,
-        "floor_difference": differs,
-        "left_out": {f"{found.horizon_s:g} s": found.left_out for found in paths},
+        "floor_difference": difference,
+        "left_out": {f"{path.horizon_s:g} s": path.left_out for path in paths},
         "steps_compared": len(rows),
         "steps_left_out": int((~steps.followed).sum()),
         "plan_error_m": plans.error_m,
     }
-    verdicts = _verdicts(steps, plan.limits, best, moved, ratios)
-    said = _not_done(steps, twins, stepped, plans, differs, noise.drift_m, calibrated, paths)
-    return Gap(about, moved, observed, earned, verdicts, (*said, *notes))
+    return TwinGap(
+        about=about,
+        paths=path_rows,
+        observations=observation_rows,
+        rewards=reward_rows,
+        verdicts=_verdicts(steps, config.limits, judged, path_rows, ratios),
+        not_done=(
+            *_not_done(steps, twins, stepped, difference, noise.drift_m, paths),
+            *notes,
+        ),
+    )
 
 
-def _floor_differs(
+def _floor_difference(
     store: Store, steps: LoggedSteps, warehouse: Warehouse, rng: np.random.Generator
 ) -> float:
     rows = np.flatnonzero(steps.conditions[NOMINAL])
     if not len(rows):
         return 1.0
-    looked_at = np.sort(rng.permutation(rows)[:_LOOKED_AT])
-    return agreement(steps, store, looked_at, warehouse)
+    return agreement(steps, store, np.sort(rng.permutation(rows)[:_FLOOR_ROWS]), warehouse)
 
 
 def _steps_to_compare(
     steps: LoggedSteps, most: int, rng: np.random.Generator
-) -> tuple[NDArray[np.int64], dict[str, NDArray[np.bool_]]]:
+) -> tuple[Ints, dict[str, Bools]]:
     """Rows, and condition -> which of them count for it: at most `most` each, drawn evenly."""
     masks = {}
     for name, holds in steps.conditions.items():
@@ -186,81 +176,173 @@ def _steps_to_compare(
     return rows, {name: mask[rows] for name, mask in masks.items()}
 
 
+def _path_rows(paths: list[PathGap], rng: np.random.Generator) -> Iterator[dict[str, Any]]:
+    """Median and 90th percentile of every quantity, by condition, horizon and source."""
+    for path in paths:
+        for condition, mask in path.holds.items():
+            for (source, quantity), values in path.gaps.items():
+                known = mask & np.isfinite(values)
+                episode = path.episode_id[known]
+                median, p90 = clustered_quantiles(values[known], episode, (0.5, 0.9), rng=rng)
+                yield {
+                    "condition": condition,
+                    "horizon_s": path.horizon_s,
+                    "quantity": quantity,
+                    "unit": QUANTITIES[quantity],
+                    "source": source,
+                    "segments": int(known.sum()),
+                    "episodes": len(np.unique(episode)),
+                    **_columns("median", median),
+                    **_columns("p90", p90),
+                }
+
+
+def _observation_rows(
+    steps: LoggedSteps, stepped: OneStep, chosen: Mapping[str, Bools], rng: np.random.Generator
+) -> Iterator[dict[str, Any]]:
+    """Mean absolute gap of every component that the twin could get wrong."""
+    sources = {name: outcome.observation for name, outcome in stepped.twins.items()}
+    sources |= {PERSISTENCE: stepped.now}
+    left_out = ["previous_action_"]  # the action that was applied
+    left_out += [] if stepped.lidar else ["clearance_", "closing_"]
+    left_out += [] if steps.task.goal == "route" else ["near_", "far_", "goal_"]
+    for column, component in enumerate(steps.task.observation_names):
+        if component.startswith(tuple(left_out)):
+            continue
+        for condition, mask in chosen.items():
+            rows = mask & stepped.valid
+            episode = steps.episode_id[stepped.rows[rows]]
+            for source, values in sources.items():
+                off = np.abs(values[rows, column] - stepped.logged.observation[rows, column])
+                yield {
+                    "condition": condition,
+                    "component": component,
+                    "source": source,
+                    "steps": int(rows.sum()),
+                    **_columns("mean_gap", _mean(off, episode, rng)),
+                }
+
+
+def _reward_rows(
+    steps: LoggedSteps, stepped: OneStep, chosen: Mapping[str, Bools], rng: np.random.Generator
+) -> tuple[Rows, dict[tuple[str, str], ConfidenceInterval]]:
+    """Gaps by term, and by (condition, source) the whole gap over the reward's own spread.
+
+    The spread is the distance of a step's reward from the median, taken to be a step's cost at
+    least: standing still earns the same at every step, and next to that any gap is large.
+    """
+    rows_by_term, ratios = [], {}
+    least = abs(steps.task.rewards.step)
+    for condition, mask in chosen.items():
+        rows = mask & stepped.valid
+        episode = steps.episode_id[stepped.rows[rows]]
+        logged_terms = {"reward": stepped.logged.reward, **stepped.logged.terms}
+        for source, outcome in stepped.twins.items():
+            for term, values in {"reward": outcome.reward, **outcome.terms}.items():
+                logged = logged_terms[term][rows]
+                off = values[rows] - logged
+                spread = np.abs(logged - np.median(logged)) if len(logged) else logged
+                mean = _mean(np.abs(off), episode, rng)
+                if term == "reward":
+                    ratios[condition, source] = clustered_ratio(
+                        np.abs(off), np.maximum(spread, least), episode, rng=rng
+                    )
+                rows_by_term.append(
+                    {
+                        "condition": condition,
+                        "term": term,
+                        "source": source,
+                        "steps": int(rows.sum()),
+                        **_columns("mean_gap", mean),
+                        "bias": float(off.mean()) if len(off) else None,
+                        "logged_mean": float(logged.mean()) if len(logged) else None,
+                        "logged_spread": float(spread.mean()) if len(spread) else None,
+                    }
+                )
+    return rows_by_term, ratios
+
+
+def _mean(
+    values: NDArray[Any], episode: NDArray[Any], rng: np.random.Generator
+) -> ConfidenceInterval:
+    return clustered_ratio(values, np.ones(len(values)), episode, rng=rng)
+
+
+def _columns(name: str, interval: ConfidenceInterval) -> dict[str, float | None]:
+    """An interval as values of a row; NaN as None."""
+    values = {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
+    return {key: None if np.isnan(value) else value for key, value in values.items()}
+
+
 def _verdicts(
     steps: LoggedSteps,
-    limits: Limits,
-    best: str,
-    moved: Rows,
+    limits: TrustLimits,
+    judged: str,
+    path_rows: Rows,
     ratios: Mapping[tuple[str, str], ConfidenceInterval],
 ) -> tuple[Verdict, ...]:
+    key = (limits.horizon_s, "position", judged)
     at = {
         row["condition"]: row
-        for row in moved
-        if (row["horizon_s"], row["quantity"], row["source"])
-        == (limits.horizon_s, "position", best)
+        for row in path_rows
+        if (row["horizon_s"], row["quantity"], row["source"]) == key
     }
     verdicts = []
     for condition in steps.conditions:
-        row = at.get(condition)
-        p90 = NOT_KNOWN if row is None else estimate(row, "p90")
+        row = at.get(condition, {})
+        ends = [row.get(f"p90{end}") for end in ("", "_low", "_high")]
         verdicts.append(
-            judge(
+            trust_verdict(
                 condition,
                 limits=limits,
-                segments=row["segments"] if row else 0,
-                episodes=row["episodes"] if row else 0,
-                position_p90=p90,
-                reward_ratio=ratios.get((condition, best), NOT_KNOWN),
+                segments=row.get("segments", 0),
+                episodes=row.get("episodes", 0),
+                position_p90=ConfidenceInterval(
+                    *(float("nan") if value is None else float(value) for value in ends)
+                ),
+                reward_ratio=ratios.get((condition, judged), NOT_KNOWN),
             )
         )
     return tuple(verdicts)
 
 
 def _not_done(
-    steps: LoggedSteps,
-    twins: Mapping[str, Perturbation],
-    stepped: OneStep,
-    plans: PlanMemory,
-    differs: float,
-    drift_m: float,
-    calibrated: Perturbation | None,
-    paths: list[PathGap],
-) -> tuple[str, ...]:
-    said = []
-    if calibrated is None:
-        said.append("No gap after calibration: no fitted perturbation was given.")
-    if differs > AGREES:
-        said.append(
+    steps: LoggedSteps, twins: Mapping[str, Perturbation], stepped: OneStep,
+    difference: float, drift_m: float, paths: list[PathGap],
+) -> Iterator[str]:  # fmt: skip
+    if AFTER not in twins:
+        yield "No gap after calibration: no fitted perturbation was given."
+    if difference > AGREES:
+        yield (
             "What the lidar sees was not compared: the log was driven on another floor than the"
-            f" twin's (their clearances differ by {differs:.2f} in the median, {AGREES:g} is the"
+            f" twin's (their clearances differ by {difference:.2f} in the median, {AGREES:g} is the"
             " most). Steps were driven on an empty floor: clearances in their rewards are the log's"
             " own, and nothing is bumped into."
         )
     if steps.task.goal != "route":
-        said.append(
+        yield (
             "Waypoints and distance to a goal were not compared: the log has no goal and no plan;"
             " progress is forward motion."
         )
     if not drift_m and any(twin.localisation_drift_m for twin in twins.values()):
-        said.append(
+        yield (
             "The pose never disagrees with the wheels, so it is their odometry: the gap is to"
             " that, slip cannot show in it, and there is no floor of localisation noise."
         )
     for path in paths:
         if not len(path.episode_id):
-            said.append(f"No stretch of {path.horizon_s:g} s could be driven again.")
+            yield f"No stretch of {path.horizon_s:g} s could be driven again."
     last_steps = int((~steps.followed).sum())
     if last_steps:
-        said.append(f"{last_steps} last steps of episodes have no step after them to compare with.")
+        yield f"{last_steps} last steps of episodes have no step after them to compare with."
     if stepped.unexplained:
-        said.append(
+        yield (
             f"The rewards of {stepped.unexplained} steps are not the sum of their terms by this"
             " version's task: their gaps by term are of the terms as recomputed."
         )
     if not stepped.valid.all():
-        said.append(f"{int((~stepped.valid).sum())} steps were left out: the physics broke.")
-    said.append(
+        yield f"{int((~stepped.valid).sum())} steps were left out: the physics broke."
+    yield (
         "Pallets, people and slippery patches of the log are not known to the replay: it drives on"
         " the floor alone, dry."
     )
-    return tuple(said)

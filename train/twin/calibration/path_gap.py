@@ -39,7 +39,7 @@ _AT_ONCE = 4096  # segments replayed at a time: bounds memory
 
 
 @dataclass(frozen=True)
-class Noise:
+class SensorNoise:
     """What a log's sensors add, standard deviations."""
 
     position_m: float  # white, of each axis, as measured in the log
@@ -57,7 +57,7 @@ class PathGap:
     horizon_s: float
     episode_id: NDArray[np.str_]  # (S,)
     holds: dict[str, Bools]  # condition -> (S,) counted for it
-    gaps: dict[str, dict[str, F64]]  # source -> quantity -> (S,); NaN where not known
+    gaps: dict[tuple[str, str], F64]  # (source, quantity) -> (S,); NaN where not known
     left_out: dict[str, int]
 
 
@@ -65,14 +65,14 @@ def path_gap(
     steps: LoggedSteps,
     horizon_s: float,
     twins: Mapping[str, Perturbation],
-    noise: Noise,
+    noise: SensorNoise,
     *,
-    most: int,
+    max_segments: int,
     seed: int,
     timestep_s: float,
     nthread: int,
 ) -> PathGap:
-    """Replay segments of `horizon_s`, which overlap by half, at most `most` a condition.
+    """Replay segments of `horizon_s`, which overlap by half, at most `max_segments` each.
 
     A segment counts for every condition that holds at any of its steps; for `nominal` where none
     does. A gap of a pose is at the segment's end, of a signal its root mean square on the way.
@@ -83,26 +83,24 @@ def path_gap(
     period = steps.task.control_period_s
     stride_s = max(round(horizon_s / 2 / period), 1) * period
     cut = log_segments(steps, horizon_s, stride_s=stride_s)
-    holds = _holds(steps, cut)
-    chosen = _choose(holds, most, np.random.default_rng([seed, cut.horizon_steps]))
+    rng = np.random.default_rng([seed, cut.horizon_steps])
+    chosen = _choose(steps, cut, max_segments, rng)
     used = np.flatnonzero(np.any(list(chosen.values()), axis=0))
     rng = np.random.default_rng([seed, cut.horizon_steps, 1])
-    found: dict[str, dict[str, list[F64]]] = {}
-    for begin in range(0, len(used), _AT_ONCE):
-        part = cut.take(used[begin : begin + _AT_ONCE])
-        for source, gaps in _gaps(part, twins, noise, rng, timestep_s, nthread).items():
-            for quantity, values in gaps.items():
-                found.setdefault(source, {}).setdefault(quantity, []).append(values)
+    parts = [
+        _gaps(cut.take(used[begin : begin + _AT_ONCE]), twins, noise, rng, timestep_s, nthread)
+        for begin in range(0, len(used), _AT_ONCE)
+    ]
     return PathGap(
-        horizon_s,
-        cut.episode_id[used],
-        {name: mask[used] for name, mask in chosen.items()},
-        {s: {q: np.concatenate(v) for q, v in gaps.items()} for s, gaps in found.items()},
-        dict(cut.left_out),
+        horizon_s=horizon_s,
+        episode_id=cut.episode_id[used],
+        holds={name: mask[used] for name, mask in chosen.items()},
+        gaps={key: np.concatenate([part[key] for part in parts]) for key in (parts or [{}])[0]},
+        left_out=dict(cut.left_out),
     )
 
 
-def measured_noise(steps: LoggedSteps, twin: Perturbation) -> Noise:
+def measured_noise(steps: LoggedSteps, twin: Perturbation) -> SensorNoise:
     """The noise of a log: localisation's white part from the log, the rest as the twin assumes.
 
     Over one step, the distance between the motion of the localised pose and that of the wheels is
@@ -129,14 +127,8 @@ def measured_noise(steps: LoggedSteps, twin: Perturbation) -> Noise:
     else:  # a step's share of the drift is not white
         keep = np.exp(-period / DRIFT_TIME_S)
         white = float(np.sqrt(max(white**2 - drift**2 * (1 - keep), 0.0)))
-    return Noise(
-        white,
-        float(yaw),
-        drift,
-        twin.encoder_noise_radps,
-        twin.gyro_noise_radps,
-        twin.accel_noise_mps2,
-    )
+    sensors = (twin.encoder_noise_radps, twin.gyro_noise_radps, twin.accel_noise_mps2)
+    return SensorNoise(white, float(yaw), drift, *sensors)
 
 
 def _spread(values: F64) -> float:
@@ -144,63 +136,60 @@ def _spread(values: F64) -> float:
     return float(1.4826 * np.median(np.abs(values - np.median(values))))
 
 
-def _holds(steps: LoggedSteps, cut: LoggedSegments) -> dict[str, Bools]:
+def _choose(
+    steps: LoggedSteps, cut: LoggedSegments, most: int, rng: np.random.Generator
+) -> dict[str, Bools]:
+    """At most `most` segments (S,) of each condition, drawn evenly."""
     rows = cut.row[:, None] + np.arange(cut.horizon_steps)
-    held = {n: mask[rows].any(axis=1) for n, mask in steps.conditions.items() if n != NOMINAL}
-    return {NOMINAL: steps.conditions[NOMINAL][rows].all(axis=1), **held}
-
-
-def _choose(holds: Mapping[str, Bools], most: int, rng: np.random.Generator) -> dict[str, Bools]:
-    """At most `most` segments of each condition, drawn evenly."""
     chosen = {}
-    for name, mask in holds.items():
-        kept, members = mask.copy(), np.flatnonzero(mask)
+    for name, holds in steps.conditions.items():
+        mask = holds[rows].all(axis=1) if name == NOMINAL else holds[rows].any(axis=1)
+        members = np.flatnonzero(mask)
         if len(members) > most:
-            kept[rng.permutation(members)[most:]] = False
-        chosen[name] = kept
+            mask[rng.permutation(members)[most:]] = False
+        chosen[name] = mask
     return chosen
 
 
 def _gaps(
     part: LoggedSegments,
     twins: Mapping[str, Perturbation],
-    noise: Noise,
+    noise: SensorNoise,
     rng: np.random.Generator,
     timestep_s: float,
     nthread: int,
-) -> dict[str, dict[str, F64]]:
-    """Source -> quantity -> (S,) of these segments."""
+) -> dict[tuple[str, str], F64]:
+    """(source, quantity) -> (S,) of these segments."""
     replayed = replay_segments(part, list(twins.values()), timestep_s=timestep_s, nthread=nthread)
     logged = {name: part.signals[name] for name in SIGNALS}
     fresh = part.pose_fresh[:, -1]
-    found = {}
+    gaps = {}
     for index, name in enumerate(twins):
+        path = replayed.pose[index]
         signals = {signal: replayed.signals[signal][index] for signal in SIGNALS}
-        found[name] = _gap(replayed.pose[index], signals, part.pose, logged, fresh)
-        for values in found[name].values():
+        gaps[name] = _gap(path, signals, part.pose, logged, fresh)
+        for values in gaps[name].values():
             values[replayed.blown_up[index]] = np.nan
-    found[ODOMETRY] = _gap(_dead_reckon(part), {}, part.pose, logged, fresh)
-    last = len(twins) - 1
-    truth = {name: replayed.signals[name][last] for name in SIGNALS}
-    path = replayed.pose[last]
-    sensed = path + _pose_noise(path.shape, noise, part.task.control_period_s, rng)
-    seen = _sense(truth, sensed, path, noise, part.task.control_period_s, rng)
-    found[FLOOR] = _gap(lay(path, sensed[:, 0]), truth, sensed, seen, fresh)
-    return found
+    gaps[ODOMETRY] = _gap(_dead_reckon(part), {}, part.pose, logged, fresh)
+    # Of the last twin, which is the calibrated one if there is one.
+    localised = path + _pose_noise(path.shape, noise, part.task.control_period_s, rng)
+    sensed = _sense(signals, localised, path, noise, part.task.control_period_s, rng)
+    gaps[FLOOR] = _gap(lay(path, localised[:, 0]), signals, localised, sensed, fresh)
+    return {(source, name): gap for source, each in gaps.items() for name, gap in each.items()}
 
 
 def _gap(
     pose: F64, signals: Mapping[str, F64], goal: F64, logged: Mapping[str, F64], fresh: Bools
 ) -> dict[str, F64]:
     off = pose[:, -1] - goal[:, -1]
-    found = {
+    gaps = {
         "position": np.where(fresh, np.hypot(off[:, 0], off[:, 1]), np.nan),
         "heading": np.where(fresh, np.abs(wrap_angle(off[:, 2])), np.nan),
     }
     for name, values in signals.items():
         squared = (values[:, 1:] - logged[name][:, 1:]) ** 2
-        found[name] = np.sqrt(squared.mean(axis=1))
-    return found
+        gaps[name] = np.sqrt(squared.mean(axis=1))
+    return gaps
 
 
 def _dead_reckon(part: LoggedSegments) -> F64:
@@ -214,14 +203,14 @@ def _dead_reckon(part: LoggedSegments) -> F64:
     middle = (heading[:, 1:] + heading[:, :-1]) / 2
     pose = np.empty((*heading.shape, 3))
     pose[..., 2] = heading
-    for axis, way in enumerate((np.cos(middle), np.sin(middle))):
+    for axis, share in enumerate((np.cos(middle), np.sin(middle))):
         pose[:, 0, axis] = start[:, 0, axis]
-        pose[:, 1:, axis] = start[..., axis] + np.cumsum(ahead * way, axis=1)
+        pose[:, 1:, axis] = start[..., axis] + np.cumsum(ahead * share, axis=1)
     return pose
 
 
 def _pose_noise(
-    shape: tuple[int, ...], noise: Noise, period_s: float, rng: np.random.Generator
+    shape: tuple[int, ...], noise: SensorNoise, period_s: float, rng: np.random.Generator
 ) -> F64:
     """Localisation errors (S, K + 1, 3): white, and a drift that wanders."""
     white = np.array([noise.position_m, noise.position_m, noise.heading_rad])
@@ -236,9 +225,9 @@ def _pose_noise(
 
 def _sense(
     truth: Mapping[str, F64],
-    sensed: F64,
+    localised: F64,
     path: F64,
-    noise: Noise,
+    noise: SensorNoise,
     period_s: float,
     rng: np.random.Generator,
 ) -> dict[str, F64]:
@@ -246,7 +235,7 @@ def _sense(
     shape = path.shape[:2]
     wheels = rng.standard_normal((2, *shape)) * noise.encoder_radps
     speed, rate = body_velocity(wheels[0], wheels[1])
-    step = np.diff(sensed[..., :2] - path[..., :2], axis=1, prepend=0.0)
+    step = np.diff(localised[..., :2] - path[..., :2], axis=1, prepend=0.0)
     heading = path[..., 2]
     along = (np.cos(heading) * step[..., 0] + np.sin(heading) * step[..., 1]) / period_s
     added = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -18,6 +19,7 @@ Ints = NDArray[np.int64]
 
 WARMUP_S = 1.0  # longer than any latency, and than a stop on friction .2
 STILL_MPS = 0.02  # slower than this a robot stands
+TOUCHING_M = 0.05  # nearer to something than this a robot may be touching it
 EVEN = 0.25  # of a control period: how far a tick or a pose may be from where it should be
 
 POSE = ("pose_x_m", "pose_y_m", "pose_yaw_rad")
@@ -144,6 +146,58 @@ def log_segments(
         pose_fresh=fresh[index],
         left_out={reason: count for reason, count in left.items() if count},
     )
+
+
+def ordinary_driving(segments: LoggedSegments) -> tuple[LoggedSegments, dict[str, int]]:
+    """Segments that ordinary driving explains, and how many were left out, by reason."""
+    touched = segments.signals["bumped"].astype(bool).any(axis=1)
+    near = ~touched & (segments.signals["clearance_m"] < TOUCHING_M).any(axis=1)
+    # A label is about what the wheels did, also on a floor that is slippery all over.
+    known = segments.true_condition != ""
+    slips = np.where(known, segments.true_condition, segments.condition) == "wheel_slip"
+    slippery = ~touched & ~near & slips.any(axis=1)
+    needed = [segments.command.reshape(len(segments), -1)]
+    needed += [segments.signals[name] for name in (*POSE, *BEFORE)]
+    missing = ~np.isfinite(np.concatenate(needed, axis=1)).all(axis=1)
+    reasons = {
+        "bumped into something": touched,
+        f"within {TOUCHING_M:g} m of something": near,
+        "on a slippery patch": slippery,
+        "signals missing": missing & ~touched & ~near & ~slippery,
+    }
+    left = {reason: int(mask.sum()) for reason, mask in reasons.items() if mask.any()}
+    return segments.take(~np.any(list(reasons.values()), axis=0)), left
+
+
+def held_out_from(segments: LoggedSegments, share: float, seed: int) -> dict[str, int]:
+    """From which stamp on each recording is held out, in ns.
+
+    Of four recordings or more, whole ones; else the last part of each.
+    """
+    names = np.unique(segments.recording_id)
+    never, always = np.iinfo(np.int64).max, np.iinfo(np.int64).min
+    if not share:
+        return {str(name): never for name in names}
+    if len(names) >= 4:
+        rng = np.random.Generator(np.random.PCG64(seed))
+        held_out = set(rng.permutation(names)[: max(round(share * len(names)), 1)])
+        return {str(name): always if name in held_out else never for name in names}
+    begin = segments.signals["stamp_ns"][:, 0]
+    return {
+        str(name): int(
+            np.quantile(begin[segments.recording_id == name], 1 - share, method="higher")
+        )
+        for name in names
+    }
+
+
+def split_at(
+    segments: LoggedSegments, stamps: Mapping[str, int]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which segments (S,) lie wholly before their recording's stamp, and which wholly after it."""
+    at = np.array([stamps[str(name)] for name in segments.recording_id], np.int64)
+    ticks = segments.signals["stamp_ns"]
+    return ticks[:, -1] <= at, ticks[:, 0] >= at
 
 
 def _fresh(steps: LoggedSteps, period_ns: int) -> NDArray[np.bool_]:

@@ -45,7 +45,7 @@ class ReportCommand:
         from restock.ingest.store.location import Location
         from restock.replay.store.store import is_store
         from restock.report import build_report, write_card, write_gap_page
-        from restock.train.twin.calibration.gap_files import FOLDER
+        from restock.train.twin.calibration.twin_gap import FOLDER
 
         if self.card:
             if self.out is not None:

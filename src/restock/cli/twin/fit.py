@@ -1,4 +1,4 @@
-"""`restock twin fit`: effective parameters of the robot, from what it was told and what it did."""
+"""`restock twin fit`: effective parameters of the robot, from its commands and what it did."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 if TYPE_CHECKING:
-    from restock.train.twin.calibration.fit import Fit
+    from restock.train.twin.calibration.fitted_twin import FittedTwin
 
 
 @dataclass
@@ -19,7 +19,7 @@ class FitCommand:
     Drives the logged commands again in the twin, open loop on an empty floor, and looks for the
     friction, payload, wheel radius, track, latency and gain under which it moves as the robot
     did: first over the whole ranges on few segments, then by least squares on all. What the log
-    does not tell stays as it was, with the reason; a quarter of the log is held out to show the
+    does not identify stays as it was, with the reason; a quarter of the log is held out to show the
     gap before and after. See docs/calibration.md.
 
     Example: `restock twin fit store/ --out fitted.toml`
@@ -65,7 +65,7 @@ class FitCommand:
         from restock.cli import output
         from restock.errors import ConfigError, ExitCode
         from restock.replay.store.store import Store
-        from restock.train.twin.calibration.fit_files import write_fit
+        from restock.train.twin.calibration.fitted_twin import write_fit
         from restock.train.twin.calibration.logged_steps import recordings_of
 
         if self.out is not None and self.out.exists():
@@ -87,32 +87,35 @@ class FitCommand:
             output.say(f"wrote {out}")
         return ExitCode.OK
 
-    def _fit(self, store: Any, recordings: tuple[str, ...]) -> Fit:
+    def _fit(self, store: Any, recordings: tuple[str, ...]) -> FittedTwin:
         from restock.cli import output
-        from restock.train.twin.calibration.fit import fit
-        from restock.train.twin.calibration.fit_parameters import DEFAULT, parse_parameters
+        from restock.toml import typed
+        from restock.train.twin.calibration.fit import FitConfig, fit
+        from restock.train.twin.calibration.fit_parameters import parse_parameters
         from restock.train.twin.physics.perturbation import load_perturbation
 
         name = "fitted" if self.out is None else self.out.stem
-        return fit(
-            store,
-            parameters=DEFAULT if self.parameters is None else parse_parameters(self.parameters),
-            base=None if self.base is None else load_perturbation(self.base),
-            recordings=recordings,
-            task_hash=self.task,
-            timestep_s=self.timestep_s,
-            horizon_s=self.horizon_s,
-            held_out=self.held_out,
-            search_points=self.search,
-            most_segments=self.segments,
-            seed=self.seed,
-            nthread=self.threads,
-            name=f"{name} {recordings[0]}" if self.per_recording else name,
-            on_progress=output.say,
-        )
+        values: dict[str, Any] = {
+            "recordings": recordings,
+            "task_hash": self.task,
+            "timestep_s": self.timestep_s,
+            "horizon_s": self.horizon_s,
+            "held_out": self.held_out,
+            "search_points": self.search,
+            "max_segments": self.segments,
+            "seed": self.seed,
+            "nthread": self.threads,
+            "name": f"{name} {recordings[0]}" if self.per_recording else name,
+        }
+        if self.parameters is not None:
+            values["parameters"] = parse_parameters(self.parameters)
+        if self.base is not None:
+            values["base"] = load_perturbation(self.base)
+        config = typed(values, FitConfig, where="restock twin fit")
+        return fit(store, config, on_progress=output.say)
 
 
-def _show(fit: Fit) -> None:
+def _show(fit: FittedTwin) -> None:
     from restock.cli import output
 
     rows = [

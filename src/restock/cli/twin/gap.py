@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 if TYPE_CHECKING:
-    from restock.train.twin.calibration.gap import Gap
+    from restock.train.twin.calibration.twin_gap import TwinGap
     from restock.train.twin.physics.perturbation import Perturbation
 
 _IN_SAMPLE = (
@@ -77,47 +77,47 @@ class GapCommand:
         from restock.errors import ConfigError, ExitCode
         from restock.replay.store.store import Store
         from restock.report import write_gap_page
-        from restock.train.twin.calibration.gap import GapPlan, measure_gap
-        from restock.train.twin.calibration.gap_files import check_place, write_gap
-        from restock.train.twin.calibration.trust import Limits
+        from restock.toml import typed
+        from restock.train.twin.calibration.gap import GapConfig, measure_gap
+        from restock.train.twin.calibration.twin_gap import check_place, write_gap
         from restock.train.twin.physics.perturbation import load_perturbation
 
         if self.fit and self.perturbation is not None:
             raise ConfigError("give --fit or --perturbation, one of them", where="restock twin gap")
         calibrated = None if self.perturbation is None else load_perturbation(self.perturbation)
-        limits = Limits(
-            self.trust_horizon_s,
-            self.trust_position_m,
-            self.trust_reward,
-            self.min_segments,
-            self.min_episodes,
-        )
-        plan = GapPlan(
-            horizons_s=_seconds(self.horizons),
-            most=self.most,
-            limits=limits,
-            seed=self.seed,
-            timestep_s=self._timestep_s(calibrated),
-            nthread=self.threads,
-        )
+        limits = {
+            "horizon_s": self.trust_horizon_s,
+            "position_m": self.trust_position_m,
+            "reward_ratio": self.trust_reward,
+            "segments": self.min_segments,
+            "episodes": self.min_episodes,
+        }
+        values = {
+            "horizons_s": _seconds(self.horizons),
+            "max_segments": self.most,
+            "limits": limits,
+            "seed": self.seed,
+            "timestep_s": self._timestep_s(calibrated),
+            "nthread": self.threads,
+        }
+        config = typed(values, GapConfig, where="restock twin gap")
         if self.out is not None:
             check_place(self.out)
         with Store(self.store) as store:
             notes: tuple[str, ...] = ()
             if self.fit:
-                from restock.train.twin.calibration.fit import fit
+                from restock.train.twin.calibration.fit import FitConfig, fit
 
-                fitted = fit(
-                    store,
+                fit_config = FitConfig(
                     task_hash=self.task,
                     timestep_s=self.timestep_s,
                     seed=self.seed,
                     nthread=self.threads,
-                    on_progress=output.say,
                 )
+                fitted = fit(store, fit_config, on_progress=output.say)
                 calibrated, notes = fitted.perturbation, (_IN_SAMPLE, *fitted.warnings)
             gap = measure_gap(
-                store, calibrated, plan, task_hash=self.task, notes=notes, tell=output.say
+                store, calibrated, config, task_hash=self.task, notes=notes, on_progress=output.say
             )
         if self.out is not None:
             write_gap(gap, self.out)
@@ -141,11 +141,11 @@ def _seconds(text: str) -> tuple[float, ...]:
         return tuple(sorted({float(part) for part in text.split(",") if part.strip()}))
     except ValueError:
         raise ConfigError(
-            f"{text!r} are no seconds", where="--horizons", remedy="write them like 1,3,6"
+            f"{text!r} is not a list of seconds", where="--horizons", remedy="write them like 1,3,6"
         ) from None
 
 
-def _show(gap: Gap) -> None:
+def _show(gap: TwinGap) -> None:
     from restock.cli.output import print_table, stdout
     from restock.report.twin_gap import headline, source_name
 
@@ -179,13 +179,13 @@ def _show(gap: Gap) -> None:
     print_table(
         [
             {
-                "condition": found.condition,
-                "verdict": found.verdict,
-                "why": "; ".join(found.reasons),
+                "condition": item.condition,
+                "verdict": item.verdict,
+                "why": "; ".join(item.reasons),
             }
-            for found in gap.verdicts
+            for item in gap.verdicts
         ]
     )
-    for said in gap.not_done:
-        stdout().print(f"- {said}", markup=False, soft_wrap=True)
+    for note in gap.not_done:
+        stdout().print(f"- {note}", markup=False, soft_wrap=True)
     stdout().print(headline(gap), markup=False)

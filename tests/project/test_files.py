@@ -1,0 +1,26 @@
+"""Files are replaced whole, or made only where there is none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from restock.files import write_bytes, write_text
+
+
+def test_a_file_is_replaced_and_its_folder_made(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "file.txt"
+    write_text(path, "première")
+    write_text(path, "second")
+    assert path.read_text(encoding="utf-8") == "second"
+    assert [item.name for item in path.parent.iterdir()] == ["file.txt"]
+
+
+def test_an_exclusive_file_is_never_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    write_bytes(path, b"first", exclusive=True)
+    with pytest.raises(FileExistsError):
+        write_bytes(path, b"second", exclusive=True)
+    assert path.read_bytes() == b"first"
+    assert [item.name for item in tmp_path.iterdir()] == ["file"]

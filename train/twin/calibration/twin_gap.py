@@ -1,0 +1,229 @@
+"""A measured gap: rows, a verdict of each condition, and the folder that holds them.
+
+The folder is `gap.json`, and the rows as Parquet for any tool that reads it.
+
+A condition is `untrusted` where the twin is shown to be off, `trusted` where it is shown to be
+near, both by the end of a 95 % interval; `undecided` where the interval holds the limit, and
+`unknown` where too little was driven to say.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from msgspec import Meta
+
+from restock.errors import RunError
+from restock.files import write_table, write_text
+from restock.stats import ConfidenceInterval
+from restock.toml import Checked
+
+Rows = list[dict[str, Any]]
+
+TRUSTED, UNTRUSTED = "trusted", "untrusted"
+UNDECIDED, UNKNOWN = "undecided", "unknown"
+
+FORMAT = "restock-twin-gap/1"
+DOCUMENT = "gap.json"
+FOLDER = "gap"  # where a report looks for it, in a run's directory or a store's
+_F, _I, _S = pa.float64(), pa.int64(), pa.string()
+
+
+def _interval(name: str) -> list[tuple[str, pa.DataType]]:
+    return [(name, _F), (f"{name}_low", _F), (f"{name}_high", _F)]
+
+
+TABLES: dict[str, pa.Schema] = {
+    "paths": pa.schema(
+        [
+            *(("condition", _S), ("horizon_s", _F), ("quantity", _S), ("unit", _S)),
+            *(("source", _S), ("segments", _I), ("episodes", _I)),
+            *(*_interval("median"), *_interval("p90")),
+        ]
+    ),
+    "observations": pa.schema(
+        [
+            *(("condition", _S), ("component", _S), ("source", _S), ("steps", _I)),
+            *_interval("mean_gap"),
+        ]
+    ),
+    "rewards": pa.schema(
+        [
+            *(("condition", _S), ("term", _S), ("source", _S), ("steps", _I)),
+            *_interval("mean_gap"),
+            *(("bias", _F), ("logged_mean", _F), ("logged_spread", _F)),
+        ]
+    ),
+}
+
+
+class TrustLimits(Checked, frozen=True):
+    """What a twin must keep to be trusted in a condition."""
+
+    horizon_s: Annotated[float, Meta(gt=0)] = 3.0
+    position_m: Annotated[float, Meta(ge=0)] = 0.2  # nine in ten segments of that horizon end here
+    reward_ratio: Annotated[float, Meta(ge=0)] = 1.0  # one-step reward gap over the reward's spread
+    segments: Annotated[int, Meta(ge=0)] = 20  # fewer say nothing
+    episodes: Annotated[int, Meta(ge=0)] = 5
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether the twin can be trusted in one condition, and why."""
+
+    condition: str
+    verdict: str
+    reasons: tuple[str, ...]
+    segments: int
+    episodes: int
+    position_p90: ConfidenceInterval  # m, at the limits' horizon
+    reward_ratio: ConfidenceInterval
+
+
+def trust_verdict(
+    condition: str,
+    *,
+    limits: TrustLimits,
+    segments: int,
+    episodes: int,
+    position_p90: ConfidenceInterval,
+    reward_ratio: ConfidenceInterval,
+) -> Verdict:
+    """The verdict on one condition."""
+    beyond, open_ = [], []
+    for interval, limit, reason in (
+        (
+            position_p90,
+            limits.position_m,
+            f"one segment in ten ends {position_p90.value:.2f} m"
+            f" [{position_p90.low:.2f}, {position_p90.high:.2f}] or more from the log after"
+            f" {limits.horizon_s:g} s; the limit is {limits.position_m:g} m",
+        ),
+        (
+            reward_ratio,
+            limits.reward_ratio,
+            f"its one-step reward is off by {reward_ratio.value:.2f}"
+            f" [{reward_ratio.low:.2f}, {reward_ratio.high:.2f}] times the reward's own spread;"
+            f" the limit is {limits.reward_ratio:g}",
+        ),
+    ):
+        if interval is reward_ratio and math.isnan(interval.value):
+            continue
+        if interval.low > limit:
+            beyond.append(reason)
+        elif not interval.high <= limit:
+            open_.append(reason)
+    verdict = UNTRUSTED if beyond else UNDECIDED if open_ else TRUSTED
+    reasons = beyond or open_
+    if segments < limits.segments or episodes < limits.episodes:
+        verdict, reasons = UNKNOWN, [
+            f"too few: segments of {limits.horizon_s:g} s {segments} (at least {limits.segments}),"
+            f" from episodes {episodes} (at least {limits.episodes})"
+        ]  # fmt: skip
+    return Verdict(
+        condition, verdict, tuple(reasons), segments, episodes, position_p90, reward_ratio
+    )
+
+
+@dataclass(frozen=True)
+class TwinGap:
+    """What was measured. Rows are plain values; statistics carry 95 % intervals over episodes."""
+
+    about: dict[str, Any]  # store, version, task, twins, noise, counts
+    paths: Rows  # condition, horizon_s, quantity, unit, source, segments, episodes, median, p90 …
+    observations: Rows  # condition, component, source, steps, mean_gap, low, high
+    rewards: Rows  # condition, term, source, steps, mean_gap, low, high, bias, spread
+    verdicts: tuple[Verdict, ...]
+    not_done: tuple[str, ...]
+
+    @property
+    def untrusted(self) -> list[str]:
+        """The conditions in which the twin should not be trusted."""
+        return [item.condition for item in self.verdicts if item.verdict == UNTRUSTED]
+
+    def document(self) -> dict[str, Any]:
+        """As JSON has it."""
+        return {
+            "about": self.about,
+            "untrusted": self.untrusted,
+            "verdicts": [asdict(item) for item in self.verdicts],
+            "not_done": list(self.not_done),
+            **{name: getattr(self, name) for name in TABLES},
+        }
+
+
+def check_place(folder: Path) -> None:
+    """Raises RunError where `folder` is something else than a gap measured before."""
+    if folder.exists() and not (folder.is_dir() and (folder / DOCUMENT).is_file()):
+        if folder.is_dir() and not any(folder.iterdir()):
+            return
+        raise RunError("is there already", where=str(folder), remedy="name another --out")
+
+
+def write_gap(gap: TwinGap, folder: Path) -> None:
+    """Write a gap; one measured before is replaced.
+
+    Raises:
+        RunError: there is something else at `folder`.
+    """
+    check_place(folder)
+    for name, schema in TABLES.items():
+        rows = getattr(gap, name)
+        write_table(pa.Table.from_pylist(rows, schema), folder / f"{name}.parquet")
+    document = {
+        "format": FORMAT,
+        "about": gap.about,
+        "verdicts": [_verdict_document(item) for item in gap.verdicts],
+        "not_done": list(gap.not_done),
+    }
+    write_text(folder / DOCUMENT, json.dumps(document, indent=1) + "\n")
+
+
+def read_gap(folder: Path) -> TwinGap:
+    """Read what `write_gap` wrote.
+
+    Raises:
+        RunError: there is no gap in `folder`, or it cannot be read.
+    """
+    try:
+        document = json.loads((folder / DOCUMENT).read_text(encoding="utf-8"))
+        if document.get("format") != FORMAT:
+            raise ValueError(f"its format is {document.get('format')!r}, not {FORMAT!r}")
+        tables = {name: pq.read_table(folder / f"{name}.parquet").to_pylist() for name in TABLES}
+        return TwinGap(
+            about=document["about"],
+            **tables,
+            verdicts=tuple(_read_verdict(item) for item in document["verdicts"]),
+            not_done=tuple(document["not_done"]),
+        )
+    except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
+        raise RunError(
+            f"no gap that can be read: {error}",
+            where=str(folder),
+            remedy=f"`restock twin gap STORE --out {folder}` measures one",
+        ) from error
+
+
+_INTERVALS = ("position_p90", "reward_ratio")
+
+
+def _verdict_document(verdict: Verdict) -> dict[str, Any]:
+    """As JSON has it: NaN, which it does not know, as null."""
+    values = asdict(verdict)
+    for name in _INTERVALS:
+        values[name] = {k: None if math.isnan(v) else v for k, v in values[name].items()}
+    return values
+
+
+def _read_verdict(values: dict[str, Any]) -> Verdict:
+    read = values | {"reasons": tuple(values["reasons"])}
+    for name in _INTERVALS:
+        ends = {k: math.nan if v is None else float(v) for k, v in values[name].items()}
+        read[name] = ConfidenceInterval(**ends)
+    return Verdict(**read)
