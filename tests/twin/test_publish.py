@@ -13,7 +13,9 @@ from restock.train.twin.recording.bag_writer import Message
 from restock.train.twin.recording.drive import Drive, Lidar, Motion, Odometer
 from restock.train.twin.recording.messages import typestore
 from restock.train.twin.recording.publish import LIDAR_LSB_M, Rates, Robot
+from restock.train.twin.recording.recorder import NOISELESS
 from restock.train.twin.recording.robot_topics import TOPICS
+from restock.train.twin.recording.scene import EMPTY
 
 START_NS = 1_772_000_000_000_000_000
 TYPES = {topic.name: topic.type_name for topic in TOPICS}
@@ -59,6 +61,7 @@ def _drive(rng: np.random.Generator) -> Drive:
         true_condition=["nominal"] * 20,
         policy=[("planner", "1", 0.98)] * 12 + [("operator", "1", 0.97)] * 8,
         plans=[(0, np.zeros((5, 2))), (10, np.ones((7, 2)))],
+        scene=replace(EMPTY, perturbation=NOISELESS),
     )
 
 

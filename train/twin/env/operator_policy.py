@@ -41,11 +41,14 @@ class Operator(SoftPolicy):
 
     def __init__(self, *, epsilon: float = 0.03, seed: int = 0) -> None:
         super().__init__(epsilon=epsilon, seed=seed)
-        self._ways = np.zeros((0, PLAN_POINTS, 2))
-        self._episode = np.zeros(0, np.int64)
-        self._anchor = np.zeros((0, 3))
-        self._still = np.zeros(0, np.int64)
-        self._backing = np.zeros(0, np.int64)
+        self._prepare(0)
+
+    def _prepare(self, count: int) -> None:
+        self._ways = np.zeros((count, PLAN_POINTS, 2))
+        self._episode = np.full(count, -1)
+        self._anchor = np.zeros((count, 3))
+        self._still = np.zeros(count, np.int64)
+        self._backing = np.zeros(count, np.int64)
 
     def choose(self, env: WarehouseVectorEnv) -> Actions:
         """The action that comes farthest along the way without coming too near to anything."""
@@ -128,11 +131,7 @@ class Operator(SoftPolicy):
     def _find_ways(self, env: WarehouseVectorEnv, pose: F64) -> None:
         """A way past the pallets at the start of each episode, and again where one has strayed."""
         if len(self._ways) != env.num_envs:
-            self._ways = np.zeros((env.num_envs, PLAN_POINTS, 2))
-            self._episode = np.full(env.num_envs, -1)
-            self._anchor = np.zeros((env.num_envs, 3))
-            self._still = np.zeros(env.num_envs, np.int64)
-            self._backing = np.zeros(env.num_envs, np.int64)
+            self._prepare(env.num_envs)
         serial = env.episodes_begun
         stale = self._episode != serial
         offset = view_route(self._ways, pose[:, 0], pose[:, 1], pose[:, 2], ()).offset_m

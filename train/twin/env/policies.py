@@ -170,10 +170,10 @@ class Handover:
         self.events: list[HandoverEvent] = []
         self.acting = np.array([], "U16")
         self.acting_version = np.array([], "U16")
-        self._taken: NDArray[np.bool_] | None = None
+        self._prepare(0)
 
     def _prepare(self, count: int) -> None:
-        self._taken = np.zeros(count, np.bool_)
+        self._taken = np.zeros(count, np.bool_)  # by the operator
         self._held = np.zeros(count, np.int64)  # steps since the last handover
         self._still = np.zeros(count, np.int64)  # steps without way made
         self._slipping = np.zeros(count, np.int64)
@@ -181,9 +181,8 @@ class Handover:
 
     def act(self, env: WarehouseVectorEnv, observation: NDArray[np.float32]) -> tuple[Actions, F64]:
         """The actions of whoever drives each robot, and their probabilities."""
-        if self._taken is None or len(self._taken) != env.num_envs:
+        if len(self._taken) != env.num_envs:
             self._prepare(env.num_envs)
-        assert self._taken is not None  # for the type checker: _prepare made it
         self._watch(env)
         action, probability = self.planner.act(env, observation)
         if self._taken.any():
@@ -198,7 +197,6 @@ class Handover:
 
     def _watch(self, env: WarehouseVectorEnv) -> None:
         """Decide whose turn it is, everywhere."""
-        assert self._taken is not None
         signals = env.signals
         begun = env.steps == 0
         self._taken[begun] = False
@@ -234,7 +232,6 @@ class Handover:
             self._pass(env, int(index), False, "clear")
 
     def _pass(self, env: WarehouseVectorEnv, index: int, taken: bool, reason: str) -> None:
-        assert self._taken is not None
         names = self.planner.name, self.operator.name
         self._taken[index] = taken
         self._held[index] = self._still[index] = 0

@@ -177,12 +177,8 @@ class Planner:
         cost = 1.0 + NEAR_COST * near**2
         index = np.arange(free.size).reshape(self.shape)
         against = self._against_rules()
-        rows: list[NDArray[Any]] = []
-        columns: list[NDArray[Any]] = []
-        weights: list[NDArray[Any]] = []
-        back_rows: list[NDArray[Any]] = []
-        back_columns: list[NDArray[Any]] = []
-        back_weights: list[NDArray[Any]] = []
+        forth: list[tuple[NDArray[Any], ...]] = []  # from, to, weight
+        back: list[tuple[NDArray[Any], ...]] = []
         for di, dj in ((1, 0), (0, 1), (1, 1), (1, -1)):
             here = (slice(0, self.shape[0] - di), slice(max(-dj, 0), self.shape[1] - max(dj, 0)))
             there = (slice(di, None), slice(max(dj, 0), self.shape[1] + min(dj, 0)))
@@ -191,16 +187,11 @@ class Planner:
             length = CELL_M * np.hypot(di, dj)
             weight = length * (cost[here][both] + cost[there][both]) / 2
             # one -> other in the graph is the robot's way from `other` to `one`, by (-di, -dj).
-            for step, found, start, end in (
-                ((-di, -dj), (rows, columns, weights), one, other),
-                ((di, dj), (back_rows, back_columns, back_weights), other, one),
-            ):
-                kept = _allowed(against, step, one, other)
-                found[0].append(start[kept])
-                found[1].append(end[kept])
-                found[2].append(weight[kept])
-        parts = (rows + back_rows, columns + back_columns, weights + back_weights)
-        row, column, value = map(np.concatenate, parts)
+            kept = _allowed(against, (-di, -dj), one, other)
+            forth.append((one[kept], other[kept], weight[kept]))
+            kept = _allowed(against, (di, dj), one, other)
+            back.append((other[kept], one[kept], weight[kept]))
+        row, column, value = map(np.concatenate, zip(*forth, *back, strict=True))
         return sparse.csr_matrix((value, (row, column)), shape=(free.size, free.size))
 
     def _against_rules(self) -> list[tuple[tuple[int, int], NDArray[np.bool_]]]:

@@ -64,10 +64,6 @@ class Drive:
     policy: list[tuple[str, str, float]]  # T of (name, version, probability of the action)
     plans: list[tuple[int, F64]]  # (tick from which it is in force, (P, 2) points)
     scene: Scene = EMPTY
-    gyro_bias_radps: float = 0.0
-    gyro_noise_radps: float = 0.0
-    accel_noise_mps2: float = 0.0
-    encoder_noise_radps: float = 0.0
 
 
 @dataclass

@@ -225,10 +225,6 @@ class Fleet:
                 goal_radius_m=env.task.goal_radius_m,
                 body_m=(env.task.body.length_m, env.task.body.width_m, 2 * CHASSIS_Z_M),
             ),
-            gyro_bias_radps=hardware.gyro_bias_radps,
-            gyro_noise_radps=hardware.gyro_noise_radps,
-            accel_noise_mps2=hardware.accel_noise_mps2,
-            encoder_noise_radps=hardware.encoder_noise_radps,
         )
         return Driven(
             mission=log.mission,

@@ -123,6 +123,18 @@ class MessageLayout:
         return np.array([place.offset for place in places]), places[0].dtype
 
 
+class Exemplar:
+    """A message whose layout is worked out when it is first needed: typestores take a while."""
+
+    def __init__(self, type_name: str, /, **fields: Any) -> None:
+        self._type_name, self._fields = type_name, fields
+
+    @functools.cached_property
+    def layout(self) -> MessageLayout:
+        """The layout of every message like this one."""
+        return MessageLayout.of(build(self._type_name, **self._fields))
+
+
 _STAMP = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])
 
 

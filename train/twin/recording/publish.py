@@ -170,9 +170,10 @@ class Robot:
 
     def _odometry(self, drive: Drive, reckoned: F64) -> list[Message]:
         times, tick = self._sample(drive, self.rates.odom)
+        hardware = drive.scene.perturbation
         rate = drive.motion.at(drive.motion.wheel_rate_radps, times)
-        rate += self.rng.normal(0, drive.encoder_noise_radps, rate.shape)
-        rate += drive.scene.perturbation.encoder_bias_radps
+        rate += self.rng.normal(0, hardware.encoder_noise_radps, rate.shape)
+        rate += hardware.encoder_bias_radps
         speed, turn = self.odometer.speeds(rate)
         speed = _at_ticks(speed, tick, drive.signals["wheel_speed_mps"])
         turn = _at_ticks(turn, tick, drive.signals["wheel_yaw_rate_radps"])
@@ -184,11 +185,12 @@ class Robot:
 
     def _inertial(self, drive: Drive) -> list[Message]:
         times, tick = self._sample(drive, self.rates.imu)
-        gyro = drive.motion.at(drive.motion.yaw_rate_radps, times) + drive.gyro_bias_radps
-        gyro += self.rng.normal(0, drive.gyro_noise_radps, len(times))
+        hardware = drive.scene.perturbation
+        gyro = drive.motion.at(drive.motion.yaw_rate_radps, times) + hardware.gyro_bias_radps
+        gyro += self.rng.normal(0, hardware.gyro_noise_radps, len(times))
         accel = drive.motion.at(drive.motion.accel_mps2, times)
-        accel += self.rng.normal(0, drive.accel_noise_mps2, accel.shape)
-        accel[:, 0] += drive.scene.perturbation.accel_bias_mps2
+        accel += self.rng.normal(0, hardware.accel_noise_mps2, accel.shape)
+        accel[:, 0] += hardware.accel_bias_mps2
         gyro = _at_ticks(gyro, tick, drive.signals["gyro_yaw_rate_radps"])
         ahead = _at_ticks(accel[:, 0], tick, drive.signals["accel_x_mps2"])
         data = topics.imu(
@@ -207,16 +209,9 @@ class Robot:
         return self._send("/joint_states", times, data)
 
     def _scans(self, drive: Drive) -> list[Message]:
-        lidar = self.lidar
-        data = topics.scans(
-            self._stamps(drive.scan_s),
-            _rounded(drive.ranges_m, LIDAR_LSB_M),
-            angle_min_rad=lidar.angle_min_rad,
-            angle_increment_rad=lidar.angle_increment_rad,
-            range_min_m=lidar.range_min_m,
-            range_max_m=lidar.range_max_m,
-            scan_time_s=max(1 / self.rates.scan, drive.scene.perturbation.lidar_period_s),
-        )
+        scan_time_s = max(1 / self.rates.scan, drive.scene.perturbation.lidar_period_s)
+        ranges_m = _rounded(drive.ranges_m, LIDAR_LSB_M)
+        data = topics.scans(self._stamps(drive.scan_s), ranges_m, self.lidar, scan_time_s)
         return self._send("/scan", drive.scan_s, data)
 
     def _localisation(self, drive: Drive, reckoned: F64) -> list[Message]:

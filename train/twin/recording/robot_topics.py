@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.train.twin.recording.bag_writer import Topic
-from restock.train.twin.recording.messages import MessageLayout, build, serialise, stamp
+from restock.train.twin.recording.drive import Lidar
+from restock.train.twin.recording.messages import Exemplar, MessageLayout, build, serialise, stamp
 from restock.train.twin.recording.scene import SCENE_TOPICS
 
 F64 = NDArray[np.float64]
@@ -44,11 +45,54 @@ LASER_FRAME, IMU_FRAME = "laser_link", "imu_link"
 WHEEL_JOINTS = ("left_wheel_joint", "right_wheel_joint")
 
 
+def _diagonal(size: int, entries: Mapping[int, float]) -> F64:
+    values = np.zeros((size, size))
+    for index, value in entries.items():
+        values[index, index] = value
+    return values.ravel()
+
+
+_ODOMETRY = Exemplar(
+    "nav_msgs/msg/Odometry",
+    header={"frame_id": "odom"},
+    child_frame_id="base_link",
+    pose={"covariance": _diagonal(6, {0: 1e-3, 1: 1e-3, 5: 1e-2})},
+    twist={"covariance": _diagonal(6, {0: 1e-4, 1: 1e-6, 5: 1e-3})},
+)
+_IMU = Exemplar(
+    "sensor_msgs/msg/Imu",
+    header={"frame_id": IMU_FRAME},
+    orientation_covariance=[-1.0] + [0.0] * 8,
+    angular_velocity_covariance=_diagonal(3, {0: 4e-4, 1: 4e-4, 2: 4e-4}),
+    linear_acceleration={"z": 9.80665},
+    linear_acceleration_covariance=_diagonal(3, {0: 1e-2, 1: 1e-2, 2: 1e-2}),
+)
+_JOINTS = Exemplar(
+    "sensor_msgs/msg/JointState",
+    name=WHEEL_JOINTS,
+    position=np.zeros(2),
+    velocity=np.zeros(2),
+)
+_POSE = Exemplar(
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    header={"frame_id": "map"},
+    pose={"covariance": _diagonal(6, {0: 4e-4, 1: 4e-4, 5: 1e-4})},
+)
+_TRANSFORMS = Exemplar(
+    "tf2_msgs/msg/TFMessage",
+    transforms=[
+        {"header": {"frame_id": "map"}, "child_frame_id": "odom"},
+        {"header": {"frame_id": "odom"}, "child_frame_id": "base_link"},
+    ],
+)
+_TWIST, _BOOL = Exemplar("geometry_msgs/msg/Twist"), Exemplar("std_msgs/msg/Bool")
+
+
 def odometry(
     stamp_ns: I64, x_m: F64, y_m: F64, yaw_rad: F64, speed_mps: F64, yaw_rate_radps: F64
 ) -> list[bytes]:
     """Dead reckoning in `odom`, twist in `base_link`."""
-    return _odometry_layout().pack(
+    return _ODOMETRY.layout.pack(
         {
             "header.stamp": stamp_ns,
             "pose.pose.position.x": x_m,
@@ -61,22 +105,9 @@ def odometry(
     )
 
 
-@functools.cache
-def _odometry_layout() -> MessageLayout:
-    return MessageLayout.of(
-        build(
-            "nav_msgs/msg/Odometry",
-            header={"frame_id": "odom"},
-            child_frame_id="base_link",
-            pose={"covariance": _diagonal(6, {0: 1e-3, 1: 1e-3, 5: 1e-2})},
-            twist={"covariance": _diagonal(6, {0: 1e-4, 1: 1e-6, 5: 1e-3})},
-        )
-    )
-
-
 def imu(stamp_ns: I64, yaw_rate_radps: F64, accel_x_mps2: F64, accel_y_mps2: F64) -> list[bytes]:
     """Rates and accelerations; no orientation (covariance[0] = -1, as sensor_msgs/Imu has it)."""
-    return _imu_layout().pack(
+    return _IMU.layout.pack(
         {
             "header.stamp": stamp_ns,
             "angular_velocity.z": yaw_rate_radps,
@@ -87,76 +118,39 @@ def imu(stamp_ns: I64, yaw_rate_radps: F64, accel_x_mps2: F64, accel_y_mps2: F64
     )
 
 
-@functools.cache
-def _imu_layout() -> MessageLayout:
-    return MessageLayout.of(
-        build(
-            "sensor_msgs/msg/Imu",
-            header={"frame_id": IMU_FRAME},
-            orientation_covariance=[-1.0] + [0.0] * 8,
-            angular_velocity_covariance=_diagonal(3, {0: 4e-4, 1: 4e-4, 2: 4e-4}),
-            linear_acceleration={"z": 9.80665},
-            linear_acceleration_covariance=_diagonal(3, {0: 1e-2, 1: 1e-2, 2: 1e-2}),
-        )
-    )
-
-
 def joint_states(stamp_ns: I64, angle_rad: F64, rate_radps: F64) -> list[bytes]:
     """Wheel angles and rates, each (n, 2): left, right."""
-    return _joint_layout().pack(
+    return _JOINTS.layout.pack(
         {"header.stamp": stamp_ns, "position": angle_rad, "velocity": rate_radps}, len(stamp_ns)
     )
 
 
-@functools.cache
-def _joint_layout() -> MessageLayout:
-    return MessageLayout.of(
-        build(
-            "sensor_msgs/msg/JointState",
-            name=WHEEL_JOINTS,
-            position=np.zeros(2),
-            velocity=np.zeros(2),
-        )
-    )
-
-
-def scans(
-    stamp_ns: I64,
-    ranges_m: F64,
-    *,
-    angle_min_rad: float,
-    angle_increment_rad: float,
-    range_min_m: float,
-    range_max_m: float,
-    scan_time_s: float,
-) -> list[bytes]:
+def scans(stamp_ns: I64, ranges_m: F64, lidar: Lidar, scan_time_s: float) -> list[bytes]:
     """Lidar scans: ranges (n, B), inf where nothing came back."""
     beams = ranges_m.shape[1]
-    layout = MessageLayout.of(
-        build(
-            "sensor_msgs/msg/LaserScan",
-            header={"frame_id": LASER_FRAME},
-            angle_min=angle_min_rad,
-            angle_max=angle_min_rad + angle_increment_rad * (beams - 1),
-            angle_increment=angle_increment_rad,
-            scan_time=scan_time_s,
-            range_min=range_min_m,
-            range_max=range_max_m,
-            ranges=np.zeros(beams, np.float32),
-        )
+    scan = Exemplar(
+        "sensor_msgs/msg/LaserScan",
+        header={"frame_id": LASER_FRAME},
+        angle_min=lidar.angle_min_rad,
+        angle_max=lidar.angle_min_rad + lidar.angle_increment_rad * (beams - 1),
+        angle_increment=lidar.angle_increment_rad,
+        scan_time=scan_time_s,
+        range_min=lidar.range_min_m,
+        range_max=lidar.range_max_m,
+        ranges=np.zeros(beams, np.float32),
     )
-    return layout.pack({"header.stamp": stamp_ns, "ranges": ranges_m}, len(stamp_ns))
+    return scan.layout.pack({"header.stamp": stamp_ns, "ranges": ranges_m}, len(stamp_ns))
 
 
 def commands(speed_mps: F64, yaw_rate_radps: F64) -> list[bytes]:
     """Velocity commands."""
-    layout = MessageLayout.of(build("geometry_msgs/msg/Twist"))
-    return layout.pack({"linear.x": speed_mps, "angular.z": yaw_rate_radps}, len(speed_mps))
+    columns = {"linear.x": speed_mps, "angular.z": yaw_rate_radps}
+    return _TWIST.layout.pack(columns, len(speed_mps))
 
 
 def localised_poses(stamp_ns: I64, x_m: F64, y_m: F64, yaw_rad: F64) -> list[bytes]:
     """Poses in `map`, as a localiser publishes them."""
-    return _pose_layout().pack(
+    return _POSE.layout.pack(
         {
             "header.stamp": stamp_ns,
             "pose.pose.position.x": x_m,
@@ -164,17 +158,6 @@ def localised_poses(stamp_ns: I64, x_m: F64, y_m: F64, yaw_rad: F64) -> list[byt
             **_orientation("pose.pose.orientation", yaw_rad),
         },
         len(stamp_ns),
-    )
-
-
-@functools.cache
-def _pose_layout() -> MessageLayout:
-    return MessageLayout.of(
-        build(
-            "geometry_msgs/msg/PoseWithCovarianceStamped",
-            header={"frame_id": "map"},
-            pose={"covariance": _diagonal(6, {0: 4e-4, 1: 4e-4, 5: 1e-4})},
-        )
     )
 
 
@@ -191,20 +174,7 @@ def transforms(
             f"{at}.transform.translation.y": y_m,
             **_orientation(f"{at}.transform.rotation", yaw_rad),
         }
-    return _transform_layout().pack(columns, len(stamp_ns))
-
-
-@functools.cache
-def _transform_layout() -> MessageLayout:
-    return MessageLayout.of(
-        build(
-            "tf2_msgs/msg/TFMessage",
-            transforms=[
-                {"header": {"frame_id": "map"}, "child_frame_id": "odom"},
-                {"header": {"frame_id": "odom"}, "child_frame_id": "base_link"},
-            ],
-        )
-    )
+    return _TRANSFORMS.layout.pack(columns, len(stamp_ns))
 
 
 def static_transforms(stamp_ns: int, lidar_x_m: float, lidar_z_m: float = 0.2) -> bytes:
@@ -226,8 +196,7 @@ def static_transforms(stamp_ns: int, lidar_x_m: float, lidar_z_m: float = 0.2) -
 
 def bumpers(pressed: NDArray[np.bool_]) -> list[bytes]:
     """Bumper states."""
-    layout = MessageLayout.of(build("std_msgs/msg/Bool"))
-    return layout.pack({"data": pressed}, len(pressed))
+    return _BOOL.layout.pack({"data": pressed}, len(pressed))
 
 
 @functools.lru_cache(maxsize=256)
@@ -272,9 +241,7 @@ def plan(stamp_ns: int, points_m: F64) -> bytes:
 @functools.lru_cache(maxsize=512)
 def _path_layout(points: int) -> MessageLayout:
     header = {"frame_id": "map"}
-    return MessageLayout.of(
-        build("nav_msgs/msg/Path", header=header, poses=[{"header": header}] * points)
-    )
+    return Exemplar("nav_msgs/msg/Path", header=header, poses=[{"header": header}] * points).layout
 
 
 def occupancy_map(
@@ -324,10 +291,3 @@ def diagnostics(
 
 def _orientation(path: str, yaw_rad: F64) -> dict[str, F64]:
     return {f"{path}.z": np.sin(yaw_rad / 2), f"{path}.w": np.cos(yaw_rad / 2)}
-
-
-def _diagonal(size: int, entries: Mapping[int, float]) -> F64:
-    values = np.zeros((size, size))
-    for index, value in entries.items():
-        values[index, index] = value
-    return values.ravel()
