@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from restock.cli import main as restock
 from restock.stats import percentiles, wilson
-from restock.train.evaluation.eval_run import load_agent
+from restock.train.evaluation.policies import load_agent
 from restock.train.run.run import Run
 from restock.train.twin.env.interface import Policy
 from restock.train.twin.env.operator_policy import Operator

@@ -18,13 +18,13 @@ from restock.errors import ExitCode, RestockError
 from restock.train.dqn.network import clone
 from restock.train.dqn.target import Hard
 from restock.train.evaluation.evaluate import (
-    GreedyPolicy,
     Score,
     fixed_episodes,
     score,
 )
 from restock.train.evaluation.ope import OpeConfig, evaluate_off_policy, measures_of
 from restock.train.evaluation.ope_dataset import load_ope_dataset
+from restock.train.evaluation.policies import GreedyPolicy
 from restock.train.feed.batches import Batch
 from restock.train.feed.probe import Probe
 from restock.train.guard import enforce, falls

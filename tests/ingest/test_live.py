@@ -21,7 +21,7 @@ from restock.ingest.profile.profile import Frames, load_profile
 from restock.ingest.steps.live import LiveObserver
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
-from restock.train.evaluation.evaluate import GreedyPolicy
+from restock.train.evaluation.policies import GreedyPolicy
 
 BAG = ROOT / "sample_logs" / "amr_tuesday"
 EXAMPLE = ROOT / "docs" / "examples" / "ros2_policy.py"

@@ -248,7 +248,7 @@ def test_people_read_what_differs_and_why_it_is_refused(tmp_path, capsys) -> Non
     assert "which is not what --treatment algorithm compares" in " ".join(shown.err.split())
 
 
-def test_what_is_no_arm_is_refused_with_a_remedy(tmp_path, capsys) -> None:
+def test_an_invalid_arm_is_refused_with_a_remedy(tmp_path, capsys) -> None:
     first = arm(tmp_path, "a", range(3))
     other = str(make_run(tmp_path / "o", document(9, config__target__tau=0.1)))
     young = str(Run.create(tmp_path / "young", document(1)).path)
@@ -256,7 +256,7 @@ def test_what_is_no_arm_is_refused_with_a_remedy(tmp_path, capsys) -> None:
         ([*first], "needs two runs, got 3"),
         ([first[0], other, "--against", first[1]], "differs from"),
         ([first[0], first[0], "--against", first[1]], "is named twice"),
-        ([first[0], young], "has no record of the episodes it was fed"),
+        ([first[0], young], "has no record of the episodes it sampled"),
         ([first[0], str(tmp_path)], "is not a run directory"),
     ):
         assert main(["compare", *words]) == 2

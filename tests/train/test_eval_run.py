@@ -13,7 +13,7 @@ from restock.train.twin.physics.episode import KINDS
 
 
 @pytest.mark.parametrize("policy", ["run:", "onnx:", "operator"])
-def test_a_policy_that_is_none_is_refused(
+def test_an_unknown_policy_is_refused(
     policy: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = kept_run(tmp_path / "a")

@@ -13,7 +13,7 @@ import pytest
 from restock.cli import main
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
-from restock.train.evaluation.eval_run import load_agent
+from restock.train.evaluation.policies import load_agent
 from restock.train.libraries.library_arm import LibraryArm, dqn_arguments, resolve, train_library
 from restock.train.run.run import Run
 from restock.train.study.study import load_study

@@ -73,7 +73,7 @@ _KINDS: dict[str, Kind] = {
     "profile": "task",
     "versions": "software",
 }
-_NO_SETTING = frozenset({"format", "created_ns", "target", "seeds"})  # or said in config as well
+_NO_SETTING = frozenset({"format", "created_ns", "target", "seeds"})  # or in config as well
 
 
 @dataclass(frozen=True)
@@ -95,9 +95,9 @@ class Arm:
         for run in self.runs:
             if not run.table("sampled_episodes").num_rows:
                 raise RunError(
-                    "has no record of the episodes it was fed",
+                    "has no record of the episodes it sampled",
                     where=str(run.path),
-                    remedy="it made no update yet, or an older Restock wrote it: train it anew",
+                    remedy="it made no update yet, or an older Restock wrote it: train it again",
                 )
         seen: dict[Path, None] = {}
         for run in self.runs:

@@ -3,7 +3,7 @@
 A difference test asks the wrong question: at a million draws it rejects trifles, and it takes rows
 of one episode for independent ones. So two feeds are comparable only when the data show that they
 differ by *at most* a stated limit. What a mixture fixes (the shares of logged strata, in exact
-quotas) is compared as it is; what chance decides (which fresh episodes there were) is resampled by
+quotas) is compared as it is; what is random (which fresh episodes there were) is resampled by
 whole episodes. Total variation distance alone does not see a rare stratum, hence the ratios.
 """
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 Verdict = Literal["comparable", "inconclusive", "incomparable"]
-_CHECKS = 30  # about as many are made of chance
+_CHECKS = 30  # about as many are made of random figures
 _ORDER: list[Verdict] = ["comparable", "inconclusive", "incomparable"]
 
 
@@ -135,7 +135,7 @@ def _unlabelled(first: Feed, second: Feed, limits: ComparabilityLimits) -> list[
 
 
 def _episodes(first: Feed, second: Feed, limits: ComparabilityLimits) -> list[Check]:
-    """Episodes that each cell was drawn from: a count, with nothing left to chance in it."""
+    """Episodes that each cell was drawn from: a count, with nothing random in it."""
     checks = []
     totals = [np.bincount(f.cell, f.drawn, len(f.cells)) / f.drawn.sum() for f in (first, second)]
     for index, cell in enumerate(first.cells):
@@ -224,8 +224,8 @@ def _resampled(feed: Feed, limits: ComparabilityLimits, rng: np.random.Generator
     counts = [np.bincount(place, a, 10 * cells).astype(np.float64) for a in amounts]
     total = np.stack(counts).reshape(2, 10, cells)
     sums: F64 = np.repeat(total[None], 1 + limits.resamples, axis=0)
-    by_chance = np.array([name.startswith("fresh/") for name in feed.cells])
-    fresh = by_chance[feed.cell]
+    random = np.array([name.startswith("fresh/") for name in feed.cells])
+    fresh = random[feed.cell]
     if not fresh.any():
         return sums
     _, episode = np.unique(feed.episode[fresh], return_inverse=True)
@@ -239,10 +239,10 @@ def _resampled(feed: Feed, limits: ComparabilityLimits, rng: np.random.Generator
         times = rng.poisson(1.0, (stop - start, episodes)).astype(np.float64)
         for kind, matrix in enumerate(matrices):
             drawn = (times @ matrix).reshape(-1, 10, cells)
-            # The source's share of the batch is a setting, no chance: it is kept.
-            was, now = total[kind][:, by_chance].sum(-1), drawn[..., by_chance].sum(-1)
+            # The source's share of the batch is a setting, not random: it is kept.
+            was, now = total[kind][:, random].sum(-1), drawn[..., random].sum(-1)
             drawn *= (was / np.maximum(now, 1e-12))[..., None]
-            sums[1 + start : 1 + stop, kind][..., by_chance] = drawn[..., by_chance]
+            sums[1 + start : 1 + stop, kind][..., random] = drawn[..., random]
     return sums
 
 

@@ -35,7 +35,7 @@ from restock.train.run.run import Run
 
 Cause = Literal["HEALTHY", "BUFFER", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED"]
 WINDOWS = 3  # the last, that figures are the median of
-_LEAST_ROWS = 20  # held out, for a condition to be judged
+_LEAST_ROWS = 20  # held out, for a condition to be diagnosed
 _LEAST_ALIKE = 50  # … for its look to be known
 
 
@@ -97,26 +97,26 @@ class Window:
         """The conditions whose replay is in doubt, with what is wrong, for people."""
         follows = [s.unexplained for s in self.symptoms if s.unexplained is not None]
         least = min(follows, default=0.0)
-        found = {}
+        doubts = {}
         for symptom in self.symptoms:
-            said = [*self._supply(symptom, limits), *self._rows(symptom, least, limits)]
+            reasons = [*self._supply(symptom, limits), *self._rows(symptom, least, limits)]
             relative = self.relative(symptom)
             if relative is not None and symptom.gap is not None:
                 if symptom.gap >= limits.gap and relative >= limits.relative:
-                    said.append(
+                    reasons.append(
                         f"held-out |TD| is {symptom.gap:.1f} times that in replay,"
                         f" {relative:.1f} times the median condition's gap"
                     )
             elif symptom.outlier >= limits.gap:
-                said.append(
+                reasons.append(
                     f"held-out |TD| is {symptom.outlier:.1f} times the median condition's, and"
                     " replay has none of it"
                 )
-            if said and symptom.quota_met is not None and symptom.quota_met < limits.quota_met:
-                said.append(f"got {symptom.quota_met:.0%} of its quota")
-            if said:
-                found[symptom.condition] = said
-        return found
+            if reasons and symptom.quota_met is not None and symptom.quota_met < limits.quota_met:
+                reasons.append(f"got {symptom.quota_met:.0%} of its quota")
+            if reasons:
+                doubts[symptom.condition] = reasons
+        return doubts
 
     def _supply(self, symptom: Symptom, limits: DiagnosisLimits) -> list[str]:
         if symptom.supply is None:  # a run from before it was kept
@@ -127,9 +127,9 @@ class Window:
         return [f"is {share:.2%} of replay and {met:.1%} of what driving meets"]
 
     def _rows(self, symptom: Symptom, least: float, limits: DiagnosisLimits) -> list[str]:
-        said = []
+        reasons = []
         if symptom.agreement is not None and symptom.agreement < limits.agreement:
-            said.append(
+            reasons.append(
                 f"of its logged rows {symptom.agreement:.0%} look like it: is the label right?"
             )
         rest = symptom.unexplained
@@ -138,11 +138,11 @@ class Window:
             and rest >= limits.unexplained
             and rest >= limits.unexplained_relative * least
         ):
-            said.append(
+            reasons.append(
                 f"its logged rows leave {rest:.0%} of their next observations unexplained"
                 f" (another condition's {least:.0%}): do they belong together?"
             )
-        return said
+        return reasons
 
     def target(self, limits: DiagnosisLimits) -> bool:
         """Whether the target is in doubt."""
@@ -190,12 +190,12 @@ def diagnose(runs: Sequence[Run], limits: DiagnosisLimits = DiagnosisLimits()) -
         RunError: a run has no evaluation after its updates.
     """
     windows = [windows_of(run) for run in runs]
-    figures = [over(found[-WINDOWS:]) for found in windows]
-    causes = [_of_run(found, own, limits) for found, own in zip(windows, figures, strict=True)]
+    figures = [median_window(of_run[-WINDOWS:]) for of_run in windows]
+    causes = [_cause_of_run(*pair, limits) for pair in zip(windows, figures, strict=True)]
     ((cause, votes), *_) = Counter(causes).most_common()
     if votes <= len(causes) / 2:
         cause = "UNDETERMINED"
-    shown = [own for own, said in zip(figures, causes, strict=True) if said == cause] or figures
+    shown = [one for one, its in zip(figures, causes, strict=True) if its == cause] or figures
     return Diagnosis(
         cause,
         causes,
@@ -206,7 +206,7 @@ def diagnose(runs: Sequence[Run], limits: DiagnosisLimits = DiagnosisLimits()) -
     )
 
 
-def _of_run(windows: Sequence[Window], figures: Window, limits: DiagnosisLimits) -> Cause:
+def _cause_of_run(windows: Sequence[Window], figures: Window, limits: DiagnosisLimits) -> Cause:
     """What the last windows come to; those that do not agree on the target are not forced."""
     if windows[-1].diverged(limits) and figures.diverged(limits):
         return "DIVERGENCE"
@@ -216,7 +216,7 @@ def _of_run(windows: Sequence[Window], figures: Window, limits: DiagnosisLimits)
     return figures.cause(limits)
 
 
-def over(windows: Sequence[Window]) -> Window:
+def median_window(windows: Sequence[Window]) -> Window:
     """The median of each figure over windows, of each condition over those in which it was met."""
 
     def middle(name: str, of: Sequence[Any] = windows) -> Any:
@@ -226,9 +226,9 @@ def over(windows: Sequence[Window]) -> Window:
     conditions = dict.fromkeys(s.condition for window in windows for s in window.symptoms)
     symptoms = []
     for condition in conditions:
-        own = [s for window in windows for s in window.symptoms if s.condition == condition]
+        same = [s for window in windows for s in window.symptoms if s.condition == condition]
         names = [name for name in Symptom.__dataclass_fields__ if name != "condition"]
-        symptoms.append(Symptom(condition, **{name: middle(name, own) for name in names}))
+        symptoms.append(Symptom(condition, **{name: middle(name, same) for name in names}))
     gaps = [symptom.gap for symptom in symptoms if symptom.gap is not None]
     return Window(
         gradient_steps=windows[-1].gradient_steps,
@@ -264,8 +264,8 @@ def windows_of(run: Run) -> list[Window]:
 
 
 def _window(rows: list[dict[str, Any]], bound: float) -> Window:
-    judged = [row for row in rows if row["evaluation_rows"] >= _LEAST_ROWS] or rows
-    middle = median(row["evaluation_td"] for row in judged)
+    known_well = [row for row in rows if row["evaluation_rows"] >= _LEAST_ROWS] or rows
+    middle = median(row["evaluation_td"] for row in known_well)
     symptoms = [
         Symptom(
             row["condition"],
@@ -277,14 +277,14 @@ def _window(rows: list[dict[str, Any]], bound: float) -> Window:
             row["unexplained"],
             row["quota_met"],
         )
-        for row in judged
+        for row in known_well
     ]
     gaps = [symptom.gap for symptom in symptoms if symptom.gap is not None]
-    weight = sum(row["evaluation_rows"] for row in judged)
-    known = [row["explained"] for row in judged if row["explained"] is not None]
+    weight = sum(row["evaluation_rows"] for row in known_well)
+    known = [row["explained"] for row in known_well if row["explained"] is not None]
 
     def mean(name: str) -> float:
-        return float(sum(row[name] * row["evaluation_rows"] for row in judged) / weight)
+        return float(sum(row[name] * row["evaluation_rows"] for row in known_well) / weight)
 
     return Window(
         gradient_steps=rows[0]["gradient_steps"],
@@ -306,20 +306,20 @@ def _value_bound(run: Run) -> float:
     return largest / (1 - discount) if largest > 0 else float("inf")
 
 
-def _told(explained: float | None) -> str:
+def _explained(explained: float | None) -> str:
     return "" if explained is None else f" {explained:.0%} of the targets' variance explained,"
 
 
 def _evidence(window: Window, limits: DiagnosisLimits) -> list[str]:
     """What a window shows, for people."""
-    said = [
+    lines = [
         f"after {window.gradient_steps:,} updates: median G {window.gap_median:.2f},"
-        f" L {window.lag:.3f}, S {window.clock:.2f},{_told(window.explained)}"
+        f" L {window.lag:.3f}, S {window.clock:.2f},{_explained(window.explained)}"
         f" max |Q| {window.q_abs_max:.3g} of at most {window.q_bound:.3g}"
     ]
-    for condition, found in window.bad(limits).items():
-        said += [f"{condition}: {what}" for what in found]
-    return said
+    for condition, reasons in window.bad(limits).items():
+        lines += [f"{condition}: {reason}" for reason in reasons]
+    return lines
 
 
 def _experiment(cause: Cause, windows: Sequence[Window], limits: DiagnosisLimits) -> str:
@@ -328,7 +328,7 @@ def _experiment(cause: Cause, windows: Sequence[Window], limits: DiagnosisLimits
     return {
         "HEALTHY": "none needed: no figure is past its limit",
         "BUFFER": f"train again with more or corrected rows of {which} and the same target rule:"
-        " what is said of them must be gone, and nothing else change",
+        " these symptoms must be gone, and nothing else change",
         "TARGET": "train again with another target rule (target.tau 0.005) on the same panel:"
         " L and S must fall, or the median G",
         "BOTH": f"first change the target rule alone, then the rows of {which} alone: one clock"

@@ -1,4 +1,4 @@
-"""Evaluating a finished run: its kept policy beside the planner and chance, on the same episodes.
+"""Evaluating a finished run: its kept policy beside scripted ones, on the same episodes.
 
 Every policy drives the same seeded episodes, clean and under each perturbation; blocked aisles are
 told apart by how much of the aisle is blocked. Seeds are apart from those that training drew its
@@ -18,16 +18,13 @@ import pyarrow as pa
 from restock.errors import ConfigError, RunError
 from restock.files import write_table
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.task.task import Task
 from restock.train.dqn.config import TrainConfig, parse_config
-from restock.train.dqn.network import make_network
 from restock.train.evaluation.evaluate import (
     EpisodeResult,
-    GreedyPolicy,
     run_episodes,
     summary_rows,
 )
-from restock.train.run import checkpoint
+from restock.train.evaluation.policies import load_agent, load_policy
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES
 from restock.train.twin.env.floor_report import refuse_unfit, unfit_kinds
@@ -49,7 +46,7 @@ Results = dict[tuple[str, str], list[EpisodeResult]]  # (policy, perturbation) -
 
 
 @dataclass(frozen=True)
-class Plan:
+class EvaluationPlan:
     """What to evaluate; every name was checked."""
 
     run: Run
@@ -82,7 +79,7 @@ def plan_evaluation(
     episodes: int = 20,
     first_seed: int = FIRST_SEED,
     layouts: str | None = None,
-) -> Plan:
+) -> EvaluationPlan:
     """Check a request. `layouts` None: the run's, with training floors' test split.
 
     Raises:
@@ -93,16 +90,16 @@ def plan_evaluation(
     run = Run.open(path)
     config = parse_config(run.document["config"], where=str(path / "config.json"))
     known = [CLEAN, *(name for name in PERTURBATIONS if name != "nominal")]
-    for flag, asked, there in (
+    for flag, names, choices in (
         ("--policies", policies, list(POLICIES)),
         ("--perturbations", perturbations, known),
     ):
-        unknown = [name for name in asked if name not in there and not _is_path(flag, name)]
-        if unknown or not asked:
+        unknown = [name for name in names if name not in choices and not _is_path(flag, name)]
+        if unknown or not names:
             raise ConfigError(
                 f"there is no {', '.join(map(repr, unknown))}" if unknown else "names nothing",
                 where=flag,
-                remedy=f"choose from {', '.join(there)}"
+                remedy=f"choose from {', '.join(choices)}"
                 + (", onnx:FILE, run:DIRECTORY" if flag == "--policies" else ", FILE.toml"),
             )
     if episodes < 1:
@@ -115,7 +112,7 @@ def plan_evaluation(
         )
     layouts = layouts or layouts_of_split(config.env.layouts, "test")
     floors = open_floors(layouts)
-    plan = Plan(
+    plan = EvaluationPlan(
         run,
         config,
         tuple(dict.fromkeys(policies)),
@@ -129,7 +126,7 @@ def plan_evaluation(
         refuse_unfit(floors, KINDS)
     for name in plan.policies:
         if _is_path("--policies", name):
-            make_policy(name, plan)  # what is wrong with it is said before anything is driven
+            make_policy(name, plan)  # refused before anything is driven
     return plan
 
 
@@ -175,7 +172,9 @@ def evaluate(
     return summary_rows(drive_evaluation(plan))
 
 
-def drive_evaluation(plan: Plan, progress: Callable[[int], None] | None = None) -> Results:
+def drive_evaluation(
+    plan: EvaluationPlan, progress: Callable[[int], None] | None = None
+) -> Results:
     """Drive all episodes, and write them to the run's `eval/episodes.parquet`."""
     from restock.train.twin.env.interface import DEFAULT_CONDITIONS
     from restock.train.twin.env.vector_env import WarehouseVectorEnv
@@ -191,7 +190,7 @@ def drive_evaluation(plan: Plan, progress: Callable[[int], None] | None = None) 
         conditions={kind: DEFAULT_CONDITIONS[kind] for kind in plan.kinds},
     )
     # One queue a policy, over all perturbations: few environments then wait for the last episodes.
-    asked = [
+    episodes = [
         (name, EpisodeSpec(kind, plan.first_seed + index, perturbation))
         for name, perturbation in plan.perturbations.items()
         for index in range(plan.episodes)
@@ -202,12 +201,12 @@ def drive_evaluation(plan: Plan, progress: Callable[[int], None] | None = None) 
         driven = run_episodes(
             env,
             make_policy(policy, plan),
-            [spec for _, spec in asked],
+            [spec for _, spec in episodes],
             control_period_s=task.control_period_s,
             time_limit_steps=task.time_limit_steps,
             progress=progress,
         )
-        for (perturbation, _), result in zip(asked, driven, strict=True):
+        for (perturbation, _), result in zip(episodes, driven, strict=True):
             results.setdefault((policy, perturbation), []).append(result)
     write_table(episodes_table(results), plan.run.path / "eval" / "episodes.parquet")
     return results
@@ -221,24 +220,24 @@ def _perturb(name: str) -> Perturbation | None:
     """
     if name == CLEAN:
         return None
-    found = find_perturbation(name, where="--perturbations")
-    if isinstance(found, Schedule):
+    perturbation = find_perturbation(name, where="--perturbations")
+    if isinstance(perturbation, Schedule):
         raise ConfigError(
             "is a schedule: policies are compared under the same parameters",
             where=name,
             remedy="give the TOML file of one perturbation",
         )
-    if found.timestep_s != Perturbation().timestep_s:
+    if perturbation.timestep_s != Perturbation().timestep_s:
         raise ConfigError(
-            f"holds for a timestep of {found.timestep_s:g} s, the evaluation runs at"
+            f"holds for a timestep of {perturbation.timestep_s:g} s, the evaluation runs at"
             f" {Perturbation().timestep_s:g} s",
             where=name,
             remedy="effective parameters are those of a timestep: fit them at this one",
         )
-    return found
+    return perturbation
 
 
-def make_policy(name: str, plan: Plan) -> Policy:
+def make_policy(name: str, plan: EvaluationPlan) -> Policy:
     """The run's kept policy, a scripted one, or one that is named."""
     from restock.train.twin.env.policies import PlannerFollower, RandomPolicy
 
@@ -248,53 +247,6 @@ def make_policy(name: str, plan: Plan) -> Policy:
         return PlannerFollower(epsilon=0.0, seed=plan.first_seed)
     named = load_policy(name, load_profile(plan.config.profile).task)
     return RandomPolicy(seed=plan.first_seed) if named is None else named
-
-
-def load_policy(name: str, task: Task) -> Policy | None:
-    """The policy that `run:DIRECTORY` (its best) or `onnx:FILE` names; None for other names.
-
-    Raises:
-        ConfigError: no such file, or a policy of another task.
-        RunError: no such run, one without a policy, or a damaged one.
-    """
-    kind, _, path = name.partition(":")
-    if kind == "onnx" and path:
-        from restock.train.evaluation.onnx_policy import OnnxPolicy
-
-        return OnnxPolicy(Path(path), task)
-    if kind != "run" or not path:
-        return None
-    run = Run.open(Path(path))
-    agent = load_agent(run)
-    own = load_profile(parse_config(run.document["config"], where=path).profile).task
-    if own.hash != task.hash:
-        raise ConfigError(
-            f"was trained on task {own.hash}, this is {task.hash}",
-            where=path,
-            remedy="name a run of this task",
-        )
-    return agent
-
-
-def load_agent(run: Run) -> GreedyPolicy:
-    """The policy that a run kept as its best, greedy.
-
-    Raises:
-        RunError: no checkpoint, a damaged one, or one of a task that the profile no longer is.
-    """
-    config = parse_config(run.document["config"], where=str(run.path / "config.json"))
-    state = checkpoint.load(run.best)
-    task = load_profile(config.profile).task
-    if state["task_hash"] != task.hash:
-        raise RunError(
-            f"its policy was trained on task {state['task_hash']}, profile"
-            f" {config.profile!r} now defines {task.hash}",
-            where=str(run.best),
-            remedy="train again: observations or actions have changed their meaning",
-        )
-    network = make_network(config.network, state["observation_size"], state["actions"])
-    network.load_state_dict(state["network"])
-    return GreedyPolicy(network.eval(), version=f"{run.path.name}@{state['gradient_steps']}")
 
 
 def episodes_table(results: Results) -> pa.Table:
@@ -314,7 +266,7 @@ def episodes_table(results: Results) -> pa.Table:
     return pa.Table.from_pylist(rows, schema=EVAL_EPISODES)
 
 
-def settings(plan: Plan) -> dict[str, Any]:
+def settings(plan: EvaluationPlan) -> dict[str, Any]:
     """What was asked, for the JSON output."""
     return {
         "run": str(plan.run.path),

@@ -14,8 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.stats import wilson
-from restock.train.dqn.learner import greedy_actions
-from restock.train.dqn.network import Network
 from restock.train.feed.fresh_log import values_entries
 from restock.train.twin.env.interface import Policy, Twin
 from restock.train.twin.physics.episode import EpisodeSpec
@@ -24,21 +22,6 @@ Step = tuple[Any, Any, Any, Any, dict[str, Any]]  # as Gymnasium's `step` return
 Stepper = Callable[[NDArray[np.float32], NDArray[np.int64]], Step]
 
 STUCK_WINDOW_S, STUCK_RADIUS_M = 10.0, 0.5
-
-
-class GreedyPolicy:
-    """A Q network, always taking its best action."""
-
-    name = "agent"
-
-    def __init__(self, network: Network, version: str = "") -> None:
-        self.network, self.version = network, version
-
-    def act(
-        self, env: Any, observation: NDArray[np.float32]
-    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        action = greedy_actions(self.network, observation)
-        return action, np.ones(len(action), np.float32)
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,7 @@ class EvaluationBuffer:
         unexplained = self._logs.unexplained if self._logs is not None else {}
         rows = probe.rows.to(learner.device)
         td, q, slow = learner.td_error(rows)
-        own = learner.td_error(rows, online=True)[0]
+        online = learner.td_error(rows, online=True)[0]
         chosen = q.gather(1, rows[:, -3:-2].long())[:, 0]
         measured = []
         for index, name in enumerate(probe.conditions):
@@ -87,7 +87,7 @@ class EvaluationBuffer:
                     "rows": part.stop - part.start,
                     "rows_met": int(ring.strata.counts[ring.conditions.index(name)]),
                     "td_abs_mean": float(td[part].abs().mean()),
-                    "td_online_abs_mean": float(own[part].abs().mean()),
+                    "td_online_abs_mean": float(online[part].abs().mean()),
                     "explained": _explained_share(td[part], chosen[part] - td[part]),
                     "q_abs_mean": float(q[part].abs().mean()),
                     "q_lag": value_lag(q[part], slow[part]),

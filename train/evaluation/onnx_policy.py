@@ -23,7 +23,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
 from restock.train.dqn.config import parse_config
 from restock.train.dqn.network import Network, QNetwork
-from restock.train.evaluation.eval_run import load_agent
+from restock.train.evaluation.policies import load_agent
 from restock.train.run.run import Run
 
 FORMAT = "restock-policy/1"
@@ -45,7 +45,7 @@ def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
     agent = load_agent(run)
     profile = load_profile(parse_config(run.document["config"], where=str(run_path)).profile)
     model = to_onnx(agent.network)
-    said = {
+    metadata = {
         "format": FORMAT,
         "task": msgspec.json.encode(profile.task).decode(),
         "task_hash": profile.task.hash,
@@ -56,10 +56,10 @@ def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
         "version": agent.version,
         "restock_version": __version__,
     }
-    onnx.helper.set_model_props(model, said)
+    onnx.helper.set_model_props(model, metadata)
     onnx.checker.check_model(model, full_check=True)
     write_bytes(out, model.SerializeToString())
-    return {"path": str(out), "bytes": out.stat().st_size, **said}
+    return {"path": str(out), "bytes": out.stat().st_size, **metadata}
 
 
 def to_onnx(network: Network) -> Any:
@@ -171,36 +171,36 @@ class OnnxPolicy:
             raise ConfigError(
                 f"is not an ONNX model: {str(error).splitlines()[0]}", where=str(path)
             ) from error
-        said = self._session.get_modelmeta().custom_metadata_map
-        if said.get("format") == FORMAT and said.get("task_hash") != task.hash:
+        metadata = self._session.get_modelmeta().custom_metadata_map
+        if metadata.get("format") == FORMAT and metadata.get("task_hash") != task.hash:
             raise ConfigError(
-                f"was made for task {said.get('task_hash')}, this is {task.hash}",
+                f"was made for task {metadata.get('task_hash')}, this is {task.hash}",
                 where=str(path),
                 remedy="export it again from a run of this task",
             )
-        (given,) = self._session.get_inputs()[:1]
-        if len(self._session.get_inputs()) != 1 or given.shape[-1] != task.observation_size:
+        (taken,) = self._session.get_inputs()[:1]
+        if len(self._session.get_inputs()) != 1 or taken.shape[-1] != task.observation_size:
             raise ConfigError(
                 f"takes {[i.shape for i in self._session.get_inputs()]}, the task's observation"
                 f" is (N, {task.observation_size})",
                 where=str(path),
             )
-        self._input, self._actions = given.name, len(task.actions)
+        self._input, self._actions = taken.name, len(task.actions)
         names = [output.name for output in self._session.get_outputs()]
         # A model of another make: its first output is taken for action values.
         self._output = "action" if "action" in names else names[0]
         self._path = path
-        self.name, self.version = f"onnx:{path}", said.get("version", "")
+        self.name, self.version = f"onnx:{path}", metadata.get("version", "")
 
     def act(
         self, env: Any, observation: NDArray[np.float32]
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """The best action (N,) of each observation (N, D), and 1 for its probability."""
-        (found,) = self._session.run([self._output], {self._input: observation})
-        action = found if found.ndim == 1 else found.argmax(axis=1)
+        (output,) = self._session.run([self._output], {self._input: observation})
+        action = output if output.ndim == 1 else output.argmax(axis=1)
         if action.shape != (len(observation),) or not np.isin(action, range(self._actions)).all():
             raise ConfigError(
-                f"its output {self._output} {found.shape} holds no action of the {self._actions}",
+                f"its output {self._output} {output.shape} holds no action of the {self._actions}",
                 where=str(self._path),
             )
         return action.astype(np.int64), np.ones(len(action), np.float32)

@@ -31,7 +31,6 @@ from restock.train.dqn.fitted_q import (
     values,
 )
 from restock.train.dqn.network import Network, QNetwork
-from restock.train.evaluation.eval_run import load_agent
 from restock.train.evaluation.ope_dataset import (
     Measure,
     OpeDataset,
@@ -40,6 +39,7 @@ from restock.train.evaluation.ope_dataset import (
     run_panel,
 )
 from restock.train.evaluation.ope_estimators import EssGate, OpeEpisodes, estimate
+from restock.train.evaluation.policies import load_agent
 from restock.train.run.run import Run
 from restock.train.run.run_tables import TABLES
 

@@ -238,8 +238,8 @@ def _halves(store: Store, ids: Ints) -> tuple[Ints, Ints]:
             "SELECT transition_id, hash(episode_id) % 2 = 0 AS evaluation"
             " FROM transitions SEMI JOIN wanted USING (transition_id)"
         ).fetchnumpy()
-    found, evaluation = np.asarray(columns["transition_id"], np.int64), columns["evaluation"]
-    return found[evaluation], found[~evaluation]
+    rows, evaluation = np.asarray(columns["transition_id"], np.int64), columns["evaluation"]
+    return rows[evaluation], rows[~evaluation]
 
 
 def run_panel(document: dict[str, Any]) -> Panel | None:

@@ -63,7 +63,7 @@ def of_baseline(name: str) -> Evaluated:
         return of_run(path)
     file = baseline_file(name)
     if not file.is_file():
-        known = ", ".join(sorted(found.stem for found in FOLDER.glob("*.parquet")))
+        known = ", ".join(sorted(path.stem for path in FOLDER.glob("*.parquet")))
         raise RunError(
             f"is neither a run nor a baseline; there are {known or 'none'} in {FOLDER}/",
             where=name,
@@ -71,12 +71,12 @@ def of_baseline(name: str) -> Evaluated:
         )
     try:
         table = pq.read_table(file, schema=EVAL_EPISODES)
-        said = json.loads((pq.read_schema(file).metadata or {})[_KEY])
+        about = json.loads((pq.read_schema(file).metadata or {})[_KEY])
     except (pa.ArrowException, KeyError, ValueError) as error:
         raise RunError(
-            "is not a baseline", where=str(file), remedy="save it anew with --save-as-baseline"
+            "is not a baseline", where=str(file), remedy="save it again with --save-as-baseline"
         ) from error
-    return Evaluated(f"{name} ({said['run']})", said["task_hash"], _cells(table))
+    return Evaluated(f"{name} ({about['run']})", about["task_hash"], _cells(table))
 
 
 def save_baseline(path: Path, name: str) -> Path:
@@ -86,8 +86,8 @@ def save_baseline(path: Path, name: str) -> Path:
         RunError: no run, or it was not evaluated.
     """
     run = Run.open(path)
-    said = {"run": path.name, "task_hash": str(run.document.get("task_hash"))}
-    table = _agent(run).replace_schema_metadata({_KEY: json.dumps(said).encode()})
+    about = {"run": path.name, "task_hash": str(run.document.get("task_hash"))}
+    table = _agent(run).replace_schema_metadata({_KEY: json.dumps(about).encode()})
     file = baseline_file(name)
     write_table(table, file)
     return file
@@ -121,11 +121,11 @@ def regression(
     for perturbation in dict.fromkeys(cell[0] for cell in baseline.cells):
         pairs = []
         for cell in sorted(key for key in baseline.cells if key[0] == perturbation):
-            theirs, ours = baseline.cells[cell], candidate.cells.get(cell, {})
-            if theirs.keys() != ours.keys():
-                rows.append(_refused(cell, theirs, ours))
+            before, after = baseline.cells[cell], candidate.cells.get(cell, {})
+            if before.keys() != after.keys():
+                rows.append(_refused(cell, before, after))
                 continue
-            pair = np.array([[theirs[key], ours[key]] for key in sorted(theirs)])
+            pair = np.array([[before[key], after[key]] for key in sorted(before)])
             pairs.append(pair)
             rows.append(_row(cell, [pair], margin, rng))
         if len(pairs) > 1:
@@ -191,8 +191,8 @@ def _row(
     }
 
 
-def _refused(cell: tuple[str, str], theirs: _Episodes, ours: _Episodes) -> dict[str, Any]:
-    shared = len(theirs.keys() & ours.keys())
+def _refused(cell: tuple[str, str], before: _Episodes, after: _Episodes) -> dict[str, Any]:
+    shared = len(before.keys() & after.keys())
     values = ("baseline", "candidate", "difference", "difference_low", "difference_high")
     return {
         "perturbation": cell[0],
@@ -202,7 +202,7 @@ def _refused(cell: tuple[str, str], theirs: _Episodes, ours: _Episodes) -> dict[
         "return_iqm": None,
         "improvement": None,
         "verdict": "refused",
-        "reason": f"not the same episodes: {len(theirs)} of the baseline, {len(ours)} of the"
+        "reason": f"not the same episodes: {len(before)} of the baseline, {len(after)} of the"
         f" candidate, {shared} in both",
     }
 

@@ -29,12 +29,12 @@ from restock.train.dqn.config import NetworkConfig, TrainConfig, load_config
 from restock.train.dqn.network import QNetwork, make_network
 from restock.train.dqn.target import Hard, describe
 from restock.train.evaluation.evaluate import (
-    GreedyPolicy,
     Score,
     fixed_episodes,
     run_episodes,
     score,
 )
+from restock.train.evaluation.policies import GreedyPolicy
 from restock.train.libraries.mixed_feed import create_run
 from restock.train.prepare import make_twin, resolve_config
 from restock.train.run import checkpoint

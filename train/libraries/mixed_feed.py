@@ -151,7 +151,7 @@ class MixedFeed:
             return NO_LOGS
         if self._untold:
             raise MixtureError(
-                "the mixture's draws follow TD errors, and this buffer is told none",
+                "the mixture's draws follow TD errors, and this buffer gets none",
                 remedy="for Stable-Baselines3 set `critic`, e.g. to dqn_critic(model); or mix"
                 " without [adaptive], `per` and `lap`",
             )

@@ -84,7 +84,7 @@ class MixtureReplayBuffer(ReplayBuffer):
         log_every: int = 500,
     ) -> None:
         if optimize_memory_usage:
-            raise MixtureError("optimize_memory_usage cannot be had with a mixture")
+            raise MixtureError("optimize_memory_usage is unsupported with a mixture")
         # The rows are kept below, packed as the panel's are; the parent keeps next to nothing.
         super().__init__(n_envs, observation_space, action_space, device, n_envs=n_envs)
         self.handle_timeout_termination = handle_timeout_termination
@@ -189,8 +189,8 @@ class MixtureReplayBuffer(ReplayBuffer):
             gradient_step=self.feed.batches,
             policy_version=self.feed.batches,
         )
-        for key, step, own in zip(keys.tolist(), self._steps.tolist(), chosen, strict=True):
-            self._waiting_actions[key, step] = np.array(own, np.float32)
+        for key, step, taken in zip(keys.tolist(), self._steps.tolist(), chosen, strict=True):
+            self._waiting_actions[key, step] = np.array(taken, np.float32)
         # An n-step row comes out steps later: its episode and step say whose action it has.
         for slot in (np.arange(before, ring.appended) % ring.capacity).tolist():
             place = int(ring.meta["episode"][slot]), int(ring.meta["episode_step"][slot])
@@ -204,11 +204,11 @@ class MixtureReplayBuffer(ReplayBuffer):
     def _drop(self, key: int, step: int) -> None:
         """A step whose physics blew up must not be learnt from: its row repeats the one before."""
         meta, ring = self.ring.meta, self.ring
-        mine = meta["episode"][: len(ring)] == key
-        steps = meta["episode_step"][: len(ring)]
-        bad, good = np.flatnonzero(mine & (steps == step)), np.flatnonzero(mine & (steps < step))
+        rows = np.flatnonzero(meta["episode"][: len(ring)] == key)
+        steps = meta["episode_step"][rows]
+        bad, good = rows[steps == step], rows[steps < step]
         if len(bad) and len(good):
-            before = good[np.argmax(steps[good])]
+            before = good[np.argmax(meta["episode_step"][good])]
             ring.rows[bad] = ring.rows[before]
             self._fresh_actions[bad] = self._fresh_actions[before]
         self.feed.invalid_steps += 1
@@ -283,11 +283,11 @@ def logged_commands(panel: Panel, store: str | Path) -> NDArray[np.float32]:
     """
     with Store(store) as opened:
         opened.connection.register("wanted", panel.meta.select(["transition_id"]))
-        found = opened.connection.sql(
+        table = opened.connection.sql(
             "SELECT transition_id, command_speed_mps, command_yaw_rate_radps"
             " FROM transitions SEMI JOIN wanted USING (transition_id) ORDER BY transition_id"
         ).to_arrow_table()
-    ids = found["transition_id"].to_numpy()
+    ids = table["transition_id"].to_numpy()
     wanted = panel.meta["transition_id"].to_numpy()
     if (missing := ~np.isin(wanted, ids)).any():
         raise MixtureError(
@@ -297,4 +297,4 @@ def logged_commands(panel: Panel, store: str | Path) -> NDArray[np.float32]:
         )
     row = np.searchsorted(ids, wanted)
     names = ("command_speed_mps", "command_yaw_rate_radps")
-    return np.stack([found[name].to_numpy()[row] for name in names], axis=1).astype(np.float32)
+    return np.stack([table[name].to_numpy()[row] for name in names], axis=1).astype(np.float32)

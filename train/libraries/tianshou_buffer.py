@@ -217,8 +217,8 @@ class MixtureVectorReplayBuffer(ReplayBufferManager):
 
 def _one(info: Any, place: int) -> dict[str, Any]:
     """One environment's info, of a Batch of them."""
-    found: dict[str, Any] = {}
+    one: dict[str, Any] = {}
     for name in info.get_keys():
         value = info[name]
-        found[name] = _one(value, place) if isinstance(value, Batch) else value[place]
-    return found
+        one[name] = _one(value, place) if isinstance(value, Batch) else value[place]
+    return one

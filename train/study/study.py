@@ -169,16 +169,16 @@ class StudyPlan:
         return [*as_overrides(self.study.settings), *as_overrides(arm.settings), f"seed={seed}"]
 
     def fingerprint(self, job: StudyJob) -> str:
-        """What a finished run was asked for, as JSON: another question makes another run."""
+        """What a finished run was asked to be, as JSON: another request makes another run."""
         panel = self.panel(job.arm)
-        asked = {
+        request = {
             "settings": self.settings(job.arm, job.seed),
             "panel": str(panel) if panel is not None else None,
             "evaluation": msgspec.to_builtins(self.study.evaluation),
         }
         if job.arm.library is not None:
-            asked |= {"library": job.arm.library, "arguments": job.arm.arguments}
-        return json.dumps(asked, indent=1) + "\n"
+            request |= {"library": job.arm.library, "arguments": job.arm.arguments}
+        return json.dumps(request, indent=1) + "\n"
 
 
 def findings(plan: StudyPlan, comparisons: Sequence[Comparison]) -> dict[str, Any]:

@@ -137,9 +137,9 @@ def load_policy(name: str) -> Policy | None:
     if name in SCRIPTED:
         return None
     from restock.ingest.profile.profile import load_profile
-    from restock.train.evaluation import eval_run
+    from restock.train.evaluation import policies
 
-    policy = eval_run.load_policy(name, load_profile("warehouse_amr").task)
+    policy = policies.load_policy(name, load_profile("warehouse_amr").task)
     if policy is None:
         raise ConfigError(
             f"unknown policy {name!r}",

@@ -1,0 +1,84 @@
+"""Policies by name: the network that a run kept, or an ONNX file. Whatever drives may use them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.errors import ConfigError, RunError
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.task import Task
+from restock.train.dqn.config import parse_config
+from restock.train.dqn.learner import greedy_actions
+from restock.train.dqn.network import Network, make_network
+from restock.train.run import checkpoint
+from restock.train.run.run import Run
+from restock.train.twin.env.interface import Policy
+
+
+class GreedyPolicy:
+    """A Q network, always taking its best action."""
+
+    name = "agent"
+
+    def __init__(self, network: Network, version: str = "") -> None:
+        self.network, self.version = network, version
+
+    def act(
+        self, env: Any, observation: NDArray[np.float32]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        action = greedy_actions(self.network, observation)
+        return action, np.ones(len(action), np.float32)
+
+
+def load_policy(name: str, task: Task) -> Policy | None:
+    """The policy that `run:DIRECTORY` (its best) or `onnx:FILE` names; None for other names.
+
+    Raises:
+        ConfigError: no such file, or a policy of another task.
+        RunError: no such run, one without a policy, or a damaged one.
+    """
+    kind, _, path = name.partition(":")
+    if kind == "onnx" and path:
+        from restock.train.evaluation.onnx_policy import OnnxPolicy
+
+        return OnnxPolicy(Path(path), task)
+    if kind != "run" or not path:
+        return None
+    run = Run.open(Path(path))
+    agent = load_agent(run)
+    trained = load_profile(parse_config(run.document["config"], where=path).profile).task
+    if trained.hash != task.hash:
+        raise ConfigError(
+            f"was trained on task {trained.hash}, this is {task.hash}",
+            where=path,
+            remedy="name a run of this task",
+        )
+    return agent
+
+
+def load_agent(run: Run) -> GreedyPolicy:
+    """The policy that a run kept as its best, greedy.
+
+    Raises:
+        RunError: no checkpoint, a damaged one, or one of a task that the profile no longer is.
+    """
+    config = parse_config(run.document["config"], where=str(run.path / "config.json"))
+    state = checkpoint.load(run.best)
+    task = load_profile(config.profile).task
+    if state["task_hash"] != task.hash:
+        raise RunError(
+            f"its policy was trained on task {state['task_hash']}, profile"
+            f" {config.profile!r} now defines {task.hash}",
+            where=str(run.best),
+            remedy="train again: observations or actions have changed their meaning",
+        )
+    network = make_network(config.network, state["observation_size"], state["actions"])
+    network.load_state_dict(state["network"])
+    return GreedyPolicy(network.eval(), version=f"{run.path.name}@{state['gradient_steps']}")
+
+
+__all__ = ["GreedyPolicy", "load_agent", "load_policy"]
