@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import glob
 import re
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal, TypeVar
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
@@ -13,6 +14,7 @@ from ruamel.yaml.error import YAMLError
 from restock.errors import RecordingError, visible
 from restock.ingest.containers import mcap_records, sqlite_file
 
+T = TypeVar("T")
 Kind = Literal["mcap", "sqlite3", "ros1"]
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 ROS1_MAGIC = b"#ROSBAG V"
@@ -87,19 +89,30 @@ def is_bag(folder: Path) -> bool:
     return bool(files) and all(split.match(item.name) for item in files)
 
 
-def bag_files(folder: Path, metadata: dict[str, Any]) -> tuple[list[Path], list[str]]:
-    """A bag's storage files in order, and the names that its metadata lists but are missing.
+@dataclass(frozen=True)
+class ClaimedTopic:
+    """What metadata.yaml says of a topic; None where it does not say it as it should."""
 
-    The metadata's paths are not trusted: only files in the folder itself are read.
-    """
-    listed = metadata.get("relative_file_paths")
-    listed = listed if isinstance(listed, list) else []
-    names = [Path(name).name for name in listed if isinstance(name, str)]
+    name: str | None
+    serialization: str | None
+    messages: int | None
+
+
+@dataclass(frozen=True)
+class BagMetadata:
+    """What metadata.yaml claims of a bag: none of it is trusted."""
+
+    files: tuple[str, ...] = ()  # names without folders: only files in the bag's own are read
+    topics: tuple[ClaimedTopic, ...] = ()
+
+
+def bag_files(folder: Path, metadata: BagMetadata) -> tuple[list[Path], list[str]]:
+    """A bag's storage files in order, and the names that its metadata lists but are missing."""
     present = {item.name: item for item in folder.iterdir() if item.is_file()}
     storages = {name: item for name, item in present.items() if is_storage_name(item)}
     order = []
     missing = []
-    for name in dict.fromkeys(names):
+    for name in dict.fromkeys(metadata.files):
         # File-mode compression adds its ending, to the names in some versions' metadata only.
         options = (name, name + ".zstd", name + ".zst")
         match = next((option for option in options if option in present), None)
@@ -112,27 +125,48 @@ def bag_files(folder: Path, metadata: dict[str, Any]) -> tuple[list[Path], list[
     return [present[name] for name in (*order, *sorted(rest, key=_natural))], missing
 
 
-def _natural(name: str) -> list[Any]:
+def _natural(name: str) -> list[int | str]:
     parts = re.split(r"(\d+)", name)
     return [int(part) if index % 2 else part for index, part in enumerate(parts)]
 
 
-def read_metadata(folder: Path) -> tuple[dict[str, Any], str | None]:
+def read_metadata(folder: Path) -> tuple[BagMetadata, str | None]:
     """What metadata.yaml says, and what is wrong with it if it cannot be used."""
     file = folder / METADATA
     if not file.is_file():
-        return {}, f"no {METADATA}: read from the storage files alone"
+        return BagMetadata(), f"no {METADATA}: read from the storage files alone"
     try:
         if file.stat().st_size > LARGEST_METADATA:
-            return {}, f"{METADATA} has {file.stat().st_size:,} bytes: not read"
+            return BagMetadata(), f"{METADATA} has {file.stat().st_size:,} bytes: not read"
         document = YAML(typ="safe", pure=True).load(file.read_text(encoding="utf-8"))
-        metadata = document["rosbag2_bagfile_information"]
+        content = document["rosbag2_bagfile_information"]
     except _INVALID_YAML as error:
         why = (str(error).splitlines() or [type(error).__name__])[0]
-        return {}, f"{METADATA} cannot be used: {visible(why[:200])}"
-    if not isinstance(metadata, dict):
-        return {}, f"{METADATA} cannot be used: not a mapping"
-    return metadata, None
+        return BagMetadata(), f"{METADATA} cannot be used: {visible(why[:200])}"
+    if not isinstance(content, dict):
+        return BagMetadata(), f"{METADATA} cannot be used: not a mapping"
+    listed = _items(content.get("relative_file_paths"), str)
+    topics = _items(content.get("topics_with_message_count"), dict)
+    return BagMetadata(
+        tuple(Path(name).name for name in listed),
+        tuple(
+            ClaimedTopic(
+                _of_type(topic["topic_metadata"].get("name"), str),
+                _of_type(topic["topic_metadata"].get("serialization_format"), str),
+                _of_type(topic.get("message_count"), int),
+            )
+            for topic in topics
+            if isinstance(topic.get("topic_metadata"), dict)
+        ),
+    ), None
+
+
+def _items(value: object, kind: type[T]) -> list[T]:
+    return [item for item in value if isinstance(item, kind)] if isinstance(value, list) else []
+
+
+def _of_type(value: object, kind: type[T]) -> T | None:
+    return value if isinstance(value, kind) else None
 
 
 def kind_of(path: Path) -> Kind | Literal["zstd"]:

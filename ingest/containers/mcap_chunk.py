@@ -1,19 +1,21 @@
-"""One MCAP chunk: bounded decompression, and where its messages are."""
+"""One MCAP chunk: bounded decompression, where its messages are, and what it defines."""
 
 from __future__ import annotations
 
 import struct
 import zlib
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import lz4.frame
 import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
-from restock.ingest.containers.mcap_records import PREFIX, Malformed, Op, parse, walk
+from restock.ingest.containers.mcap_records import PREFIX, Buffer, Malformed, Op, parse, walk
+from restock.ingest.decoding.channel import Channel
 from restock.ingest.decoding.columns import I64, gather
 
 # A chunk's uncompressed size is the file's word: beyond these it is refused, not allocated.
@@ -90,7 +92,7 @@ def refuse_implausible(chunk: Chunk) -> None:
         raise BadChunk(f"{stored:,} bytes that claim to hold {chunk.size:,}")
 
 
-def inflate(chunk: Chunk, file: Any) -> bytes:
+def inflate(chunk: Chunk, file: Buffer) -> bytes:
     """The chunk's records, uncompressed and checked against its CRC.
 
     Raises:
@@ -104,7 +106,7 @@ def inflate(chunk: Chunk, file: Any) -> bytes:
     return data
 
 
-def inflate_into(chunk: Chunk, file: Any, room: NDArray[np.uint8]) -> None:
+def inflate_into(chunk: Chunk, file: Buffer, room: NDArray[np.uint8]) -> None:
     """The same into `room`, which has the chunk's size: memory that is used again costs less.
 
     Raises:
@@ -128,12 +130,12 @@ def _unpack(stored: bytes, room: NDArray[np.uint8]) -> bool:
         return False
 
 
-def _check(chunk: Chunk, data: Any) -> None:
+def _check(chunk: Chunk, data: bytes | memoryview) -> None:
     if chunk.crc and zlib.crc32(data) != chunk.crc:
         raise BadChunk("its CRC does not match")
 
 
-def inflate_partly(chunk: Chunk, file: Any) -> bytes:
+def inflate_partly(chunk: Chunk, file: Buffer) -> bytes:
     """The part of a cut or damaged chunk that still decompresses; unchecked."""
     stored = file[chunk.start : chunk.stop]
     limit = min(chunk.size, max(PLAUSIBLE_SIZE, PLAUSIBLE_RATIO * len(stored)), LARGEST_CHUNK)
@@ -216,24 +218,17 @@ def indexed_messages(
         or (length < HEAD_SIZE - PREFIX).any()
     ):
         return None
-    stop = at + PREFIX + length.astype(np.int64)
-    if (stop > base + size).any():
-        return None
-    return Messages(
-        at + HEAD_SIZE,
-        stop,
-        _stamps(head["log_time"]),
-        _stamps(head["publish_time"]),
-    )
+    messages = _messages(at, head)
+    return None if (messages.stop > base + size).any() else messages
 
 
-def _stamps(values: NDArray[Any]) -> I64:
+def _stamps(values: NDArray[np.uint64]) -> I64:
     """Times of 64 bits without a sign: what int64 cannot hold (2262) stays the last that it can."""
     stamps: I64 = np.minimum(values, np.uint64(LATEST_NS)).astype(np.int64)
     return stamps
 
 
-def walked_messages(part: Any) -> tuple[Positions, str | None]:
+def walked_messages(part: bytes | memoryview) -> tuple[Positions, str | None]:
     """Where the message records of an uncompressed chunk start, per channel, and what is cut."""
     places: list[int] = []
     note = places.append
@@ -259,10 +254,12 @@ def walked_messages(part: Any) -> tuple[Positions, str | None]:
     return {number: at[numbers == number] for number in np.unique(numbers).tolist()}, cut
 
 
-def messages_at(buffer: NDArray[np.uint8], positions: Any) -> Messages:
+def messages_at(buffer: NDArray[np.uint8], at: I64) -> Messages:
     """Messages whose records start at these positions (which were walked, and so fit)."""
-    at = np.asarray(positions, np.int64)
-    head = gather(buffer, at, _HEAD)
+    return _messages(at, gather(buffer, at, _HEAD))
+
+
+def _messages(at: I64, head: NDArray[np.void]) -> Messages:
     return Messages(
         at + HEAD_SIZE,
         at + PREFIX + head["length"].astype(np.int64),
@@ -271,19 +268,67 @@ def messages_at(buffer: NDArray[np.uint8], positions: Any) -> Messages:
     )
 
 
-def definitions(buffer: Any, start: int, stop: int) -> tuple[dict[int, Any], dict[int, Any]]:
-    """The schema and channel records in buffer[start:stop], by id, up to what is cut."""
-    schemas: dict[int, Any] = {}
-    channels: dict[int, Any] = {}
-    try:
-        for opcode, at, end in walk(buffer, start, stop):
-            if opcode == Op.SCHEMA:
-                schema = parse(Op.SCHEMA, buffer, at, end)
-                low, high = schema["data"]
-                schemas[schema["id"]] = {**schema, "data": bytes(buffer[low:high])}
-            elif opcode == Op.CHANNEL:
-                channel = parse(Op.CHANNEL, buffer, at, end)
-                channels[channel["id"]] = channel
-    except Malformed:
-        pass
-    return schemas, channels
+class SchemaRecord(NamedTuple):
+    """How the messages of some channels are defined."""
+
+    name: str = ""
+    encoding: str = ""
+    data: bytes = b""
+
+
+class ChannelRecord(NamedTuple):
+    """A topic, and how its messages are encoded."""
+
+    topic: str
+    encoding: str
+    schema_id: int  # 0: none
+
+
+@dataclass
+class Definitions:
+    """The schemas and channels of a file or of a chunk, by id."""
+
+    schemas: dict[int, SchemaRecord] = field(default_factory=dict)
+    channels: dict[int, ChannelRecord] = field(default_factory=dict)
+
+    def take(self, opcode: int, buffer: Buffer, at: int, stop: int) -> None:
+        """Add the record whose content is buffer[at:stop], if it is a schema or a channel."""
+        if opcode == Op.SCHEMA:
+            record = parse(Op.SCHEMA, buffer, at, stop)
+            low, high = record["data"]
+            text = bytes(buffer[low:high])
+            self.schemas[record["id"]] = SchemaRecord(record["name"], record["encoding"], text)
+        elif opcode == Op.CHANNEL:
+            record = parse(Op.CHANNEL, buffer, at, stop)
+            self.channels[record["id"]] = ChannelRecord(
+                record["topic"], record["message_encoding"], record["schema_id"]
+            )
+
+    def add_chunk(self, records: bytes) -> None:
+        """Add those of an uncompressed chunk that are not known yet, up to what is cut."""
+        inside = Definitions()
+        with suppress(Malformed):
+            for opcode, at, stop in walk(records, 0, len(records)):
+                inside.take(opcode, records, at, stop)
+        self.schemas = inside.schemas | self.schemas
+        self.channels = inside.channels | self.channels
+
+    def cover(self, channels: set[int]) -> bool:
+        """Whether all these channels are defined, with their schemas."""
+        return channels <= self.channels.keys() and all(
+            self.channels[number].schema_id in self.schemas.keys() | {0} for number in channels
+        )
+
+    def named(self) -> dict[int, Channel]:
+        """Every channel with its schema; without one, its messages have no type."""
+        return {
+            number: Channel(
+                number,
+                channel.topic,
+                (schema := self.schemas.get(channel.schema_id, SchemaRecord())).name,
+                channel.encoding,
+                schema.encoding,
+                schema.data,
+            )
+            for number, channel in self.channels.items()
+        }

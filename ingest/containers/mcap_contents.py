@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import mmap
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import NamedTuple
 
-from restock.ingest.containers.mcap_chunk import HEAD_SIZE, Chunk
+from restock.ingest.containers.mcap_chunk import HEAD_SIZE, Chunk, Definitions
 from restock.ingest.containers.mcap_records import MAGIC, PREFIX, Malformed, Op, parse, walk
 from restock.ingest.decoding.channel import Extra
 
@@ -22,6 +22,13 @@ MOST_NAMED = 10_000  # attachments and metadata records; the others are counted
 MOST_DAMAGED = 100
 
 
+class Statistics(NamedTuple):
+    """How many messages the file claims to hold."""
+
+    messages: int
+    by_channel: dict[int, int]
+
+
 @dataclass
 class Contents:
     """What the walk found."""
@@ -29,9 +36,8 @@ class Contents:
     profile: str = ""
     chunks: list[Chunk] = field(default_factory=list)
     loose: dict[int, list[int]] = field(default_factory=dict)  # channel -> records outside chunks
-    schemas: dict[int, Any] = field(default_factory=dict)
-    channels: dict[int, Any] = field(default_factory=dict)
-    statistics: dict[str, Any] | None = None
+    definitions: Definitions = field(default_factory=Definitions)
+    statistics: Statistics | None = None
     data_end: tuple[int, int] = (0, 0)  # position, and CRC of the data section (0: unchecked)
     cut: Malformed | None = None  # where and why the walk could not go on
     cut_chunk: Chunk | None = None  # the chunk it could not pass, with what is left of it
@@ -52,9 +58,9 @@ class Contents:
         """Messages per channel by the statistics; None where they are missing or incomplete."""
         if self.statistics is None or (self.cut is not None and not self.resumed):
             return None
-        claimed: dict[int, int] = self.statistics["channel_message_counts"]
         # Counts per channel are optional; the total is not.
-        return claimed if sum(claimed.values()) == self.statistics["message_count"] else None
+        total, by_channel = self.statistics
+        return by_channel if sum(by_channel.values()) == total else None
 
     def distrust_index(self) -> None:
         """Forget the message indexes: every chunk is then walked."""
@@ -107,15 +113,10 @@ def take_record(contents: Contents, file: mmap.mmap, opcode: int, at: int, stop:
     elif opcode == Op.MESSAGE_INDEX and contents.chunks:
         index = parse(Op.MESSAGE_INDEX, file, at, stop)
         contents.chunks[-1].index[index["channel_id"]] = index["records"]
-    elif opcode == Op.SCHEMA:
-        schema = parse(Op.SCHEMA, file, at, stop)
-        low, high = schema["data"]
-        contents.schemas[schema["id"]] = {**schema, "data": file[low:high]}
-    elif opcode == Op.CHANNEL:
-        channel_record = parse(Op.CHANNEL, file, at, stop)
-        contents.channels[channel_record["id"]] = channel_record
+    elif opcode in (Op.SCHEMA, Op.CHANNEL):
+        contents.definitions.take(opcode, file, at, stop)
     elif opcode == Op.STATISTICS:
-        contents.statistics = parse(Op.STATISTICS, file, at, stop)
+        contents.statistics = statistics_at(file, at, stop)
     elif opcode == Op.DATA_END:
         contents.data_end = at - PREFIX, parse(Op.DATA_END, file, at, stop)["data_section_crc"]
     elif opcode == Op.ATTACHMENT:
@@ -127,6 +128,12 @@ def take_record(contents: Contents, file: mmap.mmap, opcode: int, at: int, stop:
         _name(contents, Extra("metadata", named["name"], "", stop - at))
     elif opcode == Op.HEADER and not contents.profile:
         contents.profile = parse(Op.HEADER, file, at, stop)["profile"]
+
+
+def statistics_at(file: mmap.mmap, at: int, stop: int) -> Statistics:
+    """The statistics record whose content is file[at:stop]."""
+    record = parse(Op.STATISTICS, file, at, stop)
+    return Statistics(record["message_count"], record["channel_message_counts"])
 
 
 def _name(contents: Contents, extra: Extra) -> None:

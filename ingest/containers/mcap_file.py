@@ -91,33 +91,16 @@ class McapFile:
         return counts
 
     def _channels(self) -> dict[int, Channel]:
-        contents = self._contents
+        definitions = self._contents.definitions
         needed = {channel for channel, count in self.counts.items() if count}
-        schemas, channels = contents.schemas, contents.channels
-        for chunk in contents.chunks:
-            if needed <= channels.keys() and all(
-                channels[channel]["schema_id"] in schemas.keys() | {0} for channel in needed
-            ):
+        for chunk in self._contents.chunks:
+            if definitions.cover(needed):
                 break
-            data = self._chunks.inflate(chunk)
-            more_schemas, more_channels = mcap_chunk.definitions(data, 0, len(data))
-            schemas = {**more_schemas, **schemas}
-            channels = {**more_channels, **channels}
-        named = {}
-        for number, channel in channels.items():
-            schema = schemas.get(channel["schema_id"], {})
-            named[number] = Channel(
-                number,
-                channel["topic"],
-                schema.get("name", ""),
-                channel["message_encoding"],
-                schema.get("encoding", ""),
-                schema.get("data", b""),
-            )
-        for number in needed - named.keys():
+            definitions.add_chunk(self._chunks.inflate(chunk))
+        for number in needed - definitions.channels.keys():
             what = f"{self.counts[number]} messages of channel {number}, which the file never names"
             self._checks.damaged(what, {number: self.counts[number]})
-        return named
+        return definitions.named()
 
     def _span(self) -> tuple[int, int] | None:
         contents = self._contents

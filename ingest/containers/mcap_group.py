@@ -79,17 +79,9 @@ class ChunkReader:
         """The messages of these channels in some chunks; a batch is valid until the next."""
         buffer, parts = self._inflate_group(group)
         whole = self._by_index(parts, buffer, wanted)
-        if whole is not None:
-            for channel in sorted(whole):
-                yield channel, batch_of(buffer, [whole[channel]])
-            return
-        located: dict[int, list[Messages]] = {}
-        for part in parts:
-            for channel, messages in self._locate(part, buffer, wanted):
-                if len(messages):
-                    located.setdefault(channel, []).append(messages)
-        for channel in sorted(located):
-            yield channel, batch_of(buffer, located[channel])
+        located = [whole] if whole is not None else [self._locate(p, buffer, wanted) for p in parts]
+        for channel in sorted(set().union(*located)):
+            yield channel, batch_of(buffer, [at[channel] for at in located if channel in at])
 
     def _by_index(
         self,
@@ -161,24 +153,22 @@ class ChunkReader:
 
     def _locate(
         self, part: _Part, buffer: NDArray[np.uint8], wanted: set[int]
-    ) -> Iterator[tuple[int, Messages]]:
+    ) -> dict[int, Messages]:
+        """Where a chunk's messages are: by its index, or by walking it where that is wrong."""
+        located = self._by_index([part], buffer, wanted)
+        if located is not None:
+            return located
         chunk, base, size = part
         if chunk.index and chunk.at not in self.walked:
-            located = {}
-            for channel in chunk.index.keys() & wanted:
-                start, stop = chunk.index[channel]
-                one = Indexed(base, size, self._file[start:stop])
-                located[channel] = mcap_chunk.indexed_messages(buffer, [one], channel)
-            whole = {channel: at for channel, at in located.items() if at is not None}
-            if len(whole) == len(located):
-                yield from whole.items()
-                return
             self._checks.notes.append(
                 f"chunk at byte {chunk.at:,}: its message index is wrong; walked"
             )
-        for channel, positions in self._walk_part(chunk, buffer[base : base + size].data).items():
-            if channel in wanted:
-                yield channel, mcap_chunk.messages_at(buffer, positions + base)
+        positions = self._walk_part(chunk, buffer[base : base + size].data)
+        return {
+            channel: mcap_chunk.messages_at(buffer, at + base)
+            for channel, at in positions.items()
+            if channel in wanted
+        }
 
     def _walk_part(self, chunk: Chunk, part: bytes | memoryview) -> Positions:
         if chunk.at in self.walked:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import mmap
 import struct
 from collections.abc import Iterator
 from enum import IntEnum
-from typing import Any
+from typing import Any, TypeAlias
 
 MAGIC = b"\x89MCAP0\r\n"
+Buffer: TypeAlias = "bytes | mmap.mmap"
 PREFIX = 9  # every record: opcode (1 byte), length of its content (8 bytes)
 
 
@@ -113,7 +115,7 @@ FIELDS: dict[Op, tuple[tuple[str, str], ...]] = {
 }
 
 
-def walk(buffer: Any, start: int, stop: int) -> Iterator[tuple[int, int, int]]:
+def walk(buffer: Buffer, start: int, stop: int) -> Iterator[tuple[int, int, int]]:
     """Each record's opcode and the (start, stop) of its content, from `start` to `stop`.
 
     Raises:
@@ -134,7 +136,7 @@ def walk(buffer: Any, start: int, stop: int) -> Iterator[tuple[int, int, int]]:
         position = end
 
 
-def parse(op: Op, buffer: Any, start: int, stop: int) -> dict[str, Any]:
+def parse(op: Op, buffer: Buffer, start: int, stop: int) -> dict[str, Any]:
     """The fields of the record whose content is buffer[start:stop]. Bytes after them are padding.
 
     Raises:
@@ -147,7 +149,7 @@ def parse(op: Op, buffer: Any, start: int, stop: int) -> dict[str, Any]:
 class _Cursor:
     """Reads fields one after the other, never beyond `stop`."""
 
-    def __init__(self, buffer: Any, start: int, stop: int) -> None:
+    def __init__(self, buffer: Buffer, start: int, stop: int) -> None:
         self.buffer, self.position, self.stop = buffer, start, stop
 
     def read(self, kind: str) -> Any:

@@ -13,7 +13,13 @@ from collections.abc import Iterator
 from typing import Any
 
 from restock.ingest.containers.mcap_chunk import Chunk
-from restock.ingest.containers.mcap_contents import Contents, cut_chunk_at, take_record
+from restock.ingest.containers.mcap_contents import (
+    Contents,
+    Statistics,
+    cut_chunk_at,
+    statistics_at,
+    take_record,
+)
 from restock.ingest.containers.mcap_records import MAGIC, PREFIX, Malformed, Op, parse, walk
 
 FOOTER_SIZE = PREFIX + 20
@@ -42,7 +48,7 @@ class _Summary:
     def __init__(self) -> None:
         self.indexed: list[dict[str, Any]] = []  # chunk index records
         self.definitions: list[tuple[int, int, int]] = []  # schemas, channels: opcode, start, stop
-        self.statistics: dict[str, Any] | None = None
+        self.statistics: Statistics | None = None
         self.start = 0
 
 
@@ -68,7 +74,7 @@ def _summary(file: mmap.mmap) -> _Summary | None:
             if opcode == Op.CHUNK_INDEX:
                 summary.indexed.append(parse(Op.CHUNK_INDEX, file, start, stop))
             elif opcode == Op.STATISTICS:
-                summary.statistics = parse(Op.STATISTICS, file, start, stop)
+                summary.statistics = statistics_at(file, start, stop)
             elif opcode in (Op.SCHEMA, Op.CHANNEL):
                 summary.definitions.append((opcode, start, stop))
     except Malformed:

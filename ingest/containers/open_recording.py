@@ -10,12 +10,11 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from restock.errors import RecordingError, visible
 from restock.ingest.containers import discover
 from restock.ingest.containers.compression import decompress_file
-from restock.ingest.containers.discover import METADATA, recordings_in
+from restock.ingest.containers.discover import METADATA, BagMetadata, recordings_in
 from restock.ingest.containers.mcap_file import McapFile
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.sqlite_file import SqliteFile
@@ -70,7 +69,7 @@ class _Opening:
             raise
 
     def _open(self) -> Recording:
-        metadata: dict[str, Any] = {}
+        metadata = BagMetadata()
         if self.path.is_dir():
             files, metadata = self._bag()
         elif self.path.exists():
@@ -85,7 +84,7 @@ class _Opening:
         self._compare(recording, metadata)
         return recording
 
-    def _bag(self) -> tuple[list[Path], dict[str, Any]]:
+    def _bag(self) -> tuple[list[Path], BagMetadata]:
         if not discover.is_bag(self.path):
             raise RecordingError(
                 f"a folder that is not a bag: it has no {METADATA}",
@@ -151,7 +150,7 @@ class _Opening:
             return "rosbag2-mcap" if self.path.is_dir() else "mcap"
         return {"sqlite3": "rosbag2-sqlite3", "ros1": "ros1"}[kind]
 
-    def _refuse_serialisation(self, metadata: dict[str, Any]) -> None:
+    def _refuse_serialisation(self, metadata: BagMetadata) -> None:
         """rosbag2 can store what other middlewares serialise: only CDR can be decoded."""
         ros2 = [
             storage
@@ -160,9 +159,8 @@ class _Opening:
             or (isinstance(storage, McapFile) and storage.profile == "ros2")
         ]
         encodings = {channel.encoding for storage in ros2 for channel in storage.channels.values()}
-        formats = [topic.get("serialization_format") for topic, _ in _claims(metadata)]
-        claimed = {name for name in formats if isinstance(name, str)}
-        for names in (encodings, claimed - {""}):
+        claimed = {topic.serialization for topic in metadata.topics if topic.serialization}
+        for names in (encodings, claimed):
             if names and not names & set(READABLE):
                 listed = ", ".join(sorted(map(repr, names)))
                 raise RecordingError(
@@ -171,30 +169,19 @@ class _Opening:
                     remedy="`ros2 bag convert` with that middleware installed rewrites it as cdr",
                 )
 
-    def _compare(self, recording: Recording, metadata: dict[str, Any]) -> None:
+    def _compare(self, recording: Recording, metadata: BagMetadata) -> None:
         """metadata.yaml's counts are a claim about the files: differences are worth saying."""
-        for topic, count in _claims(metadata):
-            name = topic.get("name")
-            if not isinstance(name, str) or not isinstance(count, int):
+        for topic in metadata.topics:
+            if topic.name is None or topic.messages is None:
                 continue
-            name = visible(name)  # as the files' own names are
+            name = visible(topic.name)  # as the files' names are
             info = recording.topics.get(name)
             counted = info.expected if info else 0
-            if counted != count:
+            if counted != topic.messages:
                 recording.notes.append(
-                    f"{METADATA} counts {count} messages on {name}, the files hold {counted}"
+                    f"{METADATA} counts {topic.messages} messages on {name},"
+                    f" the files hold {counted}"
                 )
-
-
-def _claims(metadata: dict[str, Any]) -> list[tuple[dict[str, Any], Any]]:
-    topics = metadata.get("topics_with_message_count")
-    if not isinstance(topics, list):
-        return []
-    return [
-        (topic["topic_metadata"], topic.get("message_count"))
-        for topic in topics
-        if isinstance(topic, dict) and isinstance(topic.get("topic_metadata"), dict)
-    ]
 
 
 __all__ = [

@@ -7,7 +7,6 @@ import io
 import struct
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Any
 
 import lz4.frame
 import numpy as np
@@ -21,7 +20,6 @@ from restock.ingest.decoding.columns import MessageBatch
 # A chunk's size is the file's word: what decompresses to more than both is refused.
 PLAUSIBLE_SIZE = 64 << 20
 PLAUSIBLE_RATIO = 1000
-ENTRY = 12  # bytes of a message in the index
 
 _BROKEN = (
     *(ReaderError, AssertionError, ValueError, KeyError, IndexError, struct.error),
@@ -182,12 +180,12 @@ class _BoundedPath:
     def exists(self) -> bool:
         return self._path.exists()
 
-    def open(self, mode: str) -> Any:
-        return _BoundedFile(self._path.open(mode, buffering=0), self._path.stat().st_size)
+    def open(self, mode: str) -> io.BufferedReader:
+        return _BoundedFile(io.FileIO(self._path, mode), self._path.stat().st_size)
 
 
 class _BoundedFile(io.BufferedReader):
-    def __init__(self, raw: Any, size: int) -> None:
+    def __init__(self, raw: io.RawIOBase, size: int) -> None:
         super().__init__(raw)
         self._size = size
 

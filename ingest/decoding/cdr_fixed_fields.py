@@ -13,12 +13,11 @@ from restock.ingest.decoding.cdr_frame import (
     Columns,
     Frame,
     Order,
-    Position,
     native,
     spread,
     uniform,
 )
-from restock.ingest.decoding.columns import gather, join, take
+from restock.ingest.decoding.columns import I64, gather, join, take
 
 PADDING_BETWEEN = 64  # unwanted bytes that are gathered along with wanted ones around them
 SECOND_NS = 1_000_000_000
@@ -71,10 +70,7 @@ class FixedFields:
     def run(self, frame: Frame, out: Columns) -> None:
         """Gather the run in all messages."""
         position = frame.position
-        if isinstance(position, int):
-            phase: Position = position & self.mask
-        else:
-            phase = uniform(position & self.mask)
+        phase = uniform(position & self.mask)
         if isinstance(phase, int):
             layout = self.layouts[phase]
             frame.check_bounds(position + layout.size)
@@ -83,7 +79,7 @@ class FixedFields:
         else:
             self._run_phases(frame, spread(position, len(frame)), phase, out)
 
-    def _run_phases(self, frame: Frame, position: Any, phase: Any, out: Columns) -> None:
+    def _run_phases(self, frame: Frame, position: I64, phase: I64, out: Columns) -> None:
         stop = position + self.sizes[phase]
         frame.check_bounds(stop)
         parts: list[Columns] = []
@@ -99,7 +95,7 @@ class FixedFields:
             out[path] = take(join([part[path] for part in parts]), back)
         frame.position = stop
 
-    def take(self, frame: Frame, at: Any, layout: _Layout, out: Columns) -> None:
+    def take(self, frame: Frame, at: I64, layout: _Layout, out: Columns) -> None:
         """The wanted items at these byte positions; they must fit."""
         times: dict[str, NDArray[np.int64]] = {}
         for first, structures in layout.groups:

@@ -116,8 +116,10 @@ class Frame:
         return uniform(words.astype(np.int64))
 
 
-def uniform(values: I64) -> Position:
+def uniform(values: Position) -> Position:
     """One int where all values are the same."""
+    if isinstance(values, int):
+        return values
     if len(values) and (values == values[0]).all():
         return int(values[0])
     return values

@@ -20,13 +20,12 @@ from restock.ingest.decoding.cdr_frame import (
     BadRows,
     Columns,
     Frame,
-    Position,
     gather_sequences,
     spread,
     texts,
     uniform,
 )
-from restock.ingest.decoding.columns import FieldColumn, Ragged, join, offsets_of, take
+from restock.ingest.decoding.columns import I64, FieldColumn, Ragged, join, offsets_of, take
 from restock.ingest.decoding.field_paths import DTYPES
 
 
@@ -68,7 +67,7 @@ def empty_column(kind: str, dims: tuple[int | None, ...]) -> FieldColumn:
     return column
 
 
-def wrap(column: FieldColumn, length: int | None, rows: int, offsets: Any) -> FieldColumn:
+def wrap(column: FieldColumn, length: int | None, rows: int, offsets: I64) -> FieldColumn:
     """Elements to rows: a fixed repetition of an array is a further axis, others are Ragged."""
     if length is not None and not isinstance(column, Ragged):
         return column.reshape(rows, length, *column.shape[1:])
@@ -165,16 +164,13 @@ class Repeat:
         for path, column in elements.items():
             out[path] = wrap(column, self.length, len(frame), offsets)
 
-    def _fixed(self, frame: Frame, counts: Any, offsets: Any) -> Columns | None:
+    def _fixed(self, frame: Frame, counts: I64, offsets: I64) -> Columns | None:
         """Elements of one fixed size lie at known places: one gather for all of them."""
         run = self._only_fixed
         if run is None:
             return None
         aligned = (frame.position + (run.first_align - 1)) & -run.first_align
-        if isinstance(aligned, int):
-            phase: Position = aligned & run.mask
-        else:
-            phase = uniform(aligned & run.mask)
+        phase = uniform(aligned & run.mask)
         stride = run.stride(phase) if isinstance(phase, int) else None
         if stride is None or not isinstance(phase, int):
             return None
@@ -196,11 +192,11 @@ class _Elements:
     where the next was thought to start. Messages where it was wrong go on one by one.
     """
 
-    def __init__(self, inner: CdrPlan, frame: Frame, counts: Any, offsets: Any) -> None:
+    def __init__(self, inner: CdrPlan, frame: Frame, counts: I64, offsets: I64) -> None:
         self.inner, self.frame = inner, frame
         self.counts, self.offsets = counts, offsets
         self.position = spread(frame.position, len(frame)).copy()
-        self.places: list[Any] = []  # of the elements that were read, in the answer
+        self.places: list[I64] = []  # of the elements that were read, in the answer
         self.parts: list[Columns] = []
 
     def read(self) -> Columns:
@@ -226,20 +222,20 @@ class _Elements:
             path: take(join([part[path] for part in self.parts]), back) for path in self.parts[0]
         }
 
-    def _read_one(self, rows: NDArray[np.intp], number: Any) -> None:
+    def _read_one(self, rows: NDArray[np.intp], number: I64) -> None:
         frame = self.frame.select(rows, uniform(self.position[rows]))
         self.parts.append(self.inner.run(frame))
         self.places.append(self.offsets[rows] + number)
         self.position[rows] = frame.position
 
-    def _guess(self, rows: NDArray[np.intp], left: Any, stride: Any) -> NDArray[np.intp]:
+    def _guess(self, rows: NDArray[np.intp], left: I64, stride: I64) -> NDArray[np.intp]:
         """Read what is left of these messages by the guess; the rows where it was right."""
         no_rows = np.zeros(0, np.intp)
         if not rows.size:
             return no_rows
         counts = left[rows]
         starts = offsets_of(counts)
-        within = np.arange(starts[-1]) - np.repeat(starts[:-1], counts)
+        within: I64 = np.arange(starts[-1]) - np.repeat(starts[:-1], counts)
         which = np.repeat(np.arange(len(rows)), counts)
         position = self.position[rows][which] + within * stride[rows][which]
         frame = self.frame.select(rows[which], position)

@@ -8,6 +8,7 @@ from functools import cache, lru_cache
 from typing import Any
 
 from rosbags.interfaces import Nodetype
+from rosbags.interfaces.typing import Typesdict
 from rosbags.typesys import (
     Stores,
     TypesysError,
@@ -16,6 +17,7 @@ from rosbags.typesys import (
     get_typestore,
 )
 from rosbags.typesys.msg import normalize_msgtype
+from rosbags.typesys.store import Typestore
 
 from restock.errors import RecordingError
 from restock.ingest.decoding.channel import Channel
@@ -42,7 +44,7 @@ class RosType(MessageType):
 
     name: str
     source: str  # "embedded" or the distribution's name
-    raw: dict[str, Any]  # rosbags' Typesdict, which the row-wise decoder registers
+    raw: Typesdict  # as rosbags has them: the row-wise decoder registers
     times = TIMES
 
     def fields_of(self, name: str) -> list[FieldType]:
@@ -69,7 +71,7 @@ def _field(name: str, description: Any) -> FieldType:
     return FieldType(name, base, None, many)
 
 
-def distro_types(distro: str) -> dict[str, Any]:
+def distro_types(distro: str) -> Typesdict:
     """A distribution's message definitions.
 
     Raises:
@@ -92,7 +94,7 @@ def refuse_unknown(distro: str) -> None:
 
 
 @cache
-def _distro_store(distro: str) -> Any:
+def _distro_store(distro: str) -> Typestore:
     refuse_unknown(distro)
     return get_typestore(_STORES[distro])
 
@@ -135,7 +137,7 @@ def _from_distro(name: str, distro: str) -> RosType:
 def _embedded(name: str, form: str, definition: bytes, distro: str) -> RosType:
     try:
         text = definition.decode()
-        types: dict[str, Any] = {}
+        types: Typesdict = {}
         rule = "=" * 80 + "\n"
         if form != "ros2idl":
             types.update(get_types_from_msg(text, name))
@@ -165,7 +167,7 @@ def _costly(idl: str) -> bool:
     return "(" in bare or _NESTED.search(bare) is not None
 
 
-def _named(types: dict[str, Any]) -> set[str]:
+def _named(types: Typesdict) -> set[str]:
     """The messages that fields of these types are made of."""
     fields = [_field(*item) for _, items in types.values() for item in items]
     return {field.message for field in fields if field.message}

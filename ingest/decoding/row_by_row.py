@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from rosbags.interfaces.typing import Typesdict
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_typestore
 from rosbags.typesys.base import normalize_fieldname
@@ -207,9 +208,10 @@ class _RosParser:
         return np.concatenate(parts) if parts else np.zeros(0, dtype)
 
 
-def _family(message: RosType) -> dict[str, Any]:
+def _family(message: RosType) -> Typesdict:
     """The type and those it is made of: all that rosbags must compile."""
-    wanted, family = [message.name], dict[str, Any]()
+    wanted: list[str] = [message.name]
+    family: Typesdict = {}
     while wanted:
         name = wanted.pop()
         if name not in family:
