@@ -8,26 +8,26 @@ ever earlier places (jump-start reinforcement learning, arXiv:2204.02372, with r
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from restock.errors import ConfigError
+from restock.state import Stateful
 from restock.train.dqn.config import JumpStartConfig
 from restock.train.dqn.fitted_q import FittedQConfig, chances, cloned_behaviour
 from restock.train.dqn.network import QNetwork
 from restock.train.feed.logs import Logs
-from restock.train.run.checkpoint import generator_state, restore_generator
 
 POLICIES = ("dqn", "cloned")  # who acts, by its code in the ring
 Ints = NDArray[np.int64]
 
 
-class JumpStart:
+class JumpStart(Stateful):
     """Drives N environments for the first steps of their episodes."""
+
+    STATE: ClassVar[tuple[str, ...]] = ("network", "_until", "_rng")
 
     def __init__(
         self, config: JumpStartConfig, network: QNetwork, num_envs: int, seed: int
@@ -96,22 +96,6 @@ class JumpStart:
         probability[cloned] = of_each[np.arange(len(cloned)), chosen]
         policy[cloned] = POLICIES.index("cloned")
         return action, probability, policy
-
-    def state_dict(self) -> dict[str, Any]:
-        """Arrays and JSON values."""
-        return {
-            "network": dict(self.network.state_dict()),
-            "until": self._until,
-            "rng": generator_state(self._rng),
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts it where `state_dict` found it."""
-        self.network.load_state_dict(
-            {name: torch.as_tensor(value) for name, value in state["network"].items()}
-        )
-        self._until = np.array(state["until"], np.int64)
-        restore_generator(self._rng, state["rng"])
 
 
 __all__ = ["POLICIES", "JumpStart"]

@@ -7,10 +7,10 @@ checkpoint, so a run that is resumed goes on exactly as it would have.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from restock.errors import RunError
 from restock.ingest.task.conditions import Condition
 from restock.ingest.task.task import Task
 from restock.replay.ring.ring import FreshRing
+from restock.state import Stateful
 from restock.train.dqn.config import TrainConfig
 from restock.train.dqn.learner import Learner
 from restock.train.evaluation.evaluate import Score
@@ -66,8 +67,29 @@ class Interval:
 
 
 @dataclass
-class Session:
+class Session(Stateful):
     """The parts of one run. `open_session` puts them together."""
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "progress",
+        "interval",
+        "best",
+        "last",
+        "learner",
+        "batches",
+        "ring",
+        "env",
+        "collector",
+        "feed",
+        "probe",
+        "jump_start",
+        "exploration",
+    )
+    STATE_TYPES: ClassVar[Mapping[str, Any]] = {
+        "best": Score | None,
+        "last": Score | None,
+        "probe": Probe | None,
+    }
 
     run: Run
     config: TrainConfig
@@ -109,46 +131,28 @@ class Session:
         """Write all state to the run's latest checkpoint, and the tables to match it."""
         keep(self.run.latest, self.progress.checkpointed_at, self.config.record.keep_checkpoints)
         self.progress.checkpointed_at = self.progress.env_steps
+        self.progress.wall_s, self._started = self.wall_s, time.monotonic()
         self.run.flush()
         self.events.flush()
-        progress = asdict(self.progress) | {"wall_s": self.wall_s}
-        checkpoint.save(
-            self.run.latest,
-            {
-                "progress": progress,
-                "interval": asdict(self.interval),
-                "best": asdict(self.best) if self.best else None,
-                "last": asdict(self.last) if self.last else None,
-                "learner": self.learner.state_dict(),
-                "batches": self.batches.state_dict(),
-                "ring": self.ring.state_dict(),
-                "collector": self.collector.state_dict(),
-                "env": self.env.state_dict(),
-                "feed": self.feed.state_dict(),
-                "probe": self.probe.state_dict() if self.probe else None,
-                "jump_start": self.jump_start.state_dict() if self.jump_start else None,
-                "exploration": checkpoint.generator_state(self.exploration),
-                "tables": self.run.row_counts(),
-            },
-        )
+        tables = self.run.row_counts()
+        checkpoint.save(self.run.latest, {**self.state_dict(), "tables": tables})
 
     def restore(self) -> None:
-        """Go on from the run's latest checkpoint."""
+        """Go on from the run's latest checkpoint.
+
+        Raises:
+            RunError: no such checkpoint, or the logs' rows are not those that the run began with.
+        """
         state = self._latest()
-        self.progress = Progress(**state["progress"])
-        self.interval = Interval(**state["interval"])
-        self.best = Score(**state["best"]) if state["best"] else None
-        self.last = Score(**state["last"]) if state["last"] else None
-        self.learner.load_state_dict(state["learner"])
-        self.batches.load_state_dict(state["batches"])
-        self.ring.load_state_dict(state["ring"])
-        self.env.load_state_dict(state["env"])
-        self.collector.load_state_dict(state["collector"])
-        self.feed.load_state_dict(state["feed"])
-        self.probe = Probe.from_state(state["probe"]) if state["probe"] else None
-        if self.jump_start is not None:
-            self.jump_start.load_state_dict(state["jump_start"])
-        checkpoint.restore_generator(self.exploration, state["exploration"])
+        before, now = state["probe"], self.probe
+        if before is not None and now is not None and before["hash"] != now.hash:
+            raise RunError(
+                f"was taken with other logged rows: its probe is {before['hash']}, that of the"
+                f" panel is {now.hash}",
+                where=str(self.run.latest),
+                remedy="resume with the panel that the run began with, or start another run",
+            )
+        self.load_state_dict(state)
         self.run.truncate(state["tables"])
         self._started = time.monotonic()
 

@@ -1,13 +1,14 @@
 """State that a checkpoint keeps, declared by name: what is saved is what is restored.
 
 A class names its attributes in `STATE`; each is an array, a number, a string, None, a list or dict
-of those, a generator, a tensor, a torch module, a msgspec struct, or another object with
-`state_dict` and `load_state_dict`.
+of those, a generator, a tensor, a torch module, a dataclass or msgspec struct, or another object
+with `state_dict` and `load_state_dict`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from typing import Any, ClassVar
 
 import msgspec
@@ -40,7 +41,7 @@ class Stateful:
             if kind is None:
                 setattr(self, name, restored(getattr(self, name), value))
             else:
-                setattr(self, name, msgspec.convert(value, kind))
+                setattr(self, name, msgspec.convert(value, kind, str_keys=True))
         self.restored()
 
     def restored(self) -> None:
@@ -55,8 +56,10 @@ def saved(value: Any) -> Any:
     """A value as arrays and JSON values, sharing no memory with it."""
     if isinstance(value, np.random.Generator):
         return value.bit_generator.state
-    if hasattr(value, "state_dict"):
-        return dict(value.state_dict())
+    if isinstance(value, Stateful):
+        return value.state_dict()
+    if hasattr(value, "state_dict"):  # a torch module gives its own tensors
+        return saved(dict(value.state_dict()))
     if hasattr(value, "detach"):  # a tensor
         return value.detach().cpu().clone()
     if hasattr(value, "get_state"):  # torch's generator
@@ -67,8 +70,10 @@ def saved(value: Any) -> Any:
         return value.item()
     if isinstance(value, msgspec.Struct):
         return msgspec.to_builtins(value)
-    if isinstance(value, Mapping):
-        return {name: saved(item) for name, item in value.items()}
+    if is_dataclass(value):
+        return {field.name: saved(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, Mapping):  # in JSON, every key is a string
+        return {str(name): saved(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
         return [saved(item) for item in value]
     return value
@@ -91,6 +96,9 @@ def restored(current: Any, state: Any) -> Any:
         return current
     if isinstance(current, np.ndarray):
         return np.array(state, current.dtype)
+    if is_dataclass(current) and not isinstance(current, type):
+        values = {name: restored(getattr(current, name), item) for name, item in state.items()}
+        return type(current)(**values)
     if isinstance(current, dict) and current.keys() == state.keys():
         return {name: restored(item, state[name]) for name, item in current.items()}
     if isinstance(current, list | tuple) and len(current) == len(state):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
@@ -20,6 +21,12 @@ class Point(msgspec.Struct, frozen=True):
     at: tuple[int, int]
 
 
+@dataclass(frozen=True)
+class Score:
+    success: dict[str, float]
+    best: bool = False
+
+
 class Inner(Stateful):
     STATE = ("count",)
 
@@ -28,13 +35,21 @@ class Inner(Stateful):
 
 
 class Outer(Stateful):
-    STATE = ("_values", "inner", "rng", "points")
-    STATE_TYPES = {"points": list[Point]}  # noqa: RUF012
+    STATE = ("_values", "inner", "rng", "points", "now", "score", "episodes", "network")
+    STATE_TYPES = {  # noqa: RUF012
+        "points": list[Point],
+        "score": Score | None,
+        "episodes": dict[int, tuple[str, str]],
+    }
 
     def __init__(self) -> None:
         self._values: dict[str, Any] = {"a": np.zeros(2, np.float32)}
         self.inner, self.rng = Inner(), np.random.default_rng(0)
         self.points: list[Point] = []
+        self.now = Score({"a": 0.0})
+        self.score: Score | None = None
+        self.episodes: dict[int, tuple[str, str]] = {}
+        self.network = torch.nn.Linear(2, 1)
         self.total = 0
 
     def restored(self) -> None:
@@ -47,17 +62,27 @@ def test_what_is_saved_is_what_is_restored() -> None:
     first.inner.count = 3
     first.rng.random(5)
     first.points = [Point((1, 2)), Point((3, 4))]
+    first.now, first.score = Score({"a": 0.5}, best=True), Score({"b": 1.0})
+    first.episodes[7] = ("worn", "{}")
     state = first.state_dict()
-    assert state.keys() == {"values", "inner", "rng", "points"}
+    network = state.pop("network")
+    assert {"values", "inner", "rng", "points", "now", "score", "episodes"} == state.keys()
     first._values["a"][:] = 0  # what was saved is a copy
+    kept = first.network.weight.detach().clone()
+    torch.nn.init.zeros_(first.network.weight)
     arrays = state.pop("values")
     inner = second.inner
-    second.load_state_dict({**json.loads(json.dumps(state)), "values": arrays})
+    objects = {"values": arrays, "network": network}
+    second.load_state_dict({**json.loads(json.dumps(state)), **objects})
     np.testing.assert_array_equal(second._values["a"], np.float32([1.5, 2.5]))
     assert second._values["a"].dtype == np.float32
     assert second.inner is inner  # objects are changed in place
     assert second.points == first.points
     assert second.total == 5
+    assert second.now == first.now
+    assert second.score == first.score
+    assert second.episodes == first.episodes
+    assert torch.equal(second.network.weight, kept)
     assert second.rng.random() == first.rng.random()
 
 

@@ -10,6 +10,7 @@ import torch
 from safetensors.torch import save_file
 
 from restock.errors import RunError
+from restock.state import restored, saved
 from restock.train.run import checkpoint
 
 
@@ -25,7 +26,7 @@ def test_everything_comes_back_exactly(tmp_path: Path) -> None:
         },
         "names": np.array(["nominal", "wheel_slip"]),
         "list": [1, 2.5, None, True, "text", np.arange(3)],
-        "generator": checkpoint.generator_state(rng),
+        "generator": saved(rng),
         "nan": float("nan"),
     }
     checkpoint.save(tmp_path / "a.safetensors", state)
@@ -42,7 +43,7 @@ def test_everything_comes_back_exactly(tmp_path: Path) -> None:
     assert np.isnan(back["nan"])
 
     other = np.random.default_rng(99)
-    checkpoint.restore_generator(other, back["generator"])
+    restored(other, back["generator"])
     assert other.random(8).tolist() == rng.random(8).tolist()
 
 

@@ -138,6 +138,15 @@ def test_an_earlier_checkpoint_leads_to_the_same_end(undisturbed: Session, tmp_p
     assert_same_run(undisturbed, again)
 
 
+def test_a_run_is_not_resumed_on_other_logged_rows(tmp_path: Path) -> None:
+    first = run_to_end(tmp_path / "run", config())
+    probe = pq.read_table(first.run.path / "probe.parquet")["probe_hash"].unique().to_pylist()
+    other = dataclasses.replace(logs(), rows=logs().rows.flip(0))
+    with pytest.raises(RunError, match=rf"other logged rows: its probe is {probe[0]}") as refused:
+        session(first.run.path, config(), logs=other, resume=True)
+    assert "the panel that the run began with" in str(refused.value)
+
+
 def test_one_checkpoint_is_kept_where_one_is_asked_for(tmp_path: Path) -> None:
     live = run_to_end(tmp_path / "run", config(record={"keep_checkpoints": 1}))
     assert earlier(live.run.latest) == {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from restock.errors import ConfigError
+from restock.state import Stateful
 from restock.train.dqn.config import LossConfig, TrainConfig
 from restock.train.dqn.loss import (
     Loss,
@@ -50,12 +51,21 @@ class _Terms:
     expert: Tensor | None
 
 
-class Learner:
+class Learner(Stateful):
     """The online network, its target, its optimizer and how many updates they have seen.
 
     Batches are packed rows (B, 2D + 3) float32 as `restock.replay.mixture.packed_row` says:
     `[observation | next_observation | action | reward | discount]`.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "network",
+        "target_network",
+        "policy_network",
+        "moments",
+        "gradient_steps",
+        "target",
+    )
 
     def __init__(
         self,
@@ -278,27 +288,8 @@ class Learner:
         """The best action (N,) of each observation (N, D)."""
         return greedy_actions(self.network, observation)
 
-    def state_dict(self) -> dict[str, Any]:
-        """Tensors and JSON values, for a checkpoint."""
-        return {
-            "network": dict(self.network.state_dict()),
-            "target_network": dict(self.target_network.state_dict()),
-            "policy_network": dict(self.policy_network.state_dict()),
-            "optimizer": self._optimizer_state(),
-            "gradient_steps": self.gradient_steps,
-            "last_sync": self.target.last_sync,
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts the learner where `state_dict` found it."""
-        self.network.load_state_dict(state["network"])
-        self.target_network.load_state_dict(state["target_network"])
-        self.policy_network.load_state_dict(state["policy_network"])
-        self._load_optimizer_state(state["optimizer"])
-        self.gradient_steps = int(state["gradient_steps"])
-        self.target.last_sync = int(state["last_sync"])
-
-    def _optimizer_state(self) -> dict[str, dict[str, Tensor]]:
+    @property
+    def moments(self) -> dict[str, dict[str, Tensor]]:
         """Adam's moments a parameter, in the network's order, as if each were its own."""
         if not (state := self.optimizer.state[self._flat.values]):
             return {}
@@ -308,7 +299,8 @@ class Learner:
             for index, pair in enumerate(moments)
         }
 
-    def _load_optimizer_state(self, entries: Mapping[str, Mapping[str, Tensor]]) -> None:
+    @moments.setter
+    def moments(self, entries: Mapping[str, Mapping[str, Tensor]]) -> None:
         self.optimizer.state.clear()
         if not entries:
             return

@@ -8,12 +8,13 @@ that the run's config, metrics and checkpoints all carry.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import msgspec
 import torch
 from msgspec import Meta
 
+from restock.state import Stateful
 from restock.toml import Checked
 
 
@@ -60,8 +61,10 @@ def describe(rule: TargetRule) -> dict[str, Any]:
     return {**msgspec.to_builtins(rule), "effective_lag_updates": rule.effective_lag}
 
 
-class TargetUpdate:
+class TargetUpdate(Stateful):
     """Applies a rule to the parameters of a pair of networks, in the same order."""
+
+    STATE: ClassVar[tuple[str, ...]] = ("last_sync",)
 
     def __init__(
         self, rule: TargetRule, online: Iterable[torch.Tensor], target: Iterable[torch.Tensor]

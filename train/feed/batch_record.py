@@ -1,40 +1,77 @@
 """What the critic was fed: exact sums over every batch, and every row of a seeded few.
 
-A batch's rows, strata, TD errors and values are kept as they are drawn (no statistics inside the
-update loop) and summed once an interval. The sums go to the run's tables `strata`, `ages` and
-`policies`; the rows of audited batches to `audit`.
+A batch's rows, strata, TD errors and values are kept as they are sampled (no statistics inside the
+update loop) and summed once an interval. The sums go to the run's tables `strata`, `conditions`,
+`ages`, `sampled_episodes` and `policies`; the rows of audited batches to `audit`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from restock.replay.ring.ring import FreshRing
+from restock.state import Stateful
 from restock.train.dqn.loss import Loss
-from restock.train.feed.audit_rows import fresh_rows, logged_rows, row_hashes
 from restock.train.feed.batches import Batch
-from restock.train.feed.drawn import BatchRecord, as_columns, from_state, to_state
 from restock.train.feed.fresh_log import FreshPerturbations
 from restock.train.feed.logs import Logs
-from restock.train.feed.sampled_episodes import episode_columns
-from restock.train.run.checkpoint import generator_state, restore_generator
+from restock.train.feed.sampled_rows import (
+    FRESH,
+    LOGGED,
+    Columns,
+    SampledRows,
+    episode_sums,
+    fresh_audit,
+    logged_audit,
+    row_hashes,
+)
 from restock.train.run.run import Run
 
 UNLABELLED = "unlabelled"
 _NS_PER_DAY = 86_400e9
+_MEANS = ("td_abs_mean", "q_mean", "q_abs_max", "reward_mean", "logs_share")
 
 
-class FeedRecord:
+@dataclass(frozen=True)
+class _Source:
+    """The rows (n,) of an interval that came from one source, and what their codes name."""
+
+    name: str  # logs | fresh
+    rows: Mapping[str, NDArray[Any]]  # td, q, weight, reward, discount
+    stratum: NDArray[np.int64]
+    strata: Sequence[str]
+    row: NDArray[np.int64]  # which row of the source each was
+    available: NDArray[np.int64]  # (S,) rows of each stratum that the source has
+    timings: Sequence[str | None]  # (S,)
+    quota: Sequence[float | None]  # (S,)
+    condition: NDArray[np.int64]
+    conditions: Sequence[str]
+    episode: NDArray[np.int64]
+    policy: NDArray[np.int64]
+    policies: Sequence[str]
+
+
+class FeedRecord(Stateful):
     """Records the batches of a run.
 
     Args:
         audit_share: of all batches, chosen by `seed`.
         perturbations: in force in the ring's episodes, where they are known.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "_rng",
+        "_total",
+        "_logged",
+        "_fresh",
+        "_quota",
+        "_quota_batches",
+    )
 
     def __init__(
         self,
@@ -53,183 +90,185 @@ class FeedRecord:
         self._age_days = (
             np.maximum(logs.as_of_ns - logs.stamp_ns, 0) / _NS_PER_DAY if logs is not None else None
         )
-        self._fresh_strata = [*ring.conditions, UNLABELLED]
-        self._drawn: dict[str, int] = {}  # "source/stratum" -> rows since the run began
-        self._kept: list[BatchRecord] = []
+        self._total: dict[str, int] = {}  # "source/stratum" -> rows since the run began
+        self._logged, self._fresh = SampledRows(LOGGED), SampledRows(FRESH)
+        # Of batches with logged rows in the open interval: the sum (S,) of the shares in force.
+        self._quota = np.zeros(0 if logs is None else len(logs.strata))
+        self._quota_batches = 0
 
     def batch(self, step: int, env_steps: int, batch: Batch, loss: Loss, last_sync: int) -> None:
         """Keep the batch of gradient step `step` (from 1), and its audit rows if it is chosen.
 
         Inside the update loop: only what will not be there any more when the interval is closed.
         """
-        ring, slots = self.ring, batch.slots
-        meta = ring.meta
-        kept = BatchRecord(
-            step=step,
-            env_steps=env_steps,
-            log_row=batch.log_rows,
-            log_stratum=batch.log_stratum,
-            quota=batch.quota,
-            code=ring.condition(slots),
-            episode=meta["episode"][slots],
-            episode_step=meta["episode_step"][slots],
-            policy=meta["behaviour_policy"][slots],
-            env_step=meta["env_step"][slots],
-            gradient_step=meta["gradient_step"][slots],
-            td=loss.td.cpu().numpy(),
-            q=loss.q.cpu().numpy(),
-            weight=None if batch.weight is None else batch.weight.cpu().numpy(),
-            tail=batch.rows[:, -2:].cpu().numpy().copy(),  # the buffer is filled anew
-        )
-        self._kept.append(kept)
+        slots, logged = batch.slots, batch.logged
+        td, q = loss.td.cpu().numpy(), loss.q.cpu().numpy()
+        weight = np.ones_like(td) if batch.weight is None else batch.weight.cpu().numpy()
+        tail = batch.rows[:, -2:].cpu().numpy().copy()  # the buffer is filled again
+        if logged:
+            self._logged.append(
+                batch.log_rows,
+                batch.log_stratum,
+                td[:logged],
+                q[:logged],
+                weight[:logged],
+                tail[:logged, 0],
+                tail[:logged, 1],
+            )
+            self._quota += batch.quota
+            self._quota_batches += 1
+        if len(slots):
+            meta = self.ring.meta
+            self._fresh.append(
+                self.ring.condition(slots),
+                meta["episode"][slots],
+                meta["episode_step"][slots],
+                meta["behaviour_policy"][slots],
+                env_steps - meta["env_step"][slots],
+                step - meta["gradient_step"][slots],
+                td[logged:],
+                q[logged:],
+                weight[logged:],
+                tail[logged:, 0],
+                tail[logged:, 1],
+            )
         if self._rng.random() < self.audit_share:
-            self._audit(step, batch, as_columns([kept], len(ring.conditions)), last_sync)
+            self._audit(step, batch, last_sync)
 
     def flush(self, env_steps: int, gradient_steps: int, phase: str) -> dict[str, float | None]:
         """Write the interval's sums; returns its means, for `progress`."""
-        clocks = {"env_steps": env_steps, "gradient_steps": gradient_steps}
-        if not self._kept:
-            return dict.fromkeys(
-                ("td_abs_mean", "q_mean", "q_abs_max", "reward_mean", "logs_share")
-            )
-        kept, self._kept = as_columns(self._kept, len(self.ring.conditions)), []
-        if self.logs is not None and len(kept["log_row"]):
-            self._log_tables(kept, clocks, phase, self.logs)
-        if len(kept["fresh_stratum"]):
-            self._fresh_tables(kept, clocks, phase)
-        td = np.concatenate([kept["log_td"], kept["fresh_td"]])
-        q = np.concatenate([kept["log_q"], kept["fresh_q"]])
-        reward = np.concatenate([kept["log_reward"], kept["fresh_reward"]])
-        return {
+        steps = {"env_steps": env_steps, "gradient_steps": gradient_steps}
+        sources = [*self._of_logs(), *self._of_ring()]
+        for source in sources:
+            self._strata(source, steps, phase)
+            self._conditions(source, steps, phase)
+            self._ages(source, steps)
+            self._episodes(source, steps)
+            self._policies(source, steps)
+        if not sources:
+            return dict.fromkeys(_MEANS)
+        td, q, reward = (
+            np.concatenate([source.rows[name] for source in sources])
+            for name in ("td", "q", "reward")
+        )
+        means: dict[str, float | None] = {
             "td_abs_mean": float(np.abs(td).mean()),
             "q_mean": float(q.mean()),
             "q_abs_max": float(np.abs(q).max()),
             "reward_mean": float(reward.mean()),
-            "logs_share": len(kept["log_row"]) / len(td),
+            "logs_share": len(self._logged) / len(td),
         }
+        self._logged.clear()
+        self._fresh.clear()
+        self._quota[:], self._quota_batches = 0.0, 0
+        return means
 
-    def _log_tables(
-        self, kept: dict[str, NDArray[Any]], clocks: dict[str, int], phase: str, logs: Logs
-    ) -> None:
-        available = np.array([len(rows) for rows in logs.stratum_rows])
-        self._strata(
-            "logs",
-            logs.strata,
-            kept["log_stratum"],
-            kept["log_row"],
-            {name: kept[f"log_{name}"] for name in ("td", "q", "weight", "reward", "discount")},
-            available,
-            {**clocks, "phase": phase},
-            timing=logs.timings,
-            quota=kept["log_quota"].tolist(),
-        )
-        condition = logs.condition
-        codes = condition.codes[kept["log_row"]]
-        self._conditions("logs", condition.names, codes, kept, {**clocks, "phase": phase})
-        if self._age_days is not None:
-            self._ages("logs", "days", self._age_days[kept["log_row"]], clocks)
-        self._episodes("logs", logs.episode.codes[kept["log_row"]], kept, logs.strata, clocks)
-        policy = logs.behaviour_policy
-        counts = np.bincount(policy.codes[kept["log_row"]], minlength=len(policy.names))
-        self._policies("logs", policy.names, counts, clocks)
+    def _of_logs(self) -> list[_Source]:
+        logs, rows = self.logs, self._logged.columns
+        if logs is None or not len(self._logged):
+            return []
+        row = rows["row"]
+        return [
+            _Source(
+                name="logs",
+                rows=rows,
+                stratum=rows["stratum"],
+                strata=logs.strata,
+                row=row,
+                available=np.array([len(members) for members in logs.stratum_rows]),
+                timings=logs.timings,
+                quota=(self._quota / self._quota_batches).tolist(),
+                condition=logs.condition.codes[row],
+                conditions=logs.condition.names,
+                episode=logs.episode.codes[row],
+                policy=logs.behaviour_policy.codes[row],
+                policies=logs.behaviour_policy.names,
+            )
+        ]
 
-    def _fresh_tables(
-        self, kept: dict[str, NDArray[Any]], clocks: dict[str, int], phase: str
-    ) -> None:
-        ring, names = self.ring, self._fresh_strata
-        labelled = ring.strata.counts
-        self._strata(
-            "fresh",
-            names,
-            kept["fresh_stratum"],
-            kept["fresh_key"],
-            {name: kept[f"fresh_{name}"] for name in ("td", "q", "weight", "reward", "discount")},
-            np.append(labelled, len(ring) - labelled.sum()),
-            {**clocks, "phase": phase},
-            timing=[None] * len(names),
-            quota=[None] * len(names),
-        )
-        codes = kept["fresh_stratum"]  # a ring's strata are conditions
-        self._conditions("fresh", names, codes, kept, {**clocks, "phase": phase})
-        for unit in ("env_steps", "gradient_steps"):
-            self._ages("fresh", unit, kept[f"age_{unit}"].astype(np.float64), clocks)
-        self._episodes("fresh", kept["fresh_key"] >> 20, kept, names, clocks)
-        counts = np.bincount(kept["fresh_policy"], minlength=len(ring.behaviour_policies))
-        self._policies("fresh", ring.behaviour_policies, counts, clocks)
+    def _of_ring(self) -> list[_Source]:
+        ring, rows = self.ring, self._fresh.columns
+        if not len(self._fresh):
+            return []
+        names, labelled = [*ring.conditions, UNLABELLED], ring.strata.counts
+        condition = rows["condition"].astype(np.int64)
+        stratum = np.where(condition < 0, len(ring.conditions), condition)
+        unknown = [None] * len(names)
+        return [
+            _Source(
+                name="fresh",
+                rows=rows,
+                stratum=stratum,  # a ring's strata are conditions
+                strata=names,
+                row=(rows["episode"] << 20) | rows["episode_step"],
+                available=np.append(labelled, len(ring) - labelled.sum()),
+                timings=unknown,
+                quota=unknown,
+                condition=stratum,
+                conditions=names,
+                episode=rows["episode"],
+                policy=rows["policy"],
+                policies=ring.behaviour_policies,
+            )
+        ]
 
-    def _strata(
-        self,
-        source: str,
-        names: list[str],
-        stratum: NDArray[Any],
-        row: NDArray[Any],
-        values: dict[str, NDArray[Any]],
-        available: NDArray[Any],
-        clocks: dict[str, Any],
-        *,
-        timing: list[Any],
-        quota: list[Any],
-    ) -> None:
-        size = len(names)
+    def _strata(self, source: _Source, steps: dict[str, int], phase: str) -> None:
+        size, stratum, rows = len(source.strata), source.stratum, source.rows
         drawn = np.bincount(stratum, minlength=size)
-        weight = np.bincount(stratum, values["weight"], minlength=size)
+        weight = np.bincount(stratum, rows["weight"], minlength=size)
         # Per stratum: a fresh row moves from "unlabelled" to its stratum when its episode ends.
-        unique = np.bincount(np.unique(row * size + stratum) % size, minlength=size)
-        of_drawn = np.maximum(drawn, 1)
+        unique = np.bincount(np.unique(source.row * size + stratum) % size, minlength=size)
         means = {
-            "td_abs_mean": np.bincount(stratum, np.abs(values["td"]), minlength=size) / of_drawn,
-            "q_mean": np.bincount(stratum, values["q"], minlength=size) / of_drawn,
-            "reward_mean": np.bincount(stratum, values["reward"], minlength=size) / of_drawn,
-            "terminal_share": np.bincount(stratum, values["discount"] == 0, minlength=size)
-            / of_drawn,
+            name: np.bincount(stratum, values, minlength=size) / np.maximum(drawn, 1)
+            for name, values in (
+                ("td_abs_mean", np.abs(rows["td"])),
+                ("q_mean", rows["q"]),
+                ("reward_mean", rows["reward"]),
+                ("terminal_share", rows["discount"] == 0),
+            )
         }
-        rows = []
-        for index, name in enumerate(names):
-            key = f"{source}/{name}"
-            self._drawn[key] = self._drawn.get(key, 0) + int(drawn[index])
-            seen = bool(drawn[index])
-            rows.append(
+        table = []
+        for index, name in enumerate(source.strata):
+            key, count = f"{source.name}/{name}", int(drawn[index])
+            self._total[key] = self._total.get(key, 0) + count
+            table.append(
                 {
-                    **clocks,
-                    "source": source,
+                    **steps,
+                    "phase": phase,
+                    "source": source.name,
                     "stratum": name,
-                    "timing": timing[index],
-                    "quota_share": quota[index],
-                    "available_rows": int(available[index]),
-                    "available_share": float(available[index] / max(available.sum(), 1)),
-                    "drawn_rows": int(drawn[index]),
-                    "drawn_share": float(drawn[index] / len(stratum)),
+                    "timing": source.timings[index],
+                    "quota_share": source.quota[index],
+                    "available_rows": int(source.available[index]),
+                    "available_share": float(
+                        source.available[index] / max(source.available.sum(), 1)
+                    ),
+                    "drawn_rows": count,
+                    "drawn_share": count / len(stratum),
                     "effective_share": float(weight[index] / max(weight.sum(), 1e-12)),
                     "unique_rows": int(unique[index]),
-                    "replays_per_row": float(drawn[index] / unique[index]) if seen else None,
-                    "total_drawn_rows": self._drawn[key],
-                    **{k: float(v[index]) if seen else None for k, v in means.items()},
+                    "replays_per_row": float(count / unique[index]) if count else None,
+                    "total_drawn_rows": self._total[key],
+                    **{k: float(v[index]) if count else None for k, v in means.items()},
                 }
             )
-        self.run.append("strata", rows)
+        self.run.append("strata", table)
 
-    def _conditions(
-        self,
-        source: str,
-        names: list[str],
-        code: NDArray[Any],
-        kept: dict[str, NDArray[Any]],
-        clocks: dict[str, Any],
-    ) -> None:
-        """`code` (n,) are the drawn rows' conditions."""
-        side = "log" if source == "logs" else "fresh"
-        drawn = np.bincount(code, minlength=len(names))
+    def _conditions(self, source: _Source, steps: dict[str, int], phase: str) -> None:
+        code, size = source.condition, len(source.conditions)
+        drawn = np.bincount(code, minlength=size)
         weight, td, q = (
-            np.bincount(code, values, minlength=len(names))
-            for values in (kept[f"{side}_weight"], np.abs(kept[f"{side}_td"]), kept[f"{side}_q"])
+            np.bincount(code, values, minlength=size)
+            for values in (source.rows["weight"], np.abs(source.rows["td"]), source.rows["q"])
         )
         met = np.flatnonzero(drawn)
         self.run.append_columns(
             "conditions",
             {
-                **clocks,
-                "source": source,
-                "condition": np.array(names, object)[met],
+                **steps,
+                "phase": phase,
+                "source": source.name,
+                "condition": np.array(source.conditions, object)[met],
                 "drawn_rows": drawn[met],
                 "drawn_share": drawn[met] / len(code),
                 "effective_share": weight[met] / max(weight.sum(), 1e-12),
@@ -238,94 +277,80 @@ class FeedRecord:
             },
         )
 
-    def _ages(
-        self, source: str, unit: str, age: NDArray[np.float64], clocks: dict[str, int]
-    ) -> None:
-        bucket = np.where(age < 1, -1, np.floor(np.log2(np.maximum(age, 1)))).astype(np.int32)
-        buckets, counts = np.unique(bucket, return_counts=True)
-        p50, p90, p99 = (float(value) for value in np.quantile(age, [0.5, 0.9, 0.99]))
-        self.run.append_columns(
-            "ages",
-            {
-                **clocks,
-                "source": source,
-                "unit": unit,
-                "bucket": buckets,
-                "count": counts,
-                "p50": p50,
-                "p90": p90,
-                "p99": p99,
-            },
-        )
+    def _ages(self, source: _Source, steps: dict[str, int]) -> None:
+        ages = {
+            unit: source.rows[f"age_{unit}"].astype(np.float64)
+            for unit in ("env_steps", "gradient_steps")
+            if source.name == "fresh"
+        }
+        if source.name == "logs" and self._age_days is not None:
+            ages["days"] = self._age_days[source.row]
+        for unit, age in ages.items():
+            bucket = np.where(age < 1, -1, np.floor(np.log2(np.maximum(age, 1)))).astype(np.int32)
+            buckets, counts = np.unique(bucket, return_counts=True)
+            quantiles = np.quantile(age, [0.5, 0.9, 0.99]).tolist()
+            self.run.append_columns(
+                "ages",
+                {
+                    **steps,
+                    "source": source.name,
+                    "unit": unit,
+                    "bucket": buckets,
+                    "count": counts,
+                    **dict(zip(("p50", "p90", "p99"), quantiles, strict=True)),
+                },
+            )
 
-    def _episodes(
-        self,
-        source: str,
-        episode: NDArray[Any],
-        kept: dict[str, NDArray[Any]],
-        strata: list[str],
-        clocks: dict[str, int],
-    ) -> None:
-        side = "log" if source == "logs" else "fresh"
-        columns = episode_columns(
-            episode, kept[f"{side}_stratum"], kept[f"{side}_weight"], len(strata)
+    def _episodes(self, source: _Source, steps: dict[str, int]) -> None:
+        sums = episode_sums(
+            source.episode, source.stratum, source.rows["weight"], len(source.strata)
         )
-        named = np.array(strata, object)[columns["stratum"]]
-        keys: Any = columns["episode"]
-        if source == "logs" and self.logs is not None:
-            names = np.array(self.logs.episode.names, object)[keys]
+        key = sums["episode"]
+        if source.name == "logs" and self.logs is not None:
+            episode = np.array(self.logs.episode.names, object)[key]
         else:
-            names = keys.astype(str)
+            episode = key.astype(str)
+        stratum = np.array(source.strata, object)[sums["stratum"]]
         self.run.append_columns(
             "sampled_episodes",
-            {**clocks, "source": source, **columns, "stratum": named, "episode": names},
+            {**steps, "source": source.name, **sums, "stratum": stratum, "episode": episode},
         )
 
-    def _policies(
-        self, source: str, names: Any, counts: NDArray[Any], clocks: dict[str, int]
-    ) -> None:
+    def _policies(self, source: _Source, steps: dict[str, int]) -> None:
+        counts = np.bincount(source.policy, minlength=len(source.policies)).tolist()
         rows = [
-            {**clocks, "source": source, "behaviour_policy": name, "rows": int(count)}
-            for name, count in zip(names, counts, strict=True)
+            {**steps, "source": source.name, "behaviour_policy": name, "rows": count}
+            for name, count in zip(source.policies, counts, strict=True)
             if count
         ]
         self.run.append("policies", rows)
 
-    def _audit(
-        self, step: int, batch: Batch, columns: Mapping[str, NDArray[Any]], last_sync: int
-    ) -> None:
-        packed = batch.rows.cpu().numpy()
+    def _audit(self, step: int, batch: Batch, last_sync: int) -> None:
+        """Every row of the batch last kept."""
+        packed, logged = batch.rows.cpu().numpy(), batch.logged
         hashes, action = row_hashes(packed), packed[:, -3].astype(np.int16)
-        parts: list[tuple[slice, dict[str, Any]]] = []
-        if batch.logged and self.logs is not None and self._age_days is not None:
-            logged = logged_rows(columns, self.logs, self._age_days)
-            parts.append((slice(0, batch.logged), logged))
+        parts: list[tuple[slice, Columns]] = []
+        if logged and self.logs is not None and self._age_days is not None:
+            rows = logged_audit(self._logged.last, self.logs, self._age_days)
+            parts.append((slice(logged), rows))
         if len(batch.slots):
-            fresh = fresh_rows(columns, batch, self.ring, self._fresh_strata, self.perturbations)
-            parts.append((slice(batch.logged, len(packed)), fresh))
-        for place, own in parts:
+            rows = fresh_audit(
+                self._fresh.last, batch.slots, self.ring, UNLABELLED, self.perturbations
+            )
+            parts.append((slice(logged, len(packed)), rows))
+        place = np.arange(len(packed))
+        for part, columns in parts:
             self.run.append_columns(
                 "audit",
                 {
                     "gradient_step": step,
-                    "batch_row": np.arange(place.start, place.stop),
-                    **own,
-                    "action": action[place],
+                    "batch_row": place[part],
+                    **columns,
+                    "action": action[part],
                     "last_target_sync": last_sync,
-                    "row_hash": hashes[place],
+                    "row_hash": hashes[part],
                 },
             )
 
-    def state_dict(self) -> dict[str, Any]:
-        """Arrays and JSON values: the totals, the audit's generator and the open interval."""
-        return {
-            "rng": generator_state(self._rng),
-            "drawn": dict(self._drawn),
-            "kept": to_state(self._kept),
-        }
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts the record where `state_dict` found it."""
-        restore_generator(self._rng, state["rng"])
-        self._drawn = {name: int(count) for name, count in state["drawn"].items()}
-        self._kept = from_state(state["kept"])
+__all__ = ["UNLABELLED", "FeedRecord"]

@@ -7,9 +7,8 @@ what each stratum has of it, the share controller says (`restock.replay.sampling
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -23,8 +22,8 @@ from restock.replay.panel.logged_sampler import (
 )
 from restock.replay.ring.ring import FreshRing
 from restock.replay.sampling.share_controller import ShareController
+from restock.state import Stateful
 from restock.train.feed.logs import Logs
-from restock.train.run.checkpoint import generator_state, restore_generator
 
 _NO_ROWS: Ints = np.empty(0, np.int64)
 _NOTHING = BatchDraw(_NO_ROWS, _NO_ROWS, None, np.empty(0))
@@ -46,7 +45,7 @@ class Batch:
         return len(self.log_rows)
 
 
-class Batches:
+class Batches(Stateful):
     """Draws batches: all from logs while offline, `logs_share` of them from logs online.
 
     Without logs every batch is fresh. Each source has its own generator, seeded from `seed`.
@@ -57,6 +56,8 @@ class Batches:
     Raises:
         MixtureError: the panel's rows cannot bear what the run will draw, where that is refused.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = ("_rng", "_draws")
 
     def __init__(
         self,
@@ -169,16 +170,3 @@ class Batches:
         if self._logs_on_device is None:
             raise RuntimeError("there are no logs to draw from")
         return self._logs_on_device
-
-    def state_dict(self) -> dict[str, Any]:
-        """Arrays and JSON values."""
-        return {
-            "fresh": generator_state(self._rng),
-            "logs": self._draws.state_dict() if self._draws is not None else None,
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts the draws to come where `state_dict` found them."""
-        restore_generator(self._rng, state["fresh"])
-        if self._draws is not None:
-            self._draws.load_state_dict(state["logs"])

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pyarrow as pa
@@ -20,6 +20,7 @@ from restock.ingest.task.conditions import NOMINAL, Condition, label, primary
 from restock.ingest.task.signals import STORED_SIGNALS
 from restock.ingest.task.task import Task
 from restock.replay.ring.ring import FreshRing
+from restock.state import Stateful, saved
 from restock.train.feed.fresh_log import FreshLog, FreshPerturbations, values_entries
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.floors.layout import DEFAULT
@@ -50,12 +51,24 @@ class Ended:
     zones: list[str] | None = None  # (steps + 1,) on its layout; None: what the profile says
 
 
-class Collector:
+class Collector(Stateful):
     """Steps the twin and keeps what the labels need.
 
     `start` sends the actions off (to a thread, with an executor), `finish` takes the result in;
     between them the learner may learn from what the ring held before.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "observation",
+        "_steps",
+        "_return",
+        "_bumps",
+        "_touching",
+        "invalid_steps",
+        "_history",
+        "perturbations",
+        "_unlabelled",
+    )
 
     def __init__(
         self,
@@ -296,34 +309,13 @@ class Collector:
         """Arrays and JSON values. Call between `finish` and `start`, never while a step is out."""
         if self._sent is not None:
             raise RuntimeError("a step is under way")
-        return {
-            "observation": self.observation,
-            "steps": self._steps,
-            "return": self._return,
-            "bumps": self._bumps,
-            "touching": self._touching,
-            "invalid_steps": self.invalid_steps,
-            "history": self._history,
-            "perturbations": self.perturbations.state_dict(),
-            "log": self.log.state_dict() if self.log is not None else None,
-            "unlabelled": [
-                {name: getattr(episode, name) for name in Ended.__dataclass_fields__}
-                for episode in self._unlabelled
-            ],
-        }
+        return {**super().state_dict(), "log": saved(self.log)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Puts the collector where `state_dict` found it; the twin has its own state."""
-        self.observation = np.array(state["observation"])
-        self._steps = np.array(state["steps"])
-        self._return = np.array(state["return"])
-        self._bumps = np.array(state["bumps"])
-        self._touching = np.array(state["touching"])
-        self.invalid_steps = int(state["invalid_steps"])
-        self._history = {name: np.array(values) for name, values in state["history"].items()}
+        super().load_state_dict(state)
         self._unlabelled = [Ended(**episode) for episode in state["unlabelled"]]
-        self._saved_log = state.get("log")
-        self.perturbations.load_state_dict(state.get("perturbations", {}))
+        self._saved_log = state["log"]
 
 
 def ring_conditions(conditions: Sequence[Condition]) -> list[str]:

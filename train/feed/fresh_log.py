@@ -10,11 +10,12 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.state import Stateful
 from restock.train.run import checkpoint
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ _STEP = ("action", "probability", "policy", "reward", "progress_m", "truth")
 _KINDS = {"action": "i2", "policy": "i2", "truth": "<U32"}
 
 
-class FreshLog:
+class FreshLog(Stateful):
     """Episodes of N environments, kept in `folder` a file each time some are labelled.
 
     Args:
@@ -33,6 +34,16 @@ class FreshLog:
         begun: (N,) steps that the episodes under way already have: those are not kept, unless a
             checkpoint brings their beginning.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        "_whole",
+        "_version",
+        "_observation",
+        "_steps",
+        "_waiting",
+        "parts",
+        "dropped_steps",
+    )
 
     def __init__(
         self, folder: Path, observation_size: int, longest: int, begun: NDArray[np.int64]
@@ -104,26 +115,8 @@ class FreshLog:
             checkpoint.save(self.folder / f"{self.parts:06d}.episodes", kept)
             self.parts += 1
 
-    def state_dict(self) -> dict[str, Any]:
-        """Arrays and JSON values; the files stay where they are."""
-        return {
-            "whole": self._whole,
-            "version": self._version,
-            "observation": self._observation,
-            "steps": self._steps,
-            "waiting": self._waiting,
-            "parts": self.parts,
-            "dropped_steps": self.dropped_steps,
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts the log where `state_dict` found it; files written since go, their steps come."""
-        self._whole = np.array(state["whole"], np.bool_)
-        self._version = np.array(state["version"], np.int64)
-        self._observation = np.array(state["observation"], np.float32)
-        self._steps |= {name: np.array(column) for name, column in state["steps"].items()}
-        self._waiting = {key: dict(episode) for key, episode in state["waiting"].items()}
-        self.parts, self.dropped_steps = int(state["parts"]), int(state["dropped_steps"])
+    def restored(self) -> None:
+        """Files written since the checkpoint go: their steps come again."""
         for path in episode_files(self.folder)[self.parts :]:
             path.unlink()
 
@@ -142,8 +135,11 @@ def read_episodes(folder: Path) -> list[dict[str, Any]]:
 Entries = list[tuple[str, float]]
 
 
-class FreshPerturbations:
+class FreshPerturbations(Stateful):
     """Names and values by the ring's key of an episode, for the audit of sampled rows."""
+
+    STATE: ClassVar[tuple[str, ...]] = ("_of",)
+    STATE_TYPES: ClassVar[Mapping[str, Any]] = {"_of": dict[int, tuple[str, str]]}
 
     def __init__(self) -> None:
         self._of: dict[int, tuple[str, str]] = {}  # name, values as JSON
@@ -158,26 +154,18 @@ class FreshPerturbations:
         """Forget episodes without a row: `kept` (n,) are the keys of the ring's rows."""
         if len(self._of) > len(kept) + 1:  # never more than one a row
             alive = set(np.unique(kept).tolist())
-            self._of = {key: told for key, told in self._of.items() if key in alive}
+            self._of = {key: entry for key, entry in self._of.items() if key in alive}
 
     def names(self, keys: NDArray[np.int64]) -> list[str | None]:
         """The name in force in each of these episodes; None where it is not known."""
-        return [told[0] if (told := self._of.get(key)) else None for key in keys.tolist()]
+        return [entry[0] if (entry := self._of.get(key)) else None for key in keys.tolist()]
 
     def values(self, keys: NDArray[np.int64]) -> list[Entries | None]:
         """The values that are not nominal, as entries of a map."""
         return [
-            values_entries(told[1]) if (told := self._of.get(key)) else None
+            values_entries(entry[1]) if (entry := self._of.get(key)) else None
             for key in keys.tolist()
         ]
-
-    def state_dict(self) -> dict[str, list[str]]:
-        """JSON values."""
-        return {str(key): list(told) for key, told in self._of.items()}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts it where `state_dict` found it."""
-        self._of = {int(key): (name, values) for key, (name, values) in state.items()}
 
 
 def values_entries(values: str) -> Entries:

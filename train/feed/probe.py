@@ -8,7 +8,6 @@ as their probe hashes agree.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -95,19 +94,6 @@ class Probe:
                 }
             )
         return rows, value_lag(q, slow)
-
-    def state_dict(self) -> dict[str, Any]:
-        return {
-            "rows": self.rows,
-            "conditions": self.conditions,
-            "bounds": self.bounds,
-            "source": self.source,
-            "hash": self.hash,
-        }
-
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> Probe:
-        return cls(**state)
 
 
 def _scramble(key: NDArray[np.int64]) -> NDArray[np.uint64]:

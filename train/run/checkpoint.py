@@ -25,6 +25,7 @@ from restock.errors import RunError
 FORMAT = "restock-checkpoint/2"
 _EARLIER = ("restock-checkpoint/1",)
 _ARRAY, _STRINGS, _NUMPY = "__array__", "__strings__", "numpy"
+_PREFIX, _SUFFIX = "env_steps_", ".safetensors"
 
 
 def save(path: Path, state: Mapping[str, Any]) -> None:
@@ -120,20 +121,6 @@ def _put_together(value: Any, tensors: Mapping[str, torch.Tensor]) -> Any:
     if isinstance(value, list):
         return [_put_together(item, tensors) for item in value]
     return value
-
-
-def generator_state(rng: np.random.Generator) -> dict[str, Any]:
-    """A numpy generator's state, JSON only."""
-    state: dict[str, Any] = json.loads(json.dumps(rng.bit_generator.state))
-    return state
-
-
-def restore_generator(rng: np.random.Generator, state: Mapping[str, Any]) -> None:
-    """Puts a generator where `generator_state` found it."""
-    rng.bit_generator.state = dict(state)
-
-
-_PREFIX, _SUFFIX = "env_steps_", ".safetensors"
 
 
 def earlier(latest: Path) -> dict[int, Path]:

@@ -1,0 +1,170 @@
+"""Rows as they were sampled: columns that grow by a batch, their sums by episode, and audit rows.
+
+The update loop only appends; what is worked out of the columns is worked out once an interval, or
+for the few batches whose every row is written down.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from restock.replay.ring.ring import FreshRing
+from restock.state import Stateful
+from restock.train.feed.fresh_log import FreshPerturbations
+from restock.train.feed.logs import Coded, Logs
+
+_MOST_CELLS = 1 << 22  # of a dense count; wider ranges of episodes are sorted instead
+_BATCH: dict[str, DTypeLike] = dict.fromkeys(("td", "q", "weight", "reward", "discount"), "f4")
+LOGGED: dict[str, DTypeLike] = {"row": "i8", "stratum": "i8", **_BATCH}  # row: of the panel
+FRESH: dict[str, DTypeLike] = {
+    "condition": "i2",  # -1 while unlabelled
+    "episode": "i8",  # the ring's key
+    "episode_step": "i4",
+    "policy": "i2",
+    "age_env_steps": "i8",
+    "age_gradient_steps": "i8",
+    **_BATCH,
+}
+
+Columns = dict[str, Any]  # arrays, lists, or scalars that hold for all rows
+Arrays = Mapping[str, NDArray[Any]]  # (n,) each
+
+
+class SampledRows(Stateful):
+    """Columns (n,) of the rows sampled since `clear`: joined when they are asked for."""
+
+    STATE: ClassVar[tuple[str, ...]] = ("columns",)
+
+    def __init__(self, kinds: Mapping[str, DTypeLike]) -> None:
+        self._kinds = {name: np.dtype(kind) for name, kind in kinds.items()}
+        self._parts: list[tuple[NDArray[Any], ...]] = []
+        self.clear()
+
+    def __len__(self) -> int:
+        return sum(len(part[0]) for part in self._parts)
+
+    def append(self, *part: NDArray[Any]) -> None:
+        """Rows (n,), columns in their order. They are kept, not copied."""
+        self._parts.append(part)
+
+    def clear(self) -> None:
+        self._parts = [tuple(np.empty(0, kind) for kind in self._kinds.values())]
+
+    @property
+    def last(self) -> dict[str, NDArray[Any]]:
+        """The rows last appended."""
+        return dict(zip(self._kinds, self._parts[-1], strict=True))
+
+    @property
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """All rows."""
+        if len(self._parts) > 1:
+            joined = zip(self._kinds.values(), zip(*self._parts, strict=True), strict=True)
+            self._parts = [tuple(np.concatenate(parts, dtype=kind) for kind, parts in joined)]
+        return self.last
+
+    @columns.setter
+    def columns(self, columns: Arrays) -> None:
+        self._parts = [tuple(columns[name] for name in self._kinds)]
+
+
+def episode_sums(
+    episode: NDArray[np.int64],  # (n,) of each row
+    stratum: NDArray[np.int64],  # (n,)
+    weight: NDArray[np.float32],  # (n,)
+    strata: int,
+) -> dict[str, NDArray[Any]]:
+    """Rows summed by episode and stratum: columns episode, stratum, drawn_rows, weight.
+
+    Rows of one episode are drawn together and are alike, so what a critic learnt from is only as
+    certain as its episodes are many. `restock compare` resamples these.
+    """
+    first = int(episode.min(initial=0))
+    key = (episode.astype(np.int64) - first) * strata + stratum
+    if int(key.max(initial=0)) < _MOST_CELLS:
+        drawn = np.bincount(key)
+        cells = np.flatnonzero(drawn)
+        count, total = drawn[cells], np.bincount(key, weight)[cells]
+    else:
+        cells, place, count = np.unique(key, return_inverse=True, return_counts=True)
+        total = np.bincount(place, weight)
+    return {
+        "episode": cells // strata + first,
+        "stratum": cells % strata,
+        "drawn_rows": count,
+        "weight": total,
+    }
+
+
+def row_hashes(packed: NDArray[np.float32]) -> list[str]:
+    """blake2b of each packed row (B, W), 16 hex digits: `restock trace` compares rows with it."""
+    return [hashlib.blake2b(row.tobytes(), digest_size=8).hexdigest() for row in packed]
+
+
+def logged_audit(rows: Arrays, logs: Logs, age_days: NDArray[np.float64]) -> Columns:
+    """Columns of the run's table `audit` for logged rows of one batch."""
+    row = rows["row"]
+    return {
+        "source": "logs",
+        "transition_id": logs.transition_id[row],
+        "panel_row": row,
+        "ring_slot": None,
+        "episode": _names(logs.episode, row),
+        "episode_step": None,
+        "age_days": age_days[row],
+        "age_env_steps": None,
+        "age_gradient_steps": None,
+        "stratum": [logs.strata[code] for code in rows["stratum"].tolist()],
+        "condition": _names(logs.condition, row),
+        "behaviour_policy": _names(logs.behaviour_policy, row),
+        "behaviour_version": _names(logs.behaviour_version, row),
+        "perturbation": (
+            [logs.perturbation.known(place) for place in row.tolist()]
+            if logs.perturbation
+            else None
+        ),
+        "perturbation_values": None,
+        **{name: rows[name] for name in _BATCH},
+    }
+
+
+def fresh_audit(
+    rows: Arrays,
+    slots: NDArray[np.int64],  # (n,) of the ring
+    ring: FreshRing,
+    unlabelled: str,
+    perturbations: FreshPerturbations | None = None,
+) -> Columns:
+    """The same of its fresh rows; `unlabelled` is the stratum of a row without a condition yet."""
+    codes, keys = rows["condition"].tolist(), rows["episode"]
+    conditions = [None if code < 0 else ring.conditions[code] for code in codes]
+    return {
+        "source": "fresh",
+        "transition_id": None,
+        "panel_row": None,
+        "ring_slot": slots,
+        "episode": [str(key) for key in keys.tolist()],
+        "episode_step": rows["episode_step"],
+        "age_days": None,
+        "age_env_steps": rows["age_env_steps"],
+        "age_gradient_steps": rows["age_gradient_steps"],
+        "stratum": [unlabelled if name is None else name for name in conditions],
+        "condition": conditions,
+        "behaviour_policy": [ring.behaviour_policies[code] for code in rows["policy"].tolist()],
+        "behaviour_version": [str(v) for v in ring.meta["policy_version"][slots].tolist()],
+        "perturbation": perturbations.names(keys) if perturbations else None,
+        "perturbation_values": perturbations.values(keys) if perturbations else None,
+        **{name: rows[name] for name in _BATCH},
+    }
+
+
+def _names(coded: Coded, rows: NDArray[np.int64]) -> list[str]:
+    return [str(coded.names[code]) for code in coded.codes[rows].tolist()]
+
+
+__all__ = ["FRESH", "LOGGED", "SampledRows", "episode_sums", "fresh_audit", "logged_audit"]
