@@ -23,7 +23,6 @@ from restock.train.twin.calibration.fit_parameters import (
     DEFAULT,
     PARAMETERS,
     Coordinates,
-    parse_parameters,
 )
 from restock.train.twin.calibration.fit_solver import ReplayResiduals, position_gap_m
 from restock.train.twin.calibration.fit_uncertainty import measure_uncertainty, unidentified
@@ -256,9 +255,10 @@ def test_points_and_perturbations_are_the_same_thing() -> None:
         assert (low, high) == pytest.approx(RANGES[name])
 
 
-def test_what_cannot_be_fitted_is_named(known: Path) -> None:
-    with pytest.raises(ConfigError, match="'grip' cannot be fitted"):
-        parse_parameters("gain,grip")
+def test_what_cannot_be_fitted_is_named(known: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for names, error in (("gain,grip", "'grip' cannot be fitted"), (" ,", "no parameter is named")):
+        assert cli.main(["twin", "fit", str(known), "--parameters", names]) == ExitCode.USAGE
+        assert error in capsys.readouterr().err
     with pytest.raises(ValueError, match="'grip' cannot be fitted"):
         FitConfig(parameters=("gain", "grip"))
     with pytest.raises(ValueError, match=r"held_out must be in \[0, 1\), got 1"):

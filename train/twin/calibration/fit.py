@@ -88,6 +88,8 @@ class FitConfig(Checked, frozen=True):
 
     def check(self) -> None:
         """Raises ValueError where a parameter cannot be fitted."""
+        if not self.parameters:
+            raise ValueError(f"no parameter is named: name some of {', '.join(PARAMETERS)}")
         for name in self.parameters:
             if name not in PARAMETERS:
                 raise ValueError(f"{name!r} cannot be fitted: name some of {', '.join(PARAMETERS)}")
@@ -121,14 +123,15 @@ def fit(
     begun = time.perf_counter()
     config, report = config or FitConfig(), on_progress or (lambda text: None)
     rng = np.random.Generator(np.random.PCG64(config.seed))
-    scope = _scope(store, config)
+    task = store.task(config.task_hash)
+    scope = fit_scope(store, task, config.parameters, config.recordings)
     data = _fit_data(store, config, rng)
     few = data.segments.take(rng.permutation(len(data.segments))[:COARSE_SEGMENTS])
     coarse, fine = (
         ReplayResiduals(segments, scope.channels, timestep_s=config.step_s, nthread=config.nthread)
         for segments in (few, data.segments)
     )
-    coordinates = Coordinates(scope.names, config.base, data.steps.task)
+    coordinates = Coordinates(scope.names, config.base, task)
     start = _search(coarse, coordinates, config, report)
     solution, uncertainty, dropped = _identify(fine, coordinates, start, config, store, report)
     perturbation = msgspec.structs.replace(
@@ -155,20 +158,6 @@ def fit(
         replays=fine.replays + coarse.replays,
         work_s=time.perf_counter() - begun,
     )
-
-
-def _scope(store: Store, config: FitConfig) -> FitScope:
-    """What of the parameters the log can identify at all; ConfigError where that is nothing."""
-    task = store.task(config.task_hash)
-    scope = fit_scope(store, task, config.parameters, config.recordings)
-    if not scope.names:
-        raise ConfigError(
-            "this log can identify none of these parameters: "
-            + "; ".join(f"{name}: {reason}" for name, reason in scope.refused.items()),
-            where=str(store.path),
-            remedy="name others with --parameters, or use another log",
-        )
-    return scope
 
 
 def _fit_data(store: Store, config: FitConfig, rng: np.random.Generator) -> _FitData:

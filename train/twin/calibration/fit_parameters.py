@@ -44,7 +44,6 @@ class Parameter:
     unit: str
     step: float  # of a difference quotient; of a `ratio` the relative step
     useful: float  # a 95 % interval wider than +- this (of a ratio: its logarithm) says too little
-    doc: str
     ratio: bool = False  # searched by its logarithm
     default: bool = True
     own_body: bool = False  # says something of the twin's own body only
@@ -53,43 +52,18 @@ class Parameter:
 PARAMETERS: dict[str, Parameter] = {
     item.name: item
     for item in (
-        Parameter(
-            *("friction_scale", "", 0.04, 0.4, "the floor's grip: seen where wheels slide"),
-            ratio=True,
-            own_body=True,
-        ),
-        Parameter(
-            *("left_friction_scale", "", 0.04, 0.4, "grip of the left wheel, likewise"),
-            ratio=True,
-            default=False,
-            own_body=True,
-        ),
-        Parameter(
-            *("payload_kg", "kg", 2.0, 20.0, "load: seen while speeds change"), own_body=True
-        ),
-        Parameter(
-            "wheel_radius_scale", "", 0.004, 0.02, "distance over ground, by the wheels' distance"
-        ),
-        Parameter("track_scale", "", 0.004, 0.02, "turn over ground, by the wheels' turn"),
-        Parameter("latency_s", "s", 0.01, 0.03, "from an observation to the wheels' set point"),
-        Parameter("gain", "", 0.005, 0.02, "wheel speed, by the commanded one"),
-        Parameter("gyro_bias_radps", "rad/s", 0.001, 0.01, "what the gyro says at rest"),
+        # The floor's grip, and that of the left wheel: seen where wheels slide.
+        Parameter("friction_scale", "", 0.04, 0.4, ratio=True, own_body=True),
+        Parameter("left_friction_scale", "", 0.04, 0.4, ratio=True, own_body=True, default=False),
+        Parameter("payload_kg", "kg", 2.0, 20.0, own_body=True),  # seen while speeds change
+        Parameter("wheel_radius_scale", "", 0.004, 0.02),  # way over ground, by the wheels' way
+        Parameter("track_scale", "", 0.004, 0.02),  # turn over ground, by the wheels' turn
+        Parameter("latency_s", "s", 0.01, 0.03),  # from an observation to the wheels' set point
+        Parameter("gain", "", 0.005, 0.02),  # wheel speed, by the commanded one
+        Parameter("gyro_bias_radps", "rad/s", 0.001, 0.01),  # what the gyroscope says at rest
     )
 }
 DEFAULT = tuple(item.name for item in PARAMETERS.values() if item.default)
-
-
-def parse_parameters(text: str) -> tuple[str, ...]:
-    """`latency_s,gain` to names. Raises ConfigError where one is not in `PARAMETERS`."""
-    names = tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
-    unknown = [name for name in names if name not in PARAMETERS]
-    if unknown or not names:
-        raise ConfigError(
-            f"{unknown[0]!r} cannot be fitted" if unknown else "no parameter is named",
-            where="--parameters",
-            remedy=f"name some of {', '.join(PARAMETERS)}",
-        )
-    return names
 
 
 class Coordinates:
@@ -99,7 +73,7 @@ class Coordinates:
     """
 
     def __init__(self, names: Sequence[str], base: Perturbation, task: Task) -> None:
-        self.names, self.base = tuple(names), base
+        self.names, self.base, self.task = tuple(names), base, task
         self.parameters = [PARAMETERS[name] for name in names]
         ends = np.array([RANGES[name] for name in names], np.float64).reshape(-1, 2)
         if "latency_s" in self.names:  # four commands are kept, and a later one is not simulated
@@ -150,12 +124,7 @@ class Coordinates:
 
     def without(self, name: str) -> Coordinates:
         """The same with one parameter fewer; it stays as in `base`."""
-        made = object.__new__(Coordinates)
-        keep = [index for index, other in enumerate(self.names) if other != name]
-        made.names, made.base = tuple(self.names[i] for i in keep), self.base
-        made.parameters = [self.parameters[i] for i in keep]
-        made._ratio, made._low, made._span = self._ratio[keep], self._low[keep], self._span[keep]
-        return made
+        return Coordinates([other for other in self.names if other != name], self.base, self.task)
 
 
 @dataclass(frozen=True)
@@ -171,7 +140,11 @@ class FitScope:
 def fit_scope(
     store: Store, task: Task, names: Sequence[str], recordings: Sequence[str]
 ) -> FitScope:
-    """What of `names` the recordings (all, if none is named) can say anything about."""
+    """What of `names` the recordings (all, if none is named) can identify at all.
+
+    Raises:
+        ConfigError: nothing.
+    """
     refused: dict[str, str] = {}
     notes: list[str] = []
     channels = list(CHANNELS)
@@ -204,6 +177,13 @@ def fit_scope(
                 "neither gyroscope nor localisation measures the turn over ground"
             )
     kept = tuple(name for name in names if name not in refused)
+    if not kept:
+        raise ConfigError(
+            "this log can identify none of these parameters: "
+            + "; ".join(f"{name}: {reason}" for name, reason in refused.items()),
+            where=str(store.path),
+            remedy="name others with --parameters, or use another log",
+        )
     return FitScope(kept, tuple(channels), refused, tuple(notes))
 
 
@@ -214,14 +194,11 @@ def _recording_filter(recordings: Sequence[str]) -> str:
 
 def _pose_is_odometry(store: Store, wanted: str) -> bool:
     """Whether, in all recordings, odometry was read and no topic that a localiser publishes."""
-    types = [
-        {str(kind) for (kind,) in store.sql(
-            "SELECT DISTINCT type FROM topics WHERE decoded > 0 AND recording_id ="
-            f" '{recording}'"
-        ).fetchall()}
-        for (recording,) in store.sql(f"SELECT recording_id FROM recordings {wanted}").fetchall()
-    ]  # fmt: skip
+    rows = store.sql(
+        "SELECT recording_id, coalesce(list(DISTINCT type) FILTER (decoded > 0), [])"
+        f" FROM recordings LEFT JOIN topics USING (recording_id) {wanted} GROUP BY recording_id"
+    ).fetchall()
     return all(
-        _ODOMETRY in kinds and not any(kind.endswith(_POSE_TYPES) for kind in kinds - {_GOAL})
-        for kinds in types
+        _ODOMETRY in types and not any(kind.endswith(_POSE_TYPES) for kind in {*types} - {_GOAL})
+        for _, types in rows
     )

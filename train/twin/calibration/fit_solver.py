@@ -25,7 +25,7 @@ from scipy.stats import qmc
 
 from restock.ingest.task.signals import wrap_angle
 from restock.train.twin.calibration.fit_parameters import CHANNELS, Coordinates
-from restock.train.twin.calibration.open_loop import Replayed, replay_segments
+from restock.train.twin.calibration.open_loop import Driven, replay_segments
 from restock.train.twin.calibration.segments import LoggedSegments
 from restock.train.twin.physics.perturbation import Perturbation
 
@@ -118,7 +118,7 @@ class ReplayResiduals:
             self._known[twin] = {name: residuals[name][index] for name in self.channels}
 
 
-def channel_residuals(segments: LoggedSegments, replayed: Replayed) -> dict[str, F64]:
+def channel_residuals(segments: LoggedSegments, replayed: Driven) -> dict[str, F64]:
     """Every channel's residuals, (P, S, R) each; 0 where the log says nothing."""
     predicted, logged = replayed.signals, segments.signals
     residuals = {
@@ -146,7 +146,7 @@ def channel_residuals(segments: LoggedSegments, replayed: Replayed) -> dict[str,
     return residuals
 
 
-def position_gap_m(segments: LoggedSegments, replayed: Replayed) -> F64:
+def position_gap_m(segments: LoggedSegments, replayed: Driven) -> F64:
     """How far the twin is from the logged position, (P, S, K + 1), from a common first pose."""
     gap: F64 = np.hypot(
         replayed.signals["pose_x_m"] - segments.signals["pose_x_m"],

@@ -143,7 +143,6 @@ def one_step(
 def _sensed(driven: Driven, twin: int) -> dict[str, NDArray[Any]]:
     """What one twin senses at the end, by the names of the signals."""
     sensed = {name: values[twin, :, -1] for name, values in driven.signals.items()}
-    sensed |= {name: driven.pose[twin, :, -1, i] for i, name in enumerate(POSE)}
     sensed["sector_clearance_m"] = driven.sector_clearance_m[twin]
     return sensed | {"bumped": driven.bumped[twin]}
 

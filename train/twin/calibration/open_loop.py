@@ -1,9 +1,9 @@
 """Open loop: logged commands driven again in the twin, which is told nothing else on the way.
 
 `drive` puts robots into logged states and drives logged commands from there, one control period or
-many. `replay` drives segments of a log with it: the W steps before a segment begin with the logged
-motion, and are driven only so that ramps and late commands are under way when the K steps begin.
-Then the twin's pose is put on the logged pose, and the two go their ways.
+many. `replay_segments` drives segments of a log with it: the W steps before a segment begin with
+the logged motion, and are driven only so that ramps and late commands are under way when the K
+steps begin. Then the twin's pose is put on the logged pose, and the two go their ways.
 
 Without a floor map the floor is empty. Obstacles of a log are not known, racks of another floor are
 not there, and a pose that localisation has 3 cm wrong must not become a collision: the question is
@@ -15,7 +15,7 @@ in the middle of an empty hall, and their paths laid onto the map.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from restock.ingest.task.signals import Columns, localised_velocity, wrap_angle
 from restock.ingest.task.task import Task
 from restock.train.twin.calibration.logged_steps import rows_of
-from restock.train.twin.calibration.segments import MOTION, POSE, LoggedSegments
+from restock.train.twin.calibration.segments import POSE, LoggedSegments
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.physics.episode import Episode, EpisodeSpec
 from restock.train.twin.physics.model import TRACK_M, WHEEL_RADIUS_M, body_velocity, wheel_commands
@@ -35,11 +35,10 @@ F64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
-PREDICTED = (*POSE, *MOTION)  # signals that a replay predicts
 ROBOTS = 512  # simulated at a time
 SLIP_MPS = 0.2  # wheels and localisation this far apart: ground speed is the localised one
 EMPTY_M = 60.0  # the side of an empty floor; who comes near its wall is put back in its middle
-_SENSED = ("wheel_speed_mps", "wheel_yaw_rate_radps", "gyro_yaw_rate_radps", "accel_x_mps2")
+SENSED = ("wheel_speed_mps", "wheel_yaw_rate_radps", "gyro_yaw_rate_radps", "accel_x_mps2")
 
 
 @dataclass(frozen=True)
@@ -65,12 +64,16 @@ class Start:
 class Driven:
     """What P twins did from S starts, without sensor noise: at the start and after each period."""
 
-    pose: F64  # (P, S, K + 1, 3) x, y and heading
-    signals: dict[str, F64]  # of wheels, gyroscope and accelerometer, (P, S, K + 1) each
+    signals: dict[str, F64]  # of pose, wheels, gyroscope and accelerometer, (P, S, K + 1) each
     sliding_mps: F64  # (P, S, K + 1) of the faster sliding wheel over the floor, along the robot
     bumped: Bools  # (P, S) in the last period
     sector_clearance_m: F64  # (P, S, sectors) at the end; none on an empty floor
     blown_up: Bools  # (P, S) the physics broke: the rest says nothing
+
+    @property
+    def pose(self) -> F64:
+        """x, y and heading, (P, S, K + 1, 3)."""
+        return np.stack([self.signals[name] for name in POSE], axis=-1)
 
 
 def drive(
@@ -95,7 +98,7 @@ def drive(
     jobs, periods = shape[0] * shape[1], start.command.shape[1]
     sectors = 0 if warehouse is None else task.sectors
     pose = np.zeros((jobs, periods + 1, 3))
-    signals = {name: np.zeros((jobs, periods + 1)) for name in _SENSED}
+    signals = {name: np.zeros((jobs, periods + 1)) for name in SENSED}
     sliding = np.zeros((jobs, periods + 1))
     bumped, blown_up = np.zeros((2, jobs), np.bool_)
     clearance = np.zeros((jobs, sectors))
@@ -118,7 +121,7 @@ def drive(
             velocity = simulation.qvel
             speed, turn = body_velocity(velocity[:, 6], velocity[:, 7])
             sensed = (speed, turn, velocity[:, 5] + bias, simulation.accel[:, 0])
-            for name, values in zip(_SENSED, sensed, strict=True):
+            for name, values in zip(SENSED, sensed, strict=True):
                 signals[name][ids, step] = values
             sliding[ids, step] = _sliding(simulation, pose[ids, step, 2])
             if warehouse is None:
@@ -126,8 +129,8 @@ def drive(
         bumped[ids] = simulation.bumped
         if sectors:
             clearance[ids] = see_sectors(simulation)
+    signals |= {name: pose[..., i] for i, name in enumerate(POSE)}
     return Driven(
-        pose=pose.reshape(*shape, -1, 3),
         signals={name: values.reshape(*shape, -1) for name, values in signals.items()},
         sliding_mps=sliding.reshape(*shape, -1),
         bumped=bumped.reshape(shape),
@@ -210,34 +213,17 @@ def _sliding(simulation: Simulation, yaw_rad: F64) -> F64:
     return faster
 
 
-@dataclass(frozen=True)
-class Replayed:
-    """What P twins did under the commands of S segments.
-
-    `signals` has the names of `PREDICTED`, each (P, S, K + 1), without sensor noise; entry 0 of a
-    pose is the logged one.
-    """
-
-    perturbations: tuple[Perturbation, ...]
-    timestep_s: float
-    signals: dict[str, F64]
-    sliding_mps: F64  # (P, S, K + 1) of the faster sliding wheel over the floor, along the robot
-    blown_up: Bools  # (P, S) the physics broke: the segment says nothing
-
-    @property
-    def pose(self) -> F64:
-        """Predicted x, y and heading, (P, S, K + 1, 3)."""
-        return np.stack([self.signals[name] for name in POSE], axis=-1)
-
-
 def replay_segments(
     segments: LoggedSegments,
     perturbations: Sequence[Perturbation],
     *,
     timestep_s: float = 0.01,
     nthread: int = 1,
-) -> Replayed:
+) -> Driven:
     """Drive every segment's commands under every perturbation, on an empty floor, as `drive` does.
+
+    The signals are those of poses, laid onto the log so that each first one is the logged one, and
+    of motion, localised speeds too.
 
     Raises:
         ConfigError: as `drive`.
@@ -248,20 +234,15 @@ def replay_segments(
     start = Start(np.zeros((len(segments), 3)), motion, segments.command)
     driven = drive(segments.task, start, perturbations, timestep_s=timestep_s, nthread=nthread)
     warmup = segments.warmup_steps
-    signals = {name: values[..., warmup:] for name, values in driven.signals.items()}
+    signals = {name: driven.signals[name][..., warmup:] for name in SENSED}
     forward, lateral = _localised(
         driven.pose, segments.task.control_period_s, signals["wheel_speed_mps"]
     )
     signals["localised_speed_mps"], signals["localised_lateral_mps"] = forward, lateral
     laid = lay(driven.pose[:, :, warmup:], segments.pose[:, 0])
     laid[..., 2] = wrap_angle(laid[..., 2])
-    return Replayed(
-        perturbations=tuple(perturbations),
-        timestep_s=timestep_s,
-        sliding_mps=driven.sliding_mps[..., warmup:],
-        signals={**{name: laid[..., i] for i, name in enumerate(POSE)}, **signals},
-        blown_up=driven.blown_up,
-    )
+    signals |= {name: laid[..., i] for i, name in enumerate(POSE)}
+    return replace(driven, signals=signals, sliding_mps=driven.sliding_mps[..., warmup:])
 
 
 def _localised(pose: F64, period_s: float, wheel_speed: F64) -> tuple[F64, F64]:

@@ -35,30 +35,21 @@ FOLDER = "gap"  # where a report looks for it, in a run's directory or a store's
 _F, _I, _S = pa.float64(), pa.int64(), pa.string()
 
 
-def _interval(name: str) -> list[tuple[str, pa.DataType]]:
-    return [(name, _F), (f"{name}_low", _F), (f"{name}_high", _F)]
+def _interval(name: str) -> dict[str, pa.DataType]:
+    return {name: _F, f"{name}_low": _F, f"{name}_high": _F}
 
 
 TABLES: dict[str, pa.Schema] = {
     "paths": pa.schema(
-        [
-            *(("condition", _S), ("horizon_s", _F), ("quantity", _S), ("unit", _S)),
-            *(("source", _S), ("segments", _I), ("episodes", _I)),
-            *(*_interval("median"), *_interval("p90")),
-        ]
+        {"condition": _S, "horizon_s": _F, "quantity": _S, "unit": _S, "source": _S}
+        | {"segments": _I, "episodes": _I, **_interval("median"), **_interval("p90")}
     ),
     "observations": pa.schema(
-        [
-            *(("condition", _S), ("component", _S), ("source", _S), ("steps", _I)),
-            *_interval("mean_gap"),
-        ]
+        {"condition": _S, "component": _S, "source": _S, "steps": _I, **_interval("mean_gap")}
     ),
     "rewards": pa.schema(
-        [
-            *(("condition", _S), ("term", _S), ("source", _S), ("steps", _I)),
-            *_interval("mean_gap"),
-            *(("bias", _F), ("logged_mean", _F), ("logged_spread", _F)),
-        ]
+        {"condition": _S, "term": _S, "source": _S, "steps": _I, **_interval("mean_gap")}
+        | {"bias": _F, "logged_mean": _F, "logged_spread": _F}
     ),
 }
 

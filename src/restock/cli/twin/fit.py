@@ -91,7 +91,6 @@ class FitCommand:
         from restock.cli import output
         from restock.toml import typed
         from restock.train.twin.calibration.fit import FitConfig, fit
-        from restock.train.twin.calibration.fit_parameters import parse_parameters
         from restock.train.twin.physics.perturbation import load_perturbation
 
         name = "fitted" if self.out is None else self.out.stem
@@ -108,7 +107,8 @@ class FitCommand:
             "name": f"{name} {recordings[0]}" if self.per_recording else name,
         }
         if self.parameters is not None:
-            values["parameters"] = parse_parameters(self.parameters)
+            names = [name.strip() for name in self.parameters.split(",")]
+            values["parameters"] = list(dict.fromkeys(filter(None, names)))
         if self.base is not None:
             values["base"] = load_perturbation(self.base)
         config = typed(values, FitConfig, where="restock twin fit")
