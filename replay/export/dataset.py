@@ -62,7 +62,7 @@ def export_dataset(
     if needs and find_spec(needs) is None:
         raise StoreError(
             f"the format {to} needs {needs}, which is not installed",
-            remedy=f"pip install {needs}, or `pip install restock[neighbours]`",
+            remedy=f"pip install {needs}, or `pip install restock[libraries]`",
         )
     out = Path(out)
     if ending and out.suffix != ending:

@@ -16,7 +16,7 @@ class ExportCommand:
     Takes a panel, or the rows of a query to a store, and puts them back together into episodes:
     in order, with how each ended and the observation after its last step. Where a query leaves
     rows out, an episode becomes several, cut where rows are missing. The data set says where it is
-    from: store version, query or panel, task, counts. See docs/neighbours.md. The policy is the one
+    from: store version, query or panel, task, counts. See docs/libraries.md. The policy is the one
     that a run kept as its best, with the task in the file's metadata. See docs/deploy.md.
     """
 
