@@ -44,8 +44,7 @@ from restock.replay.mixture.packed_row import row_width
 from restock.replay.ring.ring import FreshRing
 from restock.replay.sampling.chunked import ChunkedSampler
 from restock.replay.sampling.device import DeviceSampler
-from restock.replay.sampling.per import PrioritySampler
-from restock.replay.sampling.priorities import Lap, Per
+from restock.replay.sampling.priorities import Lap, Per, PrioritySampler
 from restock.replay.sampling.sampler import uniform_sampler
 
 MANY_WIDTH = 16  # floats in a row, of ten million

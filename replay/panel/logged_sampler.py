@@ -25,7 +25,7 @@ from restock.replay.panel.plan import outcome_column
 from restock.replay.panel.strata import rules_of
 from restock.replay.panel.weights import WeightsInForce
 from restock.replay.sampling.chunked import ChunkedSampler
-from restock.replay.sampling.per import sampler_by_rules
+from restock.replay.sampling.priorities import sampler_by_rules
 from restock.replay.sampling.sampler import QuotaSampler, Sampler
 from restock.replay.sampling.share_controller import (
     PlannedDraws,

@@ -12,8 +12,8 @@ boosted one goes round more often. Quotas are exact in every batch, as everywher
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +22,14 @@ from restock.errors import MixtureError
 from restock.replay.mixture.packed_row import F32, F64, Ints
 from restock.replay.sampling.quotas import Quotas
 from restock.replay.sampling.row_file import RowFile
+from restock.replay.sampling.sampler import another_sampler
+from restock.state import Stateful
 
 CHUNK_ROWS = 16_384
 MEMORY_BYTES = 512 << 20
 
 
-class ChunkedSampler:
+class ChunkedSampler(Stateful):
     """Exact quotas per batch over strata of a panel that need not fit in memory.
 
     Args:
@@ -46,6 +48,9 @@ class ChunkedSampler:
             for buffers of two chunks.
         PanelError: `rows` is not memory-mapped.
     """
+
+    SAME: ClassVar[tuple[str, ...]] = ("sizes",)
+    STATE: ClassVar[tuple[str, ...]] = ("quotas", "rng", "buffers")
 
     def __init__(
         self,
@@ -139,39 +144,24 @@ class ChunkedSampler:
         """Close the panel's file."""
         self._file.close()
 
-    def state_dict(self) -> dict[str, Any]:
-        """All that decides the draws to come: arrays and JSON values, row numbers but no rows."""
-        return {
-            "carry": self.quotas.carry,
-            "shares": self.shares.copy(),
-            "batch_size": self.batch_size,
-            "sizes": self.sizes.copy(),
-            "rng": self.rng.bit_generator.state,
-            "buffers": {str(s): buffer.state_dict() for s, buffer in enumerate(self.buffers)},
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Reads the buffers' rows again. Raises MixtureError for a sampler over other strata."""
-        if "buffers" not in state or not np.array_equal(state["sizes"], self.sizes):
-            raise MixtureError(
-                "the saved sampler drew from other strata, or by another rule",
-                remedy="resume with the panel and the settings the run began with",
-            )
-        self.quotas.set_batch_size(int(state["batch_size"]))
-        self.quotas.set_shares(np.asarray(state["shares"]))
-        self.quotas.carry = np.array(state["carry"], np.float64)
-        self.rng.bit_generator.state = state["rng"]
-        for stratum, buffer in enumerate(self.buffers):
-            buffer.load_state_dict(state["buffers"][str(stratum)])
+    def restored(self) -> None:
+        """The rows of the batch last drawn are not in the buffers any more."""
         self._slots = []
 
+    def mismatch(self, name: str, value: Any) -> MixtureError:
+        """Of a state of a sampler over other strata."""
+        return another_sampler()
 
-class _Buffer:
+
+class _Buffer(Stateful):
     """A stratum's shuffle buffer: `capacity` rows, filled up a chunk at a time.
 
     `order` names the slots that hold rows to be drawn, the first `filled` of it, in random order;
     the slots behind are free.
     """
+
+    SAME: ClassVar[tuple[str, ...]] = ("capacity", "chunk_rows")
+    STATE: ClassVar[tuple[str, ...]] = ("numbers", "_order", "_filled", "_chunks", "_loaded")
 
     def __init__(self, file: RowFile, members: Ints, capacity: int, chunk_rows: int) -> None:
         self._file, self._members = file, members  # ascending
@@ -239,30 +229,15 @@ class _Buffer:
         begin = int(self._chunks[index]) * self.chunk_rows
         return self._members[begin : begin + self.chunk_rows]
 
-    def state_dict(self) -> dict[str, Any]:
-        """Arrays and JSON values."""
-        return {
-            "numbers": self.numbers.copy(),
-            "order": self._order.copy(),
-            "filled": self._filled,
-            "chunks": self._chunks.copy(),
-            "chunk_rows": self.chunk_rows,
-            "loaded": self._loaded,
-        }
+    def mismatch(self, name: str, value: Any) -> MixtureError:
+        """Of a state of another memory, or other chunks."""
+        return MixtureError(
+            f"the saved buffer's {name} was {value}, this one's is {getattr(self, name)}",
+            remedy="resume with the memory and the chunks the run began with",
+        )
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Raises MixtureError for a buffer of another size."""
-        if len(state["numbers"]) != self.capacity or state["chunk_rows"] != self.chunk_rows:
-            raise MixtureError(
-                f"the saved buffer held {len(state['numbers']):,} rows read {state['chunk_rows']:,}"
-                f" at a time, this one {self.capacity:,} and {self.chunk_rows:,}",
-                remedy="resume with the memory and the chunks the run began with",
-            )
-        self.numbers = np.array(state["numbers"], np.int64)
-        self._order = np.array(state["order"], np.int64)
-        self._filled = int(state["filled"])
-        self._chunks = np.array(state["chunks"], np.int64)
-        self._loaded = bool(state["loaded"])
+    def restored(self) -> None:
+        """Read the buffer's rows again."""
         # Rows that were drawn already need not be read again.
         held = np.arange(self.capacity) if self.whole else self._order[: self._filled]
         held = held[self.numbers[held] >= 0]

@@ -12,8 +12,8 @@ sampler.update(rows, td.abs())                            # nor does this wait f
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -24,13 +24,13 @@ from restock.errors import MixtureError
 from restock.replay.mixture.packed_row import F64, Ints
 from restock.replay.sampling.priorities import Exponents, Lap, Per, Rule
 from restock.replay.sampling.quotas import Quotas
-from restock.replay.sampling.sampler import BLOCK
+from restock.replay.sampling.sampler import BLOCK, another_sampler
+from restock.state import Stateful
 
-_PRIORITY_STATE = ("priority", "new", "largest", "finite")
 _SUM_BITS = 62  # priorities are summed as integers, which add up alike in any order
 
 
-class DeviceSampler:
+class DeviceSampler(Stateful):
     """Exact quotas per batch over strata; within one uniformly, in shuffled turns or by priority.
 
     Args:
@@ -46,6 +46,13 @@ class DeviceSampler:
     Raises:
         MixtureError: shares that are no distribution, or a share on an empty stratum.
     """
+
+    SAME: ClassVar[tuple[str, ...]] = ("sizes", "_turns", "_ruled")
+    STATE: ClassVar[tuple[str, ...]] = (
+        *("quotas", "generator", "_orders", "_returned", "_cursor"),
+        *("_quota_ahead", "_rows_ahead", "_strata_ahead", "_weights_ahead", "_next", "_batches"),
+        *("_priority", "_new", "_largest", "_finite"),
+    )
 
     def __init__(
         self,
@@ -74,15 +81,21 @@ class DeviceSampler:
         joined = np.concatenate([np.asarray(rows, np.int64) for rows in stratum_rows])
         self._members = torch.from_numpy(joined).to(self.device)  # (N,) stratum by stratum
         self._first: Ints = np.concatenate([[0], np.cumsum(self.sizes)])[:-1].astype(np.int64)
-        self._orders = {stratum: self._shuffled(stratum) for stratum in self._turns}
-        self._returned = dict.fromkeys(self._turns, self._members[:0])
-        self._cursor = dict.fromkeys(self._turns, 0)
+        # Of each stratum, where it is gone through in turns.
+        self._orders = [
+            self._shuffled(stratum) if stratum in self._turns else self._members[:0]
+            for stratum in range(strata)
+        ]
+        self._returned = [self._members[:0]] * strata
+        self._cursor = [0] * strata
         self._quota_ahead: Ints = np.zeros((0, len(self.sizes)), np.int64)
         self._rows_ahead = self._strata_ahead = self._members.new_zeros((0, batch_size))
         self._weights_ahead: Tensor | None = None
         self._next = 0  # of those drawn ahead
         self._batches = 0  # handed out
         self._ruled = any(own is not None for own in self.rules)
+        self._priority = self._largest = torch.zeros(0, device=self.device)
+        self._new = self._finite = torch.zeros(0, dtype=torch.bool, device=self.device)
         if self._ruled:
             self._place = torch.full((int(joined.max()) + 1,), -1, device=self.device)
             self._place[self._members] = torch.arange(len(joined), device=self.device)
@@ -188,7 +201,7 @@ class DeviceSampler:
         first, size = int(self._first[stratum]), int(self.sizes[stratum])
         if (rule := self.rules[stratum]) is not None:
             return self._take_by_priority(rule, stratum, count)
-        if stratum not in self._orders:
+        if stratum not in self._turns:
             at = (self._random(count) * size).long().clamp_max(size - 1)
             return self._members[first + at], None
         back = self._returned[stratum]
@@ -253,65 +266,18 @@ class DeviceSampler:
         """Forget what is drawn ahead: quotas are owed again, rows that had their turn are next."""
         rows, strata = self._rows_ahead[self._next :], self._strata_ahead[self._next :]
         self.quotas.give_back(self._quota_ahead[self._next :])
-        for stratum, back in self._returned.items():
+        for stratum in self._turns:
+            back = self._returned[stratum]
             self._returned[stratum] = torch.cat([rows[strata == stratum], back])
         self._rows_ahead, self._strata_ahead = rows[:0], strata[:0]
         self._quota_ahead, self._weights_ahead = self._quota_ahead[:0], None
         self._next = 0
 
-    def state_dict(self) -> dict[str, Any]:
-        """All that decides the draws to come: tensors, arrays and JSON values."""
-        state: dict[str, Any] = {
-            "carry": self.quotas.carry,
-            "shares": self.shares.copy(),
-            "sizes": self.sizes.copy(),
-            "quota_ahead": self._quota_ahead[self._next :].copy(),
-            "rows_ahead": self._rows_ahead[self._next :].cpu().clone(),
-            "strata_ahead": self._strata_ahead[self._next :].cpu().clone(),
-            "generator": self.generator.get_state().clone(),
-            "batches": self._batches,
-        }
-        if self._weights_ahead is not None:
-            state["weights_ahead"] = self._weights_ahead[self._next :].cpu().clone()
-        if self._turns:
-            state["turns"] = list(self._turns)
-            state["order"] = torch.cat(list(self._orders.values())).cpu()
-            state["cursor"] = list(self._cursor.values())
-            state["returned"] = torch.cat(list(self._returned.values())).cpu()
-            state["returned_count"] = [len(rows) for rows in self._returned.values()]
-        if self._ruled:
-            for name in _PRIORITY_STATE:
-                state[name] = getattr(self, f"_{name}").cpu().clone()
-        return state
+    def mismatch(self, name: str, value: Any) -> MixtureError:
+        """Of a state of a sampler over other strata."""
+        return another_sampler()
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Raises MixtureError when the state is of a sampler over other strata."""
-        if (
-            not np.array_equal(state["sizes"], self.sizes)
-            or list(state.get("turns", [])) != self._turns
-            or ("priority" in state) != self._ruled
-        ):
-            raise MixtureError(
-                "the saved sampler drew from other strata, or by another rule",
-                remedy="resume with the panel and the settings the run began with",
-            )
-        self.quotas.set_batch_size(int(state["rows_ahead"].shape[1]))
-        self.quotas.set_shares(np.asarray(state["shares"]))
-        self.quotas.carry = np.array(state["carry"], np.float64)
-        self._quota_ahead = np.array(state["quota_ahead"], np.int64)
-        self._rows_ahead = state["rows_ahead"].to(self.device)
-        self._strata_ahead = state["strata_ahead"].to(self.device)
-        weights = state.get("weights_ahead")
-        self._weights_ahead = None if weights is None else weights.to(self.device)
-        self._next, self._batches = 0, int(state["batches"])
-        self.generator.set_state(state["generator"].cpu())
-        if self._turns:
-            orders = state["order"].to(self.device).split(self.sizes[self._turns].tolist())
-            counts = [int(count) for count in state["returned_count"]]
-            returned = state["returned"].to(self.device).split(counts)
-            self._orders = dict(zip(self._turns, orders, strict=True))
-            self._returned = dict(zip(self._turns, returned, strict=True))
-            self._cursor = dict(zip(self._turns, map(int, state["cursor"]), strict=True))
-        if self._ruled:
-            for name in _PRIORITY_STATE:
-                setattr(self, f"_{name}", state[name].to(self.device))
+    def restored(self) -> None:
+        """Weights that were drawn ahead go to the device."""
+        if self._weights_ahead is not None:
+            self._weights_ahead = self._weights_ahead.to(self.device)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 
 from restock.errors import MixtureError
 from restock.replay.mixture.packed_row import F64, Ints
+from restock.state import Stateful
 
 
-class Quotas:
+class Quotas(Stateful):
     """Shares to whole rows per batch by largest remainder, the rounding carried to the next.
 
     Shares and batch size may change between batches; what a stratum is owed stays owed.
@@ -22,6 +24,8 @@ class Quotas:
     Raises:
         MixtureError: shares that are no distribution or on an empty stratum, or a batch of no rows.
     """
+
+    STATE: ClassVar[tuple[str, ...]] = ("shares", "batch_size", "_carry")
 
     def __init__(
         self, shares: Sequence[float] | F64, batch_size: int, sizes: Ints | None = None
@@ -76,6 +80,10 @@ class Quotas:
             raise MixtureError(f"batch_size must be at least 1, got {batch_size}")
         self.batch_size = batch_size
         self._mean = (self.shares * batch_size).tolist()
+
+    def restored(self) -> None:
+        """What follows from shares and batch size."""
+        self._mean = (self.shares * self.batch_size).tolist()
 
     def next(self) -> Ints:
         """Rows per stratum of the next batch, (S,); they sum to the batch size."""

@@ -7,7 +7,7 @@ of 12, and a share of 0.003 of a batch is met over time, because the rounding is
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from restock.errors import MixtureError
 from restock.replay.mixture.packed_row import F32, F64, Ints
 from restock.replay.sampling.quotas import Quotas
+from restock.state import Stateful
 
 BLOCK = 64  # batches drawn at a time
 
@@ -52,7 +53,7 @@ class Sampler(Protocol):
         """Puts the draws to come where `state_dict` found them."""
 
 
-class QuotaSampler:
+class QuotaSampler(Stateful):
     """Exact quotas per batch over strata of rows, each stratum's rows alike.
 
     Batches are drawn BLOCK at a time and handed out one by one, which takes the cost of a draw from
@@ -72,6 +73,11 @@ class QuotaSampler:
         MixtureError: shares that are no distribution, or a share on an empty stratum.
     """
 
+    SAME: ClassVar[tuple[str, ...]] = ("sizes", "_turns")
+    STATE: ClassVar[tuple[str, ...]] = (
+        *("quotas", "rng", "_orders", "_cursor", "_returned"),
+        *("_ahead_rows", "_ahead_strata", "_next"),
+    )
     block = BLOCK
 
     def __init__(
@@ -194,50 +200,27 @@ class QuotaSampler:
         self._ahead_rows, self._ahead_strata = rows[:0], strata[:0]
         self._next = 0
 
-    def state_dict(self) -> dict[str, Any]:
-        """Carried rounding, what is drawn ahead, orders, the generator: arrays and JSON values."""
-        state: dict[str, Any] = {
-            "carry": self.quotas.carry.copy(),
-            "shares": self.shares.copy(),
-            "sizes": self.sizes.copy(),
-            "ahead_rows": self._ahead_rows[self._next :].copy(),
-            "ahead_strata": self._ahead_strata[self._next :].copy(),
-            "rng": self.rng.bit_generator.state,
-        }
-        if self._turns:
-            returned = [self._returned[stratum] for stratum in self._turns]
-            state |= {
-                "turns": list(self._turns),
-                "cursor": self._cursor.copy(),
-                "order": np.concatenate([self._members[stratum] for stratum in self._turns]),
-                "returned": np.concatenate(returned),
-                "returned_count": np.array([len(rows) for rows in returned], np.int64),
-            }
-        return state
+    @property
+    def _orders(self) -> list[Ints]:
+        """The rows of each stratum that is gone through in turns, in their order."""
+        return [self._members[stratum] for stratum in self._turns]
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Raises MixtureError when the state is of a sampler over other strata."""
-        if (
-            not np.array_equal(state["sizes"], self.sizes)
-            or list(state.get("turns", [])) != self._turns
-        ):
-            raise MixtureError(
-                "the saved sampler drew from other strata, or by another rule",
-                remedy="resume with the panel and the settings the run began with",
-            )
-        self.quotas.set_batch_size(int(state["ahead_rows"].shape[1]))
-        self.quotas.set_shares(np.asarray(state["shares"]))
-        self.quotas.carry = np.array(state["carry"], np.float64)
-        self._ahead_rows = np.array(state["ahead_rows"], np.int64)
-        self._ahead_strata = np.array(state["ahead_strata"], np.int64)
-        self._next = 0
-        self.rng.bit_generator.state = state["rng"]
-        if self._turns:
-            self._cursor = np.array(state["cursor"], np.int64)
-            orders = _parts(state["order"], self.sizes[self._turns])
-            returned = _parts(state["returned"], state["returned_count"])
-            for stratum, order, back in zip(self._turns, orders, returned, strict=True):
-                self._members[stratum], self._returned[stratum] = order, back
+    @_orders.setter
+    def _orders(self, orders: list[Ints]) -> None:
+        for stratum, order in zip(self._turns, orders, strict=True):
+            self._members[stratum] = order
+
+    def mismatch(self, name: str, value: Any) -> MixtureError:
+        """Of a state of a sampler over other strata."""
+        return another_sampler()
+
+
+def another_sampler() -> MixtureError:
+    """The saved state is not of this sampler."""
+    return MixtureError(
+        "the saved sampler drew from other strata, or by another rule",
+        remedy="resume with the panel and the settings the run began with",
+    )
 
 
 def _by_stratum(quota: Ints) -> Ints:
@@ -249,15 +232,9 @@ def _by_stratum(quota: Ints) -> Ints:
     )
 
 
-def _parts(joined: NDArray[Any], counts: Ints) -> list[Ints]:
-    """Arrays of `counts` (S,) entries, one after the other in `joined`."""
-    ends = np.cumsum(counts)[:-1]
-    return [part.copy() for part in np.split(np.array(joined, np.int64), ends)]
-
-
 def uniform_sampler(rows: int, batch_size: int, rng: np.random.Generator) -> QuotaSampler:
     """Every row with the same probability: one stratum of all rows."""
     return QuotaSampler([np.arange(rows)], [1.0], batch_size, rng)
 
 
-__all__ = ["BLOCK", "QuotaSampler", "Quotas", "Sampler", "uniform_sampler"]
+__all__ = ["BLOCK", "QuotaSampler", "Quotas", "Sampler", "another_sampler", "uniform_sampler"]

@@ -10,17 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import MixtureError
-from restock.replay.mixture.mixture import Mixture, Shortfall, SourceShares, StratumRule
+from restock.replay.mixture.mixture import Adaptive, Mixture, Shortfall, SourceShares, StratumRule
 from restock.replay.mixture.packed_row import F64, Ints
 from restock.replay.mixture.schedules import knots, mean_over, value_at
-from restock.replay.mixture.shares import wanted_shares, within_limits
-from restock.replay.sampling.adaptive import GroupDro
+from restock.replay.mixture.shares import scaled_within, wanted_shares, within_limits
+from restock.state import Stateful
 
 REFRESH_BATCHES = 64  # shares with a schedule are worked out anew after so many
 
@@ -46,9 +46,65 @@ class SampledStratum:
     episodes: int
 
 
+class GroupDro(Stateful):
+    """The shares (S,) of the strata of one source, and what their rows erred since the last step.
+
+    Group distributionally robust optimisation (Sagawa, Koh, Hashimoto and Liang, ICLR 2020,
+    arXiv:1911.08731), algorithm 1: q_g <- q_g exp(eta loss_g), normalised. There the gradient step
+    is weighted by q; here q is the share of the draws, which is the same in expectation and wastes
+    no rows. The loss of a group is its mean |TD error|, in units of the groups' mean, so that eta
+    means the same whatever the scale of rewards. Floor and ceiling keep every group sampled, and
+    none from taking all.
+
+    `shares` begin as planned; a stratum of share 0 stays at 0.
+
+    Raises:
+        MixtureError: floors that sum to more than 1, or ceilings to less.
+    """
+
+    STATE: ClassVar[tuple[str, ...]] = ("shares", "td_abs", "_sum", "_rows")
+
+    def __init__(self, rule: Adaptive, shares: F64, floor: F64, cap: F64) -> None:
+        self.rule = rule
+        drawn = shares > 0
+        self.low: F64 = np.where(drawn, np.maximum(floor, rule.floor), 0.0)
+        self.high: F64 = np.where(drawn, np.minimum(cap, rule.ceiling), 0.0)
+        self.low = np.minimum(self.low, self.high)
+        if self.low.sum() > 1 + 1e-9 or self.high.sum() < 1 - 1e-9:
+            raise MixtureError(
+                f"adaptive: {int(drawn.sum())} strata cannot share out 1 with floors that sum to"
+                f" {self.low.sum():g} and ceilings that sum to {self.high.sum():g}",
+                remedy="lower adaptive.floor, raise adaptive.ceiling, or drop [adaptive]",
+            )
+        self.shares: F64 = scaled_within(shares, self.low, self.high)
+        self.td_abs: F64 = np.full(len(shares), np.nan)  # what the last step saw, (S,)
+        self._sum: F64 = np.zeros(len(shares))
+        self._rows: Ints = np.zeros(len(shares), np.int64)
+
+    def observe(self, stratum: NDArray[Any], td_abs: NDArray[Any]) -> None:
+        """|TD error| (n,) of rows of these strata (n,)."""
+        self._sum += np.bincount(stratum, td_abs, minlength=len(self._sum))
+        self._rows += np.bincount(stratum, minlength=len(self._rows))
+
+    def step(self) -> F64:
+        """Take one step; returns the new shares (S,). A stratum that was not drawn errs as all."""
+        seen = self._rows > 0
+        if seen.any():
+            error = np.divide(self._sum, self._rows, out=np.zeros(len(seen)), where=seen)
+            unit = max(float(error[seen].mean()), 1e-12)
+            factor = np.exp(self.rule.step_size * np.where(seen, error / unit, 1.0))
+            self.shares = scaled_within(self.shares * factor, self.low, self.high)
+            self.td_abs = np.where(seen, error, np.nan)
+        self._sum[:] = 0.0
+        self._rows[:] = 0
+        return self.shares
+
+
 @dataclass
-class _Source:
+class _Source(Stateful):
     """The strata of one source, and what it is planned to give."""
+
+    STATE: ClassVar[tuple[str, ...]] = ("dro",)
 
     name: str
     strata: slice
@@ -61,7 +117,7 @@ class _Source:
     dro: GroupDro | None = None
 
 
-class ShareController:
+class ShareController(Stateful):
     """Shares in force and draws so far, over the strata of a panel, (S,).
 
     Args:
@@ -76,6 +132,11 @@ class ShareController:
     Raises:
         MixtureError: rows that cannot bear the offline phase, or a shortfall the mixture refuses.
     """
+
+    SAME: ClassVar[tuple[str, ...]] = ("names",)
+    STATE: ClassVar[tuple[str, ...]] = (
+        *("drawn", "batches", "learnt", "env_steps", "sources", "shares", "logs_share"),
+    )
 
     def __init__(
         self,
@@ -276,37 +337,28 @@ class ShareController:
             )
         return rows
 
+    @property
+    def names(self) -> list[str]:
+        """Of the strata, (S,)."""
+        return [stratum.name for stratum in self.strata]
+
     def state_dict(self) -> dict[str, Any]:
         """Arrays and JSON values, for a checkpoint."""
-        return {
-            "planned": asdict(self.planned),
-            "drawn": self.drawn.copy(),
-            "batches": self.batches,
-            "learnt": self.learnt,
-            "env_steps": self.env_steps,
-            "shares": self.shares.copy(),
-            "logs_share": self.logs_share,
-            "dro": [s.dro.state_dict() if s.dro is not None else None for s in self.sources],
-        }
+        return super().state_dict() | {"planned": asdict(self.planned)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts the diet where `state_dict` found it; a budget that was extended is planned anew.
+        """Goes on where `state_dict` was taken; a budget that was extended is planned again.
 
         Raises:
             MixtureError: the state is of other strata.
         """
-        if len(state["drawn"]) != len(self.drawn) or len(state["dro"]) != len(self.sources):
-            raise MixtureError(
-                "the saved diet is of other strata",
-                remedy="resume with the panel and the settings the run began with",
-            )
-        self.drawn = np.array(state["drawn"], np.int64)
-        self.batches, self.learnt = int(state["batches"]), int(state["learnt"])
-        self.env_steps = float(state["env_steps"])
-        for source, saved in zip(self.sources, state["dro"], strict=True):
-            if source.dro is not None and saved is not None:
-                source.dro.load_state_dict(saved)
-        self.shares = np.array(state["shares"], np.float64)
-        self.logs_share = float(state["logs_share"])
+        super().load_state_dict(state)
         if state["planned"] != asdict(self.planned):
             self._work_out("redistribute")
+
+    def mismatch(self, name: str, value: Any) -> MixtureError:
+        """Of a state of other strata."""
+        return MixtureError(
+            "the saved shares are of other strata",
+            remedy="resume with the panel and the settings the run began with",
+        )

@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from restock.errors import MixtureError, PanelError
 from restock.replay.sampling.chunked import ChunkedSampler
 from restock.replay.sampling.row_file import RowFile
-from restock.train.run import checkpoint
 
 WIDTH = 5
 
@@ -102,37 +101,16 @@ def test_draws_are_mixed_across_the_file(thousand: Any) -> None:
     assert np.mean(chunks) > 3
 
 
-@pytest.mark.parametrize("before", [0, 3, 90])
-def test_a_restored_sampler_goes_on_exactly(thousand: Any, tmp_path: Path, before: int) -> None:
-    def fresh(seed: int) -> ChunkedSampler:
-        return ChunkedSampler(
-            thousand,
-            [np.arange(0, 900), np.arange(900, 1000)],
-            [0.8, 0.2],
-            16,
-            np.random.default_rng(seed),
-            chunk_rows=60,
-            memory_bytes=memory_for(400),
-        )
+def test_a_state_of_other_chunks_is_refused(thousand: Any) -> None:
+    def sampler(**reading: int) -> ChunkedSampler:
+        rng = np.random.default_rng(0)
+        return ChunkedSampler(thousand, [np.arange(1000)], [1.0], 4, rng, **reading)
 
-    def go_on(sampler: ChunkedSampler, batches: int) -> list[np.ndarray]:
-        seen = []
-        for index in range(batches):
-            if index == 5:
-                sampler.set_shares([0.5, 0.5])
-                sampler.set_batch_size(11)
-            drawn, _ = sampler.draw()
-            out = np.empty((len(drawn), WIDTH), np.float32)
-            sampler.gather(out)
-            seen += [drawn, out]
-        return seen
-
-    first, second = fresh(1), fresh(2)
-    go_on(first, before)
-    checkpoint.save(tmp_path / "state", first.state_dict())
-    second.load_state_dict(checkpoint.load(tmp_path / "state"))
-    for one, other in zip(go_on(first, 100), go_on(second, 100), strict=True):
-        np.testing.assert_array_equal(one, other)
+    state = sampler(chunk_rows=50, memory_bytes=memory_for(300)).state_dict()
+    with pytest.raises(MixtureError, match="capacity was 300, this one's is 400"):
+        sampler(chunk_rows=50, memory_bytes=memory_for(400)).load_state_dict(state)
+    with pytest.raises(MixtureError, match="chunk_rows was 50, this one's is 40"):
+        sampler(chunk_rows=40, memory_bytes=memory_for(300)).load_state_dict(state)
 
 
 @pytest.fixture(scope="module")

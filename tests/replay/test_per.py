@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import numpy as np
@@ -10,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
+from support.states import through_json
 
 from restock.errors import MixtureError
-from restock.replay.sampling.per import PrioritySampler
-from restock.replay.sampling.priorities import Lap, Per, Priorities, Rule
+from restock.replay.sampling.priorities import Lap, Per, Priorities, PrioritySampler, Rule
 
 STRATA = [np.arange(0, 400, 2), np.arange(1, 101, 2)]  # 200 and 50 rows
 SHARES = [0.7, 0.3]
@@ -46,22 +45,6 @@ def priority(rule: Rule | None, td_abs: np.ndarray) -> np.ndarray:
 
 def expected(priority: np.ndarray) -> np.ndarray:
     return priority / priority.sum()
-
-
-@pytest.mark.parametrize("rule", [Per(alpha=0.7), Lap()])
-def test_draws_are_in_proportion_to_priorities_within_each_stratum(rule: Rule) -> None:
-    drawing, td = sampler(rule), errors()
-    for rows in STRATA:
-        drawing.update(rows, td[rows])
-    counts = np.zeros(400)
-    for _ in range(4000):
-        drawn, stratum = drawing.draw()
-        assert np.bincount(stratum).tolist() == [35, 15]  # quotas stay exact
-        np.add.at(counts, drawn, 1)
-    for rows, total in zip(STRATA, (140_000, 60_000), strict=True):
-        assert counts[rows].sum() == total
-        wanted = expected(priority(rule, td[rows])) * total
-        assert stats.chisquare(counts[rows], wanted).pvalue > 1e-4
 
 
 def test_priorities_are_those_of_the_papers() -> None:
@@ -210,16 +193,6 @@ def test_every_row_drawn_is_of_its_stratum_whatever_the_priorities(
         drawing.update(drawn, 10 ** rng.uniform(-30, 30, batch_size))
 
 
-def through_json(state: dict[str, Any]) -> dict[str, Any]:
-    """As a checkpoint keeps it: arrays as arrays, everything else as JSON."""
-    return {
-        key: through_json(value)
-        if isinstance(value, dict) and key != "rng"
-        else (value.copy() if isinstance(value, np.ndarray) else json.loads(json.dumps(value)))
-        for key, value in state.items()
-    }
-
-
 @settings(max_examples=30, deadline=None)
 @given(
     before=st.integers(0, 30),
@@ -259,5 +232,3 @@ def test_what_cannot_be_a_priority_is_refused() -> None:
         Priorities([np.arange(3), np.arange(2, 5)], [Lap()] * 2)
     with pytest.raises(MixtureError, match="alpha"):
         Per(alpha=2.0)
-    with pytest.raises(MixtureError, match="did not draw by priority"):
-        sampler(Lap()).load_state_dict({})

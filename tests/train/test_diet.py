@@ -21,7 +21,7 @@ from restock.replay.panel.logged_sampler import LoggedSampler
 from restock.replay.panel.panel import Panel
 from restock.replay.panel.strata import rules_of
 from restock.replay.ring.ring import FreshRing
-from restock.replay.sampling.per import sampler_by_rules
+from restock.replay.sampling.priorities import sampler_by_rules
 from restock.replay.sampling.share_controller import PlannedDraws, SampledStratum, ShareController
 from restock.train.feed.batches import Batches
 from restock.train.feed.logs import Logs

@@ -1,0 +1,321 @@
+"""What every sampler does: exact quotas met over time, rows as the rule says, and the same draws
+after a restart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+from support.states import through_json
+
+from restock.errors import MixtureError
+from restock.replay.sampling.chunked import ChunkedSampler
+from restock.replay.sampling.device import DeviceSampler
+from restock.replay.sampling.priorities import Lap, Per, PrioritySampler, Rule
+from restock.replay.sampling.sampler import Quotas, QuotaSampler, uniform_sampler
+from restock.train.run import checkpoint
+
+STRATA = [np.arange(0, 400, 2), np.arange(1, 101, 2)]  # 200 and 50 rows
+SHARES = [0.7, 0.3]
+PARTS = st.lists(st.integers(0, 1000), min_size=1, max_size=9).filter(lambda s: sum(s) > 0)
+RULES: dict[str, dict[str, Any]] = {
+    "with replacement": {},
+    "in turns": {"replacement": False},
+    "PER": {"rule": Per(alpha=0.7)},
+    "LAP": {"rule": Lap()},
+    "in turns beside PER": {"rule": [None, Per(alpha=0.7)], "replacement": False},
+}
+WIDTH = 3  # of the rows that are read in chunks
+
+
+class Drawing:
+    """One sampler, seen through numpy."""
+
+    def __init__(self, sampler: Any, device: torch.device | None = None) -> None:
+        self.sampler, self._device = sampler, device
+
+    def draw(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        rows, strata = self.sampler.draw()
+        weights = self.sampler.drawn_weights
+        if self._device is None:
+            return rows.copy(), strata.copy(), None if weights is None else weights.copy()
+        assert rows.device.type == self._device.type
+        weights = None if weights is None else weights.cpu().numpy()
+        return rows.cpu().numpy(), strata.cpu().numpy(), weights
+
+    def update(self, rows: np.ndarray, td_abs: np.ndarray) -> None:
+        if self._device is None:
+            self.sampler.update(rows, td_abs)
+        else:
+            parts = (torch.from_numpy(part).to(self._device) for part in (rows, td_abs))
+            self.sampler.update(*parts)
+
+
+Make = Callable[..., Drawing]  # seed, batch_size
+
+
+@pytest.fixture(params=["host", "cpu", "cuda", "chunks"])
+def kind(request: pytest.FixtureRequest) -> str:
+    if request.param == "cuda" and not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    return str(request.param)
+
+
+@pytest.fixture(params=RULES)
+def way(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def make(kind: str, way: str, tmp_path: Path) -> Iterator[Make]:
+    rule = RULES[way]
+    if kind == "chunks" and way != "in turns":
+        pytest.skip("rows read in chunks have their turns")
+    opened: list[ChunkedSampler] = []
+
+    def made(seed: int = 0, batch_size: int = 50) -> Drawing:
+        rng = np.random.default_rng(seed)
+        if kind == "chunks":
+            rows = np.memmap(tmp_path / "rows", np.float32, "w+", shape=(400, WIDTH))
+            memory = 200 * (4 * WIDTH + 16)
+            opened.append(
+                ChunkedSampler(
+                    rows, STRATA, SHARES, batch_size, rng, chunk_rows=40, memory_bytes=memory
+                )
+            )
+            return Drawing(opened[-1])
+        if kind == "host":
+            by = PrioritySampler if "rule" in rule else QuotaSampler
+            return Drawing(by(STRATA, SHARES, batch_size, rng, **rule))
+        device = torch.device(kind)
+        sampler = DeviceSampler(STRATA, SHARES, batch_size, seed=seed, device=device, **rule)
+        return Drawing(sampler, device)
+
+    yield made
+    for sampler in opened:
+        sampler.close()
+
+
+def rules_of(way: str) -> list[Rule | None]:
+    rule = RULES[way].get("rule")
+    return rule if isinstance(rule, list) else [rule, rule]
+
+
+def in_turns(way: str) -> list[np.ndarray]:
+    """The strata whose rows have turns."""
+    if RULES[way].get("replacement", True):
+        return []
+    return [rows for rows, rule in zip(STRATA, rules_of(way), strict=True) if rule is None]
+
+
+def errors() -> np.ndarray:
+    """|TD| of each row (400,), over three orders of magnitude."""
+    return 10 ** np.random.default_rng(5).uniform(-2, 1, 400)
+
+
+def priority(rule: Rule | None, td_abs: np.ndarray) -> np.ndarray:
+    """As the papers have it."""
+    if isinstance(rule, Per):
+        return (td_abs + rule.epsilon) ** rule.alpha
+    return np.maximum(td_abs, rule.floor) ** rule.alpha if rule else np.ones_like(td_abs)
+
+
+def test_quotas_are_exact_and_rows_drawn_as_the_rule_says(make: Make, way: str) -> None:
+    drawing, td = make(batch_size=40), errors()  # 28 and 12
+    for rows in STRATA:
+        drawing.update(rows, td[rows])
+    counts = np.zeros(400)
+    for _ in range(4000):
+        drawn, stratum, _ = drawing.draw()
+        assert np.bincount(stratum).tolist() == [28, 12]
+        assert ((drawn % 2 == 1) == (stratum == 1)).all()
+        np.add.at(counts, drawn, 1)
+    for rows, total, rule in zip(STRATA, (112_000, 48_000), rules_of(way), strict=True):
+        assert counts[rows].sum() == total
+        if any(rows is turns for turns in in_turns(way)):
+            assert np.ptp(counts[rows]) <= 1
+        else:
+            share = priority(rule, td[rows])
+            assert stats.chisquare(counts[rows], share / share.sum() * total).pvalue > 1e-4
+    assert counts.sum() == 160_000
+
+
+def test_shares_and_batch_size_may_change_between_batches(make: Make, way: str) -> None:
+    """What was drawn ahead goes back: it is owed, and is no turn."""
+    drawing, counts = make(batch_size=16), np.zeros(400)
+    for index in range(300):
+        if index % 7 == 0:
+            share = (index % 5) / 5
+            drawing.sampler.set_shares([1 - share, share])
+            drawing.sampler.set_batch_size(20 + index % 11)
+        drawn, stratum, _ = drawing.draw()
+        assert len(drawn) == drawing.sampler.batch_size
+        if share == 0:
+            assert (stratum == 0).all()
+        np.add.at(counts, drawn, 1)
+        assert all(np.ptp(counts[rows]) <= 1 for rows in in_turns(way))
+
+
+@pytest.mark.parametrize("before", [0, 3, 107])  # on the way, what was drawn ahead is given back
+def test_a_restored_sampler_goes_on_exactly(make: Make, tmp_path: Path, before: int) -> None:
+    def go_on(drawing: Drawing, batches: int, seed: int) -> list[Any]:
+        seen: list[Any] = []
+        rng = np.random.default_rng(seed)
+        for index in range(batches):
+            if index == 100:
+                drawing.sampler.set_shares([0.2, 0.8])
+            if index == 105:
+                drawing.sampler.set_batch_size(31)
+            drawn, stratum, weights = drawing.draw()
+            if isinstance(drawing.sampler, ChunkedSampler):
+                out = np.empty((len(drawn), WIDTH), np.float32)
+                drawing.sampler.gather(out)
+                seen.append(out.tolist())
+            seen += [drawn.tolist(), stratum.tolist()]
+            seen.append(None if weights is None else weights.tolist())
+            drawing.update(drawn, rng.uniform(0, 9, len(drawn)))
+        return seen
+
+    first, second, third = make(1), make(2), make(3)
+    go_on(first, before, seed=1)
+    state = first.sampler.state_dict()
+    checkpoint.save(tmp_path / "state", state)
+    second.sampler.load_state_dict(checkpoint.load(tmp_path / "state"))
+    third.sampler.load_state_dict(through_json(state))
+    assert second.sampler.batch_size == first.sampler.batch_size
+    expected = go_on(first, 250, seed=2)  # into blocks drawn later
+    assert go_on(second, 250, seed=2) == expected
+    assert go_on(third, 250, seed=2) == expected
+
+
+def test_a_state_of_other_strata_is_refused() -> None:
+    state = uniform_sampler(10, 4, np.random.default_rng(0)).state_dict()
+    with pytest.raises(MixtureError, match="other strata"):
+        uniform_sampler(11, 4, np.random.default_rng(0)).load_state_dict(state)
+
+
+def test_a_state_of_another_rule_is_refused(kind: str) -> None:
+    def sampler(by_priority: bool) -> Any:
+        if kind in ("cpu", "cuda"):
+            rule = Lap() if by_priority else None
+            return DeviceSampler(STRATA, SHARES, 50, seed=0, device=kind, rule=rule)
+        rng = np.random.default_rng(0)
+        if by_priority:
+            return PrioritySampler(STRATA, SHARES, 50, rng, rule=Lap())
+        return QuotaSampler(STRATA, SHARES, 50, rng)
+
+    with pytest.raises(MixtureError, match="another rule"):
+        sampler(by_priority=True).load_state_dict(sampler(by_priority=False).state_dict())
+    with pytest.raises(MixtureError, match="another rule"):
+        sampler(by_priority=True).load_state_dict({})
+
+
+@settings(max_examples=150, deadline=None)
+@given(parts=PARTS, batch_size=st.integers(1, 300), draws=st.integers(1, 200))
+def test_every_batch_is_full_and_every_share_is_met_over_time(
+    parts: list[int], batch_size: int, draws: int
+) -> None:
+    shares = np.array(parts) / sum(parts)
+    quotas = Quotas(shares, batch_size)
+    total = np.zeros(len(shares))
+    for index in range(1, draws + 1):
+        quota = quotas.next()
+        assert quota.sum() == batch_size
+        assert (quota >= 0).all()
+        assert (quota[shares == 0] == 0).all()
+        total += quota
+        # However long it runs, no stratum is ever two rows away from its share.
+        assert np.abs(total - index * batch_size * shares).max() < 2.0
+
+
+def test_a_share_too_small_for_one_batch_is_met_exactly_over_time() -> None:
+    quotas = Quotas([0.997, 0.003], 128)
+    assert sum(int(quotas.next()[1]) for _ in range(1000)) == 384  # 0.003 * 128 * 1000
+
+
+def test_a_quota_of_twelve_is_twelve_in_every_batch() -> None:
+    rows = [np.arange(1000), np.arange(1000, 1050)]
+    sampler = QuotaSampler(rows, [116 / 128, 12 / 128], 128, np.random.default_rng(0))
+    for _ in range(200):
+        drawn, stratum = sampler.draw()
+        assert (drawn >= 1000).sum() == 12
+        assert ((drawn >= 1000) == (stratum == 1)).all()
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    sizes=st.lists(st.integers(1, 30), min_size=1, max_size=5),
+    batch_size=st.integers(1, 90),
+    seed=st.integers(0, 2**32),
+)
+def test_without_replacement_no_row_is_drawn_twice_more_than_another(
+    sizes: list[int], batch_size: int, seed: int
+) -> None:
+    starts = np.cumsum([0, *sizes])
+    rows = [np.arange(a, b) for a, b in pairwise(starts)]
+    shares = np.full(len(sizes), 1 / len(sizes))
+    sampler = QuotaSampler(rows, shares, batch_size, np.random.default_rng(seed), replacement=False)
+    counts = np.zeros(int(starts[-1]))
+    for _ in range(12):
+        drawn, stratum = sampler.draw()
+        assert len(drawn) == batch_size
+        assert all(row in rows[code] for row, code in zip(drawn, stratum, strict=True))
+        np.add.at(counts, drawn, 1)
+        assert all(np.ptp(counts[members]) <= 1 for members in rows)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    steps=st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5), st.integers(1, 40)), max_size=8),
+    replacement=st.booleans(),
+    seed=st.integers(0, 2**32),
+)
+def test_what_is_owed_stays_within_rows_when_shares_change(
+    steps: list[tuple[int, int, int]], replacement: bool, seed: int
+) -> None:
+    rows = [np.arange(0, 30), np.arange(30, 41), np.arange(41, 60)]
+    sampler = QuotaSampler(
+        rows, [0.5, 0.3, 0.2], 16, np.random.default_rng(seed), replacement=replacement
+    )
+    counts, wanted, total = np.zeros(60), np.zeros(3), np.zeros(3)
+    for first, second, batch_size in steps:
+        shares = np.array([first, second, 1.0]) / (first + second + 1)
+        sampler.set_shares(shares)
+        sampler.set_batch_size(batch_size)
+        for _ in range(3):
+            drawn, stratum = sampler.draw()
+            quota = np.bincount(stratum, minlength=3)
+            assert quota.sum() == batch_size
+            assert (quota[shares == 0] == 0).all()
+            np.add.at(counts, drawn, 1)
+            total += quota
+            wanted += shares * batch_size
+            # A stratum whose share goes to 0 forfeits what it is owed: less than a row a change.
+            assert np.abs(total - wanted).max() < 3.0 + len(steps)
+        if not replacement:  # what was drawn ahead and given back is no turn
+            assert all(np.ptp(counts[members]) <= 1 for members in rows)
+
+
+@pytest.mark.parametrize(
+    ("shares", "message"),
+    [([0.5, 0.4], "sum to 1"), ([1.5, -0.5], "not negative"), ([1.0, np.nan], "finite")],
+)
+def test_shares_that_are_no_distribution_are_refused(shares: list[float], message: str) -> None:
+    with pytest.raises(MixtureError, match=message):
+        Quotas(shares, 8)
+
+
+def test_a_share_on_an_empty_stratum_is_refused() -> None:
+    with pytest.raises(MixtureError, match="no rows"):
+        QuotaSampler([np.arange(3), np.arange(0)], [0.5, 0.5], 8, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    sampler = QuotaSampler([np.arange(3), np.arange(0)], [1.0, 0.0], 8, rng)
+    assert set(sampler.draw()[0]) <= {0, 1, 2}
