@@ -13,17 +13,15 @@ what is reserved for them.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import MixtureError
-from restock.replay.mixture.packed_row import F32, Bools, Ints, row_columns, row_width
-from restock.replay.ring.pending import PendingSteps
-from restock.replay.ring.reserve import Reserve
-from restock.replay.ring.slots import NONE, StratumSlots
-from restock.replay.sampling.quotas import Quotas
+from restock.replay.mixture.packed_row import F32, F64, Ints, row_columns, row_width
+from restock.replay.ring.slots import NONE, Reserve, StratumSlots
+from restock.state import Stateful
 
 UNLABELLED = NONE
 
@@ -40,7 +38,89 @@ META: dict[str, type[np.generic]] = {
 }
 
 
-class FreshRing:
+class PendingSteps(Stateful):
+    """Up to n steps of each environment, the oldest at its `_first`, round and round.
+
+    Args:
+        num_envs: N.
+        observation_size: D.
+        discount: gamma of one step.
+        n_step: steps of a return.
+        meta: what is known of a step besides: name -> type.
+    """
+
+    STATE: ClassVar[tuple[str, ...]] = (
+        *("waiting", "_first", "_observation", "_reward", "_action", "_meta"),
+    )
+
+    def __init__(
+        self,
+        num_envs: int,
+        observation_size: int,
+        *,
+        discount: float,
+        n_step: int,
+        meta: Mapping[str, type[np.generic]],
+    ) -> None:
+        self.discount, self.n_step = discount, n_step
+        self._columns = row_columns(observation_size)
+        self._width = row_width(observation_size)
+        self._observation: F32 = np.zeros((num_envs, n_step, observation_size), np.float32)
+        self._reward: F64 = np.zeros((num_envs, n_step))
+        self._action: NDArray[np.int16] = np.zeros((num_envs, n_step), np.int16)
+        self._meta: dict[str, NDArray[Any]] = {
+            name: np.zeros((num_envs, n_step), dtype) for name, dtype in meta.items()
+        }
+        self.waiting: Ints = np.zeros(num_envs, np.int64)  # steps pending, 0..n_step - 1
+        self._first: Ints = np.zeros(num_envs, np.int64)  # position of the oldest step
+        self._envs = np.arange(num_envs)
+        self._ahead = np.arange(n_step)
+        self._powers = discount**self._ahead
+
+    def add(
+        self,
+        observation: NDArray[Any],
+        action: NDArray[Any],
+        reward: NDArray[Any],
+        meta: Mapping[str, Any],
+    ) -> None:
+        """One step of every environment: `observation` (N, D), `action` and `reward` (N,)."""
+        at = self._envs, (self._first + self.waiting) % self.n_step
+        self._observation[at] = observation
+        self._action[at] = action
+        self._reward[at] = reward
+        for name, value in meta.items():
+            self._meta[name][at] = value
+        self.waiting = self.waiting + 1
+
+    def pack(
+        self, envs: Ints, next_observation: NDArray[Any], terminated: NDArray[Any]
+    ) -> tuple[F32, dict[str, NDArray[Any]]]:
+        """The oldest step of each of these environments (n,), packed, and forgotten.
+
+        `next_observation` (N, D) and `terminated` (N,) are of the step added last. Returns rows
+        (n, W) and their metadata (n,) each.
+        """
+        horizon, first = self.waiting[envs], self._first[envs]  # (n,)
+        inside = self._ahead < horizon[:, None]
+        ahead = (first[:, None] + self._ahead) % self.n_step
+        part = self._columns
+        rows: F32 = np.empty((len(envs), self._width), np.float32)
+        rows[:, part["observation"]] = self._observation[envs, first]
+        rows[:, part["next_observation"]] = np.asarray(next_observation)[envs]
+        rows[:, part["action"]] = self._action[envs, first][:, None]
+        returns = (self._reward[envs[:, None], ahead] * self._powers * inside).sum(axis=1)
+        rows[:, part["reward"]] = returns[:, None]
+        not_terminated = ~np.asarray(terminated, np.bool_)[envs]
+        rows[:, part["discount"]] = (self.discount**horizon * not_terminated)[:, None]
+        meta = {name: values[envs, first] for name, values in self._meta.items()}
+        meta["horizon"] = horizon
+        self._first[envs] = (first + 1) % self.n_step
+        self.waiting[envs] -= 1
+        return rows, meta
+
+
+class FreshRing(Stateful):
     """N environments' steps as packed n-step rows, oldest overwritten first.
 
     Args:
@@ -58,6 +138,14 @@ class FreshRing:
     `rows` (capacity, W) float32 is packed as `replay.layout` says; `meta` holds the arrays of META;
     the first `len(ring)` slots are filled.
     """
+
+    SAME: ClassVar[tuple[str, ...]] = (
+        *("capacity", "num_envs", "observation_size", "n_step", "conditions"),
+    )
+    STATE: ClassVar[tuple[str, ...]] = (
+        *("_reserve", "_filled", "_pending", "strata"),
+        *("episode_key", "_episode_step", "_next_key"),
+    )
 
     def __init__(
         self,
@@ -219,77 +307,29 @@ class FreshRing:
             raise MixtureError("the fresh ring is empty", remedy="collect steps before sampling")
         return rng.integers(len(self), size=batch_size)
 
-    def sample_strata(self, quotas: Quotas, rng: np.random.Generator) -> tuple[Ints, Ints]:
-        """Slots (B,) and their condition codes (B,) by exact quotas over the conditions.
-
-        What a stratum without rows was owed is drawn from all rows instead, whatever their label
-        (then the code is that row's, -1 if it has none yet).
-        """
-        quota = quotas.next()
-        if len(quota) != len(self.conditions):
-            raise MixtureError(f"{len(quota)} quotas for {len(self.conditions)} conditions")
-        parts, missing = [], 0
-        for code, count in enumerate(quota.tolist()):
-            members = self.strata.members(code)
-            if len(members):
-                parts.append(members[rng.integers(len(members), size=count)])
-            else:
-                missing += count
-        if missing:
-            parts.append(self.sample(missing, rng))
-        slots = np.concatenate(parts)
-        return slots, self.strata.stratum[slots].astype(np.int64)
-
-    def ended_mask(self) -> Bools:
-        """Which filled slots belong to an episode that is over, (len(ring),)."""
-        return ~np.isin(self.meta["episode"][: len(self)], self.episode_key)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything, as numpy arrays and plain JSON values; only filled slots."""
+    @property
+    def _filled(self) -> dict[str, NDArray[Any]]:
+        """What the filled slots hold: rows (n, W), and each of META (n,)."""
         filled = len(self)
-        state: dict[str, Any] = {
-            "shape": [self.capacity, self.num_envs, self.observation_size, self.n_step],
-            "discount": self.discount,
-            "conditions": list(self.conditions),
-            "behaviour_policies": list(self.behaviour_policies),
-            "next_key": self._next_key,
-            "rows": self.rows[:filled].copy(),
-            "stratum": self.strata.stratum[:filled].copy(),
-            "episode_key": self.episode_key.copy(),
-            "episode_step": self._episode_step.copy(),
-            **self._reserve.state_dict(),
-            **self._pending.state_dict(),
-        }
-        state |= {f"meta.{name}": value[:filled].copy() for name, value in self.meta.items()}
-        # Draws within a stratum depend on the order of its members, so the order is kept.
-        state |= {
-            f"members.{code}": self.strata.members(code).copy()
-            for code in range(len(self.conditions))
-        }
-        return state
+        meta = {name: values[:filled] for name, values in self.meta.items()}
+        return {"rows": self.rows[:filled], **meta}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Raises MixtureError when the state is of a ring of another shape or other conditions."""
-        mine = [self.capacity, self.num_envs, self.observation_size, self.n_step]
-        if list(state["shape"]) != mine or list(state["conditions"]) != list(self.conditions):
-            raise MixtureError(
-                "the saved ring has another shape or other conditions:"
-                f" {list(state['shape'])} {list(state['conditions'])},"
-                f" not {mine} {list(self.conditions)}",
-                remedy="resume with the settings the run began with",
-            )
-        filled = len(state["rows"])
-        self._next_key = int(state["next_key"])
-        self.rows[:filled] = state["rows"]
-        for name, values in self.meta.items():
-            values[:filled] = state[f"meta.{name}"]
-        self._pending.load_state_dict(state)
-        self.episode_key = np.array(state["episode_key"], np.int64)
-        self._episode_step = np.array(state["episode_step"], np.int64)
-        self.strata = StratumSlots(self.capacity, len(self.conditions))
-        for code in range(len(self.conditions)):
-            self.strata.move(np.asarray(state[f"members.{code}"], np.int64), code)
-        self._reserve.load_state_dict(state, self.strata)
+    @_filled.setter
+    def _filled(self, held: dict[str, NDArray[Any]]) -> None:
+        for name, values in held.items():
+            place = self.rows if name == "rows" else self.meta[name]
+            place[: len(values)] = values
+
+    def mismatch(self, name: str, value: Any) -> MixtureError:
+        """Of a state of another shape, or of other conditions."""
+        return MixtureError(
+            f"the saved ring has another shape or other conditions: {name} {value},"
+            f" not {getattr(self, name)}",
+            remedy="resume with the settings the run began with",
+        )
+
+    def restored(self) -> None:
+        """Where the steps of episodes without labels are."""
         self._awaiting_labels = {}
         if self.conditions:
             self._find_slots()
@@ -306,6 +346,6 @@ class FreshRing:
             if key in env_of:
                 self._env_slots[env_of[key], steps[mine]] = slots[mine]
             else:
-                found = np.full(int(steps[mine].max()) + 1, NONE, np.int64)
-                found[steps[mine]] = slots[mine]
-                self._awaiting_labels[key] = found
+                of_step = np.full(int(steps[mine].max()) + 1, NONE, np.int64)
+                of_step[steps[mine]] = slots[mine]
+                self._awaiting_labels[key] = of_step

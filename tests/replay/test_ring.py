@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,10 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.states import leaves, through_json
 
 from restock.errors import MixtureError
 from restock.replay.ring.ring import FreshRing
-from restock.replay.sampling.sampler import Quotas
 
 SIZE = 3
 CONDITIONS = ("wheel_slip", "blocked_aisle", "nominal")
@@ -161,7 +160,7 @@ def test_the_oldest_rows_go_first() -> None:
 
 def test_labels_put_rows_in_their_strata_and_eviction_takes_them_out() -> None:
     ring, _ = filled(capacity=30, steps=200)
-    ended = ring.ended_mask()
+    ended = ~np.isin(ring.meta["episode"][: len(ring)], ring.episode_key)
     codes = ring.condition(np.arange(len(ring)))
     assert (codes[ended] >= 0).all()
     assert (codes[~ended] == -1).all()
@@ -173,26 +172,6 @@ def test_labels_put_rows_in_their_strata_and_eviction_takes_them_out() -> None:
         assert sorted(ring.strata.members(code)) == np.flatnonzero(codes == code).tolist()
 
 
-def test_quotas_over_fresh_conditions_are_exact() -> None:
-    ring, _ = filled(capacity=200, steps=150)
-    quotas = Quotas([0.25, 0.25, 0.5], 16)
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        slots, codes = ring.sample_strata(quotas, rng)
-        assert np.bincount(codes, minlength=3).tolist() == [4, 4, 8]
-        np.testing.assert_array_equal(ring.condition(slots), codes)
-
-
-def test_the_part_of_an_empty_stratum_is_drawn_from_all_rows() -> None:
-    ring = FreshRing(50, 2, SIZE, discount=0.9, conditions=CONDITIONS)
-    drive = Drive(2, 1)
-    for index in range(10):
-        ring.append(**drive.step(), env_step=index, gradient_step=0)
-    slots, codes = ring.sample_strata(Quotas([0.5, 0.25, 0.25], 8), np.random.default_rng(0))
-    assert len(slots) == 8
-    assert set(codes.tolist()) == {-1}
-
-
 def test_uniform_draws_cover_every_row() -> None:
     ring, _ = filled(capacity=25, steps=100)
     drawn = ring.sample(5000, np.random.default_rng(0))
@@ -202,14 +181,18 @@ def test_uniform_draws_cover_every_row() -> None:
         FreshRing(5, 1, SIZE, discount=0.9).sample(4, np.random.default_rng(0))
 
 
+def assert_alike(one: FreshRing, other: FreshRing) -> None:
+    pairs = zip(leaves(one.state_dict()), leaves(other.state_dict()), strict=True)
+    for (path, value), (same_path, same) in pairs:
+        assert path == same_path
+        np.testing.assert_array_equal(value, same, err_msg=path)
+
+
 @pytest.mark.parametrize("steps", [9, 150])  # before and after the ring is full
 def test_a_restored_ring_goes_on_exactly(steps: int) -> None:
     ring, drive = filled(capacity=60, steps=steps, seed=5)
-    state = ring.state_dict()
-    arrays = {name: value for name, value in state.items() if isinstance(value, np.ndarray)}
-    plain = json.loads(json.dumps({k: v for k, v in state.items() if k not in arrays}))
     other = FreshRing(60, 2, SIZE, discount=0.9, n_step=3, conditions=CONDITIONS)
-    other.load_state_dict({**arrays, **plain})
+    other.load_state_dict(through_json(ring.state_dict()))
     began = len(drive.steps)
     advance(ring, drive, 40)
     for step in drive.steps[began:]:
@@ -217,15 +200,11 @@ def test_a_restored_ring_goes_on_exactly(steps: int) -> None:
         began += 1
         for key in keys[step["terminated"] | step["truncated"]].tolist():
             other.set_labels(key, np.where(np.arange(500) % 2 == 0, 2, key % 2))
-    for name, value in ring.state_dict().items():
-        np.testing.assert_array_equal(value, other.state_dict()[name], err_msg=name)
+    assert_alike(ring, other)
     rngs = [np.random.default_rng(9), np.random.default_rng(9)]
-    quotas = [Quotas([0.2, 0.2, 0.6], 10), Quotas([0.2, 0.2, 0.6], 10)]
     for _ in range(5):
-        mine, theirs = (
-            r.sample_strata(q, g) for r, q, g in zip((ring, other), quotas, rngs, strict=True)
-        )
-        np.testing.assert_array_equal(mine[0], theirs[0])
+        one, two = (r.sample(10, rng) for r, rng in zip((ring, other), rngs, strict=True))
+        np.testing.assert_array_equal(one, two)
 
 
 def test_a_state_of_another_ring_is_refused() -> None:
@@ -331,8 +310,7 @@ def test_a_restored_ring_with_reserves_goes_on_exactly() -> None:
     other.load_state_dict(ring.state_dict())
     for one in (ring, other):
         label_rarely(one, Drive(2, 11), 200)
-    for name, value in ring.state_dict().items():
-        np.testing.assert_array_equal(value, other.state_dict()[name], err_msg=name)
+    assert_alike(ring, other)
 
 
 def test_what_cannot_be_reserved_is_refused() -> None:
