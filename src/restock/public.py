@@ -88,6 +88,10 @@ def _entry(node: ast.AST) -> str:
         for member in node.body
         if isinstance(member, ast.FunctionDef) and _is_public(member)
     )
+    if any(ast.unparse(base) == "Stateful" for base in node.bases):
+        methods += (
+            "- `state_dict()`, `load_state_dict(state)`: Saves what is to go on, and goes on.\n"
+        )
     return f"### {node.name}\n\n{signature}{text}\n" + (methods and f"\n{methods}")
 
 
@@ -105,8 +109,9 @@ def _constructor(node: ast.ClassDef) -> str:
 
 
 def _is_public(member: ast.FunctionDef) -> bool:
-    checks = member.name == "check"  # of a struct: it is called where one is made
-    return not member.name.startswith("_") and not checks and bool(ast.get_docstring(member))
+    # A struct's is called where one is made, a `Stateful`'s where one is restored.
+    called = member.name in ("check", "restored", "mismatch")
+    return not member.name.startswith("_") and not called and bool(ast.get_docstring(member))
 
 
 def _signature(node: ast.FunctionDef, *, name: str | None = None, short: bool = False) -> str:

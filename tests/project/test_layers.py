@@ -32,7 +32,7 @@ MAY_IMPORT = {
     "replay/store": "ingest/store ingest/task",
     "replay/mixture": "",
     "replay/sampling": "mixture",
-    "replay/ring": "mixture sampling",
+    "replay/ring": "mixture",
     "replay/panel": "mixture sampling store ingest/store ingest/task",
     "replay/trace": "replay panel store ingest/profile ingest/steps ingest/task",
     "replay/export": "replay mixture panel store ingest/profile ingest/task",
