@@ -1,4 +1,4 @@
-"""Records sample_logs/ anew: the same bytes from the same seeds.
+"""Records sample_logs/ again: the same bytes from the same seeds.
 
     make sample-logs                            # or: python sample_logs/make.py
     python sample_logs/make.py --out elsewhere --check   # exit 1 where they differ from these
@@ -127,9 +127,10 @@ def digests(folder: Path) -> dict[str, dict[str, object]]:
 
 def libraries() -> dict[str, str]:
     """The versions that decide the bytes."""
-    found = {name: version(name) for name in LIBRARIES}
+    versions = {name: version(name) for name in LIBRARIES}
     libc = "-".join(platform.libc_ver())
-    return {**found, "sqlite": sqlite3.sqlite_version, "libc": libc, "machine": platform.machine()}
+    system = {"sqlite": sqlite3.sqlite_version, "libc": libc, "machine": platform.machine()}
+    return {**versions, **system}
 
 
 if __name__ == "__main__":

@@ -36,8 +36,8 @@ def test_make_vec_by_vector_entry_point_gives_the_native_environment(action: str
     observation, _ = made.reset(seed=3)
     for _ in range(3):
         assert made.observation_space.contains(observation)
-        observation, earned, over, cut, info = made.step(made.action_space.sample())
-    assert earned.shape == over.shape == cut.shape == (3,)
+        observation, earned, terminated, truncated, info = made.step(made.action_space.sample())
+    assert earned.shape == terminated.shape == truncated.shape == (3,)
     assert ("action" in info) == (action == "continuous")
 
 
@@ -70,8 +70,8 @@ def test_any_command_is_driven_and_seen_and_rewarded_as_its_nearest_action() -> 
     for _ in range(20):
         now = {name: column.copy() for name, column in made.signals.items()}
         command = made.action_space.sample()
-        observation, earned, over, cut, info = made.step(command)
-        after, going = info["signals"], ~(over | cut)
+        observation, earned, terminated, truncated, info = made.step(command)
+        after, going = info["signals"], ~(terminated | truncated)
         np.testing.assert_allclose(after["command_speed_mps"], command[:, 0])
         np.testing.assert_allclose(after["command_yaw_rate_radps"], command[:, 1])
         action, residual = nearest_action(made.task, command[:, 0], command[:, 1])

@@ -68,7 +68,7 @@ def test_a_seed_belongs_to_one_split(seed: int) -> None:
 
 def test_the_splits_share_no_floor() -> None:
     floors = {split: {f.hash for f in open_floors(f"generated:{split}:40")} for split in SPLITS}
-    assert all(len(found) == 40 for found in floors.values())
+    assert all(len(hashes) == 40 for hashes in floors.values())
     assert not floors["train"] & floors["test"]
     assert not floors["train"] & floors["validation"]
     assert not floors["validation"] & floors["test"]
@@ -104,9 +104,9 @@ def test_aisles_of_both_directions_are_found_on_a_map(tmp_path: Path) -> None:
     for seed in (1, 3):  # along x, along y
         floor = replace(generate(seed), docks=())
         write_map(floor, tmp_path / "map.yaml")
-        found = read_map(tmp_path / "map.yaml").segments
-        assert {segment.along for segment in found} == {floor.segments[0].along}
-        middles = np.array([segment.area.center for segment in found])
+        segments = read_map(tmp_path / "map.yaml").segments
+        assert {segment.along for segment in segments} == {floor.segments[0].along}
+        middles = np.array([segment.area.center for segment in segments])
         inside = floor.segment_of(middles[:, 0], middles[:, 1])
         assert sorted(inside.tolist()) == list(range(len(floor.segments)))
 
@@ -155,7 +155,7 @@ def test_ascii_and_16_bit_greymaps_with_comments_are_read(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("data", "said"),
+    ("data", "message"),
     [
         (b"\x89PNG", "is not a PGM"),
         (b"P5\n4 4\n255\nab", "cut short: 2 of 16"),
@@ -168,15 +168,15 @@ def test_ascii_and_16_bit_greymaps_with_comments_are_read(tmp_path: Path) -> Non
         (b"P5\n4 4\n255\n" + bytes(16), "no free place"),
     ],
 )
-def test_a_broken_map_is_refused_with_its_reason(tmp_path: Path, data: bytes, said: str) -> None:
+def test_a_broken_map_is_refused_with_its_reason(tmp_path: Path, data: bytes, message: str) -> None:
     (tmp_path / "map.pgm").write_bytes(data)
     (tmp_path / "map.yaml").write_text("image: map.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n")
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=message):
         read_map(tmp_path / "map.yaml")
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("resolution: 0.05\norigin: [0, 0, 0]\n", "image"),
         ("image: a.pgm\nresolution: -1\norigin: [0, 0, 0]\n", "resolution"),
@@ -187,9 +187,9 @@ def test_a_broken_map_is_refused_with_its_reason(tmp_path: Path, data: bytes, sa
         ("", "got `null`"),
     ],
 )
-def test_a_broken_map_yaml_is_refused_with_its_key(tmp_path: Path, text: str, said: str) -> None:
+def test_a_broken_map_yaml_is_refused_with_its_key(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "map.yaml").write_text(text)
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=message):
         read_map(tmp_path / "map.yaml")
 
 
@@ -229,17 +229,17 @@ def test_what_does_not_fit_a_floor_is_refused_before_anything_is_driven(
 ) -> None:
     hall = tmp_path / "hall.toml"
     hall.write_text("width_m = 12.0\ndepth_m = 10.0\nracks = [[5.8, 0.0, 6.2, 10.0]]\n")
-    said = "has no room for episodes of blocked_aisle"
-    with pytest.raises(ConfigError, match=said):
+    message = "has no room for episodes of blocked_aisle"
+    with pytest.raises(ConfigError, match=message):
         WarehouseVectorEnv(2, layouts=str(hall))
     # A share of 0 is never trained on, yet evaluated.
     shares = "env.conditions={nominal=1, blocked_aisle=0}"
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=message):
         prepare_new(tmp_path / "run", None, None, [f"env.layouts={hall}", shares])
     record = ["record", "--out", str(tmp_path / "a.mcap"), "--missions", "1"]
     assert main([*record, "--layouts", str(hall)]) != 0
-    assert said in capsys.readouterr().err
-    # Without those conditions it is driven on, and what is sealed off is said.
+    assert message in capsys.readouterr().err
+    # Without those conditions it is driven on, and sealed goals are reported.
     assert main([*record, "--layouts", str(hall), "--conditions", "nominal=1"]) == 0
     assert "60 of 120 goals cannot be reached" in capsys.readouterr().err
     prepared = prepare_new(
@@ -280,7 +280,7 @@ def test_a_block_in_an_aisle_that_runs_north_is_found() -> None:
     hits = np.stack([area.center[0] + across, np.full(9, area.y_min + 1.2)], axis=-1)[None]
     arguments = (np.ones((1, 9), np.bool_), np.array([1.0]), np.array([True]))
     looks = [finder.update(np.array([0]), pose, hits, *arguments) for _ in range(3)]
-    assert [len(found) for found in looks] == [0, 0, 1]
+    assert [len(blocks) for blocks in looks] == [0, 0, 1]
     (_, (segment, step)) = looks[2][0]
     assert segment == 1
     around = Planner(floor).plan(*pose[0, :2], (area.center[0], area.y_max + 0.8), [(1, step)])

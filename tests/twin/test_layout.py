@@ -40,8 +40,8 @@ def test_every_goal_has_room_for_the_robot() -> None:
 def test_a_point_belongs_to_its_aisle_segment() -> None:
     floor = default_warehouse()
     middles = np.array([segment.area.center for segment in floor.segments])
-    found = floor.segment_of(middles[:, 0], middles[:, 1])
-    assert found.tolist() == list(range(len(floor.segments)))
+    segment = floor.segment_of(middles[:, 0], middles[:, 1])
+    assert segment.tolist() == list(range(len(floor.segments)))
     assert floor.segment_of(np.array([1.1]), np.array([5.0]))[0] == -1  # in a cross-aisle
 
 

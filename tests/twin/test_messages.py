@@ -128,7 +128,7 @@ def _write(path: Path, file_format: Format) -> list[Message]:
 def test_rosbags_reads_back_every_message(tmp_path: Path, file_format: Format, name: str) -> None:
     written = _write(tmp_path / name, file_format)
     with AnyReader([tmp_path / name]) as reader:
-        found = [
+        stored = [
             (log_ns, connection.topic, bytes(data))
             for connection, log_ns, data in reader.messages()
         ]
@@ -139,7 +139,7 @@ def test_rosbags_reads_back_every_message(tmp_path: Path, file_format: Format, n
         ]
         (text,) = (c for c in reader.connections if c.topic == "/text")
         qos: Any = text.ext.offered_qos_profiles[0]
-    assert found == [(m.log_ns, m.topic, m.data) for m in written]
+    assert stored == [(m.log_ns, m.topic, m.data) for m in written]
     assert texts == [f"message {i}" for i in range(50) if i % 3]
     assert qos.durability.name == "TRANSIENT_LOCAL"
 
@@ -148,12 +148,12 @@ def test_mcap_reads_back_both_times_and_the_definitions(tmp_path: Path) -> None:
     written = _write(tmp_path / "a.mcap", "mcap")
     with (tmp_path / "a.mcap").open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
-        found = [
+        stored = [
             (message.log_time, message.publish_time, channel.topic, message.data)
             for _, channel, message in reader.iter_messages()
         ]
         summary = reader.get_summary()
-    assert found == [(m.log_ns, m.publish_ns, m.topic, m.data) for m in written]
+    assert stored == [(m.log_ns, m.publish_ns, m.topic, m.data) for m in written]
     assert summary is not None
     assert {s.name: s.data for s in summary.schemas.values()}["std_msgs/msg/String"] == (
         b"string data\n"

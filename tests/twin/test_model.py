@@ -184,7 +184,7 @@ def test_a_blocked_aisle_stops_the_robot_at_the_pallets_face() -> None:
 
 @pytest.mark.parametrize("payload", [0.0, 60.0, 120.0])
 def test_speed_while_starting_is_what_the_motors_give_the_mass(payload: float) -> None:
-    # Two motors of torque kv (asked - actual), 18 Nm at most, move the mass and the wheels' own
+    # Two motors of torque kv (commanded - actual), 18 Nm at most, move the mass and the wheels' own
     # inertia: integrated by hand at .1 ms, on a floor that grips.
     sim = simulation(0.005)
     start(sim, (6.0, 1.0, np.pi / 2), Perturbation(payload_kg=payload, timestep_s=0.005, **QUIET))
@@ -193,8 +193,8 @@ def test_speed_while_starting_is_what_the_motors_give_the_mass(payload: float) -
     heavy = mass(sim) + payload + 2 * wheel / WHEEL_RADIUS_M**2
     speed = 0.0
     for instant in range(2000):
-        asked = min(ACCEL_LIMIT[0] * instant * 1e-4, 1.0) / WHEEL_RADIUS_M
-        torque = min(MOTOR_KV * (asked - speed / WHEEL_RADIUS_M), MOTOR_LIMIT_NM)
+        commanded = min(ACCEL_LIMIT[0] * instant * 1e-4, 1.0) / WHEEL_RADIUS_M
+        torque = min(MOTOR_KV * (commanded - speed / WHEEL_RADIUS_M), MOTOR_LIMIT_NM)
         speed += 1e-4 * 2 * torque / WHEEL_RADIUS_M / heavy
     assert sim.qvel[0, 1] == pytest.approx(speed, rel=0.15)
 

@@ -67,14 +67,14 @@ def test_a_perturbation_is_a_name_a_file_or_a_table(tmp_path: Path) -> None:
     drawn = find_perturbation(str(file), where="here")
     assert isinstance(drawn, Schedule)
     assert drawn.ranges == {"payload_kg": (0, 50)}
-    for wrong, said in (
+    for wrong, message in (
         ("damp", "there is no perturbation 'damp'"),
         (str(tmp_path / "no.toml"), "No such file"),
         ({"frictionscale": 1}, "frictionscale"),
         ({"gain": 7}, r"gain must be in \[0.5, 1.5\], got 7"),
         ({"ranges": {"gain": [1, 0.9]}}, "must rise"),
     ):
-        with pytest.raises(ConfigError, match=said):
+        with pytest.raises(ConfigError, match=message):
             find_perturbation(wrong, where="here")
 
 
@@ -151,9 +151,9 @@ def test_info_says_what_is_in_force_in_each_environment() -> None:
     env.reset(seed=1)
     info = env.step(np.array([1, 1]))[4]
     assert info["perturbation"].tolist() == ["schedule"] * 2
-    said = [json.loads(values) for values in info["perturbation_values"]]
-    assert said == [spec.perturbation.changed() for spec in env.specs if spec.perturbation]
-    assert said[0] != said[1]
+    values = [json.loads(text) for text in info["perturbation_values"]]
+    assert values == [spec.perturbation.changed() for spec in env.specs if spec.perturbation]
+    assert values[0] != values[1]
 
 
 def test_fresh_episodes_are_forgotten_with_their_rows() -> None:
@@ -177,11 +177,13 @@ def test_fresh_episodes_are_forgotten_with_their_rows() -> None:
 )
 def test_what_is_no_perturbation_is_not_known_and_said(text: str) -> None:
     assert parse_perturbation(text) is None
-    found = Perturbed.read([text, '{"name": "wet", "values": {"gain": 0.9}}'], np.array([0, 1, -1]))
-    names, values = found.columns(np.arange(3))
+    perturbed = Perturbed.read(
+        [text, '{"name": "wet", "values": {"gain": 0.9}}'], np.array([0, 1, -1])
+    )
+    names, values = perturbed.columns(np.arange(3))
     assert names.to_pylist() == [None, "wet", None]
     assert values.to_pylist() == [None, [("gain", 0.9)], None]
-    assert len(found.notes) == 1
+    assert len(perturbed.notes) == 1
 
 
 def test_a_recording_holds_what_was_said_from_then_on() -> None:
@@ -244,7 +246,7 @@ def test_the_audit_names_thin_cells_of_a_perturbation(tmp_path: Path) -> None:
     StoreWriter(tmp_path / "s").write(manifest, rows)
     thin = [audit for audit in load_audits() if audit.name == "thin_perturbation"]
     with Store(tmp_path / "s") as store:
-        (found,) = run_audits(store.connection, thin, {"thin_perturbation": {"min_rows": 100}})
+        (audit,) = run_audits(store.connection, thin, {"thin_perturbation": {"min_rows": 100}})
     counts = dict.fromkeys(("recovery", "wheel_slip", "blocked_aisle", "near_collision"), 0)
     for name, condition in zip(
         rows["perturbation"].to_pylist(), rows["condition"].to_pylist(), strict=True
@@ -252,9 +254,9 @@ def test_the_audit_names_thin_cells_of_a_perturbation(tmp_path: Path) -> None:
         if name == "wet":
             counts[condition] = counts.get(condition, 0) + 1
     expected = {name: count for name, count in counts.items() if count < 100}
-    assert {row["condition"]: row["rows"] for row in found.sample} == expected
-    assert {row["perturbation"] for row in found.sample} == {"wet"}
-    assert found.status == "info"
+    assert {row["condition"]: row["rows"] for row in audit.sample} == expected
+    assert {row["perturbation"] for row in audit.sample} == {"wet"}
+    assert audit.status == "info"
 
 
 def test_values_are_a_map_that_sql_can_index(tmp_path: Path) -> None:

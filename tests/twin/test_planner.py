@@ -74,18 +74,18 @@ def test_the_same_spec_draws_the_same_episode() -> None:
 def test_the_lidar_finds_full_blocks_and_passes_partial_ones(block: str) -> None:
     specs = [EpisodeSpec("blocked_aisle", seed) for seed in range(60)]
     specs = [s for s in specs if draw_episode(s, FLOOR, PLANNER).block == block][:12]
-    found = 0
+    blocked = 0
     env = WarehouseVectorEnv(len(specs))
     env.set_episodes(specs)
     env.reset()
     driver = _Straight()
     for _ in range(120):
         env.step(driver.act(env))
-        found = sum(bool(closures) for closures in env.navigation.closures)
+        blocked = sum(bool(closures) for closures in env.navigation.closures)
     if block == "full":
-        assert found >= 0.75 * len(specs)
+        assert blocked >= 0.75 * len(specs)
     else:
-        assert found == 0
+        assert blocked == 0
 
 
 class _Straight:
@@ -117,6 +117,6 @@ def test_a_wall_of_returns_is_a_block_after_three_looks() -> None:
     hits = np.stack([np.full(9, area.x_min + 1.0), area.center[1] + across], axis=-1)[None]
     valid = np.ones((1, 9), np.bool_)
     looks = [finder.update(np.array([0]), pose, hits, valid, np.array([1.0])) for _ in range(3)]
-    assert [bool(found) for found in looks] == [False, False, True]
+    assert [bool(blocks) for blocks in looks] == [False, False, True]
     (robot, (segment, _)) = looks[2][0]
     assert (robot, segment) == (0, 0)

@@ -19,8 +19,8 @@ def success(policy: BehaviourPolicy, kind: str, count: int = 24) -> dict[str, fl
     result: dict[int, tuple[str, bool]] = {}
     while len(result) < count:
         action, _ = policy.act(env, observation)
-        observation, _, over, cut, info = env.step(action)
-        for index in np.flatnonzero(over | cut):
+        observation, _, terminated, truncated, info = env.step(action)
+        for index in np.flatnonzero(terminated | truncated):
             number = int(info["episode_number"][index])
             if number >= 0:
                 result[number] = (str(info["block"][index]), bool(info["success"][index]))

@@ -83,11 +83,11 @@ def messages(drive: Drive) -> list[Message]:
 
 
 def _decoded(messages: list[Message]) -> dict[str, list[tuple[int, object]]]:
-    found = defaultdict(list)
+    by_topic = defaultdict(list)
     for message in messages:
         value = typestore().deserialize_cdr(message.data, TYPES[message.topic])
-        found[message.topic].append((message.log_ns, value))
-    return found
+        by_topic[message.topic].append((message.log_ns, value))
+    return by_topic
 
 
 def _stamps(rows: list[tuple[int, object]]) -> NDArray[np.int64]:
@@ -98,7 +98,7 @@ def test_every_topic_has_its_rate(messages: list[Message]) -> None:
     counts = {topic: len(rows) for topic, rows in _decoded(messages).items()}
     assert counts == {
         "/goal_pose": 1,
-        "/plan": 4,  # at 0 and 1 s, and anew at 2 and 3 s
+        "/plan": 4,  # at 0 and 1 s, and again at 2 and 3 s
         "/behaviour_policy": 2,  # the start and the handover
         "/odom": 201,
         "/imu": 201,
@@ -130,10 +130,10 @@ def test_a_message_is_measured_then_sent_then_received(messages: list[Message]) 
 def test_the_last_measurement_before_a_command_is_what_the_policy_saw(
     drive: Drive, messages: list[Message]
 ) -> None:
-    found = _decoded(messages)
-    for tick, (command_ns, _) in enumerate(found["/cmd_vel"]):
+    by_topic = _decoded(messages)
+    for tick, (command_ns, _) in enumerate(by_topic["/cmd_vel"]):
         held = {
-            topic: [value for log_ns, value in found[topic] if log_ns <= command_ns][-1]
+            topic: [value for log_ns, value in by_topic[topic] if log_ns <= command_ns][-1]
             for topic in ("/odom", "/imu", "/amcl_pose", "/scan")
         }
         signal = {name: column[tick] for name, column in drive.signals.items()}
@@ -151,24 +151,24 @@ def test_the_last_measurement_before_a_command_is_what_the_policy_saw(
 def test_a_plan_that_another_replaces_is_not_sent_again_at_that_tick(drive: Drive) -> None:
     # In floating point a plan of 1.2 s, sent every second, is due a last bit before 2.2 s.
     changed = replace(drive, plans=[(6, np.zeros((5, 2))), (11, np.ones((7, 2)))])
-    found = _decoded(_robot().publish(changed, START_NS))["/plan"]
-    assert [len(value.poses) for _, value in found] == [5, 7, 7]
+    plans = _decoded(_robot().publish(changed, START_NS))["/plan"]
+    assert [len(value.poses) for _, value in plans] == [5, 7, 7]
 
 
 def test_a_bump_between_two_ticks_is_in_their_interval_alone(messages: list[Message]) -> None:
-    found = _decoded(messages)
-    ticks = np.array([log_ns for log_ns, _ in found["/cmd_vel"]])
-    pressed = [log_ns for log_ns, value in found["/bumper"] if value.data]
+    by_topic = _decoded(messages)
+    ticks = np.array([log_ns for log_ns, _ in by_topic["/cmd_vel"]])
+    pressed = [log_ns for log_ns, value in by_topic["/bumper"] if value.data]
     assert np.searchsorted(ticks, pressed).tolist() == [6]  # after tick 5 (1.0 s), before 6
 
 
 def test_odometry_follows_the_wheels_and_tf_leads_to_the_map(
     drive: Drive, messages: list[Message]
 ) -> None:
-    found = _decoded(messages)
-    last = found["/odom"][-1][1].pose.pose.position
+    by_topic = _decoded(messages)
+    last = by_topic["/odom"][-1][1].pose.pose.position
     assert (last.x, last.y) == pytest.approx(drive.motion.pose[-1, :2], abs=5e-3)
-    to_odom, to_base = found["/tf"][-1][1].transforms
+    to_odom, to_base = by_topic["/tf"][-1][1].transforms
     assert (to_odom.header.frame_id, to_odom.child_frame_id) == ("map", "odom")
     assert (to_base.header.frame_id, to_base.child_frame_id) == ("odom", "base_link")
     yaw = 2 * np.arctan2(to_odom.transform.rotation.z, to_odom.transform.rotation.w)

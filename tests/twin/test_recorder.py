@@ -72,20 +72,20 @@ def test_json_says_what_was_recorded(tmp_path: Path, capsys: pytest.CaptureFixtu
     code = cli.main(
         ["record", "--out", str(out), "--minutes", "0.01", "--policy", "random", "--json"]
     )
-    said = json.loads(capsys.readouterr().out)
+    printed = json.loads(capsys.readouterr().out)
     assert code == ExitCode.OK
-    assert said["format"] == "rosbag2"
-    assert said["policy_steps"].keys() == {"random 1"}
+    assert printed["format"] == "rosbag2"
+    assert printed["policy_steps"].keys() == {"random 1"}
     assert sorted(file.name for file in out.iterdir()) == ["bag.db3", "metadata.yaml"]
     with AnyReader([out]) as reader:
-        assert reader.message_count == said["messages"]
+        assert reader.message_count == printed["messages"]
 
 
 def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "log.mcap"
     assert cli.main(["record", "--out", str(out), "--dry-run", "--json"]) == ExitCode.OK
-    said = json.loads(capsys.readouterr().out)
-    assert (said["minutes"], said["format"], said["conditions"]) == (5.0, "mcap", NATURAL)
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["minutes"], printed["format"], printed["conditions"]) == (5.0, "mcap", NATURAL)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -137,9 +137,9 @@ def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
         assert time.monotonic() < deadline, "nothing was ever written"
         time.sleep(0.1)
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=240)
+    _, errors = process.communicate(timeout=240)
     assert process.returncode == ExitCode.INTERRUPTED
-    assert b"interrupted" in said
+    assert b"interrupted" in errors
     assert list(tmp_path.iterdir()) == []
 
 

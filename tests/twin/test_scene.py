@@ -42,8 +42,8 @@ def _shown(data: bytes) -> list[tuple[str, int]]:
 
 def test_parameters_are_said_where_they_differ() -> None:
     assert json.loads(perturbation_text(Perturbation())) == {"name": "nominal", "values": {}}
-    said = json.loads(perturbation_text(Perturbation(name="wet", friction_scale=0.3)))
-    assert said == {"name": "wet", "values": {"friction_scale": 0.3}}
+    content = json.loads(perturbation_text(Perturbation(name="wet", friction_scale=0.3)))
+    assert content == {"name": "wet", "values": {"friction_scale": 0.3}}
 
 
 def test_a_mission_shows_its_goal_pallets_and_patches_and_nothing_parked() -> None:
@@ -55,22 +55,22 @@ def test_a_mission_shows_its_goal_pallets_and_patches_and_nothing_parked() -> No
         goal_radius_m=0.4,
         body_m=(0.7, 0.5, 0.3),
     )
-    found = _markers(mission_markers(5, scene, (4.0, 1.0)))
-    assert [(m.ns, m.id, m.action) for m in found] == [
+    decoded = _markers(mission_markers(5, scene, (4.0, 1.0)))
+    assert [(m.ns, m.id, m.action) for m in decoded] == [
         ("", 0, 3),  # deletes what was there
         ("goal", 0, 0),
         ("robot", 0, 0),
         ("pallet", 0, 0),
         ("patch", 0, 0),
     ]
-    _, goal, robot, pallet, patch = found
+    _, goal, robot, pallet, patch = decoded
     assert (goal.pose.position.x, goal.pose.position.y, goal.scale.x) == (4.0, 1.0, 0.8)
     assert (robot.header.frame_id, robot.frame_locked) == ("base_link", True)
     assert pallet.pose.orientation.z == pytest.approx(np.sin(np.pi / 4))
     assert (pallet.pose.position.x, pallet.pose.position.z) == (2.0, pallet.scale.z / 2)
     assert (patch.scale.x, patch.scale.y) == (1.0, 0.5)
     assert {m.header.frame_id for m in (goal, pallet, patch)} == {"map"}
-    assert all(m.header.stamp.nanosec == 5 for m in found)
+    assert all(m.header.stamp.nanosec == 5 for m in decoded)
 
 
 def test_traffic_is_the_whole_scene_in_every_message() -> None:
@@ -83,15 +83,15 @@ def test_traffic_is_the_whole_scene_in_every_message() -> None:
             [away, away, away],
         ]
     )
-    found = traffic_markers(np.arange(4) * 10**9, places)
-    assert [_shown(data) for data in found] == [
+    decoded = traffic_markers(np.arange(4) * 10**9, places)
+    assert [_shown(data) for data in decoded] == [
         [],
         [("person", 0)],
         [("person", 0), ("forklift", 2)],
         [],
     ]
-    assert {_markers(data)[0].action for data in found} == {3}
-    person, forklift = _markers(found[2])[1:]
+    assert {_markers(data)[0].action for data in decoded} == {3}
+    person, forklift = _markers(decoded[2])[1:]
     assert (person.pose.position.x, person.header.stamp.sec) == (1.5, 2)
     assert 2 * np.arctan2(
         forklift.pose.orientation.z, forklift.pose.orientation.w
@@ -106,10 +106,10 @@ def test_a_recording_holds_frames_map_and_scene_as_viewers_expect(
     done = record(
         tmp_path / name, RecordingPlan(format=file_format, missions=2, seed=4, conditions=kinds)
     )
-    found: dict[str, list[Any]] = {topic.name: [] for topic in TOPICS}
+    decoded: dict[str, list[Any]] = {topic.name: [] for topic in TOPICS}
     with AnyReader([tmp_path / name]) as reader:
         for connection, _, data in reader.messages():
-            found[connection.topic].append(reader.deserialize(data, connection.msgtype))
+            decoded[connection.topic].append(reader.deserialize(data, connection.msgtype))
         durability = {
             c.topic: c.ext.offered_qos_profiles[0].durability.name for c in reader.connections
         }
@@ -118,7 +118,7 @@ def test_a_recording_holds_frames_map_and_scene_as_viewers_expect(
     links = {
         (link.header.frame_id, link.child_frame_id)
         for topic in ("/tf", "/tf_static")
-        for message in found[topic]
+        for message in decoded[topic]
         for link in message.transforms
     }
     assert links == {
@@ -130,27 +130,27 @@ def test_a_recording_holds_frames_map_and_scene_as_viewers_expect(
     frames = {child for _, child in links} | {"map"}
     used = {
         message.header.frame_id
-        for topic, messages in found.items()
+        for topic, messages in decoded.items()
         for message in messages
         if hasattr(message, "header") and topic not in ("/diagnostics", "/joint_states")
     }
     assert used <= frames
 
-    (grid,) = found["/map"]
+    (grid,) = decoded["/map"]
     cells = np.array(grid.data).reshape(grid.info.height, grid.info.width)
     assert (cells.shape, grid.header.frame_id) == ((102, 122), "map")  # 12 x 10 m and its walls
     assert set(np.unique(cells)) == {0, 100}
     assert (cells[0] == 100).all()
     x, y = (grid.info.origin.position.x, grid.info.origin.position.y)
-    pose = found["/amcl_pose"][0].pose.pose.position
+    pose = decoded["/amcl_pose"][0].pose.pose.position
     row, column = (int((at - low) / grid.info.resolution) for at, low in ((pose.y, y), (pose.x, x)))
     assert cells[row, column] == 0  # the robot stands where the map is free
 
-    said = [json.loads(message.data) for message in found[PERTURBATION]]
-    assert said == [json.loads(perturbation_text(HARDWARE))] * 2
-    shown = [{marker.ns for marker in message.markers} for message in found[MARKERS]]
+    content = [json.loads(message.data) for message in decoded[PERTURBATION]]
+    assert content == [json.loads(perturbation_text(HARDWARE))] * 2
+    shown = [{marker.ns for marker in message.markers} for message in decoded[MARKERS]]
     assert sum("pallet" in names for names in shown) == done.missions["blocked_aisle"] == 1
-    walking = [m for message in found[TRAFFIC] for m in message.markers if m.ns == "person"]
+    walking = [m for message in decoded[TRAFFIC] for m in message.markers if m.ns == "person"]
     assert len({(m.pose.position.x, m.pose.position.y) for m in walking}) > 2
 
 

@@ -16,7 +16,8 @@ import restock  # noqa: F401 - registers the environment
 from restock.errors import ConfigError, RunError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.signals import SIGNALS
-from restock.ingest.task.task import observe, reward, terminated
+from restock.ingest.task.task import observe, reward
+from restock.ingest.task.task import terminated as is_terminated
 from restock.train.run import checkpoint
 from restock.train.twin.env.policies import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
@@ -34,8 +35,10 @@ def roll(env: WarehouseVectorEnv, steps: int, seed: int) -> list[np.ndarray]:
     rng = np.random.default_rng(seed)
     seen = []
     for action in rng.integers(env.single_action_space.n, size=(steps, env.num_envs)):
-        observation, earned, over, cut, info = env.step(action)
-        seen.append(np.column_stack([observation, earned, over, cut, info["true_pose"]]))
+        observation, earned, terminated, truncated, info = env.step(action)
+        seen.append(
+            np.column_stack([observation, earned, terminated, truncated, info["true_pose"]])
+        )
     return seen
 
 
@@ -57,9 +60,9 @@ def test_make_vec_gives_the_native_vector_environment() -> None:
     assert made.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     observation, _ = made.reset(seed=3)
     assert made.observation_space.contains(observation)
-    observation, earned, over, cut, _ = made.step(made.action_space.sample())
+    observation, earned, terminated, truncated, _ = made.step(made.action_space.sample())
     assert made.observation_space.contains(observation)
-    assert earned.shape == over.shape == cut.shape == (3,)
+    assert earned.shape == terminated.shape == truncated.shape == (3,)
 
 
 def test_single_and_vector_environment_are_the_same_environment() -> None:
@@ -129,8 +132,8 @@ def test_autoreset_keeps_the_final_observation(env: WarehouseVectorEnv) -> None:
     ended = 0
     for _ in range(env.task.time_limit_steps):
         before = env.episode_seed.copy()
-        observation, _, over, cut, info = env.step(np.zeros(8, np.int64))
-        done = over | cut
+        observation, _, terminated, truncated, info = env.step(np.zeros(8, np.int64))
+        done = terminated | truncated
         if done.any():
             np.testing.assert_array_equal(info["_final_obs"], done)
             np.testing.assert_array_equal(info["episode_seed"], before)  # of the one that ended
@@ -138,8 +141,8 @@ def test_autoreset_keeps_the_final_observation(env: WarehouseVectorEnv) -> None:
             assert (env.steps[done] == 0).all()
             assert not np.array_equal(info["final_obs"][done], observation[done])
             ended += int(done.sum())
-    assert ended == 8  # standing still, every episode is cut at the limit
-    assert not over.any()
+    assert ended == 8  # standing still, every episode is truncated at the limit
+    assert not terminated.any()
 
 
 def test_disabled_autoreset_resets_only_the_masked() -> None:
@@ -162,13 +165,13 @@ def test_the_environment_fills_every_signal_and_uses_the_tasks_functions(
         now = {name: column.copy() for name, column in env.signals.items()}
         assert set(now) == names
         action = rng.integers(env.single_action_space.n, size=8)
-        observation, earned, over, cut, info = env.step(action)
+        observation, earned, terminated, truncated, info = env.step(action)
         after = info["signals"]
         assert all(np.isfinite(after[signal.name]).all() for signal in SIGNALS)
         expected = reward(env.task, now, after, info["progress_m"], action, previous)
-        going = ~(over | cut)
+        going = ~(terminated | truncated)
         np.testing.assert_array_equal(earned, expected)
-        np.testing.assert_array_equal(over, terminated(env.task, after))
+        np.testing.assert_array_equal(terminated, is_terminated(env.task, after))
         seen = observe(env.task, after, now, action)
         np.testing.assert_allclose(observation[going], seen[going], atol=1e-6)
         np.testing.assert_allclose(after["command_speed_mps"], _speeds(env)[action])
@@ -215,10 +218,10 @@ def test_a_blow_up_truncates_the_episode_and_is_counted(
     count = env.blown_up
     env.simulation.qvel[3, 0] = np.nan
     before = env.observation.copy()
-    observation, earned, over, cut, info = env.step(np.full(8, 2))
+    observation, earned, terminated, truncated, info = env.step(np.full(8, 2))
     assert info["invalid"].tolist() == [index == 3 for index in range(8)]
-    assert cut[3]
-    assert not over[3]
+    assert truncated[3]
+    assert not terminated[3]
     assert env.blown_up == count + 1
     assert np.isfinite(observation).all()
     assert np.isfinite(earned).all()

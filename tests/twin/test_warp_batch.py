@@ -31,13 +31,13 @@ def drive(env: WarehouseVectorEnv) -> list[tuple[np.ndarray, ...]]:
     """Steps under commands that are held for a second, as (pose, observation, reward, bumped)."""
     env.reset(seed=3)
     rng = np.random.default_rng(0)
-    told = []
+    steps = []
     for step in range(STEPS):
         if step % 5 == 0:
             action = rng.integers(env.single_action_space.n, size=env.num_envs)
         observation, reward, _, _, info = env.step(action)
-        told.append((info["true_pose"], observation, reward, info["signals"]["bumped"]))
-    return told
+        steps.append((info["true_pose"], observation, reward, info["signals"]["bumped"]))
+    return steps
 
 
 @pytest.mark.slow  # Warp compiles its kernels once on a machine: about a minute
