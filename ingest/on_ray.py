@@ -90,11 +90,11 @@ def cluster(workers: int) -> Iterator[Any]:
 
 def _expect(address: str | None) -> None:
     """Knock at a cluster's door: Ray itself would wait for minutes."""
-    found = re.fullmatch(r"(?:ray://)?([^:/]+):(\d+)", address or "")
-    if found is None:  # none, or a word like "auto"
+    match = re.fullmatch(r"(?:ray://)?([^:/]+):(\d+)", address or "")
+    if match is None:  # none, or a word like "auto"
         return
     try:
-        socket.create_connection((found[1], int(found[2])), timeout=CONNECT_S).close()
+        socket.create_connection((match[1], int(match[2])), timeout=CONNECT_S).close()
     except (OSError, OverflowError) as error:
         raise ConfigError(
             f"no Ray cluster at {address}: {error}",

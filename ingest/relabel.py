@@ -98,9 +98,9 @@ def _one(
             where=str(store.path),
             remedy="ingest the recording again",
         )
-    seen = rows.select(ends.column_names)  # the signals, and the profile's own
+    stored = rows.select(ends.column_names)  # the signals, and the profile's own
     try:
-        found = label(pa.concat_tables([seen, ends.cast(seen.schema)]), conditions)
+        every = label(pa.concat_tables([stored, ends.cast(stored.schema)]), conditions)
     except ConfigError as error:
         raise ConfigError(
             f"{error.where}: {error.what}",
@@ -108,7 +108,7 @@ def _one(
             remedy=f"they hold {', '.join(ends.column_names)}; for signals that are new in the"
             " profile ingest the recordings again",
         ) from error
-    labels = {name: holds[: len(rows)] for name, holds in found.items()}
+    labels = {name: holds[: len(rows)] for name, holds in every.items()}
     named = primary(labels, conditions) or [NOMINAL] * len(rows)
     before = rows["condition"].to_pylist()
     version = labels_version(conditions)

@@ -1,7 +1,7 @@
 """Custom signals: values of any topic that become columns of the transitions, by the profile.
 
 `[signals.battery_v]` of a profile names the column `battery_v` and says where it comes from. At
-every step it is what the topic said last (at or before the step, at most `max_age_s` ago), or
+every step it is the latest value of the topic (at or before the step, at most `max_age_s` old), or
 null. Conditions and queries see it as they see Restock's own signals; observation and reward do
 not.
 """
@@ -127,16 +127,16 @@ def refuse_other_signals(have: Mapping[str, Any], schema: pa.Schema, where: str)
     """
     for field in schema:
         unit = (field.metadata or {}).get(b"unit")
-        known = have.get(field.name)
-        if unit is None or known is None:
+        stored = have.get(field.name)
+        if unit is None or stored is None:
             continue
-        mine = "list" if field.type == LIST else "number"
-        theirs = "list" if "Array" in type(known.type).__name__ else "number"
-        unit_there = known.metadata.get("unit", "")
-        if (mine, unit.decode()) != (theirs, unit_there):
+        kind = "list" if field.type == LIST else "number"
+        stored_kind = "list" if "Array" in type(stored.type).__name__ else "number"
+        stored_unit = stored.metadata.get("unit", "")
+        if (kind, unit.decode()) != (stored_kind, stored_unit):
             raise StoreError(
-                f"its column `{field.name}` is a {theirs} in {unit_there or '1'},"
-                f" and `signals.{field.name}` of the profile a {mine} in {unit.decode()}",
+                f"its column `{field.name}` is a {stored_kind} in {stored_unit or '1'},"
+                f" and `signals.{field.name}` of the profile a {kind} in {unit.decode()}",
                 where=where,
                 remedy="rename the signal in the profile, or use another store",
             )

@@ -47,7 +47,7 @@ INPUT_FIELDS: dict[str, dict[str, bool]] = {
     "perturbation": {"text": True},
 }
 
-# What stands in for an input that a profile leaves out, or marks optional and a recording lacks.
+# What is used instead of an input that is left out, or is optional and the recording lacks.
 FALLBACKS: dict[str, str] = {
     "scan": "no lidar: every bearing counts as free up to range_max_m",
     "imu": "gyro yaw rate taken from the wheels, acceleration 0",
@@ -102,7 +102,7 @@ class Clock(Checked, frozen=True):
 
 
 class Episodes(Checked, frozen=True):
-    """The `[episodes]` of a profile: what cuts one, beside goals, gaps and clock jumps."""
+    """The `[episodes]` of a profile: what ends one, beside goals, gaps and clock jumps."""
 
     max_pose_jump_m: float = 1.0  # between two steps: the robot was carried, or relocalised
     goal_moved_m: float = 0.01  # a goal further than this from the last one is a new one
@@ -182,14 +182,14 @@ class Profile(Checked, frozen=True):
 
     @property
     def fallbacks(self) -> dict[str, str]:
-        """Inputs the profile leaves out -> what stands in for each."""
+        """Inputs the profile leaves out -> what is used instead of each."""
         given = dict(self.inputs.items())
-        stand_ins = {name: how for name, how in FALLBACKS.items() if name not in given}
+        fallbacks = {name: how for name, how in FALLBACKS.items() if name not in given}
         if self.inputs.pose is None:
-            stand_ins["pose"] = POSE_FALLBACK
+            fallbacks["pose"] = POSE_FALLBACK
         if self.task.goal == "none":
-            stand_ins |= dict.fromkeys(("goal", "plan"), ROUTE_FALLBACK)
-        return stand_ins
+            fallbacks |= dict.fromkeys(("goal", "plan"), ROUTE_FALLBACK)
+        return fallbacks
 
     def zone_of(self, x_m: NDArray[Any], y_m: NDArray[Any]) -> list[str]:
         """The name of the first zone that holds each point (N,), or `elsewhere`."""
@@ -281,7 +281,7 @@ def _check(profile: Profile, where: str) -> None:
 
 
 def _check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
-    """That an input says what it must; `framed` where transforms can stand in for its pose.
+    """That an input says what it must; `framed` where transforms can give its pose.
 
     Raises:
         ConfigError: it does not; names the key.
@@ -302,7 +302,7 @@ def _check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
         )
     if source.optional and name not in FALLBACKS and not (name == "pose" and framed):
         raise ConfigError(
-            f"`inputs.{name}.optional`: nothing can stand in for {name}",
+            f"`inputs.{name}.optional`: {name} has no fallback, so it cannot be optional",
             where=where,
             remedy=f"optional may be {', '.join(FALLBACKS)}, and pose where there is [frames]",
         )

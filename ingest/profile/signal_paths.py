@@ -58,7 +58,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Found:
+class PathValues:
     """What a path found in N messages: V values, in the order of their messages."""
 
     message: Rows  # (V,)
@@ -107,14 +107,14 @@ class SignalPath:
 
     def beside(self) -> dict[int, str]:
         """Place of a step -> the field that its choice looks at."""
-        found = {}
+        names = {}
         for place, step in enumerate(self.steps):
             if step.choice is not None and isinstance(step.choice.which, str):
                 if step.choice.key is None:
-                    found[place] = self.leaf(place, NAMES)
+                    names[place] = self.leaf(place, NAMES)
                 else:
-                    found[place] = self.leaf(place + 1, step.choice.key)
-        return found
+                    names[place] = self.leaf(place + 1, step.choice.key)
+        return names
 
     def wanted(self, *ends: str) -> list[str]:
         """Every field path to read; `ends` are fields of the message at the path's end."""
@@ -153,7 +153,7 @@ class SignalPath:
                 raise PathProblem(f"{path!r} cannot tell elements apart: it is not one a element")
         return [kinds[path] for path in self.wanted(*ends)[: max(len(ends), 1)]]
 
-    def find(self, columns: Mapping[str, FieldColumn], end: str | None = None) -> Found:
+    def find(self, columns: Mapping[str, FieldColumn], end: str | None = None) -> PathValues:
         """The values it means in these columns (those of `wanted`)."""
         names = self.beside()
         path = self.leaf() if end is None else f"{self.leaf(len(self.steps))}.{end}"
@@ -174,7 +174,7 @@ class SignalPath:
             message = message[parent[keep]]
         if isinstance(column, Ragged) or column.ndim > 1:
             raise PathProblem("gives an array where it should give a number")
-        return Found(message, np.asarray(column))
+        return PathValues(message, np.asarray(column))
 
 
 def _choice(text: str) -> Choice:
@@ -259,8 +259,8 @@ def offer(path: str, paths: list[str]) -> str:
     ends = {known.split(".")[-1]: known for known in paths}
     near = [bare[name] for name in get_close_matches(_bare(path), bare, n=3)]
     near = near or [ends[name] for name in get_close_matches(path.split(".")[-1], ends, n=3)]
-    said = f"no field {path!r}"
+    problem = f"no field {path!r}"
     if near:
-        return f"{said}: did you mean {' or '.join(repr(name) for name in near)}?"
+        return f"{problem}: did you mean {' or '.join(repr(name) for name in near)}?"
     shown = ", ".join(paths[:12]) + (f" and {len(paths) - 12} more" if len(paths) > 12 else "")
-    return f"{said}: there are {shown}"
+    return f"{problem}: there are {shown}"

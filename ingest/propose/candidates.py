@@ -82,7 +82,7 @@ def candidates(
 
     `without` are topics to leave out, `used` fields (topic, path).
     """
-    found: dict[str, Candidate] = {}
+    named: dict[str, Candidate] = {}
     for topic in recording.topics.values():
         if topic.skipped or topic.expected < 2 or _IGNORED_TYPES.search(topic.type):
             continue
@@ -91,10 +91,10 @@ def candidates(
         possible = [c for c in _of_topic(recording, topic) if (topic.name, c.path) not in used]
         for one in _changing(recording, topic, possible)[:MOST_A_TOPIC]:
             name, count = one.name, 2
-            while name in found or name_problem(name):
+            while name in named or name_problem(name):
                 name, count = f"{one.name}_{count}", count + 1
-            found[name] = replace(one, name=name)
-    return list(found.values())
+            named[name] = replace(one, name=name)
+    return list(named.values())
 
 
 def _changing(recording: Recording, topic: TopicInfo, possible: list[Candidate]) -> list[Candidate]:
@@ -176,11 +176,11 @@ def _diagnostics(recording: Recording, topic: TopicInfo) -> Iterator[Candidate]:
     assert isinstance(keys, Ragged)
     assert isinstance(values, Ragged)
     seen: dict[tuple[str, str], str] = {}
-    inner, said = keys.values, values.values
+    inner, texts = keys.values, values.values
     assert isinstance(inner, Ragged)
-    assert isinstance(said, Ragged)
+    assert isinstance(texts, Ragged)
     owner = np.repeat(np.asarray(names.values), inner.lengths)
-    triples = zip(owner, np.asarray(inner.values), np.asarray(said.values), strict=True)
+    triples = zip(owner, np.asarray(inner.values), np.asarray(texts.values), strict=True)
     for name, one, text in triples:
         seen.setdefault((name, one), text)
     for (name, one), text in sorted(seen.items()):
@@ -197,12 +197,12 @@ def _diagnostics(recording: Recording, topic: TopicInfo) -> Iterator[Candidate]:
 def _text(recording: Recording, topic: TopicInfo, path: str) -> Iterator[Candidate]:
     """A text that takes few values, as numbers."""
     columns: TopicColumns = recording.read({topic.name: [path]})[topic.name]
-    said = sorted({str(text) for text in np.asarray(columns.fields[path])})
-    if 1 < len(said) <= MOST_WORDS and all(len(text) <= 40 for text in said):
-        if all(_number(text) for text in said):
+    texts = sorted({str(text) for text in np.asarray(columns.fields[path])})
+    if 1 < len(texts) <= MOST_WORDS and all(len(text) <= 40 for text in texts):
+        if all(_number(text) for text in texts):
             yield _one(topic, path)
             return
-        table = ", ".join(f"{json.dumps(text)} = {index}" for index, text in enumerate(said))
+        table = ", ".join(f"{json.dumps(text)} = {index}" for index, text in enumerate(texts))
         yield replace(_one(topic, path, f"values = {{ {table} }}"), unit="1")
 
 

@@ -65,7 +65,7 @@ def propose_profile(recording: Recording, name: str) -> Proposal:
     commands = _commands(recording, roles)
     seconds = _driven_s(recording, commands)
     missing = [role for role in REQUIRED if not roles[role] and not (role == "pose" and framed)]
-    best = [(role, *found[0]) for role, found in roles.items() if found]
+    best = [(role, *fitting[0]) for role, fitting in roles.items() if fitting]
     signals = candidates(
         recording,
         without={topic.name for role, topic, _ in best if role in SPENT},
@@ -83,11 +83,11 @@ def propose_profile(recording: Recording, name: str) -> Proposal:
         *_task_lines(recording, roles, commands),
         *_clock_lines(recording, roles, commands),
     ]
-    for role, found in roles.items():
+    for role, fitting in roles.items():
         if role == "pose" and framed:
             lines += ["# [inputs.pose]  # from transforms, by [frames]", ""]
         else:
-            lines += _input_lines(role, found, seconds)
+            lines += _input_lines(role, fitting, seconds)
     lines += frames.lines(used=framed) if frames is not None else []
     if signals:
         lines += [
@@ -169,8 +169,8 @@ def _task_lines(recording: Recording, roles: Roles, commands: Commands) -> list[
     actions += [(0.8 * speed, 0.6 * turn), (0.8 * speed, -0.6 * turn), (0.0, turn), (0.0, -turn)]
     actions += [(-speed / 2, 0.0)] if commands.backs else []
     period = float(np.clip(round(commands.period_s or 0.2, 2), 0.1, 0.5))
-    told = "speeds" if roles["command"] and roles["command"][0][0].type == MOTION else "commands"
-    seen = f"from {commands.count} {told} of {commands.topic}" if commands.count else "a guess"
+    kind = "speeds" if roles["command"] and roles["command"][0][0].type == MOTION else "commands"
+    seen = f"from {commands.count} {kind} of {commands.topic}" if commands.count else "a guess"
     return [
         "[task]",
         f'goal = "{"route" if routed else "none"}"'
@@ -203,7 +203,7 @@ def _lidar_range(recording: Recording, roles: Roles) -> tuple[float, float]:
 
 def _clock_lines(recording: Recording, roles: Roles, commands: Commands) -> list[str]:
     sensors = [
-        found[0][0] for role, found in roles.items() if found and role in (*REQUIRED, "scan")
+        fitting[0][0] for role, fitting in roles.items() if fitting and role in (*REQUIRED, "scan")
     ]
     stamped = {t.name for t in sensors if "header.stamp" in recording.leaves(t.name)}
     sensing = [t for t in sensors if t.name != commands.topic or t.type == MOTION]
@@ -212,7 +212,7 @@ def _clock_lines(recording: Recording, roles: Roles, commands: Commands) -> list
         topic_clock(name, recording.read({name: ["header.stamp"]})[name], 1.0)
         for name in sorted(stamped)
     ]
-    odd = [f"{clock.topic}: {said}" for clock in clocks if (said := odd_clock(clock.as_row()))]
+    odd = [f"{clock.topic}: {what}" for clock in clocks if (what := odd_clock(clock.as_row()))]
     offsets = [clock.offset_ns * 1e-9 for clock in clocks if clock.offset_ns is not None]
     period = commands.period_s
     steady = period is not None and 0.08 <= period <= 0.5
@@ -220,7 +220,7 @@ def _clock_lines(recording: Recording, roles: Roles, commands: Commands) -> list
     offset = f"  # log time is {min(offsets):,.3f} s ahead of it" if by_stamp and offsets else ""
     return [
         "[clock]",
-        *(f"# {said}" for said in odd),
+        *(f"# {what}" for what in odd),
         f'alignment = "{"header.stamp" if by_stamp else "log_time"}"' + offset,
         f'steps = "{"command" if steady else "rate"}"  # {why}',
         "max_gap_s = 0.5",
@@ -236,8 +236,8 @@ def _max_age_s(topic: TopicInfo, seconds: float) -> float | None:
     return float(np.clip(round(4 / rate, 1), 0.2, 10.0))
 
 
-def _input_lines(role: str, found: list[tuple[TopicInfo, Kind]], seconds: float) -> list[str]:
-    if not found:
+def _input_lines(role: str, fitting: list[tuple[TopicInfo, Kind]], seconds: float) -> list[str]:
+    if not fitting:
         if role in REQUIRED:
             fits = " or ".join(dict.fromkeys(kind.type for kind in KINDS[role]))
             if role == "pose":
@@ -247,12 +247,12 @@ def _input_lines(role: str, found: list[tuple[TopicInfo, Kind]], seconds: float)
                 f"# [inputs.{role}]",
                 "",
             ]
-        instead = FALLBACKS.get(role, "progress without a goal")
-        return [f"# [inputs.{role}]  # no topic seen; instead: {instead}", ""]
-    topic, kind = found[0]
+        fallback = FALLBACKS.get(role, "progress without a goal")
+        return [f"# [inputs.{role}]  # no topic seen; instead: {fallback}", ""]
+    topic, kind = fitting[0]
     rate = topic.expected / seconds if seconds > 0 else 0.0
     motion = role == "command" and topic.type == MOTION
-    others = ", ".join(other.name for other, _ in found[1:4])
+    others = ", ".join(other.name for other, _ in fitting[1:4])
     fields = ", ".join(f'{key} = "{path}"' for key, path in kind.fields.items())
     lines = [
         *(

@@ -83,14 +83,14 @@ class _ScanReducer:
 
     def _map(self, first: float, increment: float, beams: int) -> SectorMap:
         key = (first, increment, beams)
-        found = self._maps.get(key)
-        if found is None:
+        sectors = self._maps.get(key)
+        if sectors is None:
             if len(self._maps) >= _MAPS:
                 self._maps.clear()
             bearings = first + increment * np.arange(beams)
-            found = SectorMap.build(bearings, self.task.sectors, self.task.body)
-            self._maps[key] = found
-        return found
+            sectors = SectorMap.build(bearings, self.task.sectors, self.task.body)
+            self._maps[key] = sectors
+        return sectors
 
     def _angle(self, fields: Fields, path: str) -> NDArray[np.float64]:
         column = fields[path]

@@ -49,9 +49,9 @@ def topic_clock(topic: str, columns: TopicColumns, jump_s: float) -> TopicClock:
     if not isinstance(stamps, np.ndarray) or not count:
         return TopicClock(topic, count, sent)
     stamp = stamps.astype(np.int64)
-    told = stamp != 0
-    delay = log[told] - stamp[told]
-    found, repeats = np.unique(stamp, return_counts=True)
+    stamped = stamp != 0
+    delay = log[stamped] - stamp[stamped]
+    values, repeats = np.unique(stamp, return_counts=True)
     middle = median(delay) if len(delay) else 0
     low, high = np.percentile(delay - middle, [1, 99]) if len(delay) else (0, 0)
     return TopicClock(
@@ -60,10 +60,10 @@ def topic_clock(topic: str, columns: TopicColumns, jump_s: float) -> TopicClock:
         sent,
         middle,
         int(high - low),
-        len(jumps(log[told], delay, round(jump_s * 1e9))),
+        len(jumps(log[stamped], delay, round(jump_s * 1e9))),
         int((np.diff(stamp) < 0).sum()),
-        int((repeats[(repeats > 1) & (found != 0)] - 1).sum()),
-        int((~told).sum()),
+        int((repeats[(repeats > 1) & (values != 0)] - 1).sum()),
+        int((~stamped).sum()),
     )
 
 
@@ -78,10 +78,10 @@ def odd(row: Mapping[str, Any]) -> str:
         "off_clock": "left out",
         "restamped": "put at log time",
     }
-    said = [f"{row[key]:,} {word}" for key, word in words.items() if row.get(key)]
+    parts = [f"{row[key]:,} {word}" for key, word in words.items() if row.get(key)]
     if (row["spread_ns"] or 0) > WIDE_NS:
-        said.append(f"spread over {row['spread_ns'] * 1e-9:.1f} s")
-    return ", ".join(said)
+        parts.append(f"spread over {row['spread_ns'] * 1e-9:.1f} s")
+    return ", ".join(parts)
 
 
 _BLOCK = 1 << 16  # windows sorted at a time: bounds memory

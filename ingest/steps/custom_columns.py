@@ -16,7 +16,7 @@ from restock.errors import RecordingError
 from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, offsets_of
 from restock.ingest.profile.custom_signal import LIST, NUMBER, QUATERNION, CustomSignal, Reduce
-from restock.ingest.profile.signal_paths import Found, PathProblem
+from restock.ingest.profile.signal_paths import PathProblem, PathValues
 from restock.ingest.steps.align import LatestMessages
 from restock.ingest.steps.aligned_inputs import AlignedInputs
 from restock.ingest.task.signals import yaw_of
@@ -65,10 +65,10 @@ def custom_reduction(signals: Mapping[str, CustomSignal]) -> Reduction:
     fields = [path for signal in signals.values() for path in signal.wanted()]
 
     def apply(columns: Fields) -> dict[str, FieldColumn]:
-        found: dict[str, FieldColumn] = {}
+        made: dict[str, FieldColumn] = {}
         for name, signal in signals.items():
-            found |= _per_message(name, signal, columns)
-        return found
+            made |= _per_message(name, signal, columns)
+        return made
 
     return Reduction(tuple(dict.fromkeys(fields)), apply)
 
@@ -85,25 +85,25 @@ def _per_message(name: str, signal: CustomSignal, columns: Fields) -> dict[str, 
         if signal.reduce == "yaw":
             parts = [path.find(columns, end) for end in QUATERNION]
             x, y, z, w = (np.asarray(part.values, np.float64) for part in parts)
-            found = Found(parts[0].message, yaw_of(x, y, z, w))
+            read = PathValues(parts[0].message, yaw_of(x, y, z, w))
         else:
-            found = path.find(columns)
+            read = path.find(columns)
             if signal.reduce == "count":
-                counts = np.bincount(found.message, minlength=count).astype(np.float64)
-                found = Found(np.arange(count), counts)
-            elif signal.values is not None or found.values.dtype.kind not in "biuf":
-                values, unread = _numbers(found.values, signal.values)
+                counts = np.bincount(read.message, minlength=count).astype(np.float64)
+                read = PathValues(np.arange(count), counts)
+            elif signal.values is not None or read.values.dtype.kind not in "biuf":
+                values, unread = _numbers(read.values, signal.values)
                 texts[f"{_key(name)}, no number"] = first = np.full(count, "", object)
-                first[found.message[unread]] = found.values[unread].astype(str)
-                found = Found(found.message, values)
+                first[read.message[unread]] = read.values[unread].astype(str)
+                read = PathValues(read.message, values)
     except (PathProblem, ValueError, TypeError) as problem:
         raise RecordingError(
             f"`signals.{name}.path`: {signal.path!r} of {signal.topic} {problem}"
         ) from None
     if signal.reduce in ("min", "max", "mean", "sum"):
-        found = _reduced(found, signal.reduce)
-    stored = np.asarray(found.values, np.float64) * signal.scale + signal.offset
-    lengths = np.bincount(found.message, minlength=count)
+        read = _reduced(read, signal.reduce)
+    stored = np.asarray(read.values, np.float64) * signal.scale + signal.offset
+    lengths = np.bincount(read.message, minlength=count)
     return {
         _key(name): Ragged(stored.astype(np.float32) if signal.is_list else stored,
                            offsets_of(lengths)),
@@ -123,28 +123,30 @@ def _numbers(
     kinds, inverse = np.unique(values.astype(str), return_inverse=True)
     known = np.full(len(kinds), np.nan)
     unread = np.zeros(len(kinds), np.bool_)
-    told = {key.lower(): value for key, value in mapping.items()} if mapping is not None else None
+    numbers = (
+        {key.lower(): value for key, value in mapping.items()} if mapping is not None else None
+    )
     for index, text in enumerate(kinds.tolist()):
         plain = text.removesuffix(".0") if values.dtype.kind == "f" else text
         try:
-            known[index] = float(text) if told is None else told[plain.lower()]
+            known[index] = float(text) if numbers is None else numbers[plain.lower()]
         except (ValueError, KeyError):
             unread[index] = True
     return known[inverse], unread[inverse]
 
 
-def _reduced(found: Found, how: Reduce | None) -> Found:
+def _reduced(read: PathValues, how: Reduce | None) -> PathValues:
     """The finite elements of each message as one number; a message without any has none."""
-    finite = np.isfinite(found.values)
-    values, owner = np.asarray(found.values, np.float64)[finite], found.message[finite]
+    finite = np.isfinite(read.values)
+    values, owner = np.asarray(read.values, np.float64)[finite], read.message[finite]
     message, start, counts = np.unique(owner, return_index=True, return_counts=True)
     if not len(message):
-        return Found(message, values)
+        return PathValues(message, values)
     if how in ("min", "max"):
         reduce = np.minimum if how == "min" else np.maximum
-        return Found(message, reduce.reduceat(values, start))
+        return PathValues(message, reduce.reduceat(values, start))
     total = np.add.reduceat(values, start)
-    return Found(message, total / counts if how == "mean" else total)
+    return PathValues(message, total / counts if how == "mean" else total)
 
 
 @dataclass(frozen=True)
@@ -166,11 +168,11 @@ class Custom:
 
     def rows(self) -> list[dict[str, Any]]:
         """What came of each, as `recordings.signals` holds it."""
-        found = []
+        rows = []
         for column in self.table.schema:
             about = {key.decode(): text.decode() for key, text in (column.metadata or {}).items()}
             read = self.columns.get(column.name)
-            found.append(
+            rows.append(
                 {
                     "name": column.name,
                     "unit": about.get("unit", ""),
@@ -184,7 +186,7 @@ class Custom:
                     "steps": len(self.table) - self.table[column.name].null_count,
                 }
             )
-        return found
+        return rows
 
     def take(self, ticks: NDArray[np.int64]) -> pa.Table:
         """The columns at these ticks."""

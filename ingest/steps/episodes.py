@@ -1,4 +1,4 @@
-"""Steps to episodes: where one begins, where it ends, and whether it terminated or was cut.
+"""Steps to episodes: where one begins, where it ends, and whether it terminated or was truncated.
 
 - The goal is reached (or a bump, where the task says so): **terminated**. The steps after it,
   until there is another goal or the same one is ordered again, belong to no episode.
@@ -57,11 +57,11 @@ class Split:
 def split(task: Task, steps: Steps) -> Split:
     """The episodes of a recording's steps."""
     changed, routing = changed_route(steps), steps.routing
-    over_old = np.zeros(len(steps), np.bool_)
+    old_route = np.zeros(len(steps), np.bool_)
     if len(changed):  # seen with the goal and plan of the tick before
         goal, plan = routing.goal[changed - 1], routing.plan[changed - 1]
-        over_old[changed] = terminated(task, with_route(task, steps, changed, goal, plan))
-    return _Walk(task, steps, terminated(task, steps.signals), over_old).walk()
+        old_route[changed] = terminated(task, with_route(task, steps, changed, goal, plan))
+    return _Walk(task, steps, terminated(task, steps.signals), old_route).walk()
 
 
 def changed_route(steps: Steps) -> Ints:
@@ -80,10 +80,12 @@ def with_route(
 
 
 class _Walk:
-    """Goes over the ticks once, in order."""
+    """Walks the ticks once, in order."""
 
-    def __init__(self, task: Task, steps: Steps, over: Bools, over_old: Bools) -> None:
-        self.task, self.steps, self.over, self.over_old = task, steps, over, over_old
+    def __init__(self, task: Task, steps: Steps, terminated: Bools, old_route: Bools) -> None:
+        self.task, self.steps = task, steps
+        self.terminated = terminated  # (T,)
+        self.old_route_terminated = old_route  # (T,) by goal and plan of the tick before
         self.goal = steps.routing.goal.tolist()
         self.order = steps.routing.order.tolist()
         self.episodes: list[EpisodeSpan] = []
@@ -103,16 +105,18 @@ class _Walk:
     def _goes_on(self, tick: int, first: int, follows: bool) -> bool:
         """Whether the open episode uses this tick up; closes it if it ends here or before."""
         if not follows:
-            self._close(tick - 1, self.steps.problem[tick] or self.steps.cut[tick])
+            self._close(tick - 1, self.steps.problem[tick] or self.steps.break_reason[tick])
             return False
         if self.goal[tick] != self.goal[first]:
-            over = bool(self.over_old[tick])
+            terminated = bool(self.old_route_terminated[tick])
             bump = self.task.bump_terminates and self.steps.signals["bumped"][tick]
-            ended = "bump" if bump else "goal"
-            cut = "new goal" if self.goal[tick] >= 0 else "no route"
-            self._close(tick, ended if over else cut, terminated=over, shared=True)
+            if terminated:
+                reason = "bump" if bump else "goal"
+            else:
+                reason = "new goal" if self.goal[tick] >= 0 else "no route"
+            self._close(tick, reason, terminated=terminated, shared=True)
             return False
-        if self.over[tick]:
+        if self.terminated[tick]:
             reached = self._at_goal(tick)
             self.done_with = (self.goal[tick], self.order[tick]) if reached else None
             self._close(tick, "goal" if reached else "bump", terminated=True)

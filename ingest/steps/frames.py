@@ -190,16 +190,16 @@ class Tree:
         count = sum(map(len, times))
         out = Placement.nowhere(count)
         out.stamp_ns[:] = np.concatenate([*times, np.zeros(0, np.int64)])
-        held = self._hold_above(frame, times)
-        if not held:
+        transforms = self._hold_above(frame, times)
+        if not transforms:
             out.problem[:] = self._apart([source], [fixed])
             return out
-        ups = np.stack([one.parent for one in held.values()], axis=1)  # (T, C)
+        ups = np.stack([one.parent for one in transforms.values()], axis=1)  # (T, C)
         trees, which = np.unique(ups, axis=0, return_inverse=True)
         for index, tree in enumerate(trees):
             rows = np.flatnonzero(which.reshape(-1) == index)
-            parent = {child: int(up) for child, up in zip(held, tree, strict=True) if up >= 0}
-            self._fill(out, rows, held, _way(source, parent), _way(fixed, parent))
+            parent = {child: int(up) for child, up in zip(transforms, tree, strict=True) if up >= 0}
+            self._fill(out, rows, transforms, _way(source, parent), _way(fixed, parent))
         return out
 
     def way(self, frame: str, time: Sequence[Ints]) -> list[tuple[str, str, int, int]]:
@@ -208,18 +208,20 @@ class Tree:
         Each by its topic, the frame that it places, its row in `edges.topics["TOPIC FRAME"]` and
         its stamp (ns).
         """
-        held = self._hold_above(frame, time)
-        parent = {child: int(one.parent[0]) for child, one in held.items() if one.parent[0] >= 0}
+        transforms = self._hold_above(frame, time)
+        parent = {
+            child: int(one.parent[0]) for child, one in transforms.items() if one.parent[0] >= 0
+        }
         up, other = (
             _way(number, parent) for number in map(self._number, (frame, self.frames.fixed))
         )
         top = next(number for number in up if number in other)
         return [
             (
-                self.frames.topic if held[child].moving[0] else self.frames.static_topic,
+                self.frames.topic if transforms[child].moving[0] else self.frames.static_topic,
                 self._name(child),
-                int(held[child].row[0]),
-                int(held[child].stamp_ns[0]),
+                int(transforms[child].row[0]),
+                int(transforms[child].stamp_ns[0]),
             )
             for child in (*up[: up.index(top)], *other[: other.index(top)])
         ]
@@ -233,7 +235,7 @@ class Tree:
         self,
         out: Placement,
         rows: Ints,
-        held: dict[int, _Transform],
+        transforms: dict[int, _Transform],
         up: list[int],
         other: list[int],
     ) -> None:
@@ -242,12 +244,12 @@ class Tree:
         if meet is None:
             out.problem[rows] = self._apart(up, other)
             return
-        there = self._compose(out, rows, held, up[: up.index(meet)])
-        back = self._compose(out, rows, held, other[: other.index(meet)])
-        inverse = np.swapaxes(back[0], 1, 2)
-        out.rotation[rows] = inverse @ there[0]
-        out.translation_m[rows] = np.einsum("nij,nj->ni", inverse, there[1] - back[1])
-        moving = [held[f] for f in (*up[: up.index(meet)], *other[: other.index(meet)])]
+        outward = self._compose(out, rows, transforms, up[: up.index(meet)])
+        homeward = self._compose(out, rows, transforms, other[: other.index(meet)])
+        inverse = np.swapaxes(homeward[0], 1, 2)
+        out.rotation[rows] = inverse @ outward[0]
+        out.translation_m[rows] = np.einsum("nij,nj->ni", inverse, outward[1] - homeward[1])
+        moving = [transforms[f] for f in (*up[: up.index(meet)], *other[: other.index(meet)])]
         stamps = [
             np.where(one.moving, one.stamp_ns, np.iinfo(np.int64).min)[rows] for one in moving
         ]
@@ -257,12 +259,12 @@ class Tree:
             out.stamp_ns[rows[known]] = newest[known]
 
     def _compose(
-        self, out: Placement, rows: Ints, held: dict[int, _Transform], way: list[int]
+        self, out: Placement, rows: Ints, transforms: dict[int, _Transform], way: list[int]
     ) -> tuple[F64, F64]:
         """The transforms along a way as one: rotation (N, 3, 3) and translation (N, 3)."""
         rotation, translation = np.tile(np.eye(3), (len(rows), 1, 1)), np.zeros((len(rows), 3))
         for frame in way:
-            one = held[frame]
+            one = transforms[frame]
             step = one.rotation[rows]
             translation = np.einsum("nij,nj->ni", step, translation) + one.translation[rows]
             rotation = step @ rotation

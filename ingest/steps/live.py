@@ -74,7 +74,7 @@ class LiveObserver:
 
     def reset(self) -> None:
         """Forget everything: the clock was set, or the robot was put elsewhere."""
-        self._held: dict[str, list[_Message]] = {topic: [] for topic in self._inputs}
+        self._buffers: dict[str, list[_Message]] = {topic: [] for topic in self._inputs}
         self._delays: dict[str, deque[int]] = {}
         self._command: _Message | None = None  # the first since the last tick, or the last before
         self._ticked = True
@@ -104,7 +104,7 @@ class LiveObserver:
         fields = {path: _column(message, path) for path in paths}
         taken = _Message(log_time_ns, stamp_ns, fields)
         if topic != self.profile.inputs.command.topic:
-            self._held[topic].append(taken)
+            self._buffers[topic].append(taken)
         elif self._ticked:
             self._command, self._ticked = taken, False
 
@@ -114,12 +114,12 @@ class LiveObserver:
         ticks = [stamp_ns] if self._before_ns is None else [self._before_ns, stamp_ns]
         topics: dict[str, TopicColumns] = {}
         samples: dict[str, Samples] = {}
-        for topic, held in self._held.items():
+        for topic, messages in self._buffers.items():
             if topic == self.profile.inputs.command.topic:
                 topics[topic], samples[topic] = self._commands(ticks)
-            elif held or not self._optional(topic):
-                topics[topic] = _columns(held)
-                stamps = np.array([message.stamp_ns for message in held], np.int64)
+            elif messages or not self._optional(topic):
+                topics[topic] = _columns(messages)
+                stamps = np.array([message.stamp_ns for message in messages], np.int64)
                 order = np.argsort(stamps, kind="stable")
                 samples[topic] = Samples(stamps[order], order)
         silent = [topic for topic, columns in topics.items() if not len(columns)]
@@ -152,11 +152,11 @@ class LiveObserver:
     def _tick(self, stamp_ns: int) -> None:
         """Let go of what neither this tick holds nor a later one will."""
         self._before_ns, self._ticked = stamp_ns, True
-        for topic, held in self._held.items():
-            known = [message.stamp_ns for message in held if message.stamp_ns <= stamp_ns]
+        for topic, messages in self._buffers.items():
+            known = [message.stamp_ns for message in messages if message.stamp_ns <= stamp_ns]
             if known:
                 newest = max(known)
-                self._held[topic] = [m for m in held if m.stamp_ns >= newest]
+                self._buffers[topic] = [m for m in messages if m.stamp_ns >= newest]
 
     def _commands(self, ticks: Sequence[int]) -> tuple[TopicColumns, Samples]:
         """The command in force since the tick before; the one of this tick is still to come."""
@@ -189,11 +189,11 @@ class LiveObserver:
         return all(source.optional for source in self._inputs[topic])
 
 
-def _columns(held: Sequence[_Message]) -> TopicColumns:
-    times = np.array([message.log_time_ns for message in held], np.int64)
-    paths = held[0].fields if held else {}
+def _columns(messages: Sequence[_Message]) -> TopicColumns:
+    times = np.array([message.log_time_ns for message in messages], np.int64)
+    paths = messages[0].fields if messages else {}
     return TopicColumns(
-        times, times, {path: join([message.fields[path] for message in held]) for path in paths}
+        times, times, {path: join([message.fields[path] for message in messages]) for path in paths}
     )
 
 

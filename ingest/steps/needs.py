@@ -116,10 +116,10 @@ def _both(parts: Sequence[Reduction]) -> Reduction:
 
 def field_paths(source: Input) -> list[str]:
     """The field paths that an input reads."""
-    found: list[str] = []
-    for key, path in source.fields.items():
-        found += [f"{path}.{axis}" for axis in "xyzw"] if key == "orientation" else [path]
-    return found
+    paths: list[str] = []
+    for key, field in source.fields.items():
+        paths += [f"{field}.{axis}" for axis in "xyzw"] if key == "orientation" else [field]
+    return paths
 
 
 def input_problems(
@@ -132,21 +132,21 @@ def input_problems(
     wrong: dict[str, list[str]] = {}
     fields: list[str] = []
     for name, source in profile.inputs.items():
-        found = available.get(source.topic)
-        if (found is None or not found.expected) and not source.optional:
-            what = "no message of" if found is not None else "no topic"
+        topic = available.get(source.topic)
+        if (topic is None or not topic.expected) and not source.optional:
+            what = "no message of" if topic is not None else "no topic"
             needed.setdefault(f"{what} {source.topic}", []).append(name)
-        elif found is not None and found.type != source.type:
-            said = f"{source.topic} holds {found.type}, not {source.type}"
-            wrong.setdefault(said, []).append(name)
-        elif found is not None and leaves is not None:
+        elif topic is not None and topic.type != source.type:
+            what = f"{source.topic} holds {topic.type}, not {source.type}"
+            wrong.setdefault(what, []).append(name)
+        elif topic is not None and leaves is not None:
             fields += _field_problems(name, source, leaves[source.topic])
     for name, signal in profile.signals.items():
-        found = available.get(signal.topic)
-        if found is not None and found.type != signal.type:
-            said = f"{signal.topic} holds {found.type}, not {signal.type}"
-            wrong.setdefault(said, []).append(f"signals.{name}")
-        elif found is not None and leaves is not None:
+        topic = available.get(signal.topic)
+        if topic is not None and topic.type != signal.type:
+            what = f"{signal.topic} holds {topic.type}, not {signal.type}"
+            wrong.setdefault(what, []).append(f"signals.{name}")
+        elif topic is not None and leaves is not None:
             problem = signal.problem(leaves[signal.topic])
             fields += [f"`signals.{name}.path`: {signal.topic}: {problem}"] if problem else []
     hints = {what: near(what.split()[-1], available) for what in needed}
@@ -159,8 +159,8 @@ def input_problems(
 
 def near(topic: str, available: Mapping[str, Any]) -> str:
     """A question about a topic that is nearly the one that is missing, or ""."""
-    found = [] if topic in available else get_close_matches(topic, available, n=1)
-    return f"did you mean {found[0]}?" if found else ""
+    close = [] if topic in available else get_close_matches(topic, available, n=1)
+    return f"did you mean {close[0]}?" if close else ""
 
 
 def _field_problems(name: str, source: Input, leaves: Sequence[Leaf]) -> list[str]:

@@ -39,7 +39,7 @@ class Steps:
     signals: dict[str, NDArray[Any]]  # every signal, leading axis T
     segment: Ints  # (T,) of the clock
     follows: Bools  # (T,) comes directly after the tick before, and both are usable
-    cut: list[str]  # (T,) why it does not follow, or ""
+    break_reason: list[str]  # (T,) why it does not follow, or ""
     problem: list[str]  # (T,) why the tick is unusable whatever its route, or ""
     route_problem: list[str]  # (T,) why its route is unusable, or ""
     routing: Routing
@@ -80,7 +80,7 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
         signals,
         filling.segment,
         filled.follows,
-        filled.cut,
+        filled.break_reason,
         list(filling.problem),
         list(filling.route_problem),
         filling.routing,
@@ -136,9 +136,9 @@ class Filling:
     def continuity(self) -> tuple[Bools, list[str]]:
         """Whether each tick follows the one before, and why not."""
         count = len(self.tick_ns)
-        cut = np.full(count, "", object)
+        break_reason = np.full(count, "", object)
         if count:
-            cut[0] = "start of the recording"
+            break_reason[0] = "start of the recording"
         x, y = self.signals["pose_x_m"], self.signals["pose_y_m"]
         jump = np.hypot(np.diff(x), np.diff(y)) > self.profile.episodes.max_pose_jump_m
         gap = np.diff(self.tick_ns) > round(self.profile.clock.max_gap_s * NS)
@@ -149,8 +149,8 @@ class Filling:
             (unusable, "unusable step"),
             (jump, "pose jump"),
         ):
-            cut[1:][bad & (cut[1:] == "")] = reason
-        return np.asarray(cut == "", np.bool_), list(cut)
+            break_reason[1:][bad & (break_reason[1:] == "")] = reason
+        return np.asarray(break_reason == "", np.bool_), list(break_reason)
 
     def behaviour(self) -> tuple[list[str], list[str | None], list[float | None]]:
         """Who acted at each tick: policy, version, probability of the action."""
@@ -314,17 +314,17 @@ class Filled:
     filling: Filling
     signals: dict[str, NDArray[Any]]  # every signal, leading axis T
     follows: Bools  # (T,) comes directly after the tick before, and both are usable
-    cut: list[str]  # (T,) why it does not follow, or ""
+    break_reason: list[str]  # (T,) why it does not follow, or ""
 
 
 def fill_signals(aligned: AlignedInputs) -> Filled:
     """Every signal at every tick, from the latest messages at it."""
     filling = Filling(aligned)
     signals = filling.fill()
-    follows, cut = filling.continuity()
+    follows, break_reason = filling.continuity()
     before = np.arange(len(follows)) - follows  # the tick before, or itself
     forward, lateral = localised_velocity(
         signals, {name: signals[name][before] for name in signals if name.startswith("pose_")}
     )
     signals |= {"localised_speed_mps": forward, "localised_lateral_mps": lateral}
-    return Filled(filling, signals, follows, cut)
+    return Filled(filling, signals, follows, break_reason)

@@ -72,9 +72,9 @@ class Location:
         if isinstance(place, Location):
             return place
         text = str(place)
-        if found := _S3.fullmatch(text):
-            prefix = found["prefix"].strip("/")
-            return cls(f"s3://{found['bucket']}" + (f"/{prefix}" if prefix else ""), None)
+        if match := _S3.fullmatch(text):
+            prefix = match["prefix"].strip("/")
+            return cls(f"s3://{match['bucket']}" + (f"/{prefix}" if prefix else ""), None)
         if scheme := _SCHEME.match(text):
             raise StoreError(
                 f"a store cannot lie on {scheme[1]}:",
@@ -118,7 +118,7 @@ class Location:
 
         A folder of a log is not yet one: another writer may be making its first version.
         """
-        with self.explained():
+        with self.translate_errors():
             return bool(DeltaTable.is_deltatable(self.table(name), self.options))
 
     def open_table(self, name: str, version: int | None = None) -> DeltaTable:
@@ -128,7 +128,7 @@ class Location:
             StoreError: no such table or version, or the place cannot be reached.
         """
         try:
-            with self.explained():
+            with self.translate_errors():
                 return DeltaTable(self.table(name), version=version, storage_options=self.options)
         except (TableNotFoundError, DeltaError, ValueError) as error:
             raise StoreError(
@@ -155,7 +155,7 @@ class Location:
     def write(self, rows: pa.Table, path: str, **options: Any) -> int:
         """Write a Parquet file, whole and on disks flushed; returns its size in bytes."""
         if self.folder is None:
-            with self.explained(), self.files.open_output_stream(path) as out:
+            with self.translate_errors(), self.files.open_output_stream(path) as out:
                 pq.write_table(rows, out, **options)
                 return int(out.tell())
         file = self.folder / path
@@ -173,16 +173,16 @@ class Location:
             FileNotFoundError: it is not there.
             StoreError: the place cannot be reached.
         """
-        with self.explained(), self.files.open_input_file(path) as file:
+        with self.translate_errors(), self.files.open_input_file(path) as file:
             return pq.read_table(file, partitioning=None)
 
     def listing(self, folder: str) -> set[str]:
         """The files below a folder of the store, by their paths in that folder."""
-        with self.explained():
-            found = self.files.get_file_info(
+        with self.translate_errors():
+            infos = self.files.get_file_info(
                 pa.fs.FileSelector(folder, recursive=True, allow_not_found=True)
             )
-        return {info.path.removeprefix(f"{folder}/") for info in found if info.is_file}
+        return {info.path.removeprefix(f"{folder}/") for info in infos if info.is_file}
 
     def delete(self, paths: Iterable[str]) -> None:
         """Delete files; one that is not there is as good."""
@@ -191,13 +191,13 @@ class Location:
                 (self.folder / path).unlink(missing_ok=True)
             return
         # Not by Arrow's client: it puts an empty object where a folder's last file was.
-        with self.explained():
+        with self.translate_errors():
             s3 = DeltaStorageHandler(self.text, self.options)
             for path in paths:
                 s3.delete_file(path)
 
     @contextmanager
-    def explained(self) -> Iterator[None]:
+    def translate_errors(self) -> Iterator[None]:
         """Turn what goes wrong on the way to S3 into a StoreError that says what to do.
 
         What Delta says of its tables passes, and so do conflicts of writers and missing files.

@@ -109,14 +109,14 @@ def recorded_facts(
 
 def topic_rows(recording: Recording) -> list[dict[str, Any]]:
     """Every topic: the messages the container counts, those decoded, and why not the rest."""
-    found = []
+    rows = []
     for name, info in recording.topics.items():
         account = recording.accounts.get(name)
         reason = info.skipped or UNUSED
         if account is not None:
             reason = "; ".join(f"{why}: {count}" for why, count in account.reasons.items() if count)
         decoded = account.decoded if account is not None else 0
-        found.append(
+        rows.append(
             {
                 "topic": name,
                 "type": info.type,
@@ -126,7 +126,7 @@ def topic_rows(recording: Recording) -> list[dict[str, Any]]:
                 "reason": reason,
             }
         )
-    return found
+    return rows
 
 
 def clock_rows(recording: Recording, steps: Steps) -> list[dict[str, Any]]:

@@ -129,7 +129,7 @@ class StoreWriter:
         for name in (RECORDINGS, TRANSITIONS):
             if not self.path.has_table(name):
                 continue
-            with self.path.explained():
+            with self.path.translate_errors():
                 unneeded = self.path.open_table(name).vacuum(
                     retention_hours=retention_hours,
                     dry_run=True,
@@ -137,8 +137,8 @@ class StoreWriter:
                     full=True,
                 )
             # It names removed files for as long as the log does, there or not.
-            there = sorted(set(unneeded) & self.path.listing(name))
-            deleted += [f"{name}/{file}" for file in there]
+            stale = sorted(set(unneeded) & self.path.listing(name))
+            deleted += [f"{name}/{file}" for file in stale]
         # Without commits of its own: cleaning changes no version of a table.
         self.path.delete(deleted)
         return deleted
@@ -214,8 +214,8 @@ class StoreWriter:
 
         def commit() -> int:
             table = self.path.open_table(name)
-            there = _files(table)
-            if {file.path for file in added} <= {file.path for file in there}:
+            active = _files(table)
+            if {file.path for file in added} <= {file.path for file in active}:
                 return table.version()  # by the attempt before, whose answer was lost
             self._still(instead_of)
             now_ms = time.time_ns() // 1_000_000
@@ -225,7 +225,7 @@ class StoreWriter:
             ]
             turns = []
             if name == TRANSITIONS:
-                replaced[:] = [file.path for file in there if file.recording_id in recordings]
+                replaced[:] = [file.path for file in active if file.recording_id in recordings]
                 actions += [RemoveAction(path, True, now_ms) for path in replaced]
                 # Two first ingests of one recording add without removing, which is no conflict by
                 # itself: the transaction id makes it one.
@@ -281,7 +281,7 @@ class StoreWriter:
         for recording, ingest in instead_of.items():
             if shown.get(recording) != ingest:
                 raise StoreError(
-                    f"recording {recording} was ingested anew meanwhile",
+                    f"recording {recording} was ingested again meanwhile",
                     where=str(self.path),
                     remedy="try again; the store is as that ingest left it",
                 )
@@ -290,7 +290,7 @@ class StoreWriter:
         """Do it again, from a fresh look at the table, while other writers are faster."""
         for attempt in range(ATTEMPTS):
             try:
-                with self.path.explained():
+                with self.path.translate_errors():
                     return work()
             except CommitFailedError as error:
                 conflict = error

@@ -57,18 +57,18 @@ def select_of(columns: str) -> str:
 def refusal(sql: str, timing: Literal["pre", "post"]) -> str | None:
     """Why this SQL may not be a condition's, or None. Whether it binds is DuckDB's to say."""
     with duckdb.connect(config=SANDBOX) as connection:
-        asked = "SELECT json_serialize_sql(?::VARCHAR)"
-        text = connection.execute(asked, [select_of(f"({sql}\n)")]).fetchall()[0][0]
+        query = "SELECT json_serialize_sql(?::VARCHAR)"
+        text = connection.execute(query, [select_of(f"({sql}\n)")]).fetchall()[0][0]
     try:
         return _read(json.loads(text), timing)
     except RecursionError:
         return "it nests too deeply"
 
 
-def _read(said: dict[str, Any], timing: str) -> str | None:
-    if said["error"]:
-        return "its SQL cannot be read: " + str(said["error_message"]).splitlines()[0]
-    statements = said["statements"]
+def _read(parsed: dict[str, Any], timing: str) -> str | None:
+    if parsed["error"]:
+        return "its SQL cannot be read: " + str(parsed["error_message"]).splitlines()[0]
+    statements = parsed["statements"]
     node = statements[0]["node"]
     if len(statements) != 1 or node["type"] != "SELECT_NODE" or len(node["select_list"]) != 1:
         return "it is more than one expression"

@@ -24,8 +24,8 @@ VALUES = pa.map_(pa.string(), pa.float64())
 class Perturbed:
     """Which of a few sets of parameters was in force at each of T places; -1: not known."""
 
-    said: Sequence[tuple[str, Mapping[str, float]] | None]  # name, values; None: unreadable
-    row: Ints  # (T,) of `said`
+    sets: Sequence[tuple[str, Mapping[str, float]] | None]  # name, values; None: unreadable
+    row: Ints  # (T,) of `sets`
     notes: list[str] = field(default_factory=list)
 
     @classmethod
@@ -36,16 +36,16 @@ class Perturbed:
     @classmethod
     def read(cls, texts: Sequence[str], row: Ints) -> Perturbed:
         """From messages `{"name", "values": {field: number}}`, and which is held where."""
-        said = [parse_perturbation(text) for text in texts]
-        unread = sum(item is None for item in said)
+        sets = [parse_perturbation(text) for text in texts]
+        unread = sum(item is None for item in sets)
         many = "message is" if unread == 1 else "messages are"
         notes = [f'perturbation: {unread} {many} not JSON {{"name", "values": {{field: number}}}}']
-        return cls(said, row, notes if unread else [])
+        return cls(sets, row, notes if unread else [])
 
     def columns(self, places: Ints) -> tuple[pa.Array, pa.Array]:
         """`perturbation` and `perturbation_values` at some places (n,)."""
-        named = [None if item is None else item[0] for item in self.said]
-        values = [None if item is None else list(item[1].items()) for item in self.said]
+        named = [None if item is None else item[0] for item in self.sets]
+        values = [None if item is None else list(item[1].items()) for item in self.sets]
         row = self.row[places]
         chosen = pa.array(row, pa.int64(), mask=row < 0)
         return (
@@ -57,11 +57,11 @@ class Perturbed:
 def parse_perturbation(text: str) -> tuple[str, dict[str, float]] | None:
     """`{"name": …, "values": {field: number}}` to the two; None where it is something else."""
     try:
-        said = json.loads(text)
-        name, values = said["name"], said["values"]
-        found = {field: float(value) for field, value in values.items()}
+        message = json.loads(text)
+        name, values = message["name"], message["values"]
+        numbers = {field: float(value) for field, value in values.items()}
     except (ValueError, TypeError, KeyError, AttributeError):
         return None
-    if not isinstance(name, str) or not all(isfinite(value) for value in found.values()):
+    if not isinstance(name, str) or not all(isfinite(value) for value in numbers.values()):
         return None
-    return name, found
+    return name, numbers

@@ -41,8 +41,10 @@ TRANSITION: tuple[Column, ...] = (
     Column("action", pa.int16(), "index of the discrete action in force over [t, t + 1)"),
     Column("reward", pa.float32(), "of [t, t + 1)"),
     Column("next_observation", _F32_LIST, "what the robot knew at t + 1; float32[D]"),
-    Column("terminated", pa.bool_(), "the episode ended for good at t + 1: do not bootstrap"),
-    Column("truncated", pa.bool_(), "the episode was cut at t + 1 (time, gap, end of recording)"),
+    Column("terminated", pa.bool_(), "the episode terminated at t + 1: do not bootstrap"),
+    Column(
+        "truncated", pa.bool_(), "the episode was truncated at t + 1: time, gap, end of recording"
+    ),
 )
 COVERAGE: tuple[Column, ...] = (
     Column("condition", pa.string(), "the one condition of highest priority, or 'nominal'"),
@@ -87,8 +89,8 @@ COLUMNS: tuple[Column, ...] = IDENTITY + TRANSITION + COVERAGE + SIGNAL_COLUMNS 
 def steps_schema(custom: Sequence[pa.Field] = ()) -> pa.Schema:
     """The steps as conditions see them: the stored signals, and a profile's custom ones."""
     keys = [("episode_index", pa.int64()), ("step_index", pa.int64())]
-    own = [(column.name, column.type) for column in SIGNAL_COLUMNS]
-    return pa.schema([*(pa.field(*field) for field in keys + own), *custom])
+    signals = [(column.name, column.type) for column in SIGNAL_COLUMNS]
+    return pa.schema([*(pa.field(*field) for field in keys + signals), *custom])
 
 
 def transition_schema(observation_size: int, custom: Sequence[pa.Field] = ()) -> pa.Schema:

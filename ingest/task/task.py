@@ -148,11 +148,11 @@ def reached_goal(task: Task, after: Columns) -> Bools:
 
 
 def terminated(task: Task, after: Columns) -> Bools:
-    """Whether the episode ends for good at t + 1, (N,): no value is to be bootstrapped there."""
-    over = reached_goal(task, after)
+    """Whether the episode terminates at t + 1, (N,): no value is to be bootstrapped there."""
+    terminates = reached_goal(task, after)
     if task.bump_terminates:
-        over = over | after["bumped"].astype(np.bool_)
-    return over
+        terminates = terminates | after["bumped"].astype(np.bool_)
+    return terminates
 
 
 def reward(

@@ -162,7 +162,7 @@ class Store:
                 parquet,
                 self.path.files,
             )
-            with self.path.explained():
+            with self.path.translate_errors():
                 self.connection.register(view, remote.to_table() if hold else remote)
         return files
 

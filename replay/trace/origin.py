@@ -83,7 +83,7 @@ def find_origin(
     raise StoreError(
         f"no transition {transition} in it",
         where=", ".join(source.path for source in sources),
-        remedy="its recording was taken out, or ingested anew with other steps: `restock sql STORE"
+        remedy="its recording was taken out, or ingested again with other steps: `restock sql STORE"
         ' "FROM recordings"` lists what is there; `--store` names another store',
     )
 
@@ -157,8 +157,8 @@ def _changes(row: Mapping[str, Any], now: Origin | None) -> list[str]:
     changed = [name for name in _RELABELLED if row.get(name) != now.transition.get(name)]
     if not changed:
         return []
-    said = ", ".join(f"{name} {row.get(name)} -> {now.transition.get(name)}" for name in changed)
-    return [f"ingested or labelled anew since (version {now.store['version']}): {said}"]
+    changes = ", ".join(f"{name} {row.get(name)} -> {now.transition.get(name)}" for name in changed)
+    return [f"ingested or labelled again since (version {now.store['version']}): {changes}"]
 
 
 def _interpret(origin: Origin, recording: Path | None, name: str | None) -> None:

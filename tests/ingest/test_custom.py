@@ -279,7 +279,7 @@ def test_they_are_columns_of_the_table_with_units(store, capsys):
     ]
 
 
-def test_conditions_use_them_and_label_runs_changed_ones_anew(store, tmp_path, capsys):
+def test_conditions_use_them_and_label_runs_changed_ones_again(store, tmp_path, capsys):
     """Stored signals are enough: no recording is read, and the audit names the old labels."""
     by_hand = "SELECT count(*) AS n FROM transitions WHERE left_radps > {} AND battery_v > 20"
     labelled = "SELECT count(*) AS n FROM transitions WHERE condition = 'fast_wheel'"

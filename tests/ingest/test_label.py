@@ -124,7 +124,7 @@ def test_a_recording_that_was_ingested_meanwhile_is_left_alone(store, tmp_path):
         return found
 
     writer.rows = rows_and_a_rival  # type: ignore[method-assign]
-    with pytest.raises(StoreError, match="ingested anew meanwhile"):
+    with pytest.raises(StoreError, match="ingested again meanwhile"):
         relabel_store(writer, conditions_of)
     assert {name for (name,) in rows(store, "condition")} == {"nominal", "soon"}
 
@@ -168,7 +168,7 @@ def stale(store: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
     return [Path(row["source_file"]).name for row in one["sample"]]
 
 
-def test_the_audit_names_stale_labels_until_they_are_run_anew(store, tmp_path, capsys):
+def test_the_audit_names_stale_labels_until_they_are_run_again(store, tmp_path, capsys):
     """End to end: a changed condition, one recording ingested by it, the other one labelled."""
     profile = tmp_path / "amr.toml"
     assert stale(store, capsys) == []

@@ -128,7 +128,7 @@ def test_memory_does_not_grow_with_messages() -> None:
         observer.receive("/odom", odometry(index * 10**7, 1.0), index * 10**7)
         if index % 20 == 19:
             observer.observe(index * 10**7)
-    assert sum(len(held) for held in observer._held.values()) < 30
+    assert sum(len(held) for held in observer._buffers.values()) < 30
 
 
 def test_a_profile_that_needs_transforms_is_refused() -> None:

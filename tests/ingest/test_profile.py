@@ -75,7 +75,7 @@ def test_an_error_names_the_file_and_the_key(old, new, said):
 
 def test_what_nothing_can_stand_in_for_is_not_optional():
     text = TEXT.replace("[inputs.wheels]", "[inputs.wheels]\noptional = true")
-    with pytest.raises(ConfigError, match="nothing can stand in for wheels"):
+    with pytest.raises(ConfigError, match="wheels has no fallback, so it cannot be optional"):
         parse_profile(text, where="mine.toml")
 
 

@@ -153,7 +153,10 @@ def test_a_robot_that_was_carried_does_not_drive_on():
     topics = Drive().topics()
     topics["/amcl_pose"].fields["pose.pose.position.x"][30:] += 3.0
     steps = steps_of(PROFILE, topics)
-    assert [cut for cut in steps.cut if cut] == ["start of the recording", "pose jump"]
+    assert [reason for reason in steps.break_reason if reason] == [
+        "start of the recording",
+        "pose jump",
+    ]
     # No speed is made up across the jump.
     assert steps.signals["localised_speed_mps"] == pytest.approx(np.full(30, SPEED_MPS))
 

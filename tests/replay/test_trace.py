@@ -234,7 +234,7 @@ def test_another_recording_is_refused(places: Places) -> None:
         trace_row(places.store, str(row["transition_id"]), TracePlaces(recording=other))
 
 
-def test_a_row_that_was_labelled_anew_since_says_so(tmp_path: Path) -> None:
+def test_a_row_that_was_labelled_again_since_says_so(tmp_path: Path) -> None:
     before = recording_transitions(1)
     writer = write_store(tmp_path / "store", [before, recording_transitions(2)])
     with Store(writer) as store:
@@ -246,7 +246,7 @@ def test_a_row_that_was_labelled_anew_since_says_so(tmp_path: Path) -> None:
     found = trace_row(tmp_path / "panel", "0").origin
     assert found is not None
     assert found.transition["condition"] == before["condition"][0].as_py()
-    assert any("anew since" in note and "-> recovery" in note for note in found.notes)
+    assert any("again since" in note and "-> recovery" in note for note in found.notes)
     replace_recording(tmp_path / "store", later.slice(1))
     found = trace_row(tmp_path / "panel", "0").origin
     assert found is not None

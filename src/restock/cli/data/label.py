@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class LabelCommand:
-    """Label a store's transitions anew where their conditions have changed.
+    """Label a store's transitions again where their conditions have changed.
 
     Conditions run over the signals that are stored: no recording is read, and observations,
     actions and rewards stay as they are. Recordings whose labels are of the conditions they should
