@@ -102,7 +102,7 @@ def train(
         notify: told of every row of `progress` and every evaluation.
 
     Raises:
-        RunError: `out` is there already.
+        RunError: `out` already exists.
         ConfigError: a config that cannot be used, or no such device.
         PanelError: a panel made for another task or discount than the twin's.
         TrainingInterrupted: `stop` returned True.
@@ -127,7 +127,7 @@ def prepare_new(
     """A new run, checked; `config` may be the path of a TOML file, None for the defaults.
 
     Raises:
-        RunError: `out` is there already.
+        RunError: `out` already exists.
         ConfigError: a config that cannot be used, or no such device.
         PanelError: a panel made for another task or discount than the twin's.
     """

@@ -117,7 +117,7 @@ def build_panel(
 
     Raises:
         ConfigError, MixtureError, StoreError: see `plan_panel`.
-        PanelError: `out` is there already.
+        PanelError: `out` already exists.
     """
     with open_source(transitions, mixture, task=task, conditions=conditions) as source:
         plan = plan_panel(source.connection, mixture, source.conditions, source.others)

@@ -41,7 +41,7 @@ def init_script(store: Store) -> str:
 def export_views(store: Store, out: str | Path) -> Path:
     """Write `out`: an init file (.sql), or a database of views (.duckdb).
 
-    Raises StoreError for another ending, a file that is there already, or an empty store.
+    Raises StoreError for another ending, a file that already exists, or an empty store.
     """
     out = Path(out)
     if out.suffix not in (".sql", ".duckdb"):

@@ -58,13 +58,13 @@ def markdown() -> str:
 
 def imported(face: str) -> dict[str, list[str]]:
     """What type checkers see of a face: module -> names. It must be what `lazy` is given."""
-    found: dict[str, list[str]] = {}
+    names_by_module: dict[str, list[str]] = {}
     for node in ast.walk(_tree(face)):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("restock."):
             names = [alias.name for alias in node.names if alias.asname == alias.name]
             if names:
-                found.setdefault(node.module or "", []).extend(names)
-    return found
+                names_by_module.setdefault(node.module or "", []).extend(names)
+    return names_by_module
 
 
 @functools.cache

@@ -182,5 +182,5 @@ arguments = {{ n_steps = 40, batch_size = 20, n_epochs = 2 }}
     assert "Not held: replay (library.replay); the target rule (library.target)" in page
     made = {path: path.stat().st_mtime_ns for path in out.glob("runs/*/*.parquet")}
     main(argv)
-    assert "3 of 3 runs are there already" in capsys.readouterr().err
+    assert "3 of 3 runs already exist" in capsys.readouterr().err
     assert {path: path.stat().st_mtime_ns for path in made} == made

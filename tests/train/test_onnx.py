@@ -92,7 +92,7 @@ def test_what_is_no_policy_of_this_task_is_refused(run: Path, tmp_path: Path, ca
     argv = ["export", str(run), "--to", "onnx", "--out", str(out)]
     assert main(argv) == 0
     assert main(argv) == 2  # there already
-    assert "is there already" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err
     (tmp_path / "text.onnx").write_text("hello")
     other = make_network(NetworkConfig(hidden=(4,)), 3, 2)
     (tmp_path / "other.onnx").write_bytes(to_onnx(other).SerializeToString())

@@ -97,7 +97,7 @@ def test_a_table_shorter_than_the_checkpoint_is_an_error(tmp_path: Path) -> None
 
 def test_an_existing_directory_is_refused_with_a_remedy(tmp_path: Path) -> None:
     Run.create(tmp_path / "a", {})
-    with pytest.raises(RunError, match=r"is there already\n.*--resume"):
+    with pytest.raises(RunError, match=r"already exists\n.*--resume"):
         Run.create(tmp_path / "a", {})
     (tmp_path / "empty").mkdir()
     Run.create(tmp_path / "empty", {})  # an empty directory is free

@@ -51,7 +51,7 @@ def test_a_study_runs_every_arm_once_and_ends_in_a_comparison(tmp_path: Path, ca
     made = {path: path.stat().st_mtime_ns for path in out.glob("runs/*/*.parquet")}
     assert len({path.parent.name for path in made}) == 2
     main(argv)
-    assert "2 of 2 runs are there already" in capsys.readouterr().err
+    assert "2 of 2 runs already exist" in capsys.readouterr().err
     assert {path: path.stat().st_mtime_ns for path in made} == made
     # The same directory, another question.
     (tmp_path / "s.toml").write_text(SMALL.replace("400", "500", 1))

@@ -208,7 +208,7 @@ def test_from_python_a_run_is_trained_and_evaluated_as_by_the_commands(
     documents = [json.loads((run / "config.json").read_text()) for run in (tmp_path / "a", trained)]
     assert documents[0]["config"] == documents[1]["config"]
     assert documents[0]["panel"]["id"] == documents[1]["panel"]["id"]
-    with pytest.raises(RestockError, match="is there already"):
+    with pytest.raises(RestockError, match="already exists"):
         restock.train.train(config, out=str(tmp_path / "a"))
 
     rows = restock.train.evaluate(tmp_path / "a", policies=["agent", "planner"], episodes=1)
@@ -230,7 +230,7 @@ def test_from_python_a_run_is_trained_and_evaluated_as_by_the_commands(
         (["train", "--out", "{new}", "--config", "{missing}"], "cannot be read"),
         (["train", "--out", "{new}", "--device", "cuda"], "sees no CUDA device"),
         (["train", "--out", "{new}", "--panel", "{missing}"], "no such panel"),
-        (["train", "--out", "{trained}"], "is there already"),
+        (["train", "--out", "{trained}"], "already exists"),
         (["train", "--resume", "{missing}"], "no config.json"),
         (["train", "--resume", "{trained}", "--seed", "3"], "own panel, config and seed"),
         (["train", "--out", "{new}", "--panel", "{panel}", "--set", "loss.discount=0.9"], "0.97"),

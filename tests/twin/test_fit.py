@@ -171,7 +171,7 @@ def test_known_latency_gain_and_wheels_are_recovered(known: Path, tmp_path: Path
 
     write_fit(tmp_path / "fitted.toml", [found])
     assert load_perturbation(tmp_path / "fitted.toml") == found.perturbation
-    with pytest.raises(ConfigError, match="is there already"):
+    with pytest.raises(ConfigError, match="already exists"):
         write_fit(tmp_path / "fitted.toml", [found])
 
 

@@ -41,7 +41,7 @@ def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
     onnx = _library("onnx")
     run = Run.open(run_path)
     if out.exists():
-        raise RunError("is there already", where=str(out), remedy="choose another --out")
+        raise RunError("already exists", where=str(out), remedy="choose another --out")
     agent = load_agent(run)
     profile = load_profile(parse_config(run.document["config"], where=str(run_path)).profile)
     model = to_onnx(agent.network)

@@ -175,7 +175,7 @@ def check_free(path: Path) -> None:
     """Raises RunError when there is something at `path` that a new run would overwrite."""
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise RunError(
-            "is there already",
+            "already exists",
             where=str(path),
             remedy="choose another --out, remove it, or continue it with"
             f" `restock train --resume {path}`",

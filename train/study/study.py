@@ -22,7 +22,7 @@ class ArmConfig(Checked, frozen=True):
 
     name: str
     mixture: str | None = None  # of the study's store: a shipped name or a TOML file
-    panel: str | None = None  # one that is there already
+    panel: str | None = None  # one that already exists
     settings: dict[str, Any] = msgspec.field(default_factory=dict)  # of `restock train --set`
     library: Library | None = None  # whose algorithm learns, in the same twin; None: Restock's
     arguments: dict[str, Any] = msgspec.field(default_factory=dict)  # that algorithm's own

@@ -1,6 +1,6 @@
 """Running a study: every arm with every seed, then the comparisons through the gate.
 
-A study is a TOML file and a directory. What is there already is not done again: a panel that was
+A study is a TOML file and a directory. What already exists is not done again: a panel that was
 built, a run that has ended, an evaluation that was driven. So a study that was interrupted, or got
 another seed or arm, goes on where it was.
 """
@@ -57,7 +57,7 @@ def run_study(
     for arm in plan.study.arms:
         _build(plan, arm, say)
     todo = [job for job in plan.jobs if not job.done.exists()]
-    say(f"{len(plan.jobs) - len(todo)} of {len(plan.jobs)} runs are there already")
+    say(f"{len(plan.jobs) - len(todo)} of {len(plan.jobs)} runs already exist")
     if engine == "ray":
         _run_on_ray(plan, todo, workers, say)
     else:

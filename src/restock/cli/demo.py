@@ -177,8 +177,8 @@ def run_demo(
 def find_logs() -> Path | None:
     """`sample_logs/` of the source tree that this code runs from, if it runs from one."""
     here = Path(__file__).resolve()
-    found = here.parents[3] / "sample_logs"
-    return found if found.is_dir() and any(found.iterdir()) else None
+    logs = here.parents[3] / "sample_logs"
+    return logs if logs.is_dir() and any(logs.iterdir()) else None
 
 
 def prepare(out: Path) -> None:
@@ -189,7 +189,7 @@ def prepare(out: Path) -> None:
     """
     if out.exists() and not (out / MARKER).exists() and (not out.is_dir() or any(out.iterdir())):
         raise RestockError(
-            "is there already, and not from a demo",
+            "already exists, and not from a demo",
             where=str(out),
             remedy="give another --out",
         )

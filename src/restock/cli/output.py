@@ -102,8 +102,8 @@ def clock_cells(clock: Row | None) -> dict[str, str]:
     from restock.ingest.steps.clocks import odd
 
     offset = None if clock is None else clock["offset_ns"]
-    said = ["" if offset is None else f"{offset * 1e-9:,.3f}", "" if clock is None else odd(clock)]
-    return dict(zip(CLOCK_COLUMNS, said, strict=True))
+    cells = ["" if offset is None else f"{offset * 1e-9:,.3f}", "" if clock is None else odd(clock)]
+    return dict(zip(CLOCK_COLUMNS, cells, strict=True))
 
 
 def cell(value: Any) -> str:

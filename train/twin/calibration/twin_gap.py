@@ -154,7 +154,7 @@ def check_place(folder: Path) -> None:
     if folder.exists() and not (folder.is_dir() and (folder / DOCUMENT).is_file()):
         if folder.is_dir() and not any(folder.iterdir()):
             return
-        raise RunError("is there already", where=str(folder), remedy="name another --out")
+        raise RunError("already exists", where=str(folder), remedy="name another --out")
 
 
 def write_gap(gap: TwinGap, folder: Path) -> None:

@@ -87,20 +87,20 @@ class AuditCommand:
         from restock.replay.store.capacity import recommend_capacity
 
         with open_place(self.store, only_store=True) as connection:
-            found = recommend_capacity(connection)
+            capacity = recommend_capacity(connection)
         if self.json:
-            output.print_json({"store": str(self.store), "capacity": asdict(found)})
+            output.print_json({"store": str(self.store), "capacity": asdict(capacity)})
             return int(ExitCode.OK)
-        output.print_table(found.curve, title="what the newest rows cover")
+        output.print_table(capacity.curve, title="what the newest rows cover")
         output.stdout().print(
-            f"{found.recommended:,} of {found.rows:,} rows keep {found.cells_share:.0%} of the"
-            f" {found.cells} condition x zone x action cells ever seen: with less, a buffer forgets"
-            " some that no sampling brings back"
+            f"{capacity.recommended:,} of {capacity.rows:,} rows keep"
+            f" {capacity.cells_share:.0%} of the {capacity.cells} condition x zone x action cells"
+            " ever seen: with less, a buffer forgets some that no sampling brings back"
         )
-        if not found.saturated:
+        if not capacity.saturated:
             output.stdout().print(
-                f"the newest half keeps {found.half_share:.0%}: the logs still show new cells, and"
-                " more recordings will show more"
+                f"the newest half keeps {capacity.half_share:.0%}: the logs still show new cells,"
+                " and more recordings will show more"
             )
         return int(ExitCode.OK)
 
@@ -145,10 +145,10 @@ def _print(findings: list[Finding], shown: int) -> None:
 
 def _summary(findings: list[Finding]) -> str:
     """How many of each, and what would have let the skipped ones run."""
-    said = {"fail": "failed", "warn": "warned", "info": "informed", "pass": "passed"}
+    past_tense = {"fail": "failed", "warn": "warned", "info": "informed", "pass": "passed"}
     counts = [
         f"{count} {word}"
-        for status, word in said.items()
+        for status, word in past_tense.items()
         if (count := sum(finding.status == status for finding in findings))
     ]
     skipped = [finding.audit.place for finding in findings if finding.status == "skipped"]

@@ -43,7 +43,7 @@ class InfoCommand:
 
         if not self.paths:
             raise RecordingError("no path given", remedy="restock info PATH [PATH …]")
-        found: list[dict[str, Any]] = []
+        entries: list[dict[str, Any]] = []
         code = ExitCode.OK
         for name in self.paths:
             try:
@@ -63,11 +63,11 @@ class InfoCommand:
                     continue
                 if entry["damage"] and code == ExitCode.OK:
                     code = ExitCode.LOSSY
-                found.append(entry)
+                entries.append(entry)
                 if not self.json:
                     _print(entry)
         if self.json:
-            output.print_json({"recordings": found})
+            output.print_json({"recordings": entries})
         return code
 
 

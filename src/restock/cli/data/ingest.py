@@ -99,15 +99,15 @@ class IngestCommand:
         """The recordings of all paths, each once, and the paths that have none."""
         from restock.ingest.containers.open_recording import recordings_in
 
-        found: dict[Path, None] = {}
+        paths: dict[Path, None] = {}
         failures: list[dict[str, Any]] = []
         for name in self.paths:
             try:
-                found.update(dict.fromkeys(recordings_in(name)))
+                paths.update(dict.fromkeys(recordings_in(name)))
             except RecordingError as error:
                 sys.stderr.write(f"restock: {error}\n")
                 failures.append({"path": name, "status": "failed", "error": str(error)})
-        return list(found), failures
+        return list(paths), failures
 
 
 def as_json(outcome: IngestResult) -> dict[str, Any]:
@@ -157,12 +157,12 @@ def show(outcome: IngestResult) -> None:
         return
     into = f"{outcome.status}: {episodes}, profile {row['profile']} {row['profile_hash']}"
     console.print(into + (f", store version {outcome.version}" if outcome.version else ""))
-    told = [topic for topic in row["topics"] if topic["reason"] != UNUSED]
+    used = [topic for topic in row["topics"] if topic["reason"] != UNUSED]
     clocks = {clock["topic"]: clock for clock in row["clocks"] or []}
-    told = [{**topic, **output.clock_cells(clocks.get(topic["topic"]))} for topic in told]
+    used = [{**topic, **output.clock_cells(clocks.get(topic["topic"]))} for topic in used]
     columns = ["topic", "type", "expected", "decoded", "skipped", *output.CLOCK_COLUMNS, "reason"]
-    output.print_table(told, columns)
-    if len(told) < len(row["topics"]):
+    output.print_table(used, columns)
+    if len(used) < len(row["topics"]):
         rest = [topic["expected"] for topic in row["topics"] if topic["reason"] == UNUSED]
         topics = _count(len(rest), "further topic")
         console.print(f"{topics} ({sum(rest):,} messages): not used by the profile")

@@ -100,8 +100,8 @@ class MixCommand:
         panel = Panel.open(path, verify=True)
         size = sum(record.bytes for record in panel.header.files.values())
         if self.json:
-            found = {"panel": str(path), "id": panel.id, "rows": len(panel), "bytes": size}
-            output.print_json(found | {"unchanged": True})
+            document = {"panel": str(path), "id": panel.id, "rows": len(panel), "bytes": size}
+            output.print_json(document | {"unchanged": True})
             return
         output.stdout().print(
             f"panel {panel.id}: {len(panel):,} rows, all {size:,} bytes as they were written"

@@ -56,7 +56,7 @@ class ProfileCommand:
         from restock.ingest.propose.propose import propose_profile
 
         if self.out is not None and self.out.exists():
-            raise ConfigError("is there already", where=str(self.out), remedy="name another --out")
+            raise ConfigError("already exists", where=str(self.out), remedy="name another --out")
         stem = (self.out or Path(self.paths[0])).stem
         with open_recording(self.paths[0], typestore=self.typestore) as recording:
             proposal = propose_profile(recording, re.sub(r"\W+", "_", stem).strip("_") or "robot")
@@ -86,7 +86,7 @@ class ProfileCommand:
             leaves = {name: recording.fields(name) for name in profile.topics if name in topics}
             problems = input_problems(profile, topics, leaves)
             inputs = _inputs(profile, topics)
-        said: dict[str, Any] = {"profile": profile.name, "hash": profile.hash, "inputs": inputs}
+        document: dict[str, Any] = {"profile": profile.name, "hash": profile.hash, "inputs": inputs}
         if not self.json:
             output.print_table(inputs)
         outcome, code = None, ExitCode.OK
@@ -98,8 +98,8 @@ class ProfileCommand:
         if problems:
             code = ExitCode.USAGE
         if self.json:
-            said |= {"problems": problems, "outcome": as_json(outcome) if outcome else None}
-            output.print_json(said)
+            document |= {"problems": problems, "outcome": as_json(outcome) if outcome else None}
+            output.print_json(document)
         elif outcome is not None:
             show(outcome)
         for problem in problems:
@@ -123,14 +123,14 @@ def _inputs(profile: Any, topics: Any) -> list[dict[str, Any]]:
             "": near(topic, topics),
         }
 
-    found = [
+    rows = [
         row(name, source.topic, source.type, source.max_age_s, source.optional)
         for name, source in profile.inputs.items()
     ]
     for topic in profile.transform_topics:
         moving = topic == profile.frames.topic
         kind = topics[topic].type if topic in topics else ""
-        found.append(row("frames", topic, kind, profile.frames.max_age_s if moving else None, True))
+        rows.append(row("frames", topic, kind, profile.frames.max_age_s if moving else None, True))
     for name, signal in profile.signals.items():
-        found.append(row(f"signals.{name}", signal.topic, signal.type, signal.max_age_s, True))
-    return found
+        rows.append(row(f"signals.{name}", signal.topic, signal.type, signal.max_age_s, True))
+    return rows

@@ -53,19 +53,19 @@ class CompareCommand:
                     remedy="several seeds of a method: RUN RUN --against RUN RUN",
                 )
             first, second = first[:1], first[1:]
-        found = compare(first, second, treatment=self.treatment)
+        comparison = compare(first, second, treatment=self.treatment)
         if self.json:
-            print_json(found.as_json())
+            print_json(comparison.as_json())
         else:
-            _show(found, self.all_checks)
-        return int(ExitCode.OK if found.verdict == "comparable" else ExitCode.FAILED)
+            _show(comparison, self.all_checks)
+        return int(ExitCode.OK if comparison.verdict == "comparable" else ExitCode.FAILED)
 
 
-def _show(found: Comparison, all_checks: bool) -> None:
+def _show(comparison: Comparison, all_checks: bool) -> None:
     from restock.cli.output import print_table, say
 
-    refused = {difference.setting for difference in found.refused}
-    if found.differences:
+    refused = {difference.setting for difference in comparison.refused}
+    if comparison.differences:
         rows = [
             {
                 "setting": difference.setting,
@@ -73,20 +73,25 @@ def _show(found: Comparison, all_checks: bool) -> None:
                 "second": difference.second,
                 "": "not allowed" if difference.setting in refused else difference.kind,
             }
-            for difference in found.differences
+            for difference in comparison.differences
         ]
-        print_table(rows, title=f"what differs (treatment: {found.treatment})")
-    checks = found.totals + found.checks
+        print_table(rows, title=f"what differs (treatment: {comparison.treatment})")
+    checks = comparison.totals + comparison.checks
     shown = checks if all_checks else [c for c in checks if c.verdict != "comparable"]
     if shown:
-        feed = found.treatment in ("mixture", "method")
+        feed = comparison.treatment in ("mixture", "method")
         judged = " (the treatment: shown, not judged)" if feed else ""
         print_table([_check(check) for check in shown], title=f"what was fed{judged}")
-    say(_sentence(found))
-    if found.rows:
-        of = "restock eval's episodes" if found.source == "restock eval" else "the last evaluation"
+    say(_sentence(comparison))
+    if comparison.rows:
+        of = (
+            "restock eval's episodes"
+            if comparison.source == "restock eval"
+            else "the last evaluation"
+        )
         print_table(
-            [_outcome(row) for row in found.rows], title=f"success on the same episodes, from {of}"
+            [_outcome(row) for row in comparison.rows],
+            title=f"success on the same episodes, from {of}",
         )
 
 
@@ -116,23 +121,25 @@ def _outcome(row: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _sentence(found: Comparison) -> str:
-    if found.verdict == "comparable":
+def _sentence(comparison: Comparison) -> str:
+    if comparison.verdict == "comparable":
         what = {
             "mixture": "settings, steps",
             "method": "environment, environment steps and evaluation",
-        }.get(found.treatment, "settings, steps and feed")
-        return f"COMPARABLE: {what} are the same within the limits, but for the {found.treatment}"
-    if found.refused:
-        names = ", ".join(difference.setting for difference in found.refused)
+        }.get(comparison.treatment, "settings, steps and feed")
+        return (
+            f"COMPARABLE: {what} are the same within the limits, but for the {comparison.treatment}"
+        )
+    if comparison.refused:
+        names = ", ".join(difference.setting for difference in comparison.refused)
         return (
             f"REFUSED: the runs differ in {names}, which is not what --treatment"
-            f" {found.treatment} compares"
+            f" {comparison.treatment} compares"
         )
-    failed = [check for check in found.gate if check.verdict == found.verdict]
+    failed = [check for check in comparison.gate if check.verdict == comparison.verdict]
     names = ", ".join(dict.fromkeys(f"{check.name} ({check.part})" for check in failed[:4]))
     more = f" and {len(failed) - 4} more" if len(failed) > 4 else ""
-    if found.verdict == "inconclusive":
+    if comparison.verdict == "inconclusive":
         return (
             f"REFUSED, inconclusive: too few episodes to show that {names}{more} are the same;"
             " add seeds to both sides (RUN RUN --against RUN RUN)"

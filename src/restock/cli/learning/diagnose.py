@@ -42,18 +42,20 @@ class DiagnoseCommand:
         if not self.runs:
             raise ConfigError("needs a run", where="restock diagnose")
         runs = [Run.open(path) for path in self.runs]
-        found = diagnose(runs)
+        diagnosis = diagnose(runs)
         if not self.json:
-            _show(found, self.runs)
-        confirmed = confirm(runs[0], found, self.confirm) if self.confirm is not None else None
+            _show(diagnosis, self.runs)
+        confirmation = (
+            confirm(runs[0], diagnosis, self.confirm) if self.confirm is not None else None
+        )
         if self.json:
-            print_json(_document(found, self.runs) | {"confirmation": confirmed})
-        elif confirmed is not None:
-            _show_confirmation(confirmed)
+            print_json(_document(diagnosis, self.runs) | {"confirmation": confirmation})
+        elif confirmation is not None:
+            _show_confirmation(confirmation)
         return 0
 
 
-def _show(found: Diagnosis, paths: tuple[Path, ...]) -> None:
+def _show(diagnosis: Diagnosis, paths: tuple[Path, ...]) -> None:
     from restock.cli.output import print_table, stdout
 
     print_table(
@@ -69,32 +71,34 @@ def _show(found: Diagnosis, paths: tuple[Path, ...]) -> None:
                 "G": symptom.gap,
                 "G / median": figures.relative(symptom),
             }
-            for path, cause, figures in zip(paths, found.runs, found.figures, strict=True)
+            for path, cause, figures in zip(paths, diagnosis.runs, diagnosis.figures, strict=True)
             for symptom in figures.symptoms
         ],
         title="supply: share of replay / of what driving meets; agreement: logged rows that look"
         " like it; unexplained: of their next observations; G: |TD| held out / in replay",
     )
     out = stdout()
-    out.print(f"{found.cause}")
-    for line in found.evidence:
+    out.print(f"{diagnosis.cause}")
+    for line in diagnosis.evidence:
         out.print(f"  {line}")
-    out.print(f"to confirm: {found.experiment}")
+    out.print(f"to confirm: {diagnosis.experiment}")
 
 
-def _show_confirmation(confirmed: dict[str, Any]) -> None:
+def _show_confirmation(confirmation: dict[str, Any]) -> None:
     from restock.cli.output import stdout
 
-    answer = {True: "CONFIRMED", False: "REFUTED", None: "NOT DECIDED"}[confirmed["confirmed"]]
-    changed = ", ".join(confirmed["changed"])
-    stdout().print(f"{answer}: with {changed} it is {confirmed['cause']} ({confirmed['run']})")
+    answer = {True: "CONFIRMED", False: "REFUTED", None: "NOT DECIDED"}[confirmation["confirmed"]]
+    changed = ", ".join(confirmation["changed"])
+    stdout().print(
+        f"{answer}: with {changed} it is {confirmation['cause']} ({confirmation['run']})"
+    )
 
 
-def _document(found: Diagnosis, paths: tuple[Path, ...]) -> dict[str, Any]:
+def _document(diagnosis: Diagnosis, paths: tuple[Path, ...]) -> dict[str, Any]:
     return {
-        "cause": found.cause,
-        "evidence": found.evidence,
-        "experiment": found.experiment,
+        "cause": diagnosis.cause,
+        "evidence": diagnosis.evidence,
+        "experiment": diagnosis.experiment,
         "runs": [
             {
                 "run": str(path),
@@ -103,7 +107,7 @@ def _document(found: Diagnosis, paths: tuple[Path, ...]) -> dict[str, Any]:
                 "windows": [asdict(window) for window in windows],
             }
             for path, cause, figures, windows in zip(
-                paths, found.runs, found.figures, found.windows, strict=True
+                paths, diagnosis.runs, diagnosis.figures, diagnosis.windows, strict=True
             )
         ],
     }

@@ -15,7 +15,7 @@ class StudyCommand:
     """Train and evaluate every arm of a study with every seed, then compare them through the gate.
 
     The study is a TOML file: a store, arms (a mixture or a panel, and settings), seeds, what is
-    compared. Each run is a directory under OUT/runs. What is there already is not done again, so
+    compared. Each run is a directory under OUT/runs. What already exists is not done again, so
     an interrupted study goes on where it was: run the same command. Ends with OUT/study.md and
     OUT/study.json. See docs/study.md.
 
@@ -68,12 +68,12 @@ class StudyCommand:
                 print_table(rows, title="what would be run")
             return 0
         comparisons = run_study(plan, workers=self.workers, engine=self.engine, say=say)
-        found = findings(plan, comparisons)
-        page = as_markdown(found)
+        document = findings(plan, comparisons)
+        page = as_markdown(document)
         write_text(self.out / "study.md", page)
-        write_text(self.out / "study.json", dumps(plain(found), indent=1) + "\n")
+        write_text(self.out / "study.json", dumps(plain(document), indent=1) + "\n")
         if self.json:
-            print_json(found)
+            print_json(document)
         else:
             sys.stdout.write(page)
         refused = any(comparison.verdict != "comparable" for comparison in comparisons)

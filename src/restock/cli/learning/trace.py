@@ -59,37 +59,37 @@ class TraceCommand:
                 output.say(f"`restock trace {self.place} {listed[0]['row']}` follows one")
             return
         where = TracePlaces(self.store, self.panel, self.recording, self.profile)
-        found = trace_row(self.place, self.row, where)
+        trace = trace_row(self.place, self.row, where)
         if self.json:
-            output.print_json(document(found))
+            output.print_json(document(trace))
         else:
-            _print(found, self.recording is not None)
+            _print(trace, self.recording is not None)
 
 
-def document(found: tracing.Trace) -> dict[str, Any]:
+def document(trace: tracing.Trace) -> dict[str, Any]:
     """A trace as one document: what `--json` prints. What is not known is null."""
-    origin = asdict(found.origin) if found.origin is not None else None
+    origin = asdict(trace.origin) if trace.origin is not None else None
     names = ("transition", "reward_parts", "store", "recording", "moment", "topics", "messages")
     return {
-        "audit": found.audit,
-        "episode": found.episode,
-        "panel": found.panel,
+        "audit": trace.audit,
+        "episode": trace.episode,
+        "panel": trace.panel,
         **{name: origin[name] if origin else None for name in names},
-        "notes": found.notes + (origin["notes"] if origin else []),
+        "notes": trace.notes + (origin["notes"] if origin else []),
     }
 
 
-def _print(found: tracing.Trace, with_messages: bool) -> None:
+def _print(trace: tracing.Trace, with_messages: bool) -> None:
     from restock.cli import output
 
-    _section("as it was sampled", found.audit)
-    _section("its episode of the twin", found.episode)
-    stored = found.origin.transition if found.origin is not None else {}
-    packed = {k: v for k, v in (found.panel or {}).items() if k == "path" or k not in stored}
+    _section("as it was sampled", trace.audit)
+    _section("its episode of the twin", trace.episode)
+    stored = trace.origin.transition if trace.origin is not None else {}
+    packed = {k: v for k, v in (trace.panel or {}).items() if k == "path" or k not in stored}
     _section("its row of the panel", packed)
-    if found.origin is not None:
-        _print_origin(found.origin, with_messages)
-    for note in found.notes + (found.origin.notes if found.origin else []):
+    if trace.origin is not None:
+        _print_origin(trace.origin, with_messages)
+    for note in trace.notes + (trace.origin.notes if trace.origin else []):
         output.stdout().print(f"note: {note}", markup=False)
 
 

@@ -140,17 +140,17 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
 @contextmanager
 def _stop_on_interrupt() -> Iterator[Any]:
     """The first Ctrl-C asks the loop to stop with a checkpoint, the second one stops at once."""
-    asked = False
+    stopping = False
 
     def ask(number: int, frame: FrameType | None) -> None:
-        nonlocal asked
-        if asked:
+        nonlocal stopping
+        if stopping:
             raise KeyboardInterrupt
-        asked = True
+        stopping = True
 
     before = signal.signal(signal.SIGINT, ask)
     try:
-        yield lambda: asked
+        yield lambda: stopping
     finally:
         signal.signal(signal.SIGINT, before)
 

@@ -69,7 +69,7 @@ class FitCommand:
         from restock.train.twin.calibration.logged_steps import recordings_of
 
         if self.out is not None and self.out.exists():
-            raise ConfigError("is there already", where=str(self.out), remedy="name another --out")
+            raise ConfigError("already exists", where=str(self.out), remedy="name another --out")
         with Store(self.store) as store:
             groups: list[tuple[str, ...]] = [self.recording]
             if self.per_recording:

@@ -49,17 +49,17 @@ class LayoutCommand:
         for path in written:
             if path.exists():
                 raise RestockError(
-                    "is there already", where=str(path), remedy="give another name, or remove it"
+                    "already exists", where=str(path), remedy="give another name, or remove it"
                 )
-        found = describe_floor(floor)
+        facts = describe_floor(floor)
         if self.out is not None:
             write_map(floor, self.out) if maps else write_floor(floor, self.out)
         if self.png is not None:
             write_png(self.png, draw_floor(floor))
         if self.json:
-            output.print_json({**found, "written": [str(path) for path in written]})
+            output.print_json({**facts, "written": [str(path) for path in written]})
             return 0
-        output.print_table([{"": key, floor.name: str(value)} for key, value in found.items()])
+        output.print_table([{"": key, floor.name: str(value)} for key, value in facts.items()])
         if written:
             output.say(f"written: {', '.join(map(str, written))}")
         return 0
