@@ -112,8 +112,8 @@ class Operator(SoftPolicy):
     def _arrived(self, env: WarehouseVectorEnv, ends: F64) -> NDArray[np.bool_]:
         """From which step on (N, A, T) the robot has been at its goal."""
         gap = ends[..., :2] - env.navigation.goals_m[:, None, None]
-        there = np.hypot(gap[..., 0], gap[..., 1]) < env.task.goal_radius_m - 0.05
-        return np.asarray(np.logical_or.accumulate(there, axis=2), np.bool_)
+        at_goal = np.hypot(gap[..., 0], gap[..., 1]) < env.task.goal_radius_m - 0.05
+        return np.asarray(np.logical_or.accumulate(at_goal, axis=2), np.bool_)
 
     def _standing(self, env: WarehouseVectorEnv, pose: F64) -> NDArray[np.bool_]:
         """Who has not moved for a second, and for a few steps after."""

@@ -22,7 +22,7 @@ Actions = NDArray[np.int64]
 
 STUCK_STEPS = 15
 SLIP_STEPS = 4
-MIN_HELD_STEPS = 15
+MIN_STEPS_BETWEEN_HANDOVERS = 15
 
 
 class BehaviourPolicy(Policy, Protocol):
@@ -173,34 +173,34 @@ class Handover:
         self._prepare(0)
 
     def _prepare(self, count: int) -> None:
-        self._taken = np.zeros(count, np.bool_)  # by the operator
-        self._held = np.zeros(count, np.int64)  # steps since the last handover
+        self._by_operator = np.zeros(count, np.bool_)
+        self._since_handover = np.zeros(count, np.int64)  # steps
         self._still = np.zeros(count, np.int64)  # steps without way made
         self._slipping = np.zeros(count, np.int64)
         self._anchor = np.zeros((count, 3))
 
     def act(self, env: WarehouseVectorEnv, observation: NDArray[np.float32]) -> tuple[Actions, F64]:
         """The actions of whoever drives each robot, and their probabilities."""
-        if len(self._taken) != env.num_envs:
+        if len(self._by_operator) != env.num_envs:
             self._prepare(env.num_envs)
         self._watch(env)
         action, probability = self.planner.act(env, observation)
-        if self._taken.any():
-            theirs, theirs_probability = self.operator.act(env, observation)
-            action = np.where(self._taken, theirs, action)
-            probability = np.where(self._taken, theirs_probability, probability)
+        if self._by_operator.any():
+            operator_action, operator_probability = self.operator.act(env, observation)
+            action = np.where(self._by_operator, operator_action, action)
+            probability = np.where(self._by_operator, operator_probability, probability)
         names = self.planner.name, self.operator.name
-        self.acting = np.where(self._taken, names[1], names[0]).astype("U16")
+        self.acting = np.where(self._by_operator, names[1], names[0]).astype("U16")
         versions = self.planner.version, self.operator.version
-        self.acting_version = np.where(self._taken, versions[1], versions[0]).astype("U16")
+        self.acting_version = np.where(self._by_operator, versions[1], versions[0]).astype("U16")
         return action, probability
 
     def _watch(self, env: WarehouseVectorEnv) -> None:
         """Decide whose turn it is, everywhere."""
         signals = env.signals
         begun = env.steps == 0
-        self._taken[begun] = False
-        self._held[begun] = self._still[begun] = self._slipping[begun] = 0
+        self._by_operator[begun] = False
+        self._since_handover[begun] = self._still[begun] = self._slipping[begun] = 0
         pose = np.stack(
             [signals["pose_x_m"], signals["pose_y_m"], signals["pose_yaw_rad"]], axis=-1
         )
@@ -212,11 +212,11 @@ class Handover:
         slip = np.abs(signals["wheel_speed_mps"] - signals["localised_speed_mps"]) > 0.3
         slip |= np.abs(signals["wheel_yaw_rate_radps"] - signals["gyro_yaw_rate_radps"]) > 0.5
         self._slipping = np.where(slip, self._slipping + 1, np.maximum(self._slipping - 1, 0))
-        self._held += 1
+        self._since_handover += 1
         stuck = self._still >= STUCK_STEPS
         slipping = self._slipping >= SLIP_STEPS
         trouble = stuck | signals["bumped"] | slipping
-        for index in np.flatnonzero(trouble & ~self._taken):
+        for index in np.flatnonzero(trouble & ~self._by_operator):
             reason = (
                 "bumped" if signals["bumped"][index] else "slipping" if slipping[index] else "stuck"
             )
@@ -225,16 +225,16 @@ class Handover:
             (signals["clearance_m"] > 0.2)
             & (self._slipping == 0)
             & ~signals["bumped"]
-            & (self._held >= MIN_HELD_STEPS)
+            & (self._since_handover >= MIN_STEPS_BETWEEN_HANDOVERS)
             & ~self.operator.sees_trouble(env)
         )
-        for index in np.flatnonzero(clear & self._taken):
+        for index in np.flatnonzero(clear & self._by_operator):
             self._pass(env, int(index), False, "clear")
 
     def _pass(self, env: WarehouseVectorEnv, index: int, taken: bool, reason: str) -> None:
         names = self.planner.name, self.operator.name
-        self._taken[index] = taken
-        self._held[index] = self._still[index] = 0
+        self._by_operator[index] = taken
+        self._since_handover[index] = self._still[index] = 0
         self.events.append(
             HandoverEvent(
                 env=index,

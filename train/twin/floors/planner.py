@@ -180,12 +180,12 @@ class Planner:
         forth: list[tuple[NDArray[Any], ...]] = []  # from, to, weight
         back: list[tuple[NDArray[Any], ...]] = []
         for di, dj in ((1, 0), (0, 1), (1, 1), (1, -1)):
-            here = (slice(0, self.shape[0] - di), slice(max(-dj, 0), self.shape[1] - max(dj, 0)))
-            there = (slice(di, None), slice(max(dj, 0), self.shape[1] + min(dj, 0)))
-            both = free[here] & free[there]
-            one, other = index[here][both], index[there][both]
+            cells = (slice(0, self.shape[0] - di), slice(max(-dj, 0), self.shape[1] - max(dj, 0)))
+            neighbours = (slice(di, None), slice(max(dj, 0), self.shape[1] + min(dj, 0)))
+            both = free[cells] & free[neighbours]
+            one, other = index[cells][both], index[neighbours][both]
             length = CELL_M * np.hypot(di, dj)
-            weight = length * (cost[here][both] + cost[there][both]) / 2
+            weight = length * (cost[cells][both] + cost[neighbours][both]) / 2
             # one -> other in the graph is the robot's way from `other` to `one`, by (-di, -dj).
             kept = _allowed(against, (-di, -dj), one, other)
             forth.append((one[kept], other[kept], weight[kept]))
@@ -331,7 +331,7 @@ class BlockFinder(Stateful):
         y = np.where(swap, hits_m[..., 0], hits_m[..., 1])
         ahead = (x - pose[:, None, 0]) * heading_x[:, None]
         rack = 0.1  # returns this near to a rack are the rack
-        own = (
+        obstacle = (
             valid
             & (segment >= 0)[:, None]
             & (ahead > 0.1)
@@ -341,13 +341,13 @@ class BlockFinder(Stateful):
             & (x > edges[:, 0, None] - 0.1)
             & (x < edges[:, 2, None] + 0.1)
         )
-        face = np.where(own, ahead, np.inf).min(axis=1)
-        own &= ahead < face[:, None] + 0.5
-        across = np.where(own, y, edges[:, 3, None])
+        face = np.where(obstacle, ahead, np.inf).min(axis=1)
+        obstacle &= ahead < face[:, None] + 0.5
+        across = np.where(obstacle, y, edges[:, 3, None])
         across = np.concatenate([edges[:, 1, None], across, edges[:, 3, None]], axis=1)
         across.sort(axis=1)
         gap = np.diff(across, axis=1).max(axis=1)
-        shut = own.any(axis=1) & (gap < self.passable_m)
+        shut = obstacle.any(axis=1) & (gap < self.passable_m)
         middle = pose[:, 0] + heading_x * (np.where(shut, face, 0.0) + 0.3)
         step = ((middle - edges[:, 0]) / CLOSURE_STEP_M).astype(np.int64)
         step = np.clip(step, 0, ((edges[:, 2] - edges[:, 0]) / CLOSURE_STEP_M).astype(np.int64) - 1)

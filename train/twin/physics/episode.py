@@ -169,7 +169,7 @@ def _sharpest_turn(plan: F64) -> float:
 def _draw_block(
     rng: np.random.Generator, warehouse: Warehouse, plan: F64, *, full: bool
 ) -> F64 | None:
-    """Pallets across an aisle that the plan runs through; None where there is no room for it."""
+    """Pallets across an aisle that the plan runs through; None where placed is no room for it."""
     if not warehouse.segments:
         return None
     spacing = length_m(plan) / (len(plan) - 1)
@@ -206,9 +206,9 @@ def _draw_block(
         y = area.center[1] + side * (width / 2 - gap - half_y)
         pallets[0] = (x, y, rng.normal(0.0, 0.02))
     if turned[place]:
-        there = pallets[:, 0] > 0
-        pallets[there] = pallets[there][:, [1, 0, 2]]
-        pallets[there, 2] = np.pi / 2 - pallets[there, 2]
+        placed = pallets[:, 0] > 0
+        pallets[placed] = pallets[placed][:, [1, 0, 2]]
+        pallets[placed, 2] = np.pi / 2 - pallets[placed, 2]
     return pallets
 
 

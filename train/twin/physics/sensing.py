@@ -113,12 +113,12 @@ class Sensing(Stateful):
         fresh = step % self._pose_every[ids] == 0
         self.pose[ids[fresh]] = localised[fresh]
         self.pose_stamp_ns[ids[fresh]] = stamp[fresh]
-        held = self.pose[ids]
+        last = self.pose[ids]
         return {
             "stamp_ns": stamp,
-            "pose_x_m": held[:, 0],
-            "pose_y_m": held[:, 1],
-            "pose_yaw_rad": held[:, 2],
+            "pose_x_m": last[:, 0],
+            "pose_y_m": last[:, 1],
+            "pose_yaw_rad": last[:, 2],
             "pose_stamp_ns": self.pose_stamp_ns[ids],
             "wheel_speed_mps": speed,
             "wheel_yaw_rate_radps": yaw_rate,

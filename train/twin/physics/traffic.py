@@ -194,15 +194,15 @@ class Traffic(Stateful):
         gap, toward = self._gap(ids, pose)
         careless = np.where(self._driven_at(ids, pose, velocity[ids]), 0.0, STANDING_M)
         look_out = np.where(self.attentive[ids], YIELD_M, careless)
-        held = (state == WALKING) & toward & (gap < look_out)
-        waited = np.where(held, self.waited_s[ids] + elapsed_s, 0.0)
+        halted = (state == WALKING) & toward & (gap < look_out)
+        waited = np.where(halted, self.waited_s[ids] + elapsed_s, 0.0)
         hit = touched[ids, None] & (gap < 0.2) & ((state == WALKING) | (state == RETREATING))
         self.attentive[ids] |= hit  # having been touched, one looks out
         state = np.where((hit & toward) | (waited > WAIT_S), RETREATING, state)
         state = np.where(
             (state == RETREATING) & ((gap > RETREAT_M) | (hit & ~toward)), WALKING, state
         )
-        pace = np.where(state == RETREATING, -0.6, np.where((state == WALKING) & ~held, 1.0, 0.0))
+        pace = np.where(state == RETREATING, -0.6, np.where((state == WALKING) & ~halted, 1.0, 0.0))
         travelled = self.travelled_m[ids] + pace * self.speed_mps[ids] * elapsed_s
         # Who is back at the start or at the end of the way leaves the floor, out of sight.
         left = ((travelled >= self.length_m[ids]) & (gap > 1.0)) | (
@@ -220,10 +220,10 @@ class Traffic(Stateful):
         share = self.travelled_m[ids] / self.length_m[ids] * (WAY_POINTS - 1)
         first = np.clip(share.astype(np.int64), 0, WAY_POINTS - 2)
         way = self.way_m[ids]
-        here = np.take_along_axis(way, first[..., None, None], axis=2)[:, :, 0]
-        there = np.take_along_axis(way, first[..., None, None] + 1, axis=2)[:, :, 0]
-        step = there - here
-        point = here + (share - first)[..., None] * step
+        start = np.take_along_axis(way, first[..., None, None], axis=2)[:, :, 0]
+        end = np.take_along_axis(way, first[..., None, None] + 1, axis=2)[:, :, 0]
+        step = end - start
+        point = start + (share - first)[..., None] * step
         self.position_m[ids] = np.where(shown[..., None], point, PARKED_M[0])
         self.heading_rad[ids] = np.where(shown, np.arctan2(step[..., 1], step[..., 0]), 0.0)
 

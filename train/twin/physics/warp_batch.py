@@ -32,7 +32,7 @@ _MOVED = ("qpos", "qvel", "qacc_warmstart", "mocap_pos", "ctrl")
 _MOST = 1e10  # MuJoCo's own limit of positions and velocities
 # Both only save MuJoCo time (see `restock.train.twin.physics.model`), and Warp does not take the
 # first.
-_HOSTS_OWN = int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE | mujoco.mjtDisableBit.mjDSBL_ISLAND)
+_HOST_ONLY = int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE | mujoco.mjtDisableBit.mjDSBL_ISLAND)
 
 
 class WarpBatch(Batch):  # type: ignore[misc]  # MuJoCo has no types
@@ -54,20 +54,21 @@ class WarpBatch(Batch):  # type: ignore[misc]  # MuJoCo has no types
         except (RuntimeError, ValueError) as error:
             raise ConfigError(f"Warp has no device {device!r}", where="the twin") from error
         self._plain = copy.copy(model)
-        self._plain.opt.disableflags &= ~_HOSTS_OWN
-        self._own: frozenset[str] = frozenset()  # fields with a value per simulation, there
-        self._stale = True  # … which may no longer be all that the batch has
+        self._plain.opt.disableflags &= ~_HOST_ONLY
+        # Fields of the device's model with a value per simulation; stale: no longer all of them.
+        self._per_simulation: frozenset[str] = frozenset()
+        self._stale = True
         with self._wp.ScopedDevice(self.device):
             data = mujoco.MjData(self._plain)
-            self._model_there = self._put_model()
-            self._there = self._mjw.put_data(
+            self._device_model = self._put_model()
+            self._device_data = self._mjw.put_data(
                 *(self._plain, data), nworld=nsim, nconmax=CONTACTS, njmax=CONSTRAINTS
             )
 
     def _put_model(self) -> Any:
-        """The model on the device, with a value per simulation in the fields `_own`."""
+        """The model on the device, with a value per simulation in the fields `_per_simulation`."""
         try:
-            return self._mjw.put_model(self._plain, dict.fromkeys(self._own, self.nsim))
+            return self._mjw.put_model(self._plain, dict.fromkeys(self._per_simulation, self.nsim))
         except (NotImplementedError, ValueError) as error:
             raise ConfigError(
                 f"MuJoCo Warp cannot run this twin: {error}",
@@ -90,29 +91,29 @@ class WarpBatch(Batch):  # type: ignore[misc]  # MuJoCo has no types
 
     def _send_model(self) -> None:
         if self._stale:
-            there = set(dir(self._model_there))
-            if unknown := sorted(set(self._expanded) - there):
+            known = set(dir(self._device_model))
+            if unknown := sorted(set(self._expanded) - known):
                 raise ConfigError(
                     f"MuJoCo Warp has no {', '.join(unknown)} for each simulation apart",
                     where="the twin",
                     remedy='use physics="mujoco"',
                 )
             # Derived ones that Warp lacks it does not use.
-            expanded = {name for name in MODEL_FIELDS if self.expanded(name) is not None} & there
-            if expanded != self._own:
-                self._own = frozenset(expanded)
-                self._model_there = self._put_model()
+            expanded = {name for name in MODEL_FIELDS if self.expanded(name) is not None} & known
+            if expanded != self._per_simulation:
+                self._per_simulation = frozenset(expanded)
+                self._device_model = self._put_model()
             self._stale = False
-        for name in self._own:
-            array = getattr(self._model_there, name)
+        for name in self._per_simulation:
+            array = getattr(self._device_model, name)
             array.assign(np.asarray(self.expanded(name), np.float32).reshape(_shape(array)))
 
     def _send_state(self) -> None:
         for name in _STATE:
-            array = getattr(self._there, name)
+            array = getattr(self._device_data, name)
             array.assign(np.asarray(self.bind(name), np.float32).reshape(_shape(array)))
 
-    # -- what runs there ------------------------------------------------------------------------
+    # -- what runs on the device ------------------------------------------------------------------
 
     def rollout(
         self,
@@ -130,7 +131,7 @@ class WarpBatch(Batch):  # type: ignore[misc]  # MuJoCo has no types
         """
         if ids is not None or out is not None or control_spec not in (_CTRL, _CTRL | _MOCAP):
             raise ValueError("WarpBatch.rollout takes all simulations and ctrl, or ctrl and mocap")
-        wp, data, nu = self._wp, self._there, self.model.nu
+        wp, data, nu = self._wp, self._device_data, self.model.nu
         with wp.ScopedDevice(self.device):
             self._send_model()
             self._send_state()
@@ -151,13 +152,13 @@ class WarpBatch(Batch):  # type: ignore[misc]  # MuJoCo has no types
             for step in range(nstep):
                 for target, values in inputs:
                     wp.copy(target, values[step])
-                self._mjw.step(self._model_there, data)
+                self._mjw.step(self._device_model, data)
                 for source, kept in records.values():
                     wp.copy(kept[step], source)
             recorded = {name: kept.numpy().swapaxes(0, 1) for name, (_, kept) in records.items()}
             for name in _MOVED:
-                here = self.bind(name)
-                here[...] = getattr(data, name).numpy().reshape(here.shape)
+                rows = self.bind(name)
+                rows[...] = getattr(data, name).numpy().reshape(rows.shape)
         self.bind("time")[...] += nstep * self.model.opt.timestep
         self._warn((recorded["nefc"] > CONSTRAINTS).any(axis=1))
         return {name: recorded[name].astype(np.float64) for name in record}
@@ -191,7 +192,7 @@ class WarpBatch(Batch):  # type: ignore[misc]  # MuJoCo has no types
         with wp.ScopedDevice(self.device):
             self._send_model()
             self._send_state()
-            self._mjw.kinematics(self._model_there, self._there)
+            self._mjw.kinematics(self._device_model, self._device_data)
             lines = [
                 wp.array(np.broadcast_to(part, (*shape, 3)).astype(np.float32), dtype=wp.vec3)
                 for part in (pnt, vec)
@@ -199,7 +200,7 @@ class WarpBatch(Batch):  # type: ignore[misc]  # MuJoCo has no types
             distance = wp.full(shape, -1.0, dtype=float)
             geom = wp.full(shape, -1, dtype=int)
             self._mjw.rays(
-                *(self._model_there, self._there, *lines, wp.types.vector(6, float)(groups)),
+                *(self._device_model, self._device_data, *lines, wp.types.vector(6, float)(groups)),
                 flg_static,
                 wp.full(shape[1], int(bodyexclude), dtype=int),
                 *(distance, geom, wp.zeros(shape, dtype=wp.vec3)),

@@ -104,7 +104,7 @@ class BehaviourPolicies:
                 self._drivers[key] = self._make(*key)
             driver = self._drivers[key]
             actions, probabilities = driver.act(env, env.observation)
-            for robot in (robot for robot, own in enumerate(self._keys) if own == key):
+            for robot in (robot for robot, other in enumerate(self._keys) if other == key):
                 action[robot], probability[robot] = actions[robot], probabilities[robot]
                 tags[robot] = (str(driver.acting[robot]), str(driver.acting_version[robot]))
         return action, tags, probability

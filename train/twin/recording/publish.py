@@ -102,7 +102,7 @@ class Rates(Checked, frozen=True):
 
 @dataclass
 class Robot:
-    """The robot that logs: what it carries from one mission to the next, and its own dice."""
+    """The robot that logs: what it carries from one mission to the next, and its generator."""
 
     rng: np.random.Generator
     lidar: Lidar

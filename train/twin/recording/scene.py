@@ -118,15 +118,15 @@ def traffic_markers(stamp_ns: I64, places: F64) -> list[bytes]:
     for seen in {tuple(row) for row in shown.tolist()}:
         rows = np.flatnonzero((shown == seen).all(axis=1))
         layout = _traffic_layout(seen)
-        here = places[rows][:, np.array(seen, np.bool_)]
+        agents = places[rows][:, np.array(seen, np.bool_)]
         columns: dict[str, NDArray[Any]] = {"markers[0].header.stamp": stamp_ns[rows]}
-        for slot in range(here.shape[1]):
+        for slot in range(agents.shape[1]):
             at = f"markers[{slot + 1}]"
-            yaw = here[:, slot, 2]
+            yaw = agents[:, slot, 2]
             columns |= {
                 f"{at}.header.stamp": stamp_ns[rows],
-                f"{at}.pose.position.x": here[:, slot, 0],
-                f"{at}.pose.position.y": here[:, slot, 1],
+                f"{at}.pose.position.x": agents[:, slot, 0],
+                f"{at}.pose.position.y": agents[:, slot, 1],
                 f"{at}.pose.orientation.z": np.sin(yaw / 2),
                 f"{at}.pose.orientation.w": np.cos(yaw / 2),
             }
