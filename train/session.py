@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
@@ -24,6 +24,7 @@ from restock.train.dqn.config import TrainConfig
 from restock.train.dqn.learner import Learner
 from restock.train.evaluation.evaluate import Score
 from restock.train.evaluation.evaluation_buffer import EvaluationBuffer
+from restock.train.evaluation.policies import save_agent
 from restock.train.feed.batch_record import FeedRecord
 from restock.train.feed.batches import Batches
 from restock.train.feed.collector import Collector, ring_conditions
@@ -170,18 +171,11 @@ class Session(Stateful):
 
     def save_best(self, results: Score) -> None:
         """Keep the policy as it is now as the run's best."""
-        checkpoint.save(
-            self.run.best,
-            {
-                "network": dict(self.learner.policy_network.state_dict()),
-                "observation_size": self.learner.network.observation_size,
-                "actions": self.learner.network.actions,
-                "task_hash": self.task.hash,
-                "env_steps": self.progress.env_steps,
-                "gradient_steps": self.learner.gradient_steps,
-                "score": asdict(results),
-            },
-        )
+        clocks = {
+            "env_steps": self.progress.env_steps,
+            "gradient_steps": self.learner.gradient_steps,
+        }
+        save_agent(self.run, self.learner.policy_network, self.task, results, clocks)
 
     def close(self) -> None:
         """Release the thread and the event files."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from restock.ingest.task.task import Task
 from restock.train.dqn.config import parse_config
 from restock.train.dqn.learner import greedy_actions
 from restock.train.dqn.network import Network, make_network
+from restock.train.evaluation.evaluate import Score
 from restock.train.run import checkpoint
 from restock.train.run.run import Run
 from restock.train.twin.env.interface import Policy
@@ -81,4 +84,19 @@ def load_agent(run: Run) -> GreedyPolicy:
     return GreedyPolicy(network.eval(), version=f"{run.path.name}@{state['gradient_steps']}")
 
 
-__all__ = ["GreedyPolicy", "load_agent", "load_policy"]
+def save_agent(
+    run: Run, network: Network, task: Task, score: Score, clocks: Mapping[str, int]
+) -> None:
+    """Keep a network as the best of a run so far; `clocks` are `env_steps` and `gradient_steps`."""
+    state = {
+        "network": dict(network.state_dict()),
+        "observation_size": task.observation_size,
+        "actions": len(task.actions),
+        "task_hash": task.hash,
+        **clocks,
+        "score": asdict(score),
+    }
+    checkpoint.save(run.best, state)
+
+
+__all__ = ["GreedyPolicy", "load_agent", "load_policy", "save_agent"]

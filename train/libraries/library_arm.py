@@ -15,7 +15,6 @@ import importlib.util
 import json
 import sys
 import time
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,10 +33,9 @@ from restock.train.evaluation.evaluate import (
     run_episodes,
     score,
 )
-from restock.train.evaluation.policies import GreedyPolicy
+from restock.train.evaluation.policies import GreedyPolicy, save_agent
 from restock.train.libraries.mixed_feed import create_run
 from restock.train.prepare import make_twin, resolve_config
-from restock.train.run import checkpoint
 from restock.train.run.run import Run
 from restock.train.twin.floors.floors import layouts_of_split
 
@@ -162,14 +160,7 @@ class Evaluations:
         clocks = {"env_steps": env_steps, "gradient_steps": gradient_steps}
         if best := evaluated.beats(self.best):
             self.best = evaluated
-            state = {
-                "network": dict(network.state_dict()),
-                "observation_size": network.observation_size,
-                "actions": network.actions,
-                "task_hash": self.task.hash,
-                "score": asdict(evaluated),
-            }
-            checkpoint.save(self.run.best, state | clocks)
+            save_agent(self.run, network, self.task, evaluated, clocks)
         self.run.append("evaluations", [{**clocks, **r.row, "best": best} for r in results])
         self.run.flush()
 

@@ -12,7 +12,7 @@ import time
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 import torch
@@ -32,10 +32,22 @@ from restock.train.run.run import Run, now_ns, panel_document, software_versions
 from restock.train.run.run_tables import TABLES
 
 Ints = NDArray[np.int64]
+PROFILE = "warehouse_amr"
 # Of an episode that ended, by the info of its last step.
 _INFO = ("episode_seed", "perturbation", "block", "success", "bumps")
 _NO_ROWS: Ints = np.empty(0, np.int64)
 NO_LOGS = BatchDraw(_NO_ROWS, _NO_ROWS, None, np.empty(0))
+
+
+class FeedOptions(TypedDict, total=False):
+    """What every library's buffer takes by keyword."""
+
+    run: str | Path | None  # the run directory to make; None, the default: no record is kept
+    logs_share: float | None  # of a batch; default the panel's own
+    profile: str  # whose task and conditions the environment has; default "warehouse_amr"
+    seed: int  # of the draws and of which batches are audited; default 0
+    audit_share: float  # of all batches, each row of which is written down; default 0.01
+    log_every: int  # batches summed into one row of each table; default 500
 
 
 class MixedFeed:
@@ -45,13 +57,8 @@ class MixedFeed:
         library: the distribution whose loop this is, e.g. "stable-baselines3".
         num_envs: N.
         observation_size: D, of the library's environment.
-        panel: a panel or its directory; None for fresh rows alone.
-        run: the run directory to make; None keeps no record.
-        logs_share: of a batch; default the panel's own.
-        profile: whose task and conditions the environment has.
-        seed: of the draws and of which batches are audited.
-        audit_share: of all batches, each row of which is written down.
-        log_every: batches summed into one row of each table.
+        panel: None for fresh rows alone.
+        run, logs_share, profile, seed, audit_share, log_every: see `FeedOptions`.
 
     Raises:
         ConfigError: a share outside [0, 1].
@@ -65,29 +72,28 @@ class MixedFeed:
         num_envs: int,
         observation_size: int,
         *,
-        panel: Panel | str | Path | None,
-        run: str | Path | None,
-        logs_share: float | None,
-        profile: str,
-        seed: int,
-        audit_share: float,
-        log_every: int,
+        panel: Panel | None,
+        run: str | Path | None = None,
+        logs_share: float | None = None,
+        profile: str = PROFILE,
+        seed: int = 0,
+        audit_share: float = 0.01,
+        log_every: int = 500,
     ) -> None:
-        definition = load_profile(profile)
-        self.panel = Panel.open(panel) if isinstance(panel, str | Path) else panel
+        definition, self.panel = load_profile(profile), panel
         if logs_share is not None and not 0 <= logs_share <= 1:
             raise ConfigError(f"logs_share must be in [0, 1], got {logs_share:g}")
         self.logs_share = logs_share
-        if self.panel is not None:
-            _check(self.panel, definition.task.hash, profile, observation_size)
-        self.logs = Logs.of_panel(self.panel) if self.panel is not None else None
+        if panel is not None:
+            _check(panel, definition.task.hash, profile, observation_size)
+        self.logs = Logs.of_panel(panel) if panel is not None else None
         self.seed, self.log_every, self.audit_share = seed, log_every, audit_share
         self.rng = np.random.default_rng([seed, 1])
         self.labels = InfoLabels(definition.conditions, num_envs)
         self.num_envs, self.library = num_envs, library
         self.env_steps = self.batches = self.invalid_steps = 0
-        self._draws: LoggedSampler | None = None
-        self._untold = False  # of the TD errors of the batch before
+        self._sampler: LoggedSampler | None = None
+        self._td_missing = False  # of the TD errors of the batch before
         self._phase = "offline"
         self._open = 0  # batches since the last rows were written
         self._episodes: dict[int, dict[str, Any]] = {}
@@ -110,9 +116,9 @@ class MixedFeed:
         """Say what the fresh rows are: a `FreshRing`, or a `FreshMeta`."""
         self.fresh = fresh
         if self.run is not None:
-            sink: Any = NullsForNaN(self.run)
+            tables: Any = PartialTables(self.run)
             self.record = FeedRecord(
-                sink, self.logs, fresh, audit_share=self.audit_share, seed=self.seed
+                tables, self.logs, fresh, audit_share=self.audit_share, seed=self.seed
             )
 
     # -- steps ----------------------------------------------------------------------------------
@@ -149,22 +155,22 @@ class MixedFeed:
         """
         if self.logs is None:
             return NO_LOGS
-        if self._untold:
+        if self._td_missing:
             raise MixtureError(
                 "the mixture's draws follow TD errors, and this buffer gets none",
                 remedy="for Stable-Baselines3 set `critic`, e.g. to dqn_critic(model); or mix"
                 " without [adaptive], `per` and `lap`",
             )
-        if self._draws is None:
-            self._draws = self.logs.sampler(batch_size, self.logs_share, self.seed)
+        if self._sampler is None:
+            self._sampler = self.logs.sampler(batch_size, self.logs_share, self.seed)
         count = batch_size
         if len(self.fresh):
-            self._draws.move_to(self.env_steps)
-            count = round(batch_size * self._draws.controller.logs_share)
-        drawing = self._draws.draw(count) if count else NO_LOGS
+            self._sampler.move_to(self.env_steps)
+            count = round(batch_size * self._sampler.controller.logs_share)
+        drawing = self._sampler.draw(count) if count else NO_LOGS
         if not len(self.fresh) and len(drawing.rows) < batch_size:
             raise MixtureError(
-                f"every row of the panel was drawn {self._draws.controller.max_replays} times",
+                f"every row of the panel was drawn {self._sampler.controller.max_replays} times",
                 remedy="collect steps, or mix with more draws a row",
             )
         return drawing
@@ -202,11 +208,11 @@ class MixedFeed:
         `weight` as applied, `td` (Q - target) and `q` (B,); unknown ones are null in the tables.
         Priorities and adaptive shares follow `td` where it is known.
         """
-        if self._draws is not None and self._draws.needs_td and len(drawing.rows):
-            self._untold = td is None
+        if self._sampler is not None and self._sampler.needs_td and len(drawing.rows):
+            self._td_missing = td is None
             if td is not None:
                 td_abs = np.abs(td[: len(drawing.rows)])
-                self._draws.update(drawing.rows, drawing.strata, td_abs)
+                self._sampler.update(drawing.rows, drawing.strata, td_abs)
         phase = "online" if len(slots) else "offline"
         if phase != self._phase:
             self.flush()  # an interval is of one phase
@@ -248,14 +254,10 @@ class MixedFeed:
                 "updates": self._open,
                 "ring_rows": len(self.fresh),
                 "episodes": len(self._episodes),
-                **{name: known(value) for name, value in means.items()},
+                **means,
             }
-            blank = dict.fromkeys(TABLES["progress"].names)
-            self.run.append("progress", [blank | row])
-        if self._episodes:
-            blank = dict.fromkeys(TABLES["episodes"].names)
-            rows = [blank | row for row in self._episodes.values()]
-            self.run.append("episodes", rows)
+            PartialTables(self.run).append("progress", [row])
+        PartialTables(self.run).append("episodes", list(self._episodes.values()))
         self._open, self._episodes = 0, {}
         self.run.flush()
 
@@ -313,14 +315,15 @@ def create_run(
     )
 
 
-class NullsForNaN:
-    """A run whose NaNs are nulls: what a library keeps to itself is not known here."""
+class PartialTables:
+    """A run's tables, null where a value is missing or NaN: what a library keeps to itself."""
 
     def __init__(self, run: Run) -> None:
         self.run = run
 
     def append(self, table: str, rows: Sequence[Mapping[str, Any]]) -> None:
-        self.run.append(table, [{k: known(v) for k, v in row.items()} for row in rows])
+        blank = dict.fromkeys(TABLES[table].names)
+        self.run.append(table, [blank | {k: known(v) for k, v in row.items()} for row in rows])
 
     def append_columns(self, table: str, columns: Mapping[str, Any]) -> None:
         self.run.append_columns(table, {k: column(v) for k, v in columns.items()})

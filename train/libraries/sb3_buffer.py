@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import torch
@@ -32,7 +32,7 @@ from restock.errors import MixtureError
 from restock.replay.panel.panel import Panel
 from restock.replay.ring.ring import FreshRing
 from restock.replay.store.store import Store
-from restock.train.libraries.mixed_feed import MixedFeed
+from restock.train.libraries.mixed_feed import FeedOptions, MixedFeed
 
 Critic = Callable[[ReplayBufferSamples], tuple[torch.Tensor, torch.Tensor]]
 SB3 = "stable-baselines3"
@@ -44,14 +44,12 @@ class MixtureReplayBuffer(ReplayBuffer):
     `replay_buffer_kwargs` may hold:
 
     - `panel`: a panel or its directory; without one all rows are fresh.
-    - `run`: a directory to make, with the tables of `restock train`'s runs.
-    - `logs_share`: of a batch; default the panel's own.
     - `n_step`, `discount`: of fresh rows; default 1, and the panel's discount or .99.
     - `ignore_weights`: the panel's importance weights are not used: Stable-Baselines3's losses
       have no place for any. Without it a panel that has weights is refused.
     - `commands`: (n, 2), the command of every row of the panel, for a continuous action space; see
       `logged_commands`. Default: the task's action that was nearest to it.
-    - `profile`, `seed`, `audit_share`, `log_every`: see `MixedFeed`.
+    - `run`, `logs_share`, `profile`, `seed`, `audit_share`, `log_every`: see `FeedOptions`.
 
     `critic`, if set, is asked for (Q, TD) of every batch, (B,) each, which are then recorded by
     condition; `dqn_critic(model)` makes one. It costs its forward passes.
@@ -72,16 +70,11 @@ class MixtureReplayBuffer(ReplayBuffer):
         handle_timeout_termination: bool = True,
         *,
         panel: Panel | str | Path | None = None,
-        run: str | Path | None = None,
-        logs_share: float | None = None,
         n_step: int = 1,
         discount: float | None = None,
         ignore_weights: bool = False,
         commands: NDArray[Any] | None = None,
-        profile: str = "warehouse_amr",
-        seed: int = 0,
-        audit_share: float = 0.01,
-        log_every: int = 500,
+        **options: Unpack[FeedOptions],
     ) -> None:
         if optimize_memory_usage:
             raise MixtureError("optimize_memory_usage is unsupported with a mixture")
@@ -100,18 +93,7 @@ class MixtureReplayBuffer(ReplayBuffer):
             )
         if discount is None:
             discount = panel.discount if panel is not None else 0.99
-        self.feed = MixedFeed(
-            SB3,
-            n_envs,
-            size,
-            panel=panel,
-            run=run,
-            logs_share=logs_share,
-            profile=profile,
-            seed=seed,
-            audit_share=audit_share,
-            log_every=log_every,
-        )
+        self.feed = MixedFeed(SB3, n_envs, size, panel=panel, **options)
         self.ring = FreshRing(
             self.buffer_size,
             n_envs,

@@ -24,10 +24,9 @@ from restock.ingest.profile.profile import load_profile
 from restock.train.dqn.config import TrainConfig
 from restock.train.libraries.fresh_meta import InfoLabels
 from restock.train.libraries.library_arm import Evaluations, as_network
-from restock.train.libraries.mixed_feed import NullsForNaN, episode_row
+from restock.train.libraries.mixed_feed import PartialTables, episode_row
 from restock.train.libraries.sb3_buffer import MixtureReplayBuffer, dqn_critic
 from restock.train.run.run import Run
-from restock.train.run.run_tables import TABLES
 from restock.train.twin.physics.perturbation import find_perturbation
 
 UNLABELLED = "unlabelled"
@@ -147,8 +146,7 @@ class _OnPolicyFeed(BaseCallback):
     def __init__(self, config: TrainConfig, run: Run, model: PPO) -> None:
         super().__init__()
         definition = load_profile(config.profile)
-        self.run = run
-        self.sink: Any = NullsForNaN(run)
+        self.run, self.tables = run, PartialTables(run)
         self.count, self.epochs = model.n_envs, int(model.n_epochs)
         self.budget, self.rollout_calls = config.schedule.env_steps, model.n_steps
         rollout = model.n_steps * model.n_envs
@@ -174,7 +172,7 @@ class _OnPolicyFeed(BaseCallback):
                 self.ended[key] = first, self.calls - first, row
                 self.keys[env] += self.count
                 self.began[env] = self.calls
-        # The budget may cut a rollout; one that just became whole is learnt from first.
+        # The budget may cut a rollout short; one that just became whole is learnt from first.
         return self.num_timesteps < self.budget or self.calls % self.rollout_calls == 0
 
     def _on_rollout_end(self) -> None:
@@ -205,10 +203,23 @@ class _OnPolicyFeed(BaseCallback):
             names = names or [UNLABELLED] * learnt
             rows += [(name, key, names.count(name)) for name in dict.fromkeys(names)]
         self._fed(rows)
-        blank = dict.fromkeys(TABLES["episodes"].names)
-        self.sink.append("episodes", [blank | row for *_, row in self.ended.values()])
-        self.ended = {}
-        self._progress()
+        self.tables.append("episodes", [row for *_, row in self.ended.values()])
+        self.tables.append(
+            "progress",
+            [
+                {
+                    "env_steps": self.num_timesteps,
+                    "gradient_steps": self.updates,
+                    "wall_s": time.monotonic() - self.clock,
+                    "phase": "online",
+                    "updates": self.updates - self.shown,
+                    "target_rule": "none",
+                    "logs_share": 0.0,
+                    "ring_rows": 0,
+                }
+            ],
+        )
+        self.ended, self.shown = {}, self.updates
         self.run.flush()
 
     def _fed(self, rows: list[tuple[str, int, int]]) -> None:
@@ -227,20 +238,6 @@ class _OnPolicyFeed(BaseCallback):
                 for stratum, key, steps in rows
             ],
         )
-
-    def _progress(self) -> None:
-        row = {
-            "env_steps": self.num_timesteps,
-            "gradient_steps": self.updates,
-            "wall_s": time.monotonic() - self.clock,
-            "phase": "online",
-            "updates": self.updates - self.shown,
-            "target_rule": "none",
-            "logs_share": 0.0,
-            "ring_rows": 0,
-        }
-        self.shown = self.updates
-        self.run.append("progress", [dict.fromkeys(TABLES["progress"].names) | row])
 
 
 __all__ = ["dqn", "ppo"]

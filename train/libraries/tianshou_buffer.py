@@ -15,7 +15,7 @@ and the TD errors that Tianshou hands back for priorities are recorded by condit
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Unpack, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.packed_row import row_columns, row_width
 from restock.replay.panel.logged_sampler import BatchDraw
 from restock.replay.panel.panel import Panel
-from restock.train.libraries.mixed_feed import Ints, MixedFeed
+from restock.train.libraries.mixed_feed import PROFILE, FeedOptions, Ints, MixedFeed
 
 TIANSHOU = "tianshou"
 
@@ -39,11 +39,9 @@ class MixtureVectorReplayBuffer(ReplayBufferManager):
         buffer_num: environments.
         panel: a panel of single steps, or its directory; without one all rows are fresh. Its
             discount is not used: the algorithm has its own.
-        run: a directory to make, with the tables of `restock train`'s runs.
-        logs_share: of a batch; default the panel's own.
         commands: (n, 2), the command of every row of the panel, for a continuous action space; as
             the algorithm acts, so scaled to [-1, 1] where it scales actions.
-        profile, seed, audit_share, log_every: see `MixedFeed`.
+        run, logs_share, profile, seed, audit_share, log_every: see `FeedOptions`.
 
     Raises:
         MixtureError: a panel of n-step rows: Tianshou makes its returns from single steps.
@@ -56,13 +54,8 @@ class MixtureVectorReplayBuffer(ReplayBufferManager):
         buffer_num: int,
         *,
         panel: Panel | str | Path | None = None,
-        run: str | Path | None = None,
-        logs_share: float | None = None,
         commands: NDArray[Any] | None = None,
-        profile: str = "warehouse_amr",
-        seed: int = 0,
-        audit_share: float = 0.01,
-        log_every: int = 500,
+        **options: Unpack[FeedOptions],
     ) -> None:
         panel = Panel.open(panel) if isinstance(panel, str | Path) else panel
         if panel is not None and panel.n_step != 1:
@@ -75,19 +68,9 @@ class MixtureVectorReplayBuffer(ReplayBufferManager):
         parts = [ReplayBuffer(size) for _ in range(buffer_num)]
         logs = [ReplayBuffer(len(panel))] if panel is not None else []
         super().__init__([*parts, *logs])
-        observation_size = load_profile(profile).task.observation_size
-        self.feed = MixedFeed(
-            TIANSHOU,
-            buffer_num,
-            observation_size,
-            panel=panel,
-            run=run,
-            logs_share=logs_share,
-            profile=profile,
-            seed=seed,
-            audit_share=audit_share,
-            log_every=log_every,
-        )
+        task = load_profile(options.get("profile", PROFILE)).task
+        observation_size = task.observation_size
+        self.feed = MixedFeed(TIANSHOU, buffer_num, observation_size, panel=panel, **options)
         self.fresh = self.feed.fresh_meta(size * buffer_num)
         self.feed.keep_record(self.fresh)
         self._columns, self._width = row_columns(observation_size), row_width(observation_size)
