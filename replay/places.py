@@ -9,6 +9,7 @@ from pathlib import Path
 import duckdb
 import msgspec
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from restock.errors import StoreError
 from restock.ingest.store.location import Location
@@ -78,10 +79,16 @@ def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> bool
     tables = sorted(path.glob("*.parquet"))
     if not tables or not (path / RUN_CONFIG).is_file():
         return False
-    for file in tables:
-        read_parquet(connection, file.stem, [file], schema=schema)
-    for file in sorted(path.glob("eval/*.parquet")):
-        read_parquet(connection, f"eval_{file.stem}", [file], schema=schema)
+    files = {file.stem: file for file in tables}
+    files |= {f"eval_{file.stem}": file for file in sorted(path.glob("eval/*.parquet"))}
+    for view, file in files.items():
+        read_parquet(connection, view, [file], schema=schema)
+        for field in pq.read_schema(file):
+            if meaning := (field.metadata or {}).get(b"meaning", b"").decode():
+                text = meaning.replace("'", "''")
+                connection.execute(
+                    f'COMMENT ON COLUMN "{schema}"."{view}"."{field.name}" IS \'{text}\''
+                )
     return True
 
 
@@ -92,8 +99,8 @@ def _keep(connection: duckdb.DuckDBPyConnection, schema: str, name: str, table: 
 
 
 def _list_columns(connection: duckdb.DuckDBPyConnection) -> None:
-    """The view `columns` of a run or panel: names and types."""
+    """The view `columns` of a run or panel: names, types, and meanings where a run has them."""
     connection.execute(
         'CREATE VIEW columns AS SELECT table_name AS "view", column_name AS "column",'
-        ' data_type AS "type" FROM duckdb_columns() WHERE NOT internal'
+        ' data_type AS "type", comment AS meaning FROM duckdb_columns() WHERE NOT internal'
     )

@@ -21,6 +21,7 @@ from restock import cli
 from restock.replay.mixture.mixture import load_mixture
 from restock.replay.panel.build import build_panel
 from restock.replay.store.store import Store
+from restock.train.run.run import Run
 
 
 def out_of(capsys: pytest.CaptureFixture[str], *args: str, code: int = 0) -> str:
@@ -99,6 +100,23 @@ def test_a_run_is_queried_by_its_tables(run_dir: Path, capsys: pytest.CaptureFix
     ]
     assert "dqn" in out_of(capsys, str(run_dir), "FROM eval_episodes")
     assert "gradient_step" in out_of(capsys, str(run_dir), "FROM columns")
+
+
+def test_a_runs_columns_are_listed_with_their_meanings(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Run.create(tmp_path / "run", {})
+    query = "SELECT * FROM columns WHERE \"column\" = 'row_hash'"
+    assert json.loads(out_of(capsys, str(tmp_path / "run"), query, "--json")) == [
+        {
+            "view": "audit",
+            "column": "row_hash",
+            "type": "VARCHAR",
+            "meaning": "of the packed row, 16 hex digits: `restock trace` checks it",
+        }
+    ]
+    undocumented = "SELECT count(*) AS n FROM columns WHERE meaning IS NULL AND view <> 'columns'"
+    assert json.loads(out_of(capsys, str(tmp_path / "run"), undocumented, "--json")) == [{"n": 0}]
 
 
 def test_what_was_sampled_joins_what_was_logged(

@@ -9,10 +9,11 @@ import duckdb
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from support.paths import ROOT
 
 from restock.errors import RunError
 from restock.train.run.run import Run
-from restock.train.run.run_tables import TABLES
+from restock.train.run.run_tables import EVAL_EPISODES, TABLES, rewrite
 
 
 def policies(step: int, rows: int) -> dict[str, object]:
@@ -93,6 +94,15 @@ def test_a_table_shorter_than_the_checkpoint_is_an_error(tmp_path: Path) -> None
     run = Run.create(tmp_path / "a", {})
     with pytest.raises(RunError, match=r"audit.parquet: has 0 rows, the checkpoint .* after 5"):
         run.truncate({"audit": 5})
+
+
+def test_every_column_of_every_table_is_documented() -> None:
+    for name, schema in {**TABLES, "eval_episodes": EVAL_EPISODES}.items():
+        assert schema.metadata[b"doc"], name
+        for field in schema:
+            assert field.metadata[b"meaning"], f"{name}.{field.name}"
+    page = (ROOT / "docs" / "run.md").read_text(encoding="utf-8")
+    assert rewrite(page) == page, "run: python -m restock.train.run.run_tables docs/run.md"
 
 
 def test_an_existing_directory_is_refused_with_a_remedy(tmp_path: Path) -> None:
