@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pyarrow as pa
 import pytest
+from support import s3_server as s3
 from support.stores import recording_transitions, write_store
 
 
@@ -20,3 +22,17 @@ def store_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store of the same three recordings."""
     path = tmp_path_factory.mktemp("replay") / "store"
     return write_store(path, [recording_transitions(index) for index in (1, 2, 3)])
+
+
+@pytest.fixture(scope="module")
+def s3_server() -> Iterator[str]:
+    """A server with one bucket, that the environment names: its address."""
+    boto3 = pytest.importorskip("boto3")
+    pytest.importorskip("moto")
+    with s3.s3_server() as address, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("AWS_ENDPOINT_URL", address)
+        patch.setenv("AWS_ACCESS_KEY_ID", "key")
+        patch.setenv("AWS_SECRET_ACCESS_KEY", "secret")
+        patch.setenv("AWS_REGION", "us-east-1")
+        boto3.client("s3").create_bucket(Bucket=s3.BUCKET)
+        yield address

@@ -1,4 +1,7 @@
-"""The store's writer: whole or not at all, replaced in one commit, whoever else is writing."""
+"""The store's writer: whole or not at all, replaced in one commit, whoever else is writing.
+
+What `place` is given to holds in a folder and on S3.
+"""
 
 from __future__ import annotations
 
@@ -13,35 +16,124 @@ import pyarrow.parquet as pq
 import pytest
 from deltalake import DeltaTable
 from deltalake.exceptions import CommitFailedError
+from support.s3_server import address, files_of
 from support.stores import one, shown
 
+import restock
 from restock.errors import StoreError
 from restock.ingest.store.location import Location
 from restock.ingest.store.writer import RECORDINGS, TRANSITIONS, StoreWriter
 from restock.replay.store.store import Store
 
 
-def test_what_is_written_is_read(tmp_path):
+@pytest.fixture(params=["folder", "s3"])
+def place(request: pytest.FixtureRequest, tmp_path: Path) -> Path | str:
+    """Where a store may lie, of this test alone."""
+    if request.param == "folder":
+        return tmp_path / "s"
+    request.getfixturevalue("s3_server")
+    return address(request)
+
+
+def test_what_is_written_is_read_with_every_type(place):
     manifest, rows = one(1)
-    version = StoreWriter(tmp_path / "s").write(manifest, rows)
-    with Store(tmp_path / "s") as store:
+    version = StoreWriter(place).write(manifest, rows)
+    with restock.open(place) as store:
         assert store.version == version
+        assert str(store.path) == str(place)
         found = store.sql("FROM transitions ORDER BY transition_id").to_arrow_table()
-    assert found["transition_id"].equals(rows["transition_id"])
-    assert found["observation"].to_pylist() == rows["observation"].to_pylist()
+    for name in rows.column_names:
+        assert found[name].to_pylist() == rows[name].to_pylist(), name
+    assert found.schema.field("observation").type.list_size == len(rows["observation"][0])
+    written = [file for file in files_of(place) if file.startswith("transitions/0")]
+    assert written == ["transitions/0000000000000001/0000000000000001-a.parquet"]
 
 
-def test_a_recording_written_again_replaces_its_rows_and_no_others(tmp_path):
-    writer = StoreWriter(tmp_path / "s")
-    writer.write(*one(1, "a"))
+def test_a_query_reads_only_the_columns_and_rows_it_asks_for(place):
+    StoreWriter(place).write(*one(1))
+    with Store(place) as store:
+        plan = store.sql(
+            "EXPLAIN SELECT avg(reward) FROM stored_transitions WHERE action = 2"
+        ).fetchall()[0][1]
+    assert "observation" not in plan
+    assert "Filters" in plan
+    assert "action" in plan.split("Filters")[1]
+
+
+def test_a_recording_written_again_replaces_its_rows_and_no_others(place):
+    writer = StoreWriter(place)
+    version = writer.write(*one(1, "a"))
     writer.write(*one(2, "b"))
     writer.write(*one(1, "c", seed=9))
     first, second = one(1, "c", seed=9)[1], one(2, "b")[1]
-    assert shown(tmp_path / "s") == {
+    assert shown(place) == {
         first["ingest_id"][0].as_py(): len(first),
         second["ingest_id"][0].as_py(): len(second),
     }
-    assert sorted(writer.live()["ingest_id"].to_pylist()) == sorted(shown(tmp_path / "s"))
+    assert sorted(writer.live()["ingest_id"].to_pylist()) == sorted(shown(place))
+    # An old version keeps its manifests: they are taken out of `recordings` when the rows are
+    # replaced, and found by their names until they are cleaned away.
+    with Store(place, version=version) as store:
+        old_ingest = [("0000000000000001-a",)]
+        assert store.sql("SELECT DISTINCT ingest_id FROM transitions").fetchall() == old_ingest
+        assert store.sql("SELECT ingest_id FROM recordings").fetchall() == old_ingest
+    assert writer.clean() == []
+    old = "0000000000000001/0000000000000001-a.parquet"
+    assert writer.clean(retention_hours=0) == [f"{RECORDINGS}/{old}", f"{TRANSITIONS}/{old}"]
+    assert not [file for file in files_of(place) if file.endswith(old)]
+    assert len(shown(place)) == 2
+
+
+def _write(place: Path | str, recording: int, ingest: str) -> None:
+    StoreWriter(place).write(*one(recording, ingest))
+
+
+def test_writers_at_the_same_time_lose_nothing_and_double_nothing(place):
+    """Processes that all make the store, two of them with the same recording."""
+    context = multiprocessing.get_context("spawn")
+    jobs = [(1, "a"), (1, "b"), (2, "a"), (3, "a")]
+    processes = [context.Process(target=_write, args=(place, *job)) for job in jobs]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+    assert [process.exitcode for process in processes] == [0] * len(jobs)
+    found = shown(place)
+    assert sorted(ingest.split("-")[0][-1] for ingest in found) == ["1", "2", "3"]
+    for ingest, count in found.items():
+        recording, name = ingest.split("-")
+        assert count == len(one(int(recording, 16), name)[1])
+
+
+def _write_for_ever(place: Path | str) -> None:
+    for turn in range(1000):
+        StoreWriter(place).write(*one(1, f"{turn}", seed=turn))
+
+
+@pytest.mark.parametrize(
+    ("place", "after_s"),
+    [("folder", 0.05), ("folder", 0.13), ("folder", 0.21), ("s3", 0.2)],
+    indirect=["place"],
+)
+def test_a_killed_writer_leaves_the_last_whole_commit(place, after_s):
+    StoreWriter(place).write(*one(1, "first"))
+    on_disk = isinstance(place, Path)
+    context = multiprocessing.get_context("fork" if on_disk else "spawn")
+    process = context.Process(target=_write_for_ever, args=(place,))
+    process.start()
+    while not on_disk and "-first" in next(iter(shown(place))):  # until it is at work
+        assert process.is_alive()
+        time.sleep(0.01)
+    time.sleep(after_s)
+    assert process.pid is not None
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    ((ingest, count),) = shown(place).items()
+    name = ingest.split("-")[1]
+    assert on_disk or name != "first"
+    assert count == len(one(1, name, seed=0 if name == "first" else int(name))[1])
+    StoreWriter(place).write(*one(1, "last"))
+    assert list(shown(place)) == ["0000000000000001-last"]
 
 
 def test_the_old_rows_can_still_be_read_at_the_old_version(tmp_path):
@@ -50,18 +142,6 @@ def test_the_old_rows_can_still_be_read_at_the_old_version(tmp_path):
     writer.write(*one(1, "b"))
     files = DeltaTable(str(tmp_path / "s" / "transitions"), version=version).file_uris()
     assert pq.read_table(files[0].removeprefix("file://")).to_pylist() == one(1, "a")[1].to_pylist()
-
-
-def test_an_old_version_keeps_its_manifests(tmp_path):
-    """They are taken out of `recordings` when the rows are replaced, and found by their names."""
-    writer = StoreWriter(tmp_path / "s")
-    version = writer.write(*one(1, "a"))
-    writer.write(*one(1, "b"))
-    with Store(tmp_path / "s", version=version) as store:
-        assert store.sql("SELECT DISTINCT ingest_id FROM transitions").fetchall() == [
-            ("0000000000000001-a",)
-        ]
-        assert store.sql("SELECT ingest_id FROM recordings").fetchall() == [("0000000000000001-a",)]
 
 
 def test_a_reader_between_a_replacing_writers_commits_sees_the_recording(tmp_path, monkeypatch):
@@ -130,28 +210,6 @@ def test_orphans_are_cleaned_after_the_retention_window_only(tmp_path):
     assert DeltaTable(str(tmp_path / "s" / "transitions")).version() == version
 
 
-def _write(path: Path, recording: int, ingest: str) -> None:
-    StoreWriter(path).write(*one(recording, ingest))
-
-
-def test_writers_at_the_same_time_lose_nothing_and_double_nothing(tmp_path):
-    path = tmp_path / "s"
-    context = multiprocessing.get_context("spawn")
-    # Two writers of the same recording among them: one replaces the other.
-    jobs = [(1, "a"), (1, "b"), (2, "a"), (3, "a")]
-    processes = [context.Process(target=_write, args=(path, *job)) for job in jobs]
-    for process in processes:
-        process.start()
-    for process in processes:
-        process.join()
-    assert [process.exitcode for process in processes] == [0] * len(jobs)
-    found = shown(path)
-    assert sorted(ingest.split("-")[0][-1] for ingest in found) == ["1", "2", "3"]
-    for ingest, count in found.items():
-        recording, name = ingest.split("-")
-        assert count == len(one(int(recording, 16), name)[1])
-
-
 def test_columns_that_two_writers_add_at_once_are_added_once(tmp_path, monkeypatch):
     path, (manifest, rows) = tmp_path / "s", one(1)
     StoreWriter(path).write(manifest, rows.drop_columns(["zone"]))
@@ -218,30 +276,6 @@ def test_a_writer_overtaken_by_another_of_the_same_recording_loses_nothing(tmp_p
     assert shown(path) == {"0000000000000001-a": len(one(1, "a")[1])}
     manifests = DeltaTable(str(path / RECORDINGS)).file_uris()
     assert [Path(uri).stem for uri in manifests] == ["0000000000000001-a"]
-
-
-def _write_for_ever(path: Path) -> None:
-    for turn in range(1000):
-        StoreWriter(path).write(*one(1, f"{turn}", seed=turn))
-
-
-@pytest.mark.parametrize("after_s", [0.05, 0.13, 0.21])
-def test_a_killed_writer_leaves_the_last_whole_commit(tmp_path, after_s):
-    path = tmp_path / "s"
-    StoreWriter(path).write(*one(1, "first"))
-    process = multiprocessing.get_context("fork").Process(target=_write_for_ever, args=(path,))
-    process.start()
-    time.sleep(after_s)
-    assert process.pid is not None
-    os.kill(process.pid, signal.SIGKILL)
-    process.join()
-    (ingest, count), *others = shown(path).items()
-    assert not others
-    name = ingest.split("-")[1]
-    seed = 0 if name == "first" else int(name)
-    assert count == len(one(1, name, seed=seed)[1])
-    StoreWriter(path).write(*one(1, "last"))
-    assert list(shown(path)) == ["0000000000000001-last"]
 
 
 def test_new_columns_are_added_and_old_rows_hold_null(tmp_path):

@@ -6,10 +6,34 @@
 from __future__ import annotations
 
 import logging
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import pytest
+
+BUCKET = "warehouse"
+
+
+def address(request: pytest.FixtureRequest) -> str:
+    """Where a store of this test alone may lie, with a space in it."""
+    return f"s3://{BUCKET}/site 7/" + re.sub(r"\W+", "_", request.node.name)
+
+
+def files_of(place: Path | str) -> list[str]:
+    """The files of a store by their paths in it, as the disk or the server lists them."""
+    if isinstance(place, Path):
+        return sorted(str(p.relative_to(place)) for p in place.rglob("*") if p.is_file())
+    import boto3
+
+    prefix = place.removeprefix(f"s3://{BUCKET}/") + "/"
+    answer = boto3.client("s3").list_objects_v2(Bucket=BUCKET, Prefix=prefix)
+    return sorted(entry["Key"].removeprefix(prefix) for entry in answer.get("Contents", []))
 
 
 @contextmanager

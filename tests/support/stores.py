@@ -143,7 +143,7 @@ def one(recording: int, ingest: str = "a", seed: int = 0) -> tuple[pa.Table, pa.
     return pa.Table.from_pylist([row], schema=recording_schema()), rows
 
 
-def shown(path: Path) -> dict[str, int]:
+def shown(path: Path | str) -> dict[str, int]:
     """recording_id/ingest_id -> rows, as a reader sees the store."""
     with Store(path) as store:
         found = store.sql(
