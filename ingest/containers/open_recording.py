@@ -79,8 +79,10 @@ class _Opening:
         for file in files:
             self._open_file(file)
         self._refuse_serialisation(metadata)
-        recording = Recording(self.path, self._format(), files, self.storages, self.distro)
-        recording.adopt(self.damage, self.notes, self.cleanup)
+        recording = Recording(
+            *(self.path, self._format(), files, self.storages, self.distro),
+            *(self.damage, self.notes, self.cleanup),
+        )
         self._compare(recording, metadata)
         return recording
 

@@ -59,29 +59,20 @@ class Recording:
         files: Sequence[Path],
         storages: Sequence[Storage],
         distro: str,
+        damage: Sequence[Damage] = (),
+        notes: Sequence[str] = (),
+        cleanup: Sequence[Callable[[], None]] = (),
     ) -> None:
         self.path, self.format, self.files, self.distro = path, format, tuple(files), distro
         self.accounts: dict[str, Account] = {}
-        self.notes: list[str] = []
         self._storages = tuple(storages)
-        self._cleanup: list[Callable[[], None]] = []
-        self._bag_damage: list[Damage] = []
+        self.notes = [*notes, *(note for storage in self._storages for note in storage.notes)]
+        self._bag_damage, self._cleanup = list(damage), tuple(cleanup)
         self._streams: dict[str, list[_Stream]] = {}
         self._types: dict[tuple[int, int], MessageType] = {}  # by storage and channel
         for storage in self._storages:
             for channel in storage.channels.values():
                 self._streams.setdefault(channel.topic, []).append(_Stream(storage, channel))
-
-    def adopt(
-        self,
-        damage: Sequence[Damage],
-        notes: Sequence[str],
-        cleanup: Sequence[Callable[[], None]],
-    ) -> None:
-        """Take over the damage and notes of opening its files, and what is to be cleaned up."""
-        self._bag_damage += damage
-        self.notes += [*notes, *(note for storage in self._storages for note in storage.notes)]
-        self._cleanup += cleanup
 
     @cached_property
     def recording_id(self) -> str:

@@ -133,8 +133,7 @@ class SqliteFile:
 
     def _count(self) -> tuple[dict[int, int], tuple[int, int] | None]:
         counts = dict.fromkeys(self.channels, 0)
-        low: list[int] = []
-        high: list[int] = []
+        stamps = list[int]()
         try:
             for number, count, first, last in self._connection.execute(
                 "SELECT topic_id, count(*), min(stamp), max(stamp) FROM (SELECT topic_id, CASE"
@@ -146,8 +145,7 @@ class SqliteFile:
                     self.damage.append(Damage(what, {number: count}))
                     continue
                 counts[number] = count
-                low += [first] if first is not None else []
-                high += [last] if last is not None else []
+                stamps += [stamp for stamp in (first, last) if stamp is not None]
         except sqlite3.DatabaseError:
             if not self.salvage:
                 raise
@@ -155,9 +153,8 @@ class SqliteFile:
             for number, stamp in self._whole_rows("topic_id, timestamp"):
                 if number in counts:
                     counts[number] += 1
-                    low += [stamp] if isinstance(stamp, int) else []
-                    high += [stamp] if isinstance(stamp, int) else []
-        return counts, ((min(low), max(high)) if low else None)
+                    stamps += [stamp] if isinstance(stamp, int) else []
+        return counts, (min(stamps), max(stamps)) if stamps else None
 
     def _whole_rows(self, columns: str) -> Iterator[tuple[int, int]]:
         cursor = self._connection.execute(f"SELECT {columns} FROM messages NOT INDEXED ORDER BY id")

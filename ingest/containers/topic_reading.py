@@ -15,10 +15,11 @@ from restock.ingest.containers.compression import decompressed
 from restock.ingest.decoding.columns import (
     FieldColumn,
     GrowingArray,
-    GrowingColumn,
+    GrowingRagged,
     MessageBatch,
     PendingBatch,
     TopicColumns,
+    growing,
     take,
 )
 from restock.ingest.decoding.row_by_row import Decoded
@@ -93,7 +94,7 @@ class TopicReading:
         self._wanted, self._reduction = list(dict.fromkeys(wanted)), reduction
         no_times = np.zeros(0, np.int64)
         self._log, self._publish = GrowingArray(no_times), GrowingArray(no_times)
-        self._fields: dict[str, GrowingColumn] = {}
+        self._fields: dict[str, GrowingArray | GrowingRagged] = {}
         self.decodable = False
 
     @property
@@ -109,7 +110,7 @@ class TopicReading:
         """Make columns for the fields decoded, even if no message comes."""
         self.decodable = True
         for path, column in self._kept(empty).items():
-            self._fields.setdefault(path, GrowingColumn(column))
+            self._fields.setdefault(path, growing(column))
 
     def skip(self, reason: str, count: int) -> None:
         """Messages that are not read at all."""
@@ -158,7 +159,7 @@ class TopicReading:
 
     def columns(self) -> TopicColumns:
         """All of it, in the order of log time."""
-        log, publish = self._log.array(), self._publish.array()
+        log, publish = self._log.column(), self._publish.column()
         fields: dict[str, FieldColumn] = {}
         order = None
         self._account.log_backsteps = int((log[1:] < log[:-1]).sum())
@@ -190,6 +191,3 @@ def together(batches: Iterable[tuple[int, MessageBatch]]) -> Iterator[tuple[int,
         yield channel, batch
     for channel, waiting in pending.items():
         yield channel, waiting.batch()
-
-
-__all__ = ["Fields", "Reduction", "TopicReading", "together"]

@@ -214,8 +214,9 @@ class GrowingArray:
     def __len__(self) -> int:
         return self._size
 
-    def add(self, part: NDArray[Any], expected: int) -> None:
+    def add(self, part: FieldColumn, expected: int) -> None:
         """Copy a part in; `expected` is how many rows there will be in the end, as far as known."""
+        assert not isinstance(part, Ragged)
         size = self._size + len(part)
         if size > len(self._room):
             row_bytes = max(part.nbytes // max(len(part), 1), 1)
@@ -226,51 +227,37 @@ class GrowingArray:
         self._room[self._size : size] = part
         self._size = size
 
-    def array(self) -> NDArray[Any]:
+    def column(self) -> NDArray[Any]:
         """All of it, (N, …)."""
         return self._room[: self._size]
 
 
-class GrowingColumn:
-    """A field of a topic's messages as it grows; the like of the empty column it starts from."""
+class GrowingRagged:
+    """A ragged column as it grows."""
 
-    def __init__(self, empty: FieldColumn) -> None:
-        self._values: GrowingArray | GrowingColumn
-        self._offsets: GrowingArray | None = None
-        if isinstance(empty, Ragged):
-            self._values = GrowingColumn(empty.values)
-            self._offsets = GrowingArray(np.zeros(0, np.int64))
-            self._offsets.add(np.zeros(1, np.int64), 1)
-        else:
-            self._values = GrowingArray(empty)
+    def __init__(self, empty: Ragged) -> None:
+        self._values = growing(empty.values)
+        self._offsets = GrowingArray(np.zeros(0, np.int64))
+        self._offsets.add(np.zeros(1, np.int64), 1)
 
     def __len__(self) -> int:
-        return len(self._values) if self._offsets is None else len(self._offsets) - 1
+        return len(self._offsets) - 1
 
     def add(self, part: FieldColumn, expected: int) -> None:
-        """Copy a part in; `expected` is how many rows there will be in the end, as far as known."""
-        if isinstance(self._values, GrowingColumn) or isinstance(part, Ragged):
-            self._add_ragged(part, expected)
-        else:
-            self._values.add(part, expected)
-
-    def _add_ragged(self, part: FieldColumn, expected: int) -> None:
+        """Copy a part in, as `GrowingArray.add` does."""
         assert isinstance(part, Ragged)
-        assert self._offsets is not None
         before, rows = len(self._values), len(self) + len(part)
-        inside = part.offsets[-1] + before
-        # As many values in the rows to come as in those there are, and a few more.
-        share = -(-int(inside) * max(expected, rows) * 33 // (32 * max(rows, 1)))
-        values: Any = part.values
-        self._values.add(values, share)
+        inside = int(part.offsets[-1]) + before
+        # As many values in the rows to come as in those so far, and a few more.
+        share = -(-inside * max(expected, rows) * 33 // (32 * max(rows, 1)))
+        self._values.add(part.values, share)
         self._offsets.add(part.offsets[1:] + before, expected + 1)
 
-    def column(self) -> FieldColumn:
-        """All of it, (N, …) or Ragged."""
-        if self._offsets is None:
-            assert isinstance(self._values, GrowingArray)
-            return self._values.array()
-        inner = self._values
-        values = inner.array() if isinstance(inner, GrowingArray) else inner.column()
-        offsets: I64 = self._offsets.array()
-        return Ragged(values, offsets)
+    def column(self) -> Ragged:
+        """All of it."""
+        return Ragged(self._values.column(), self._offsets.column())
+
+
+def growing(empty: FieldColumn) -> GrowingArray | GrowingRagged:
+    """What grows into a column of the kind of this empty one."""
+    return GrowingRagged(empty) if isinstance(empty, Ragged) else GrowingArray(empty)

@@ -19,8 +19,8 @@ from support.driven_robot import write_bag as write_drive
 from restock.ingest.containers import mcap_file, sqlite_file
 from restock.ingest.containers import topic_reading as reading
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.decoding import columns as growing
-from restock.ingest.decoding.columns import GrowingColumn, Ragged, TopicColumns, equal, offsets_of
+from restock.ingest.decoding import columns as columns_module
+from restock.ingest.decoding.columns import Ragged, TopicColumns, equal, growing, offsets_of
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.steps.episodes import split
@@ -39,7 +39,7 @@ def cut_by(patch: pytest.MonkeyPatch, size: int, rows: int) -> None:
     patch.setattr(sqlite_file, "BYTES_PER_BATCH", size)
     patch.setattr(reading, "SMALL_ROWS", rows)
     patch.setattr(reading, "TOGETHER_ROWS", rows)
-    patch.setattr(growing, "AHEAD_BYTES", size)
+    patch.setattr(columns_module, "AHEAD_BYTES", size)
 
 
 def read(path: Path, size: int, rows: int, *, salvage: bool) -> dict[str, Any]:
@@ -198,8 +198,8 @@ def test_a_column_that_grows_is_its_parts_one_after_the_other(
         flat = np.array([value for row in rows for value in row], np.int32)
         return Ragged(flat, offsets_of(np.array([len(row) for row in rows], np.int64)))
 
-    nested = GrowingColumn(column([]))
-    plain = GrowingColumn(np.zeros((0, 2), np.float32))
+    nested = growing(column([]))
+    plain = growing(np.zeros((0, 2), np.float32))
     for part in parts:
         nested.add(column(part), expected)
         plain.add(np.array([(len(row), sum(row)) for row in part]).reshape(-1, 2), expected)
