@@ -20,7 +20,7 @@ from pathlib import Path
 
 import duckdb
 import numpy as np
-from harness import markdown, mean_interval
+from harness import markdown, mean_interval, run_restock
 
 from restock.cli import main as restock
 from restock.stats import percentiles
@@ -50,10 +50,8 @@ def main() -> int:
     hours = [(logs / f"hour{hour}.mcap", 100 + hour) for hour in range(1, options.hours + 1)]
     with ThreadPoolExecutor(options.workers) as pool:
         list(pool.map(_record, *zip(*hours, strict=True)))
-    if not (options.out / "store").exists() and restock(
-        ["ingest", str(logs), "--store", str(options.out / "store")]
-    ) not in (0, 3):
-        return 1
+    if not (options.out / "store").exists():
+        run_restock(["ingest", str(logs), "--store", str(options.out / "store")])
     for file in HERE.glob("*.toml"):
         shutil.copy(file, options.out / file.name)
     study, out = options.out / "study.toml", options.out / "study"
@@ -64,11 +62,10 @@ def main() -> int:
 
 
 def _record(recording: Path, seed: int) -> None:
-    if recording.exists():
-        return
-    words = ["--minutes", "60", "--seed", str(seed), "--rates", RATES, "--conditions", NATURAL]
-    command = [sys.executable, "-m", "restock", "record", "--out", str(recording), *words]
-    subprocess.run(command, check=True)
+    if not recording.exists():
+        flags = ["--minutes", "60", "--seed", str(seed), "--rates", RATES, "--conditions", NATURAL]
+        command = [sys.executable, "-m", "restock", "record", "--out", str(recording), *flags]
+        subprocess.run(command, check=True)
 
 
 def ends(plan: StudyPlan) -> str:

@@ -7,16 +7,20 @@ missed goes to stderr in either case, and `--check` exits 1 where a target is mi
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.cli import main as restock
 from restock.stats import percentiles
+from restock.train.run.run import Run
 
 T = TypeVar("T")
 
@@ -66,6 +70,25 @@ def mean_interval(
         for _ in range(resamples)
     ]
     return percentiles(np.array(means))
+
+
+def run_restock(arguments: Sequence[str]) -> None:
+    """A command of Restock in this process; what it prints goes to stderr."""
+    with contextlib.redirect_stdout(sys.stderr):
+        code = restock(arguments)
+    if code not in (0, 3):
+        raise SystemExit(f"restock {' '.join(arguments)} failed")
+
+
+def trained(path: Path, settings: Sequence[str], panel: Path | None = None) -> Run:
+    """The run at a path, trained or resumed where it has not ended."""
+    if not (path / "done").exists():
+        flags = [word for setting in settings for word in ("--set", setting)]
+        panel_flags = ["--panel", str(panel)] if panel else []
+        new = ["--out", str(path), *panel_flags, *flags]
+        run_restock(["train", *(["--resume", str(path)] if path.exists() else new)])
+        (path / "done").touch()
+    return Run.open(path)
 
 
 def markdown(header: Sequence[object], rows: Iterable[Sequence[object]]) -> str:

@@ -30,10 +30,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from drivers import drive
-from harness import finish, markdown, mean_interval, option_parser
+from harness import finish, markdown, mean_interval, option_parser, trained
 from numpy.typing import NDArray
 
-from restock.cli import main as restock
 from restock.stats import percentiles, wilson
 from restock.train.evaluation.policies import load_agent
 from restock.train.run.run import Run
@@ -98,17 +97,8 @@ def fixed(per_cell: int) -> list[tuple[EpisodeSpec, str]]:
 
 def train(out: Path, agent: str, seed: int, env_steps: int) -> Path:
     """The run of an agent and a seed, trained where it is not there or not at its end."""
-    name = agent.replace(", ", "-").replace(" ", "_")
-    path = out / f"{name}-{seed}"
-    if (path / "done").exists():
-        return path
-    sets = [*AGENTS[agent], *SETTINGS, f"schedule.env_steps={env_steps}", f"seed={seed}"]
-    flags = [word for setting in sets for word in ("--set", setting)]
-    start = ["--resume", str(path)] if path.exists() else ["--out", str(path), *flags]
-    if restock(["train", *start]) != 0:
-        raise SystemExit(f"training {path} failed")
-    (path / "done").touch()
-    return path
+    settings = [*AGENTS[agent], *SETTINGS, f"schedule.env_steps={env_steps}", f"seed={seed}"]
+    return trained(out / f"{agent.replace(', ', '-').replace(' ', '_')}-{seed}", settings).path
 
 
 def outcomes(policy: Policy, episodes: list[tuple[EpisodeSpec, str]]) -> NDArray[np.float64]:

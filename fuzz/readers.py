@@ -1,4 +1,4 @@
-"""Fuzzing the readers and decoders: bytes nobody wrote must end in columns or in a clear refusal.
+"""Fuzzing the readers and decoders: arbitrary bytes must end in columns or in a clear refusal.
 
     python fuzz/readers.py --minutes 60          # coverage-guided, with `pip install atheris`
     python fuzz/readers.py --again INPUT …       # what one input does, with its stack trace
@@ -93,12 +93,12 @@ def _read(path: Path, *, salvage: bool) -> None:
         describe_recording(path, salvage=salvage)
         with open_recording(path, salvage=salvage) as opened:
             wanted = {topic: opened.leaves(topic)[:MOST_LEAVES] for topic in opened.topics}
-            found = opened.read(wanted)
+            by_topic = opened.read(wanted)
             for topic, account in opened.accounts.items():
-                said = account.decoded + sum(account.reasons.values())
-                require(said >= account.expected, f"messages went missing: {account}")
-                if topic in found:
-                    columns = found[topic]
+                explained = account.decoded + sum(account.reasons.values())
+                require(explained >= account.expected, f"messages went missing: {account}")
+                if topic in by_topic:
+                    columns = by_topic[topic]
                     require(len(columns) == account.decoded, "as many rows as were decoded")
                     require(bool((np.diff(columns.log_time_ns) >= 0).all()), "in order")
                     for path_, column in columns.fields.items():
@@ -127,12 +127,12 @@ def _beside_rosbags(encoding: str, form: str, definition: bytes, payloads: list[
     try:
         kind = type_of(channel, "humble", lambda: payloads)
         leaves = kind.leaves()[:MOST_LEAVES]
-        ours = decoder_of(channel, kind, leaves)
-        theirs = RowDecoder(kind, leaves, ros1=encoding == "ros1")  # type: ignore[arg-type]
+        decoder = decoder_of(channel, kind, leaves)
+        rosbags = RowDecoder(kind, leaves, ros1=encoding == "ros1")  # type: ignore[arg-type]
     except CannotDecode:
         return
-    require(isinstance(ours, ColumnDecoder), "columns")
-    left, right = ours.decode(batch), theirs.decode(batch)
+    require(isinstance(decoder, ColumnDecoder), "columns")
+    left, right = decoder.decode(batch), rosbags.decode(batch)
     require(len(left.rows) + sum(left.bad.values()) == len(batch), "every message is counted")
     both = np.intersect1d(left.rows, right.rows)
     for leaf in leaves:
@@ -160,10 +160,10 @@ def _decode(channel: Channel, payloads: list[bytes]) -> None:
         decoder = decoder_of(channel, kind, kind.leaves()[:MOST_LEAVES])
     except CannotDecode:
         return
-    found = decoder.decode(batch)
-    require(len(found.rows) + sum(found.bad.values()) == len(batch), "every message is counted")
-    for path, column in found.fields.items():
-        require(len(column) == len(found.rows), f"as many rows in {path}")
+    decoded = decoder.decode(batch)
+    require(len(decoded.rows) + sum(decoded.bad.values()) == len(batch), "every message is counted")
+    for path, column in decoded.fields.items():
+        require(len(column) == len(decoded.rows), f"as many rows in {path}")
 
 
 def _parts(data: bytes) -> tuple[bytes, list[bytes]]:
@@ -198,7 +198,7 @@ def _memory() -> str | None:
 
 
 class Findings:
-    """What was found, each kind once."""
+    """Inputs that went wrong, each kind once."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -292,7 +292,7 @@ def main() -> int:
         "--corpus", type=Path, default=place / "corpus", help="grows from run to run"
     )
     parser.add_argument(
-        "--out", type=Path, default=place / "findings", help="inputs that were found"
+        "--out", type=Path, default=place / "findings", help="inputs that went wrong"
     )
     parser.add_argument("--again", type=Path, nargs="+", help="try these inputs, and stop at one")
     parser.add_argument("--child", type=int, help=argparse.SUPPRESS)
