@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from restock.ingest.steps.steps import Steps
+from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task, terminated
 
 Bools = NDArray[np.bool_]
@@ -71,9 +71,7 @@ def changed_route(steps: Steps) -> Ints:
     return changed[goal[changed - 1] >= 0]
 
 
-def with_route(
-    task: Task, steps: Steps, ticks: Ints, goal: Ints, plan: Ints
-) -> dict[str, NDArray[Any]]:
+def with_route(task: Task, steps: Steps, ticks: Ints, goal: Ints, plan: Ints) -> Signals:
     """The signals at these ticks as they are with this goal and plan in force."""
     now = {name: column[ticks] for name, column in steps.signals.items()}
     return now | steps.routing.signals(task, goal, plan, now)

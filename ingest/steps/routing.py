@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from restock.ingest.task.route import RouteView, pad_plans, view_route
-from restock.ingest.task.signals import Columns
+from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task, clearance_ahead
 
 F64 = NDArray[np.float64]
@@ -40,7 +39,7 @@ class Routing:
         nowhere = np.full(ticks, -1, np.int64)
         return cls(np.zeros((0, 2)), [], nowhere, nowhere, nowhere)
 
-    def view(self, task: Task, plan: Ints, pose: Columns) -> RouteView:
+    def view(self, task: Task, plan: Ints, pose: Signals) -> RouteView:
         """Along plan `plan[i]` from pose i, for N poses."""
         count = len(plan)
         ahead = np.zeros((count, 2, 2))
@@ -57,7 +56,7 @@ class Routing:
             remaining[rows] = seen.remaining_m
         return RouteView(ahead, remaining, offset)
 
-    def signals(self, task: Task, goal: Ints, plan: Ints, now: Columns) -> dict[str, NDArray[Any]]:
+    def signals(self, task: Task, goal: Ints, plan: Ints, now: Signals) -> Signals:
         """The route's signals for N steps that have `goal[i]` and `plan[i]` in force."""
         seen = self.view(task, plan, now)
         distance = np.zeros(len(goal))
@@ -77,7 +76,7 @@ class Routing:
             ),
         }
 
-    def progress_m(self, task: Task, plan: Ints, now: Columns, after: Columns) -> F64:
+    def progress_m(self, task: Task, plan: Ints, now: Signals, after: Signals) -> F64:
         """How much shorter plan `plan[i]` became from `now` to `after`; without one, how far
         the robot moved forward (along the mean of its two headings)."""
         shorter: F64 = now["route_remaining_m"] - self.view(task, plan, after).remaining_m

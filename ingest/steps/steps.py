@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +23,7 @@ from restock.ingest.steps.clocks import TopicClock, topic_clocks
 from restock.ingest.steps.custom_columns import Custom, custom_signals
 from restock.ingest.steps.routing import LARGEST, Routing, plan_ends, plan_problems, same_goals
 from restock.ingest.task.perturbation_columns import Perturbed
-from restock.ingest.task.signals import localised_velocity
+from restock.ingest.task.signals import Signals, localised_velocity
 from restock.ingest.task.task import nearest_action
 
 F64 = NDArray[np.float64]
@@ -36,7 +35,7 @@ Ints = NDArray[np.int64]
 class Steps:
     """Every tick of a recording (T of them), with all that is known at it."""
 
-    signals: dict[str, NDArray[Any]]  # every signal, leading axis T
+    signals: Signals  # every signal, leading axis T
     segment: Ints  # (T,) of the clock
     follows: Bools  # (T,) comes directly after the tick before, and both are usable
     break_reason: list[str]  # (T,) why it does not follow, or ""
@@ -110,10 +109,10 @@ class Filling:
         self.segment = np.repeat(np.arange(len(lengths)), lengths)
         self.problem = np.full(len(self.tick_ns), "", object)
         self.route_problem = np.full(len(self.tick_ns), "", object)
-        self.signals: dict[str, NDArray[Any]] = {"stamp_ns": self.tick_ns}
+        self.signals: Signals = {"stamp_ns": self.tick_ns}
         self.routing = Routing.none(len(self.tick_ns))
 
-    def fill(self) -> dict[str, NDArray[Any]]:
+    def fill(self) -> Signals:
         """Every signal but the localised velocity, which needs to know the tick before."""
         self._numbers(
             "command", speed_mps="command_speed_mps", yaw_rate_radps="command_yaw_rate_radps"
@@ -312,7 +311,7 @@ class Filled:
     """The signals at T ticks, and what is asked about them afterwards."""
 
     filling: Filling
-    signals: dict[str, NDArray[Any]]  # every signal, leading axis T
+    signals: Signals  # every signal, leading axis T
     follows: Bools  # (T,) comes directly after the tick before, and both are usable
     break_reason: list[str]  # (T,) why it does not follow, or ""
 

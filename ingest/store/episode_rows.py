@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -16,6 +15,7 @@ from restock.ingest.steps.episodes import Split, changed_route, with_route
 from restock.ingest.steps.steps import Steps
 from restock.ingest.task.conditions import label
 from restock.ingest.task.schema import SIGNAL_COLUMNS
+from restock.ingest.task.signals import Signals
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
@@ -32,7 +32,7 @@ class EpisodeRows:
     episode: Ints  # (R,) index of the episode
     step: Ints  # (R,) in its episode, from 0
     is_end: Bools  # (R,)
-    signals: dict[str, NDArray[Any]]  # leading axis R, as the row's episode sees them
+    signals: Signals  # leading axis R, as the row's episode sees them
     labels: dict[str, Bools]  # condition -> (R,)
     custom: pa.Table  # (R,) the profile's own signals
 
@@ -55,7 +55,7 @@ class EpisodeRows:
     @classmethod
     def join(cls, parts: Sequence[EpisodeRows]) -> EpisodeRows:
         """Steps of several groups of episodes, without their signals."""
-        none: dict[str, NDArray[Any]] = {}
+        none: Signals = {}
         labels = {name: np.concatenate([p.labels[name] for p in parts]) for name in parts[0].labels}
         return cls(
             np.concatenate([part.tick for part in parts]),
@@ -108,9 +108,7 @@ def episode_rows(
     return EpisodeRows(tick, episode, step, is_end, signals, labels, custom)
 
 
-def label_table(
-    signals: Mapping[str, NDArray[Any]], episode: Ints, step: Ints, custom: pa.Table
-) -> pa.Table:
+def label_table(signals: Signals, episode: Ints, step: Ints, custom: pa.Table) -> pa.Table:
     """The steps as conditions see them: stored signals and custom ones, as they are stored."""
     columns = {
         column.name: pa.array(np.asarray(signals[column.name]), pa.float64()).cast(column.type)

@@ -4,20 +4,19 @@ One row of signals is one step of the control clock, at time t. A profile says h
 topics fill them; the twin fills them from MuJoCo. Everything after this point (task, conditions,
 store) sees only signals, and so cannot tell a log from a simulation.
 
-`Columns` maps a signal's name to an array whose leading axis is the step (in a log) or the
+`Signals` maps a signal's name to an array whose leading axis is the step (in a log) or the
 environment (in the twin).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-Columns = Mapping[str, NDArray[Any]]
+Signals = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ STORED_SIGNALS: tuple[Signal, ...] = tuple(signal for signal in SIGNALS if signa
 
 
 def localised_velocity(
-    now: Columns, before: Columns
+    now: Signals, before: Signals
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Forward and lateral speed (m/s) from two localised poses, in the body frame of `now`.
 

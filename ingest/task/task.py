@@ -17,7 +17,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from restock.ingest.task.scan import Body
-from restock.ingest.task.signals import Columns
+from restock.ingest.task.signals import Signals
 from restock.toml import Checked
 
 F32 = NDArray[np.float32]
@@ -96,7 +96,7 @@ class Task(Checked, frozen=True):
         return hashlib.blake2b(content, digest_size=6).hexdigest()
 
 
-def observe(task: Task, now: Columns, before: Columns, previous_action: Ints) -> F32:
+def observe(task: Task, now: Signals, before: Signals, previous_action: Ints) -> F32:
     """The observation at t, (N, D) float32, from signals at t and t - 1 and the action before t."""
     near = np.arctan2(now["waypoint_near_y_m"], now["waypoint_near_x_m"])
     far = np.arctan2(now["waypoint_far_y_m"], now["waypoint_far_x_m"])
@@ -139,7 +139,7 @@ def nearest_action(
     return action.astype(np.int64), distance[np.arange(len(action)), action]
 
 
-def reached_goal(task: Task, after: Columns) -> Bools:
+def reached_goal(task: Task, after: Signals) -> Bools:
     """Whether the robot is within the goal radius at t + 1, (N,)."""
     if task.goal == "none":
         return np.zeros(len(after["goal_distance_m"]), np.bool_)
@@ -147,7 +147,7 @@ def reached_goal(task: Task, after: Columns) -> Bools:
     return reached
 
 
-def terminated(task: Task, after: Columns) -> Bools:
+def terminated(task: Task, after: Signals) -> Bools:
     """Whether the episode terminates at t + 1, (N,): no value is to be bootstrapped there."""
     terminates = reached_goal(task, after)
     if task.bump_terminates:
@@ -157,8 +157,8 @@ def terminated(task: Task, after: Columns) -> Bools:
 
 def reward(
     task: Task,
-    now: Columns,
-    after: Columns,
+    now: Signals,
+    after: Signals,
     progress_m: NDArray[Any],
     action: Ints,
     previous_action: Ints,
@@ -174,8 +174,8 @@ def reward(
 
 def reward_parts(
     task: Task,
-    now: Columns,
-    after: Columns,
+    now: Signals,
+    after: Signals,
     progress_m: NDArray[Any],
     action: Ints,
     previous_action: Ints,

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.ingest.task.signals import Signals
 from restock.stats import wilson
 from restock.train.feed.fresh_log import values_entries
 from restock.train.twin.env.interface import Policy, Twin
@@ -144,7 +145,7 @@ def run_episodes(
     return [result for result in results if result is not None]
 
 
-def _position(signals: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
+def _position(signals: Signals) -> NDArray[np.float64]:
     return np.stack([signals["pose_x_m"], signals["pose_y_m"]], axis=-1)
 
 

@@ -17,7 +17,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from restock.ingest.task.conditions import NOMINAL, Condition, label, primary
-from restock.ingest.task.signals import STORED_SIGNALS
+from restock.ingest.task.signals import STORED_SIGNALS, Signals
 from restock.ingest.task.task import Task
 from restock.replay.ring.ring import FreshRing
 from restock.state import Stateful, saved
@@ -45,7 +45,7 @@ class Ended:
     success: bool
     bumps: int
     steps: int
-    signals: dict[str, NDArray[Any]]  # (steps + 1,) each
+    signals: Signals  # (steps + 1,) each
     perturbation_values: str = "{}"  # JSON: those that are not nominal
     layout: str = DEFAULT
     zones: list[str] | None = None  # (steps + 1,) on its layout; None: what the profile says

@@ -24,7 +24,7 @@ from restock.errors import ConfigError, StoreError
 from restock.ingest.store.episode_rows import episode_ends
 from restock.ingest.store.writer import TRANSITIONS
 from restock.ingest.task.schema import SIGNAL_COLUMNS
-from restock.ingest.task.signals import Columns
+from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task
 from restock.replay.store.store import Store, passed_in
 
@@ -44,7 +44,7 @@ class LoggedSteps:
     """N rows of one task, by recording, episode and step."""
 
     task: Task
-    now: dict[str, NDArray[Any]]  # the stored signals at t, (N,) each
+    now: Signals  # the stored signals at t, (N,) each
     transition_id: Ints  # (N,)
     recording_id: Strings  # (N,)
     episode_id: Strings  # (N,)
@@ -57,7 +57,7 @@ class LoggedSteps:
     reward: F64  # (N,)
     progress_m: F64  # (N,)
     ending: Ints  # (E,) rows whose successor only ends their episode
-    ends: dict[str, NDArray[Any]]  # the signals of those successors, (E,) each
+    ends: Signals  # the signals of those successors, (E,) each
 
     def __len__(self) -> int:
         return len(self.transition_id)
@@ -70,7 +70,7 @@ class LoggedSteps:
         return followed
 
     @cached_property
-    def after(self) -> dict[str, NDArray[Any]]:
+    def after(self) -> Signals:
         """The signals at t + 1, (N,) each; of no meaning where not `followed`."""
         after = {name: np.append(column[1:], column[:1]) for name, column in self.now.items()}
         for name, column in self.ends.items():
@@ -202,7 +202,7 @@ def previous_action(task: Task, observation: F32) -> Ints:
     return chosen
 
 
-def rows_of(columns: Columns, rows: NDArray[Any]) -> dict[str, NDArray[Any]]:
+def rows_of(columns: Signals, rows: NDArray[Any]) -> Signals:
     """Some rows of every column."""
     return {name: column[rows] for name, column in columns.items()}
 
@@ -216,7 +216,7 @@ def _conditions(held: Sequence[Sequence[str] | None]) -> dict[str, Bools]:
 
 def _ends(
     store: Store, recordings: Sequence[str], episode: Strings, step: Ints, last: Bools
-) -> tuple[Ints, dict[str, NDArray[Any]]]:
+) -> tuple[Ints, Signals]:
     """Of the `last` rows (N,) of stretches those that an episode's end follows, and these ends."""
     row_of = {(str(episode[row]), int(step[row])): row for row in np.flatnonzero(last).tolist()}
     rows, parts, root = [], [], store.path.table(TRANSITIONS)

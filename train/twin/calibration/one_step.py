@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.ingest.steps.routing import Routing
-from restock.ingest.task.signals import Columns, localised_velocity, wrap_angle
+from restock.ingest.task.signals import Signals, localised_velocity, wrap_angle
 from restock.ingest.task.task import Task, clearance_ahead, observe, reward_parts
 from restock.replay.store.store import Store
 from restock.train.twin.calibration.logged_steps import (
@@ -101,7 +101,7 @@ def one_step(
     after["sector_clearance_m"] = sector_clearance(task, next_observed)
     action, before = steps.action[rows], previous_action(task, observed)
 
-    def terms(then: Columns, progress_m: F64) -> dict[str, F64]:
+    def terms(then: Signals, progress_m: F64) -> dict[str, F64]:
         parts = reward_parts(task, now, then, progress_m, action, before)
         return {name: np.asarray(value, np.float64) for name, value in parts.items()}
 
@@ -140,14 +140,14 @@ def one_step(
     )
 
 
-def _sensed(driven: Driven, twin: int) -> dict[str, NDArray[Any]]:
+def _sensed(driven: Driven, twin: int) -> Signals:
     """What one twin senses at the end, by the names of the signals."""
     sensed = {name: values[twin, :, -1] for name, values in driven.signals.items()}
     sensed["sector_clearance_m"] = driven.sector_clearance_m[twin]
     return sensed | {"bumped": driven.bumped[twin]}
 
 
-def _localise(period_s: float, now: Columns, after: Columns, twin: dict[str, NDArray[Any]]) -> None:
+def _localise(period_s: float, now: Signals, after: Signals, twin: Signals) -> None:
     """The twin's pose as localisation would report it: as old as the log's, and speeds from it."""
     elapsed_s = (after["pose_stamp_ns"] - now["pose_stamp_ns"]) * 1e-9
     share = np.clip(elapsed_s / period_s, 0.0, 2.0)
@@ -188,7 +188,7 @@ class PlanMemory:
     next_plan: Ints  # (N,) at t + 1
     error_m: float  # of what remains, seen on the rebuilt plans from the logged poses, median
 
-    def seen_after(self, steps: LoggedSteps, rows: Ints, pose: Columns) -> dict[str, F64]:
+    def seen_after(self, steps: LoggedSteps, rows: Ints, pose: Signals) -> dict[str, F64]:
         """The route's signals at t + 1 from other poses (n,), for `rows` (n,).
 
         The logged ones, and what the rebuilt plan says of the difference between the two poses:
@@ -199,7 +199,7 @@ class PlanMemory:
         logged = self._view(self.next_plan[rows], after)
         return {name: after[name] + moved[name] - logged[name] for name in ROUTE}
 
-    def progress_m(self, steps: LoggedSteps, rows: Ints, pose: Columns) -> F64:
+    def progress_m(self, steps: LoggedSteps, rows: Ints, pose: Signals) -> F64:
         """How much shorter the plan in force at t would have become, had it ended at `pose`."""
         plan = self.routing.plan[rows]
         now, after = ({n: c[rows] for n, c in side.items()} for side in (steps.now, steps.after))
@@ -207,7 +207,7 @@ class PlanMemory:
         logged = self.routing.progress_m(self.task, plan, now, after)
         return np.asarray(steps.progress_m[rows] + moved - logged, np.float64)
 
-    def _view(self, plan: Ints, pose: Columns) -> dict[str, F64]:
+    def _view(self, plan: Ints, pose: Signals) -> dict[str, F64]:
         seen = self.routing.view(self.task, plan, pose)
         near, far = seen.look_ahead_m[:, 0], seen.look_ahead_m[:, 1]
         values = (near[:, 0], near[:, 1], far[:, 0], far[:, 1], seen.remaining_m)

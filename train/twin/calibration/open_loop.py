@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.ingest.task.signals import Columns, localised_velocity, wrap_angle
+from restock.ingest.task.signals import Signals, localised_velocity, wrap_angle
 from restock.ingest.task.task import Task
 from restock.train.twin.calibration.logged_steps import rows_of
 from restock.train.twin.calibration.segments import POSE, LoggedSegments
@@ -51,7 +51,7 @@ class Start:
     """
 
     pose: F64  # (S, 3) x, y and heading
-    motion: Columns
+    motion: Signals
     command: F64  # (S, K, 2) speed m/s and yaw rate rad/s
     past: F64 | None = None  # (S, P, 2) the commands of the periods before
 

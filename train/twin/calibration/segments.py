@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import ConfigError
+from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task
 from restock.train.twin.calibration.logged_steps import COMMAND, LoggedSteps, rows_of
 
@@ -55,7 +56,7 @@ class LoggedSegments:
     command: F64  # (S, W + K, 2) speed m/s and yaw rate rad/s; stop where nothing was before
     still: NDArray[np.bool_]  # (S,) the robot stood before the first of the W steps
     before: dict[str, F64]  # the signals of `BEFORE` as the W steps begin, (S,) each
-    signals: dict[str, NDArray[Any]]  # (S, K + 1) each
+    signals: Signals  # (S, K + 1) each
     pose_fresh: NDArray[np.bool_]  # (S, K + 1) the pose was measured at its tick
     left_out: dict[str, int] = field(default_factory=dict)
 

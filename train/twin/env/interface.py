@@ -13,6 +13,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from restock.ingest.task.signals import Signals
 from restock.toml import Checked
 
 if TYPE_CHECKING:  # an episode needs MuJoCo; a run's config does not
@@ -36,7 +37,7 @@ class Twin(Protocol):
     num_envs: int
 
     @property
-    def signals(self) -> dict[str, NDArray[Any]]: ...
+    def signals(self) -> Signals: ...
     def set_episodes(self, specs: Iterable[EpisodeSpec], /) -> None: ...
     def reset(self, *, seed: int | None = None) -> tuple[NDArray[Any], dict[str, Any]]: ...
     def step(self, actions: NDArray[Any], /) -> tuple[Any, Any, Any, Any, dict[str, Any]]: ...

@@ -12,12 +12,13 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task
 from restock.state import Stateful
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.planner import PLAN_POINTS, BlockFinder, Closure, Planner, planners
 from restock.train.twin.physics.episode import Episode
-from restock.train.twin.physics.sensing import Sensing, Signals
+from restock.train.twin.physics.sensing import Sensing
 
 F64 = NDArray[np.float64]
 

@@ -41,6 +41,7 @@ from numpy.typing import NDArray
 
 from restock.errors import ConfigError, RunError
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task, observe, reached_goal, reward
 from restock.ingest.task.task import terminated as is_terminated
 from restock.state import Stateful
@@ -54,7 +55,7 @@ from restock.train.twin.floors.floors import floors_of
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.physics.episode import Episode, EpisodeSpec, draw_episode
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
-from restock.train.twin.physics.sensing import Sensing, Signals, add_motion, add_route
+from restock.train.twin.physics.sensing import Sensing, add_motion, add_route
 from restock.train.twin.physics.simulation import BodyState, Physics, Simulation
 from restock.train.twin.physics.truth import Truth
 

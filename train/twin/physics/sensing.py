@@ -8,7 +8,6 @@ noise of a perturbation. All noise of an episode is drawn when it begins, from i
 from __future__ import annotations
 
 from statistics import NormalDist
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from scipy.signal import lfilter
 
 from restock.ingest.task.route import view_route
 from restock.ingest.task.scan import SectorMap
-from restock.ingest.task.signals import localised_velocity, wrap_angle
+from restock.ingest.task.signals import Signals, localised_velocity, wrap_angle
 from restock.ingest.task.task import Task, clearance_ahead
 from restock.state import Stateful
 from restock.train.twin.physics.model import body_velocity
@@ -25,7 +24,6 @@ from restock.train.twin.physics.simulation import Simulation
 
 F64 = NDArray[np.float64]
 Ids = NDArray[np.int64]
-Signals = dict[str, NDArray[Any]]
 
 FIRST_STAMP_NS = 1_000_000_000  # of an episode's first step: stamps are never 0
 DRIFT_TIME_S = 3.0

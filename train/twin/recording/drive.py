@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.ingest.task.signals import Columns
+from restock.ingest.task.signals import Signals
 from restock.train.twin.recording.scene import EMPTY, Scene
 
 F64 = NDArray[np.float64]
@@ -56,7 +56,7 @@ class Drive:
     goal_m: tuple[float, float]
     motion: Motion
     tick_s: F64  # (T + 1,) from the start of the mission
-    signals: Columns  # each (T + 1, …): what the policy saw
+    signals: Signals  # each (T + 1, …): what the policy saw
     scan_s: F64  # (K,) when the lidar scanned; the first tick is among them
     ranges_m: F64  # (K, B) as measured; inf where nothing came back
     command: F64  # (T, 2) speed_mps, yaw_rate_radps

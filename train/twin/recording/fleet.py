@@ -13,6 +13,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
+from restock.ingest.task.signals import Signals
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.physics.episode import EpisodeSpec
@@ -172,7 +173,7 @@ class Fleet:
             log.ranges_m.append(self._measured(log, self._scan[robot]))
         self._note_tick(log, robot, info["signals"])
 
-    def _note_tick(self, log: _Log, robot: int, signals: Mapping[str, NDArray[Any]]) -> None:
+    def _note_tick(self, log: _Log, robot: int, signals: Signals) -> None:
         """What the policy sees at a tick."""
         env, tick = self.env, len(log.action)
         log.signals.append({name: column[robot] for name, column in signals.items()})
