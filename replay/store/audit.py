@@ -35,6 +35,13 @@ Status = Literal["pass", "fail", "warn", "info", "skipped"]
 Thresholds = Mapping[str, Mapping[str, float | str]]
 
 SAMPLE_ROWS = 10
+# Audits and thresholds by the names of earlier versions.
+RENAMED = {
+    "flattering_evaluation": "evaluation_bias",
+    "flattering_panel": "panel_bias",
+    "flattering_policy": "policy_bias",
+    "max_flattery": "max_bias",
+}
 BEGIN = "<!-- audits: written by `python -m restock.replay.store.audit docs/audit.md` -->"
 END = "<!-- end of audits -->"
 _OFFENDED: dict[Severity, Status] = {"error": "fail", "warning": "warn", "info": "info"}
@@ -209,14 +216,18 @@ def _check_thresholds(audits: Sequence[Audit], thresholds: Thresholds) -> None:
     used = {audit.name: audit.parameters for audit in audits}
     for name, table in thresholds.items():
         if name not in used:
-            raise ConfigError(
-                f"no audit named {name!r}", where="thresholds", remedy=f"there is {', '.join(used)}"
-            )
+            remedy = f"there is {', '.join(used)}"
+            if name in RENAMED:
+                remedy = f"it is now called {RENAMED[name]!r}: rename it"
+            raise ConfigError(f"no audit named {name!r}", where="thresholds", remedy=remedy)
         if unknown := sorted(table.keys() - used[name]):
+            remedy = f"it has {', '.join(sorted(used[name])) or 'none'}"
+            if unknown[0] in RENAMED:
+                remedy = f"it is now called {RENAMED[unknown[0]]!r}: rename it"
             raise ConfigError(
-                f"{name}.{unknown[0]} is no threshold of this audit",
+                f"{name}.{unknown[0]} is not a threshold of this audit",
                 where="thresholds",
-                remedy=f"it has {', '.join(sorted(used[name])) or 'none'}",
+                remedy=remedy,
             )
 
 

@@ -22,7 +22,7 @@ from restock.replay.panel.build import build_panel
 from restock.replay.store.store import Store
 from restock.report import build_report
 from restock.report.facts import gather
-from restock.report.feed import flattery
+from restock.report.feed import evaluation_bias
 from restock.stats import ConfidenceInterval
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES, TABLES
@@ -145,7 +145,7 @@ def test_the_replay_card_answers_every_question(run: Path, capsys) -> None:
         ("fqe", 0.5),
         ("wdr", None),
     ]
-    assert "flatters most" in card["imbalance"]
+    assert "biases it most" in card["imbalance"]
     assert json.loads((run / "replay_card.json").read_text()) == card
 
 
@@ -296,15 +296,15 @@ def test_the_kept_evaluation_is_the_best_and_not_the_last(run: Path) -> None:
     assert (kept["env_steps"], kept["success"]) == (2000, 1.0)
 
 
-def test_the_imbalance_that_flatters_is_named(run: Path) -> None:
+def test_the_evaluation_bias_is_named(run: Path) -> None:
     facts = gather(run)
     facts.logged = [
         {"condition": "nominal", "share": 0.1, "episodes": 1},
         {"condition": "wheel_slip", "share": 0.9, "episodes": 9},
     ]
     # Half of the evaluation is nominal, which is easier, but a tenth of what was logged.
-    assert "success would be 27% instead of 55%" in flattery(facts)
-    assert "flatters most is nominal" in flattery(facts)
+    assert "success would be 27% instead of 55%" in evaluation_bias(facts)
+    assert "biases it most is nominal" in evaluation_bias(facts)
 
 
 def test_a_young_run_without_evaluation_still_has_a_page(tmp_path: Path) -> None:

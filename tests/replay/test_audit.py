@@ -231,8 +231,8 @@ PLANTS: list[tuple[str, Plant, int, dict[str, object]]] = [
     ("far_actions", far_operator, 1, {"behaviour_policy": "operator", "far_share": 1.0}),
     ("repeated_steps", bag_and_a_part_of_it, 1, {"same_as_file": "logs/part.mcap", "rows": 60}),
     ("observation_drift", drifting_clearance, 2, {"signal": "clearance_m"}),
-    ("flattering_policy", picky_operator, 1, {"behaviour_policy": "operator"}),
-    ("flattering_policy", mostly_easy_operator, 1, {"behaviour_policy": "operator"}),
+    ("policy_bias", picky_operator, 1, {"behaviour_policy": "operator"}),
+    ("policy_bias", mostly_easy_operator, 1, {"behaviour_policy": "operator"}),
 ]
 
 
@@ -268,7 +268,7 @@ def test_missing_action_probabilities_are_said(clean: Tables) -> None:
     assert {row["behaviour_policy"] for row in finding.sample} == {"planner", "operator"}
 
 
-def test_an_evaluation_full_of_easy_episodes_flatters(tmp_path: Path) -> None:
+def test_an_evaluation_full_of_easy_episodes_is_biased(tmp_path: Path) -> None:
     # The logs are about nominal and blocked episodes in equal parts; the evaluation is nine parts
     # nominal, where the policy succeeds. Only the last evaluation counts.
     table = recording_transitions(1, episodes=40)
@@ -282,7 +282,7 @@ def test_an_evaluation_full_of_easy_episodes_flatters(tmp_path: Path) -> None:
     run.mkdir()
     (run / "config.json").write_text("{}")
     store = write_store(tmp_path / "store", [replaced(table, "true_condition", truth)])
-    name = "flattering_evaluation"
+    name = "evaluation_bias"
     thresholds = {name: load_thresholds()[name]}
     pq.write_table(pa.Table.from_pylist(evaluations), run / "evaluations.parquet")
     with open_place(store, beside={"run": run}) as connection:
@@ -295,7 +295,7 @@ def test_an_evaluation_full_of_easy_episodes_flatters(tmp_path: Path) -> None:
             "success_share": 1.0,
         }
         assert run_audits(connection, [AUDITS[name]], thresholds)[0].status == "skipped"
-    # Where the policy does as well everywhere, more of one condition flatters nobody.
+    # Where the policy does as well everywhere, more of one condition biases nothing.
     everywhere = [row | {"success": True} for row in evaluations]
     pq.write_table(pa.Table.from_pylist(everywhere), run / "evaluations.parquet")
     with open_place(store, beside={"run": run}) as connection:
@@ -322,10 +322,10 @@ def beside_panel(store: Path, panel: Path, name: str, spoil: str = "SELECT 1") -
         return run_audits(connection, [AUDITS[name]], chosen, beside=["panel"])[0]
 
 
-def test_strata_that_the_panel_flatters_are_named(
+def test_strata_that_the_panel_overrepresents_are_named(
     store_path: Path, panels: dict[str, Path]
 ) -> None:
-    finding = beside_panel(store_path, panels["episode"], "flattering_panel")
+    finding = beside_panel(store_path, panels["episode"], "panel_bias")
     boosted = {row["stratum"] for row in finding.sample}
     assert boosted == {"wheel_slip", "blocked_aisle", "near_collision", "recovery"}
 
@@ -427,8 +427,14 @@ def test_ones_own_audits_and_thresholds(tmp_path: Path, clean: Tables) -> None:
         assert (finding.status, finding.rows) == ("fail", 3)
         with pytest.raises(ConfigError, match="no threshold least"):
             run_audits(connection, [audits["slow"]], {})
-        with pytest.raises(ConfigError, match=r"slow\.most is no threshold"):
+        with pytest.raises(ConfigError, match=r"slow\.most is not a threshold"):
             run_audits(connection, [audits["slow"]], {"slow": {"least": 1, "most": 2}})
+        for old, new, renamed in (
+            ("flattering_policy", {}, "policy_bias"),
+            ("slow", {"max_flattery": 1}, "max_bias"),
+        ):
+            with pytest.raises(ConfigError, match=f"it is now called '{renamed}'"):
+                run_audits(connection, [audits["slow"]], {old: new})
         with pytest.raises(ConfigError, match="no audit named 'sloow'"):
             run_audits(connection, [audits["slow"]], {"sloow": {"least": 1}})
         broken = Audit("broken", "error", "", "", None, "SELECT nothing FROM transitions")

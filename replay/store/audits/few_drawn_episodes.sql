@@ -1,5 +1,5 @@
 -- severity: warning
--- needs: run.fed_episodes
+-- needs: run.sampled_episodes
 -- advice: What the critic knows of this stratum is what these few episodes show: add episodes, or read its results as theirs.
 -- doc: Strata of which a run drew so unevenly that its draws are worth few episodes.
 SELECT
@@ -10,7 +10,7 @@ SELECT
     sum(drawn) ^ 2 / sum(drawn ^ 2) AS effective_episodes
 FROM (
     SELECT source, stratum, episode, sum(drawn_rows)::DOUBLE AS drawn
-    FROM run.fed_episodes
+    FROM run.sampled_episodes
     GROUP BY source, stratum, episode
 )
 WHERE stratum <> 'unlabelled'  -- of fresh rows: no stratum, but episodes that have not ended

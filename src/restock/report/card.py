@@ -14,7 +14,7 @@ import msgspec
 
 from restock.report.blocks import estimate
 from restock.report.facts import Facts, Rows
-from restock.report.feed import flattery
+from restock.report.feed import evaluation_bias
 
 FORMAT = "restock-replay-card/1"
 _UNKNOWN = "not known: run `restock eval` on a run whose panel and store are at hand"
@@ -91,7 +91,7 @@ def replay_card(facts: Facts) -> dict[str, Any]:
             for row in facts.off_policy
         ],
         "left_out": dict(panel.header.left_out) if panel is not None else None,
-        "imbalance": flattery(facts) or None,
+        "imbalance": evaluation_bias(facts) or None,
         "missing": list(facts.missing),
     }
 
@@ -100,7 +100,7 @@ def as_markdown(card: dict[str, Any]) -> str:
     """The card as a page of Markdown."""
     capacity, sampling = card["capacity"], card["sampling"]
     lines = [f"# Replay card of {_cell(card['run'])}", ""]
-    lines += [f"**The imbalance that flatters most.** {_cell(card['imbalance'] or _UNKNOWN)}", ""]
+    lines += [f"**Evaluation bias.** {_cell(card['imbalance'] or _UNKNOWN)}", ""]
     facts = {
         "Capacity": f"{_count(capacity['ring_rows'])} fresh rows; {_panel(capacity)}",
         "Sampling rule": f"batches of {_or_none(sampling['batch_size'])},"

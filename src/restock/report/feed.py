@@ -81,7 +81,7 @@ def fed(facts: Facts) -> Section:
         "What was the critic fed?",
         intro="The replay mix is the training distribution. Intended is what the mixture asks for,"
         " drawn what the batches held, after weights what the gradient saw.",
-        callout=flattery(facts),
+        callout=evaluation_bias(facts),
         figures=figures,
         two=True,
         tables=[
@@ -131,7 +131,7 @@ def _short(value: int) -> str:
     return f"{value / 1024:.0f}k" if value >= 1024 else str(value)
 
 
-def flattery(facts: Facts) -> str:
+def evaluation_bias(facts: Facts) -> str:
     """The imbalance most likely to make the evaluation look better than deployment."""
     cells = clean_cells(facts)
     if not cells or not facts.logged:
@@ -151,18 +151,18 @@ def flattery(facts: Facts) -> str:
     logged = {name: logged.get(name, 0.0) / total for name in success}
     as_evaluated = sum(evaluated[name] * success[name] for name in success)
     as_logged = sum(logged[name] * success[name] for name in success)
-    flatter = max(success, key=lambda n: (evaluated[n] - logged[n]) * (success[n] - as_logged))
-    gain = (evaluated[flatter] - logged[flatter]) * (success[flatter] - as_logged)
-    more = evaluated[flatter] > logged[flatter]
+    worst = max(success, key=lambda n: (evaluated[n] - logged[n]) * (success[n] - as_logged))
+    gain = (evaluated[worst] - logged[worst]) * (success[worst] - as_logged)
+    more = evaluated[worst] > logged[worst]
     text = (
         f"Evaluation against deployment: weighted as the logs' episodes met them, success would be"
         f" {as_logged:.0%} instead of {as_evaluated:.0%}."
     )
     if gain <= 0.0005:
-        return text + " No condition's share flatters the evaluation."
+        return text + " No condition's share biases the evaluation upward."
     return text + (
-        f" The share that flatters most is {words(flatter)}: {evaluated[flatter]:.0%} of the"
-        f" evaluation's episodes, {logged[flatter]:.0%} of the logs', and"
-        f" {'easier' if more else 'harder'} than average ({success[flatter]:.0%}); it is worth"
+        f" The share that biases it most is {words(worst)}: {evaluated[worst]:.0%} of the"
+        f" evaluation's episodes, {logged[worst]:.0%} of the logs', and"
+        f" {'easier' if more else 'harder'} than average ({success[worst]:.0%}); it is worth"
         f" {gain * 100:+.1f} points."
     )

@@ -24,10 +24,10 @@ WITH kinds AS (
     GROUP BY behaviour_policy
 )
 FROM by_policy
-WHERE success_share - success_share_in_fleet_mix > $max_flattery
+WHERE success_share - success_share_in_fleet_mix > $max_bias
     -- It never drove the kinds that cost the fleet its failures.
     OR (
         kinds_driven_share < $min_kinds_share
-        AND success_share - (SELECT avg(success::INTEGER) FROM kinds) > $max_flattery
+        AND success_share - (SELECT avg(success::INTEGER) FROM kinds) > $max_bias
     )
 ORDER BY behaviour_policy
