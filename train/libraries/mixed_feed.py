@@ -40,7 +40,8 @@ NO_LOGS = BatchDraw(_NO_ROWS, _NO_ROWS, None, np.empty(0))
 
 
 class FeedOptions(TypedDict, total=False):
-    """What every library's buffer takes by keyword."""
+    """What every library's buffer takes by keyword; each may be left out. Defaults: no run, the
+    panel's own share, warehouse_amr, seed 0, a hundredth of the batches, 500 batches."""
 
     run: str | Path | None  # the run directory to make; None, the default: no record is kept
     logs_share: float | None  # of a batch; default the panel's own
