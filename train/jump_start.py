@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from restock.errors import ConfigError
 from restock.state import Stateful
 from restock.train.dqn.config import JumpStartConfig
-from restock.train.dqn.fitted_q import FittedQConfig, chances, cloned_behaviour
+from restock.train.dqn.fitted_q import FittedQConfig, cloned_behaviour, cloned_probabilities
 from restock.train.dqn.network import QNetwork
 from restock.train.feed.logs import Logs
 
@@ -59,7 +59,7 @@ class JumpStart(Stateful):
             return None
         if logs is None:
             raise ConfigError(
-                "jump_start.env_steps is about the logs' behaviour, and there are none",
+                "jump_start.env_steps is about the logs' behaviour, and this run has no logs",
                 remedy="give --panel, or leave it out",
             )
         num_envs, observation_size, actions = size
@@ -88,7 +88,9 @@ class JumpStart(Stateful):
         cloned = np.flatnonzero(step < self._until)
         if not len(cloned):
             return action, probability, policy
-        of_each = chances(self.network, np.ascontiguousarray(observation[cloned]))  # (n, A)
+        of_each = cloned_probabilities(
+            self.network, np.ascontiguousarray(observation[cloned])
+        )  # (n, A)
         chosen = (self._rng.random((len(cloned), 1)) > of_each.cumsum(axis=1)).sum(axis=1)
         chosen = np.minimum(chosen, of_each.shape[1] - 1)
         action, probability = action.copy(), probability.copy()

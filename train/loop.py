@@ -25,7 +25,7 @@ from restock.train.evaluation.evaluate import (
 from restock.train.evaluation.ope import OpeConfig, evaluate_off_policy, measures_of
 from restock.train.evaluation.ope_dataset import load_ope_dataset
 from restock.train.evaluation.policies import GreedyPolicy
-from restock.train.feed.batches import Batch
+from restock.train.feed.batches import ReplayBatch
 from restock.train.feed.probe import Probe
 from restock.train.guard import enforce, falls
 from restock.train.session import Interval, Session
@@ -162,7 +162,7 @@ def _updates_due(session: Session) -> int:
     return int(collected * session.config.schedule.updates_per_env_step) - progress.online_updates
 
 
-def _update(session: Session, batch: Batch, phase: str, notify: Notify) -> None:
+def _update(session: Session, batch: ReplayBatch, phase: str, notify: Notify) -> None:
     """One gradient step, its record, and the target's progress."""
     learner, interval = session.learner, session.interval
     expert, return_to_go = session.log_terms.rows(batch.log_rows)

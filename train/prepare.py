@@ -139,7 +139,7 @@ def prepare_new(
         config = load_config(config, overrides)
     open_device(config.device)
     for layouts in {config.env.layouts, _evaluation_layouts(config)}:
-        # What is wrong with one is said before anything is written. Evaluation drives all kinds
+        # What is wrong with one is reported before anything is written. Evaluation drives all kinds
         # that are named, whatever their share.
         refuse_unfit(open_floors(layouts), config.env.conditions)
     profile = load_profile(config.profile)
@@ -196,7 +196,7 @@ def open_panel(path: Path, config: TrainConfig, profile: Profile) -> Panel:
             f"its rows are of task {panel.task_hash}, the twin's ({profile.name}) is"
             f" {profile.task.hash}: observation, action or reward differ",
             where=str(path),
-            remedy=f"ingest the logs again with `--profile {profile.name}` and mix anew",
+            remedy=f"ingest the logs again with `--profile {profile.name}` and mix again",
         )
     if abs(panel.discount - config.loss.discount) > 1e-9:
         raise PanelError(
@@ -242,8 +242,8 @@ def resolve_config(config: TrainConfig, panel: Panel | None) -> TrainConfig:
         epsilon = msgspec.structs.replace(epsilon, start=AFTER_LOGS if learns_first else 1.0)
     env = config.env
     if env.perturbation not in PERTURBATIONS:  # what is in a file may change: the run keeps it
-        found = find_perturbation(env.perturbation, where="env.perturbation")
-        env = msgspec.structs.replace(env, perturbation=msgspec.to_builtins(found))
+        perturbation = find_perturbation(env.perturbation, where="env.perturbation")
+        env = msgspec.structs.replace(env, perturbation=msgspec.to_builtins(perturbation))
     return msgspec.structs.replace(config, epsilon=epsilon, env=env)
 
 

@@ -184,7 +184,7 @@ def test_a_run_with_a_jump_start_resumes_bit_exact(tmp_path: Path) -> None:
 
 
 def test_a_jump_start_needs_logs(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="about the logs' behaviour, and there are none"):
+    with pytest.raises(ConfigError, match="about the logs' behaviour, and this run has no logs"):
         session(tmp_path / "run", config(**JUMP_START), logs=None)
 
 

@@ -7,7 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from restock.train.dqn.fitted_q import FittedQConfig, Rows, cloned_behaviour, fitted_q, values
+from restock.train.dqn.fitted_q import (
+    FittedQConfig,
+    Transitions,
+    cloned_behaviour,
+    fitted_q,
+    values,
+)
 from restock.train.evaluation.ope_estimators import (
     EssGate,
     OpeEpisodes,
@@ -195,7 +201,7 @@ TABULAR = FittedQConfig(iterations=40, updates=20, batch_size=512, hidden=(), la
 TABULAR = replace(TABULAR, learning_rate=0.03)
 
 
-def rows(episodes: int, seed: int) -> tuple[Rows, np.ndarray]:
+def rows(episodes: int, seed: int) -> tuple[Transitions, np.ndarray]:
     """Transitions with one-hot observations, and their next states."""
     state, action, reward, following, alive = CHAIN.drive(
         BEHAVIOUR, episodes, np.random.default_rng(seed)
@@ -204,7 +210,7 @@ def rows(episodes: int, seed: int) -> tuple[Rows, np.ndarray]:
         column[alive] for column in (state, action, reward, following)
     )
     one_hot = np.eye(STATES, dtype=np.float32)
-    return Rows(
+    return Transitions(
         one_hot[state],
         action,
         reward.astype(np.float32),

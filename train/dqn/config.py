@@ -199,14 +199,14 @@ def apply_overrides(document: Mapping[str, Any], overrides: Sequence[str]) -> di
 
 def as_overrides(document: Mapping[str, Any], prefix: str = "") -> list[str]:
     """Nested settings as `key.path=value`, which `apply_overrides` takes."""
-    found = []
+    overrides = []
     for key, value in document.items():
         # A target rule is one value: half of one and half of another is no rule.
         if isinstance(value, Mapping) and prefix + key != "target":
-            found += as_overrides(value, f"{prefix}{key}.")
+            overrides += as_overrides(value, f"{prefix}{key}.")
         elif value is not None:
-            found.append(f"{prefix}{key}={toml_value(value)}")
-    return found
+            overrides.append(f"{prefix}{key}={toml_value(value)}")
+    return overrides
 
 
 def parse_config(document: Mapping[str, Any], *, where: str) -> TrainConfig:

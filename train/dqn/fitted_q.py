@@ -23,7 +23,7 @@ _PART = 8192  # rows
 
 
 @dataclass(frozen=True)
-class Rows:
+class Transitions:
     """Transitions, in no particular order."""
 
     observation: F32  # (N, D)
@@ -50,7 +50,7 @@ class FittedQConfig:
 
 
 def soft_greedy(network: Network, observation: F32, epsilon: float) -> F32:
-    """The probabilities (N, A) of the greedy policy that acts at random with chance `epsilon`.
+    """The probabilities (N, A) of the greedy policy that acts at random with probability `epsilon`.
 
     A deterministic policy has none for any action but one, so an episode in which the logs did
     anything else once says nothing about it.
@@ -62,7 +62,7 @@ def soft_greedy(network: Network, observation: F32, epsilon: float) -> F32:
 
 
 def fitted_q(
-    rows: Rows,
+    rows: Transitions,
     next_probability: F32,
     *,
     discount: float,
@@ -88,9 +88,9 @@ def fitted_q(
         layer_norm=config.layer_norm,
         generator=generator,
     )
-    observation, following = map(torch.from_numpy, (rows.observation, rows.next_observation))
+    observation, next_observation = map(torch.from_numpy, (rows.observation, rows.next_observation))
     action, reward = torch.from_numpy(rows.action), torch.from_numpy(rows.reward)
-    going_on = torch.from_numpy(discount * ~rows.terminated).float()
+    not_terminated = torch.from_numpy(discount * ~rows.terminated).float()
     policy = torch.from_numpy(next_probability)
     optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, fused=True)
     decay = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.1, config.iterations)
@@ -101,8 +101,8 @@ def fitted_q(
             target = reward[some]
             if before is not None:
                 with torch.no_grad():
-                    value = (policy[some] * before(following[some])).sum(dim=1)
-                target = target + going_on[some] * value
+                    value = (policy[some] * before(next_observation[some])).sum(dim=1)
+                target = target + not_terminated[some] * value
             if bounds is not None:
                 target = target.clamp(*bounds)
             q = network(observation[some]).gather(1, action[some, None])[:, 0]
@@ -120,7 +120,7 @@ def cloned_behaviour(
     config: FittedQConfig = FittedQConfig(),
     seed: int = 0,
 ) -> QNetwork:
-    """Behaviour cloning: a network whose softmax is the chance of each action in the logs.
+    """Behaviour cloning: a network whose softmax is the probability of each action in the logs.
 
     For logs that do not say with which probability they acted. Weights from it are estimates.
     """
@@ -137,11 +137,11 @@ def cloned_behaviour(
     return network
 
 
-def chances(clone: QNetwork, observation: F32) -> NDArray[np.float64]:
-    """The chance of each action (N, A) under a cloned behaviour."""
+def cloned_probabilities(clone: QNetwork, observation: F32) -> NDArray[np.float64]:
+    """The probability of each action (N, A) under a cloned behaviour."""
     logits = values(clone, observation)
-    chance = np.exp(logits - logits.max(axis=1, keepdims=True))
-    return np.asarray(chance / chance.sum(axis=1, keepdims=True), np.float64)
+    probability = np.exp(logits - logits.max(axis=1, keepdims=True))
+    return np.asarray(probability / probability.sum(axis=1, keepdims=True), np.float64)
 
 
 @torch.no_grad()
@@ -160,8 +160,8 @@ def _descend(optimizer: Any, loss: Tensor) -> None:
 
 __all__ = [
     "FittedQConfig",
-    "Rows",
-    "chances",
+    "Transitions",
+    "cloned_probabilities",
     "cloned_behaviour",
     "fitted_q",
     "soft_greedy",

@@ -99,8 +99,8 @@ def quantile_target(
     index = best[:, None, None].expand(-1, 1, count)
     each = torch.stack([q.gather(1, index).squeeze(1) for q in next_quantiles])  # (K, B, N)
     least = each.mean(dim=2).argmin(dim=0)
-    following = each[least, torch.arange(len(least), device=each.device)]
-    return reward.unsqueeze(1) + discount.unsqueeze(1) * following
+    next_value = each[least, torch.arange(len(least), device=each.device)]
+    return reward.unsqueeze(1) + discount.unsqueeze(1) * next_value
 
 
 def munchausen_target(

@@ -49,9 +49,9 @@ class _Layer:
         self.linear = _Affine(linear)
         self.norm: _Affine | None = None
         self.shape, self.eps = (linear.out_features,), 0.0  # of the norm
-        none = self.linear.weight.new_empty(0)
-        self.before = self.after = none  # (n, H) z and h
-        self.mean = self.inverse_deviation = none  # (n, 1) of z
+        empty = self.linear.weight.new_empty(0)
+        self.before = self.after = empty  # (n, H) z and h
+        self.mean = self.inverse_deviation = empty  # (n, 1) of z
 
 
 class ManualBackprop:
@@ -120,8 +120,8 @@ class ManualBackprop:
                     norm.bias,
                     [True, True, True],
                 )
-                _there(norm.weight_gradient).copy_(weight)
-                _there(norm.bias_gradient).copy_(bias)
+                _required(norm.weight_gradient).copy_(weight)
+                _required(norm.bias_gradient).copy_(bias)
             below = self._layers[index - 1].after[:count] if index else self._input
             _fill(layer.linear, down, below)
             if index:
@@ -135,11 +135,11 @@ class ManualBackprop:
 
 def _fill(affine: _Affine, gradient: Tensor, given: Tensor) -> None:
     """The gradients of a Linear from that of its output (B, O) and its input (B, I)."""
-    torch.mm(gradient.t(), given, out=_there(affine.weight_gradient))
-    torch.sum(gradient, 0, out=_there(affine.bias_gradient))
+    torch.mm(gradient.t(), given, out=_required(affine.weight_gradient))
+    torch.sum(gradient, 0, out=_required(affine.bias_gradient))
 
 
-def _there(gradient: Tensor | None) -> Tensor:
+def _required(gradient: Tensor | None) -> Tensor:
     if gradient is None:
         raise RuntimeError("this network does not learn: its parameters have no gradients")
     return gradient

@@ -56,7 +56,7 @@ class QNetwork(nn.Module):
         return [self]
 
     def _initialise(self, generator: torch.Generator | None) -> None:
-        """PyTorch's own initialisation of a Linear layer, but from a generator of ours."""
+        """PyTorch's initialisation of a Linear layer, but from a generator of ours."""
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 bound = module.in_features**-0.5

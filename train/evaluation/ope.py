@@ -24,8 +24,8 @@ from restock.toml import Checked
 from restock.train.dqn.config import parse_config
 from restock.train.dqn.fitted_q import (
     FittedQConfig,
-    chances,
     cloned_behaviour,
+    cloned_probabilities,
     fitted_q,
     soft_greedy,
     values,
@@ -239,7 +239,7 @@ def _behaviour_probability(
         clone = cloned_behaviour(
             rows.observation, rows.action, actions, config=config.model, seed=config.seed
         )
-        cloned = chances(clone, steps.rows.observation[unknown])
+        cloned = cloned_probabilities(clone, steps.rows.observation[unknown])
         probability[unknown] = cloned[np.arange(len(cloned)), steps.rows.action[unknown]]
     return probability, int(unknown.sum()) / max(len(steps.rows), 1)
 

@@ -23,7 +23,7 @@ from restock.ingest.store.location import Location
 from restock.ingest.task.task import Task
 from restock.replay.panel.panel import EVALUATION_SPLIT, HEADER, Panel
 from restock.replay.store.store import Store, passed_in
-from restock.train.dqn.fitted_q import Rows
+from restock.train.dqn.fitted_q import Transitions
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
@@ -35,7 +35,7 @@ MODEL_ROWS = 200_000  # at most, chosen at random: bounds memory and time
 class OpeSteps:
     """Rows by episode and step; only the first steps of an episode may be there."""
 
-    rows: Rows
+    rows: Transitions
     episode: Ints  # (N,) ascending, the place in `condition`
     condition: NDArray[np.str_]  # (E,) of each episode
     probability: NDArray[np.float64]  # (N,) of the action, as logged; NaN where it is not
@@ -53,7 +53,7 @@ class OpeSteps:
         keep = ~self.bumped_before
         rows = self.rows
         arrives = (rows.terminated & ~self.bumps)[keep]
-        counted = Rows(
+        counted = Transitions(
             rows.observation[keep],
             rows.action[keep],
             arrives.astype(np.float32),
@@ -180,7 +180,7 @@ def read_steps(connection: duckdb.DuckDBPyConnection, ids: Ints) -> OpeSteps:
         return np.array(table[name].to_numpy(), kind)
 
     return OpeSteps(
-        Rows(
+        Transitions(
             _matrix(table["observation"]),
             column("action", np.int64),
             column("reward", np.float32),

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from restock.replay.ring.ring import FreshRing
 from restock.state import Stateful
 from restock.train.dqn.loss import Loss
-from restock.train.feed.batches import Batch
+from restock.train.feed.batches import ReplayBatch
 from restock.train.feed.fresh_log import FreshPerturbations
 from restock.train.feed.logs import Logs
 from restock.train.feed.sampled_rows import (
@@ -96,7 +96,9 @@ class FeedRecord(Stateful):
         self._quota = np.zeros(0 if logs is None else len(logs.strata))
         self._quota_batches = 0
 
-    def batch(self, step: int, env_steps: int, batch: Batch, loss: Loss, last_sync: int) -> None:
+    def batch(
+        self, step: int, env_steps: int, batch: ReplayBatch, loss: Loss, last_sync: int
+    ) -> None:
         """Keep the batch of gradient step `step` (from 1), and its audit rows if it is chosen.
 
         Inside the update loop: only what will not be there any more when the interval is closed.
@@ -325,7 +327,7 @@ class FeedRecord(Stateful):
         ]
         self.run.append("policies", rows)
 
-    def _audit(self, step: int, batch: Batch, last_sync: int) -> None:
+    def _audit(self, step: int, batch: ReplayBatch, last_sync: int) -> None:
         """Every row of the batch last kept."""
         packed, logged = batch.rows.cpu().numpy(), batch.logged
         hashes, action = row_hashes(packed), packed[:, -3].astype(np.int16)

@@ -30,7 +30,7 @@ _NOTHING = BatchDraw(_NO_ROWS, _NO_ROWS, None, np.empty(0))
 
 
 @dataclass(frozen=True)
-class Batch:
+class ReplayBatch:
     """One batch: the logged rows first, then the fresh ones."""
 
     rows: Tensor  # (B, W) float32, on the learner's device; valid until the next draw
@@ -93,7 +93,7 @@ class Batches(Stateful):
         """Rows for the run's table `shares`; none without logs."""
         return self._draws.describe() if self._draws is not None else []
 
-    def draw_offline(self) -> Batch:
+    def draw_offline(self) -> ReplayBatch:
         """A batch from logs alone.
 
         Raises:
@@ -109,7 +109,7 @@ class Batches(Stateful):
             )
         return self._gather(drawn, _NO_ROWS)
 
-    def draw_online(self, env_steps: int = 0) -> Batch:
+    def draw_online(self, env_steps: int = 0) -> ReplayBatch:
         """A batch from logs and the fresh ring, after `env_steps` environment steps."""
         drawn = _NOTHING
         if self._draws is not None:
@@ -121,7 +121,7 @@ class Batches(Stateful):
             slots = self._sample_fresh(self.batch_size - len(drawn.rows), env_steps)
         return self._gather(drawn, slots)
 
-    def learnt(self, batch: Batch, td: Tensor) -> None:
+    def learnt(self, batch: ReplayBatch, td: Tensor) -> None:
         """The TD errors (B,) of a batch, once it was learnt from: priorities and shares follow."""
         if self._draws is not None and self._draws.needs_td and batch.logged:
             td_abs = td[: batch.logged].detach().abs().cpu().numpy()
@@ -139,7 +139,7 @@ class Batches(Stateful):
             )
         return young[self._rng.integers(len(young), size=count)]
 
-    def _gather(self, drawn: BatchDraw, slots: Ints) -> Batch:
+    def _gather(self, drawn: BatchDraw, slots: Ints) -> ReplayBatch:
         logged, size = len(drawn.rows), len(drawn.rows) + len(slots)
         packed = self._buffer[:size]
         on_cpu = self.device.type == "cpu"
@@ -163,7 +163,7 @@ class Batches(Stateful):
             weight = torch.ones(size)
             weight[:logged] = torch.from_numpy(drawn.weight)
             weight = weight.to(self.device)
-        return Batch(packed, weight, drawn.rows, drawn.strata, slots, drawn.quota)
+        return ReplayBatch(packed, weight, drawn.rows, drawn.strata, slots, drawn.quota)
 
     @property
     def _logs_tensor(self) -> Tensor:

@@ -30,7 +30,7 @@ _NO_VALUES = ("{}",)  # of a twin that has only a name for them
 
 
 @dataclass(frozen=True)
-class Ended:
+class EndedEpisode:
     """A training episode that ended; a row of the run's `episodes`."""
 
     env_steps: int
@@ -91,7 +91,7 @@ class Collector(Stateful):
         self._return = np.zeros(count)
         self._bumps = np.zeros(count, np.int64)
         self._touching = np.zeros(count, np.bool_)
-        self._unlabelled: list[Ended] = []
+        self._unlabelled: list[EndedEpisode] = []
         self.invalid_steps = 0  # whose physics blew up
         self.observation: NDArray[np.float32] = np.zeros(0, np.float32)
         self._sent: tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int16]] | None = None
@@ -150,7 +150,9 @@ class Collector(Stateful):
             self._result = self.env.step(action)
         return self._result
 
-    def finish(self, *, env_steps: int, gradient_steps: int, acting_step: int) -> list[Ended]:
+    def finish(
+        self, *, env_steps: int, gradient_steps: int, acting_step: int
+    ) -> list[EndedEpisode]:
         """Take the step's result into the ring.
 
         Args:
@@ -167,16 +169,16 @@ class Collector(Stateful):
         observation, reward, terminated, truncated, info = result
         (action, probability, policy), self._sent = self._sent, None
         ended = np.asarray(terminated | truncated, np.bool_)
-        following = np.array(observation, copy=True)
+        next_observation = np.array(observation, copy=True)
         for place in np.flatnonzero(ended):  # SAME_STEP: `observation` is the next episode's first
-            following[place] = info["final_obs"][place]
+            next_observation[place] = info["final_obs"][place]
         keys = self.ring.append(
             observation=self.observation,
             action=action,
             reward=reward,
             terminated=terminated,
             truncated=truncated,
-            next_observation=following,
+            next_observation=next_observation,
             env_step=env_steps,
             gradient_step=acting_step,
             policy_version=acting_step,
@@ -211,7 +213,7 @@ class Collector(Stateful):
             for name, history in self._history.items():
                 history[place, count] = after[name][place]
             finished.append(
-                Ended(
+                EndedEpisode(
                     env_steps=env_steps + self.env.num_envs,
                     gradient_steps=gradient_steps,
                     key=int(keys[place]),
@@ -237,7 +239,7 @@ class Collector(Stateful):
                 self.log.ended(
                     int(place),
                     finished[-1],
-                    following[place],
+                    next_observation[place],
                     terminated=bool(terminated[place]),
                     broken=bool(info["invalid"][place]),
                 )
@@ -314,7 +316,7 @@ class Collector(Stateful):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Puts the collector where `state_dict` found it; the twin has its own state."""
         super().load_state_dict(state)
-        self._unlabelled = [Ended(**episode) for episode in state["unlabelled"]]
+        self._unlabelled = [EndedEpisode(**episode) for episode in state["unlabelled"]]
         self._saved_log = state["log"]
 
 
@@ -324,7 +326,7 @@ def ring_conditions(conditions: Sequence[Condition]) -> list[str]:
     return [condition.name for condition in ordered] + [NOMINAL]
 
 
-def steps_table(episodes: Sequence[Ended]) -> pa.Table:
+def steps_table(episodes: Sequence[EndedEpisode]) -> pa.Table:
     """The steps of episodes, as `restock.ingest.task.conditions.label` takes them."""
     lengths = [episode.steps + 1 for episode in episodes]
     columns: dict[str, Any] = {

@@ -19,7 +19,7 @@ from restock.state import Stateful
 from restock.train.run import checkpoint
 
 if TYPE_CHECKING:
-    from restock.train.feed.collector import Ended
+    from restock.train.feed.collector import EndedEpisode
 
 Bools = NDArray[np.bool_]
 _STEP = ("action", "probability", "policy", "reward", "progress_m", "truth")
@@ -73,12 +73,18 @@ class FreshLog(Stateful):
             self._steps[name][np.arange(len(at)), at] = value
 
     def ended(
-        self, env: int, episode: Ended, last: NDArray[np.float32], *, terminated: bool, broken: bool
+        self,
+        env: int,
+        episode: EndedEpisode,
+        last: NDArray[np.float32],
+        *,
+        terminated: bool,
+        broken: bool,
     ) -> None:
         """An episode is over, with observation `last` (D,); `broken` where its physics blew up."""
         if not self._whole[env]:
             return
-        count = episode.steps - int(broken)  # a step that blew up is none
+        count = episode.steps - int(broken)  # a step that blew up does not count
         self.dropped_steps += int(broken)
         if not count:
             return
@@ -95,17 +101,17 @@ class FreshLog(Stateful):
             **{name: column[env, :count].copy() for name, column in self._steps.items()},
         }
 
-    def labelled(self, episodes: Sequence[Ended], labels: Mapping[str, Bools]) -> None:
+    def labelled(self, episodes: Sequence[EndedEpisode], labels: Mapping[str, Bools]) -> None:
         """Keep ended episodes; `labels` are over their steps, (steps + 1) each, end to end."""
         kept: dict[str, dict[str, Any]] = {}
         begin = 0
         for episode in episodes:
-            found = self._waiting.pop(str(episode.key), None)
-            if found is not None:
-                inside = slice(begin, begin + found["count"] + 1)
-                kept[f"{len(kept):06d}"] = found | {
+            entry = self._waiting.pop(str(episode.key), None)
+            if entry is not None:
+                inside = slice(begin, begin + entry["count"] + 1)
+                kept[f"{len(kept):06d}"] = entry | {
                     "signals": {
-                        name: column[: found["count"] + 1]
+                        name: column[: entry["count"] + 1]
                         for name, column in episode.signals.items()
                     },
                     "labels": {name: holds[inside] for name, holds in labels.items()},

@@ -21,7 +21,7 @@ from restock.train.feed.logs import Logs
 from restock.train.feed.probe import Probe
 
 ROWS = 512  # of each condition, chosen by hash
-_LEAST_ROWS = 50  # of a condition, to be judged
+_LEAST_ROWS = 50  # of a condition, to count
 _SHRINKAGE = 0.05  # of the covariance towards its diagonal's mean
 _RIDGE = 1.0  # on standardised features
 
@@ -46,41 +46,41 @@ class LogFidelity:
         rows = Probe.of_logs(logs, ROWS)
         return cls(rows, observation_size) if rows is not None else None
 
-    def agreement(self, held_out: Probe) -> dict[str, float]:
+    def agreement(self, fresh: Probe) -> dict[str, float]:
         """The share of each condition's rows that held-out steps of known condition confirm."""
         size = self._observation.shape[1]
-        fresh = np.asarray(held_out.rows.numpy(), np.float64)[:, :size]
-        counts = np.diff(held_out.bounds)
+        observation = np.asarray(fresh.rows.numpy(), np.float64)[:, :size]
+        counts = np.diff(fresh.bounds)
         kept = [code for code, count in enumerate(counts) if count >= _LEAST_ROWS]
         if len(kept) < 2:
             return {}
-        parts = [fresh[held_out.bounds[code] : held_out.bounds[code + 1]] for code in kept]
-        names = [held_out.conditions[code] for code in kept]
-        said = discriminant(parts, self._observation)
+        parts = [observation[fresh.bounds[code] : fresh.bounds[code + 1]] for code in kept]
+        names = [fresh.conditions[code] for code in kept]
+        predicted = discriminant(parts, self._observation)
         return {
-            name: float(np.mean(said[own] == names.index(name)))
-            for name, own in self._parts()
+            name: float(np.mean(predicted[part] == names.index(name)))
+            for name, part in self._parts()
             if name in names
         }
 
-    def _unexplained(self, following: F64, action: F64) -> dict[str, float]:
-        """`following` (n, D) are next observations, `action` (n,) indices."""
+    def _unexplained(self, next_observation: F64, action: F64) -> dict[str, float]:
+        """`next_observation` (n, D) are next observations, `action` (n,) indices."""
         taken = np.eye(int(action.max()) + 1)[action.astype(np.int64)]
         features = _standard(np.concatenate([self._observation, taken], axis=1))
         features = np.concatenate([features, np.ones((len(features), 1))], axis=1)
-        target = _standard(following)
+        target = _standard(next_observation)
         fit = np.arange(len(features)) % 2 == 0  # rows of a condition are in the order of a hash
         x, y = features[fit], target[fit]
         weights = np.linalg.solve(x.T @ x + _RIDGE * np.eye(x.shape[1]), x.T @ y)
         error = (target - features @ weights) ** 2
-        found = {}
-        for name, own in self._parts():
-            tested = np.arange(own.start, own.stop)
-            tested = tested[~fit[own]]
+        shares = {}
+        for name, part in self._parts():
+            tested = np.arange(part.start, part.stop)
+            tested = tested[~fit[part]]
             spread = ((target[tested] - target[tested].mean(axis=0)) ** 2).sum()
             if spread > 0:
-                found[name] = float(error[tested].sum() / spread)
-        return found
+                shares[name] = float(error[tested].sum() / spread)
+        return shares
 
     def _parts(self) -> list[tuple[str, slice]]:
         return [

@@ -156,13 +156,13 @@ class LogTerms:
 
         Raises:
             ConfigError: it names a behaviour policy or stratum that they do not have, or there are
-                none.
+                no logs.
             PanelError: Cal-QL without a return-to-go in the panel.
         """
         if logs is None:
             if loss.margin or loss.calibrated:
                 raise ConfigError(
-                    "loss.margin and loss.calibrated are about logged rows, and there are none",
+                    "loss.margin and loss.calibrated are for logged rows, and this run has no logs",
                     remedy="give --panel, or leave them out",
                 )
             return cls(None, None)
@@ -202,8 +202,8 @@ def _expert(loss: LossConfig, logs: Logs) -> np.ndarray[tuple[int], np.dtype[np.
     return chosen
 
 
-def _known(key: str, asked: tuple[str, ...], known: list[str]) -> None:
-    for name in asked:
+def _known(key: str, names: tuple[str, ...], known: list[str]) -> None:
+    for name in names:
         if name not in known:
             raise ConfigError(
                 f"{key}: the logs have no {name!r}", remedy=f"they have {', '.join(known)}"

@@ -59,20 +59,20 @@ class Probe:
         source: str,
     ) -> Probe | None:
         chosen: list[NDArray[np.int64]] = []
-        found, bounds = [], [0]
+        kept, bounds = [], [0]
         for code, name in enumerate(names):
             members = np.flatnonzero(codes == code)
             if not len(members) or not per_condition:
                 continue
             order = np.argsort(_scramble(key[members]), kind="stable")[:per_condition]
             chosen.append(members[order])
-            found.append(name)
+            kept.append(name)
             bounds.append(bounds[-1] + len(order))
         if not chosen:
             return None
         picked = rows[torch.from_numpy(np.concatenate(chosen))].clone()
         digest = hashlib.blake2b(picked.numpy().tobytes(), digest_size=8).hexdigest()
-        return cls(picked, found, bounds, source, digest)
+        return cls(picked, kept, bounds, source, digest)
 
     def measure(self, learner: Learner) -> tuple[list[dict[str, Any]], float]:
         """Rows for the run's `probe`, per condition, and the lag over all of it."""

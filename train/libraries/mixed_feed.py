@@ -24,7 +24,7 @@ from restock.replay.panel.logged_sampler import BatchDraw, LoggedSampler
 from restock.replay.panel.panel import Panel
 from restock.train.dqn.loss import Loss
 from restock.train.feed.batch_record import FeedRecord
-from restock.train.feed.batches import Batch
+from restock.train.feed.batches import ReplayBatch
 from restock.train.feed.fresh_log import values_entries
 from restock.train.feed.logs import Logs
 from restock.train.libraries.fresh_meta import FreshMeta, InfoLabels
@@ -222,7 +222,7 @@ class MixedFeed:
         if self.record is None:
             return
         unknown = np.full(len(packed), np.nan, np.float32)
-        batch = Batch(
+        batch = ReplayBatch(
             rows=torch.from_numpy(packed),
             weight=None if weight is None else torch.from_numpy(weight),
             log_rows=drawing.rows,

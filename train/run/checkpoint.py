@@ -32,7 +32,7 @@ def save(path: Path, state: Mapping[str, Any]) -> None:
     """Write `state` to `path`, replacing what is there in one step.
 
     Raises:
-        TypeError: a leaf that is none of the kinds above; names its path.
+        TypeError: a leaf of another kind than those above; names its path.
     """
     tensors: dict[str, torch.Tensor] = {}
     document = _take_apart(state, "", tensors)
@@ -52,7 +52,7 @@ def load(path: Path) -> dict[str, Any]:
     """What `save` was given: arrays as numpy where they were numpy, else as CPU tensors.
 
     Raises:
-        RunError: no such file, or none that `save` wrote.
+        RunError: no such file, or not one that `save` wrote.
     """
     if not path.is_file():
         raise RunError(
@@ -125,12 +125,12 @@ def _put_together(value: Any, tensors: Mapping[str, torch.Tensor]) -> Any:
 
 def earlier(latest: Path) -> dict[int, Path]:
     """The checkpoints before the latest, oldest first, by their environment steps."""
-    found = {}
+    kept = {}
     for path in latest.parent.glob(f"{_PREFIX}*{_SUFFIX}"):
         steps = path.name.removeprefix(_PREFIX).removesuffix(_SUFFIX)
         if steps.isdigit():
-            found[int(steps)] = path
-    return dict(sorted(found.items()))
+            kept[int(steps)] = path
+    return dict(sorted(kept.items()))
 
 
 def keep(latest: Path, env_steps: int, count: int) -> None:
@@ -149,17 +149,17 @@ def check_earlier(latest: Path, env_steps: int) -> dict[int, Path]:
     """The checkpoints before the latest, one of which was taken after these environment steps.
 
     Raises:
-        RunError: none was; names those that there are.
+        RunError: no such checkpoint; names those that are kept.
     """
-    found = earlier(latest)
-    if env_steps not in found:
-        there = ", ".join(f"{steps}" for steps in found) or "none"
+    kept = earlier(latest)
+    if env_steps not in kept:
+        names = ", ".join(f"{steps}" for steps in kept) or "none"
         raise RunError(
             f"no earlier checkpoint was taken after {env_steps} environment steps",
             where=str(latest.parent),
-            remedy=f"those that are kept: {there}",
+            remedy=f"those that are kept: {names}",
         )
-    return found
+    return kept
 
 
 def go_back(latest: Path, env_steps: int) -> None:
@@ -168,9 +168,9 @@ def go_back(latest: Path, env_steps: int) -> None:
     Raises:
         RunError: see `check_earlier`.
     """
-    found = check_earlier(latest, env_steps)
-    _put(found[env_steps], latest)
-    for steps, path in found.items():
+    kept = check_earlier(latest, env_steps)
+    _put(kept[env_steps], latest)
+    for steps, path in kept.items():
         if steps >= env_steps:
             path.unlink()
 

@@ -164,7 +164,7 @@ class Run:
                 raise RunError(
                     f"has {table.num_rows} rows, the checkpoint was taken after {count}",
                     where=str(self.path / f"{name}.parquet"),
-                    remedy="the run directory was changed by hand; start the run anew",
+                    remedy="the run directory was changed by hand; start the run again",
                 )
             self._written[name] = table.slice(0, count)
             if table.num_rows != count:
