@@ -59,7 +59,7 @@ Target = Callable[[bytes], None]
 
 
 class Wrong(Exception):
-    """What came of an input does not add up."""
+    """The result of an input is inconsistent."""
 
 
 def require(holds: bool, what: str) -> None:
@@ -109,19 +109,21 @@ def _read(path: Path, *, salvage: bool) -> None:
 
 
 def cdr(data: bytes) -> None:
-    """A ROS 2 definition and messages of it, beside rosbags."""
+    """A ROS 2 definition and messages of it, compared with rosbags."""
     definition, payloads = _parts(data)
     form = "ros2idl" if definition.startswith(b"module") else "ros2msg"
-    _beside_rosbags("cdr", form, definition, payloads)
+    _compare_with_rosbags("cdr", form, definition, payloads)
 
 
 def ros1(data: bytes) -> None:
-    """A ROS 1 definition and messages of it, beside rosbags."""
+    """A ROS 1 definition and messages of it, compared with rosbags."""
     definition, payloads = _parts(data)
-    _beside_rosbags("ros1", "ros1msg", definition, payloads)
+    _compare_with_rosbags("ros1", "ros1msg", definition, payloads)
 
 
-def _beside_rosbags(encoding: str, form: str, definition: bytes, payloads: list[bytes]) -> None:
+def _compare_with_rosbags(
+    encoding: str, form: str, definition: bytes, payloads: list[bytes]
+) -> None:
     channel = Channel(1, "/t", "pkg/msg/T", encoding, form, definition)
     batch = MessageBatch.of(payloads, range(len(payloads)), range(len(payloads)))
     try:

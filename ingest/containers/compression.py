@@ -94,7 +94,7 @@ def _plain(payload: bytes) -> bytes:
         return bytes(zstandard.ZstdDecompressor().decompress(payload, max_output_size=limit))
     if size >= 0:
         raise zstandard.ZstdError("implausibly large")
-    # It does not say its size: nothing is set aside for it.
+    # Its size is not given: nothing is allocated for it.
     decoder, parts, total = zstandard.ZstdDecompressor().decompressobj(), list[bytes](), 0
     for at in range(0, len(payload), BLOCK):
         parts.append(decoder.decompress(payload[at : at + BLOCK]))

@@ -91,7 +91,7 @@ def is_bag(folder: Path) -> bool:
 
 @dataclass(frozen=True)
 class ClaimedTopic:
-    """What metadata.yaml says of a topic; None where it does not say it as it should."""
+    """What metadata.yaml claims of a topic; None where that is missing or of another type."""
 
     name: str | None
     serialization: str | None
@@ -131,7 +131,7 @@ def _natural(name: str) -> list[int | str]:
 
 
 def read_metadata(folder: Path) -> tuple[BagMetadata, str | None]:
-    """What metadata.yaml says, and what is wrong with it if it cannot be used."""
+    """What metadata.yaml claims, and what is wrong with it if it cannot be used."""
     file = folder / METADATA
     if not file.is_file():
         return BagMetadata(), f"no {METADATA}: read from the storage files alone"

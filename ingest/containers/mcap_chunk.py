@@ -18,7 +18,7 @@ from restock.ingest.containers.mcap_records import PREFIX, Buffer, Malformed, Op
 from restock.ingest.decoding.channel import Channel
 from restock.ingest.decoding.columns import I64, gather
 
-# A chunk's uncompressed size is the file's word: beyond these it is refused, not allocated.
+# A chunk's uncompressed size is the file's claim: beyond these it is refused, not allocated.
 LARGEST_CHUNK = 4 << 30
 PLAUSIBLE_SIZE = 64 << 20
 PLAUSIBLE_RATIO = 1000
@@ -48,13 +48,13 @@ class BadChunk(Exception):
 
 @dataclass(frozen=True)
 class Chunk:
-    """Where a chunk is in the file, and what its record and its message index say."""
+    """Where a chunk is in the file, with the fields of its record and its message index."""
 
     at: int  # of its record in the file
     start: int  # of its (compressed) records
     stop: int
     size: int  # uncompressed
-    crc: int  # of the uncompressed records; 0 says unchecked
+    crc: int  # of the uncompressed records; 0: unchecked
     compression: str
     span_ns: tuple[int, int]
     index: dict[int, tuple[int, int]] = field(default_factory=dict)  # channel -> entries in file
@@ -81,10 +81,10 @@ class Messages:
 
 
 def refuse_implausible(chunk: Chunk) -> None:
-    """Check the size that a chunk claims, before as much is set aside.
+    """Check the size that a chunk claims, before as much is allocated.
 
     Raises:
-        BadChunk: it is more than so few bytes can hold.
+        BadChunk: it is more than its stored bytes can hold.
     """
     stored = chunk.stop - chunk.start
     limit = max(PLAUSIBLE_SIZE, PLAUSIBLE_RATIO * stored)

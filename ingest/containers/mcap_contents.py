@@ -1,6 +1,6 @@
 """What is in an MCAP file: its chunks, loose messages, channels and counts, from one walk.
 
-The summary at a file's end is taken for what it says about channels and counts, never for where
+The summary at a file's end is used for channels and counts, never for where
 things are: the walk over the top-level records is cheap (a few records a chunk) and finds all
 there is in a file with a wrong summary, or none. See https://mcap.dev/spec.
 """
@@ -15,7 +15,7 @@ from restock.ingest.containers.mcap_chunk import HEAD_SIZE, Chunk, Definitions
 from restock.ingest.containers.mcap_records import MAGIC, PREFIX, Malformed, Op, parse, walk
 from restock.ingest.decoding.channel import Extra
 
-FORGET_BYTES = 64 << 20  # read this much, then let go of it
+FORGET_BYTES = 64 << 20  # read this much, then release it
 # What the survey keeps is bounded, whatever a file is made of.
 MOST_CHUNKS = 1_000_000
 MOST_NAMED = 10_000  # attachments and metadata records; the others are counted
@@ -39,7 +39,7 @@ class Contents:
     definitions: Definitions = field(default_factory=Definitions)
     statistics: Statistics | None = None
     data_end: tuple[int, int] = (0, 0)  # position, and CRC of the data section (0: unchecked)
-    cut: Malformed | None = None  # where and why the walk could not go on
+    cut: Malformed | None = None  # where and why the walk ended
     cut_chunk: Chunk | None = None  # the chunk it could not pass, with what is left of it
     resumed: bool = False  # beyond the cut, up to a whole summary
     damaged: list[str] = field(default_factory=list)  # records that could not be parsed
@@ -157,7 +157,7 @@ def _chunk(file: mmap.mmap, at: int, stop: int) -> Chunk:
 
 
 def cut_chunk_at(file: mmap.mmap, at: int, end: int) -> Chunk | None:
-    """The chunk at a place, whatever its record's length says: its fields, and what there is of
+    """The chunk at a place, whatever its record's length field is: its fields, and what there is of
     its records before `end`. None where that is nothing."""
     if at < 0 or at + PREFIX + 40 > end or file[at] != Op.CHUNK:
         return None
@@ -177,7 +177,7 @@ def cut_chunk_at(file: mmap.mmap, at: int, end: int) -> Chunk | None:
 
 
 def forget(file: mmap.mmap, start: int = 0, stop: int | None = None) -> None:
-    """Let go of the pages of file[start:stop]; reading them again brings them back.
+    """Release the pages of file[start:stop]; reading them again brings them back.
 
     Until then each page that was read counts as this process' memory, whatever the system's
     cache does with it: a large recording would look like a leak, and hit a limit like one.

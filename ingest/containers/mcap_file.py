@@ -104,7 +104,7 @@ class McapFile:
 
     def _span(self) -> tuple[int, int] | None:
         contents = self._contents
-        # A chunk without messages says 0 to 0.
+        # A chunk without messages has the span 0 to 0.
         spans = [chunk.span_ns for chunk in contents.chunks if any(chunk.span_ns)]
         for _, messages in self._loose(contents.loose):
             stamps = messages.log_time_ns
@@ -118,11 +118,11 @@ class McapFile:
 
     @property
     def integrity(self) -> Integrity:
-        """Whether checksums vouch for what was read so far."""
+        """Whether checksums confirm what was read so far."""
         return self._checks.integrity
 
     def _check_loose(self) -> None:
-        """Messages outside chunks are vouched for by the CRC of the whole data section."""
+        """Messages outside chunks are checked by the CRC of the whole data section."""
         position, crc = self._contents.data_end
         if not crc:
             self._checks.unchecked += 1
@@ -184,7 +184,7 @@ class McapFile:
             yield group
 
     def close(self) -> None:
-        """Let go of the file; the arrays that were read from it stay valid."""
+        """Close the file; the arrays that were read from it stay valid."""
         self._contents.loose.clear()
         del self._buffer
         with suppress(BufferError):  # a batch still looks into it: closed when that goes

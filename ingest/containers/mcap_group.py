@@ -24,12 +24,12 @@ class Checks:
 
     damage: list[Damage] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    verified: int = 0  # chunks and data sections that a CRC vouches for
+    verified: int = 0  # chunks and data sections that a CRC confirms
     unchecked: int = 0  # … that carry none
 
     @property
     def integrity(self) -> Integrity:
-        """Whether checksums vouch for what was read so far."""
+        """Whether checksums confirm what was read so far."""
         if self.damage:
             return "damaged"
         return "verified" if self.verified and not self.unchecked else "unverified"
@@ -89,7 +89,7 @@ class ChunkReader:
         buffer: NDArray[np.uint8],
         wanted: set[int],
     ) -> dict[int, Messages] | None:
-        """Where the messages of some chunks are, if the index of each says so, and rightly."""
+        """Where the messages of some chunks are, by their indexes; None where one is wrong."""
         entries: dict[int, list[Indexed]] = {}
         for chunk, base, size in parts:
             if not chunk.index or chunk.at in self.walked:

@@ -14,7 +14,7 @@ PREFIX = 9  # every record: opcode (1 byte), length of its content (8 bytes)
 
 
 class Malformed(Exception):
-    """A record that says it holds more than there is. `at` is its position in the buffer."""
+    """A record that claims to hold more than there is. `at` is its position in the buffer."""
 
     def __init__(self, what: str, at: int) -> None:
         super().__init__(what)

@@ -1,7 +1,7 @@
 """Beyond the damage in an MCAP file: chunks whose place can be proven are read again.
 
-Where the summary at the file's end is whole, its chunk index says where chunks are; a chunk's own
-record must say the same. Without one, a compressed chunk is recognised by the name of its
+Where the summary at the file's end is whole, its chunk index gives the places of chunks; a chunk's
+record must agree. Without one, a compressed chunk is recognised by the name of its
 compression and two lengths that must agree. Its CRC is checked when it is read, as always.
 """
 
@@ -83,7 +83,7 @@ def _summary(file: mmap.mmap) -> _Summary | None:
 
 
 def _by_index(file: mmap.mmap, contents: Contents, summary: _Summary, cut: int) -> list[str]:
-    """The chunks are those of the chunk index whose records say the same."""
+    """The chunks are those of the chunk index whose records agree with it."""
     lost = []
     chunks = []
     for record in summary.indexed:

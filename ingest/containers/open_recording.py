@@ -48,7 +48,7 @@ def open_recording(
 
 
 class _Opening:
-    """Opens the files of one recording, and lets go of them again if one is refused."""
+    """Opens the files of one recording, and closes them again if one is refused."""
 
     def __init__(self, path: Path, distro: str, salvage: bool) -> None:
         self.path, self.distro, self.salvage = path, distro, salvage
@@ -172,7 +172,7 @@ class _Opening:
                 )
 
     def _compare(self, recording: Recording, metadata: BagMetadata) -> None:
-        """metadata.yaml's counts are a claim about the files: differences are worth saying."""
+        """metadata.yaml's counts are a claim about the files: differences are noted."""
         for topic in metadata.topics:
             if topic.name is None or topic.messages is None:
                 continue

@@ -126,7 +126,7 @@ class Recording:
 
     @property
     def integrity(self) -> Integrity:
-        """Whether checksums vouch for what was read; final after `read`."""
+        """Whether checksums confirm what was read; final after `read`."""
         states = {storage.integrity for storage in self._storages}
         if "damaged" in states or self._bag_damage:
             return "damaged"
@@ -139,7 +139,7 @@ class Recording:
 
     @property
     def extras(self) -> list[Extra]:
-        """What its files hold beside messages: attachments and metadata records, by name."""
+        """What its files hold besides messages: attachments and metadata records, by name."""
         return [extra for storage in self._storages for extra in storage.extras]
 
     @property
@@ -172,7 +172,7 @@ class Recording:
     ) -> dict[str, TopicColumns]:
         """Columns of these topics: field paths to arrays (N, …) or Ragged, by log time.
 
-        A topic that cannot be decoded is not in the answer; `accounts` says why. `reductions`
+        A topic that cannot be decoded is left out; `accounts` has the reason. `reductions`
         names, of some of these topics, fields that are made into others as they are read: for
         fields that are wide, and of which little is needed.
 
@@ -249,7 +249,7 @@ class Recording:
         return lost
 
     def close(self) -> None:
-        """Let go of its files."""
+        """Close its files."""
         for storage in self._storages:
             storage.close()
         for clean in self._cleanup:

@@ -17,7 +17,7 @@ from restock.errors import RecordingError
 from restock.ingest.decoding.channel import Channel, Damage, Extra, Integrity
 from restock.ingest.decoding.columns import MessageBatch
 
-# A chunk's size is the file's word: what decompresses to more than both is refused.
+# A chunk's size is the file's claim: what decompresses to more than both is refused.
 PLAUSIBLE_SIZE = 64 << 20
 PLAUSIBLE_RATIO = 1000
 
@@ -87,7 +87,7 @@ class Ros1File:
             yield from batches
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._reader.close()
 
 

@@ -35,7 +35,7 @@ class SqliteFile:
     """One sqlite3 storage file, read only. rosbag2 keeps no checksums: it is never verified.
 
     Rows that a writer left in a `-wal` or `-journal` file beside it count too: such a file is
-    read from a private copy, so that nothing beside the user's recording is ever written.
+    read from a private copy, so that nothing next to the user's recording is ever written.
     """
 
     def __init__(self, path: Path, *, salvage: bool = False) -> None:
@@ -231,7 +231,7 @@ def _add_rows(rows: list[tuple[int, int, Any]], pending: dict[int, PendingBatch]
 def guard(connection: sqlite3.Connection, size: int) -> None:
     """Bound what queries on a file of `size` bytes may take.
 
-    A query that goes on for longer than the file can have rows is interrupted: that raises
+    A query that runs for longer than the file can have rows is interrupted: that raises
     sqlite3.OperationalError, as damage does.
     """
     connection.text_factory = lambda text: text.decode("utf-8", "backslashreplace")

@@ -85,7 +85,7 @@ class Reduction:
 
 
 class TopicReading:
-    """What has come of one topic so far."""
+    """One topic's columns and account so far."""
 
     def __init__(
         self, topic: TopicInfo, wanted: Iterable[str], reduction: Reduction | None = None
@@ -149,7 +149,7 @@ class TopicReading:
             self._account.reasons[reason] = self._account.reasons.get(reason, 0) + count
 
     def close(self, lost: Mapping[str, int]) -> Account:
-        """The account, reconciled: what the container counts beyond what came is a loss too."""
+        """The account, reconciled: messages that are counted but not there are lost too."""
         account = self._account
         self._add(lost)
         unexplained = account.expected - account.decoded - sum(account.reasons.values())
@@ -166,7 +166,7 @@ class TopicReading:
         if self._account.log_backsteps:
             order = np.argsort(log, kind="stable")
             log, publish = log[order], publish[order]
-        for path in list(self._fields):  # one by one: each lets go of its unordered self
+        for path in list(self._fields):  # one by one: the unordered column is freed first
             column = self._fields.pop(path).column()
             fields[path] = column if order is None else take(column, order)
         return TopicColumns(log, publish, fields)
@@ -175,7 +175,7 @@ class TopicReading:
 def together(batches: Iterable[tuple[int, MessageBatch]]) -> Iterator[tuple[int, MessageBatch]]:
     """The same messages by channel, in the same order, with small batches put together.
 
-    Decoding has a price per batch, beside that per message: of a topic of few messages a second
+    Decoding has a cost per batch, besides that per message: of a topic of few messages a second
     there are only a handful in 8 MiB of a recording.
     """
     pending: dict[int, PendingBatch] = {}

@@ -1,6 +1,6 @@
 """Batches of ROS messages to columns: CDR in both byte orders, and ROS 1's serialisation.
 
-The first four bytes of a payload (the encapsulation header) say how the rest is laid out;
+The first four bytes of a payload (the encapsulation header) define how the rest is laid out;
 alignment is relative to the byte after them. Of these layouts, ROS 2 writes plain CDR
 ("00 01", little-endian); XCDR2 and parameter lists are refused by name.
 """

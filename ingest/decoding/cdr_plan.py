@@ -189,7 +189,7 @@ class _Elements:
 
     The first two of every message are read one after the other. The rest are then guessed to be
     as long as the second, and read all at once: a guess is right where every element ends just
-    where the next was thought to start. Messages where it was wrong go on one by one.
+    where the next was thought to start. Where it was wrong, elements are read one by one.
     """
 
     def __init__(self, inner: CdrPlan, frame: Frame, counts: I64, offsets: I64) -> None:

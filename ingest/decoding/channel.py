@@ -45,7 +45,7 @@ class Damage:
 
 @dataclass(frozen=True)
 class Extra:
-    """What a file holds beside messages."""
+    """What a file holds besides messages."""
 
     kind: Literal["attachment", "metadata"]
     name: str
@@ -62,7 +62,7 @@ class Storage(Protocol):
 
     `counts` are the messages by the container's own count, per channel id; `span_ns` the first and
     last log time, or None when it holds no message. `damage` is final once everything wanted
-    has been read. `notes` are worth saying and lose nothing. `extras` are not read, but named.
+    has been read. `notes` are for the user to know and lose nothing. `extras` are listed, not read.
     """
 
     channels: dict[int, Channel]
@@ -74,7 +74,7 @@ class Storage(Protocol):
 
     @property
     def integrity(self) -> Integrity:
-        """Whether checksums vouch for what was read so far."""
+        """Whether checksums confirm what was read so far."""
         ...
 
     def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
@@ -82,5 +82,5 @@ class Storage(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         ...

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 I64 = NDArray[np.int64]
 
-# How many messages come is the file's word: no more than this is set aside for those to come.
-# Memory that is set aside and not yet written to costs nothing.
+# The number of messages to come is the file's claim: no more than this is allocated for them.
+# Memory that is allocated and not yet written to costs nothing.
 AHEAD_BYTES = 32 << 20
 
 

@@ -34,7 +34,7 @@ LONGEST_DEFINITION = 512 << 10  # real ones have up to some 50 kB, and the parse
 LONGEST_ARRAY = 1 << 20
 KEPT = 1024  # types as recordings define them
 
-EMPTY = "structure_needs_at_least_one_member"  # stands in a message without fields
+EMPTY = "structure_needs_at_least_one_member"  # ROS's placeholder in a message without fields
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 
 
@@ -112,7 +112,7 @@ def message_type(channel: Channel, distro: str) -> RosType:
             raise CannotDecode(f"{kind} events are not supported")
     # An empty definition is that of a message without fields, or was left out by the writer.
     embedded = channel.definition_format in ("ros2msg", "ros2idl", "ros1msg")
-    # Loading a distribution takes a quarter of a second: not where a recording says it all.
+    # Loading a distribution takes a quarter of a second: not where a recording defines all.
     types = {} if embedded and channel.definition else distro_types(distro)
     if embedded and (channel.definition or name not in types):
         if len(channel.definition) > LONGEST_DEFINITION:

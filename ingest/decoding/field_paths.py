@@ -78,7 +78,7 @@ class Leaf:
 class MessageType(ABC):
     """A message type with everything it is made of.
 
-    `source` says where its definition comes from: "embedded", a distribution's name, "inferred".
+    `source` is where its definition comes from: "embedded", a distribution's name, "inferred".
     `times` are the messages that stand for a moment or a duration: read as nanoseconds.
     """
 

@@ -121,7 +121,7 @@ def parse(payload: bytes) -> dict[str, Any]:
 
 
 class _Schema:
-    """A JSON Schema's document, as far as it says which values are where."""
+    """A JSON Schema's document, as far as it describes which values are where."""
 
     def __init__(self, text: bytes) -> None:
         if len(text) > LONGEST_SCHEMA:
@@ -161,7 +161,7 @@ class _Schema:
         return node
 
     def _at(self, target: str) -> Any:
-        """What a reference within the document points to; others say nothing."""
+        """What a reference within the document points to; others describe nothing."""
         place = self._document if target.startswith("#") else None
         for part in target.split("/")[1:]:
             place = place.get(part) if isinstance(place, dict) else None
@@ -169,7 +169,7 @@ class _Schema:
 
 
 def _complete(node: Node) -> bool:
-    """Whether the schema says all: an object with no members or an array of anything does not."""
+    """Whether the schema describes all: not with an object without members, or any array."""
     if not node.declared or (node.kind == "object" and not node.members):
         return False
     if node.kind == "array" and (node.items is None or not _complete(node.items)):

@@ -26,7 +26,7 @@ BYTES_AT_ONCE = 1 << 20  # of payloads that are parsed, and so objects, at the s
 
 @dataclass(frozen=True)
 class Decoded:
-    """What came of one batch: columns of the good rows, and why the others failed."""
+    """One batch, decoded: columns of the good rows, and why the others failed."""
 
     rows: NDArray[np.intp]  # (G,) of the batch
     fields: dict[str, FieldColumn]  # (G, …) each
