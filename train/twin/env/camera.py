@@ -28,8 +28,8 @@ from restock.train.twin.physics.model import (
     PEOPLE,
     RACK_HALF_HEIGHT_M,
     TRACK_M,
-    WALL_HALF_HEIGHT_M,
     WHEEL_RADIUS_M,
+    building_boxes,
 )
 
 if TYPE_CHECKING:
@@ -331,15 +331,8 @@ def _rack(rack: Rect) -> Iterator[Part]:
 
 
 def _walls(floor: Warehouse) -> Iterator[Part]:
-    thick, width, depth = floor.wall_m, floor.width_m, floor.depth_m
-    up = WALL_HALF_HEIGHT_M
-    for place, half in (
-        ((-thick, depth / 2), (thick, depth / 2 + 2 * thick)),
-        ((width + thick, depth / 2), (thick, depth / 2 + 2 * thick)),
-        ((width / 2, -thick), (width / 2, thick)),
-        ((width / 2, depth + thick), (width / 2, thick)),
-    ):
-        yield _BOX, (*place, up), (*half, up), 0.0, WALL
+    for middle, half in zip(*building_boxes(floor, 0), strict=True):
+        yield _BOX, tuple(middle), tuple(half), 0.0, WALL
 
 
 def _route(plan_m: NDArray[np.float64]) -> Iterator[Part]:

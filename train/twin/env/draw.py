@@ -93,8 +93,7 @@ class _Canvas:
 
     def fill(self, area: Rect, color: Color) -> None:
         """An axis-aligned box, its edges rounded to whole pixels."""
-        edges = (area.x_min, area.y_min, area.x_max, area.y_max)
-        x0, y0, x1, y1 = (round(edge * self._scale) for edge in edges)
+        x0, y0, x1, y1 = (round(edge * self._scale) for edge in area.edges)
         self._image[y0:y1, x0:x1] = color
 
     def box(

@@ -53,7 +53,7 @@ from restock.train.twin.env.interface import DEFAULT_CONDITIONS
 from restock.train.twin.env.navigation import Navigation
 from restock.train.twin.floors.floors import floors_of
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
-from restock.train.twin.physics.episode import Episode, EpisodeSpec, draw_episode
+from restock.train.twin.physics.episode import EpisodeSpec, draw_episode
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 from restock.train.twin.physics.sensing import Sensing, add_motion, add_route
 from restock.train.twin.physics.simulation import BodyState, Physics, Simulation
@@ -151,7 +151,6 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         self.sensing = Sensing(self.simulation, self.task)
         self.truth = Truth(self.task, num_envs)
         self.navigation = Navigation(self.floors, num_envs, self.task)
-        self.episodes: list[Episode | None] = [None] * num_envs
         self.specs: list[EpisodeSpec] = [EpisodeSpec("nominal", 0)] * num_envs
         self.blown_up = 0  # episodes that ended in a NaN or a blow-up
         self.signals: Signals = {}
@@ -224,7 +223,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
             )
         floor = self.queue.floor_of(spec)
         episode = draw_episode(spec, self.floors[floor], self.navigation.planners[floor])
-        self.episodes[env], self.specs[env] = episode, spec
+        self.specs[env] = spec
         self.layout[env] = floor
         self.simulation.reset(env, episode, perturbation, floor)
         self.sensing.reset(env, episode.noise, perturbation)

@@ -145,7 +145,7 @@ def floor_toml(floor: Warehouse) -> str:
 
 
 def _box(area: Rect) -> list[float]:
-    return [float(edge) for edge in (area.x_min, area.y_min, area.x_max, area.y_max)]
+    return [float(edge) for edge in area.edges]
 
 
 def write_floor(floor: Warehouse, path: Path) -> None:

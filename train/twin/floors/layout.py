@@ -47,6 +47,11 @@ class Rect:
     y_max: float
 
     @property
+    def edges(self) -> tuple[float, float, float, float]:
+        """x_min, y_min, x_max, y_max."""
+        return self.x_min, self.y_min, self.x_max, self.y_max
+
+    @property
     def center(self) -> tuple[float, float]:
         return (self.x_min + self.x_max) / 2, (self.y_min + self.y_max) / 2
 
@@ -147,8 +152,9 @@ class Warehouse:
         for what, box in areas:
             inside = -1e-9 <= box.x_min < box.x_max <= self.width_m + 1e-9
             if not inside or not -1e-9 <= box.y_min < box.y_max <= self.depth_m + 1e-9:
+                edges = ", ".join(f"{edge:g}" for edge in box.edges)
                 raise ConfigError(
-                    f"{what} {_box(box)} is not a box within 0 to {self.width_m:g} m by 0 to"
+                    f"{what} [{edges}] is not a box within 0 to {self.width_m:g} m by 0 to"
                     f" {self.depth_m:g} m",
                     where=where,
                     remedy="give a box as x0, y0, x1, y1 with x0 < x1 and y0 < y1, in metres",
@@ -180,7 +186,7 @@ class Warehouse:
     def zone_of(self, x_m: F64, y_m: F64) -> list[str]:
         """The name of the first zone that holds each point (N,), or `elsewhere`."""
         names = np.array([*self.zones, ELSEWHERE], object)
-        boxes = np.array([[a.x_min, a.y_min, a.x_max, a.y_max] for a in self.zones.values()])
+        boxes = np.array([area.edges for area in self.zones.values()])
         inside = np.ones((len(x_m), len(names)), np.bool_)
         inside[:, :-1] = _inside(boxes.reshape(-1, 4), x_m, y_m)
         return [str(name) for name in names[inside.argmax(axis=1)]]
@@ -195,9 +201,7 @@ class Warehouse:
     @cached_property
     def segment_edges(self) -> F64:
         """(S, 4): x_min, y_min, x_max, y_max of each aisle segment."""
-        return np.array(
-            [(a.x_min, a.y_min, a.x_max, a.y_max) for a in (s.area for s in self.segments)]
-        ).reshape(-1, 4)
+        return np.array([segment.area.edges for segment in self.segments]).reshape(-1, 4)
 
     @cached_property
     def segment_along_y(self) -> NDArray[np.bool_]:
@@ -209,10 +213,6 @@ class Warehouse:
         """Names everything but the name, 12 hex digits."""
         content = asdict(self) | {"name": ""}
         return hashlib.blake2b(msgspec.json.encode(content), digest_size=6).hexdigest()
-
-
-def _box(box: Rect) -> str:
-    return f"[{box.x_min:g}, {box.y_min:g}, {box.x_max:g}, {box.y_max:g}]"
 
 
 def _inside(edges: F64, x_m: F64, y_m: F64) -> NDArray[np.bool_]:

@@ -97,7 +97,7 @@ def building_boxes(warehouse: Warehouse, rack_slots: int) -> tuple[F64, F64]:
     thick, width, depth = warehouse.wall_m, warehouse.width_m, warehouse.depth_m
     middle = np.full((rack_slots + 4, 3), PARKED_RACK_M)
     half = np.full((rack_slots + 4, 3), 0.1)
-    for index, rack in enumerate(warehouse.racks):
+    for index, rack in enumerate(warehouse.racks[:rack_slots]):
         middle[index] = (*rack.center, RACK_HALF_HEIGHT_M)
         half[index] = (*rack.half_size, RACK_HALF_HEIGHT_M)
     for index, (center, size) in enumerate(

@@ -134,6 +134,10 @@ class Exemplar:
         """The layout of every message like this one."""
         return MessageLayout.of(build(self._type_name, **self._fields))
 
+    def pack(self, columns: Mapping[str, NDArray[Any]]) -> list[bytes]:
+        """As many messages as the columns, of which there is one or more, have rows."""
+        return self.layout.pack(columns, len(next(iter(columns.values()))))
+
 
 _STAMP = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])
 

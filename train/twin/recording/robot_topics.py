@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from restock.train.twin.recording.bag_writer import Topic
 from restock.train.twin.recording.drive import Lidar
-from restock.train.twin.recording.messages import Exemplar, MessageLayout, build, serialise, stamp
+from restock.train.twin.recording.messages import Exemplar, build, serialise, stamp
 from restock.train.twin.recording.scene import SCENE_TOPICS
 
 F64 = NDArray[np.float64]
@@ -92,7 +92,7 @@ def odometry(
     stamp_ns: I64, x_m: F64, y_m: F64, yaw_rad: F64, speed_mps: F64, yaw_rate_radps: F64
 ) -> list[bytes]:
     """Dead reckoning in `odom`, twist in `base_link`."""
-    return _ODOMETRY.layout.pack(
+    return _ODOMETRY.pack(
         {
             "header.stamp": stamp_ns,
             "pose.pose.position.x": x_m,
@@ -100,29 +100,25 @@ def odometry(
             **_orientation("pose.pose.orientation", yaw_rad),
             "twist.twist.linear.x": speed_mps,
             "twist.twist.angular.z": yaw_rate_radps,
-        },
-        len(stamp_ns),
+        }
     )
 
 
 def imu(stamp_ns: I64, yaw_rate_radps: F64, accel_x_mps2: F64, accel_y_mps2: F64) -> list[bytes]:
     """Rates and accelerations; no orientation (covariance[0] = -1, as sensor_msgs/Imu has it)."""
-    return _IMU.layout.pack(
+    return _IMU.pack(
         {
             "header.stamp": stamp_ns,
             "angular_velocity.z": yaw_rate_radps,
             "linear_acceleration.x": accel_x_mps2,
             "linear_acceleration.y": accel_y_mps2,
-        },
-        len(stamp_ns),
+        }
     )
 
 
 def joint_states(stamp_ns: I64, angle_rad: F64, rate_radps: F64) -> list[bytes]:
     """Wheel angles and rates, each (n, 2): left, right."""
-    return _JOINTS.layout.pack(
-        {"header.stamp": stamp_ns, "position": angle_rad, "velocity": rate_radps}, len(stamp_ns)
-    )
+    return _JOINTS.pack({"header.stamp": stamp_ns, "position": angle_rad, "velocity": rate_radps})
 
 
 def scans(stamp_ns: I64, ranges_m: F64, lidar: Lidar, scan_time_s: float) -> list[bytes]:
@@ -139,25 +135,23 @@ def scans(stamp_ns: I64, ranges_m: F64, lidar: Lidar, scan_time_s: float) -> lis
         range_max=lidar.range_max_m,
         ranges=np.zeros(beams, np.float32),
     )
-    return scan.layout.pack({"header.stamp": stamp_ns, "ranges": ranges_m}, len(stamp_ns))
+    return scan.pack({"header.stamp": stamp_ns, "ranges": ranges_m})
 
 
 def commands(speed_mps: F64, yaw_rate_radps: F64) -> list[bytes]:
     """Velocity commands."""
-    columns = {"linear.x": speed_mps, "angular.z": yaw_rate_radps}
-    return _TWIST.layout.pack(columns, len(speed_mps))
+    return _TWIST.pack({"linear.x": speed_mps, "angular.z": yaw_rate_radps})
 
 
 def localised_poses(stamp_ns: I64, x_m: F64, y_m: F64, yaw_rad: F64) -> list[bytes]:
     """Poses in `map`, as a localiser publishes them."""
-    return _POSE.layout.pack(
+    return _POSE.pack(
         {
             "header.stamp": stamp_ns,
             "pose.pose.position.x": x_m,
             "pose.pose.position.y": y_m,
             **_orientation("pose.pose.orientation", yaw_rad),
-        },
-        len(stamp_ns),
+        }
     )
 
 
@@ -174,7 +168,7 @@ def transforms(
             f"{at}.transform.translation.y": y_m,
             **_orientation(f"{at}.transform.rotation", yaw_rad),
         }
-    return _TRANSFORMS.layout.pack(columns, len(stamp_ns))
+    return _TRANSFORMS.pack(columns)
 
 
 def static_transforms(stamp_ns: int, lidar_x_m: float, lidar_z_m: float = 0.2) -> bytes:
@@ -196,7 +190,7 @@ def static_transforms(stamp_ns: int, lidar_x_m: float, lidar_z_m: float = 0.2) -
 
 def bumpers(pressed: NDArray[np.bool_]) -> list[bytes]:
     """Bumper states."""
-    return _BOOL.layout.pack({"data": pressed}, len(pressed))
+    return _BOOL.pack({"data": pressed})
 
 
 @functools.lru_cache(maxsize=256)
@@ -235,13 +229,13 @@ def plan(stamp_ns: int, points_m: F64) -> bytes:
         "poses[].pose.position.y": points_m[None, :, 1],
         **_orientation("poses[].pose.orientation", yaw[None]),
     }
-    return _path_layout(len(points_m)).pack(columns, 1)[0]
+    return _path(len(points_m)).pack(columns)[0]
 
 
 @functools.lru_cache(maxsize=512)
-def _path_layout(points: int) -> MessageLayout:
+def _path(points: int) -> Exemplar:
     header = {"frame_id": "map"}
-    return Exemplar("nav_msgs/msg/Path", header=header, poses=[{"header": header}] * points).layout
+    return Exemplar("nav_msgs/msg/Path", header=header, poses=[{"header": header}] * points)
 
 
 def occupancy_map(
