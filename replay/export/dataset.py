@@ -1,8 +1,8 @@
 """The rows of a store or a panel as another library's data set.
 
-Each format is a module with one function `write(selection, found, out, counts)`, which returns
-notes for the user; what it needs from elsewhere is imported there, so that only the format asked
-for must be installed.
+Each format is a function `write_FORMAT(selection, trajectories, out, counts)`, which returns notes
+for the user; what it needs from elsewhere is imported there, so that only the format asked for must
+be installed.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from restock.replay.export.trajectory import Counts, Trajectory, count_episodes,
 # name -> (module, what must be installed, what a file's name must end with or "" for a directory)
 FORMATS: dict[str, tuple[str, str, str]] = {
     "minari": ("minari_hdf5", "minari", ""),
-    "d3rlpy": ("d3rlpy_h5", "h5py", ".h5"),
+    "d3rlpy": ("one_file", "h5py", ".h5"),
     "lerobot": ("lerobot_v3", "", ""),
-    "parquet": ("parquet", "", ".parquet"),
-    "npz": ("npz", "", ".npz"),
+    "parquet": ("one_file", "", ".parquet"),
+    "npz": ("one_file", "", ".npz"),
 }
 
 
@@ -70,10 +70,10 @@ def export_dataset(
     if out.exists():
         raise StoreError("already there", where=str(out), remedy="choose another name")
     counts = Counts()
-    write = importlib.import_module(f"restock.replay.export.{module}").write
+    write = getattr(importlib.import_module(f"restock.replay.export.{module}"), f"write_{to}")
     with open_selection(source, query=query, panel=panel, continuous=continuous) as selection:
-        found = _advancing(_trajectories(selection, counts), advance)
-        if (first := next(found, None)) is None:
+        episodes = _advancing(_trajectories(selection, counts), advance)
+        if (first := next(episodes, None)) is None:
             raise StoreError("no whole transition is left of the rows", where=selection.where)
         if first.observations.shape[1] != selection.observation_size:
             raise StoreError(
@@ -86,7 +86,7 @@ def export_dataset(
         partial = out.with_name(f".{out.stem}.{os.getpid()}.partial{ending}")
         _remove(partial)
         try:
-            notes = write(selection, chain([first], found), partial, counts)
+            notes = write(selection, chain([first], episodes), partial, counts)
             partial.rename(out)
         finally:
             _remove(partial)
@@ -111,8 +111,10 @@ def _trajectories(selection: Selection, counts: Counts) -> Iterator[Trajectory]:
     )
 
 
-def _advancing(found: Iterator[Trajectory], advance: Callable[[int], None]) -> Iterator[Trajectory]:
-    for trajectory in found:
+def _advancing(
+    episodes: Iterator[Trajectory], advance: Callable[[int], None]
+) -> Iterator[Trajectory]:
+    for trajectory in episodes:
         yield trajectory
         advance(len(trajectory))
 

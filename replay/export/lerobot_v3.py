@@ -21,7 +21,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from restock.replay.export.parquet import fixed_lists
+from restock.replay.export.one_file import fixed_lists
 from restock.replay.export.selection import Selection
 from restock.replay.export.trajectory import Counts, Trajectory
 
@@ -35,8 +35,8 @@ PATTERN = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 Stats = dict[str, dict[str, NDArray[np.float64]]]
 
 
-def write(
-    selection: Selection, found: Iterator[Trajectory], out: Path, counts: Counts
+def write_lerobot(
+    selection: Selection, trajectories: Iterator[Trajectory], out: Path, counts: Counts
 ) -> list[str]:
     """Write the directory `out`."""
     (out / "meta").mkdir(parents=True)
@@ -46,7 +46,7 @@ def write(
     frames = 0
     features: dict[str, dict[str, Any]] = {}
     fps = 1 / selection.task.control_period_s
-    for number, trajectory in enumerate(found):
+    for number, trajectory in enumerate(trajectories):
         columns = _frames(trajectory, number, frames, fps)
         features = features or _features(selection, columns)
         stats = {

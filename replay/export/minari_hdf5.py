@@ -23,8 +23,8 @@ from restock.replay.export.trajectory import Counts, Trajectory
 TWIN, TWIN_PROFILE = "restock/Warehouse-v0", "warehouse_amr"
 
 
-def write(
-    selection: Selection, found: Iterator[Trajectory], out: Path, counts: Counts
+def write_minari(
+    selection: Selection, trajectories: Iterator[Trajectory], out: Path, counts: Counts
 ) -> list[str]:
     """Write the directory `out`."""
     import minari  # type: ignore[import-untyped]
@@ -64,7 +64,7 @@ def write(
             truncations=_only_last(t.truncated, len(t)),
             infos={name: _padded(column) for name, column in t.carried.items()},
         )
-        for number, t in enumerate(found)
+        for number, t in enumerate(trajectories)
     )
     about = selection.provenance | {"counts": counts.describe()}
     storage.update_metadata({"restock": json.dumps(about)})

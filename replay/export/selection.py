@@ -93,8 +93,8 @@ def _of_query(
     continuous: bool,
 ) -> Selection:
     where = str(store.path)
-    asked = run_query(connection, text, where=where)
-    columns = asked.columns
+    result = run_query(connection, text, where=where)
+    columns = result.columns
     if missing := missing_columns(columns, continuous=continuous):
         raise QueryError(
             f"the query gives no {', '.join(missing)}",
@@ -102,7 +102,7 @@ def _of_query(
             remedy="select whole transitions, as `FROM transitions WHERE …` does; an export needs "
             + ", ".join((*REQUIRED, *COMMAND) if continuous else REQUIRED),
         )
-    for name, kind in zip(columns, asked.types, strict=True):
+    for name, kind in zip(columns, result.types, strict=True):
         if name in ("observation", "next_observation") and not str(kind).endswith("]"):
             raise QueryError(f"its {name} is a {kind}, not a list of numbers", where=where)
     by_command = ", ".join(f"min({name}), max({name})" for name in COMMAND) if continuous else "0"

@@ -167,20 +167,20 @@ class _Rows:
 def _trajectory(rows: _Rows, begin: int, end: int, counts: Counts) -> Iterator[Trajectory]:
     """The rows [begin, end) as one trajectory, or none where nothing is left of them."""
     last = end - 1
-    over = bool(rows.terminated[last] or rows.truncated[last])
+    ended = bool(rows.terminated[last] or rows.truncated[last])
     after = rows.next_observation[last]
     if not rows.known[last]:  # then its own observation is the last one that is known
         counts.left_out[NO_NEXT] += 1
-        end, after, over = last, rows.observation[last], False
+        end, after, ended = last, rows.observation[last], False
     if end == begin:
         return
-    terminated = over and bool(rows.terminated[last])
+    terminated = ended and bool(rows.terminated[last])
     inside = slice(begin, end)
     counts.transitions += end - begin
     counts.trajectories += 1
     counts.terminated += terminated
-    counts.truncated += over and not terminated
-    counts.cut += not over
+    counts.truncated += ended and not terminated
+    counts.cut += not ended
     yield Trajectory(
         episode_id=str(rows.episode[begin]),
         first_step=int(rows.step[begin]),
@@ -188,15 +188,15 @@ def _trajectory(rows: _Rows, begin: int, end: int, counts: Counts) -> Iterator[T
         actions=rows.action[inside],
         rewards=rows.reward[inside],
         terminated=terminated,
-        cut=not over,
+        cut=not ended,
         carried={name: column[inside] for name, column in rows.carried.items()},
     )
 
 
-def count_episodes(found: Iterable[Trajectory], counts: Counts) -> Iterator[Trajectory]:
+def count_episodes(trajectories: Iterable[Trajectory], counts: Counts) -> Iterator[Trajectory]:
     """Pass trajectories on, counting the episodes they are of (they come episode by episode)."""
     before: str | None = None
-    for trajectory in found:
+    for trajectory in trajectories:
         counts.episodes += trajectory.episode_id != before
         before = trajectory.episode_id
         yield trajectory

@@ -130,8 +130,8 @@ def _flexible_parts(shares: Sequence[Share], flexible: Bools, rows: Ints) -> F64
     parts = flexible.astype(np.float64)
     if natural.any():
         pool = natural.sum() if (flexible & ~natural).any() else 1.0
-        held = np.where(natural, rows, 0)
-        parts[natural] = pool * held[natural] / max(int(held.sum()), 1)
+        natural_rows = np.where(natural, rows, 0)
+        parts[natural] = pool * natural_rows[natural] / max(int(natural_rows.sum()), 1)
     return parts
 
 

@@ -26,15 +26,15 @@ from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.packed_row import PACKING_VERSION
 from restock.replay.panel.pack import Packer
 from restock.replay.panel.panel import EVALUATION_SPLIT, HEADER, META, ROWS, Header, Panel, Stratum
-from restock.replay.panel.plan import Plan, plan_panel
-from restock.replay.panel.scratch import Steps
+from restock.replay.panel.plan import PanelPlan, plan_panel
+from restock.replay.panel.scratch import SourceSteps
 from restock.replay.panel.seal import FileRecord, seal
 from restock.replay.panel.stores import AllStores, PinnedStore, all_stores
 from restock.replay.store.store import Store
 
 
 @dataclass(frozen=True)
-class Source:
+class TransitionSource:
     """Where transitions come from: a connection with a view `transitions`, and what it is."""
 
     connection: duckdb.DuckDBPyConnection
@@ -53,24 +53,24 @@ def open_source(
     task: Task | None = None,
     conditions: Sequence[Condition] | None = None,
     folder: Path | None = None,
-) -> Iterator[Source]:
+) -> Iterator[TransitionSource]:
     """A store, or a table with the columns of `ingest.schema`, as a source of a panel.
 
     A store comes with the other stores of `mixture`, whose relative paths begin at `folder`.
     Without `conditions` a table's are the shipped ones that its labels name.
     """
     if isinstance(transitions, Store):
-        found = transitions.conditions() if conditions is None else tuple(conditions)
+        named = transitions.conditions() if conditions is None else tuple(conditions)
         with contextlib.ExitStack() as opened:
             stores = AllStores(transitions.connection, ())
             if mixture is not None:
                 stores = opened.enter_context(all_stores(transitions, mixture, folder))
-            yield Source(
+            yield TransitionSource(
                 stores.connection,
                 _address(str(transitions.path)),
                 transitions.version,
                 transitions.task_json,
-                found,
+                named,
                 stores.others,
             )
         return
@@ -78,10 +78,10 @@ def open_source(
         connection.register("given", transitions)
         connection.execute("CREATE VIEW transitions AS SELECT *, stamp_ns AS logged_ns FROM given")
         if conditions is None:
-            named = connection.sql("SELECT DISTINCT unnest(conditions) FROM transitions").fetchall()
+            names = connection.sql("SELECT DISTINCT unnest(conditions) FROM transitions").fetchall()
             known = shipped()
             conditions = [
-                known.get(name) or Condition(name, "post", "false") for (name,) in sorted(named)
+                known.get(name) or Condition(name, "post", "false") for (name,) in sorted(names)
             ]
 
         def task_json(task_hash: str) -> str:
@@ -91,7 +91,7 @@ def open_source(
                 raise StoreError(f"its rows are of task {task_hash}, the task given is {task.hash}")
             return msgspec.json.encode(task).decode()
 
-        yield Source(connection, "table in memory", -1, task_json, tuple(conditions))
+        yield TransitionSource(connection, "table in memory", -1, task_json, tuple(conditions))
 
 
 def build_panel(
@@ -125,8 +125,8 @@ def build_panel(
 
 
 def write_panel(
-    source: Source,
-    plan: Plan,
+    source: TransitionSource,
+    plan: PanelPlan,
     out: str | Path,
     *,
     force: bool = False,
@@ -143,11 +143,11 @@ def write_panel(
         scratch = partial / "scratch"
         scratch.mkdir()
         task_json = source.task_json(plan.task_hash)
-        steps = Steps(
+        steps = SourceSteps(
             scratch,
             source.connection,
             len(plan.stratum),
-            chance=_chance(task_json),
+            random_probability=_random_probability(task_json),
             cut_at_off_policy=plan.mixture.cut_at_off_policy,
         )
         packer = Packer(source.connection, plan, steps, scratch)
@@ -200,13 +200,15 @@ def _building(out: Path) -> Iterator[Path]:
     Those of builders that were killed go away first.
     """
     out.parent.mkdir(parents=True, exist_ok=True)
-    mine = f".{out.name}.building~"
+    prefix = f".{out.name}.building~"
     for left in out.parent.iterdir():
-        host, _, process = left.name.removeprefix(mine).rpartition("~")[0].rpartition("~")
-        ours = left.name.startswith(mine) and host == platform.node() and process.isdigit()
-        if ours and not _alive(int(process)):
+        host, _, process = left.name.removeprefix(prefix).rpartition("~")[0].rpartition("~")
+        of_this_host = (
+            left.name.startswith(prefix) and host == platform.node() and process.isdigit()
+        )
+        if of_this_host and not _alive(int(process)):
             shutil.rmtree(left, ignore_errors=True)
-    partial = Path(tempfile.mkdtemp("", f"{mine}{platform.node()}~{os.getpid()}~", out.parent))
+    partial = Path(tempfile.mkdtemp("", f"{prefix}{platform.node()}~{os.getpid()}~", out.parent))
     try:
         yield partial
     finally:
@@ -251,14 +253,14 @@ def _put(partial: Path, out: Path, force: bool) -> None:
         shutil.rmtree(old, ignore_errors=True)
 
 
-def _chance(task_json: str) -> float:
+def _random_probability(task_json: str) -> float:
     """How probable each action is to one who chooses blindly; 0 where the task is not known."""
     if not task_json:
         return 0.0
     return 1.0 / len(msgspec.json.decode(task_json, type=Task).actions)
 
 
-def panel_id(source: Source, plan: Plan, digest: str) -> str:
+def panel_id(source: TransitionSource, plan: PanelPlan, digest: str) -> str:
     """What names a panel: store versions, mixture, task, rows (by `digest`), packing version."""
     versions = [source.version, *(store.version for store in source.others)]
     named = [PACKING_VERSION, versions, plan.mixture, plan.task_hash, digest]
@@ -266,8 +268,8 @@ def panel_id(source: Source, plan: Plan, digest: str) -> str:
 
 
 def _header(
-    source: Source,
-    plan: Plan,
+    source: TransitionSource,
+    plan: PanelPlan,
     identity: str,
     task_json: str,
     observation_size: int,

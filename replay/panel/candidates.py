@@ -12,7 +12,7 @@ from restock.errors import ConfigError, MixtureError, StoreError
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.packed_row import Bools, Ints
 from restock.replay.panel.scratch import ORDER
-from restock.replay.panel.strata import Stratum
+from restock.replay.panel.strata import ResolvedStratum
 
 META_COLUMNS = (
     *("transition_id", "recording_id", "episode_id", "step_index", "stamp_ns", "logged_ns"),
@@ -43,7 +43,7 @@ def meta_columns(connection: duckdb.DuckDBPyConnection) -> str:
 def read_candidates(
     connection: duckdb.DuckDBPyConnection,
     mixture: Mixture,
-    strata: Sequence[Stratum],
+    strata: Sequence[ResolvedStratum],
     *,
     several_stores: bool = False,
 ) -> pa.Table:

@@ -83,16 +83,18 @@ class OutcomeModel:
             log_p = log_softmax(x @ theta, axis=1)
             value = -(weight * log_p[np.arange(len(x)), outcome]).mean()
             gradient = x.T @ (weight[:, None] * (np.exp(log_p) - chosen)) / len(x)
-            held = theta.copy()
-            held[0] = 0.0  # the intercepts are free
-            value += 0.5 * PENALTY * float((held**2).sum())
-            return float(value), (gradient + PENALTY * held).ravel()
+            penalised = theta.copy()
+            penalised[0] = 0.0  # the intercepts are free
+            value += 0.5 * PENALTY * float((penalised**2).sum())
+            return float(value), (gradient + PENALTY * penalised).ravel()
 
         start = np.zeros((x.shape[1], outcomes))
         share = np.bincount(outcome, weights=weight, minlength=outcomes) / weight.sum()
         start[0] = np.log(np.maximum(share, 1e-6))
-        found = minimize(loss, start.ravel(), jac=True, method="L-BFGS-B", options={"maxiter": 200})
-        self.theta: F64 = found.x.reshape(x.shape[1], outcomes)
+        fitted = minimize(
+            loss, start.ravel(), jac=True, method="L-BFGS-B", options={"maxiter": 200}
+        )
+        self.theta: F64 = fitted.x.reshape(x.shape[1], outcomes)
 
     def probability(self, features: NDArray[Any]) -> F64:
         """P(outcome) of each row, (n, outcomes)."""
@@ -188,7 +190,7 @@ def _observations(
     wanted = ids[at]
     order = np.argsort(wanted)
     ordered = wanted[order]
-    find: Callable[[Ints], Ints] = lambda found: order[np.searchsorted(ordered, found)]  # noqa: E731
+    find: Callable[[Ints], Ints] = lambda these: order[np.searchsorted(ordered, these)]  # noqa: E731
     with passed_in(connection, ratio_ids=pa.table({"transition_id": wanted})):
         reader = connection.sql(
             "SELECT transition_id, observation FROM transitions"

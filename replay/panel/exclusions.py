@@ -13,7 +13,7 @@ from restock.errors import MixtureError
 from restock.replay.mixture.mixture import EvaluationSplit, Mixture
 from restock.replay.mixture.packed_row import GOLDEN, Bools, Ints, splitmix64
 from restock.replay.panel.candidates import bools, codes
-from restock.replay.panel.strata import NO_STRATUM, Stratum
+from restock.replay.panel.strata import NO_STRATUM, ResolvedStratum
 
 DAY_NS = 86_400 * 10**9
 
@@ -67,7 +67,7 @@ def leave_out(table: pa.Table, mixture: Mixture, evaluation_split: Bools) -> Lef
 def leave_out_of_strata(
     table: pa.Table,
     mixture: Mixture,
-    strata: list[Stratum],
+    strata: list[ResolvedStratum],
     stratum: NDArray[np.int16],
     out: LeftOut,
 ) -> None:
@@ -87,18 +87,18 @@ def leave_out_of_strata(
     for column, name in (("episode_id", "episode"), ("recording_id", "recording")):
         caps = np.array([_cap(s, mixture, f"max_rows_per_{name}") for s in strata], np.int64)
         if (caps < len(table)).any():
-            over = beyond_cap(table, column, stratum, caps, out.gone, mixture.seed)
+            beyond = beyond_cap(table, column, stratum, caps, out.gone, mixture.seed)
             out.add(
                 f"beyond the cap of rows an {name}"
                 if name == "episode"
                 else f"beyond the cap of rows a {name}",
-                over,
+                beyond,
             )
 
 
-def _cap(stratum: Stratum, mixture: Mixture, name: str) -> int:
-    own, common = getattr(stratum.rule, name), getattr(mixture, name)
-    cap = own if own is not None else common
+def _cap(stratum: ResolvedStratum, mixture: Mixture, name: str) -> int:
+    of_stratum, common = getattr(stratum.rule, name), getattr(mixture, name)
+    cap = of_stratum if of_stratum is not None else common
     return np.iinfo(np.int64).max if cap is None else int(cap)
 
 
@@ -122,9 +122,9 @@ def beyond_cap(
     sorted_group = group[order]
     first = np.flatnonzero(np.append(True, sorted_group[1:] != sorted_group[:-1]))
     place = np.arange(len(rows)) - np.repeat(first, np.diff(np.append(first, len(rows))))
-    over = np.zeros(len(table), np.bool_)
-    over[rows[order]] = place >= caps[stratum[rows[order]]]
-    return over
+    beyond = np.zeros(len(table), np.bool_)
+    beyond[rows[order]] = place >= caps[stratum[rows[order]]]
+    return beyond
 
 
 def versions_behind(table: pa.Table) -> Ints:

@@ -23,8 +23,8 @@ from restock.errors import PanelError
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.packed_row import Ints, row_columns, row_width
 from restock.replay.panel.candidates import meta_columns
-from restock.replay.panel.plan import Plan
-from restock.replay.panel.scratch import BATCH_ROWS, ORDER, STRETCH, Steps
+from restock.replay.panel.plan import PanelPlan
+from restock.replay.panel.scratch import BATCH_ROWS, ORDER, STRETCH, SourceSteps
 from restock.replay.panel.strata import NO_STRATUM
 
 ROW_GROUP_ROWS = 65_536
@@ -48,7 +48,11 @@ class Packer:
     """Packs one plan. `steps` are those of the source, in the order of the plan."""
 
     def __init__(
-        self, connection: duckdb.DuckDBPyConnection, plan: Plan, steps: Steps, scratch: Path
+        self,
+        connection: duckdb.DuckDBPyConnection,
+        plan: PanelPlan,
+        steps: SourceSteps,
+        scratch: Path,
     ) -> None:
         self.connection, self.plan, self.steps = connection, plan, steps
         self.mixture: Mixture = plan.mixture
@@ -74,14 +78,14 @@ class Packer:
         digests = [hashlib.blake2b(digest_size=8) for _ in range(4)]
         at = 0
         for begin, _, rows in self._stretches():
-            mine = slice(at, at + len(rows))
+            packed = slice(at, at + len(rows))
             for digest, values in zip(
                 digests,
                 (
-                    self.steps.ids[self.chosen[mine]],
+                    self.steps.ids[self.chosen[packed]],
                     self.plan.stratum[begin + rows],
-                    self.last[mine] - self.chosen[mine],
-                    self.plan.weight[mine],
+                    self.last[packed] - self.chosen[packed],
+                    self.plan.weight[packed],
                 ),
                 strict=True,
             ):
@@ -124,29 +128,33 @@ class Packer:
         """Put a batch's values where they belong; returns how many halves of rows were filled."""
         part = row_columns(size)
         target = np.searchsorted(self.chosen, place)
-        mine = np.flatnonzero(_at(self.chosen, target) == place)
-        target = target[mine]
-        observation = _matrix(batch.column("observation"), size)[mine]
-        following = _matrix(batch.column("next_observation"), size)
+        packed = np.flatnonzero(_at(self.chosen, target) == place)
+        target = target[packed]
+        observation = _matrix(batch.column("observation"), size)[packed]
+        next_observation = _matrix(batch.column("next_observation"), size)
         rows[target, part["observation"]] = observation
-        horizon = self.last[target] - place[mine] + 1
-        returns = np.zeros(len(mine))
+        horizon = self.last[target] - place[packed] + 1
+        returns = np.zeros(len(packed))
         for ahead in range(int(horizon.max(initial=0))):
             reach = np.flatnonzero(horizon > ahead)
-            reward = self.steps.reward[place[mine[reach]] + ahead]
+            reward = self.steps.reward[place[packed[reach]] + ahead]
             returns[reach] += self.mixture.discount**ahead * reward
-        rows[target, part["action"]] = batch.column("action").to_numpy()[mine, None]
+        rows[target, part["action"]] = batch.column("action").to_numpy()[packed, None]
         rows[target, part["reward"]] = returns[:, None]
         # Returns that end with a row of this batch take its next observation.
         first, behind = (np.searchsorted(self.last, place, side) for side in ("left", "right"))
         source = np.repeat(np.arange(len(place)), behind - first)
         ends = np.arange(len(source)) + np.repeat(first - _starts(behind - first), behind - first)
-        rows[ends, part["next_observation"]] = following[source]
-        going_on = ~np.asarray(batch.column("terminated").to_numpy(zero_copy_only=False), np.bool_)
+        rows[ends, part["next_observation"]] = next_observation[source]
+        not_terminated = ~np.asarray(
+            batch.column("terminated").to_numpy(zero_copy_only=False), np.bool_
+        )
         spanned = self.last[ends] - self.chosen[ends] + 1
-        rows[ends, part["discount"]] = (self.mixture.discount**spanned * going_on[source])[:, None]
+        rows[ends, part["discount"]] = (self.mixture.discount**spanned * not_terminated[source])[
+            :, None
+        ]
         fine = np.isfinite(observation).all(axis=1) & np.isfinite(returns)
-        if not fine.all() or not np.isfinite(following[source]).all():
+        if not fine.all() or not np.isfinite(next_observation[source]).all():
             raise PanelError(
                 "an observation or a reward is NaN or infinite, which no network survives",
                 where=f"recording {batch.column('recording_id')[0].as_py()}",
@@ -172,22 +180,24 @@ class Packer:
                 if not np.array_equal(ids, self.steps.ids[begin:end]):
                     raise PanelError("the source changed while it was read", where=str(meta.parent))
                 table = _encoded(pa.Table.from_batches([batch]))
-                held = table.select(_SPLIT_COLUMNS).filter(
+                split = table.select(_SPLIT_COLUMNS).filter(
                     pa.array(self.plan.evaluation_split[begin:end])
                 )
                 # For the audit `leakage`.
-                split_by = pa.repeat(self.mixture.evaluation_split.by, len(held))
-                left.write(held.append_column("split_by", split_by))
+                split_by = pa.repeat(self.mixture.evaluation_split.by, len(split))
+                left.write(split.append_column("split_by", split_by))
                 code = self.plan.stratum[begin:end]
                 rows = np.flatnonzero(code != NO_STRATUM)
                 table, code = table.take(pa.array(rows)), code[rows]
-                mine = slice(at, at + len(rows))
+                packed = slice(at, at + len(rows))
                 beside: dict[str, Any] = {
                     "stratum": pa.DictionaryArray.from_arrays(pa.array(code, pa.int32()), names),
                     "stratum_code": pa.array(code),
-                    "horizon": pa.array((self.last[mine] - self.chosen[mine] + 1).astype(np.int16)),
-                    "weight": pa.array(self.plan.weight[mine]),
-                    **{name: pa.array(v[mine]) for name, v in self.plan.beside.items()},
+                    "horizon": pa.array(
+                        (self.last[packed] - self.chosen[packed] + 1).astype(np.int16)
+                    ),
+                    "weight": pa.array(self.plan.weight[packed]),
+                    **{name: pa.array(v[packed]) for name, v in self.plan.beside.items()},
                 }
                 if to_go is not None:
                     beside["return_to_go"] = pa.array(to_go[0][begin:end][rows])
@@ -249,8 +259,8 @@ def _at(values: Ints, place: Ints) -> Ints:
     """values[place], and -1 beyond the end."""
     if not len(values):
         return np.full(len(place), -1)
-    found: Ints = np.where(place < len(values), values[np.minimum(place, len(values) - 1)], -1)
-    return found
+    at: Ints = np.where(place < len(values), values[np.minimum(place, len(values) - 1)], -1)
+    return at
 
 
 def _starts(counts: Ints) -> Ints:

@@ -30,14 +30,14 @@ from restock.replay.panel.exclusions import (
 )
 from restock.replay.panel.source_plan import SourcePlan, SourceRows, StratumPlan, plan_source
 from restock.replay.panel.stores import PinnedStore
-from restock.replay.panel.strata import NO_STRATUM, Stratum, assign, resolve_strata
+from restock.replay.panel.strata import NO_STRATUM, ResolvedStratum, assign, resolve_strata
 from restock.replay.panel.weights import effective_count
 
 LOGS = "logs"  # the name of the first store's part
 
 
 @dataclass(frozen=True)
-class Plan:
+class PanelPlan:
     """A mixture worked out against a store. Row arrays are over the store's rows, in order."""
 
     mixture: Mixture
@@ -67,7 +67,7 @@ def plan_panel(
     mixture: Mixture,
     conditions: Sequence[Condition],
     others: Sequence[PinnedStore] = (),
-) -> Plan:
+) -> PanelPlan:
     """Work a mixture out over the connection's `transitions`.
 
     `others` are the mixture's other stores, where the view holds their rows too (`replay.stores`).
@@ -124,10 +124,10 @@ def _sources(
     """What each store may give, with its share of a batch as a run begins."""
     store, episode = table["store"].to_numpy(), codes(table, "episode_id")
     ids, action = table["transition_id"].to_numpy(), table["action"].to_numpy()
-    found = []
+    sources = []
     for number, (name, part) in enumerate(mixture.sources.parts.items()):
         at = np.flatnonzero((stratum != NO_STRATUM) & (store == number))
-        found.append(
+        sources.append(
             SourceRows(
                 name,
                 mean_over(part, 0, mixture.sources.last_bend),
@@ -139,12 +139,12 @@ def _sources(
                 episode[at],
             )
         )
-    return found
+    return sources
 
 
 def _joined(
     mixture: Mixture,
-    strata: Sequence[Stratum],
+    strata: Sequence[ResolvedStratum],
     table: pa.Table,
     task_hash: str,
     evaluation_split: Bools,
@@ -152,7 +152,7 @@ def _joined(
     given: Sequence[SourceRows],
     worked_out: Sequence[SourcePlan],
     others: Sequence[PinnedStore],
-) -> Plan:
+) -> PanelPlan:
     """All sources as one plan: the strata of source k are k * S and on."""
     size = len(strata)
     code = np.full(len(table), NO_STRATUM, np.int16)
@@ -192,7 +192,7 @@ def _joined(
     chosen = np.flatnonzero(code != NO_STRATUM)
     rows = np.array([line.rows for line in lines])
     drawn = (np.array([line.share for line in lines]) / np.maximum(rows, 1))[code[chosen]]
-    return Plan(
+    return PanelPlan(
         mixture=mixture,
         rows=table.select(META_COLUMNS),
         task_hash=task_hash,
@@ -216,4 +216,4 @@ def outcome_column(stratum: str) -> str:
     return f"probability_of_{stratum}"
 
 
-__all__ = ["META_COLUMNS", "Plan", "StratumPlan", "outcome_column", "plan_panel"]
+__all__ = ["META_COLUMNS", "PanelPlan", "StratumPlan", "outcome_column", "plan_panel"]

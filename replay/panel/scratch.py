@@ -34,18 +34,18 @@ STRETCH = 1 << 18  # scalars in memory at a time
 _STEPS = f"""
 SELECT transition_id, episode_id, step_index, reward,
     behaviour_policy || '@' || coalesce(behaviour_version, '') AS policy,
-    terminated, truncated, coalesce(action_probability < $chance, false) AS explored
+    terminated, truncated, coalesce(action_probability < $random_probability, false) AS explored
 FROM transitions {ORDER}
 """
 
 
-class Steps:
+class SourceSteps:
     """Every row of the source in order: ids, rewards and what each is to the next, (N,) on disk.
 
     Args:
         folder: where the files go.
         connection: with the view `transitions`, of `rows` rows.
-        chance: what the probability of a random action is; below it a policy explores. 0: unknown.
+        random_probability: of an action chosen blindly; below it a policy explores. 0: unknown.
         cut_at_off_policy: end returns before off-policy actions; see `n_step`.
     """
 
@@ -55,7 +55,7 @@ class Steps:
         connection: duckdb.DuckDBPyConnection,
         rows: int,
         *,
-        chance: float,
+        random_probability: float,
         cut_at_off_policy: bool,
     ) -> None:
         self.rows = rows
@@ -64,11 +64,13 @@ class Steps:
         self.reward: F32 = _on_disk(folder / "reward", np.float32, rows)
         self.flags: NDArray[np.uint8] = _on_disk(folder / "flags", np.uint8, rows)
         self._folder = folder
-        self._read(connection, chance)
+        self._read(connection, random_probability)
 
-    def _read(self, connection: duckdb.DuckDBPyConnection, chance: float) -> None:
+    def _read(self, connection: duckdb.DuckDBPyConnection, random_probability: float) -> None:
         at, before = 0, None
-        reader = connection.sql(_STEPS, params={"chance": chance}).to_arrow_reader(BATCH_ROWS)
+        reader = connection.sql(
+            _STEPS, params={"random_probability": random_probability}
+        ).to_arrow_reader(BATCH_ROWS)
         for batch in reader:
             count = len(batch)
             if at + count > self.rows:
@@ -154,16 +156,16 @@ class Places:
 
     def of(self, ids: Ints) -> Ints:
         """The place of each of these ids. Raises PanelError for one that was not there."""
-        found = np.empty(len(ids), np.int64)
+        place = np.empty(len(ids), np.int64)
         run = np.maximum(np.searchsorted(self._first, ids, "right") - 1, 0)
         for number in np.unique(run).tolist():
-            mine = run == number
+            in_run = run == number
             begin, end = int(self._begins[number]), int(self._ends[number])
-            found[mine] = begin + np.searchsorted(self._ids[begin:end], ids[mine])
-        found = np.minimum(found, len(self._ids) - 1)
-        if not np.array_equal(self._ids[found], ids):
+            place[in_run] = begin + np.searchsorted(self._ids[begin:end], ids[in_run])
+        place = np.minimum(place, len(self._ids) - 1)
+        if not np.array_equal(self._ids[place], ids):
             raise _changed(self._where)
-        return found if self._order is None else self._order[found]
+        return place if self._order is None else self._order[place]
 
 
 def _flags(rows: pa.Table) -> NDArray[np.uint8]:

@@ -43,12 +43,12 @@ class FileRecord(msgspec.Struct, frozen=True):
                 where=str(path),
                 remedy=AGAIN,
             )
-        found, expected = sample_checksum(path), self.sample
-        if verify and found == expected:
-            found, expected = checksum(path), self.blake2b
-        if found != expected:
+        actual, expected = sample_checksum(path), self.sample
+        if verify and actual == expected:
+            actual, expected = checksum(path), self.blake2b
+        if actual != expected:
             raise PanelError(
-                f"its checksum is {found}, not {expected}: it was changed or damaged",
+                f"its checksum is {actual}, not {expected}: it was changed or damaged",
                 where=str(path),
                 remedy=AGAIN,
             )
@@ -99,13 +99,13 @@ def unseal(content: bytes, kind: type[T], where: Path) -> T:
     """What `seal` was given. Raises PanelError for what is no such header, or was edited."""
     try:
         values = msgspec.json.decode(content, type=dict[str, Any])
-        found = values.pop("seal", None)
+        given_seal = values.pop("seal", None)
         header = msgspec.convert(values, kind)
     except (msgspec.DecodeError, ValueError) as error:
         raise PanelError(
             f"its header cannot be read: {error}", where=str(where), remedy=AGAIN
         ) from error
-    if found != _seal_of(values):
+    if given_seal != _seal_of(values):
         raise PanelError(
             "its header was changed after it was written",
             where=str(where),

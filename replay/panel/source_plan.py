@@ -14,7 +14,7 @@ from restock.replay.mixture.packed_row import F32, Bools, Ints
 from restock.replay.mixture.shares import SharePlan, plan_shares
 from restock.replay.panel.density_ratio import RatioFit, RatioRows, estimate_outcomes
 from restock.replay.panel.exclusions import scramble
-from restock.replay.panel.strata import Stratum
+from restock.replay.panel.strata import ResolvedStratum
 from restock.replay.panel.weights import effective_count, effective_shares, importance_weights
 
 
@@ -74,7 +74,7 @@ class SourcePlan:
 def plan_source(
     connection: duckdb.DuckDBPyConnection,
     mixture: Mixture,
-    strata: Sequence[Stratum],
+    strata: Sequence[ResolvedStratum],
     source: SourceRows,
 ) -> SourcePlan:
     """Shares, weights and lines of one source.
@@ -125,7 +125,7 @@ def plan_source(
 def _outcomes(
     connection: duckdb.DuckDBPyConnection,
     mixture: Mixture,
-    strata: Sequence[Stratum],
+    strata: Sequence[ResolvedStratum],
     source: SourceRows,
     kept: Bools,
 ) -> tuple[F32 | None, RatioFit | None]:
@@ -140,7 +140,7 @@ def _outcomes(
         ids, source.action[kept], source.state_code[kept], code, scramble(ids, mixture.seed)
     )
     names = tuple(strata[index].name for index in estimated.tolist())
-    found, fit = estimate_outcomes(connection, rows, estimated, names, source.name)
+    estimate, fit = estimate_outcomes(connection, rows, estimated, names, source.name)
     outcome = np.zeros((len(code), len(strata)), np.float32)
-    outcome[:, estimated] = found
+    outcome[:, estimated] = estimate
     return outcome, fit

@@ -26,7 +26,7 @@ WHERE_PRIORITY = 50
 
 
 @dataclass(frozen=True)
-class Stratum:
+class ResolvedStratum:
     """A stratum as resolved against a store's conditions."""
 
     rule: StratumRule
@@ -43,7 +43,7 @@ class Stratum:
         return self.rule.name
 
 
-def resolve_strata(mixture: Mixture, conditions: Sequence[Condition]) -> list[Stratum]:
+def resolve_strata(mixture: Mixture, conditions: Sequence[Condition]) -> list[ResolvedStratum]:
     """The mixture's strata, and those of `each_condition`, in the order of the table they make.
 
     Raises:
@@ -82,7 +82,7 @@ def _rule_for(name: str, each: EachCondition) -> StratumRule:
     )
 
 
-def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -> Stratum:
+def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -> ResolvedStratum:
     timing: Literal["pre", "post"]
     state_predicate = None
     if rule.where is not None:
@@ -109,7 +109,7 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
         predicate = "true" if left_over else _of_episodes(predicate, rule.min_steps)
     timing = rule.timing or timing
     default = mixture.correction.pre if timing == "pre" else mixture.correction.post
-    return Stratum(
+    return ResolvedStratum(
         rule,
         predicate,
         state_predicate,
@@ -127,7 +127,7 @@ def _of_episodes(predicate: str, min_steps: int) -> str:
 
 
 def assign(
-    member: Bools, strata: Sequence[Stratum], *, only_pre: bool = False
+    member: Bools, strata: Sequence[ResolvedStratum], *, only_pre: bool = False
 ) -> NDArray[np.int16]:
     """The stratum of each row (N,), from membership (N, S); -1 where it belongs to none.
 

@@ -148,20 +148,20 @@ class WeightsInForce:
         self._parts = []
         for number in range(sources):
             at = np.flatnonzero(code // self._size == number)
-            mine = slice(number * self._size, (number + 1) * self._size)
-            own = code[at] - number * self._size
-            chances = None if outcome is None else outcome[at]
+            span = slice(number * self._size, (number + 1) * self._size)
+            of_source = code[at] - number * self._size
+            probability = None if outcome is None else outcome[at]
             self._parts.append(
-                (at, mine, RowWeights(own, state_code[at], strata[mine], rule, chances))
+                (at, span, RowWeights(of_source, state_code[at], strata[span], rule, probability))
             )
         self._weight: F32 = np.ones(len(code), np.float32)
 
     def set_shares(self, shares: F64) -> None:
         """Weights under these shares (K * S,) from now on, of mean 1 in each source."""
-        for at, mine, weights in self._parts:
-            total = shares[mine].sum()
+        for at, span, weights in self._parts:
+            total = shares[span].sum()
             if len(at) and total > 0:
-                self._weight[at] = weights.under(shares[mine] / total)
+                self._weight[at] = weights.under(shares[span] / total)
 
     def of(self, rows: NDArray[Any]) -> F32:
         """The weights (n,) of rows (n,)."""

@@ -280,10 +280,10 @@ class FreshRing(Stateful):
         slots = self._awaiting_labels.pop(int(episode_key), np.empty(0, np.int64))
         steps = np.arange(len(slots))
         # The others were overwritten, by other episodes' rows or later ones of the same.
-        there = slots >= 0
-        there &= self.meta["episode"][slots] == episode_key
-        there &= self.meta["episode_step"][slots] == steps
-        slots, steps = slots[there], steps[there]
+        still = slots >= 0
+        still &= self.meta["episode"][slots] == episode_key
+        still &= self.meta["episode_step"][slots] == steps
+        slots, steps = slots[still], steps[still]
         if steps.max(initial=-1) >= len(codes):
             raise MixtureError(
                 f"{len(codes)} labels for an episode of at least {int(steps.max()) + 1} steps",
@@ -315,8 +315,8 @@ class FreshRing(Stateful):
         return {"rows": self.rows[:filled], **meta}
 
     @_filled.setter
-    def _filled(self, held: dict[str, NDArray[Any]]) -> None:
-        for name, values in held.items():
+    def _filled(self, filled: dict[str, NDArray[Any]]) -> None:
+        for name, values in filled.items():
             place = self.rows if name == "rows" else self.meta[name]
             place[: len(values)] = values
 
@@ -342,10 +342,10 @@ class FreshRing(Stateful):
         self._env_slots = np.full((self.num_envs, longest), NONE, np.int64)
         env_of = {key: env for env, key in enumerate(self.episode_key.tolist())}
         for key in np.unique(keys).tolist():
-            mine = keys == key
+            of_key = keys == key
             if key in env_of:
-                self._env_slots[env_of[key], steps[mine]] = slots[mine]
+                self._env_slots[env_of[key], steps[of_key]] = slots[of_key]
             else:
-                of_step = np.full(int(steps[mine].max()) + 1, NONE, np.int64)
-                of_step[steps[mine]] = slots[mine]
+                of_step = np.full(int(steps[of_key].max()) + 1, NONE, np.int64)
+                of_step[steps[of_key]] = slots[of_key]
                 self._awaiting_labels[key] = of_step

@@ -239,11 +239,11 @@ class _Buffer(Stateful):
     def restored(self) -> None:
         """Read the buffer's rows again."""
         # Rows that were drawn already need not be read again.
-        held = np.arange(self.capacity) if self.whole else self._order[: self._filled]
-        held = held[self.numbers[held] >= 0]
-        held = held[np.argsort(self.numbers[held], kind="stable")]
-        for begin in range(0, len(held), self.chunk_rows):
-            slots = held[begin : begin + self.chunk_rows]
+        waiting = np.arange(self.capacity) if self.whole else self._order[: self._filled]
+        waiting = waiting[self.numbers[waiting] >= 0]
+        waiting = waiting[np.argsort(self.numbers[waiting], kind="stable")]
+        for begin in range(0, len(waiting), self.chunk_rows):
+            slots = waiting[begin : begin + self.chunk_rows]
             staged = np.empty((len(slots), self.rows.shape[1]), np.float32)
             self._file.read(self.numbers[slots], staged)
             self.rows[slots] = staged

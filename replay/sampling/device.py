@@ -93,7 +93,7 @@ class DeviceSampler(Stateful):
         self._weights_ahead: Tensor | None = None
         self._next = 0  # of those drawn ahead
         self._batches = 0  # handed out
-        self._ruled = any(own is not None for own in self.rules)
+        self._ruled = any(rule_of is not None for rule_of in self.rules)
         self._priority = self._largest = torch.zeros(0, device=self.device)
         self._new = self._finite = torch.zeros(0, dtype=torch.bool, device=self.device)
         if self._ruled:

@@ -134,7 +134,10 @@ class Priorities(Stateful):
             )
         ruled = [rule is not None for rule in rules]
         self.sizes: Ints = np.array(
-            [len(rows) if own else 0 for rows, own in zip(stratum_rows, ruled, strict=True)]
+            [
+                len(rows) if has_rule else 0
+                for rows, has_rule in zip(stratum_rows, ruled, strict=True)
+            ]
         )
         room = -(-self.sizes // CHUNK) * CHUNK
         self._first: Ints = np.concatenate([[0], np.cumsum(room)])[:-1].astype(np.int64)
@@ -212,9 +215,9 @@ class Priorities(Stateful):
             rule = self.rules[stratum]
             beta = 0.0 if rule is None else rule.beta_after(batches)
             if beta > 0:
-                own = self._priority[first : first + size]
+                priorities = self._priority[first : first + size]
                 total = float(chunks.sum(dtype=np.float64))
-                weights.append(_weights(self._priority[place], own, total, beta))
+                weights.append(_weights(self._priority[place], priorities, total, beta))
                 weighted = True
             else:
                 weights.append(np.ones(count, np.float32))
@@ -285,7 +288,7 @@ class PrioritySampler(QuotaSampler):
             raise MixtureError(f"{len(rules)} rules for {len(stratum_rows)} strata")
         given = [replacement] * len(rules) if isinstance(replacement, bool) else list(replacement)
         # By priority is with replacement.
-        again = [own or rule is not None for own, rule in zip(given, rules, strict=True)]
+        again = [replaced or rule is not None for replaced, rule in zip(given, rules, strict=True)]
         super().__init__(stratum_rows, shares, batch_size, rng, weights=weights, replacement=again)
         if refresh_every is None:
             some = int(self.sizes.sum()) // (16 * batch_size)

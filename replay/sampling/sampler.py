@@ -102,7 +102,7 @@ class QuotaSampler(Stateful):
         self._again = [again] * len(shares) if isinstance(again, bool) else list(again)
         if len(self._again) != len(shares):
             raise MixtureError(f"{len(self._again)} rules for {len(shares)} strata")
-        self._turns = [stratum for stratum, own in enumerate(self._again) if not own]
+        self._turns = [stratum for stratum, repeats in enumerate(self._again) if not repeats]
         self._cursor: Ints = np.zeros(len(self.sizes), np.int64)
         for stratum in self._turns:
             self.rng.shuffle(self._members[stratum])

@@ -22,7 +22,7 @@ from restock.replay.mixture.schedules import knots, mean_over, value_at
 from restock.replay.mixture.shares import scaled_within, wanted_shares, within_limits
 from restock.state import Stateful
 
-REFRESH_BATCHES = 64  # shares with a schedule are worked out anew after so many
+REFRESH_BATCHES = 64  # shares with a schedule are worked out again after so many
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class GroupDro(Stateful):
 
 
 @dataclass
-class _Source(Stateful):
+class _SourceDraws(Stateful):
     """The strata of one source, and what it is planned to give."""
 
     STATE: ClassVar[tuple[str, ...]] = ("dro",)
@@ -177,20 +177,20 @@ class ShareController(Stateful):
             for name, share in zip(names, shares, strict=True)
         )
         mixture = Mixture(strata=rules, sources=SourceShares(logs=1.0))
-        fed = [SampledStratum(r.name, "logs", r, n, 1) for r, n in zip(rules, rows, strict=True)]
-        return cls(mixture, fed, PlannedDraws(), logs_share=logs_share)
+        strata = [SampledStratum(r.name, "logs", r, n, 1) for r, n in zip(rules, rows, strict=True)]
+        return cls(mixture, strata, PlannedDraws(), logs_share=logs_share)
 
-    def _source(self, name: str) -> _Source:
+    def _source(self, name: str) -> _SourceDraws:
         places = [i for i, stratum in enumerate(self.strata) if stratum.source == name]
-        mine = slice(places[0], places[-1] + 1)
-        strata = self.strata[mine]
+        of_source = slice(places[0], places[-1] + 1)
+        strata = self.strata[of_source]
         sources, planned = self.mixture.sources, self.planned
         parts = self.parts_at(0)
         span = (planned.begin_env_steps, planned.end_env_steps)
         mean = self._scaled({n: mean_over(part, *span) for n, part in sources.parts.items()})
-        return _Source(
+        return _SourceDraws(
             name,
-            mine,
+            of_source,
             [stratum.rule for stratum in strata],
             np.array([stratum.rows for stratum in strata], np.int64),
             np.array([self._cap_of(stratum.rule) for stratum in strata]),
@@ -255,8 +255,8 @@ class ShareController(Stateful):
         stepping = self.learnt > rule.after_updates and self.learnt % rule.every_updates == 0
         for source in self.sources:
             if source.dro is not None:
-                mine = (stratum >= source.strata.start) & (stratum < source.strata.stop)
-                source.dro.observe(stratum[mine] - source.strata.start, td_abs[mine])
+                of_source = (stratum >= source.strata.start) & (stratum < source.strata.stop)
+                source.dro.observe(stratum[of_source] - source.strata.start, td_abs[of_source])
                 if stepping:
                     source.dro.step()
         return self._work_out("redistribute") if stepping else False
@@ -277,7 +277,7 @@ class ShareController(Stateful):
         self.shares, self.logs_share = shares, logs_share
         return changed
 
-    def _plan(self, source: _Source, shortfall: Shortfall) -> tuple[F64, float, float]:
+    def _plan(self, source: _SourceDraws, shortfall: Shortfall) -> tuple[F64, float, float]:
         """A source's shares, and how much it can fill of its draws to come, and of online ones."""
         wanted = (
             wanted_shares(source.rules, source.rows, self.env_steps)

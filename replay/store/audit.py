@@ -55,7 +55,7 @@ class Audit:
     severity: Severity
     advice: str
     doc: str
-    needs: str | None  # "run", "panel" or a table of one: "run.fed_episodes"
+    needs: str | None  # "run", "panel" or a table of one: "run.sampled_episodes"
     sql: str
 
     @property
@@ -91,13 +91,13 @@ def load_audits(folder: str | Path | None = None) -> list[Audit]:
 
     Raises ConfigError for a folder without audits, or a file whose header is not as it must be.
     """
-    found = {audit.name: audit for audit in shipped_audits()}
+    by_name = {audit.name: audit for audit in shipped_audits()}
     if folder is not None:
         path = Path(folder)
         if not path.is_dir() or not list(path.glob("*.sql")):
             raise ConfigError("no audits (*.sql) in it", where=str(path))
-        found |= {audit.name: audit for audit in _load(path.iterdir(), str(path))}
-    return [found[name] for name in sorted(found)]
+        by_name |= {audit.name: audit for audit in _load(path.iterdir(), str(path))}
+    return [by_name[name] for name in sorted(by_name)]
 
 
 def load_thresholds(file: str | Path | None = None) -> dict[str, dict[str, float | str]]:
@@ -106,9 +106,9 @@ def load_thresholds(file: str | Path | None = None) -> dict[str, dict[str, float
     Raises ConfigError for a file that is no TOML or holds anything but tables of values.
     """
     shipped = (files("restock.replay.store") / "audits.toml").read_text(encoding="utf-8")
-    found: dict[str, dict[str, float | str]] = tomllib.loads(shipped)
+    thresholds: dict[str, dict[str, float | str]] = tomllib.loads(shipped)
     if file is None:
-        return found
+        return thresholds
     try:
         given = tomllib.loads(Path(file).read_text(encoding="utf-8"))
     except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -118,8 +118,8 @@ def load_thresholds(file: str | Path | None = None) -> dict[str, dict[str, float
             raise ConfigError(
                 f"{name!r} is no table", where=str(file), remedy="write [audit] tables of values"
             )
-        found[name] = {**found.get(name, {}), **table}
-    return found
+        thresholds[name] = {**thresholds.get(name, {}), **table}
+    return thresholds
 
 
 def run_audits(
@@ -139,11 +139,13 @@ def run_audits(
             uses.
     """
     _check_thresholds(audits, thresholds)
-    there = set(beside)
-    there |= {f"{schema}.{table}" for schema, table in _tables(connection) if schema in there}
+    available = set(beside)
+    available |= {
+        f"{schema}.{table}" for schema, table in _tables(connection) if schema in available
+    }
     findings = [
         _run(connection, audit, thresholds.get(audit.name, {}))
-        if audit.needs is None or audit.needs in there
+        if audit.needs is None or audit.needs in available
         else Finding(audit, "skipped", 0, [], [], {})
         for audit in audits
     ]
@@ -154,8 +156,8 @@ def run_audits(
 def _tables(connection: duckdb.DuckDBPyConnection) -> list[tuple[str, str]]:
     """Schema and name of every table and view."""
     query = "SELECT table_schema, table_name FROM information_schema.tables"
-    found: list[tuple[str, str]] = connection.sql(query).fetchall()
-    return found
+    rows: list[tuple[str, str]] = connection.sql(query).fetchall()
+    return rows
 
 
 def junit_xml(findings: Sequence[Finding], suite: str) -> str:
@@ -204,12 +206,12 @@ def _run(
         return relation.columns, values(relation)
 
     try:
-        columns, found = interruptible(connection, run)
+        columns, rows = interruptible(connection, run)
     except duckdb.Error as error:
         raise ConfigError(f"its SQL does not run: {error}", where=where) from error
-    sample = [dict(zip(columns, row, strict=True)) for row in found[:SAMPLE_ROWS]]
-    status: Status = _OFFENDED[audit.severity] if found else "pass"
-    return Finding(audit, status, len(found), columns, sample, thresholds)
+    sample = [dict(zip(columns, row, strict=True)) for row in rows[:SAMPLE_ROWS]]
+    status: Status = _OFFENDED[audit.severity] if rows else "pass"
+    return Finding(audit, status, len(rows), columns, sample, thresholds)
 
 
 def _check_thresholds(audits: Sequence[Audit], thresholds: Thresholds) -> None:
@@ -232,10 +234,10 @@ def _check_thresholds(audits: Sequence[Audit], thresholds: Thresholds) -> None:
 
 
 def _load(entries: Iterable[Traversable], where: str) -> list[Audit]:
-    found = sorted((e for e in entries if e.name.endswith(".sql")), key=lambda entry: entry.name)
+    ordered = sorted((e for e in entries if e.name.endswith(".sql")), key=lambda entry: entry.name)
     return [
         _parse(entry.name.removesuffix(".sql"), entry.read_text(encoding="utf-8"), where)
-        for entry in found
+        for entry in ordered
     ]
 
 

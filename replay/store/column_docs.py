@@ -45,15 +45,15 @@ def view_docs() -> dict[str, str]:
 
 def column_docs() -> dict[tuple[str, str], str]:
     """(view, column) -> meaning, as far as they are named there; see `meaning` for the rest."""
-    found = {
+    meanings = {
         (view, column): text
         for view, table in _read().items()
         for column, text in table.items()
         if column != "doc"
     }
-    found |= {("transitions", column.name): column.meaning for column in COLUMNS}
-    found |= {("recordings", column.name): column.meaning for column in RECORDING_COLUMNS}
-    return found
+    meanings |= {("transitions", column.name): column.meaning for column in COLUMNS}
+    meanings |= {("recordings", column.name): column.meaning for column in RECORDING_COLUMNS}
+    return meanings
 
 
 def unit(column: str) -> str:
@@ -67,13 +67,15 @@ def install_columns(connection: duckdb.DuckDBPyConnection) -> None:
     for name, own_unit, meaning, topic, path in _custom(connection):
         docs["transitions", name] = meaning or f"{path} of {topic}"
         own_units["transitions", name] = own_unit
-    there = connection.sql(
+    columns = connection.sql(
         "SELECT table_name, column_name, data_type FROM duckdb_columns()"
         " WHERE NOT internal AND table_name NOT LIKE 'stored_%' ORDER BY table_name, column_index"
     ).fetchall()
     order = list(view_docs())
-    there = [(view, column, kind) for view, column, kind in there if view in order]
-    own = [("columns", name, "VARCHAR") for name in ("view", "column", "type", "unit", "meaning")]
+    columns = [(view, column, kind) for view, column, kind in columns if view in order]
+    of_columns = [
+        ("columns", name, "VARCHAR") for name in ("view", "column", "type", "unit", "meaning")
+    ]
     rows = [
         {
             "view": view,
@@ -82,7 +84,7 @@ def install_columns(connection: duckdb.DuckDBPyConnection) -> None:
             "unit": own_units.get((view, column)) or unit(column),
             "meaning": docs.get((view, column)) or docs.get(("shared", column)),
         }
-        for view, column, kind in sorted(there, key=lambda row: order.index(row[0])) + own
+        for view, column, kind in sorted(columns, key=lambda row: order.index(row[0])) + of_columns
     ]
     names = ("view", "column", "type", "unit", "meaning")
     schema = pa.schema([pa.field(name, pa.string()) for name in names])

@@ -96,12 +96,12 @@ class Store:
 
         Only what the table keeps of them: name, timing, priority and SQL.
         """
-        found = self.connection.sql(
+        rows = self.connection.sql(
             "SELECT conditions_json FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1"
         ).fetchall()
-        if not found:
+        if not rows:
             return ()
-        return tuple(msgspec.json.decode(found[0][0], type=list[Condition], strict=False))
+        return tuple(msgspec.json.decode(rows[0][0], type=list[Condition], strict=False))
 
     def task_json(self, task_hash: str | None = None) -> str:
         """The task of the store's rows as JSON.
@@ -205,8 +205,8 @@ def _manifests(place: Location, recordings: DeltaTable, rows: Sequence[str]) -> 
     """
     active = _paths(recordings)
     gone = sorted(set(filter(OWN_PATH.fullmatch, rows)) - set(active))
-    found = place.files.get_file_info([f"{RECORDINGS}/{path}" for path in gone])
-    return active + [path for path, info in zip(gone, found, strict=True) if info.is_file]
+    infos = place.files.get_file_info([f"{RECORDINGS}/{path}" for path in gone])
+    return active + [path for path, info in zip(gone, infos, strict=True) if info.is_file]
 
 
 @contextmanager

@@ -58,20 +58,20 @@ def trace_row(place: str | Path, row: str, where: TracePlaces | None = None) -> 
         RecordingError: the recording given is not the one the row is of.
     """
     path, where = Path(place), where or TracePlaces()
-    found = Trace()
+    trace = Trace()
     if (path / RUN_CONFIG).is_file():
-        _of_run(found, path, row, where)
+        _of_run(trace, path, row, where)
     elif (path / HEADER).is_file():
-        _of_panel(found, Panel.open(path), _number(row, path, "row number of the panel"), where)
+        _of_panel(trace, Panel.open(path), _number(row, path, "row number of the panel"), where)
     elif is_store(str(place)):
         number = _number(row, path, "transition id")
-        found.origin = _origin([StoreVersion(str(place))], number, where)
+        trace.origin = _origin([StoreVersion(str(place))], number, where)
     else:
         raise StoreError(
             "neither a run, a panel nor a store" if path.exists() else "nothing is there",
             where=str(path),
         )
-    return found
+    return trace
 
 
 def audited_rows(run: str | Path, limit: int = 20) -> list[dict[str, Any]]:
@@ -87,11 +87,11 @@ def audited_rows(run: str | Path, limit: int = 20) -> list[dict[str, Any]]:
         return rows_of(connection, sql_file("trace_rows.sql"), {"file": table, "limit": limit})
 
 
-def _of_run(found: Trace, run: Path, row: str, where: TracePlaces) -> None:
+def _of_run(trace: Trace, run: Path, row: str, where: TracePlaces) -> None:
     document = json.loads((run / RUN_CONFIG).read_text(encoding="utf-8"))
-    found.audit = audit = _audit_row(run, row)
+    trace.audit = audit = _audit_row(run, row)
     if audit["source"] == "fresh":
-        _of_twin(found, run, document, audit)
+        _of_twin(trace, run, document, audit)
         return
     fed = document.get("panel") or {}
     panel_path = where.panel or Path(fed.get("path", ""))
@@ -112,34 +112,34 @@ def _of_run(found: Trace, run: Path, row: str, where: TracePlaces) -> None:
     if number is None:  # a run from before audit rows had it
         ids = panel.meta_column("transition_id")
         number = int(np.flatnonzero(ids == audit["transition_id"])[0])
-    _of_panel(found, panel, int(number), where)
+    _of_panel(trace, panel, int(number), where)
 
 
-def _of_panel(found: Trace, panel: Panel, number: int, where: TracePlaces) -> None:
+def _of_panel(trace: Trace, panel: Panel, number: int, where: TracePlaces) -> None:
     if not 0 <= number < len(panel):
         raise PanelError(f"has rows 0 to {len(panel) - 1}, not {number}", where=str(panel.path))
     meta = panel.meta.slice(number, 1).to_pylist()[0]
     packed = np.array(panel.rows[number])
-    found.panel = {"path": str(panel.path), "id": panel.id, "row": number, **meta}
-    if found.audit is not None:
+    trace.panel = {"path": str(panel.path), "id": panel.id, "row": number, **meta}
+    if trace.audit is not None:
         digest = hashlib.blake2b(packed.tobytes(), digest_size=8).hexdigest()
-        found.panel["same_bytes_as_sampled"] = digest == found.audit["row_hash"]
-        if not found.panel["same_bytes_as_sampled"]:
-            found.notes.append("the row in the panel is not the one that was sampled")
+        trace.panel["same_bytes_as_sampled"] = digest == trace.audit["row_hash"]
+        if not trace.panel["same_bytes_as_sampled"]:
+            trace.notes.append("the row in the panel is not the one that was sampled")
     header = panel.header
     if header.store_version < 0:
-        found.notes.append(
+        trace.notes.append(
             "the panel was made from a table in memory: there is no store to look in"
         )
         return
     sources = [StoreVersion(where.store or header.store, header.store_version)]
     sources += [StoreVersion(other.path, other.version) for other in header.others]
-    found.origin = _origin(sources, int(meta["transition_id"]), where)
-    stored = np.float32(found.origin.transition["observation"])
+    trace.origin = _origin(sources, int(meta["transition_id"]), where)
+    stored = np.float32(trace.origin.transition["observation"])
     same = np.array_equal(packed[panel.columns["observation"]], stored)
-    found.panel["same_observation_as_stored"] = same
+    trace.panel["same_observation_as_stored"] = same
     if not same:
-        found.notes.append("the observation in the store is not the one that was packed")
+        trace.notes.append("the observation in the store is not the one that was packed")
 
 
 def _origin(sources: list[StoreVersion], transition: int, where: TracePlaces) -> Origin:
@@ -147,31 +147,31 @@ def _origin(sources: list[StoreVersion], transition: int, where: TracePlaces) ->
 
 
 def _of_twin(
-    found: Trace, run: Path, document: Mapping[str, Any], audit: Mapping[str, Any]
+    trace: Trace, run: Path, document: Mapping[str, Any], audit: Mapping[str, Any]
 ) -> None:
     """A fresh row: its episode of the twin, and how that is laid out again."""
     query = "FROM read_parquet($file) WHERE episode = $episode"
-    asked = {"file": str(run / "episodes.parquet"), "episode": int(audit["episode"])}
+    values = {"file": str(run / "episodes.parquet"), "episode": int(audit["episode"])}
     with duckdb.connect() as connection:
-        rows = rows_of(connection, query, asked)
-    found.episode = {"run_seed": document.get("seeds", {}).get("run")}
+        rows = rows_of(connection, query, values)
+    trace.episode = {"run_seed": document.get("seeds", {}).get("run")}
     if not rows:
-        found.notes.append(
+        trace.notes.append(
             "its episode had not ended when the run stopped, or its tables end before"
         )
         return
-    found.episode |= rows[0]
-    if found.episode.get("episode_seed") is not None:
-        found.episode["spec"] = {
-            "condition": found.episode["true_condition"],
-            "seed": found.episode["episode_seed"],
+    trace.episode |= rows[0]
+    if trace.episode.get("episode_seed") is not None:
+        trace.episode["spec"] = {
+            "condition": trace.episode["true_condition"],
+            "seed": trace.episode["episode_seed"],
         }
-        found.notes.append(
+        trace.notes.append(
             "the twin lays the episode out again from its spec; the actions taken are not kept"
         )
-        if found.episode["perturbation"] != "nominal":
-            found.notes.append(
-                f"its perturbation {found.episode['perturbation']!r} is part of what lays it out"
+        if trace.episode["perturbation"] != "nominal":
+            trace.notes.append(
+                f"its perturbation {trace.episode['perturbation']!r} is part of what lays it out"
             )
 
 
@@ -186,9 +186,9 @@ def _audit_row(run: Path, row: str) -> dict[str, Any]:
             f" `restock trace {run}` lists some",
         )
     query = "FROM read_parquet($file) WHERE gradient_step = $step AND batch_row = $place"
-    asked = {"file": table, "step": int(step), "place": int(place)}
+    values = {"file": table, "step": int(step), "place": int(place)}
     with duckdb.connect() as connection:
-        rows = rows_of(connection, query, asked)
+        rows = rows_of(connection, query, values)
     if not rows:
         raise RunError(
             f"the batch of gradient step {step} was not audited, or has no row {place}",

@@ -12,7 +12,7 @@ from restock.replay.mixture.mixture import CorrectionRule, StratumRule, parse_mi
 from restock.replay.panel.build import build_panel, open_source
 from restock.replay.panel.density_ratio import OutcomeModel, density_ratio
 from restock.replay.panel.plan import plan_panel
-from restock.replay.panel.strata import Stratum
+from restock.replay.panel.strata import ResolvedStratum
 from restock.replay.panel.weights import effective_count, importance_weights
 
 COUNT = 30_000
@@ -26,10 +26,10 @@ def slippery(seed: int = 0) -> tuple[NDArray[np.float64], NDArray[np.float64], N
     return x, chance, rng.random(COUNT) < chance
 
 
-def strata(correction: str) -> list[Stratum]:
+def strata(correction: str) -> list[ResolvedStratum]:
     return [
-        Stratum(StratumRule(name="slip"), "true", None, 1, "post", correction),  # type: ignore[arg-type]
-        Stratum(StratumRule(name="nominal"), "true", None, 9, "pre", "none"),
+        ResolvedStratum(StratumRule(name="slip"), "true", None, 1, "post", correction),  # type: ignore[arg-type]
+        ResolvedStratum(StratumRule(name="nominal"), "true", None, 9, "pre", "none"),
     ]
 
 

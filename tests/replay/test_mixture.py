@@ -36,19 +36,19 @@ from restock.replay.mixture.mixture import (
 from restock.replay.mixture.schedules import Cosine, Linear, Piecewise
 from restock.replay.mixture.shares import plan_shares, scaled_within, wanted_shares
 from restock.replay.panel.build import build_panel, open_source
-from restock.replay.panel.plan import Plan, plan_panel
-from restock.replay.panel.strata import Stratum, assign, resolve_strata
+from restock.replay.panel.plan import PanelPlan, plan_panel
+from restock.replay.panel.strata import ResolvedStratum, assign, resolve_strata
 from restock.replay.panel.weights import effective_count, effective_shares, importance_weights
 
 EVERY = "[each_condition]\nshare = 'natural'\n"
 
 
-def planned(transitions: pa.Table, text: str) -> Plan:
+def planned(transitions: pa.Table, text: str) -> PanelPlan:
     with open_source(transitions, task=TASK, conditions=CONDITIONS) as source:
         return plan_panel(source.connection, parse_mixture(text), source.conditions)
 
 
-def shares(plan: Plan) -> dict[str, float]:
+def shares(plan: PanelPlan) -> dict[str, float]:
     return {line.stratum: line.share for line in plan.strata}
 
 
@@ -247,9 +247,9 @@ def test_priority_decides_overlap(transitions: pa.Table) -> None:
     assert 0 < count(500) < fast  # before nominal, after every condition
 
 
-def strata_of(*timings: str, correction: str = "full") -> list[Stratum]:
+def strata_of(*timings: str, correction: str = "full") -> list[ResolvedStratum]:
     return [
-        Stratum(
+        ResolvedStratum(
             StratumRule(name=f"s{i}"),
             "true",
             None,

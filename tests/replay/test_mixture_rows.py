@@ -28,7 +28,7 @@ from restock.replay.mixture.mixture import (
 from restock.replay.panel.build import build_panel, open_source
 from restock.replay.panel.logged_sampler import controller_for
 from restock.replay.panel.panel import Panel
-from restock.replay.panel.plan import Plan, plan_panel
+from restock.replay.panel.plan import PanelPlan, plan_panel
 from restock.replay.sampling.share_controller import PlannedDraws
 from restock.replay.store.store import Store
 
@@ -36,12 +36,12 @@ EVERY = "[each_condition]\nshare = 'natural'\n"
 NO_HOLD = "[evaluation_split]\nby = 'none'\n"
 
 
-def planned(transitions: pa.Table, text: str) -> Plan:
+def planned(transitions: pa.Table, text: str) -> PanelPlan:
     with open_source(transitions, task=TASK, conditions=CONDITIONS) as source:
         return plan_panel(source.connection, parse_mixture(text), source.conditions)
 
 
-def taken(plan: Plan) -> pa.Table:
+def taken(plan: PanelPlan) -> pa.Table:
     return plan.rows.take(pa.array(plan.panel_rows))
 
 

@@ -14,7 +14,7 @@ from restock.errors import MixtureError
 from restock.replay.mixture.mixture import Adaptive, StratumRule
 from restock.replay.mixture.schedules import Cosine, Linear, Piecewise, mean_over, value_at
 from restock.replay.mixture.shares import wanted_shares, within_limits
-from restock.replay.panel.strata import Stratum, assign
+from restock.replay.panel.strata import ResolvedStratum, assign
 from restock.replay.sampling.share_controller import GroupDro
 
 PARTS = st.integers(0, 1000).map(lambda thousandths: thousandths / 1000)
@@ -105,7 +105,7 @@ def test_priorities_part_the_rows(data: st.DataObject) -> None:
     member = np.array(flags, np.bool_).reshape(count, size)
     priority = data.draw(st.lists(st.integers(0, 3), min_size=size, max_size=size))
     strata = [
-        Stratum(StratumRule(name=f"s{i}"), "true", None, p, "pre", "none")
+        ResolvedStratum(StratumRule(name=f"s{i}"), "true", None, p, "pre", "none")
         for i, p in enumerate(priority)
     ]
     code = assign(member, strata)

@@ -13,7 +13,7 @@ import tyro
 from restock.errors import MixtureError
 
 if TYPE_CHECKING:
-    from restock.replay.panel.plan import Plan
+    from restock.replay.panel.plan import PanelPlan
 
 _WIDE = 110  # columns of a terminal from which on the table says more
 
@@ -108,7 +108,7 @@ class MixCommand:
         )
 
 
-def describe(plan: Plan) -> dict[str, Any]:
+def describe(plan: PanelPlan) -> dict[str, Any]:
     """The plan as a document: what `--json` prints."""
     return {
         "strata": [asdict(line) for line in plan.strata],

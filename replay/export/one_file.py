@@ -1,0 +1,153 @@
+"""Data sets of one file: Parquet, arrays in an `.npz`, and d3rlpy's own dump of episodes (HDF5).
+
+    with open("OUT.h5", "rb") as file:
+        dataset = d3rlpy.dataset.ReplayBuffer.load(file, d3rlpy.dataset.InfiniteBuffer())
+
+d3rlpy keeps as many observations as steps, and takes no transition from the last step of an
+episode that did not terminate. So such an episode gets one closing step: the observation after its
+last step, that step's action again, reward 0. Nothing is lost, and the closing step itself gives
+no transition.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from restock.replay.export.selection import Selection
+from restock.replay.export.trajectory import Counts, Trajectory
+
+GROUP_ROWS = 16_384
+D3RLPY_VERSION = "2.1"  # of its format
+D3RLPY_COLUMNS = ("observations", "actions", "rewards", "terminated")
+
+
+def write_parquet(
+    selection: Selection, trajectories: Iterator[Trajectory], out: Path, counts: Counts
+) -> list[str]:
+    """One row a transition, in order; provenance in the schema's metadata."""
+    writer: pq.ParquetWriter | None = None
+    waiting: list[pa.Table] = []
+    rows = 0
+    try:
+        for number, trajectory in enumerate(trajectories):
+            table = as_table(trajectory, number)
+            waiting.append(table)
+            rows += len(table)
+            if writer is None:
+                writer = pq.ParquetWriter(out, table.schema, compression="zstd")
+            if rows >= GROUP_ROWS:
+                writer.write_table(pa.concat_tables(waiting))
+                waiting, rows = [], 0
+        if writer is not None:
+            if waiting:
+                writer.write_table(pa.concat_tables(waiting))
+            about = selection.provenance | {"counts": counts.describe()}
+            writer.add_key_value_metadata({"restock": json.dumps(about)})
+    finally:
+        if writer is not None:
+            writer.close()
+    return []
+
+
+def as_table(trajectory: Trajectory, number: int) -> pa.Table:
+    """A trajectory's transitions as rows."""
+    t, steps = trajectory, len(trajectory)
+    last = np.arange(steps) == steps - 1
+    columns: dict[str, Any] = {
+        "trajectory": np.full(steps, number, np.int64),
+        "episode_id": pa.array([t.episode_id] * steps, pa.string()),
+        "step_index": t.first_step + np.arange(steps, dtype=np.int64),
+        "observation": fixed_lists(t.observations[:-1]),
+        "action": fixed_lists(t.actions) if t.actions.ndim == 2 else t.actions,
+        "reward": t.rewards,
+        "next_observation": fixed_lists(t.observations[1:]),
+        "terminated": last & t.terminated,
+        "truncated": last & t.truncated,
+        "cut": last & t.cut,
+    }
+    for name, column in t.carried.items():
+        text = column.dtype == object
+        columns[name] = pa.array(column, pa.string() if text else pa.from_numpy_dtype(column.dtype))
+    return pa.table(columns)
+
+
+def fixed_lists(values: NDArray[np.float32]) -> pa.FixedSizeListArray:
+    """(n, k) float32 as n lists of k."""
+    flat = np.ascontiguousarray(values, np.float32).ravel()
+    return pa.FixedSizeListArray.from_arrays(pa.array(flat), values.shape[1])
+
+
+def write_npz(
+    selection: Selection, trajectories: Iterator[Trajectory], out: Path, counts: Counts
+) -> list[str]:
+    """Arrays by the names that D4RL's data sets use; held in memory while written."""
+    all_of_them = list(trajectories)
+    lengths = np.array([len(t) for t in all_of_them])
+    last = np.zeros(lengths.sum(), np.bool_)
+    last[np.cumsum(lengths) - 1] = True
+
+    def each(name: str) -> NDArray[Any]:
+        return np.repeat([getattr(t, name) for t in all_of_them], lengths)
+
+    arrays: dict[str, Any] = {
+        "observations": np.concatenate([t.observations[:-1] for t in all_of_them]),
+        "actions": np.concatenate([t.actions for t in all_of_them]),
+        "rewards": np.concatenate([t.rewards for t in all_of_them]),
+        "next_observations": np.concatenate([t.observations[1:] for t in all_of_them]),
+        "terminals": last & each("terminated"),
+        "timeouts": last & each("truncated"),
+        "trajectory": np.repeat(np.arange(len(lengths)), lengths),
+        "episode_id": each("episode_id"),
+    }
+    for name in all_of_them[0].carried:
+        column = np.concatenate([t.carried[name] for t in all_of_them])
+        if column.dtype == object:  # as fixed-width text: no pickles
+            column = np.array(["" if value is None else str(value) for value in column])
+        arrays[name] = column
+    about = selection.provenance | {"counts": counts.describe()}
+    np.savez_compressed(out, **arrays, restock=np.array(json.dumps(about)))
+    return []
+
+
+def write_d3rlpy(
+    selection: Selection, trajectories: Iterator[Trajectory], out: Path, counts: Counts
+) -> list[str]:
+    """Episodes as d3rlpy dumps them."""
+    import h5py  # type: ignore[import-untyped]
+
+    number = -1
+    with h5py.File(out, "w") as file:
+        file.create_dataset("columns", data=list(D3RLPY_COLUMNS))
+        for number, trajectory in enumerate(trajectories):
+            t = trajectory
+            steps = len(t) if t.terminated else len(t) + 1
+            actions = t.actions if t.actions.ndim == 2 else t.actions[:, None]
+            values = {
+                "observations": t.observations[:steps],
+                "actions": actions if t.terminated else np.concatenate([actions, actions[-1:]]),
+                "rewards": np.pad(t.rewards, (0, steps - len(t)))[:, None],
+                "terminated": t.terminated,
+            }
+            for name in D3RLPY_COLUMNS:
+                file.create_dataset(f"{name}_{number}", data=values[name])
+            # Beside what d3rlpy reads: which transition each step was.
+            group = file.require_group(f"restock/{number}")
+            group.attrs.update(
+                {"episode_id": t.episode_id, "first_step": t.first_step, "cut": t.cut}
+            )
+            if "transition_id" in t.carried:
+                group.create_dataset("transition_id", data=t.carried["transition_id"])
+        file.create_dataset("num_episodes", data=number + 1)
+        file.create_dataset("version", data=D3RLPY_VERSION)
+        about = selection.provenance | {"counts": counts.describe()}
+        file["restock"].attrs["provenance"] = json.dumps(about)
+    closed = counts.truncated + counts.cut
+    return [f"{closed} truncated episodes got a closing step, so that no transition is lost"]
