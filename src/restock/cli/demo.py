@@ -27,11 +27,11 @@ COVERAGE = (
 
 @dataclass
 class DemoCommand:
-    """Run every stage on sample_logs/, say what each does and why, and end with a report.
+    """Run every stage on sample_logs/, explain each, and end with a report.
 
     Takes recordings through info, ingest, sql, audit, mix, train, eval and report: at most five
-    minutes on two cores. Every stage shows the command that it runs, so that you can run it on
-    recordings of your own.
+    minutes on two cores. Every stage shows its command, so that you can run it on
+    your own recordings.
 
     Example: `restock demo --out build/demo`
     """
@@ -60,7 +60,7 @@ class DemoCommand:
         if logs is None:
             logs = self.out / "logs"
             record = ["record", "--out", str(logs / "sample.mcap"), "--missions", "60"]
-            why = "No sample recordings beside this installation: the stand-in drives some."
+            why = "This installation has no sample recordings: a simulated robot drives some."
             plan.append(Stage("Record", why, record))
         plan += stages(logs, self.out, self.seconds, self.episodes, self.device)
         if self.dry_run:
@@ -88,7 +88,7 @@ class Stage:
     why: str
     command: list[str]
     expected: tuple[int, ...] = (0,)  # exit codes that do not stop the demo
-    remark: str = ""  # said where the exit code is not 0
+    remark: str = ""  # printed where the exit code is not 0
 
 
 def stages(logs: Path, out: Path, seconds: float, episodes: int, device: str) -> list[Stage]:
@@ -97,17 +97,17 @@ def stages(logs: Path, out: Path, seconds: float, episodes: int, device: str) ->
     return [
         Stage(
             "What is in these recordings?",
-            "Bytes that somebody else wrote come first: topics, types, counts, durations.",
+            "The recordings come first: topics, types, counts, durations.",
             ["info", str(logs)],
         ),
         Stage(
             "Recordings to labelled transitions",
             "Topics become steps of the control clock (held causally, never interpolated), steps"
             " become observation, action and reward, and SQL labels each with its conditions."
-            " These recordings know the truth, so the labels are scored.",
+            " These recordings contain the true condition, so the labels are scored.",
             ["ingest", str(logs), "--store", str(store)],
             expected=(0, 3),
-            remark="some data was lost or skipped: the table above says what",
+            remark="some data was lost or skipped: see the table above",
         ),
         Stage(
             "What is on each shelf?",
@@ -124,15 +124,15 @@ def stages(logs: Path, out: Path, seconds: float, episodes: int, device: str) ->
             remark="an audit failed: a pipeline would stop here, the demo goes on",
         ),
         Stage(
-            "A replay diet that keeps the rare shelves stocked",
-            "Quotas per stratum, caps on replays per row, and the shortfall said aloud; the result"
+            "A replay panel that keeps the rare conditions in stock",
+            "Quotas per stratum, caps on replays per row, and shortfalls reported; the result"
             " is a pinned panel with an id.",
             ["mix", str(store), "--mixture", "coverage", "--out", str(panel)],
         ),
         Stage(
             "Train: first on the panel, then online in the twin",
             f"About {seconds:.0f} s of double DQN. Half of each batch comes from the logs by"
-            " quotas, half is fresh. Everything the critic is fed is recorded.",
+            " quotas, half is fresh. Every row the critic is fed is recorded.",
             [
                 *("train", "--panel", str(panel), "--out", str(run)),
                 *("--seconds", f"{seconds:g}", "--device", device),
@@ -141,7 +141,7 @@ def stages(logs: Path, out: Path, seconds: float, episodes: int, device: str) ->
         Stage(
             "Evaluate on the same seeded episodes",
             "The kept checkpoint, the scripted planner and a random policy, clean and with less"
-            " friction and more latency than any of them has seen.",
+            " friction and more latency than in training.",
             ["eval", str(run), "--episodes", str(episodes)],
         ),
         Stage(

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class AuditCommand:
-    """Is what the store holds good enough to learn from? Exits 1 when an audit fails.
+    """Is the coverage of a store good enough to learn from? Exits 1 when an audit fails.
 
     Each audit is a query that returns offending rows, with a severity: an error fails, a warning
     warns, an info informs. Those that look at a panel or a run are skipped unless one is given.
@@ -26,19 +26,19 @@ class AuditCommand:
     store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
     """The store to audit."""
     panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
-    """A panel made from it, to be audited too."""
+    """A panel made from it, audited too."""
     run_dir: Annotated[Path | None, tyro.conf.arg(name="run", metavar="RUN")] = None
-    """A run whose evaluation is to be audited too."""
+    """A run whose evaluation is audited too."""
     audits: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """A folder of audits (*.sql) of your own; one of the same name takes a shipped one's place."""
+    """A folder of your own audits (*.sql); one with a shipped one's name replaces it."""
     thresholds: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A TOML file with thresholds in place of the shipped ones."""
     capacity: bool = False
-    """Instead of auditing, say how coverage grows with the rows kept, and how many are enough."""
+    """Instead of auditing, show how coverage grows with the rows kept, and how many are enough."""
     strict: bool = False
     """Let warnings fail, too."""
     rows: int = 5
-    """Offending rows shown of each audit, 10 at most; `restock sql` shows them all."""
+    """Offending rows shown per audit, 10 at most; `restock sql` shows them all."""
     json: bool = False
     """Print one JSON document."""
     junit: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None

@@ -13,11 +13,11 @@ import tyro
 class ExportCommand:
     """Transitions as another library's data set, or a run's policy as an ONNX file.
 
-    Takes a panel, or the rows of a query to a store, and puts them back together into episodes:
-    in order, with how each ended and the observation after its last step. Where a query leaves
-    rows out, an episode becomes several, cut where rows are missing. The data set says where it is
-    from: store version, query or panel, task, counts. See docs/libraries.md. The policy is the one
-    that a run kept as its best, with the task in the file's metadata. See docs/deploy.md.
+    Reassembles a panel, or the rows of a query to a store, into episodes: in order, with how each
+    ended and the observation after its last step. Where a query leaves rows out, an episode becomes
+    several, cut where rows are missing. The data set has its provenance: store version, query or
+    panel, task, counts. See docs/libraries.md. The policy is the one that a run kept as its best,
+    with the task in the file's metadata. See docs/deploy.md.
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
@@ -27,7 +27,7 @@ class ExportCommand:
     out: Annotated[Path, tyro.conf.arg(metavar="OUT")]
     """The file or directory to write, which must not exist yet."""
     query: Annotated[str | None, tyro.conf.arg(metavar="SQL")] = None
-    """What to take of a store, as whole transitions; everything without one."""
+    """A query for whole transitions of a store (default: all)."""
     panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
     """A panel whose tables the query may use, as panel.rows and panel.strata."""
     action: Literal["discrete", "continuous"] = "discrete"

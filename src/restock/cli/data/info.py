@@ -19,7 +19,7 @@ class InfoCommand:
 
     PATH is an MCAP file, a rosbag2 folder or one of its files, a ROS 1 bag, a folder of many
     recordings, or a quoted glob. Nothing is decoded (but for --clocks) and nothing is written. A
-    recording that cannot be read is said so on stderr and makes the exit code 2; the others are
+    recording that cannot be read is reported on stderr and makes the exit code 2; the others are
     still shown.
     """
 
@@ -28,7 +28,7 @@ class InfoCommand:
     typestore: str | None = None
     """Distribution whose message definitions serve recordings without their own (humble)."""
     salvage: bool = False
-    """Look into files that are cut short, too (exit code 3)."""
+    """Read truncated files, too (exit code 3)."""
     clocks: bool = False
     """Read the header stamps, too, and compare the clocks: how far log time is ahead of them, how
     often they jump, go back, repeat or are zero."""

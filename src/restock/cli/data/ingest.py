@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 
 @dataclass
 class IngestCommand:
-    """Turn recordings into labelled transitions in a store, one atomic commit a recording.
+    """Turn recordings into labelled transitions in a store, one atomic commit per recording.
 
     PATH is an MCAP file, a rosbag2 folder or one of its files, a ROS 1 bag, a folder of many
-    recordings, or a quoted glob. A recording that is in the store already, as it would be put
-    there now, is left alone; one that has changed definitions replaces its old rows. A recording
+    recordings, or a quoted glob. A recording that is in the store with the same content and
+    definitions is skipped; one with changed definitions replaces its old rows. A recording
     that cannot be used is named on stderr, leaves the store as it was, and the others go on.
 
     Exit codes: 0 all ingested (or unchanged), 2 nothing was written, 3 written, but a recording
@@ -31,23 +31,23 @@ class IngestCommand:
     paths: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     """Recordings, folders of recordings, or globs."""
     store: Annotated[str | None, tyro.conf.arg(metavar="STORE")] = None
-    """The store's folder, or s3://bucket/prefix; made where there is none. Needed unless
+    """The store's folder, or s3://bucket/prefix; created if missing. Required unless
     --dry-run."""
     profile: str = "warehouse_amr"
     """How topics become signals: a profile that comes with Restock, or a TOML file."""
     dry_run: bool = False
-    """Do all but write: say what would be."""
+    """Do everything but write, and print the result."""
     force: bool = False
-    """Ingest again what has not changed."""
+    """Ingest unchanged recordings again, too."""
     salvage: bool = False
-    """Take what is whole of files that are cut short or damaged (exit code 3)."""
+    """Read what is intact of truncated or damaged files (exit code 3)."""
     typestore: str | None = None
     """Distribution whose message definitions serve recordings without their own (humble)."""
     workers: int = 1
     """Processes that read recordings at the same time."""
     engine: Literal["processes", "ray"] = "processes"
     """Where they run: on this machine, or recording by recording on the cluster of RAY_ADDRESS
-    (without one, a Ray that is started here). Ray is an extra: pip install 'restock[ray]'."""
+    (without one, of a Ray that is started here). Ray is an extra: pip install 'restock[ray]'."""
     json: bool = False
     """Print one JSON document: {"recordings": [{"path", "status", "transitions", …}]}."""
 

@@ -21,8 +21,8 @@ class LabelCommand:
     """Label a store's transitions again where their conditions have changed.
 
     Conditions run over the signals that are stored: no recording is read, and observations,
-    actions and rewards stay as they are. Recordings whose labels are of the conditions they should
-    have are left alone; the others change in one commit. Each row keeps the version of its labels.
+    actions and rewards stay as they are. Recordings whose labels are up to date are left
+    unchanged; the others change in one commit. Each row keeps the version of its labels.
 
     The conditions of a recording are those of the profile that read it, by name; `--profile` gives
     others, for the recordings of that profile's name (or, with --all, for every recording).
@@ -35,7 +35,7 @@ class LabelCommand:
     all: bool = False
     """Use that profile's conditions for recordings that another profile read, too."""
     dry_run: bool = False
-    """Do all but write: say what would change."""
+    """Do everything but write, and print what would change."""
     json: bool = False
     """Print one JSON document: {"version", "recordings": [{"recording_id", "changed", …}]}."""
 

@@ -20,12 +20,12 @@ _WIDE = 110  # columns of a terminal from which on the table says more
 
 @dataclass
 class MixCommand:
-    """A pinned replay panel: which transitions a run is fed, in which shares.
+    """Make a pinned replay panel: which transitions a run samples, in which shares.
 
-    Works a mixture out against a store and packs the chosen transitions into one memory-mapped
-    file. The plan says for each stratum what is there, what was wanted and what it got, how often
-    each of its rows will be replayed, and what is left of its share after importance weights. A
-    panel never changes; its id names the store version, the mixture, the task and the rows.
+    Applies a mixture to a store and packs the chosen transitions into one memory-mapped
+    file. The plan shows for each stratum its rows, the wanted and the actual share, how often
+    each of its rows will be replayed, and its share after importance weights. A
+    panel never changes; its id is a hash of store version, mixture, task and rows.
     """
 
     store: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")] = None
@@ -37,14 +37,14 @@ class MixCommand:
     dry_run: bool = False
     """Only show the plan; write nothing."""
     force: bool = False
-    """Replace a panel that is already there."""
+    """Replace an existing panel."""
     version: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Version of the store to take (the newest)."""
+    """Version of the store (default: the newest)."""
     memory_limit: Annotated[str | None, tyro.conf.arg(metavar="SIZE")] = None
-    """What DuckDB may hold in memory, e.g. 1GB; panels are packed in little more, whatever their
+    """Limit of DuckDB's memory, e.g. 1GB; packing needs little more, whatever the panel's
     size."""
     verify: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
-    """Check every byte of a panel that is there, and do nothing else."""
+    """Check every byte of an existing panel, and do nothing else."""
     schema: bool = False
     """Print the JSON Schema of mixture files, for editors, and nothing else."""
     json: bool = False

@@ -18,11 +18,11 @@ class ProfileCommand:
     """Propose a profile for an unknown robot, or check one against a recording.
 
     `restock profile new RECORDING` proposes one from what is in the file: topics by type and name,
-    rates, clocks, frames, the speeds that were commanded, with a comment at each guess; and, to be
-    taken in by removing a #, every field that might become a column of its own. It is printed, or
+    rates, clocks, frames, the speeds that were commanded, with a comment at each guess; and,
+    commented out with a #, every field that might become a custom column. It is printed, or
     written to --out.
 
-    `restock profile check PROFILE RECORDING` says what would be used, what is missing (and what
+    `restock profile check PROFILE RECORDING` shows what would be used, what is missing (and what
     the recording has instead), how many transitions there would be and what each condition would
     label. Nothing is written. Exit code 2 where the profile does not fit.
     """

@@ -35,15 +35,15 @@ class SqlCommand:
     query: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[QUERY]")] = None
     """The query, or - to read it from stdin; a prompt without one."""
     run_dir: Annotated[Path | None, tyro.conf.arg(name="run", metavar="RUN")] = None
-    """A run whose tables are to be had beside, as run.audit, run.strata, …"""
+    """A run whose tables are joined as run.audit, run.strata, …"""
     panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
-    """A panel whose tables are to be had beside, as panel.rows, panel.strata."""
+    """A panel whose tables are joined as panel.rows, panel.strata."""
     json: bool = False
     """Print a list of row objects."""
     csv: bool = False
     """Print CSV with a header."""
     memory_limit: Annotated[str | None, tyro.conf.arg(metavar="SIZE")] = None
-    """What DuckDB may hold in memory, e.g. 4GB; beyond that it spills to a temporary folder."""
+    """Limit of DuckDB's memory, e.g. 4GB; beyond that it spills to a temporary folder."""
     export: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write a store's views for any DuckDB: an init file (.sql) or a database (.duckdb)."""
 

@@ -17,13 +17,14 @@ class CompareCommand:
     """Compare two methods, unless their critics were fed differently: then it is refused, exit 1.
 
     Name the treatment: the one thing that may differ. Under `algorithm` (network, loss, optimizer)
-    and `target` (the target rule) the arms must have been fed the same rows in the same mix,
-    which an equivalence test over episodes decides, and been evaluated alike. Under `mixture` the
-    feed is what is compared, and the store, the algorithm, the target rule, the evaluation and
-    the numbers of steps and updates must be the same. Under `method` all of how an arm learns may
-    differ (replay, target rule, updates); the twin, the environment steps and the evaluation not.
+    and `target` (the target rule) the arms must have been fed the same rows in the same mix, which
+    an equivalence test over episodes decides, and been evaluated in the same way. Under `mixture`
+    the feed is what is compared, and the store, the algorithm, the target rule, the evaluation and
+    the numbers of steps and updates must be the same. Under `method` everything about how an arm
+    learns may differ (replay, target rule, updates), but not the twin, the environment steps and
+    the evaluation.
 
-    Several seeds an arm show more: `restock compare runs/a1 runs/a2 --against runs/b1 runs/b2`
+    With several seeds per arm: `restock compare runs/a1 runs/a2 --against runs/b1 runs/b2`
 
     Example: `restock compare runs/uniform runs/quotas --treatment mixture`
     """
@@ -35,7 +36,7 @@ class CompareCommand:
     treatment: Literal["algorithm", "target", "mixture", "method"] = "algorithm"
     """What is compared, and so may differ."""
     all_checks: bool = False
-    """Show every check of the gate, not only the ones that decided."""
+    """Show every check, not only the deciding ones."""
     json: bool = False
     """Print the verdict, the differences, the checks and the outcomes as JSON."""
 

@@ -17,10 +17,10 @@ class DiagnoseCommand:
     """Tell a failure of the buffer from a failure of the target.
 
     Compares replay with the periodic evaluations' own steps, which no replay has, condition by
-    condition: the critic's TD error, how often it is met, what it looks like. And the online
-    network with the target network. Says HEALTHY, BUFFER, TARGET, BOTH, DIVERGENCE or
-    UNDETERMINED, on what evidence, and which experiment would confirm it. Figures are of the last
-    three evaluations; most of the runs must agree.
+    condition: the critic's TD error, its frequency, its rows; and the online network with the
+    target network. The verdict is HEALTHY, BUFFER, TARGET, BOTH, DIVERGENCE or UNDETERMINED, with
+    the evidence and the experiment that would confirm it. Figures are of the last three
+    evaluations; most of the runs must agree.
 
     Example: `restock diagnose runs/a runs/a-seed1 runs/a-seed2`
     """

@@ -11,11 +11,11 @@ import tyro
 
 @dataclass
 class EvalCommand:
-    """Drive a run's kept policy through fixed episodes, beside the scripted planner and chance.
+    """Drive a run's kept policy through fixed episodes, beside the scripted and a random policy.
 
-    Every policy meets the same seeded episodes of every condition that its floors have room for,
+    Every policy drives the same seeded episodes of every condition that its floors have room for,
     clean and under each perturbation. Prints success with 95 % Wilson intervals, contacts, time and
-    return, blocked aisles apart by partly and wholly, and writes RUN/eval/episodes.parquet.
+    return, with partly and wholly blocked aisles apart, and writes RUN/eval/episodes.parquet.
 
     With --baseline it is compared with another run or a saved baseline on the same episodes.
     With --on-logs nothing drives: off-policy evaluation on logged episodes that it did not
@@ -38,13 +38,13 @@ class EvalCommand:
     baseline: str | None = None
     """Compare with this run, or a saved baseline, on the same episodes, per condition."""
     margin: float = 0.05
-    """With --baseline: a success lower by more than this, and surely lower, is worse."""
+    """With --baseline: a success lower by more than this, with the interval below 0, is worse."""
     check: bool = False
-    """With --baseline: exit 1 where something is worse, or cannot be compared."""
+    """With --baseline: exit 1 where a condition is worse, or cannot be compared."""
     save_as_baseline: str | None = None
     """Keep the evaluation as baselines/NAME.parquet (or in the .parquet file that is named)."""
     drive: bool = True
-    """--no-drive takes the episodes that RUN/eval/episodes.parquet has."""
+    """--no-drive uses the episodes in RUN/eval/episodes.parquet."""
     on_logs: str | None = None
     """Off-policy evaluation on a store's episodes, or on those that a panel holds out. "own": its
     own panel."""

@@ -18,8 +18,8 @@ class ReportCommand:
 
     What the critic was fed (intended, drawn and available share per stratum, ages, behaviour
     policies), learning curves, TD error by condition, target lag, success per condition with
-    intervals against planner and random (run `restock eval RUN` first), a map of where the logs
-    have been and where the agent failed, and where all of it comes from.
+    intervals against planner and random (run `restock eval RUN` first), a map of the logs'
+    positions and of the agent's failures, and the provenance of all of it.
 
     A gap between twin and logs that `restock twin gap` measured into RUN/gap, or into the gap
     folder of the panel's store, is a section of it. Of a STORE the page is about its gap alone,

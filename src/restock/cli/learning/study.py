@@ -12,11 +12,11 @@ import tyro
 
 @dataclass
 class StudyCommand:
-    """Train and evaluate every arm of a study with every seed, then compare them through the gate.
+    """Train and evaluate every arm of a study with every seed, then compare them.
 
     The study is a TOML file: a store, arms (a mixture or a panel, and settings), seeds, what is
     compared. Each run is a directory under OUT/runs. What already exists is not done again, so
-    an interrupted study goes on where it was: run the same command. Ends with OUT/study.md and
+    the same command continues an interrupted study. Ends with OUT/study.md and
     OUT/study.json. See docs/study.md.
 
     Example: `restock study mixtures.toml --out studies/mixtures --workers 2`
@@ -33,7 +33,7 @@ class StudyCommand:
     dry_run: bool = False
     """Check the study and print what would be run; write nothing."""
     json: bool = False
-    """Print what was found as JSON."""
+    """Print the result as JSON."""
 
     def run(self) -> int:
         from json import dumps

@@ -18,13 +18,13 @@ _TABLES = ("clocks", "signals", "stand_ins")  # of a manifest: for `--json` and 
 
 @dataclass
 class TraceCommand:
-    """Where did a row that the critic was fed come from? Down to the recording's messages.
+    """Trace a sampled row to its source, down to the recording's messages.
 
     Of a RUN, ROW is an audited row, STEP/ROW: the gradient step and the row of its batch. Without
     ROW it lists those with the largest TD errors. Of a PANEL, ROW is a row number; of a STORE, a
     transition id. Shows the audited row, the row of the panel and of the store it was drawn from,
-    the recording and the moment it lies at, and, with --recording, the messages that were held at
-    that tick. A fresh row leads to its episode in the twin, and to what lays that out again.
+    the recording and its time in it, and, with --recording, the messages that were held at
+    that tick. A fresh row leads to its episode in the twin, and to the spec that draws it again.
     """
 
     place: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|PANEL|STORE")]
@@ -34,7 +34,7 @@ class TraceCommand:
     recording: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
     """The recording it is from: shows the messages it was made of."""
     profile: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
-    """The profile that read the recording, where it is one of your own."""
+    """The profile that read the recording, if it is not a shipped one."""
     store: Annotated[str | None, tyro.conf.arg(metavar="STORE")] = None
     """Where the store is now, if it was moved."""
     panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None

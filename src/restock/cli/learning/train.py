@@ -25,12 +25,12 @@ class TrainCommand:
 
     Writes a run directory: resolved config, metrics and replay audit as Parquet, checkpoints (the
     latest, and the best by greedy evaluation on fixed episodes) and TensorBoard events. Ctrl-C
-    writes a checkpoint and exits 130; `--resume RUN` goes on exactly where it was. docs/train.md
-    explains the recipe and every key of the config.
+    writes a checkpoint and exits 130; `--resume RUN` continues exactly where it stopped.
+    docs/train.md explains the recipe and every key of the config.
     """
 
     out: Path | None = None
-    """Directory of the new run; it must not be there yet."""
+    """Directory of the new run; it must not exist yet."""
     panel: Path | None = None
     """Panel from `restock mix`. Without one, training is online only."""
     config: Path | None = None
@@ -38,10 +38,10 @@ class TrainCommand:
     set: Annotated[list[str], tyro.conf.UseAppendAction] = field(default_factory=list)
     """One key of the config, e.g. --set optimizer.learning_rate=1e-4; may be repeated."""
     resume: Path | None = None
-    """Go on with this run, from its latest checkpoint."""
+    """Continue this run from its latest checkpoint."""
     from_env_steps: int | None = None
     """With --resume: from the earlier checkpoint that was taken after so many environment steps
-    (record.keep_checkpoints says how many are kept); what came after it is forgotten."""
+    (record.keep_checkpoints says how many are kept); what came after it is discarded."""
     env_steps: int | None = None
     """Budget in environment steps (schedule.env_steps)."""
     seconds: float | None = None
@@ -49,10 +49,10 @@ class TrainCommand:
     seed: int | None = None
     """Seed of networks, exploration, batches and episodes."""
     device: Literal["cpu", "cuda"] | None = None
-    """Where the network lives."""
+    """Device of the network."""
     flush_fresh: Path | None = None
     """Put the twin's labelled episodes in this store at the end, as a recording of format `twin`.
-    They are kept in the run's directory from the moment this is given."""
+    They are kept in the run's directory as soon as this is given."""
     dry_run: bool = False
     """Check everything and print the resolved config; write nothing."""
     json: bool = False

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 class FitCommand:
     """Fit the twin's robot to a store's logs, and write a perturbation that training uses.
 
-    Drives the logged commands again in the twin, open loop on an empty floor, and looks for the
+    Drives the logged commands again in the twin, open loop on an empty floor, and searches for the
     friction, payload, wheel radius, track, latency and gain under which it moves as the robot
     did: first over the whole ranges on few segments, then by least squares on all. What the log
     does not identify stays as it was, with the reason; a quarter of the log is held out to show the
@@ -31,24 +31,24 @@ class FitCommand:
     """Where the perturbation goes, as TOML; with --per-recording a schedule over the robots.
     Nothing is overwritten."""
     parameters: str | None = None
-    """Which ones, e.g. latency_s,gain (default: all but left_friction_scale)."""
+    """Which parameters, e.g. latency_s,gain (default: all but left_friction_scale)."""
     recording: tuple[str, ...] = ()
     """Only these recordings, by their ids."""
     per_recording: bool = False
     """Fit each recording by itself, for robots that differ."""
     base: Path | None = None
-    """A perturbation (TOML) with what is not fitted, and to compare with; default the nominal."""
+    """A perturbation (TOML): values that are not fitted, and the reference (default: nominal)."""
     timestep_s: float | None = None
     """Physics timestep to fit at; values are effective, so the one training uses (default: the
     base's, .01)."""
     horizon_s: float = 3.0
     """Length of the segments that are driven again."""
     held_out: float = 0.25
-    """Share of the log kept from the fit: whole recordings of four or more, else each one's end."""
+    """Share of the log held out: whole recordings where there are four, else the end of each."""
     search: int = 64
     """Points of the coarse search, a power of two."""
     segments: int = 200
-    """Fit so many segments at most."""
+    """Number of segments at most."""
     seed: int = 0
     """Of the search, the draw of segments and the bootstrap."""
     threads: int = 1

@@ -20,10 +20,10 @@ _IN_SAMPLE = (
 
 @dataclass
 class GapCommand:
-    """Drive a store's logged commands again in the twin, and say how far it is from the log.
+    """Drive a store's logged commands again in the twin, and measure how far it is from the log.
 
-    Per condition: how far pose and signals are off after 1, 3 and 6 s, open loop, and how far
-    observation and reward are off after one step from each logged state; of the nominal twin, and
+    Per condition: the error of pose and signals after 1, 3 and 6 s, open loop, and of
+    observation and reward after one step from each logged state; of the nominal twin, and
     with --perturbation of a calibrated one beside it. Beside them odometry, dead-reckoned, and
     the floor that localisation noise sets. Names the conditions in which the twin should not be
     trusted, by the limits below, each with 95 % confidence over episodes. See docs/calibration.md.
@@ -45,7 +45,7 @@ class GapCommand:
     horizons: str = "1,3,6"
     """Seconds to drive open loop."""
     trust_horizon_s: float = 3.0
-    """Trust is judged at this one."""
+    """The horizon of the verdict."""
     trust_position_m: float = 0.2
     """Trusted where nine in ten segments end within this of the log."""
     trust_reward: float = 1.0
@@ -55,7 +55,7 @@ class GapCommand:
     min_episodes: int = 5
     """From fewer a condition is unknown."""
     most: int = 400
-    """Segments a condition and horizon at most, drawn evenly; of single steps five times as many.
+    """Segments per condition and horizon at most, drawn evenly; of single steps five times as many.
     """
     seed: int = 0
     """Of that draw, the floor's noise and the bootstrap."""

@@ -13,7 +13,7 @@ from restock.errors import RestockError
 
 @dataclass
 class LayoutCommand:
-    """Look at a floor: its size, aisles and goals, and which episodes fit on it.
+    """Describe a floor: its size, aisles and goals, and which episodes fit on it.
 
     A floor is `default`, `generated:SEED`, `narrow:SEED`, a TOML file, or the map.yaml of a ROS
     occupancy map. --out writes it as TOML, or as map.yaml with a PGM. See docs/layouts.md.
@@ -28,7 +28,7 @@ class LayoutCommand:
     png: Path | None = None
     """Draw it here, from above."""
     json: bool = False
-    """Print what is known of it as JSON."""
+    """Print the description as JSON."""
 
     def run(self) -> int:
         """Print, and write what was asked for."""

@@ -17,9 +17,9 @@ LEARNED = "dqn"  # the behaviour policy's name of what `restock train` made
 
 @dataclass
 class RecordCommand:
-    """Drive the simulated stand-in for the hardware and write what a real robot would log.
+    """Drive a simulated robot and write what a real one would log.
 
-    The stand-in is the twin with other friction, payload, wheels, latency and sensors than
+    It is the twin with other friction, payload, wheels, latency and sensors than
     training assumes. It drives one mission after another, and writes odometry, lidar, IMU,
     localisation, plans, commands, transforms and diagnostics, each at its own rate, delay and
     resolution, to an MCAP file or a rosbag2 folder that any ROS 2 tool opens. Recording pauses
@@ -45,23 +45,23 @@ class RecordCommand:
     """Shares of missions, e.g. nominal=.8,wheel_slip=.1,near_collision=.1 (default: the natural
     nominal=.8,wheel_slip=.07,blocked_aisle=.07,near_collision=.06)."""
     policy: str = "handover"
-    """Who drives: handover, planner, operator, random, run:DIRECTORY (what that run kept), or
+    """The driver: handover, planner, operator, random, run:DIRECTORY (what that run kept), or
     onnx:FILE. handover is the fleet: planners, an operator who takes over when one is stuck, and
     some missions that an operator drives throughout."""
     epsilon: float | None = None
     """Share of random actions (default: the scripted drivers' own, none of a learned policy)."""
     perturbation: str | None = None
-    """Effective parameters in place of the stand-in's: a name as in `restock eval`, or a TOML file
-    of a perturbation, or of a schedule that draws one for every mission."""
+    """Effective parameters in place of the default ones: a name as in `restock eval`, or a TOML
+    file of a perturbation, or of a schedule that draws one for every mission."""
     layouts: str = "default"
     """The floors: default, generated:train, FILE.toml, map.yaml, … as `restock train` takes them; a
     mission is on one of them that its seed draws."""
     rates: str | None = None
     """Messages a second of some topics, e.g. odom=20,scan=5."""
     exact: bool = False
-    """Record the nominal twin without sensor noise instead of the stand-in: to check a pipeline."""
+    """Record the nominal twin without sensor noise instead: to check a pipeline."""
     dry_run: bool = False
-    """Say what would be driven and written, and write nothing."""
+    """Print what would be driven and written, and write nothing."""
     json: bool = False
     """Print one JSON document: {"path", "format", "missions", "messages", "topics", …}."""
 

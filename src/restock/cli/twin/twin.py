@@ -14,8 +14,8 @@ from restock.cli.twin.layout import LayoutCommand
 
 @dataclass
 class TwinCommand:
-    """The twin against the logs, how its robot is fitted to them and how far it is from them; and
-    the floors it drives on.
+    """Fit the twin's robot to logs, measure its gap to them, and describe the floors it drives
+    on.
 
     See docs/calibration.md and docs/layouts.md. `restock twin JOB --help` explains one job.
     """
