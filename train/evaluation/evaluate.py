@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from restock.ingest.task.signals import Signals
 from restock.stats import wilson
 from restock.train.feed.fresh_log import values_entries
-from restock.train.twin.env.interface import Policy, Twin
+from restock.train.twin.env.interface import Policy, Step, Twin
 from restock.train.twin.physics.episode import EpisodeSpec
 
-Step = tuple[Any, Any, Any, Any, dict[str, Any]]  # as Gymnasium's `step` returns it
 Stepper = Callable[[NDArray[np.float32], NDArray[np.int64]], Step]
 
 STUCK_WINDOW_S, STUCK_RADIUS_M = 10.0, 0.5

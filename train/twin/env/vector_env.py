@@ -49,7 +49,7 @@ from restock.train.twin.env.action_face import Face, action_face
 from restock.train.twin.env.camera import Renderer, View
 from restock.train.twin.env.episode_queue import EpisodeQueue
 from restock.train.twin.env.floor_report import refuse_unfit
-from restock.train.twin.env.interface import DEFAULT_CONDITIONS
+from restock.train.twin.env.interface import DEFAULT_CONDITIONS, Info, Step
 from restock.train.twin.env.navigation import Navigation
 from restock.train.twin.floors.floors import floors_of
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
@@ -239,7 +239,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    ) -> tuple[NDArray[np.float32], Info]:
         """Begin an episode everywhere, or where `options["reset_mask"]` (N,) says."""
         super().reset(seed=seed)
         ids = np.arange(self.num_envs)
@@ -256,15 +256,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         self._begin(ids)
         return self.observation.copy(), self._info_now()
 
-    def step(
-        self, actions: NDArray[Any]
-    ) -> tuple[
-        NDArray[np.float32],
-        NDArray[np.float32],
-        NDArray[np.bool_],
-        NDArray[np.bool_],
-        dict[str, Any],
-    ]:
+    def step(self, actions: NDArray[Any]) -> Step:
         """One control period everywhere. `actions` (N,) index the task's actions, or are (N, 2)."""
         action, command, chosen = self.face.read(actions)
         now, sim, task = self.signals, self.simulation, self.task
@@ -308,7 +300,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         for name, column in rows.items():
             after[name][ids] = column
 
-    def _info_now(self) -> dict[str, Any]:
+    def _info_now(self) -> Info:
         return {
             "signals": {name: column.copy() for name, column in self.signals.items()},
             "episode_condition": self.episode_condition.copy(),
@@ -330,7 +322,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         progress_m: NDArray[np.float64],
         ended: NDArray[np.bool_],
         invalid: NDArray[np.bool_],
-    ) -> dict[str, Any]:
+    ) -> Info:
         sim = self.simulation
         condition = self.truth.conclude(sim.slipped, sim.bumped, self.sensing.true_clearance_m)
         return self._info_now() | {
