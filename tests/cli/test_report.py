@@ -21,8 +21,7 @@ from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
 from restock.replay.store.store import Store
 from restock.report import build_report
-from restock.report.facts import gather
-from restock.report.feed import evaluation_bias
+from restock.report.facts import evaluation_bias, gather
 from restock.stats import ConfidenceInterval
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES, TABLES
@@ -267,7 +266,7 @@ def test_a_measured_gap_is_a_section(run: Path, tmp_path: Path) -> None:
 
 
 def test_drawn_shares_are_over_the_whole_run(run: Path) -> None:
-    fed = {(r["source"], r["stratum"]): r for r in gather(run).fed}
+    fed = {(r["source"], r["stratum"]): r for r in gather(run).sampled}
     assert fed["logs", "nominal"]["drawn_rows"] == 180
     assert fed["logs", "nominal"]["drawn_share"] == pytest.approx(0.9)
     assert fed["fresh", HOSTILE]["drawn_share"] == pytest.approx(0.1)
@@ -286,7 +285,7 @@ def test_shares_after_weights_count_intervals_by_what_was_drawn_in_them(tmp_path
         ],
     )
     made.flush()
-    fed = {row["stratum"]: row["effective_share"] for row in gather(made.path).fed}
+    fed = {row["stratum"]: row["effective_share"] for row in gather(made.path).sampled}
     assert fed == pytest.approx({"a": 0.95, "b": 0.05})
 
 

@@ -1,51 +1,57 @@
-"""The building blocks of the page: sections, tables, and numbers as people read them."""
+"""The building blocks of the page: sections, tables, figures, and numbers as people read them."""
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
-from restock.report.facts import Facts, Rows
-
-Section = dict[str, Any]
+Rows = list[dict[str, Any]]
 
 
-def section(
-    name: str,
-    title: str,
-    *,
-    intro: str = "",
-    callout: str = "",
-    figures: Sequence[dict[str, Any]] = (),
-    two: bool = False,
-    tables: Sequence[dict[str, Any]] = (),
-    details: str = "",
-    details_title: str = "",
-) -> Section:
-    drawn = [{"title": "", "caption": "", **figure} for figure in figures]
-    return {
-        "id": name,
-        "title": title,
-        "intro": intro,
-        "callout": callout,
-        "figures": drawn,
-        "two": two,
-        "tables": list(tables),
-        "details": details,
-        "details_title": details_title,
-    }
+@dataclass(frozen=True)
+class Figure:
+    """One chart as SVG."""
+
+    svg: str
+    title: str = ""
+    caption: str = ""
 
 
-def table(
-    rows: Rows, *, numbers: set[str] | None = None, title: str = "", caption: str = ""
-) -> dict[str, Any]:
-    return {
-        "title": title,
-        "caption": caption,
-        "columns": list(rows[0]) if rows else [],
-        "rows": rows,
-        "numbers": numbers or set(),
-    }
+@dataclass(frozen=True)
+class Table:
+    """Rows with the same keys, which are the columns; those in `numbers` are right-aligned."""
+
+    rows: Rows
+    numbers: frozenset[str] | set[str] = frozenset()
+    title: str = ""
+    caption: str = ""
+
+    @property
+    def columns(self) -> list[str]:
+        return list(self.rows[0]) if self.rows else []
+
+
+@dataclass(frozen=True)
+class Section:
+    """A section of the page; its figures side by side if `two`."""
+
+    id: str
+    title: str
+    intro: str = ""
+    callout: str = ""
+    figures: Sequence[Figure] = ()
+    two: bool = False
+    tables: Sequence[Table] = field(default_factory=list)
+    details: str = ""
+    details_title: str = ""
+
+
+def words(name: str) -> str:
+    """`blocked_aisle` to `blocked aisle`."""
+    return name.replace("_", " ")
 
 
 def estimate(row: dict[str, Any]) -> str:
@@ -68,23 +74,19 @@ def count(value: int | None) -> str:
 
 
 def number(value: float | None) -> str:
-    return "" if value is None else f"{value:.3f}"
+    return "" if value is None else f"{round(value, 3) + 0.0:.3f}"  # no -0.000
 
 
-def mean(cells: Rows) -> float:
-    return float(sum(row["success"] for row in cells) / len(cells))
+def span(seconds: float) -> str:
+    """A duration for people."""
+    if not math.isfinite(seconds):
+        return "?"
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    if seconds < 5400:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h"
 
 
-def clean_cells(facts: Facts, perturbation: str = "none", policy: str = "agent") -> Rows:
-    return [
-        row
-        for row in facts.cells
-        if row["policy"] == policy and row["perturbation"] == perturbation
-    ]
-
-
-def target_rule(facts: Facts) -> str:
-    rule = facts.config.get("config", {}).get("target", {})
-    if rule.get("rule") == "polyak":
-        return f"Polyak τ {rule['tau']:g}"
-    return f"hard, every {rule['every']:,}" if rule.get("rule") == "hard" else "?"
+def pretty(document: Any) -> str:
+    return json.dumps(document, indent=2, default=str)

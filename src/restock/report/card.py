@@ -12,12 +12,11 @@ from typing import Any
 
 import msgspec
 
-from restock.report.blocks import estimate
-from restock.report.facts import Facts, Rows
-from restock.report.feed import evaluation_bias
+from restock.report.blocks import Rows, count, estimate, number
+from restock.report.facts import Facts, evaluation_bias
 
 FORMAT = "restock-replay-card/1"
-_UNKNOWN = "not known: run `restock eval` on a run whose panel and store are at hand"
+_UNKNOWN = "unknown: run `restock eval` on a run whose panel and store are at hand"
 
 
 def replay_card(facts: Facts) -> dict[str, Any]:
@@ -26,7 +25,7 @@ def replay_card(facts: Facts) -> dict[str, Any]:
     replay = settings.get("replay", {})
     panel = facts.panel
     mixture = msgspec.to_builtins(panel.header.mixture) if panel is not None else None
-    logs = [row for row in facts.fed if row["source"] == "logs"]
+    logs = [row for row in facts.sampled if row["source"] == "logs"]
     return {
         "format": FORMAT,
         "run": str(facts.run),
@@ -48,30 +47,19 @@ def replay_card(facts: Facts) -> dict[str, Any]:
         },
         "ages": [_ages(facts.ages, *key) for key in _keys(facts.ages, "source", "unit")],
         "target": facts.config.get("target") or settings.get("target"),
-        "conditions": [
-            {
-                name: row[name]
-                for name in (
-                    *("source", "condition", "drawn_rows", "drawn_share", "effective_share"),
-                    "td_abs_mean",
-                )
-            }
-            for row in facts.conditions
-        ],
-        "strata": [
-            {
-                name: row[name]
-                for name in (
-                    *("source", "stratum", "timing", "available_rows", "quota_share"),
-                    *("drawn_rows", "drawn_share", "effective_share", "terminal_share"),
-                )
-            }
-            for row in facts.fed
-        ],
-        "behaviour_policies": [
-            {name: row[name] for name in ("source", "behaviour_policy", "rows", "share")}
-            for row in facts.policies
-        ],
+        "conditions": _columns(
+            facts.conditions,
+            *("source", "condition", "drawn_rows", "drawn_share", "effective_share"),
+            "td_abs_mean",
+        ),
+        "strata": _columns(
+            facts.sampled,
+            *("source", "stratum", "timing", "available_rows", "quota_share"),
+            *("drawn_rows", "drawn_share", "effective_share", "terminal_share"),
+        ),
+        "behaviour_policies": _columns(
+            facts.policies, "source", "behaviour_policy", "rows", "share"
+        ),
         "corrections": {
             "rules": mixture.get("correction") if mixture is not None else None,
             "post_strata": [row["stratum"] for row in logs if row["timing"] == "post"],
@@ -80,45 +68,21 @@ def replay_card(facts: Facts) -> dict[str, Any]:
             )
             / 2,
         },
-        "off_policy": [
-            {
-                name: row[name]
-                for name in (
-                    *("measure", "estimator", "value", "low", "high", "refused", "episodes"),
-                    *("ess", "horizon", "epsilon", "estimated_share"),
-                )
-            }
-            for row in facts.off_policy
-        ],
+        "off_policy": _columns(
+            facts.off_policy,
+            *("measure", "estimator", "value", "low", "high", "refused", "episodes"),
+            *("ess", "horizon", "epsilon", "estimated_share"),
+        ),
         "left_out": dict(panel.header.left_out) if panel is not None else None,
         "imbalance": evaluation_bias(facts) or None,
         "missing": list(facts.missing),
     }
 
 
-def as_markdown(card: dict[str, Any]) -> str:
-    """The card as a page of Markdown."""
-    capacity, sampling = card["capacity"], card["sampling"]
-    lines = [f"# Replay card of {_cell(card['run'])}", ""]
-    lines += [f"**Evaluation bias.** {_cell(card['imbalance'] or _UNKNOWN)}", ""]
-    facts = {
-        "Capacity": f"{_count(capacity['ring_rows'])} fresh rows; {_panel(capacity)}",
-        "Sampling rule": f"batches of {_or_none(sampling['batch_size'])},"
-        f" {_percent(sampling['logs_share'])} of all rows from logs, the offline phase among them:"
-        f" {sampling['logs'] or 'rule not known'}; fresh: {sampling['fresh'] or 'none'}",
-        "Returns": f"{_or_none(sampling['n_step']['logs'])}-step in the logs,"
-        f" {_or_none(sampling['n_step']['fresh'])}-step fresh",
-        "Target rule": _words(card["target"]),
-        "Corrections": f"{_words(card['corrections']['rules'])}; outcome strata:"
-        f" {', '.join(card['corrections']['post_strata']) or 'none'}; weights moved"
-        f" {_percent(card['corrections']['moved_by_weights'])} of the logs' mix",
-        "Left out of the panel": _words(card["left_out"]),
-    }
-    lines += ["| | |", "| --- | --- |"]
-    lines += [f"| {name} | {_cell(value)} |" for name, value in facts.items()]
-    lines += ["", "## Conditions in the sampled batches", ""]
-    lines += _table(
-        card["conditions"],
+_TABLES = (
+    (
+        "Conditions in the sampled batches",
+        "conditions",
         {
             "source": "source",
             "condition": "condition",
@@ -127,10 +91,10 @@ def as_markdown(card: dict[str, Any]) -> str:
             "effective_share": "after weights",
             "td_abs_mean": "mean absolute TD error at the end",
         },
-    )
-    lines += ["", "## Strata: asked for and drawn", ""]
-    lines += _table(
-        card["strata"],
+    ),
+    (
+        "Strata: asked for and drawn",
+        "strata",
         {
             "source": "source",
             "stratum": "stratum",
@@ -141,32 +105,50 @@ def as_markdown(card: dict[str, Any]) -> str:
             "effective_share": "after weights",
             "terminal_share": "terminal",
         },
-    )
-    lines += ["", "## Age of the sampled rows", ""]
-    lines += _table(
-        card["ages"],
-        {
-            "source": "source",
-            "unit": "unit",
-            "rows": "rows",
-            "p50": "p50",
-            "p90": "p90",
-            "p99": "p99",
-        },
-    )
-    lines += ["", "## Whose behaviour it was", ""]
-    lines += _table(
-        card["behaviour_policies"],
+    ),
+    (
+        "Age of the sampled rows",
+        "ages",
+        {name: name for name in ("source", "unit", "rows", "p50", "p90", "p99")},
+    ),
+    (
+        "Whose behaviour it was",
+        "behaviour_policies",
         {"source": "source", "behaviour_policy": "policy", "rows": "rows", "share": "share"},
-    )
-    if card["off_policy"]:
-        lines += ["", "## Off-policy evaluation on held-out logs, before it drove", ""]
-        lines += _table(
-            [{**row, "value": estimate(row)} for row in card["off_policy"]],
-            {"measure": "measure", "estimator": "estimator", "value": "value [95 %]"},
-        )
+    ),
+    (
+        "Off-policy evaluation on held-out logs, before it drove",
+        "off_policy",
+        {"measure": "measure", "estimator": "estimator", "value": "value [95 %]"},
+    ),
+)
+
+
+def as_markdown(card: dict[str, Any]) -> str:
+    """The card as a page of Markdown."""
+    capacity, sampling = card["capacity"], card["sampling"]
+    lines = [f"# Replay card of {_cell(card['run'])}", ""]
+    lines += [f"**Evaluation bias.** {_cell(card['imbalance'] or _UNKNOWN)}", ""]
+    facts = {
+        "Capacity": f"{count(capacity['ring_rows'])} fresh rows; {_panel(capacity)}",
+        "Sampling rule": f"batches of {_or_none(sampling['batch_size'])},"
+        f" {_percent(sampling['logs_share'])} of all rows from logs, the offline phase among them:"
+        f" {sampling['logs'] or 'rule unknown'}; fresh: {sampling['fresh'] or 'none'}",
+        "Returns": f"{_or_none(sampling['n_step']['logs'])}-step in the logs,"
+        f" {_or_none(sampling['n_step']['fresh'])}-step fresh",
+        "Target rule": _words(card["target"]),
+        "Corrections": f"{_words(card['corrections']['rules'])}; outcome strata:"
+        f" {', '.join(card['corrections']['post_strata']) or 'none'}; weights moved"
+        f" {_percent(card['corrections']['moved_by_weights'])} of the logs' mix",
+        "Left out of the panel": _words(card["left_out"]),
+    }
+    lines += ["| | |", "| --- | --- |"]
+    lines += [f"| {name} | {_cell(value)} |" for name, value in facts.items()]
+    for title, key, columns in _TABLES:
+        if card[key] or key != "off_policy":
+            lines += ["", f"## {title}", "", *_table(card[key], columns)]
     if card["missing"]:
-        lines += ["", "## Not known", "", *(f"- {_cell(line)}" for line in card["missing"])]
+        lines += ["", "## Unknown", "", *(f"- {_cell(line)}" for line in card["missing"])]
     return "\n".join(lines) + "\n"
 
 
@@ -176,7 +158,7 @@ def _panel(capacity: dict[str, Any]) -> str:
     if capacity["panel_rows"] is None:
         return f"panel {capacity['panel']}, which is not at hand"
     return (
-        f"panel {capacity['panel']} of {_count(capacity['panel_rows'])} rows"
+        f"panel {capacity['panel']} of {count(capacity['panel_rows'])} rows"
         f" (store version {capacity['store_version']})"
     )
 
@@ -192,8 +174,12 @@ def _rule(mixture: dict[str, Any] | None) -> str | None:
 
 
 def _drawn_share(facts: Facts, source: str) -> float | None:
-    rows = sum(row["drawn_rows"] for row in facts.fed)
-    return sum(r["drawn_rows"] for r in facts.fed if r["source"] == source) / rows if rows else None
+    rows = sum(row["drawn_rows"] for row in facts.sampled)
+    return (
+        sum(r["drawn_rows"] for r in facts.sampled if r["source"] == source) / rows
+        if rows
+        else None
+    )
 
 
 def _keys(rows: Rows, *names: str) -> list[tuple[Any, ...]]:
@@ -202,50 +188,47 @@ def _keys(rows: Rows, *names: str) -> list[tuple[Any, ...]]:
 
 def _ages(rows: Rows, source: str, unit: str) -> dict[str, Any]:
     """Quantiles of a log2 histogram: the upper end of the bucket that each falls into."""
-    mine = sorted(
-        (row["bucket"], row["rows"])
+    buckets = sorted(
+        (row["bucket"], float(row["rows"]))
         for row in rows
         if (row["source"], row["unit"]) == (source, unit)
     )
-    total = sum(count for _, count in mine)
-    found: dict[str, Any] = {"source": source, "unit": unit, "rows": int(total)}
+    total = sum(rows_in_it for _, rows_in_it in buckets)
+    ages: dict[str, Any] = {"source": source, "unit": unit, "rows": int(total)}
     for name, part in (("p50", 0.5), ("p90", 0.9), ("p99", 0.99)):
         below = 0.0
-        for bucket, count in mine:
-            below += float(count)
-            if below >= part * float(total):
-                found[name] = f"below {2 ** (bucket + 1):,}"
+        for bucket, rows_in_it in buckets:
+            below += rows_in_it
+            if below >= part * total:
+                ages[name] = f"below {2 ** (bucket + 1):,}"
                 break
-    return found
+    return ages
 
 
-def _table(rows: list[dict[str, Any]], columns: dict[str, str]) -> list[str]:
+def _columns(rows: Rows, *names: str) -> Rows:
+    return [{name: row[name] for name in names} for row in rows]
+
+
+def _table(rows: Rows, columns: dict[str, str]) -> list[str]:
     if not rows:
         return ["nothing"]
-    numbers = {"available_rows", "drawn_rows", "rows"}
     lines = [f"| {' | '.join(columns.values())} |", f"|{' --- |' * len(columns)}"]
-    for row in rows:
-        cells = []
-        for name in columns:
-            value = row[name]
-            if name in numbers:
-                cells.append(_count(value))
-            elif name.endswith("share"):
-                cells.append(_percent(value))
-            elif name == "td_abs_mean":
-                cells.append(f"{value:.3f}")
-            else:
-                cells.append(_cell(value))
-        lines.append(f"| {' | '.join(cells)} |")
-    return lines
+    return lines + [f"| {' | '.join(_shown(row, name) for name in columns)} |" for row in rows]
+
+
+def _shown(row: dict[str, Any], name: str) -> str:
+    """A row's column as its cell shows it."""
+    if name in ("available_rows", "drawn_rows", "rows"):
+        return count(row[name])
+    if name.endswith("share"):
+        return _percent(row[name])
+    if name == "td_abs_mean":
+        return number(row[name])
+    return _cell(estimate(row) if name == "value" else row[name])
 
 
 def _percent(value: float | None) -> str:
     return "" if value is None else f"{value:.1%}"
-
-
-def _count(value: int | None) -> str:
-    return "" if value is None else f"{int(value):,}"
 
 
 def _or_none(value: Any) -> str:

@@ -73,13 +73,8 @@ def scale(names: Sequence[str], colours: Mapping[str, str]) -> alt.Scale:
 
 def ordered(rows: Sequence[Row], key: str, first: Mapping[str, str]) -> list[str]:
     """The values of a column: the known ones in their order, then the others by name."""
-    found = {str(row[key]) for row in rows}
-    return [name for name in first if name in found] + sorted(found - set(first))
-
-
-def words(name: str) -> str:
-    """`blocked_aisle` to `blocked aisle`."""
-    return name.replace("_", " ")
+    values = {str(row[key]) for row in rows}
+    return [name for name in first if name in values] + sorted(values - set(first))
 
 
 def success(rows: Sequence[Row]) -> str:

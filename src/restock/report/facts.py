@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -15,36 +13,24 @@ import pyarrow.parquet as pq
 from restock.errors import RestockError, RunError
 from restock.replay.panel.panel import Panel, Stratum
 from restock.replay.store.store import Store, read_parquet
+from restock.report.blocks import Rows, words
 from restock.stats import wilson
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES
 from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 
-Rows = list[dict[str, Any]]
 CELL_M = 0.25
 MOST_DOTS = 1500
-LISTS = (
-    "fed",
-    "conditions",
-    "ages",
-    "policies",
-    "learning",
-    "td",
-    "lag",
-    "loss",
-    "cells",
-    "failures",
-)
 
 
 @dataclass
 class Facts:
-    """Everything that the page is made of. Lists are empty where a run has not got there."""
+    """Everything that the page is made of. Lists are empty where a run is not that far yet."""
 
     run: Path
     config: dict[str, Any]
-    fed: Rows
+    sampled: Rows  # per source and stratum: available, intended, drawn
     conditions: Rows  # in the batches, whatever the strata are
     ages: Rows
     policies: Rows
@@ -68,6 +54,20 @@ class Facts:
     def strata(self) -> list[Stratum]:
         return [] if self.panel is None else list(self.panel.strata)
 
+    @property
+    def target_rule(self) -> str:
+        """How the target network follows, for people."""
+        rule = self.config.get("config", {}).get("target", {})
+        if rule.get("rule") == "polyak":
+            return f"Polyak τ {rule['tau']:g}"
+        return f"hard, every {rule['every']:,}" if rule.get("rule") == "hard" else "?"
+
+    def clean_cells(self, policy: str = "agent") -> Rows:
+        """The evaluation of a policy without perturbation."""
+        return [
+            row for row in self.cells if (row["policy"], row["perturbation"]) == (policy, "none")
+        ]
+
 
 def gather(path: Path) -> Facts:
     """Read a run.
@@ -86,23 +86,20 @@ def gather(path: Path) -> Facts:
         if file.exists():
             evaluated = pq.read_table(file, schema=EVAL_EPISODES)
         connection.register("evaluated", evaluated)
-        queries = _queries()
-        found = {name: _rows(connection, sql) for name, sql in queries.items()}
-    if not found["loss"]:
+        rows = {
+            name: _as_dicts(connection.execute(sql)) for name, sql in _queries("run.sql").items()
+        }
+    if not rows["loss"]:
         raise RunError(
             "has no update to report on yet",
             where=str(path),
             remedy="let it train past its first logging interval",
         )
-    for row in found["cells"]:
+    for row in rows["cells"]:
         row["success"] = row["successes"] / row["episodes"]
         row["low"], row["high"] = wilson(int(row["successes"]), int(row["episodes"]))
-    facts = Facts(
-        run=path,
-        config=run.document,
-        kept=found["kept"][0] if found["kept"] else None,
-        **{name: found[name] for name in LISTS},  # type: ignore[arg-type]
-    )
+    kept = rows.pop("kept")
+    facts = Facts(run=path, config=run.document, kept=kept[0] if kept else None, **rows)  # type: ignore[arg-type]
     facts.off_policy = [
         row for row in run.table("off_policy").to_pylist() if row["condition"] == "all"
     ]
@@ -115,8 +112,8 @@ def gather(path: Path) -> Facts:
 
 
 def _add_panel(facts: Facts) -> None:
-    said = facts.config.get("panel")
-    where = said.get("path") if isinstance(said, dict) else said
+    panel = facts.config.get("panel")
+    where = panel.get("path") if isinstance(panel, dict) else panel
     if not where:
         facts.missing.append("The run had no panel: it learnt from fresh experience alone.")
         return
@@ -151,15 +148,11 @@ def _store_rows(store: Store, name: str, **parameters: Any) -> Rows:
     return _as_dicts(store.connection.execute(sql, parameters or None))
 
 
-def _queries(name: str = "run.sql") -> dict[str, str]:
+def _queries(name: str) -> dict[str, str]:
     """The statements of a file, by the `-- name:` line before each."""
     text = (files("restock.report") / name).read_text(encoding="utf-8")
     parts = text.split("-- name: ")[1:]
     return {part.split("\n", 1)[0].strip(): part.split("\n", 1)[1] for part in parts}
-
-
-def _rows(connection: duckdb.DuckDBPyConnection, sql: str) -> Rows:
-    return _as_dicts(connection.execute(sql))
 
 
 def _as_dicts(cursor: duckdb.DuckDBPyConnection) -> Rows:
@@ -167,16 +160,42 @@ def _as_dicts(cursor: duckdb.DuckDBPyConnection) -> Rows:
     return [dict(zip(names, row, strict=True)) for row in cursor.fetchall()]
 
 
-def span(seconds: float) -> str:
-    """A duration for people."""
-    if not math.isfinite(seconds):
-        return "?"
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    if seconds < 5400:
-        return f"{seconds / 60:.0f} min"
-    return f"{seconds / 3600:.1f} h"
+def mean_success(cells: Rows) -> float:
+    return float(sum(row["success"] for row in cells) / len(cells))
 
 
-def pretty(document: Any) -> str:
-    return json.dumps(document, indent=2, default=str)
+def evaluation_bias(facts: Facts) -> str:
+    """The imbalance most likely to make the evaluation look better than deployment."""
+    cells = facts.clean_cells()
+    if not cells or not facts.logged:
+        return ""
+    by_condition: dict[str, Rows] = {}
+    for row in cells:
+        by_condition.setdefault(row["cell"].split(" (")[0], []).append(row)
+    success = {name: mean_success(rows) for name, rows in by_condition.items()}
+    episodes = sum(row["episodes"] for row in cells)
+    evaluated = {
+        name: sum(row["episodes"] for row in rows) / episodes for name, rows in by_condition.items()
+    }
+    logged = {row["condition"]: row["share"] for row in facts.logged if row["condition"] in success}
+    total = sum(logged.values())
+    if not total:
+        return ""
+    logged = {name: logged.get(name, 0.0) / total for name in success}
+    as_evaluated = sum(evaluated[name] * success[name] for name in success)
+    as_logged = sum(logged[name] * success[name] for name in success)
+    worst = max(success, key=lambda n: (evaluated[n] - logged[n]) * (success[n] - as_logged))
+    gain = (evaluated[worst] - logged[worst]) * (success[worst] - as_logged)
+    more = evaluated[worst] > logged[worst]
+    text = (
+        f"Evaluation against deployment: weighted as the logs' episodes met them, success would be"
+        f" {as_logged:.0%} instead of {as_evaluated:.0%}."
+    )
+    if gain <= 0.0005:
+        return text + " No condition's share biases the evaluation upward."
+    return text + (
+        f" The share that biases it most is {words(worst)}: {evaluated[worst]:.0%} of the"
+        f" evaluation's episodes, {logged[worst]:.0%} of the logs', and"
+        f" {'easier' if more else 'harder'} than average ({success[worst]:.0%}); it is worth"
+        f" {gain * 100:+.1f} points."
+    )

@@ -5,11 +5,9 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
-from restock.report.blocks import clean_cells, mean, target_rule
-from restock.report.charts import words
-from restock.report.facts import Facts, span
-from restock.report.feed import fed
-from restock.report.sections import critic, floor_map, learning, provenance, success
+from restock.report.blocks import span, words
+from restock.report.facts import Facts, mean_success
+from restock.report.sections import critic, learning, provenance, sampled, success, where
 from restock.report.twin_gap import run_section
 
 
@@ -17,10 +15,10 @@ def page(facts: Facts) -> dict[str, Any]:
     """Everything the template asks for."""
     sections = [
         success(facts),
-        fed(facts),
+        sampled(facts),
         learning(facts),
         critic(facts),
-        floor_map(facts),
+        where(facts),
         run_section(facts),
         provenance(facts),
     ]
@@ -37,10 +35,10 @@ def page(facts: Facts) -> dict[str, Any]:
 
 
 def _headline(facts: Facts) -> str:
-    cells = clean_cells(facts)
+    cells = facts.clean_cells()
     if not cells:
         return f"Run {facts.run.name}: trained, not yet evaluated"
-    average = mean(cells)
+    average = mean_success(cells)
     worst = min(cells, key=lambda row: row["success"])
     return (
         f"Success {average:.0%} on average over {len(cells)} kinds of episode, "
@@ -55,11 +53,11 @@ def _lead(facts: Facts) -> str:
         f"A DQN trained on {fed} for {last['env_steps']:,} environment steps and"
         f" {last['gradient_steps']:,} updates in {span(last['wall_s'])}."
     )
-    planner, random = clean_cells(facts, policy="planner"), clean_cells(facts, policy="random")
+    planner, random = facts.clean_cells("planner"), facts.clean_cells("random")
     if planner and random:
         text += (
-            f" On the same episodes the scripted planner reaches {mean(planner):.0%}"
-            f" and a random policy {mean(random):.0%}."
+            f" On the same episodes the scripted planner reaches {mean_success(planner):.0%}"
+            f" and a random policy {mean_success(random):.0%}."
         )
     return text
 
@@ -77,7 +75,7 @@ def _cards(facts: Facts) -> list[dict[str, str]]:
             "label": "capacity of the fresh ring, rows",
         },
         {"value": _sampling(facts), "label": "of each online batch from logs, by quotas"},
-        {"value": target_rule(facts), "label": "target rule"},
+        {"value": facts.target_rule, "label": "target rule"},
         {"value": f"{facts.loss[-1]['env_steps']:,}", "label": "environment steps"},
     ]
     if kept is not None:

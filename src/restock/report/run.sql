@@ -1,12 +1,12 @@
 -- What the report shows of a run, one statement a fact, named by the comment before it.
 -- The run's tables are views of the same names; `panel_strata` is the panel's.
 
--- name: fed
+-- name: sampled
 -- Over the whole run, per source and stratum: what was there, intended, drawn.
 -- Shares after weights are of an interval: each counts by all that its source drew in it.
 WITH drawn AS (
     SELECT *, sum(drawn_rows) OVER (PARTITION BY source, gradient_steps) AS source_rows FROM strata
-), fed AS (
+), totals AS (
     SELECT source, sum(drawn_rows) AS rows FROM strata GROUP BY source
 )
 SELECT source,
@@ -17,11 +17,11 @@ SELECT source,
        last(quota_share ORDER BY gradient_steps) AS quota_share,
        sum(drawn_rows) AS drawn_rows,
        sum(drawn_rows) / sum(sum(drawn_rows)) OVER (PARTITION BY source) AS drawn_share,
-       sum(effective_share * source_rows) / nullif(any_value(fed.rows), 0) AS effective_share,
+       sum(effective_share * source_rows) / nullif(any_value(totals.rows), 0) AS effective_share,
        last(td_abs_mean ORDER BY gradient_steps) AS td_abs_mean,
        sum(reward_mean * drawn_rows) / nullif(sum(drawn_rows), 0) AS reward_mean,
        sum(terminal_share * drawn_rows) / nullif(sum(drawn_rows), 0) AS terminal_share
-FROM drawn JOIN fed USING (source)
+FROM drawn JOIN totals USING (source)
 GROUP BY source, stratum
 ORDER BY source DESC, available_share DESC NULLS LAST, stratum;
 

@@ -1,4 +1,4 @@
-"""The other sections: success, learning, the critic's health, the map, provenance."""
+"""The sections: success, what was sampled, learning, the critic's health, the map, provenance."""
 
 from __future__ import annotations
 
@@ -6,22 +6,40 @@ from typing import Any
 
 from markupsafe import Markup
 
-from restock.report import charts, floor
-from restock.report.blocks import Section, count, estimate, section, table, target_rule
-from restock.report.charts import words
-from restock.report.facts import CELL_M, Facts, Rows, pretty, span
+from restock.report import charts, floor_map
+from restock.report.blocks import (
+    Figure,
+    Rows,
+    Section,
+    Table,
+    count,
+    estimate,
+    number,
+    percent,
+    pretty,
+    span,
+    words,
+)
+from restock.report.facts import CELL_M, Facts, evaluation_bias
 
 
 def success(facts: Facts) -> Section | None:
     if not facts.cells:
         return None
     cells = sorted(facts.cells, key=_cell_order)
-    worst = "; ".join(_regressions(facts))
+    shown = [
+        {
+            **row,
+            "cell": words(row["cell"]),
+            "perturbation": "clean" if row["perturbation"] == "none" else row["perturbation"],
+        }
+        for row in cells
+    ]
     rows = [
         {
             "policy": row["policy"],
-            "perturbation": "clean" if row["perturbation"] == "none" else row["perturbation"],
-            "kind of episode": words(row["cell"]),
+            "perturbation": row["perturbation"],
+            "kind of episode": row["cell"],
             "success": f"{row['success']:.0%}",
             "95 % interval": f"{row['low']:.0%} to {row['high']:.0%}",
             "episodes": row["episodes"],
@@ -29,38 +47,25 @@ def success(facts: Facts) -> Section | None:
             "time to goal": "" if row["time_s"] is None else f"{row['time_s']:.1f} s",
             "return": f"{row['mean_return']:.2f}",
         }
-        for row in cells
+        for row in shown
+        if row["policy"] == "agent"
     ]
-    shown = [
-        {
-            **{key: row[key] for key in ("policy", "success", "low", "high")},
-            "cell": words(row["cell"]),
-            "perturbation": "clean" if row["perturbation"] == "none" else row["perturbation"],
-        }
-        for row in cells
-    ]
-    return section(
+    texts = {"policy", "perturbation", "kind of episode"}
+    return Section(
         "success",
         "Does it reach the goal?",
         intro="Success per kind of episode, on the same seeded episodes for every policy, clean and"
         " under each perturbation. Lines are 95 % Wilson intervals.",
-        callout=worst,
-        figures=[{"svg": charts.success(shown)}],
-        tables=[
-            table(
-                [row for row in rows if row["policy"] == "agent"],
-                numbers={
-                    "success",
-                    "95 % interval",
-                    "episodes",
-                    "collisions per episode",
-                    "time to goal",
-                    "return",
-                },
-                title="The agent, cell by cell",
-            )
-        ],
+        callout="; ".join(_regressions(facts)),
+        figures=[Figure(charts.success(shown))],
+        tables=[_table(rows, texts, title="The agent, cell by cell")],
     )
+
+
+def _table(rows: Rows, texts: set[str], *, title: str = "", caption: str = "") -> Table:
+    """A table whose columns are numbers, but for `texts`."""
+    numbers = set(rows[0]) - texts if rows else set()
+    return Table(rows, numbers, title=title, caption=caption)
 
 
 def _cell_order(row: dict[str, Any]) -> tuple[str, int, str]:
@@ -75,26 +80,119 @@ def _regressions(facts: Facts) -> list[str]:
     planner = {
         (row["perturbation"], row["cell"]): row for row in facts.cells if row["policy"] == "planner"
     }
-    said = []
+    lines = []
     for row in facts.cells:
         other = planner.get((row["perturbation"], row["cell"]))
         if row["policy"] == "agent" and other is not None and row["high"] < other["low"]:
             where = "" if row["perturbation"] == "none" else f" under {row['perturbation']}"
-            said.append(
+            lines.append(
                 f"Worse than the planner in {words(row['cell'])}{where}: {row['success']:.0%}"
                 f" against {other['success']:.0%}"
             )
-    return said
+    return lines
+
+
+def sampled(facts: Facts) -> Section:
+    """The section that matters most: what the critic was fed."""
+    figures = []
+    bars = _share_bars(facts)
+    if bars:
+        title = "Logs: what was there, what was asked for, what was drawn"
+        figures.append(Figure(charts.shares(bars), title))
+    if facts.ages:
+        figures.append(
+            Figure(
+                charts.ages(_age_rows(facts)),
+                "How old the sampled rows were",
+                "Logs age by the calendar (days); fresh rows by environment steps since they were"
+                " collected. The two are never pooled.",
+            )
+        )
+    if facts.policies:
+        policies = [{**row, "who": row["behaviour_policy"]} for row in facts.policies]
+        stacked = charts.stacked(policies, group="source", part="who", value="share")
+        figures.append(Figure(stacked, "Whose experience it was"))
+    rows = [
+        {
+            "source": row["source"],
+            "stratum": words(row["stratum"]),
+            "timing": row["timing"] or "",
+            "available": count(row["available_rows"]),
+            "intended": percent(row["quota_share"]),
+            "drawn": percent(row["drawn_share"]),
+            "after weights": percent(row["effective_share"]),
+            "rows drawn": count(row["drawn_rows"]),
+            "replays per row": f"{row['drawn_rows'] / row['available_rows']:.1f}"
+            if row["available_rows"]
+            else "",
+            "mean reward": number(row["reward_mean"]),
+            "terminal": percent(row["terminal_share"]),
+        }
+        for row in facts.sampled
+    ]
+    return Section(
+        "fed",
+        "What was the critic fed?",
+        intro="The replay mix is the training distribution. Intended is what the mixture asks for,"
+        " drawn what the batches held, after weights what the gradient saw.",
+        callout=evaluation_bias(facts),
+        figures=figures,
+        two=True,
+        tables=[
+            _table(
+                rows,
+                {"source", "stratum", "timing"},
+                caption="Shares are of the source. Replays per row: rows drawn over rows available"
+                " at the end, so for a ring that turned over it is an upper bound.",
+            )
+        ],
+    )
+
+
+def _share_bars(facts: Facts) -> Rows:
+    """Of each logged stratum its share in the logs, as intended and as drawn."""
+    natural = {stratum.name: stratum.natural_share for stratum in facts.strata}
+    intended = {stratum.name: stratum.share for stratum in facts.strata}
+    return [
+        {"stratum": words(row["stratum"]), "kind": kind, "share": value}
+        for row in facts.sampled
+        if row["source"] == "logs"
+        for kind, value in (
+            ("in the logs", natural.get(row["stratum"], row["available_share"])),
+            ("intended", intended.get(row["stratum"], row["quota_share"])),
+            ("drawn", row["drawn_share"]),
+        )
+        if value is not None
+    ]
+
+
+def _age_rows(facts: Facts) -> Rows:
+    rows: Rows = []
+    for row in facts.ages:
+        unit = "d" if row["unit"] == "days" else "steps"
+        low = 2 ** row["bucket"] if row["bucket"] >= 0 else 0
+        text = f"< 1 {unit}" if row["bucket"] < 0 else f"{_short(low)} to {_short(2 * low)} {unit}"
+        rows.append(
+            {
+                "source": row["source"],
+                "bucket": text,
+                "order": row["bucket"] + (0 if unit == "d" else 100),
+                "share": row["share"],
+            }
+        )
+    return rows
+
+
+def _short(value: int) -> str:
+    return f"{value / 1024:.0f}k" if value >= 1024 else str(value)
 
 
 def learning(facts: Facts) -> Section:
     figures = []
-    marker = float(facts.kept["env_steps"]) if facts.kept else None
     if facts.learning:
         figures.append(
-            {
-                "title": "Greedy success on fixed episodes",
-                "svg": charts.lines(
+            Figure(
+                charts.lines(
                     [{**row, "condition": words(row["condition"])} for row in facts.learning],
                     x="env_steps",
                     y="success",
@@ -104,16 +202,16 @@ def learning(facts: Facts) -> Section:
                     colours={words(k): v for k, v in charts.CONDITION_COLOURS.items()},
                     percent=True,
                     points=True,
-                    marker=marker,
+                    marker=float(facts.kept["env_steps"]) if facts.kept else None,
                 ),
-                "caption": "The checkpoint that is kept is the best of these evaluations,"
-                " never simply the last.",
-            }
+                "Greedy success on fixed episodes",
+                "The checkpoint that is kept is the best of these evaluations, never simply the"
+                " last.",
+            )
         )
     figures.append(
-        {
-            "title": "Loss",
-            "svg": charts.lines(
+        Figure(
+            charts.lines(
                 facts.loss,
                 x="gradient_steps",
                 y="loss",
@@ -122,22 +220,16 @@ def learning(facts: Facts) -> Section:
                 y_title="Huber loss",
                 colours={"offline": "#334155", "warmup": "#94a3b8", "online": "#14b8a6"},
             ),
-            "caption": "A low loss alone says little: a frozen target has the lowest loss of all.",
-        }
+            "Loss",
+            "A low loss alone says little: a frozen target has the lowest loss of all.",
+        )
     )
-    return section(
-        "learning",
-        "How did it learn?",
-        figures=figures,
-        two=True,
-        tables=_off_policy(facts.off_policy),
-    )
+    tables = [_off_policy(facts.off_policy)] if facts.off_policy else []
+    return Section("learning", "How did it learn?", figures=figures, two=True, tables=tables)
 
 
-def _off_policy(rows: Rows) -> list[dict[str, Any]]:
+def _off_policy(rows: Rows) -> Table:
     """Off-policy estimates, where a run has them."""
-    if not rows:
-        return []
     shown = [
         {
             "measure": row["measure"],
@@ -147,24 +239,21 @@ def _off_policy(rows: Rows) -> list[dict[str, Any]]:
         }
         for row in rows
     ]
-    return [
-        table(
-            shown,
-            numbers={"episodes"},
-            title="Off-policy evaluation on held-out logs, before it drove",
-            caption="Over all conditions; an estimate is refused where the weights leave too few"
-            " episodes to say.",
-        )
-    ]
+    return Table(
+        shown,
+        {"episodes"},
+        title="Off-policy evaluation on held-out logs, before it drove",
+        caption="Over all conditions; an estimate is refused where the weights leave too few"
+        " episodes to say.",
+    )
 
 
 def critic(facts: Facts) -> Section | None:
     figures = []
     if facts.td:
         figures.append(
-            {
-                "title": "TD error by condition",
-                "svg": charts.lines(
+            Figure(
+                charts.lines(
                     facts.td,
                     x="gradient_steps",
                     y="td_abs_mean",
@@ -172,17 +261,21 @@ def critic(facts: Facts) -> Section | None:
                     x_title="updates",
                     y_title="mean |TD error| on a fixed probe",
                 ),
-                "caption": "On the same rows at every point. A condition that stays high while"
-                " the others fall is one that the buffer does not teach.",
-            }
+                "TD error by condition",
+                "On the same rows at every point. A condition that stays high while the others"
+                " fall is one that the buffer does not teach.",
+            )
         )
-    lag = [row for row in facts.lag if row["target_q_lag"] is not None]
+    lag = [
+        {**row, "what": "relative value lag"}
+        for row in facts.lag
+        if row["target_q_lag"] is not None
+    ]
     if lag:
         figures.append(
-            {
-                "title": "How far the target is behind",
-                "svg": charts.lines(
-                    [{**row, "what": "relative value lag"} for row in lag],
+            Figure(
+                charts.lines(
+                    lag,
                     x="gradient_steps",
                     y="target_q_lag",
                     series="what",
@@ -190,100 +283,90 @@ def critic(facts: Facts) -> Section | None:
                     y_title="mean |Q − Q target| / mean |Q|",
                     colours={"relative value lag": "#0f766e"},
                 ),
-                "caption": f"Target rule: {target_rule(facts)}. Near zero the target keeps up;"
-                " above about a quarter it holds learning back.",
-            }
+                "How far the target is behind",
+                f"Target rule: {facts.target_rule}. Near zero the target keeps up; above about a"
+                " quarter it holds learning back.",
+            )
         )
     return (
-        section("critic", "Is the critic healthy?", figures=figures, two=True) if figures else None
+        Section("critic", "Is the critic healthy?", figures=figures, two=True) if figures else None
     )
 
 
-def floor_map(facts: Facts) -> Section | None:
+def where(facts: Facts) -> Section | None:
+    """The map: where the logs have been, and where the agent failed."""
     layout = facts.floor
     if layout is None:
         return None
     racks = [(r.x_min, r.y_min, r.x_max, r.y_max) for r in layout.racks]
-    plan = floor.Floor(layout.width_m, layout.depth_m, racks)
+    plan = floor_map.FloorMap(layout.width_m, layout.depth_m, racks)
     failures = [
         row
         for row in facts.failures
         if row["perturbation"] == "none" and row["layout"] == layout.name
     ]
-    conditions = {row["condition"] for row in facts.rare} | {row["condition"] for row in failures}
-    known = [name for name in charts.CONDITION_COLOURS if name in conditions]
-    return section(
+    conditions = {row["condition"] for row in [*facts.rare, *failures]}
+    names = charts.ordered(
+        [{"condition": name} for name in conditions], "condition", charts.CONDITION_COLOURS
+    )
+    steps = sum(row["rows"] for row in facts.visited)
+    return Section(
         "map",
         "Where did it happen?",
         figures=[
-            {
-                "title": "Where the logs have been",
-                "svg": floor.visited(plan, facts.visited, CELL_M),
-                "caption": f"{sum(row['rows'] for row in facts.visited):,} logged steps in cells of"
-                f" {CELL_M} m, darker where there are more (logarithmic). Drawn on the floor that"
-                f" the run drives on, {layout.name}.",
-            },
-            {
-                "title": "Rare conditions in the logs (dots), the agent's failures (crosses)",
-                "svg": floor.events(plan, facts.rare, failures),
-                "caption": Markup(floor.legend(known + sorted(conditions - set(known))))
+            Figure(
+                floor_map.visited(plan, facts.visited, CELL_M),
+                "Where the logs have been",
+                f"{steps:,} logged steps in cells of {CELL_M} m, darker where there are more"
+                f" (logarithmic). Drawn on the floor that the run drives on, {layout.name}.",
+            ),
+            Figure(
+                floor_map.events(plan, facts.rare, failures),
+                "Rare conditions in the logs (dots), the agent's failures (crosses)",
+                Markup(floor_map.legend(names))
                 + Markup("<br>")
                 + f"{len(failures)} failed clean episodes there.",
-            },
+            ),
         ],
         two=True,
     )
 
 
 def provenance(facts: Facts) -> Section:
-    config = facts.config
     tables = []
     if facts.panel is not None:
         header = facts.panel.header
-        pins = [
-            ("panel", header.id),
-            ("store", f"{header.store}, version {header.store_version}"),
-            ("task", header.task_hash),
-            ("labels", header.labels_version),
-            ("left out of the panel", _left_out(header.left_out)),
-        ]
-        tables.append(table([{"pinned": name, "value": value} for name, value in pins]))
+        left_out = [f"{count:,} {reason}" for reason, count in header.left_out.items() if count]
+        pins = {
+            "panel": header.id,
+            "store": f"{header.store}, version {header.store_version}",
+            "task": header.task_hash,
+            "labels": header.labels_version,
+            "left out of the panel": ", ".join(left_out) or "nothing",
+        }
+        tables.append(Table([{"pinned": name, "value": value} for name, value in pins.items()]))
     if facts.recordings:
-        tables.append(
-            table(
-                [
-                    {
-                        "recording": row["source_file"],
-                        "format": row["format"],
-                        "length": span(row["duration_s"]),
-                        "episodes": row["episodes"],
-                        "transitions": count(row["transitions"]),
-                        "profile": f"{row['profile']} {row['profile_hash']}",
-                        "id": row["recording_id"],
-                    }
-                    for row in facts.recordings
-                ],
-                numbers={"length", "episodes", "transitions"},
-                title="Recordings",
-            )
-        )
-    versions = config.get("versions", {})
-    tables.append(
-        table(
-            [{"software": name, "version": str(value)} for name, value in versions.items()],
-            title="Software",
-        )
-    )
-    return section(
+        rows = [
+            {
+                "recording": row["source_file"],
+                "format": row["format"],
+                "length": span(row["duration_s"]),
+                "episodes": row["episodes"],
+                "transitions": count(row["transitions"]),
+                "profile": f"{row['profile']} {row['profile_hash']}",
+                "id": row["recording_id"],
+            }
+            for row in facts.recordings
+        ]
+        tables.append(Table(rows, {"length", "episodes", "transitions"}, title="Recordings"))
+    versions = facts.config.get("versions", {})
+    software = [{"software": name, "version": str(value)} for name, value in versions.items()]
+    tables.append(Table(software, title="Software"))
+    return Section(
         "provenance",
         "Where does all of this come from?",
         intro=" ".join(facts.missing),
         tables=tables,
-        details=pretty(config),
+        details=pretty(facts.config),
         details_title="The whole configuration of the run",
     )
-
-
-def _left_out(counts: dict[str, int]) -> str:
-    said = [f"{count:,} {reason}" for reason, count in counts.items() if count]
-    return ", ".join(said) or "nothing"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -11,9 +13,9 @@ import altair as alt
 from restock import __version__
 from restock.errors import RestockError
 from restock.report import charts
-from restock.report.blocks import Section, section, table
-from restock.report.charts import words
+from restock.report.blocks import Figure, Section, Table, number, words
 from restock.report.facts import Facts
+from restock.stats import ConfidenceInterval
 from restock.train.twin.calibration.gap import AFTER, BEFORE
 from restock.train.twin.calibration.twin_gap import (
     DOCUMENT,
@@ -65,13 +67,14 @@ def run_section(facts: Facts) -> Section | None:
     gap = find_gap(facts)
     if gap is None:
         return None
-    found = gap_section(gap)
-    if facts.panel is not None and gap.about["store_version"] != facts.panel.header.store_version:
-        found["intro"] += (
-            f" It was measured at version {gap.about['store_version']} of the store; the run's"
-            f" panel is of version {facts.panel.header.store_version}."
-        )
-    return found
+    section, version = gap_section(gap), gap.about["store_version"]
+    if facts.panel is None or version == facts.panel.header.store_version:
+        return section
+    note = (
+        f" It was measured at version {version} of the store; the run's panel is of version"
+        f" {facts.panel.header.store_version}."
+    )
+    return replace(section, intro=section.intro + note)
 
 
 def gap_page(gap: TwinGap) -> dict[str, Any]:
@@ -84,8 +87,11 @@ def gap_page(gap: TwinGap) -> dict[str, Any]:
         "lead": f"{_count(about['rows'], 'logged step')} of {_count(about['episodes'], 'episode')},"
         f" driven again in the twin. Judged is the {source_name(about['judged'])}.",
         "cards": [
-            {"value": str(sum(v.verdict == kind for v in gap.verdicts)), "label": f"{kind}: {said}"}
-            for kind, said in _MEANING.items()
+            {
+                "value": str(sum(v.verdict == kind for v in gap.verdicts)),
+                "label": f"{kind}: {meaning}",
+            }
+            for kind, meaning in _MEANING.items()
         ],
         "sections": [gap_section(gap), _steps_section(gap), _signals_section(gap)],
         "footer": f"restock {__version__} · written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC from"
@@ -98,9 +104,9 @@ def headline(gap: TwinGap) -> str:
     names = ", ".join(words(name) for name in gap.untrusted)
     if names:
         return f"Do not trust the twin in: {names}"
-    if all(found.verdict == UNKNOWN for found in gap.verdicts):
+    if all(item.verdict == UNKNOWN for item in gap.verdicts):
         return "Too little could be driven again to judge the twin in any condition"
-    if all(found.verdict == TRUSTED for found in gap.verdicts):
+    if all(item.verdict == TRUSTED for item in gap.verdicts):
         return "The twin is within its limits in every logged condition"
     return "No condition is shown to be beyond the limits; not all are shown to be within"
 
@@ -120,17 +126,17 @@ def gap_section(gap: TwinGap) -> Section:
     ]
     rows = [
         {
-            "condition": words(found.condition),
-            "verdict": found.verdict,
-            "segments": found.segments,
-            "episodes": found.episodes,
-            f"90 % within, {limits['horizon_s']:g} s": _interval(found.position_p90, "m"),
-            "reward gap / spread": _interval(found.reward_ratio, ""),
-            "why": "; ".join(found.reasons),
+            "condition": words(item.condition),
+            "verdict": item.verdict,
+            "segments": item.segments,
+            "episodes": item.episodes,
+            f"90 % within, {limits['horizon_s']:g} s": _interval(item.position_p90, "m"),
+            "reward gap / spread": _interval(item.reward_ratio, ""),
+            "why": "; ".join(item.reasons),
         }
-        for found in gap.verdicts
+        for item in gap.verdicts
     ]
-    return section(
+    return Section(
         "twin-gap",
         "Can the twin be trusted?",
         intro="Logged commands, driven again in the twin without a look at what the robot did."
@@ -141,18 +147,18 @@ def gap_section(gap: TwinGap) -> Section:
         " its own spread, both with 95 % confidence over episodes.",
         callout=headline(gap) + "." if gap.untrusted else "",
         figures=[
-            {
-                "title": "How far from the log it ends",
-                "svg": _positions(shown),
-                "caption": "Dots are medians with 95 % intervals over episodes, ticks the 90th"
-                " percentile. A segment counts for every condition it meets.",
-            }
+            Figure(
+                _positions(shown),
+                "How far from the log it ends",
+                "Dots are medians with 95 % intervals over episodes, ticks the 90th percentile. A"
+                " segment counts for every condition it meets.",
+            )
         ]
         if shown
         else [],
         tables=[
-            table(rows, numbers={"segments", "episodes"}),
-            table([{"what else to know": said} for said in gap.not_done]),
+            Table(rows, numbers={"segments", "episodes"}),
+            Table([{"what else to know": note} for note in gap.not_done]),
         ],
     )
 
@@ -182,8 +188,8 @@ def _steps_section(gap: TwinGap) -> Section:
         {
             "condition": words(row["condition"]),
             "term": words(row["term"]),
-            "logged mean": _number(row["logged_mean"]),
-            "logged spread": _number(row["logged_spread"]),
+            "logged mean": number(row["logged_mean"]),
+            "logged spread": number(row["logged_spread"]),
             **{
                 source_name(source): _cell(
                     gap.rewards,
@@ -200,20 +206,20 @@ def _steps_section(gap: TwinGap) -> Section:
         and (row["term"] == "reward" or _any(gap, row["condition"], row["term"]))
     ]
     observed = _grouped(gap)
-    return section(
+    return Section(
         "one-step",
         "One step from each logged state",
         intro="The twin is put into the logged state, drives the logged action for one control"
         " period, and the task's own functions make observation and reward of it. Mean absolute"
         " differences; persistence is what saying “nothing changes” would miss.",
         tables=[
-            table(
+            Table(
                 rewards,
                 numbers={"logged mean", "logged spread", *map(source_name, sources)},
                 title="Reward, by term",
                 caption="Terms that are the same on both sides everywhere are left out.",
             ),
-            table(
+            Table(
                 observed,
                 numbers={*map(source_name, sources), "persistence"},
                 title="Observation, by component, in nominal driving",
@@ -243,12 +249,12 @@ def _signals_section(gap: TwinGap) -> Section:
                     },
                 }
             )
-    return section(
+    return Section(
         "signals",
         "Pose and signals, by horizon",
         intro="Medians over segments: of a pose at the horizon's end, of a signal the root mean"
         " square on the way.",
-        tables=[table(rows, numbers={"segments", *map(source_name, sources)})],
+        tables=[Table(rows, numbers={"segments", *map(source_name, sources)})],
     )
 
 
@@ -279,23 +285,20 @@ def _any(gap: TwinGap, condition: str, term: str) -> bool:
 def _cell(rows: list[dict[str, Any]], source: str, value: str, **key: Any) -> str:
     for row in rows:
         if row["source"] == source and all(row[name] == part for name, part in key.items()):
-            return _number(row[value])
+            return number(row[value])
     return ""
-
-
-def _number(value: float | None) -> str:
-    return "" if value is None else f"{round(value, 3) + 0.0:.3f}"  # no -0.000
 
 
 def _count(number: int, noun: str) -> str:
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
-def _interval(found: Any, unit: str) -> str:
-    if found.value != found.value:
+def _interval(interval: ConfidenceInterval, unit: str) -> str:
+    if math.isnan(interval.value):
         return ""
-    text = f"{found.value:.2f} {unit}".strip()
-    return text if found.low != found.low else f"{text} [{found.low:.2f}, {found.high:.2f}]"
+    text = f"{interval.value:.2f} {unit}".strip()
+    ends = f" [{interval.low:.2f}, {interval.high:.2f}]"
+    return text if math.isnan(interval.low) else text + ends
 
 
 __all__ = ["find_gap", "gap_page", "gap_section", "headline", "run_section", "source_name"]

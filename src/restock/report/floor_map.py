@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
-from restock.report.charts import CONDITION_COLOURS, SPARE_COLOURS, words
+from restock.report.blocks import words
+from restock.report.charts import CONDITION_COLOURS, SPARE_COLOURS
 
 Row = Mapping[str, Any]
 Box = tuple[float, float, float, float]  # x0, y0, x1, y1 in metres
@@ -16,7 +17,7 @@ SCALE = 40  # SVG units a metre
 
 
 @dataclass(frozen=True)
-class Floor:
+class FloorMap:
     """The extent of the map and what stands on it, in metres in the map frame."""
 
     width_m: float
@@ -55,7 +56,7 @@ class Floor:
         )
 
 
-def visited(floor: Floor, cells: Sequence[Row], cell_m: float) -> str:
+def visited(floor: FloorMap, cells: Sequence[Row], cell_m: float) -> str:
     """Cells of x_m, y_m (their south-west corner) and rows, darker where the logs have more."""
     most = max((row["rows"] for row in cells), default=1)
     marks = []
@@ -66,7 +67,7 @@ def visited(floor: Floor, cells: Sequence[Row], cell_m: float) -> str:
     return floor.draw(marks, "where the logs have been")
 
 
-def events(floor: Floor, logged: Sequence[Row], failures: Sequence[Row]) -> str:
+def events(floor: FloorMap, logged: Sequence[Row], failures: Sequence[Row]) -> str:
     """Dots where a rare condition was logged, crosses where the agent's episodes failed."""
     marks = []
     for row in logged:
