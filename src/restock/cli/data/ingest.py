@@ -153,7 +153,9 @@ def show(outcome: IngestResult) -> None:
     )
     episodes = f"{_count(row['transitions'], 'transition')} in {_count(row['episodes'], 'episode')}"
     if outcome.status == "unchanged":
-        console.print(f"unchanged: {episodes} are in the store already (--force does it again)\n")
+        console.print(
+            f"unchanged: {episodes} are in the store already (--force ingests them again)\n"
+        )
         return
     into = f"{outcome.status}: {episodes}, profile {row['profile']} {row['profile_hash']}"
     console.print(into + (f", store version {outcome.version}" if outcome.version else ""))

@@ -137,15 +137,15 @@ def describe(plan: PanelPlan) -> dict[str, Any]:
 
 
 def _table(strata: list[dict[str, Any]], *, wide: bool) -> list[dict[str, Any]]:
-    """What fits beside each other: shares in percent; more of it where there is room."""
+    """As many columns as fit; shares in percent."""
     rows = []
     for line in strata:
-        row = {"stratum": line["stratum"], "rows\nthere": line["rows"]}
+        row = {"stratum": line["stratum"], "rows": line["rows"]}
         if wide:
             row |= {"episodes": line["episodes"], "% of\nrows": _percent(line["natural_share"])}
         row |= {
             "%\nwanted": _percent(line["wanted_share"]),
-            "%\ngot": _percent(line["share"]),
+            "%\nactual": _percent(line["share"]),
             "replays\na row": line["replays_per_row"],
             "effective\nrows": round(line["effective_rows"]),
         }
@@ -165,20 +165,20 @@ def _percent(share: float) -> float:
 def _summary(document: dict[str, Any]) -> list[str]:
     lines = [
         f"{line['stratum']}: {line['note']} ({line['wanted_share']:.1%} wanted,"
-        f" {line['share']:.1%} got)"
+        f" {line['share']:.1%} actual)"
         for line in document["strata"]
         if line["note"]
     ]
     if document["logs_share"] < document["logs_share_wanted"] - 1e-9:
         lines.append(
             f"logs get {document['logs_share']:.1%} of a batch, not"
-            f" {document['logs_share_wanted']:.1%}: their rows can bear no more"
+            f" {document['logs_share_wanted']:.1%}: their rows allow no more"
         )
     for fit in document["density_ratios"]:
         lines.append(
             f"density ratio of {', '.join(fit['strata'])} ({fit['source']}): fitted on"
             f" {fit['rows']:,} rows, log loss {fit['log_loss']:.3f} against"
-            f" {fit['base_log_loss']:.3f} of knowing nothing"
+            f" {fit['base_log_loss']:.3f} of a constant prediction"
         )
     others = "".join(
         f", and of {store['name']} ({store['path']}) version {store['version']}"
@@ -187,14 +187,14 @@ def _summary(document: dict[str, Any]) -> list[str]:
     left_out = ", ".join(f"{count:,} {reason}" for reason, count in document["left_out"].items())
     draws = f"replays a row are over the {document['planned_draws']:,} draws of [planned]"
     if document["max_replays_per_row"] is not None:
-        draws += f" (limit {document['max_replays_per_row']:g}); a run reckons with its own"
+        draws += f" (limit {document['max_replays_per_row']:g}); a run uses its own"
     moving = " on average" if document["schedules"] else ""
     lines += [
         draws,
         f"{document['rows']:,} rows of store version {document['store_version']}{others};"
         f" not in the panel: {left_out or 'none'}",
         f"{document['logs_share']:.1%} of a batch{moving} from the logs, worth"
-        f" {document['effective_rows']:,.0f} rows drawn equally often; largest weight"
+        f" {document['effective_rows']:,.0f} equally weighted rows; largest weight"
         f" {document['largest_weight']:.3g}",
     ]
     rules = dict.fromkeys(line["within"] for line in document["strata"])

@@ -81,8 +81,8 @@ def _show(comparison: Comparison, all_checks: bool) -> None:
     shown = checks if all_checks else [c for c in checks if c.verdict != "comparable"]
     if shown:
         feed = comparison.treatment in ("mixture", "method")
-        judged = " (the treatment: shown, not judged)" if feed else ""
-        print_table([_check(check) for check in shown], title=f"what was fed{judged}")
+        treated = " (the treatment: shown, not compared)" if feed else ""
+        print_table([_check(check) for check in shown], title=f"what was fed{treated}")
     say(_sentence(comparison))
     if comparison.rows:
         of = (

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def show_off_policy(path: Path, result: OpeResult, config: OpeConfig, *, as_json: bool) -> None:
-    """A row a measure and condition, its estimators beside; and why weighting is refused."""
+    """A row per measure and condition, a column per estimator; and why weighting is refused."""
     from restock.cli.output import print_json, print_table, say
 
     if as_json:
@@ -38,13 +38,13 @@ def show_off_policy(path: Path, result: OpeResult, config: OpeConfig, *, as_json
     )
     for row in result.rows:
         if row["condition"] == "all" and row["estimator"] == "pdwis" and row["refused"]:
-            longest = f"; --horizon {row['ess_steps']} would do" if row["ess_steps"] else ""
+            longest = f"; --horizon {row['ess_steps']} is enough" if row["ess_steps"] else ""
             say(f"{row['measure']}: pdwis and wdr are refused: {row['refused']}{longest}")
     estimated = result.rows[0]["estimated_share"] if result.rows else 0.0
     if estimated:
         say(
             f"the behaviour's probabilities are estimated (cloned) for {estimated:.0%} of the rows:"
-            " the logs do not say them"
+            " the logs do not contain them"
         )
     for note in result.notes:
         say(note)
@@ -59,7 +59,7 @@ def _value(row: dict[str, Any]) -> str:
 
 
 def show_regression(rows: list[dict[str, Any]], baseline: str, margin: float) -> None:
-    """A row a perturbation and condition, and one line that says what it comes to."""
+    """A row per perturbation and condition, and one line with the result."""
     from restock.cli.output import print_table, say
 
     print_table(

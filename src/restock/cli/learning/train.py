@@ -96,7 +96,7 @@ class TrainCommand:
 
 
 def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed | None]:
-    """Train to the end; then flush what the twin gave, where a store is given."""
+    """Train to the end; then flush the twin's episodes, where a store is given."""
     from restock.cli.output import progress, stderr
     from restock.ingest.store.writer import StoreWriter
     from restock.train.flush_fresh import flush
