@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
-from support.bag_samples import write_bag, write_mcap
+from support.bag_samples import assert_same_columns, write_bag, write_mcap
 from support.driven_robot import Drive
 from support.driven_robot import write_bag as write_drive
 
@@ -20,7 +20,7 @@ from restock.ingest.containers import mcap_file, sqlite_file
 from restock.ingest.containers import topic_reading as reading
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding import columns as columns_module
-from restock.ingest.decoding.columns import Ragged, TopicColumns, equal, growing, offsets_of
+from restock.ingest.decoding.columns import Ragged, equal, growing, offsets_of
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.steps.episodes import split
@@ -53,17 +53,6 @@ def read(path: Path, size: int, rows: int, *, salvage: bool) -> dict[str, Any]:
                 "lost_messages": recording.lost_messages,
                 "integrity": recording.integrity,
             }
-
-
-def same(left: dict[str, TopicColumns], right: dict[str, TopicColumns]) -> None:
-    assert left.keys() == right.keys()
-    for topic, columns in left.items():
-        other = right[topic]
-        assert np.array_equal(columns.log_time_ns, other.log_time_ns), topic
-        assert np.array_equal(columns.publish_time_ns, other.publish_time_ns), topic
-        assert columns.fields.keys() == other.fields.keys()
-        for path, column in columns.fields.items():
-            assert equal(column, other.fields[path]), (topic, path)
 
 
 def shuffled(source: Path, target: Path, chunk_size: int, seed: int, **options: Any) -> Path:
@@ -128,7 +117,7 @@ def test_any_grouping_of_an_mcap_gives_the_same_columns(
         path.write_bytes(path.read_bytes()[: int(path.stat().st_size * whole)])
     expected = read(path, WHOLE, 1, salvage=whole is not None)
     found = read(path, size, rows, salvage=whole is not None)
-    same(expected.pop("columns"), found.pop("columns"))
+    assert_same_columns(expected.pop("columns"), found.pop("columns"))
     assert expected == found
 
 
@@ -138,7 +127,7 @@ def test_any_batches_of_a_sqlite_bag_give_the_same_columns(size: int, tmp_path: 
     expected = read(bag, WHOLE, 1, salvage=False)
     for salvage in (False, True):
         found = read(bag, size, 7, salvage=salvage)
-        same(expected["columns"], found["columns"])
+        assert_same_columns(expected["columns"], found["columns"])
         assert expected["accounts"] == found["accounts"]
 
 

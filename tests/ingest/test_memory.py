@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import zstandard
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
+from support.bag_samples import compress_files
 from support.driven_robot import Drive
 from support.driven_robot import write_bag as write_drive
 
@@ -83,20 +83,11 @@ def unchunked(bag: Path) -> Path:
     return target
 
 
-def packed(bag: Path) -> Path:
-    """The bag with its storage file compressed as a whole, as rosbag2's file mode does."""
-    for file in bag.glob("*.mcap"):
-        with file.open("rb") as source, file.with_name(file.name + ".zstd").open("wb") as sink:
-            zstandard.ZstdCompressor(level=1).copy_stream(source, sink)
-        file.unlink()
-    return bag
-
-
 def recording(kind: str, drive: Path, folder: Path, images: int) -> Path:
     bag = with_images(drive, folder / "run", images, "sqlite3" if kind == "sqlite3" else "mcap")
     if kind == "not chunked":
         return unchunked(bag)
-    return packed(bag) if kind == "zstd file" else bag
+    return compress_files(bag) if kind == "zstd file" else bag
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="no /proc to read peaks from")

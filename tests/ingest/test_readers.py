@@ -11,7 +11,15 @@ import pytest
 import zstandard
 from mcap.writer import CompressionType, IndexType, Writer
 from ruamel.yaml import YAML
-from support.bag_samples import START_NS, TOPICS, messages, write_bag, write_mcap
+from support.bag_samples import (
+    START_NS,
+    TOPICS,
+    assert_same_columns,
+    compress_files,
+    messages,
+    write_bag,
+    write_mcap,
+)
 from support.paths import SHARED
 
 from restock.errors import RecordingError
@@ -27,16 +35,6 @@ from restock.ingest.describe import describe_recording
 
 def everything(recording: Recording) -> dict[str, TopicColumns]:
     return recording.read({topic: recording.leaves(topic) for topic in recording.topics})
-
-
-def same(left: dict[str, TopicColumns], right: dict[str, TopicColumns]) -> None:
-    assert left.keys() == right.keys()
-    for topic, columns in left.items():
-        other = right[topic]
-        assert np.array_equal(columns.log_time_ns, other.log_time_ns), topic
-        assert columns.fields.keys() == other.fields.keys()
-        for path, column in columns.fields.items():
-            assert equal(column, other.fields[path]), (topic, path)
 
 
 @pytest.fixture(scope="module")
@@ -77,14 +75,6 @@ CONTAINERS = {
         for version in range(1, 10)
     },
 }
-
-
-def compress_files(bag: Path) -> Path:
-    for file in [*bag.glob("*.db3"), *bag.glob("*.mcap")]:
-        packed = zstandard.ZstdCompressor().compress(file.read_bytes())
-        file.with_name(file.name + ".zstd").write_bytes(packed)
-        file.unlink()
-    return bag
 
 
 def compress_messages(bag: Path) -> Path:
@@ -163,7 +153,7 @@ def test_every_container_gives_the_same_columns(container: str, mcap: Path, tmp_
         assert not other.lost_messages
         assert not [note for note in other.notes if "no metadata" not in note]
         assert {name: topic.type for name, topic in other.topics.items()} == TOPICS
-        same(expected, found)
+        assert_same_columns(expected, found, publish=False)
         for topic, account in other.accounts.items():
             assert account.expected == account.read == account.decoded == 20, topic
 

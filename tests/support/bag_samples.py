@@ -14,6 +14,8 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
 
+from restock.ingest.decoding.columns import TopicColumns, equal
+
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 START_NS = 1_700_000_000_000_000_000
 
@@ -141,3 +143,27 @@ def write_mcap(
             writer.add_message(channels[topic], log, data, publish_time=log)
         writer.finish()
     return path
+
+
+def compress_files(bag: Path) -> Path:
+    """The bag with each storage file compressed as a whole, as rosbag2's file mode does."""
+    for file in [*bag.glob("*.db3"), *bag.glob("*.mcap")]:
+        with file.open("rb") as source, file.with_name(file.name + ".zstd").open("wb") as sink:
+            zstandard.ZstdCompressor(level=1).copy_stream(source, sink)
+        file.unlink()
+    return bag
+
+
+def assert_same_columns(
+    left: dict[str, TopicColumns], right: dict[str, TopicColumns], *, publish: bool = True
+) -> None:
+    """Every topic's times and values; sqlite3 bags do not keep when messages were published."""
+    assert left.keys() == right.keys()
+    for topic, columns in left.items():
+        other = right[topic]
+        assert np.array_equal(columns.log_time_ns, other.log_time_ns), topic
+        if publish:
+            assert np.array_equal(columns.publish_time_ns, other.publish_time_ns), topic
+        assert columns.fields.keys() == other.fields.keys()
+        for path, column in columns.fields.items():
+            assert equal(column, other.fields[path]), (topic, path)
