@@ -39,16 +39,16 @@ def batch(payloads: list[bytes], lead: int = 3) -> MessageBatch:
 def agree(message: RosType, payloads: list[bytes], *, ros1: bool = False) -> None:
     leaves = message.leaves()
     given_batch = batch(payloads)
-    ours = ColumnDecoder(message, leaves, ros1=ros1).decode(given_batch)
-    theirs = RowDecoder(message, leaves, ros1=ros1).decode(given_batch)
-    assert ours.bad == theirs.bad == {}
-    assert np.array_equal(ours.rows, theirs.rows)
-    assert ours.fields.keys() == theirs.fields.keys()
-    for path, column in theirs.fields.items():
-        assert equal(ours.fields[path], column), path
+    columnar = ColumnDecoder(message, leaves, ros1=ros1).decode(given_batch)
+    rosbags = RowDecoder(message, leaves, ros1=ros1).decode(given_batch)
+    assert columnar.bad == rosbags.bad == {}
+    assert np.array_equal(columnar.rows, rosbags.rows)
+    assert columnar.fields.keys() == rosbags.fields.keys()
+    for path, column in rosbags.fields.items():
+        assert equal(columnar.fields[path], column), path
     for leaf in leaves:  # and each on its own, so that the others are stepped over
         alone = ColumnDecoder(message, [leaf], ros1=ros1).decode(given_batch)
-        assert equal(alone.fields[leaf.path], theirs.fields[leaf.path]), leaf.path
+        assert equal(alone.fields[leaf.path], rosbags.fields[leaf.path]), leaf.path
 
 
 # -- generated definitions ------------------------------------------------------------------
@@ -199,18 +199,21 @@ def test_other_peoples_messages_decode_as_rosbags_does(name: str) -> None:
                 continue
             (stream, *_) = recording._streams[topic]
             message = message_type(stream.channel, "humble")
-            for _, found in stream.storage.batches([stream.channel.id]):
+            for _, messages in stream.storage.batches([stream.channel.id]):
                 few = slice(None, 40)
                 part = MessageBatch(
-                    found.buffer, found.start[few], found.stop[few], *[found.log_time_ns[few]] * 2
+                    messages.buffer,
+                    messages.start[few],
+                    messages.stop[few],
+                    *[messages.log_time_ns[few]] * 2,
                 )
                 ros1 = info.encoding == "ros1"
                 leaves = message.leaves()
-                ours = ColumnDecoder(message, leaves, ros1=ros1).decode(part)
-                theirs = RowDecoder(message, leaves, ros1=ros1).decode(part)
-                assert len(ours.rows) == len(part)
-                for path, column in theirs.fields.items():
-                    assert equal(ours.fields[path], column), (topic, path)
+                columnar = ColumnDecoder(message, leaves, ros1=ros1).decode(part)
+                rosbags = RowDecoder(message, leaves, ros1=ros1).decode(part)
+                assert len(columnar.rows) == len(part)
+                for path, column in rosbags.fields.items():
+                    assert equal(columnar.fields[path], column), (topic, path)
                 break
 
 
@@ -229,36 +232,36 @@ def leaf(message: RosType, path: str) -> Leaf:
 def test_alignment_is_relative_to_the_byte_after_the_header() -> None:
     message = one("pkg/msg/T", "uint8 a\nfloat64 b\nuint8 c\nuint16 d")
     payload = bytes.fromhex("00010000 07 00000000000000 000000000000f83f 09 00 3412")
-    found = ColumnDecoder(message, message.leaves()).decode(batch([payload])).fields
-    assert [column[0] for column in found.values()] == [7, 1.5, 9, 0x1234]
+    decoded = ColumnDecoder(message, message.leaves()).decode(batch([payload])).fields
+    assert [column[0] for column in decoded.values()] == [7, 1.5, 9, 0x1234]
 
 
 def test_an_empty_sequence_takes_no_padding() -> None:
     message = one("pkg/msg/T", "float64[] a\nuint8 b")
     empty = bytes.fromhex("00010000 00000000 07")
     full = bytes.fromhex("00010000 01000000 00000000 000000000000f03f 08")
-    found = ColumnDecoder(message, message.leaves()).decode(batch([empty, full])).fields
-    assert found["b"].tolist() == [7, 8]
-    assert isinstance(found["a"], Ragged)
-    assert [row.tolist() for row in (found["a"][0], found["a"][1])] == [[], [1.0]]
+    decoded = ColumnDecoder(message, message.leaves()).decode(batch([empty, full])).fields
+    assert decoded["b"].tolist() == [7, 8]
+    assert isinstance(decoded["a"], Ragged)
+    assert [row.tolist() for row in (decoded["a"][0], decoded["a"][1])] == [[], [1.0]]
 
 
 def test_a_message_without_fields_carries_one_byte() -> None:
     message = one("std_msgs/msg/Empty")
     assert message.leaves() == []
-    found = ColumnDecoder(message, []).decode(batch([bytes.fromhex("0001000000")] * 3))
-    assert len(found.rows) == 3
-    assert not found.bad
+    decoded = ColumnDecoder(message, []).decode(batch([bytes.fromhex("0001000000")] * 3))
+    assert len(decoded.rows) == 3
+    assert not decoded.bad
 
 
 def test_xcdr2_and_parameter_lists_are_refused_by_name() -> None:
     message = one("std_msgs/msg/Bool")
     good, xcdr2 = bytes.fromhex("0001000001"), bytes.fromhex("0007000001")
-    found = ColumnDecoder(message, message.leaves()).decode(
+    decoded = ColumnDecoder(message, message.leaves()).decode(
         batch([good, xcdr2, xcdr2, b"\0\3\0\0"])
     )
-    assert found.rows.tolist() == [0]
-    assert found.bad == {
+    assert decoded.rows.tolist() == [0]
+    assert decoded.bad == {
         "serialised as XCDR2, 00 07: not supported": 2,
         "serialised as a parameter list (PL_CDR), 00 03: not supported": 1,
     }
@@ -268,10 +271,10 @@ def test_mis_sized_messages_are_counted_and_the_others_kept() -> None:
     message = one("std_msgs/msg/String")
     rows = [bytes(STORE.serialize_cdr(STORE.types[message.name](t), message.name)) for t in "abc"]
     rows[1:1] = [rows[0][:-1], rows[0] + b"\0\0\0\0", b"\0\1", b"\0\1\0\0\xff\xff\xff\xff"]
-    found = ColumnDecoder(message, message.leaves()).decode(batch(rows))
-    assert found.fields["data"].tolist() == ["a", "b", "c"]
-    assert found.rows.tolist() == [0, 5, 6]
-    assert found.bad == {
+    decoded = ColumnDecoder(message, message.leaves()).decode(batch(rows))
+    assert decoded.fields["data"].tolist() == ["a", "b", "c"]
+    assert decoded.rows.tolist() == [0, 5, 6]
+    assert decoded.bad == {
         "mis-sized: it ends before its last field": 2,
         "mis-sized: bytes are left after its last field": 1,
         "mis-sized: shorter than its header": 1,
@@ -285,9 +288,9 @@ def test_invalid_text_is_counted() -> None:
         bytes.fromhex("00010000 02000000 6161"),
         bytes.fromhex("00010000 02000000 6100"),
     ]
-    found = ColumnDecoder(message, message.leaves()).decode(batch(rows))
-    assert found.fields["data"].tolist() == ["a"]
-    assert found.bad == {
+    decoded = ColumnDecoder(message, message.leaves()).decode(batch(rows))
+    assert decoded.fields["data"].tolist() == ["a"]
+    assert decoded.bad == {
         "text that is not valid UTF-8": 1,
         "text without its terminating zero": 1,
     }
@@ -298,9 +301,9 @@ def test_a_count_that_cannot_be_is_refused_before_anything_is_allocated() -> Non
     point = "MSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z"
     message = one("pkg/msg/T", f"geometry_msgs/Point[] p\n{rule}\n{point}")
     rows = [bytes.fromhex("00010000 ffffffff") + bytes(28)]
-    found = ColumnDecoder(message, message.leaves()).decode(batch(rows))
-    assert not len(found.rows)
-    assert sum(found.bad.values()) == 1
+    decoded = ColumnDecoder(message, message.leaves()).decode(batch(rows))
+    assert not len(decoded.rows)
+    assert sum(decoded.bad.values()) == 1
 
 
 @pytest.mark.parametrize(
@@ -326,6 +329,6 @@ def test_rows_that_are_wrong_in_many_ways_still_all_get_counted() -> None:
         b"\0\1\0\0" + rng.integers(0, 3, rng.integers(0, 90)).astype(np.uint8).tobytes()
         for _ in range(400)
     ]
-    found = ColumnDecoder(message, message.leaves()).decode(batch(rows))
-    assert len(found.rows) + sum(found.bad.values()) == 400
-    assert found.bad
+    decoded = ColumnDecoder(message, message.leaves()).decode(batch(rows))
+    assert len(decoded.rows) + sum(decoded.bad.values()) == 400
+    assert decoded.bad

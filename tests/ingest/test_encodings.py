@@ -421,9 +421,9 @@ def proto_name(kind: str) -> str:
 
 def as_descriptor(kind: RosType) -> Files:
     """A ROS type as protobuf would define it."""
-    found = build_file_descriptor_set(timestamp_pb2.Timestamp)
-    found.MergeFrom(build_file_descriptor_set(duration_pb2.Duration))
-    file = found.file.add(name="ros.proto", package="ros", syntax="proto3")
+    files = build_file_descriptor_set(timestamp_pb2.Timestamp)
+    files.MergeFrom(build_file_descriptor_set(duration_pb2.Duration))
+    file = files.file.add(name="ros.proto", package="ros", syntax="proto3")
     file.dependency.extend(["google/protobuf/timestamp.proto", "google/protobuf/duration.proto"])
     wanted, done = [kind.name], set(kind.times)
     while wanted:
@@ -441,7 +441,7 @@ def as_descriptor(kind: RosType) -> Files:
                 type_name=proto_name(field.message) if field.message else None,
             )
             wanted += [field.message] if field.message else []
-    return found
+    return files
 
 
 def plain(value: Any) -> Any:
@@ -522,13 +522,13 @@ def copies(folder: Path, count: int) -> dict[str, Path]:
 
 
 def family(kind: RosType) -> set[str]:
-    wanted, found = [kind.name], set[str]()
+    wanted, names = [kind.name], set[str]()
     while wanted:
         name = wanted.pop()
-        if name not in found:
-            found.add(name)
+        if name not in names:
+            names.add(name)
             wanted += [field.message for field in kind.fields_of(name) if field.message]
-    return found
+    return names
 
 
 def test_the_same_drive_in_every_encoding(tmp_path: Path) -> None:

@@ -58,12 +58,12 @@ def read(path: Path, size: int, rows: int, *, salvage: bool) -> dict[str, Any]:
 def shuffled(source: Path, target: Path, chunk_size: int, seed: int, **options: Any) -> Path:
     """The same messages out of order, as several recorders' buffers leave them."""
     with source.open("rb") as file, target.open("wb") as sink:
-        found = list(make_reader(file).iter_messages(log_time_order=False))
-        random.Random(seed).shuffle(found)
+        messages = list(make_reader(file).iter_messages(log_time_order=False))
+        random.Random(seed).shuffle(messages)
         writer = Writer(sink, chunk_size=chunk_size, **options)
         writer.start(profile="ros2")
         channels: dict[int, int] = {}
-        for schema, channel, message in found:
+        for schema, channel, message in messages:
             if channel.id not in channels:
                 assert schema is not None
                 kind = writer.register_schema(schema.name, schema.encoding, schema.data)
@@ -116,9 +116,9 @@ def test_any_grouping_of_an_mcap_gives_the_same_columns(
     if whole is not None:
         path.write_bytes(path.read_bytes()[: int(path.stat().st_size * whole)])
     expected = read(path, WHOLE, 1, salvage=whole is not None)
-    found = read(path, size, rows, salvage=whole is not None)
-    assert_same_columns(expected.pop("columns"), found.pop("columns"))
-    assert expected == found
+    regrouped = read(path, size, rows, salvage=whole is not None)
+    assert_same_columns(expected.pop("columns"), regrouped.pop("columns"))
+    assert expected == regrouped
 
 
 @pytest.mark.parametrize("size", [1, 3000, 40_000])
@@ -126,9 +126,9 @@ def test_any_batches_of_a_sqlite_bag_give_the_same_columns(size: int, tmp_path: 
     bag = write_bag(tmp_path / "run", count=60)
     expected = read(bag, WHOLE, 1, salvage=False)
     for salvage in (False, True):
-        found = read(bag, size, 7, salvage=salvage)
-        assert_same_columns(expected["columns"], found["columns"])
-        assert expected["accounts"] == found["accounts"]
+        regrouped = read(bag, size, 7, salvage=salvage)
+        assert_same_columns(expected["columns"], regrouped["columns"])
+        assert expected["accounts"] == regrouped["accounts"]
 
 
 class Kept:

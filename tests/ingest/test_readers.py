@@ -149,11 +149,11 @@ def test_every_container_gives_the_same_columns(container: str, mcap: Path, tmp_
         open_recording(mcap) as reference,
         open_recording(CONTAINERS[container](tmp_path)) as other,
     ):
-        expected, found = everything(reference), everything(other)
+        expected, by_topic = everything(reference), everything(other)
         assert not other.lost_messages
         assert not [note for note in other.notes if "no metadata" not in note]
         assert {name: topic.type for name, topic in other.topics.items()} == TOPICS
-        assert_same_columns(expected, found, publish=False)
+        assert_same_columns(expected, by_topic, publish=False)
         for topic, account in other.accounts.items():
             assert account.expected == account.read == account.decoded == 20, topic
 
@@ -291,14 +291,14 @@ def test_a_cut_mcap_is_refused_and_salvaged(mcap: Path, tmp_path: Path) -> None:
         with pytest.raises(RecordingError, match="cut short"):
             open_recording(cut)
         with open_recording(cut, salvage=True) as recording, open_recording(mcap) as full:
-            found = everything(recording)
+            by_topic = everything(recording)
             expected = everything(full)
             assert recording.integrity == "damaged"
             assert "cut short" in recording.lost_messages[0].reason
-            got = sum(len(columns) for columns in found.values())
-            assert got > 0.6 * share * 140
+            decoded = sum(len(columns) for columns in by_topic.values())
+            assert decoded > 0.6 * share * 140
             # What came is what is in the whole file, from the start of each topic.
-            for topic, columns in found.items():
+            for topic, columns in by_topic.items():
                 times = set(expected[topic].log_time_ns.tolist())
                 assert set(columns.log_time_ns.tolist()) <= times
 
@@ -310,8 +310,8 @@ def test_a_cut_sqlite_bag_is_refused_and_salvaged(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="cut short"):
         open_recording(file)
     with open_recording(file, salvage=True) as recording:
-        found = everything(recording)
-        assert 0.3 * 2100 < sum(len(columns) for columns in found.values()) < 2100
+        by_topic = everything(recording)
+        assert 0.3 * 2100 < sum(len(columns) for columns in by_topic.values()) < 2100
         assert recording.lost_messages
 
 
@@ -324,9 +324,9 @@ def test_a_bad_chunk_loses_only_itself(mcap: Path, tmp_path: Path) -> None:
     damaged[(chunks[1].start + chunks[1].stop) // 2] ^= 0xFF
     (tmp_path / "bad.mcap").write_bytes(damaged)
     with open_recording(tmp_path / "bad.mcap") as recording:
-        found = everything(recording)
+        by_topic = everything(recording)
         lost = sum(chunks[1].counts().values())
-        assert sum(len(columns) for columns in found.values()) == 140 - lost
+        assert sum(len(columns) for columns in by_topic.values()) == 140 - lost
         assert recording.lost_messages[0].messages == lost
         assert recording.integrity == "damaged"
         assert sum(account.lost for account in recording.accounts.values()) == lost
@@ -412,8 +412,8 @@ def test_an_unknown_type_skips_its_topic_by_name(tmp_path: Path) -> None:
     base.close()
     with open_recording(file) as recording:
         assert "gazebo_msgs/msg/Performance" in str(recording.topics["/odom"].skipped)
-        found = recording.read({"/odom": ["x"], "/bumper": ["data"]})
-        assert list(found) == ["/bumper"]
+        by_topic = recording.read({"/odom": ["x"], "/bumper": ["data"]})
+        assert list(by_topic) == ["/bumper"]
         assert recording.accounts["/odom"].expected == recording.accounts["/odom"].lost == 20
         assert [loss.topic for loss in recording.lost_messages] == ["/odom"]
 
@@ -494,13 +494,13 @@ COUNTS = {
 def test_other_peoples_recordings_are_counted_and_read(name: str) -> None:
     with open_recording(SHARED / name) as recording:
         assert recording.messages == COUNTS[name]
-        found = everything(recording)
+        by_topic = everything(recording)
         for topic, account in recording.accounts.items():
             info = recording.topics[topic]
             assert account.expected == info.expected
             assert account.decoded + sum(account.reasons.values()) == account.expected
             if info.skipped is None:
-                assert len(found[topic]) == account.decoded
+                assert len(by_topic[topic]) == account.decoded
                 assert account.read == account.expected
 
 

@@ -20,13 +20,13 @@ COUNT = 140
 def chunks_of(path: Path) -> list[tuple[int, int]]:
     """Where each chunk's record and its index records are."""
     content = path.read_bytes()
-    found: list[tuple[int, int]] = []
+    places: list[tuple[int, int]] = []
     for opcode, at, stop in walk(content, len(MAGIC), len(content) - len(MAGIC)):
         if opcode == Op.CHUNK:
-            found.append((at - 9, stop))
+            places.append((at - 9, stop))
         elif opcode == Op.MESSAGE_INDEX:
-            found[-1] = (found[-1][0], stop)
-    return found
+            places[-1] = (places[-1][0], stop)
+    return places
 
 
 def read(path: Path) -> tuple[int, list[str], int]:

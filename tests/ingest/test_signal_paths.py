@@ -14,7 +14,7 @@ from restock.ingest.decoding.field_paths import Leaf
 from restock.ingest.profile.signal_paths import PathProblem, SignalPath
 
 
-def found(path: str, columns: dict[str, FieldColumn], end: str | None = None) -> list[list]:
+def values_at(path: str, columns: dict[str, FieldColumn], end: str | None = None) -> list[list]:
     """What a path finds, message by message."""
     read = SignalPath.read(path)
     got = read.find(columns, end)
@@ -35,48 +35,48 @@ STATUS = {
 
 
 def test_a_plain_field_and_elements_of_a_list():
-    assert found("voltage", {"voltage": np.array([1.0, 2.0])}) == [[1.0], [2.0]]
+    assert values_at("voltage", {"voltage": np.array([1.0, 2.0])}) == [[1.0], [2.0]]
     ranges = {"ranges": ragged([[1, 2, 3, 4, 5], [6], []])}
-    assert found("ranges[0]", ranges) == [[1], [6], []]
-    assert found("ranges[-1]", ranges) == [[5], [6], []]
-    assert found("ranges[4]", ranges) == [[5], [], []]
-    assert found("ranges[]", ranges) == [[1, 2, 3, 4, 5], [6], []]
-    assert found("ranges[::2]", ranges) == [[1, 3, 5], [6], []]
-    assert found("ranges[1:-1]", ranges) == [[2, 3, 4], [], []]
-    assert found("ranges[-2:]", ranges) == [[4, 5], [6], []]
+    assert values_at("ranges[0]", ranges) == [[1], [6], []]
+    assert values_at("ranges[-1]", ranges) == [[5], [6], []]
+    assert values_at("ranges[4]", ranges) == [[5], [], []]
+    assert values_at("ranges[]", ranges) == [[1, 2, 3, 4, 5], [6], []]
+    assert values_at("ranges[::2]", ranges) == [[1, 3, 5], [6], []]
+    assert values_at("ranges[1:-1]", ranges) == [[2, 3, 4], [], []]
+    assert values_at("ranges[-2:]", ranges) == [[4, 5], [6], []]
 
 
 def test_elements_of_a_fixed_array():
     columns = {"covariance": np.arange(12.0).reshape(3, 4)}
-    assert found("covariance[3]", columns) == [[3], [7], [11]]
-    assert found("covariance[::3]", columns) == [[0, 3], [4, 7], [8, 11]]
+    assert values_at("covariance[3]", columns) == [[3], [7], [11]]
+    assert values_at("covariance[::3]", columns) == [[0, 3], [4, 7], [8, 11]]
 
 
 def test_an_element_by_the_name_beside_it():
-    assert found("velocity[left]", JOINTS) == [[1.0], [4.0], [], []]
-    assert found("velocity[arm]", JOINTS) == [[], [], [5.0], []]
+    assert values_at("velocity[left]", JOINTS) == [[1.0], [4.0], [], []]
+    assert values_at("velocity[arm]", JOINTS) == [[], [], [5.0], []]
 
 
 def test_names_without_values_beside_them_find_nothing():
     columns = JOINTS | {"velocity": ragged([[], [3.0], [], []])}
-    assert found("velocity[left]", columns) == [[], [], [], []]
-    assert found("velocity[right]", columns) == [[], [3.0], [], []]
+    assert values_at("velocity[left]", columns) == [[], [], [], []]
+    assert values_at("velocity[right]", columns) == [[], [3.0], [], []]
 
 
 def test_an_element_by_what_a_field_of_it_says():
     path = "status[name=battery].values[key=v].value"
-    assert found(path, STATUS) == [["24"], [], []]
-    assert found("status[name=lidar].values[key=v].value", STATUS) == [[], ["9"], []]
-    assert found("status[name=lidar].level", STATUS) == [[1], [2], []]
-    assert found("status[level=2].name", STATUS) == [[], ["lidar"], []]
-    assert found("status[0].values[-1].value", STATUS) == [["1"], ["9"], []]
-    assert found("status[].values[].value", STATUS) == [["24", "1", "7"], ["8", "9"], []]
-    assert found("status[].values[key=n].value", STATUS) == [["7"], ["8"], []]
+    assert values_at(path, STATUS) == [["24"], [], []]
+    assert values_at("status[name=lidar].values[key=v].value", STATUS) == [[], ["9"], []]
+    assert values_at("status[name=lidar].level", STATUS) == [[1], [2], []]
+    assert values_at("status[level=2].name", STATUS) == [[], ["lidar"], []]
+    assert values_at("status[0].values[-1].value", STATUS) == [["1"], ["9"], []]
+    assert values_at("status[].values[].value", STATUS) == [["24", "1", "7"], ["8", "9"], []]
+    assert values_at("status[].values[key=n].value", STATUS) == [["7"], ["8"], []]
 
 
 def test_of_two_elements_that_say_so_the_first_counts():
     columns = {"s[].k": ragged([["a", "a"]]), "s[].v": ragged([[1, 2]])}
-    assert found("s[k=a].v", columns) == [[1]]
+    assert values_at("s[k=a].v", columns) == [[1]]
 
 
 @given(
@@ -87,18 +87,18 @@ def test_of_two_elements_that_say_so_the_first_counts():
 )
 def test_slices_are_pythons(rows, start, stop, step):
     text = f"x[{'' if start is None else start}:{'' if stop is None else stop}:{step}]"
-    assert found(text, {"x": ragged(rows)}) == [row[start:stop:step] for row in rows]
+    assert values_at(text, {"x": ragged(rows)}) == [row[start:stop:step] for row in rows]
 
 
 @given(st.lists(st.lists(st.integers(-9, 9), max_size=6), min_size=1, max_size=5))
 def test_an_index_is_pythons(rows):
     for index in range(-7, 7):
         want = [[row[index]] if -len(row) <= index < len(row) else [] for row in rows]
-        assert found(f"x[{index}]", {"x": ragged(rows)}) == want
+        assert values_at(f"x[{index}]", {"x": ragged(rows)}) == want
 
 
 @pytest.mark.parametrize(
-    ("path", "said"),
+    ("path", "problem_text"),
     [
         ("", "ends without a field"),
         ("a.", "ends without a field"),
@@ -110,10 +110,10 @@ def test_an_index_is_pythons(rows):
         ("a[::0]", "a step of 0"),
     ],
 )
-def test_what_is_no_path(path, said):
+def test_invalid_paths(path, problem_text):
     with pytest.raises(PathProblem) as problem:
         SignalPath.read(path)
-    assert said in str(problem.value)
+    assert problem_text in str(problem.value)
 
 
 def leaves(kind: str) -> list[Leaf]:
@@ -123,7 +123,7 @@ def leaves(kind: str) -> list[Leaf]:
 
 
 @pytest.mark.parametrize(
-    ("kind", "path", "said"),
+    ("kind", "path", "problem_text"),
     [
         ("sensor_msgs/msg/BatteryState", "voltge", "did you mean 'voltage'"),
         ("sensor_msgs/msg/BatteryState", "voltage[0]", "voltage does not repeat"),
@@ -137,10 +137,10 @@ def leaves(kind: str) -> list[Leaf]:
         ("diagnostic_msgs/msg/DiagnosticArray", "status[0].values[0].valu", "].value'"),
     ],
 )
-def test_a_path_that_a_type_does_not_have(kind, path, said):
+def test_a_path_that_a_type_does_not_have(kind, path, problem_text):
     with pytest.raises(PathProblem) as problem:
         SignalPath.read(path).check(leaves(kind))
-    assert said in str(problem.value)
+    assert problem_text in str(problem.value)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import pytest
 from support.paths import ROOT
 
 FUZZ = ROOT / "fuzz"
-FOUND = sorted((FUZZ / "found").iterdir())
+FINDINGS = sorted((FUZZ / "found").iterdir())
 
 
 def target() -> ModuleType:
@@ -30,7 +30,7 @@ READERS = target()
 SEEDS: list[bytes] = list(READERS.seeds())
 
 
-@pytest.mark.parametrize("path", FOUND, ids=lambda path: path.name)
+@pytest.mark.parametrize("path", FINDINGS, ids=lambda path: path.name)
 def test_what_was_found_stays_fixed(path: Path) -> None:
     READERS.examine(path.read_bytes())
 
