@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.conditions import label_scores
 from restock.ingest.task.perturbation_columns import Perturbed
 from restock.ingest.task.schema import SIGNAL_COLUMNS, recording_schema
-from restock.train.feed.fresh_log import read_episodes
+from restock.train.feed.fresh_log import FreshEpisode, read_episodes
 from restock.train.jump_start import POLICIES
 from restock.train.run.run import now_ns
 
@@ -60,7 +60,7 @@ def flush(run: Path, store: StoreWriter, profile: Profile, dropped_steps: int = 
             remedy="give --flush-fresh when the run begins: episodes are kept from then on",
         )
     recording_id = _content_id(episodes)
-    count = sum(int(episode["count"]) for episode in episodes)
+    count = sum(episode.count for episode in episodes)
     for row in store.live(recording_id).to_pylist():
         if all(row[name] == value for name, value in definitions(profile).items()):
             return Flushed(recording_id, "unchanged", len(episodes), count, None)
@@ -73,32 +73,32 @@ def flush(run: Path, store: StoreWriter, profile: Profile, dropped_steps: int = 
     return Flushed(recording_id, "written", len(episodes), len(table), version)
 
 
-def _content_id(episodes: Sequence[Mapping[str, Any]]) -> str:
+def _content_id(episodes: Sequence[FreshEpisode]) -> str:
     digest = hashlib.blake2b(digest_size=8)
     for episode in episodes:
         for name in ("observation", "action", "reward", "probability"):
-            digest.update(np.ascontiguousarray(episode[name]).tobytes())
-        for name in sorted(episode["signals"]):
-            digest.update(np.ascontiguousarray(episode["signals"][name]).tobytes())
+            digest.update(np.ascontiguousarray(getattr(episode, name)).tobytes())
+        for name in sorted(episode.signals):
+            digest.update(np.ascontiguousarray(episode.signals[name]).tobytes())
     return digest.hexdigest()
 
 
-def _lay_out(episodes: Sequence[Mapping[str, Any]], profile: Profile) -> EpisodeRows:
+def _lay_out(episodes: Sequence[FreshEpisode], profile: Profile) -> EpisodeRows:
     """All steps one after the other, as if one robot had driven the episodes in turn."""
-    lengths = np.array([int(episode["count"]) + 1 for episode in episodes], np.int64)
+    lengths = np.array([episode.count + 1 for episode in episodes], np.int64)
     first = np.concatenate([[0], np.cumsum(lengths)])[:-1].astype(np.int64)
     tick = np.arange(lengths.sum(), dtype=np.int64)
     step = tick - np.repeat(first, lengths)
     signals = {
-        column.name: np.concatenate([episode["signals"][column.name] for episode in episodes])
+        column.name: np.concatenate([episode.signals[column.name] for episode in episodes])
         for column in SIGNAL_COLUMNS
     }
     period_ns = round(profile.task.control_period_s * 1e9)
     for name in _MOVED:
         signals[name] = signals[name] + np.repeat(first, lengths) * period_ns
     labels = {
-        name: np.concatenate([episode["labels"][name] for episode in episodes])
-        for name in episodes[0]["labels"]
+        name: np.concatenate([episode.labels[name] for episode in episodes])
+        for name in episodes[0].labels
     }
     number = np.repeat(np.arange(len(episodes), dtype=np.int64), lengths)
     is_end = step == np.repeat(lengths, lengths) - 1
@@ -106,15 +106,15 @@ def _lay_out(episodes: Sequence[Mapping[str, Any]], profile: Profile) -> Episode
 
 
 def _values(
-    rows: EpisodeRows, episodes: Sequence[Mapping[str, Any]], profile: Profile, run: str
+    rows: EpisodeRows, episodes: Sequence[FreshEpisode], profile: Profile, run: str
 ) -> TransitionValues:
     """What was kept of each step, end to end."""
     begin = rows.starts
     number = rows.episode[begin]
-    version = [f"{run}@{int(episode['version'])}" for episode in episodes]
+    version = [f"{run}@{episode.version}" for episode in episodes]
 
     def each(name: str) -> NDArray[Any]:
-        return np.concatenate([episode[name] for episode in episodes])
+        return np.concatenate([getattr(episode, name) for episode in episodes])
 
     return TransitionValues(
         observation=each("observation"),
@@ -122,41 +122,32 @@ def _values(
         reward=each("reward"),
         progress_m=each("progress_m"),
         residual=np.zeros(len(begin)),  # the action is the command
-        terminates=np.array([bool(episode["terminated"]) for episode in episodes])[number],
+        terminates=np.array([episode.terminated for episode in episodes])[number],
         zone=_zones(rows, episodes, profile)[begin].tolist(),
         truth=each("truth").tolist(),
-        policy=_policies(episodes),
+        policy=[POLICIES[code] for code in each("policy")],
         policy_version=[version[episode] for episode in number],
         probability=each("probability"),
         perturbation=_perturbed(episodes).columns(number),
     )
 
 
-def _policies(episodes: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Who chose each step; an older run had no jump start."""
-    codes = [episode.get("policy", np.zeros(int(episode["count"]), int)) for episode in episodes]
-    return [POLICIES[code] for code in np.concatenate(codes)]
-
-
 def _zones(
-    rows: EpisodeRows, episodes: Sequence[Mapping[str, Any]], profile: Profile
+    rows: EpisodeRows, episodes: Sequence[FreshEpisode], profile: Profile
 ) -> NDArray[np.object_]:
     """The zone of every step: the profile's on the floor that it describes, else the layout's."""
     names = profile.zone_of(rows.signals["pose_x_m"], rows.signals["pose_y_m"])
     zones = np.array(names, object)
     for number, episode in enumerate(episodes):
-        if (of_layout := episode.get("zones")) is not None:
-            zones[rows.episode == number] = of_layout
+        if episode.zones is not None:
+            zones[rows.episode == number] = episode.zones
     return zones
 
 
-def _perturbed(episodes: Sequence[Mapping[str, Any]]) -> Perturbed:
-    """What was in force in each episode; those that an older run kept do not know."""
+def _perturbed(episodes: Sequence[FreshEpisode]) -> Perturbed:
+    """What was in force in each episode."""
     known = [
-        (str(episode["perturbation"]), json.loads(episode["perturbation_values"]))
-        if "perturbation" in episode
-        else None
-        for episode in episodes
+        (episode.perturbation, json.loads(episode.perturbation_values)) for episode in episodes
     ]
     return Perturbed(known, np.arange(len(known), dtype=np.int64))
 

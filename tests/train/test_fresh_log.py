@@ -26,7 +26,7 @@ from restock.replay.mixture.mixture import load_mixture
 from restock.replay.panel.build import build_panel
 from restock.replay.ring.ring import FreshRing
 from restock.train.feed.collector import Collector, ring_conditions
-from restock.train.feed.fresh_log import FreshLog, episode_files
+from restock.train.feed.fresh_log import FreshEpisode, FreshLog, episode_files, write_episodes
 from restock.train.flush_fresh import flush
 from restock.train.run import checkpoint
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
@@ -132,7 +132,7 @@ def test_rows_are_those_that_ingest_makes_of_the_same_steps(tmp_path: Path) -> N
     profile, writer = load_profile("warehouse_amr"), StoreWriter(tmp_path / "store")
     ingested = ingest(ROOT / "sample_logs" / "amr_tuesday", profile, store=writer).manifest
     logged = writer.rows(ingested["recording_id"], ingested["ingest_id"])
-    checkpoint.save(tmp_path / "run" / "fresh" / "000000.episodes", episodes_of(logged, profile))
+    write_episodes(tmp_path / "run" / "fresh" / "000000.episodes", episodes_of(logged, profile))
     flush(tmp_path / "run", writer, profile)
     (manifest,) = (row for row in writer.live().to_pylist() if row["format"] == "twin")
     flushed = writer.rows(manifest["recording_id"], manifest["ingest_id"])
@@ -162,7 +162,7 @@ DIFFERENT |= {"behaviour_policy", "behaviour_version", "perturbation", "perturba
 DIFFERENT |= {"action_residual"}
 
 
-def episodes_of(rows: pa.Table, profile: Profile) -> dict[str, dict[str, Any]]:
+def episodes_of(rows: pa.Table, profile: Profile) -> list[FreshEpisode]:
     """A recording's rows as the twin's episodes are kept."""
     ends = episode_ends(rows)
     assert ends is not None
@@ -170,7 +170,7 @@ def episodes_of(rows: pa.Table, profile: Profile) -> dict[str, dict[str, Any]]:
     observation = np.array(rows["observation"].to_pylist(), np.float32)
     final = np.array(rows["next_observation"].to_pylist(), np.float32)
     conditions = [condition.name for condition in profile.conditions]
-    episodes: dict[str, dict[str, Any]] = {}
+    episodes = []
     for number in range(len(ends)):
         inside = np.flatnonzero(rows["episode_index"].to_numpy() == number)
         part = rows.take(pa.array(inside))
@@ -178,20 +178,26 @@ def episodes_of(rows: pa.Table, profile: Profile) -> dict[str, dict[str, Any]]:
             [part.select(names), ends.slice(number, 1).select(names)], promote_options="permissive"
         )
         named = [set(held) for held in part["conditions"].to_pylist()] + [set()]
-        episodes[f"{number:06d}"] = {
-            "count": len(part),
-            "terminated": part["terminated"][-1].as_py(),
-            "version": 0,
-            "zones": np.array([*part["zone"].to_pylist(), "elsewhere"]),
-            "observation": np.concatenate([observation[inside], final[inside[-1:]]]),
-            "action": part["action"].to_numpy(),
-            "probability": part["action_probability"].to_numpy(),
-            "reward": part["reward"].to_numpy(),
-            "progress_m": part["progress_m"].to_numpy(),
-            "truth": np.array(part["true_condition"].to_pylist(), "<U32"),
-            "signals": {name: signals[name].to_numpy() for name in names},
-            "labels": {name: np.array([name in held for held in named]) for name in conditions},
-        }
+        episodes.append(
+            FreshEpisode(
+                count=len(part),
+                terminated=part["terminated"][-1].as_py(),
+                version=0,
+                zones=np.array([*part["zone"].to_pylist(), "elsewhere"]),
+                observation=np.concatenate([observation[inside], final[inside[-1:]]]),
+                action=part["action"].to_numpy(),
+                probability=part["action_probability"].to_numpy(),
+                reward=part["reward"].to_numpy(),
+                progress_m=part["progress_m"].to_numpy(),
+                truth=np.array(part["true_condition"].to_pylist(), "<U32"),
+                signals={name: signals[name].to_numpy() for name in names},
+                labels={name: np.array([name in held for held in named]) for name in conditions},
+                perturbation="nominal",
+                perturbation_values="{}",
+                layout="default",
+                policy=np.zeros(len(part), np.int16),
+            )
+        )
     return episodes
 
 

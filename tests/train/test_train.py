@@ -108,7 +108,7 @@ def test_resuming_in_the_twin_is_bit_exact(tmp_path: Path, panel: Path) -> None:
     parts = checkpoint.load(tmp_path / "parts" / "checkpoints" / "latest.safetensors")
     for name, value in whole["learner"]["network"].items():
         assert torch.equal(value, parts["learner"]["network"][name]), name
-    np.testing.assert_array_equal(whole["ring"]["rows"], parts["ring"]["rows"])
+    np.testing.assert_equal(whole["ring"], parts["ring"])
     assert whole["exploration"] == parts["exploration"]
 
 
@@ -132,7 +132,7 @@ def test_ctrl_c_writes_a_checkpoint_and_says_how_to_go_on(tmp_path: Path) -> Non
     assert process.returncode == 130, complaint
     assert "restock train --resume" in complaint
     assert "Traceback" not in complaint
-    stopped = checkpoint.load(path / "checkpoints" / "latest.safetensors")["clock"]["env_steps"]
+    stopped = checkpoint.load(path / "checkpoints" / "latest.safetensors")["progress"]["env_steps"]
     assert stopped > 0
     assert main(["train", "--resume", str(path), "--env-steps", str(stopped + 40)]) == 0
 
@@ -161,7 +161,7 @@ def test_a_run_killed_at_any_instant_goes_on_bit_exactly(tmp_path: Path, rows: i
     )
     for name, value in whole["learner"]["network"].items():
         assert torch.equal(value, killed["learner"]["network"][name]), name
-    np.testing.assert_array_equal(whole["ring"]["rows"], killed["ring"]["rows"])
+    np.testing.assert_equal(whole["ring"], killed["ring"])
     for name in ("strata", "audit", "evaluations", "episodes"):
         one, two = (
             pq.read_table(tmp_path / run / f"{name}.parquet") for run in ("whole", "killed")

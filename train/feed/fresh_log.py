@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.state import Stateful
+from restock.replay.mixture.packed_row import F32
+from restock.state import Stateful, saved
 from restock.train.run import checkpoint
 
 if TYPE_CHECKING:
@@ -24,6 +26,28 @@ if TYPE_CHECKING:
 Bools = NDArray[np.bool_]
 _STEP = ("action", "probability", "policy", "reward", "progress_m", "truth")
 _KINDS = {"action": "i2", "policy": "i2", "truth": "<U32"}
+
+
+@dataclass(frozen=True)
+class FreshEpisode:
+    """An episode of T steps as it is kept; of the last of its T + 1 observations no action is."""
+
+    count: int  # T
+    terminated: bool
+    version: int  # gradient step of the policy at its begin
+    perturbation: str
+    perturbation_values: str  # JSON: those that are not nominal
+    layout: str
+    zones: Sequence[str] | None  # (T + 1,) on its layout; None: what the profile says
+    observation: F32  # (T + 1, D)
+    action: NDArray[np.int16]  # (T,)
+    probability: F32  # (T,)
+    policy: NDArray[np.int16]  # (T,) the ring's code of who chose the action
+    reward: F32  # (T,)
+    progress_m: F32  # (T,)
+    truth: NDArray[np.str_]  # (T,) the true condition
+    signals: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # (T + 1,) each
+    labels: Mapping[str, Bools] = field(default_factory=dict)  # (T + 1,) each
 
 
 class FreshLog(Stateful):
@@ -56,7 +80,7 @@ class FreshLog(Stateful):
         self._steps: dict[str, NDArray[Any]] = {
             name: np.zeros((count, longest), _KINDS.get(name, "f4")) for name in _STEP
         }
-        self._waiting: dict[str, dict[str, Any]] = {}  # ended, not labelled; by the ring's key
+        self._waiting: dict[int, FreshEpisode] = {}  # ended, not labelled; by the ring's key
         self.parts = 0  # files written
         self.dropped_steps = 0  # whose physics blew up
 
@@ -89,40 +113,40 @@ class FreshLog(Stateful):
         if not count:
             return
         self._observation[env, episode.steps] = last
-        self._waiting[str(episode.key)] = {
-            "count": count,
-            "terminated": terminated and not broken,
-            "version": int(self._version[env]),
-            "perturbation": episode.perturbation,
-            "layout": episode.layout,
-            "zones": None if episode.zones is None else episode.zones[: count + 1],
-            "perturbation_values": episode.perturbation_values,
-            "observation": self._observation[env, : count + 1].copy(),
-            **{name: column[env, :count].copy() for name, column in self._steps.items()},
+        of_steps: dict[str, Any] = {
+            n: column[env, :count].copy() for n, column in self._steps.items()
         }
+        self._waiting[episode.key] = FreshEpisode(
+            count=count,
+            terminated=terminated and not broken,
+            version=int(self._version[env]),
+            perturbation=episode.perturbation,
+            perturbation_values=episode.perturbation_values,
+            layout=episode.layout,
+            zones=None if episode.zones is None else episode.zones[: count + 1],
+            observation=self._observation[env, : count + 1].copy(),
+            **of_steps,
+        )
 
     def labelled(self, episodes: Sequence[EndedEpisode], labels: Mapping[str, Bools]) -> None:
         """Keep ended episodes; `labels` are over their steps, (steps + 1) each, end to end."""
-        kept: dict[str, dict[str, Any]] = {}
+        kept: list[FreshEpisode] = []
         begin = 0
         for episode in episodes:
-            entry = self._waiting.pop(str(episode.key), None)
-            if entry is not None:
-                inside = slice(begin, begin + entry["count"] + 1)
-                kept[f"{len(kept):06d}"] = entry | {
-                    "signals": {
-                        name: column[: entry["count"] + 1]
-                        for name, column in episode.signals.items()
-                    },
-                    "labels": {name: holds[inside] for name, holds in labels.items()},
-                }
+            if (entry := self._waiting.pop(episode.key, None)) is not None:
+                steps, inside = slice(entry.count + 1), slice(begin, begin + entry.count + 1)
+                signals = {name: column[steps] for name, column in episode.signals.items()}
+                holds = {name: column[inside] for name, column in labels.items()}
+                kept.append(replace(entry, signals=signals, labels=holds))
             begin += episode.steps + 1
         if kept:
-            checkpoint.save(self.folder / f"{self.parts:06d}.episodes", kept)
+            write_episodes(self.folder / f"{self.parts:06d}.episodes", kept)
             self.parts += 1
 
     def restored(self) -> None:
         """Files written since the checkpoint go: their steps come again."""
+        waiting: Mapping[Any, Any] = self._waiting  # as JSON has it
+        self._waiting = {int(key): FreshEpisode(**entry) for key, entry in waiting.items()}
         for path in episode_files(self.folder)[self.parts :]:
             path.unlink()
 
@@ -132,10 +156,19 @@ def episode_files(folder: Path) -> list[Path]:
     return sorted(folder.glob("*.episodes"))
 
 
-def read_episodes(folder: Path) -> list[dict[str, Any]]:
-    """Every episode kept, in order: count, terminated, version, observation (T + 1, D), the values
-    of each step (T,), signals (T + 1,) and labels (T + 1,)."""
-    return [episode for path in episode_files(folder) for episode in checkpoint.load(path).values()]
+def write_episodes(path: Path, episodes: Sequence[FreshEpisode]) -> None:
+    """A file of episodes, in order."""
+    checkpoint.save(path, {f"{at:06d}": saved(episode) for at, episode in enumerate(episodes)})
+
+
+def read_episodes(folder: Path) -> list[FreshEpisode]:
+    """Every episode kept, in order.
+
+    Raises:
+        RunError: a file is damaged, or of an earlier Restock.
+    """
+    files = map(checkpoint.load, episode_files(folder))
+    return [FreshEpisode(**episode) for file in files for episode in file.values()]
 
 
 Entries = list[tuple[str, float]]
