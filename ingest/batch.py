@@ -47,7 +47,7 @@ class IngestJob:
     typestore: str | None = None
 
     def run(self, path: Path) -> Result:
-        """Ingest one recording. What goes wrong with it is an answer, too: the others go on."""
+        """Ingest one recording; an error is returned, so that the others continue."""
         from restock.ingest.pipeline import ingest
         from restock.ingest.store.writer import StoreWriter
 

@@ -67,7 +67,7 @@ def ingest(
     salvage: bool = False,
     typestore: str | None = None,
 ) -> IngestResult:
-    """Read one recording and put its transitions in the store (None: a dry run).
+    """Read one recording and write its transitions to the store (None: a dry run).
 
     A recording that is in the store as this profile, these conditions and this software would
     put it there is left alone, unless `force`.

@@ -54,7 +54,7 @@ def relabel_store(
     *,
     dry_run: bool = False,
 ) -> tuple[list[Relabelled], int | None]:
-    """Label every recording again whose labels are not of the conditions it should have.
+    """Label every recording again whose conditions have changed.
 
     `conditions_of` gives the conditions for the profile (by name) that read a recording. Returns
     what became of each, and the version of `transitions` (None where nothing was written).

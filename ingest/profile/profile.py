@@ -163,8 +163,10 @@ class Profile(Checked, frozen=True):
 
     @property
     def hash(self) -> str:
-        """Names all that the profile says but its conditions, 12 hex digits: rows depend on the
-        rest, and labels, which can be changed without the recordings, on `labels_version`."""
+        """12 hex digits of everything in the profile but its conditions: rows depend on that.
+
+        Labels depend on `labels_version`: they can be changed without the recordings.
+        """
         rest = msgspec.structs.replace(self, shipped_conditions=[], own_conditions=[])
         return hashlib.blake2b(msgspec.json.encode(rest), digest_size=6).hexdigest()
 

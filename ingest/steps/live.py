@@ -73,7 +73,7 @@ class LiveObserver:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: the clock was set, or the robot was put elsewhere."""
+        """Discard all messages: the clock was set, or the robot was moved."""
         self._buffers: dict[str, list[_Message]] = {topic: [] for topic in self._inputs}
         self._delays: dict[str, deque[int]] = {}
         self._command: _Message | None = None  # the first since the last tick, or the last before

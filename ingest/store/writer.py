@@ -51,7 +51,7 @@ class StoreWriter:
         self.path = Location.of(path)
 
     def reach(self) -> None:
-        """See that the place can be reached. Raises StoreError where it cannot."""
+        """Check that the place can be reached. Raises StoreError where it cannot."""
         self.path.has_table(TRANSITIONS)
 
     def live(self, recording_id: str | None = None) -> pa.Table:
@@ -71,7 +71,7 @@ class StoreWriter:
         return self.path.read(f"{TRANSITIONS}/{recording_id}/{ingest_id}.parquet")
 
     def write(self, manifest: pa.Table, rows: pa.Table) -> int:
-        """Put one recording's manifest row and transitions in the store, replacing its old ones.
+        """Write one recording's manifest row and transitions, replacing its old ones.
 
         Returns the version of `transitions` that has them.
 
@@ -86,7 +86,7 @@ class StoreWriter:
         *,
         instead_of: Mapping[str, str] | None = None,
     ) -> int:
-        """Put several recordings, as (manifest row, transitions), in the store in one commit.
+        """Write several recordings, as (manifest row, transitions), in one commit.
 
         `instead_of` (recording -> ingest) are the ingests that were read to make them: if another
         writer has replaced one since, nothing is written.

@@ -209,7 +209,7 @@ def _check_stratum(name: str, rule: StratumRule | EachCondition) -> None:
 
 
 class Mixture(Checked, frozen=True):
-    """The whole file. See `docs/mixture.md`."""
+    """Which transitions a run samples, in which shares. `docs/mixture.md` explains every key."""
 
     doc: str = ""
     seed: int = 0

@@ -218,7 +218,7 @@ def sampler_for(
     logs_share: float | None = None,
     lap_floor: float = 1.0,
 ) -> LoggedSampler:
-    """What draws from a panel as its mixture says.
+    """The sampler that draws from a panel as its mixture says.
 
     Args:
         batch_size: logged rows of a batch.

@@ -35,7 +35,7 @@ class Trace:
 
 @dataclass(frozen=True)
 class TracePlaces:
-    """Places that are not where they were, and what a trace may use."""
+    """New places of what was moved, and the recording and profile to read."""
 
     store: str | None = None
     panel: Path | None = None
@@ -75,7 +75,7 @@ def trace_row(place: str | Path, row: str, where: TracePlaces | None = None) -> 
 
 
 def audited_rows(run: str | Path, limit: int = 20) -> list[dict[str, Any]]:
-    """The audited rows of a run with the largest TD errors, each with its name for `trace`."""
+    """The audited rows of a run with the largest TD errors, each with its name for `trace_row`."""
     if not (Path(run) / RUN_CONFIG).is_file():
         raise RunError(
             "is no run: only of a run can rows be listed",

@@ -36,7 +36,7 @@ class ExitCode(IntEnum):
 
 
 class RestockError(Exception):
-    """Something the user can mend. `what` is wrong, `where`, and the `remedy`."""
+    """An error that the user can fix: `what` is wrong, `where`, and the `remedy`."""
 
     exit_code = ExitCode.USAGE
 

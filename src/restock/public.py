@@ -15,7 +15,14 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-FACES = ("restock", "restock.ingest", "restock.replay", "restock.train", "restock.twin")
+FACES = (
+    "restock",
+    "restock.ingest",
+    "restock.replay",
+    "restock.train",
+    "restock.twin",
+    "restock.report",
+)
 BEGIN = "<!-- names: written by `python -m restock.public docs/api.md` -->"
 END = "<!-- end of names -->"
 
@@ -48,8 +55,13 @@ def markdown() -> str:
         tree = _tree(face)
         parts.append(f"## {face}\n\n{_first_paragraph(tree)}\n")
         homes = {name: module for module, names in imported(face).items() for name in names}
+        homes |= {
+            node.name: face
+            for node in tree.body
+            if isinstance(node, ast.FunctionDef) and not node.name.startswith("_")
+        }
         if face == "restock":
-            homes = {"open": "restock", "RestockError": "restock.errors"}
+            homes["RestockError"] = "restock.errors"
         for name in sorted(homes, key=str.lower):
             node = next(n for n in _tree(homes[name]).body if getattr(n, "name", "") == name)
             parts.append(_entry(node))
@@ -88,9 +100,11 @@ def _entry(node: ast.AST) -> str:
         for member in node.body
         if isinstance(member, ast.FunctionDef) and _is_public(member)
     )
-    if any(ast.unparse(base) == "Stateful" for base in node.bases):
+    inherits = any(ast.unparse(base) == "Stateful" for base in node.bases)
+    if inherits and "`state_dict()`" not in methods:
         methods += (
-            "- `state_dict()`, `load_state_dict(state)`: Saves what is to go on, and goes on.\n"
+            "- `state_dict()`, `load_state_dict(state)`: The state that a checkpoint keeps, as"
+            " arrays and JSON values.\n"
         )
     return f"### {node.name}\n\n{signature}{text}\n" + (methods and f"\n{methods}")
 

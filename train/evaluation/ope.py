@@ -49,7 +49,7 @@ FILE = "off_policy.parquet"  # in RUN/eval
 
 
 class OpeConfig(Checked, frozen=True):
-    """How a policy is evaluated on logs.
+    """Settings of off-policy evaluation.
 
     Raises:
         ValueError: a value out of its range.

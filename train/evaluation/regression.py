@@ -153,7 +153,7 @@ def compare_with_baseline(
 
 
 def regressed(rows: Sequence[dict[str, Any]]) -> bool:
-    """Whether a pipeline should stop: something is worse, or could not be compared."""
+    """Whether a pipeline should stop: a row is worse, or could not be compared."""
     return any(row["verdict"] in ("worse", "refused") for row in rows)
 
 

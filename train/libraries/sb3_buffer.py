@@ -234,7 +234,7 @@ class MixtureReplayBuffer(ReplayBuffer):
         )
 
     def close(self) -> None:
-        """Write what the record still holds; the run is whole after it."""
+        """Write the rest of the record; the run is complete after it."""
         self.feed.flush()
 
 

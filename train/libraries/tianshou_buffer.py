@@ -193,7 +193,7 @@ class MixtureVectorReplayBuffer(ReplayBufferManager):
         packed[:, column["discount"]] = ~np.asarray(rows.terminated[slots])[:, None]
 
     def close(self) -> None:
-        """Write what the record still holds; the run is whole after it."""
+        """Write the rest of the record; the run is complete after it."""
         self._note(None)
         self.feed.flush()
 

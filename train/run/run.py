@@ -153,7 +153,7 @@ class Run:
         return {name: self.table(name).num_rows for name in TABLES}
 
     def truncate(self, counts: Mapping[str, int]) -> None:
-        """Forget rows that were written after the checkpoint that `counts` is from.
+        """Remove rows that were written after the checkpoint of `counts`.
 
         Raises:
             RunError: a table has fewer rows than the checkpoint knew of.

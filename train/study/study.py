@@ -139,7 +139,7 @@ class StudyJob:
 
 @dataclass(frozen=True)
 class StudyPlan:
-    """What there is to do."""
+    """A study and its folders: the runs to do."""
 
     study: Study
     folder: Path  # of the TOML: its paths are relative to it
@@ -147,7 +147,7 @@ class StudyPlan:
 
     @property
     def jobs(self) -> list[StudyJob]:
-        """Seeds first: a study that is cut has fewer seeds of all arms, not fewer arms."""
+        """Seeds first: an interrupted study has fewer seeds of all arms, not fewer arms."""
         return [
             StudyJob(arm, seed, self.out / "runs" / f"{arm.name}-{seed}")
             for seed in self.study.seeds

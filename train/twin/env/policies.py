@@ -102,7 +102,7 @@ class PlannerFollower(SoftPolicy):
         super().__init__(epsilon=epsilon, seed=seed)
 
     def choose(self, env: WarehouseVectorEnv) -> Actions:
-        """The action of the nearest velocity to what the plan asks for."""
+        """The action whose velocity is nearest to the plan's."""
         signals = env.signals
         near = np.arctan2(signals["waypoint_near_y_m"], signals["waypoint_near_x_m"])
         far = np.arctan2(signals["waypoint_far_y_m"], signals["waypoint_far_x_m"])

@@ -35,7 +35,7 @@ class WarehouseEnv(gymnasium.Env[NDArray[np.float32], Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begin the next episode; a seed begins the sequence of episodes it names anew."""
+        """Begin the next episode; a seed starts its sequence of episodes again."""
         super().reset(seed=seed)
         if seed is None and not self._seeded:  # unseeded environments differ, as Gymnasium's do
             seed = int(self.np_random.integers(2**31))
@@ -59,7 +59,7 @@ class WarehouseEnv(gymnasium.Env[NDArray[np.float32], Any]):
         return frames[0] if frames else None
 
     def close(self) -> None:
-        """Give back what `render` holds."""
+        """Release what `render` holds."""
         self.vector.close()
 
 

@@ -63,7 +63,7 @@ OBSERVATION_LIMIT = 20.0  # no sensor of this robot gives more; holds the space'
 
 
 class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]], Stateful):
-    """N warehouses. See the module for what `info` holds."""
+    """N warehouses as a Gymnasium vector environment; `docs/twin.md` explains `info`."""
 
     # What changes while episodes run; the rest (layout, noise, ways of traffic) follows from specs.
     STATE = (
@@ -342,7 +342,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         return None if self.render_mode is None else self._renderer.frames(self)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Give the camera's context back; Gymnasium's `close` calls it."""
+        """Release the camera's context; Gymnasium's `close` calls it."""
         self._renderer.close()
 
     # -- recorders ------------------------------------------------------------------------------

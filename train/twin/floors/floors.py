@@ -170,7 +170,7 @@ def turned(floor: Warehouse) -> Warehouse:
 
 
 def open_floors(text: str) -> tuple[Warehouse, ...]:
-    """The floors that a user names; see the module.
+    """The floors of a name, file or comma-separated list; `docs/layouts.md` lists them.
 
     Raises:
         ConfigError: no such floor, or a file that is not a floor; says which and what to write.

@@ -74,7 +74,7 @@ def no_pallets() -> F64:
 
 
 def draw_episode(spec: EpisodeSpec, warehouse: Warehouse, planner: Planner) -> Episode:
-    """Lay out the episode that `spec` names: the same for the same spec, always."""
+    """The episode that `spec` determines: the same spec always gives the same episode."""
     entropy = [spec.seed, zlib.crc32(spec.condition.encode())]
     layout, noise = np.random.SeedSequence(entropy).spawn(2)
     rng = np.random.Generator(np.random.PCG64(layout))
