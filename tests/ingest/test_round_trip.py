@@ -43,7 +43,7 @@ from restock.replay.store.store import Store
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 from restock.train.twin.recording.bag_writer import Format
 from restock.train.twin.recording.drivers import BehaviourPolicies, ExternalPolicy
-from restock.train.twin.recording.fleet import Driven, Fleet
+from restock.train.twin.recording.fleet import DrivenMission, Fleet
 from restock.train.twin.recording.missions import HANDOVER, Mission, schedule
 from restock.train.twin.recording.publish import ACCEL_LSB_MPS2, GYRO_LSB_RADPS, LIDAR_LSB_M
 from restock.train.twin.recording.recorder import HARDWARE, NOISELESS, RecordingPlan, record
@@ -107,7 +107,7 @@ class Trip:
     case: Case
     folder: Path
     plan: RecordingPlan = field(init=False)
-    driven: list[Driven] = field(init=False)
+    driven: list[DrivenMission] = field(init=False)
     rows: pa.Table = field(init=False)
 
     def __post_init__(self) -> None:

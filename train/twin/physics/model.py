@@ -279,24 +279,20 @@ def pallet_half_m(yaw_rad: F64) -> F64:
     return np.where(across, PALLET_HALF_M[1::-1], PALLET_HALF_M[:2])
 
 
-def wheel_commands(
-    speed_mps: NDArray[Any], yaw_rate_radps: NDArray[Any]
-) -> tuple[NDArray[Any], NDArray[Any]]:
+def wheel_commands(speed_mps: F64, yaw_rate_radps: F64) -> tuple[F64, F64]:
     """Body velocity to the left and right wheels' speeds in rad/s, at the nominal radius."""
     turn = yaw_rate_radps * (TRACK_M / 2)
     return (speed_mps - turn) / WHEEL_RADIUS_M, (speed_mps + turn) / WHEEL_RADIUS_M
 
 
-def body_velocity(
-    left_radps: NDArray[Any], right_radps: NDArray[Any]
-) -> tuple[NDArray[Any], NDArray[Any]]:
+def body_velocity(left_radps: F64, right_radps: F64) -> tuple[F64, F64]:
     """Wheel speeds in rad/s to forward speed (m/s) and yaw rate (rad/s): wheel odometry."""
     speed = (left_radps + right_radps) * (WHEEL_RADIUS_M / 2)
     return speed, (right_radps - left_radps) * (WHEEL_RADIUS_M / TRACK_M)
 
 
-def yaw_of(quat: NDArray[np.float64]) -> NDArray[np.float64]:
+def yaw_of(quat: F64) -> F64:
     """Heading (N,) from unit quaternions (N, 4), w first."""
     w, x, y, z = quat[..., 0], quat[..., 1], quat[..., 2], quat[..., 3]
-    heading: NDArray[np.float64] = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    heading: F64 = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     return heading

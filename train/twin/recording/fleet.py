@@ -31,7 +31,7 @@ MOTION_PERIOD_S = 0.02
 
 
 @dataclass(frozen=True)
-class Driven:
+class DrivenMission:
     """A mission that was driven: its T steps as the twin has them."""
 
     mission: Mission
@@ -40,7 +40,6 @@ class Driven:
     action: NDArray[np.int64]  # (T,)
     reward: NDArray[np.float32]  # (T,)
     success: bool
-    block: str
     terminated: bool  # at its last step; else it was truncated there
     floor: Warehouse
 
@@ -51,20 +50,21 @@ class _Log:
 
     place: int  # among the missions
     mission: Mission
+    hardware: Perturbation
     rng: np.random.Generator  # of the scans between ticks
+    pallets: F64  # (P, 3)
+    patches: F64  # (K, 5)
+    motion: list[BodyState]  # of all robots
     signals: list[dict[str, Any]] = field(default_factory=list)  # T + 1 rows
     observation: list[NDArray[np.float32]] = field(default_factory=list)  # T + 1
     action: list[int] = field(default_factory=list)
     reward: list[float] = field(default_factory=list)
     policy: list[tuple[str, str, float]] = field(default_factory=list)
     truth: list[str] = field(default_factory=list)
-    motion: list[BodyState] = field(default_factory=list)  # of all robots
     scan_s: list[float] = field(default_factory=list)
     ranges_m: list[F64] = field(default_factory=list)
     plans: list[tuple[int, F64]] = field(default_factory=list)
     plan_number: int = -1
-    pallets: F64 = field(default_factory=lambda: np.zeros((0, 3)))
-    patches: F64 = field(default_factory=lambda: np.zeros((0, 5)))
     traffic: list[F64] = field(default_factory=list)  # T + 1
 
 
@@ -73,8 +73,8 @@ class Fleet:
 
     Args:
         hardware: those parameters, where a mission names none of its own.
-        layouts: the floors, as `restock.train.twin.floors.floors.open_floors` reads them; a
-        mission that names     none is on one that its seed draws.
+        layouts: the floors, as `restock.train.twin.floors.floors.open_floors` reads them; a mission
+            that names none is on one that its seed draws.
         conditions: the kinds of the missions to come (keys), which must fit on the floors.
         scan_hz: the lidar scans at every control tick, and above 5 Hz once more between two.
     """
@@ -102,10 +102,12 @@ class Fleet:
         self._scan: F64 | None = None  # true ranges half-way through it
         self.env.set_block_callback(self._note_motion, MOTION_PERIOD_S)
 
-    def drive(self, missions: Iterator[Mission], policies: BehaviourPolicies) -> Iterator[Driven]:
+    def drive(
+        self, missions: Iterator[Mission], policies: BehaviourPolicies
+    ) -> Iterator[DrivenMission]:
         """Drive missions, for as long as there are more and the caller wants them."""
         env, numbered = self.env, enumerate(missions)
-        finished: dict[int, Driven] = {}
+        finished: dict[int, DrivenMission] = {}
         delivered = 0
         self._begin(np.arange(env.num_envs), numbered, policies)
         while any(log is not None for log in self._logs):
@@ -152,10 +154,15 @@ class Fleet:
                 self._logs[robot] = None
                 continue
             place, mission = entry
-            log = _Log(place, mission, np.random.Generator(np.random.PCG64(mission.spec.seed)))
-            log.motion.append(standing)
-            log.pallets = env.simulation.pallets[robot].copy()
-            log.patches = env.simulation.patches[robot].copy()
+            log = _Log(
+                place,
+                mission,
+                mission.spec.perturbation or env.perturbation,
+                np.random.Generator(np.random.PCG64(mission.spec.seed)),
+                env.simulation.pallets[robot].copy(),
+                env.simulation.patches[robot].copy(),
+                [standing],
+            )
             self._logs[robot] = log
             self._note_tick(log, robot, env.signals)
             policies.begin(robot, mission)
@@ -168,7 +175,7 @@ class Fleet:
     def _note_step(self, log: _Log, robot: int, info: Mapping[str, Any]) -> None:
         """What came of the action."""
         log.motion.extend(self._motion)
-        if self._scan is not None and not self._hardware(log).lidar_period_s:
+        if self._scan is not None and not log.hardware.lidar_period_s:
             log.scan_s.append(round((len(log.action) - 1) * self.period_s + BLOCK_S, 6))
             log.ranges_m.append(self._measured(log, self._scan[robot]))
         self._note_tick(log, robot, info["signals"])
@@ -178,7 +185,7 @@ class Fleet:
         env, tick = self.env, len(log.action)
         log.signals.append({name: column[robot] for name, column in signals.items()})
         log.observation.append(env.observation[robot].copy())
-        every = max(round(self._hardware(log).lidar_period_s / self.period_s), 1)
+        every = max(round(log.hardware.lidar_period_s / self.period_s), 1)
         if tick % every == 0:  # else the robot goes on with the scan before
             log.scan_s.append(round(tick * self.period_s, 6))
             log.ranges_m.append(env.sensing.ranges_m[robot].copy())
@@ -189,23 +196,19 @@ class Fleet:
             log.plans.append((tick, env.navigation.plans_m[robot].copy()))
             log.plan_number = number
 
-    def _hardware(self, log: _Log) -> Perturbation:
-        return log.mission.spec.perturbation or self.env.perturbation
-
     def _measured(self, log: _Log, true_ranges_m: F64) -> F64:
-        """A scan between ticks: the same noise and dropout, drawn anew."""
-        hardware = self._hardware(log)
+        """A scan between ticks: the same noise and dropout, drawn for itself."""
+        hardware = log.hardware
         ranges = true_ranges_m + log.rng.normal(0, hardware.lidar_noise_m, len(true_ranges_m))
         lost = log.rng.random(len(ranges)) < hardware.lidar_dropout
         return np.where(lost, np.inf, np.maximum(ranges, 0.0))
 
     def _finish(
         self, log: _Log, robot: int, info: Mapping[str, Any], *, terminated: bool
-    ) -> Driven:
+    ) -> DrivenMission:
         env = self.env
         goal = env.navigation.goals_m[robot]
         names = log.signals[0].keys()
-        hardware = self._hardware(log)
         action = np.array(log.action, np.int64)
         drive = Drive(
             goal_m=(float(goal[0]), float(goal[1])),
@@ -222,19 +225,18 @@ class Fleet:
                 pallets=log.pallets,
                 patches=log.patches,
                 traffic=np.array(log.traffic),
-                perturbation=hardware,
+                perturbation=log.hardware,
                 goal_radius_m=env.task.goal_radius_m,
                 body_m=(env.task.body.length_m, env.task.body.width_m, 2 * CHASSIS_Z_M),
             ),
         )
-        return Driven(
+        return DrivenMission(
             mission=log.mission,
             drive=drive,
             observation=np.array(log.observation),
             action=action,
             reward=np.array(log.reward, np.float32),
             success=bool(info["success"][robot]),
-            block=str(info["block"][robot]),
             terminated=terminated,
             floor=env.floor_of(robot),
         )

@@ -127,7 +127,7 @@ class RecordingPlan:
 
 
 @dataclass
-class Summary:
+class RecordingSummary:
     """What was recorded."""
 
     path: Path
@@ -167,7 +167,7 @@ def record(
     *,
     policy: Policy | None = None,
     on_mission: Callable[[int, float], None] | None = None,
-) -> Summary:
+) -> RecordingSummary:
     """Drive and write a recording; `on_mission(1, minutes)` is called after each mission.
 
     A `policy` drives in place of the script that the plan names: a trained one, or whatever of your
@@ -194,7 +194,7 @@ def record(
         scan_hz=plan.rates.scan,
     )
     robot = _robot(plan, fleet)
-    summary = Summary(path, plan)
+    summary = RecordingSummary(path, plan)
     driver, version = (plan.policy, "1") if policy is None else (policy.name, policy.version)
     missions = schedule(plan.seed, plan.conditions, driver, plan.hardware, version=version)
     drivers = BehaviourPolicies(
