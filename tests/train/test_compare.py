@@ -16,6 +16,7 @@ from restock.train.dqn.config import TrainConfig
 from restock.train.run.run import Run
 
 UPDATES, ENV_STEPS = 10_000, 40_000
+EXTRA = ("update_path",)
 DOCUMENT: dict[str, Any] = {
     "created_ns": 0,
     "config": msgspec.to_builtins(TrainConfig()),
@@ -119,7 +120,7 @@ def make_run(
 
 
 def arm(tmp_path: Path, name: str, seeds: range, **given: Any) -> list[str]:
-    settings = {key: given.pop(key) for key in list(given) if "__" in key}
+    settings = {key: given.pop(key) for key in list(given) if "__" in key or key in EXTRA}
     return [
         str(make_run(tmp_path / f"{name}{seed}", document(seed, **settings), **given))
         for seed in seeds
@@ -134,8 +135,9 @@ def compared(
 
 
 def test_algorithms_fed_alike_are_compared(tmp_path, capsys) -> None:
-    first = arm(tmp_path, "a", range(3), success=0.2)
-    second = arm(tmp_path, "b", range(3, 6), success=0.7, config__network__dueling=True)
+    first = arm(tmp_path, "a", range(3), success=0.2, update_path="manual")
+    dueling = {"config__network__dueling": True, "update_path": "autograd"}  # one follows the other
+    second = arm(tmp_path, "b", range(3, 6), success=0.7, **dueling)
     code, found = compared(capsys, first, second)
     assert (code, found["verdict"], found["outcomes_from"]) == (0, "comparable", "training")
     assert [d["setting"] for d in found["differences"]] == ["config.network.dueling"]

@@ -73,7 +73,9 @@ _KINDS: dict[str, Kind] = {
     "profile": "task",
     "versions": "software",
 }
-_NO_SETTING = frozenset({"format", "created_ns", "target", "seeds"})  # or in config as well
+_NO_SETTING = frozenset(  # or it follows from the config
+    {"format", "created_ns", "target", "seeds", "update_path"}
+)
 
 
 @dataclass(frozen=True)
