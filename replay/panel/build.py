@@ -54,7 +54,7 @@ def open_source(
     conditions: Sequence[Condition] | None = None,
     folder: Path | None = None,
 ) -> Iterator[TransitionSource]:
-    """A store, or a table with the columns of `ingest.schema`, as a source of a panel.
+    """A store, or a table with the columns of `ingest.task.schema`, as a source of a panel.
 
     A store comes with the other stores of `mixture`, whose relative paths begin at `folder`.
     Without `conditions` a table's are the shipped ones that its labels name.
@@ -107,7 +107,7 @@ def build_panel(
     """Plan, pack and open a panel.
 
     Args:
-        transitions: a store, or a table with the columns of `ingest.schema.transition_schema`.
+        transitions: a store, or a table with the columns of `ingest.task.schema.transition_schema`.
         mixture: what to take, in which shares.
         out: the panel's directory, which must not exist yet.
         task: for a table, the task its rows were made by.

@@ -27,7 +27,7 @@ _TEXT = (
 )
 _CODED = pa.dictionary(pa.int32(), pa.string())
 BATCH_ROWS = 65_536  # read at a time
-# Of a view of several stores, which one a row is from (`replay.stores`).
+# Of a view of several stores, which one a row is from (`replay.panel.stores`).
 STORE_COLUMN = "mixture_store"
 
 

@@ -3,7 +3,7 @@
 A directory that never changes once it is there:
 
     panel.json       what it was made from, its strata, sizes and checksums
-    rows.f32         packed float32 rows, little-endian, as `replay.layout` says
+    rows.f32         packed float32 rows, little-endian, as `replay.mixture.packed_row` says
     meta.parquet     one row beside each packed row: ids, condition, behaviour policy, weight, …
     evaluation_split.parquet the transitions that were kept out, by whole episodes
 """
@@ -23,9 +23,9 @@ from restock.errors import PanelError
 from restock.ingest.task.task import Task
 from restock.replay.mixture.mixture import Mixture, Within
 from restock.replay.mixture.packed_row import F32, PACKING_VERSION, Ints, row_columns, row_width
-from restock.replay.panel.density_ratio import RatioFit
 from restock.replay.panel.seal import AGAIN, FileRecord, packed_by, unseal
 from restock.replay.panel.stores import PinnedStore
+from restock.replay.panel.weights import RatioFit
 
 if TYPE_CHECKING:
     from restock.replay.panel.logged_sampler import LoggedSampler

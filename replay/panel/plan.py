@@ -21,7 +21,6 @@ from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.packed_row import F32, Bools, Ints
 from restock.replay.mixture.schedules import mean_over
 from restock.replay.panel.candidates import META_COLUMNS, bools, codes, one_task, read_candidates
-from restock.replay.panel.density_ratio import RatioFit
 from restock.replay.panel.exclusions import (
     LeftOut,
     leave_out,
@@ -31,7 +30,7 @@ from restock.replay.panel.exclusions import (
 from restock.replay.panel.source_plan import SourcePlan, SourceRows, StratumPlan, plan_source
 from restock.replay.panel.stores import PinnedStore
 from restock.replay.panel.strata import NO_STRATUM, ResolvedStratum, assign, resolve_strata
-from restock.replay.panel.weights import effective_count
+from restock.replay.panel.weights import RatioFit, effective_count
 
 LOGS = "logs"  # the name of the first store's part
 
@@ -70,7 +69,7 @@ def plan_panel(
 ) -> PanelPlan:
     """Work a mixture out over the connection's `transitions`.
 
-    `others` are the mixture's other stores, where the view holds their rows too (`replay.stores`).
+    `others` are the mixture's other stores, where the view holds their rows too (`replay.panel.stores`).
 
     Raises:
         ConfigError: a predicate that does not run.

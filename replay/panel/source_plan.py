@@ -12,10 +12,16 @@ from numpy.typing import NDArray
 from restock.replay.mixture.mixture import Mixture, Within
 from restock.replay.mixture.packed_row import F32, Bools, Ints
 from restock.replay.mixture.shares import SharePlan, plan_shares
-from restock.replay.panel.density_ratio import RatioFit, RatioRows, estimate_outcomes
 from restock.replay.panel.exclusions import scramble
 from restock.replay.panel.strata import ResolvedStratum
-from restock.replay.panel.weights import effective_count, effective_shares, importance_weights
+from restock.replay.panel.weights import (
+    RatioFit,
+    RatioRows,
+    effective_count,
+    effective_shares,
+    estimate_outcomes,
+    importance_weights,
+)
 
 
 @dataclass(frozen=True)

@@ -4,21 +4,42 @@ A stratum that gets a share s of the draws and holds n of N rows is drawn s N / 
 it occurs. A row chosen on its outcome is weighted back to the density of the rows of the same state
 whose outcome was another, which keeps P(s'|s, a) what it was; a row chosen on its state, where that
 is asked for, to its natural density. So a weight depends on two strata of a row alone: its own, and
-the one its state would put it in. A density ratio adds a factor of the state and action, see
-`replay.density_ratio`.
+the one its state would put it in. A density ratio adds a factor of the state and action.
+
+A stratum chosen on the outcome (slip) is boosted b times. Full correction takes the boost away: of
+the states too in which the outcome is likely. But a state and action may be drawn as often as one
+likes; only what comes of them may not change. So its rows, whatever their outcome, are weighted to
+
+    r(s, a) = q(s, a) / p(s, a) = sum over outcomes k of P(k | s, a) b_k
+
+times their natural density: the ratio of the density at which the quotas draw the state and action
+to the one at which they occur. P(k | s, a) is estimated by logistic regression, which is how a
+density ratio is estimated by classification (Bickel, Brückner and Scheffer, JMLR 10, 2009;
+Sugiyama, Suzuki and Kanamori, Density Ratio Estimation in Machine Learning, 2012, chapter 4). r is
+clipped from above and weights are normalised over what is drawn (self-normalised importance
+sampling). As r is a function of the state and action alone, a poor fit changes which states are
+boosted, and not the outcomes that the critic sees in each.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
+import duckdb
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.special import log_softmax, softmax
 
 from restock.replay.mixture.mixture import CorrectionRule
-from restock.replay.mixture.packed_row import F32, F64
-from restock.replay.panel.density_ratio import density_ratio
+from restock.replay.mixture.packed_row import F32, F64, Ints
+from restock.replay.store.store import passed_in
+
+FIT_ROWS = 20_000  # of each outcome, chosen by id
+PENALTY = 1e-3  # L2, on standardised features
 
 
 class Corrected(Protocol):
@@ -167,3 +188,170 @@ class WeightsInForce:
         """The weights (n,) of rows (n,)."""
         weight: F32 = self._weight[rows]
         return weight
+
+
+@dataclass(frozen=True)
+class RatioFit:
+    """How well outcomes are told from states and actions. Losses are of rows kept from the fit."""
+
+    source: str
+    strata: tuple[str, ...]
+    rows: int  # fitted on
+    log_loss: float  # nats a row
+    base_log_loss: float  # of the outcomes' plain frequencies: what knowing nothing costs
+
+
+def density_ratio(outcome: F32, boost: F64, state_aim: F64, clip: float) -> F64:
+    """r(s, a) of each row (N,), in units of its state's own density and at most `clip`.
+
+    `outcome` (N, S) is P(k | s, a) of the strata it is estimated for, `boost` (S,) how much oftener
+    each stratum is drawn than it occurs, `state_aim` (N,) the same for rows of other outcomes.
+    """
+    drawn = outcome @ boost + (1.0 - outcome.sum(axis=1)) * state_aim
+    ratio = np.divide(drawn, state_aim, out=np.ones(len(drawn)), where=state_aim > 0)
+    return np.asarray(np.minimum(ratio, clip), np.float64)
+
+
+class OutcomeModel:
+    """Multinomial logistic regression of an outcome (0: none of them) on standardised features.
+
+    Args:
+        features: (n, D).
+        outcome: (n,) in 0..outcomes - 1.
+        weight: (n,) how many rows each stands for.
+    """
+
+    def __init__(
+        self, features: NDArray[Any], outcome: Ints, outcomes: int, weight: F64 | None = None
+    ) -> None:
+        given = np.asarray(features, np.float64)
+        weight = np.ones(len(given)) if weight is None else weight / weight.mean()
+        self.mean = np.average(given, axis=0, weights=weight)
+        spread = np.sqrt(np.average((given - self.mean) ** 2, axis=0, weights=weight))
+        self.scale = np.where(spread > 1e-9, spread, 1.0)
+        self.outcomes = outcomes
+        x = self._design(given)
+        chosen = np.eye(outcomes)[outcome]
+
+        def loss(flat: F64) -> tuple[float, F64]:
+            theta = flat.reshape(x.shape[1], outcomes)
+            log_p = log_softmax(x @ theta, axis=1)
+            value = -(weight * log_p[np.arange(len(x)), outcome]).mean()
+            gradient = x.T @ (weight[:, None] * (np.exp(log_p) - chosen)) / len(x)
+            penalised = theta.copy()
+            penalised[0] = 0.0  # the intercepts are free
+            value += 0.5 * PENALTY * float((penalised**2).sum())
+            return float(value), (gradient + PENALTY * penalised).ravel()
+
+        start = np.zeros((x.shape[1], outcomes))
+        share = np.bincount(outcome, weights=weight, minlength=outcomes) / weight.sum()
+        start[0] = np.log(np.maximum(share, 1e-6))
+        fitted = minimize(
+            loss, start.ravel(), jac=True, method="L-BFGS-B", options={"maxiter": 200}
+        )
+        self.theta: F64 = fitted.x.reshape(x.shape[1], outcomes)
+
+    def probability(self, features: NDArray[Any]) -> F64:
+        """P(outcome) of each row, (n, outcomes)."""
+        return np.asarray(softmax(self._design(features) @ self.theta, axis=1), np.float64)
+
+    def _design(self, features: NDArray[Any]) -> F64:
+        # Clipped: an observation unlike any seen is no reason for certainty.
+        scaled = np.clip((np.asarray(features, np.float64) - self.mean) / self.scale, -5.0, 5.0)
+        return np.concatenate([np.ones((len(scaled), 1)), scaled], axis=1)
+
+
+@dataclass(frozen=True)
+class RatioRows:
+    """The rows of one source that a ratio is estimated over, (n,) each."""
+
+    transition_id: Ints
+    action: Ints
+    state_code: NDArray[np.int16]  # of the strata, -1 for none
+    code: NDArray[np.int16]  # the stratum of each row
+    order: NDArray[np.uint64]  # a fixed shuffle of ids: which rows are fitted on
+
+
+def estimate_outcomes(
+    connection: duckdb.DuckDBPyConnection,
+    rows: RatioRows,
+    estimated: Ints,
+    names: tuple[str, ...],
+    source: str,
+) -> tuple[F32, RatioFit]:
+    """P(k | s, a) (n, K) of the strata `estimated` (K,) for each row, and how good it is.
+
+    The features are the observation, the action and the state's own stratum.
+    """
+    label = np.zeros(len(rows.code), np.int64)
+    for place, stratum in enumerate(estimated.tolist(), start=1):
+        label[rows.code == stratum] = place
+    parts, weights = [], []
+    for outcome in range(len(estimated) + 1):
+        members = np.flatnonzero(label == outcome)
+        some = members[np.argsort(rows.order[members], kind="stable")[:FIT_ROWS]]
+        parts.append(some)
+        weights.append(np.full(len(some), len(members) / max(len(some), 1)))
+    chosen, weight = np.concatenate(parts), np.concatenate(weights)
+    actions, states = int(rows.action.max()) + 1, np.unique(rows.state_code)
+
+    def features(observation: NDArray[Any], at: Ints) -> NDArray[Any]:
+        acted = np.eye(actions)[rows.action[at]]
+        state = (rows.state_code[at][:, None] == states[None, :]).astype(np.float64)
+        return np.concatenate([observation, acted, state], axis=1)
+
+    x = np.empty((len(chosen), 0))
+    place_of = {int(row): place for place, row in enumerate(chosen.tolist())}
+    for observation, at in _observations(connection, rows.transition_id, chosen):
+        made = features(observation, at)
+        if not x.shape[1]:
+            x = np.zeros((len(chosen), made.shape[1]))
+        x[[place_of[int(row)] for row in at]] = made
+    kept = rows.order[chosen] % np.uint64(5) == 0  # a fifth, to judge the fit by
+    if kept.all() or not kept.any():
+        kept = np.zeros(len(chosen), np.bool_)
+    y = label[chosen]
+    model = OutcomeModel(x[~kept], y[~kept], len(estimated) + 1, weight[~kept])
+    judge = kept if kept.any() else ~kept
+    fit = RatioFit(
+        source,
+        names,
+        int((~kept).sum()),
+        _log_loss(model.probability(x[judge]), y[judge], weight[judge]),
+        _log_loss(
+            np.tile(
+                np.bincount(label, minlength=len(estimated) + 1) / len(label), (judge.sum(), 1)
+            ),
+            y[judge],
+            weight[judge],
+        ),
+    )
+    outcome_of = np.zeros((len(rows.code), len(estimated)), np.float32)
+    everything = np.arange(len(rows.code))
+    for observation, at in _observations(connection, rows.transition_id, everything):
+        outcome_of[at] = model.probability(features(observation, at))[:, 1:]
+    return outcome_of, fit
+
+
+def _log_loss(probability: F64, outcome: Ints, weight: F64) -> float:
+    taken = np.maximum(probability[np.arange(len(outcome)), outcome], 1e-12)
+    return float(-(weight * np.log(taken)).sum() / weight.sum())
+
+
+def _observations(
+    connection: duckdb.DuckDBPyConnection, ids: Ints, at: Ints
+) -> Iterator[tuple[NDArray[np.float32], Ints]]:
+    """Batches of observations (m, D) of the rows `at`, with the rows they are of."""
+    wanted = ids[at]
+    order = np.argsort(wanted)
+    ordered = wanted[order]
+    find: Callable[[Ints], Ints] = lambda these: order[np.searchsorted(ordered, these)]  # noqa: E731
+    with passed_in(connection, ratio_ids=pa.table({"transition_id": wanted})):
+        reader = connection.sql(
+            "SELECT transition_id, observation FROM transitions"
+            " WHERE transition_id IN (SELECT transition_id FROM ratio_ids)"
+        ).to_arrow_reader(16_384)
+        for batch in reader:
+            flat = batch.column("observation").flatten().to_numpy(zero_copy_only=False)
+            size = len(flat) // max(batch.num_rows, 1)
+            yield flat.reshape(-1, size), at[find(batch.column("transition_id").to_numpy())]

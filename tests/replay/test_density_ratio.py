@@ -10,10 +10,14 @@ from support.stores import CONDITIONS, TASK
 
 from restock.replay.mixture.mixture import CorrectionRule, StratumRule, parse_mixture
 from restock.replay.panel.build import build_panel, open_source
-from restock.replay.panel.density_ratio import OutcomeModel, density_ratio
 from restock.replay.panel.plan import plan_panel
 from restock.replay.panel.strata import ResolvedStratum
-from restock.replay.panel.weights import effective_count, importance_weights
+from restock.replay.panel.weights import (
+    OutcomeModel,
+    density_ratio,
+    effective_count,
+    importance_weights,
+)
 
 COUNT = 30_000
 
