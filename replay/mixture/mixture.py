@@ -158,18 +158,13 @@ class Adaptive(Checked, frozen=True):
         _require(self.floor < self.ceiling, "adaptive needs floor < ceiling")
 
 
-class StratumRule(Checked, frozen=True):
-    """What one stratum gets. A row goes to the matching stratum of the lowest priority number."""
+class StratumLimits(Checked, frozen=True, kw_only=True):
+    """What may be said of one stratum and of all at once."""
 
-    name: str  # a condition's name or "nominal", unless `where` says otherwise
-    where: str | None = None  # SQL predicate over `transitions`
-    unit: Unit = "step"  # or all rows of the episodes that it holds in
+    unit: Unit = "step"  # or all rows of the episodes that it holds in; nominal: what is left
     min_steps: AtLeastOne = 1  # of an episode in which it must hold
-    share: Share = "natural"  # of its source's part of a batch
     floor: Fraction = 0.0
     cap: Fraction = 1.0
-    priority: int | None = None  # default: the condition's; `where` strata 50; nominal 1000
-    timing: Timing | None = None  # default: the condition's; "post" for a `where` stratum
     correction: Correction | None = None  # default: the mixture's rule for its timing
     within: Within | None = None  # default: the mixture's
     min_rows: Count = 1
@@ -178,34 +173,28 @@ class StratumRule(Checked, frozen=True):
     max_rows_per_recording: AtLeastOne | None = None  # default: the mixture's
 
     def check(self) -> None:
-        _check_stratum(self.name, self)
+        name = getattr(self, "name", "each_condition")
+        _require(self.floor <= self.cap, f"{name!r} needs floor <= cap")
+        _require(
+            self.unit == "episode" or self.min_steps == 1,
+            f'min_steps of {name!r} is of episodes: it needs unit = "episode"',
+        )
 
 
-class EachCondition(Checked, frozen=True):
+class StratumRule(StratumLimits, frozen=True, kw_only=True):
+    """What one stratum gets. A row goes to the matching stratum of the lowest priority number."""
+
+    name: str  # a condition's name or "nominal", unless `where` says otherwise
+    where: str | None = None  # SQL predicate over `transitions`
+    share: Share = "natural"  # of its source's part of a batch
+    priority: int | None = None  # default: the condition's; `where` strata 50; nominal 1000
+    timing: Timing | None = None  # default: the condition's; "post" for a `where` stratum
+
+
+class EachCondition(StratumLimits, frozen=True, kw_only=True):
     """A stratum for every condition of the store (and nominal) that `strata` does not name."""
 
     share: Literal["natural", "equal"] = "natural"
-    unit: Unit = "step"  # of the conditions; nominal is what is left
-    min_steps: AtLeastOne = 1
-    floor: Fraction = 0.0
-    cap: Fraction = 1.0
-    correction: Correction | None = None
-    within: Within | None = None
-    min_rows: Count = 1
-    min_episodes: Count = 1
-    max_rows_per_episode: AtLeastOne | None = None
-    max_rows_per_recording: AtLeastOne | None = None
-
-    def check(self) -> None:
-        _check_stratum("each_condition", self)
-
-
-def _check_stratum(name: str, rule: StratumRule | EachCondition) -> None:
-    _require(rule.floor <= rule.cap, f"{name!r} needs floor <= cap")
-    _require(
-        rule.unit == "episode" or rule.min_steps == 1,
-        f'min_steps of {name!r} is of episodes: it needs unit = "episode"',
-    )
 
 
 class Mixture(Checked, frozen=True):
@@ -331,9 +320,10 @@ def mixture_schema() -> str:
             key: _without_null(value) for key, value in definition["properties"].items()
         }
         struct = globals().get(name) or getattr(schedules, name)
-        for key, comment in _FIELD.findall(inspect.getsource(struct)):
-            if key in definition["properties"]:
-                definition["properties"][key]["description"] = comment
+        for part in (struct, *struct.__bases__):
+            for key, comment in _FIELD.findall(inspect.getsource(part)):
+                if key in definition["properties"]:
+                    definition["properties"][key]["description"] = comment
     whole = {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "Restock mixture",

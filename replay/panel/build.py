@@ -10,7 +10,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import duckdb
@@ -25,7 +25,7 @@ from restock.ingest.task.task import Task
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.packed_row import PACKING_VERSION
 from restock.replay.panel.pack import Packer
-from restock.replay.panel.panel import EVALUATION_SPLIT, HEADER, META, ROWS, Header, Panel, Stratum
+from restock.replay.panel.panel import EVALUATION_SPLIT, HEADER, META, ROWS, Header, Panel
 from restock.replay.panel.plan import PanelPlan, plan_panel
 from restock.replay.panel.scratch import SourceSteps
 from restock.replay.panel.seal import FileRecord, seal
@@ -294,10 +294,7 @@ def _header(
         conditions=[*(c.name for c in by_priority), NOMINAL],
         left_out=plan.left_out,
         effective_rows=plan.effective_rows,
-        strata=[
-            Stratum(name=line.stratum, **{k: v for k, v in asdict(line).items() if k != "stratum"})
-            for line in plan.strata
-        ],
+        strata=list(plan.strata),
         mixture=plan.mixture,
         others=[msgspec.structs.replace(o, path=_address(o.path)) for o in plan.others],
         ratios=list(plan.ratios),

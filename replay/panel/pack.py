@@ -164,7 +164,7 @@ class Packer:
 
     def write_meta(self, meta: Path, evaluation_split: Path) -> None:
         """Write what stands beside the rows, and the rows that are held out, in the same order."""
-        names = pa.array([line.stratum for line in self.plan.strata], pa.string())
+        names = pa.array([line.name for line in self.plan.strata], pa.string())
         to_go = None
         if self.mixture.return_to_go:
             to_go = self.steps.returns_to_go(self.mixture.discount)

@@ -21,10 +21,11 @@ from numpy.typing import NDArray
 
 from restock.errors import PanelError
 from restock.ingest.task.task import Task
-from restock.replay.mixture.mixture import Mixture, Within
+from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.packed_row import F32, PACKING_VERSION, Ints, row_columns, row_width
 from restock.replay.panel.seal import AGAIN, FileRecord, packed_by, unseal
 from restock.replay.panel.stores import PinnedStore
+from restock.replay.panel.strata import Stratum
 from restock.replay.panel.weights import RatioFit
 
 if TYPE_CHECKING:
@@ -36,27 +37,6 @@ HEADER, ROWS, META, EVALUATION_SPLIT = (
     "meta.parquet",
     "evaluation_split.parquet",
 )
-
-
-class Stratum(msgspec.Struct, frozen=True):
-    """A stratum of a panel: what it wanted, what it got, what its rows must bear."""
-
-    name: str
-    source: str  # logs, or the name of another store
-    timing: str
-    correction: str
-    within: Within
-    rows: int
-    episodes: int
-    natural_share: float
-    wanted_share: float
-    share: float  # of the logs' part of a batch; shares of a panel sum to 1
-    replays_per_row: float  # expected over the mixture's planned updates
-    effective_episodes: float
-    effective_rows: float  # rows drawn equally often that its weighted draw is worth
-    largest_weight: float
-    effective_share: float  # after weights
-    note: str
 
 
 class Header(msgspec.Struct, frozen=True):

@@ -7,10 +7,11 @@ DuckDB says what each row is; everything that must come out the same on every ma
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import duckdb
+import msgspec
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
@@ -20,17 +21,25 @@ from restock.ingest.task.conditions import NOMINAL, Condition
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.packed_row import F32, Bools, Ints
 from restock.replay.mixture.schedules import mean_over
+from restock.replay.mixture.shares import SharePlan, plan_shares
 from restock.replay.panel.candidates import META_COLUMNS, bools, codes, one_task, read_candidates
 from restock.replay.panel.exclusions import (
     LeftOut,
     leave_out,
     leave_out_of_strata,
+    scramble,
     split_for_evaluation,
 )
-from restock.replay.panel.source_plan import SourcePlan, SourceRows, StratumPlan, plan_source
 from restock.replay.panel.stores import PinnedStore
-from restock.replay.panel.strata import NO_STRATUM, ResolvedStratum, assign, resolve_strata
-from restock.replay.panel.weights import RatioFit, effective_count
+from restock.replay.panel.strata import NO_STRATUM, ResolvedStratum, Stratum, assign, resolve_strata
+from restock.replay.panel.weights import (
+    RatioFit,
+    RatioRows,
+    effective_count,
+    effective_shares,
+    estimate_outcomes,
+    importance_weights,
+)
 
 LOGS = "logs"  # the name of the first store's part
 
@@ -46,7 +55,7 @@ class PanelPlan:
     weight: F32  # (n,) of the panel's rows
     beside: dict[str, NDArray[Any]]  # (n,) each: what new shares need for new weights
     evaluation_split: Bools  # (N,)
-    strata: tuple[StratumPlan, ...]
+    strata: tuple[Stratum, ...]
     logs_share: float  # of a batch, all stores together; the mean over a schedule
     logs_share_wanted: float  # the same, had all strata rows enough
     left_out: dict[str, int]  # rows not in the panel, by reason
@@ -69,7 +78,7 @@ def plan_panel(
 ) -> PanelPlan:
     """Work a mixture out over the connection's `transitions`.
 
-    `others` are the mixture's other stores, where the view holds their rows too (`replay.panel.stores`).
+    `others` are the mixture's other stores, where the view holds their rows too (`all_stores`).
 
     Raises:
         ConfigError: a predicate that does not run.
@@ -160,7 +169,7 @@ def _joined(
     outcome: dict[str, F32] = {}
     filled = np.array([s.part * p.drawn for s, p in zip(given, worked_out, strict=True)])
     part_of_logs = filled / filled.sum()
-    lines: list[StratumPlan] = []
+    lines: list[Stratum] = []
     never = 0
     for number, (source, plan) in enumerate(zip(given, worked_out, strict=True)):
         at = source.at[plan.kept]
@@ -177,9 +186,9 @@ def _joined(
             column[at] = plan.outcome[:, index] if plan.outcome is not None else 0
         of_logs = float(part_of_logs[number])
         lines += [
-            replace(
+            msgspec.structs.replace(
                 line,
-                stratum=line.stratum if source.name == LOGS else f"{source.name}/{line.stratum}",
+                name=line.name if source.name == LOGS else f"{source.name}/{line.name}",
                 wanted_share=line.wanted_share * of_logs,
                 share=line.share * of_logs,
                 effective_share=line.effective_share * of_logs,
@@ -215,4 +224,110 @@ def outcome_column(stratum: str) -> str:
     return f"probability_of_{stratum}"
 
 
-__all__ = ["META_COLUMNS", "PanelPlan", "StratumPlan", "outcome_column", "plan_panel"]
+@dataclass(frozen=True)
+class SourceRows:
+    """The rows of one source that may be drawn, (n,) each."""
+
+    name: str
+    part: float  # of a batch that this source is to fill
+    at: Ints  # their places in the table of candidates
+    code: NDArray[np.int16]  # stratum
+    state_code: NDArray[np.int16]  # the one their state alone would put them in
+    transition_id: Ints
+    action: Ints
+    episode: Ints
+
+
+@dataclass(frozen=True)
+class SourcePlan:
+    """A source worked out. Shares in `lines` are of the source's own part of a batch."""
+
+    shares: SharePlan
+    kept: Bools  # (n,) rows of strata that are drawn at all
+    weight: F32  # of the kept rows
+    outcome: F32 | None  # (kept, S) P(stratum | state, action), where one is estimated
+    fit: RatioFit | None
+    lines: list[Stratum]
+
+    @property
+    def drawn(self) -> float:
+        """How much of its part the source can fill."""
+        return self.shares.scale
+
+
+def plan_source(
+    connection: duckdb.DuckDBPyConnection,
+    mixture: Mixture,
+    strata: Sequence[ResolvedStratum],
+    source: SourceRows,
+) -> SourcePlan:
+    """Shares, weights and lines of one source.
+
+    Raises:
+        MixtureError: too few rows where the mixture refuses that.
+    """
+    size = len(strata)
+    rows = np.bincount(source.code, minlength=size).astype(np.int64)
+    per_episode = [
+        np.unique(source.episode[source.code == i], return_counts=True)[1] for i in range(size)
+    ]
+    episodes = np.array([len(counts) for counts in per_episode], np.int64)
+    draws = mixture.planned.updates * mixture.planned.batch_size * source.part
+    rules = [stratum.rule for stratum in strata]
+    shares = plan_shares(mixture, rules, rows, episodes, draws=draws)
+    # A share with a schedule may begin at 0; others that are 0 are never drawn.
+    drawn = (shares.got > 0) | [not isinstance(rule.share, int | float | str) for rule in rules]
+    kept = np.asarray(drawn[source.code], np.bool_)
+    code, state = source.code[kept], source.state_code[kept]
+    outcome, fit = _outcomes(connection, mixture, strata, source, kept)
+    weight = importance_weights(code, state, strata, shares.got, mixture.correction, outcome)
+    after = effective_shares(code, weight, shares.got)
+    lines = [
+        Stratum(
+            name=stratum.name,
+            source=source.name,
+            timing=stratum.timing,
+            correction=stratum.correction,
+            within=stratum.within,
+            rows=int(rows[i]),
+            episodes=int(episodes[i]),
+            natural_share=float(rows[i] / max(rows.sum(), 1)),
+            wanted_share=float(shares.wanted[i]),
+            share=float(shares.got[i]),
+            replays_per_row=float(draws * shares.scale * shares.got[i] / max(rows[i], 1)),
+            effective_episodes=effective_count(per_episode[i]),
+            effective_rows=effective_count(weight[code == i]),
+            largest_weight=float(weight[code == i].max(initial=0.0)),
+            effective_share=float(after[i]),
+            note=shares.notes[i],
+        )
+        for i, stratum in enumerate(strata)
+    ]
+    return SourcePlan(shares, kept, weight, outcome, fit, lines)
+
+
+def _outcomes(
+    connection: duckdb.DuckDBPyConnection,
+    mixture: Mixture,
+    strata: Sequence[ResolvedStratum],
+    source: SourceRows,
+    kept: Bools,
+) -> tuple[F32 | None, RatioFit | None]:
+    """P(k | s, a) of the strata that a density ratio corrects, (kept, S), or None for none."""
+    code = source.code[kept]
+    by_ratio = [s.correction == "density_ratio" and s.timing == "post" for s in strata]
+    estimated = np.flatnonzero(by_ratio & (np.bincount(code, minlength=len(strata)) > 0))
+    if not len(estimated):
+        return None, None
+    ids = source.transition_id[kept]
+    rows = RatioRows(
+        ids, source.action[kept], source.state_code[kept], code, scramble(ids, mixture.seed)
+    )
+    names = tuple(strata[index].name for index in estimated.tolist())
+    estimate, fit = estimate_outcomes(connection, rows, estimated, names, source.name)
+    outcome = np.zeros((len(code), len(strata)), np.float32)
+    outcome[:, estimated] = estimate
+    return outcome, fit
+
+
+__all__ = ["META_COLUMNS", "PanelPlan", "outcome_column", "plan_panel"]

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +24,27 @@ from restock.replay.mixture.packed_row import Bools
 NO_STRATUM = -1
 NOMINAL_PRIORITY = 1000
 WHERE_PRIORITY = 50
+
+
+class Stratum(msgspec.Struct, frozen=True):
+    """A stratum of a panel: what it wanted, what it got, what its rows must bear."""
+
+    name: str
+    source: str  # logs, or the name of another store
+    timing: str
+    correction: str
+    within: Within
+    rows: int
+    episodes: int
+    natural_share: float  # of its source's rows
+    wanted_share: float  # of the logs' part of a batch, as the other shares
+    share: float  # those of a panel sum to 1
+    replays_per_row: float  # expected over the mixture's planned updates
+    effective_episodes: float  # (sum n)^2 / sum n^2 over the rows per episode
+    effective_rows: float  # rows drawn equally often that its weighted draw is worth
+    largest_weight: float
+    effective_share: float  # after weights
+    note: str
 
 
 @dataclass(frozen=True)
@@ -66,20 +88,7 @@ def rules_of(mixture: Mixture, names: Sequence[str]) -> list[StratumRule]:
 
 
 def _rule_for(name: str, each: EachCondition) -> StratumRule:
-    return StratumRule(
-        name=name,
-        share=each.share,
-        unit=each.unit,
-        min_steps=each.min_steps,
-        floor=each.floor,
-        cap=each.cap,
-        correction=each.correction,
-        within=each.within,
-        min_rows=each.min_rows,
-        min_episodes=each.min_episodes,
-        max_rows_per_episode=each.max_rows_per_episode,
-        max_rows_per_recording=each.max_rows_per_recording,
-    )
+    return StratumRule(name=name, **msgspec.structs.asdict(each))
 
 
 def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -> ResolvedStratum:

@@ -135,8 +135,8 @@ class FreshRing(Stateful):
             most `capacity`. Without, the oldest row is overwritten whatever its condition. With
             them `sample` draws reserved rows as often as others, so more often than they occur.
 
-    `rows` (capacity, W) float32 is packed as `replay.mixture.packed_row` says; `meta` holds the arrays of META;
-    the first `len(ring)` slots are filled.
+    `rows` (capacity, W) float32 is packed as `replay.mixture.packed_row` says; `meta` holds the
+    arrays of META; the first `len(ring)` slots are filled.
     """
 
     SAME: ClassVar[tuple[str, ...]] = (

@@ -49,7 +49,7 @@ def planned(transitions: pa.Table, text: str) -> PanelPlan:
 
 
 def shares(plan: PanelPlan) -> dict[str, float]:
-    return {line.stratum: line.share for line in plan.strata}
+    return {line.name: line.share for line in plan.strata}
 
 
 @pytest.mark.parametrize("name", shipped_mixtures())
@@ -239,7 +239,7 @@ def test_priority_decides_overlap(transitions: pa.Table) -> None:
             "unlisted = 'drop'\n[evaluation_split]\nby = 'none'\n[[strata]]\nname = 'fast'\n"
             f"where = 'command_speed_mps > 0'\npriority = {priority}\n" + EVERY,
         )
-        return next(line.rows for line in plan.strata if line.stratum == "fast")
+        return next(line.rows for line in plan.strata if line.name == "fast")
 
     fast = np.sum(transitions["command_speed_mps"].to_numpy() > 0)
     assert count(1) == fast
@@ -315,7 +315,7 @@ def test_the_state_of_a_slip_is_nominal_where_nothing_was_known_before(
 ) -> None:
     """Its row is weighted to the density of nominal rows, boosted or not: P(s'|s, a) stays."""
     plan = planned(transitions, "[[strata]]\nname = 'nominal'\nshare = 0.2\n" + EVERY)
-    names = [line.stratum for line in plan.strata]
+    names = [line.name for line in plan.strata]
     slip, nominal = names.index("wheel_slip"), names.index("nominal")
     chosen = plan.panel_rows
     code, state = plan.stratum[chosen], plan.beside["state_code"]

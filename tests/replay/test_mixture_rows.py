@@ -66,7 +66,7 @@ def test_a_stratum_of_episodes_has_all_rows_of_those_that_met_it(
     )
     assert len(plan.panel_rows) == len(transitions)  # nominal is what is left
     rows = taken(plan)
-    names = [line.stratum for line in plan.strata]
+    names = [line.name for line in plan.strata]
     stratum = dict(
         zip(
             rows["transition_id"].to_pylist(),
@@ -143,7 +143,7 @@ def test_caps_an_episode_and_recording_hold_in_each_stratum(
         transitions,
         text + f"[[strata]]\nname = 'nominal'\nmax_rows_per_{name} = 2\n",
     )
-    line = next(line for line in own.strata if line.stratum == "nominal")
+    line = next(line for line in own.strata if line.name == "nominal")
     assert line.rows == 2 * line.episodes if name == "episode" else line.rows == 6
 
 
@@ -165,8 +165,8 @@ def test_rows_without_a_label_are_refused_dropped_or_taken_for_nominal(
     assert dropped.left_out == {"without a coverage label": 50}
     nominal = planned(table, "unlabelled = 'nominal'\n" + NO_HOLD + EVERY)
     assert nominal.left_out == {}
-    rows = {line.stratum: line.rows for line in nominal.strata}
-    before = {line.stratum: line.rows for line in dropped.strata}
+    rows = {line.name: line.rows for line in nominal.strata}
+    before = {line.name: line.rows for line in dropped.strata}
     assert rows["nominal"] == before["nominal"] + 50
 
 

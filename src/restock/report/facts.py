@@ -11,7 +11,8 @@ import duckdb
 import pyarrow.parquet as pq
 
 from restock.errors import RestockError, RunError
-from restock.replay.panel.panel import Panel, Stratum
+from restock.replay.panel.panel import Panel
+from restock.replay.panel.strata import Stratum
 from restock.replay.store.store import Store, read_parquet
 from restock.report.blocks import Rows, words
 from restock.stats import wilson

@@ -14,6 +14,7 @@ from restock.errors import MixtureError
 
 if TYPE_CHECKING:
     from restock.replay.panel.plan import PanelPlan
+    from restock.replay.panel.strata import Stratum
 
 _WIDE = 110  # columns of a terminal from which on the table says more
 
@@ -111,7 +112,7 @@ class MixCommand:
 def describe(plan: PanelPlan) -> dict[str, Any]:
     """The plan as a document: what `--json` prints."""
     return {
-        "strata": [asdict(line) for line in plan.strata],
+        "strata": [_line(stratum) for stratum in plan.strata],
         "rows": len(plan.panel_rows),
         "left_out": plan.left_out,
         "logs_share": plan.logs_share,
@@ -134,6 +135,11 @@ def describe(plan: PanelPlan) -> dict[str, Any]:
         "n_step": plan.mixture.n_step,
         "discount": plan.mixture.discount,
     }
+
+
+def _line(stratum: Stratum) -> dict[str, Any]:
+    values = msgspec.structs.asdict(stratum)
+    return {"stratum": values.pop("name"), **values}
 
 
 def _table(strata: list[dict[str, Any]], *, wide: bool) -> list[dict[str, Any]]:
