@@ -4,7 +4,7 @@ A cold file read at random gives some ten thousand rows a second, in chunks of t
 some million. So each stratum's rows, in the order of the file, are cut into chunks; chunks are read
 in shuffled order into the stratum's buffer, from which rows are drawn at random.
 
-What an epoch is: a stratum's chunks are read once each, in an order drawn anew for every epoch, and
+What an epoch is: a stratum's chunks are read once each, in an order drawn for every epoch, and
 each row is drawn once; the buffer is drawn empty before the next epoch's first chunk is read. So
 within a stratum any two rows' draws differ by at most one. Strata have epochs of their own: a
 boosted one goes round more often. Quotas are exact in every batch, as everywhere.

@@ -9,7 +9,7 @@ The header of an audit's file says what it is:
 
 `$name` in the query is a threshold, from `audits.toml` or a file of the user's.
 
-`python -m restock.replay.store.audit docs/audit.md` writes the table of the page anew.
+`python -m restock.replay.store.audit docs/audit.md` rewrites the table of the page.
 """
 
 from __future__ import annotations
@@ -262,7 +262,7 @@ def _parse(name: str, text: str, where: str) -> Audit:
 
 
 def rewrite(text: str) -> str:
-    """A page with the table between its two markers written anew."""
+    """A page with the table between its two markers written again."""
     thresholds = load_thresholds()
     lines = ["| audit | severity | finds | thresholds |", "| --- | --- | --- | --- |"]
     for audit in shipped_audits():

@@ -1,6 +1,6 @@
 """What each column of each view means: the view `columns`, and the tables in docs/sql.md.
 
-`python -m restock.replay.store.column_docs docs/sql.md` writes the tables of the page anew.
+`python -m restock.replay.store.column_docs docs/sql.md` rewrites the tables of the page.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def markdown() -> str:
 
 
 def rewrite(text: str) -> str:
-    """A page with the tables between its two markers written anew."""
+    """A page with the tables between its two markers written again."""
     before, rest = text.split(BEGIN, 1)
     return f"{before}{BEGIN}\n\n{markdown()}\n{END}{rest.split(END, 1)[1]}"
 

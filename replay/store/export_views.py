@@ -17,7 +17,7 @@ STORAGE_VERSION = "v1.4.0"
 def init_script(store: Store) -> str:
     """SQL that makes the store's views and macros: `duckdb -init FILE`.
 
-    Paths are absolute, and of the version that is open: write it anew after an ingest.
+    Paths are absolute, and of the version that is open: write it again after an ingest.
     """
     columns = ", ".join(
         "(" + ", ".join(_literal(value) for value in row) + ")"
@@ -53,7 +53,7 @@ def export_views(store: Store, out: str | Path) -> Path:
         )
     if store.path.folder is None:
         raise StoreError(
-            "views of a store on S3 cannot be had by other DuckDBs",
+            "views of a store on S3 cannot be exported to other DuckDBs",
             where=str(store.path),
             remedy="ask it with `restock sql`, or from Python with restock.open()",
         )

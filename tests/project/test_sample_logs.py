@@ -1,4 +1,4 @@
-"""The sample logs are what their manifest says, small, varied, readable, and can be made anew."""
+"""The sample logs are what their manifest says, small, varied, readable, and can be made again."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 -- severity: error
--- advice: A bag and a part of it, or a copy cut anew, were both ingested: take one of the two recordings out, or these steps weigh twice and may be trained on and held out at once.
+-- advice: A bag and a part of it, or a copy cut otherwise, were both ingested: take one of the two recordings out, or these steps weigh twice and may be trained on and held out at once.
 -- doc: Recordings that hold the same steps as another one: equal stamp, action and observation under another id.
 WITH steps AS (
     SELECT recording_id, source_file, stamp_ns, action, hash(observation) AS seen
