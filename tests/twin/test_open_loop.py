@@ -15,7 +15,12 @@ from restock.ingest.profile.profile import Profile, load_profile
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 from restock.train.twin.calibration.logged_steps import LoggedSteps, logged_steps
-from restock.train.twin.calibration.open_loop import SENSED, Start, drive, replay_segments
+from restock.train.twin.calibration.open_loop import (
+    SENSED,
+    OpenLoopStart,
+    drive_open_loop,
+    replay_segments,
+)
 from restock.train.twin.calibration.segments import POSE, log_segments
 from restock.train.twin.floors.layout import default_warehouse
 from restock.train.twin.physics.perturbation import Perturbation
@@ -56,11 +61,11 @@ def steps(store: Path) -> Iterator[LoggedSteps]:
         yield logged_steps(opened)
 
 
-def start_of(steps: LoggedSteps, rows: np.ndarray, count: int) -> Start:
+def start_of(steps: LoggedSteps, rows: np.ndarray, count: int) -> OpenLoopStart:
     """What a drive of `count` periods from these rows begins with."""
     now = {name: column[rows] for name, column in steps.now.items()}
     pose = np.stack([now[name] for name in POSE], axis=-1)
-    return Start(pose, now, steps.commands(rows, 0, count), past=steps.commands(rows, 5, 0))
+    return OpenLoopStart(pose, now, steps.commands(rows, 0, count), past=steps.commands(rows, 5, 0))
 
 
 def test_the_fit_and_the_gap_read_the_same_rows(store: Path, steps: LoggedSteps) -> None:
@@ -92,7 +97,9 @@ def test_one_step_is_the_first_of_a_longer_drive(steps: LoggedSteps, mapped: boo
     rows = log_segments(steps, 1.2).row[::3]
     warehouse = default_warehouse() if mapped else None
     one, many = (
-        drive(steps.task, start_of(steps, rows, count), [Perturbation(), LATE], warehouse=warehouse)
+        drive_open_loop(
+            steps.task, start_of(steps, rows, count), [Perturbation(), LATE], warehouse=warehouse
+        )
         for count in (1, 4)
     )
     assert one.pose.shape == (2, len(rows), 2, 3)
@@ -108,8 +115,8 @@ def test_an_empty_floor_has_no_middle_and_no_end(steps: LoggedSteps) -> None:
     rows = log_segments(steps, 1.2).row[:2]
     near = start_of(steps, rows, 5)
     shift = np.array([1e4, -2e4, 0.0])
-    far = Start(near.pose + shift, near.motion, near.command, near.past)
-    here, there = (drive(steps.task, start, [LATE]) for start in (near, far))
+    far = OpenLoopStart(near.pose + shift, near.motion, near.command, near.past)
+    here, there = (drive_open_loop(steps.task, start, [LATE]) for start in (near, far))
     np.testing.assert_allclose(there.pose - shift, here.pose, atol=1e-9)
 
 
@@ -120,8 +127,8 @@ def test_a_replay_is_a_drive_whose_warm_up_is_laid_onto_the_log(steps: LoggedSte
     moving = ~cut.still
     motion = {name: np.where(moving, values, 0.0) for name, values in cut.before.items()}
     motion["localised_lateral_mps"] = np.zeros(len(cut))
-    start = Start(np.zeros((len(cut), 3)), motion, cut.command)
-    driven = drive(cut.task, start, [Perturbation(), LATE])
+    start = OpenLoopStart(np.zeros((len(cut), 3)), motion, cut.command)
+    driven = drive_open_loop(cut.task, start, [Perturbation(), LATE])
     for name in SENSED:
         values = driven.signals[name]
         assert np.array_equal(values[..., cut.warmup_steps :], replayed.signals[name]), name

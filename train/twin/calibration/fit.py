@@ -42,7 +42,8 @@ from restock.train.twin.calibration.fit_solver import (
 )
 from restock.train.twin.calibration.fit_uncertainty import (
     Uncertainty,
-    estimate,
+    as_in_base,
+    estimates,
     fit_warnings,
     measure_uncertainty,
     unidentified,
@@ -134,6 +135,8 @@ def fit(
     coordinates = Coordinates(scope.names, config.base, task)
     start = _search(coarse, coordinates, config, report)
     solution, uncertainty, dropped = _identify(fine, coordinates, start, config, store, report)
+    refused = [as_in_base(name, config.base, reason) for name, reason in scope.refused.items()]
+    kept = [*refused, *dropped]
     perturbation = msgspec.structs.replace(
         solution.coordinates.perturbation(solution.z), name=config.name, timestep_s=config.step_s
     )
@@ -142,11 +145,15 @@ def fit(
         base=config.base,
         timestep_s=config.step_s,
         recordings=data.recordings,
-        estimates=_estimates(config, scope, solution, uncertainty, dropped),
+        estimates=tuple(
+            sorted(
+                [*estimates(solution, uncertainty), *kept],
+                key=lambda item: config.parameters.index(item.name),
+            )
+        ),
         warnings=(
             *scope.notes,
-            *(f"{name} is not fitted: {reason}" for name, reason in scope.refused.items()),
-            *(f"{item.name} is not fitted: {item.note}" for item in dropped),
+            *(f"{item.name} is not fitted: {item.note}" for item in kept),
             *fit_warnings(solution, uncertainty),
         ),
         held_out=_held_out_gaps(data, scope, config, perturbation, report),
@@ -243,22 +250,6 @@ def _least_squares(
         scale=scale,
         converged=converged,
     )
-
-
-def _estimates(
-    config: FitConfig, scope: FitScope, solution: FitSolution, uncertainty: Uncertainty,
-    dropped: list[ParameterEstimate],
-) -> tuple[ParameterEstimate, ...]:  # fmt: skip
-    """Of every parameter, in the order in which they were named."""
-    fitted = [estimate(solution, uncertainty, index) for index in range(len(solution.z))]
-    refused = [
-        ParameterEstimate(
-            name, PARAMETERS[name].unit, getattr(config.base, name), None, None, False, reason
-        )
-        for name, reason in scope.refused.items()
-    ]
-    order = config.parameters.index
-    return tuple(sorted([*fitted, *dropped, *refused], key=lambda item: order(item.name)))
 
 
 def _held_out_gaps(

@@ -25,7 +25,7 @@ from scipy.stats import qmc
 
 from restock.ingest.task.signals import wrap_angle
 from restock.train.twin.calibration.fit_parameters import CHANNELS, Coordinates
-from restock.train.twin.calibration.open_loop import Driven, replay_segments
+from restock.train.twin.calibration.open_loop import OpenLoopResult, replay_segments
 from restock.train.twin.calibration.segments import LoggedSegments
 from restock.train.twin.physics.perturbation import Perturbation
 
@@ -89,18 +89,9 @@ class ReplayResiduals:
         low = int(np.floor(ticks + 1e-6))
         above = max(ticks - low, 0.0)
         pair = [(low, 1 - above), (low + 1, above if above > 1e-6 else 0.0)]
-        return [
-            (
-                msgspec.structs.replace(
-                    perturbation,
-                    name="",
-                    gyro_bias_radps=0.0,
-                    latency_s=min(tick * self.timestep_s, 0.5),
-                ),
-                weight,
-            )
-            for tick, weight in pair
-        ]
+        base = msgspec.structs.replace(perturbation, name="", gyro_bias_radps=0.0)
+        latencies = [(min(tick * self.timestep_s, 0.5), weight) for tick, weight in pair]
+        return [(msgspec.structs.replace(base, latency_s=s), weight) for s, weight in latencies]
 
     def _drive(self, twins: Sequence[Perturbation]) -> None:
         new = [twin for twin in dict.fromkeys(twins) if twin not in self._known]
@@ -118,16 +109,13 @@ class ReplayResiduals:
             self._known[twin] = {name: residuals[name][index] for name in self.channels}
 
 
-def channel_residuals(segments: LoggedSegments, replayed: Driven) -> dict[str, F64]:
+def channel_residuals(segments: LoggedSegments, replayed: OpenLoopResult) -> dict[str, F64]:
     """Every channel's residuals, (P, S, R) each; 0 where the log says nothing."""
     predicted, logged = replayed.signals, segments.signals
     residuals = {
-        channel: predicted[name] - logged[name]
-        for channel, name in (
-            ("wheel speed", "wheel_speed_mps"),
-            ("wheel yaw rate", "wheel_yaw_rate_radps"),
-            ("gyro", "gyro_yaw_rate_radps"),
-        )
+        "wheel speed": predicted["wheel_speed_mps"] - logged["wheel_speed_mps"],
+        "wheel yaw rate": predicted["wheel_yaw_rate_radps"] - logged["wheel_yaw_rate_radps"],
+        "gyro": predicted["gyro_yaw_rate_radps"] - logged["gyro_yaw_rate_radps"],
     }
     weight = segments.pose_fresh / segments.pose_fresh.sum(axis=1, keepdims=True)  # (S, K + 1)
     pose, goal = replayed.pose, segments.pose
@@ -146,7 +134,7 @@ def channel_residuals(segments: LoggedSegments, replayed: Driven) -> dict[str, F
     return residuals
 
 
-def position_gap_m(segments: LoggedSegments, replayed: Driven) -> F64:
+def position_gap_m(segments: LoggedSegments, replayed: OpenLoopResult) -> F64:
     """How far the twin is from the logged position, (P, S, K + 1), from a common first pose."""
     gap: F64 = np.hypot(
         replayed.signals["pose_x_m"] - segments.signals["pose_x_m"],

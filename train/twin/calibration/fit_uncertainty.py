@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from restock.stats import cluster_counts
+from restock.train.twin.calibration.fit_parameters import PARAMETERS
 from restock.train.twin.calibration.fit_solver import (
     FitProblem,
     FitSolution,
@@ -21,6 +22,7 @@ from restock.train.twin.calibration.fit_solver import (
 )
 from restock.train.twin.calibration.fitted_twin import ParameterEstimate
 from restock.train.twin.calibration.open_loop import replay_segments
+from restock.train.twin.physics.perturbation import Perturbation
 
 F64 = NDArray[np.float64]
 
@@ -92,7 +94,7 @@ def measure_uncertainty(solution: FitSolution, episode: NDArray[np.str_], seed: 
     )
 
 
-def profile(problem: FitProblem, solution: FitSolution, index: int) -> tuple[float, float]:
+def cost_profile(problem: FitProblem, solution: FitSolution, index: int) -> tuple[float, float]:
     """Between which z a parameter explains the log as well, within 95 %: (low, high).
 
     The parameter is put to values over its whole range; at each the others make one Gauss-Newton
@@ -148,7 +150,7 @@ def _kept_as_in_base(
     coordinates = solution.coordinates
     parameter = coordinates.parameters[index]
     problem = FitProblem(residuals, coordinates, solution.scale)
-    low, high = profile(problem, solution, index)
+    low, high = cost_profile(problem, solution, index)
     ends = [_value(solution, index, end) for end in (low, high)]
     start = coordinates.point(coordinates.base)[index]
     base_fits = low - 1e-9 <= start <= high + 1e-9 or high - low > 0.9
@@ -173,8 +175,7 @@ def _kept_as_in_base(
         if other is not None:
             correlation = uncertainty.correlation[index, other]
             reason += f" (its correlation with {coordinates.names[other]} is {correlation:.2f})"
-    base = float(getattr(coordinates.base, parameter.name))
-    return ParameterEstimate(parameter.name, parameter.unit, base, ends[0], ends[1], False, reason)
+    return as_in_base(parameter.name, coordinates.base, reason, *ends)
 
 
 def _confounded_with(correlation: F64, index: int) -> int | None:
@@ -185,13 +186,22 @@ def _confounded_with(correlation: F64, index: int) -> int | None:
     return at if others[at] > 0.8 else None
 
 
-def estimate(solution: FitSolution, uncertainty: Uncertainty, index: int) -> ParameterEstimate:
-    parameter = solution.coordinates.parameters[index]
-    low, middle, high = (
-        _value(solution, index, solution.z[index] + sign * uncertainty.half[index])
-        for sign in (-1, 0, 1)
-    )
-    return ParameterEstimate(parameter.name, parameter.unit, middle, low, high, True)
+def as_in_base(
+    name: str, base: Perturbation, reason: str, low: float | None = None, high: float | None = None
+) -> ParameterEstimate:
+    """A parameter that is not fitted."""
+    value, unit = float(getattr(base, name)), PARAMETERS[name].unit
+    return ParameterEstimate(name, unit, value, low, high, False, reason)
+
+
+def estimates(solution: FitSolution, uncertainty: Uncertainty) -> list[ParameterEstimate]:
+    """Of every parameter that was fitted."""
+    made = []
+    for index, parameter in enumerate(solution.coordinates.parameters):
+        z, half = solution.z[index], uncertainty.half[index]
+        low, middle, high = (_value(solution, index, end) for end in (z - half, z, z + half))
+        made.append(ParameterEstimate(parameter.name, parameter.unit, middle, low, high, True))
+    return made
 
 
 def _value(solution: FitSolution, index: int, z: float) -> float:

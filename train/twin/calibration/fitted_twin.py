@@ -28,7 +28,7 @@ class ParameterEstimate:
     value: float
     low: float | None
     high: float | None
-    fitted: bool  # False: as in the base
+    fitted: bool  # False: as in the base, for the reason that `note` gives
     note: str = ""
 
 

@@ -201,7 +201,7 @@ def _observation_rows(
     steps: LoggedSteps, stepped: OneStep, chosen: Mapping[str, Bools], rng: np.random.Generator
 ) -> Iterator[dict[str, Any]]:
     """Mean absolute gap of every component that the twin could get wrong."""
-    sources = {name: outcome.observation for name, outcome in stepped.twins.items()}
+    sources = {name: result.observation for name, result in stepped.twins.items()}
     sources |= {PERSISTENCE: stepped.now}
     left_out = ["previous_action_"]  # the action that was applied
     left_out += [] if stepped.lidar else ["clearance_", "closing_"]
@@ -237,8 +237,8 @@ def _reward_rows(
         rows = mask & stepped.valid
         episode = steps.episode_id[stepped.rows[rows]]
         logged_terms = {"reward": stepped.logged.reward, **stepped.logged.terms}
-        for source, outcome in stepped.twins.items():
-            for term, values in {"reward": outcome.reward, **outcome.terms}.items():
+        for source, result in stepped.twins.items():
+            for term, values in {"reward": result.reward, **result.terms}.items():
                 logged = logged_terms[term][rows]
                 off = values[rows] - logged
                 spread = np.abs(logged - np.median(logged)) if len(logged) else logged

@@ -32,7 +32,12 @@ from restock.train.twin.calibration.logged_steps import (
     rows_of,
     sector_clearance,
 )
-from restock.train.twin.calibration.open_loop import Driven, Start, drive, see_sectors
+from restock.train.twin.calibration.open_loop import (
+    OpenLoopResult,
+    OpenLoopStart,
+    drive_open_loop,
+    see_sectors,
+)
 from restock.train.twin.calibration.segments import POSE
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.physics.perturbation import Perturbation
@@ -54,7 +59,7 @@ ROUTE = (
 
 
 @dataclass(frozen=True)
-class Outcome:
+class StepResult:
     """What followed n steps, in the log or in a twin."""
 
     observation: F32  # (n, D) at t + 1
@@ -68,8 +73,8 @@ class OneStep:
 
     rows: Ints  # (n,) of the logged steps
     now: F32  # (n, D) the logged observation at t
-    logged: Outcome
-    twins: dict[str, Outcome]
+    logged: StepResult
+    twins: dict[str, StepResult]
     valid: Bools  # (n,) no twin blew up
     lidar: bool  # the floor is the twin's: otherwise lidar entries are the log's own
     unexplained: int  # logged rewards that their terms do not add up to
@@ -105,15 +110,15 @@ def one_step(
         parts = reward_parts(task, now, then, progress_m, action, before)
         return {name: np.asarray(value, np.float64) for name, value in parts.items()}
 
-    logged = Outcome(next_observed, steps.reward[rows], terms(after, steps.progress_m[rows]))
+    logged = StepResult(next_observed, steps.reward[rows], terms(after, steps.progress_m[rows]))
     adds_up = np.abs(sum(logged.terms.values()) - logged.reward) < 1e-3
     pose = np.stack([now[name] for name in POSE], axis=-1)
-    start = Start(pose, now, steps.commands(rows, 0, 1), past=steps.commands(rows, PAST, 0))
-    driven = drive(
+    start = OpenLoopStart(pose, now, steps.commands(rows, 0, 1), past=steps.commands(rows, PAST, 0))
+    driven = drive_open_loop(
         task, start, list(twins.values()),
         warehouse=warehouse, timestep_s=timestep_s, nthread=nthread,
     )  # fmt: skip
-    outcomes = {}
+    results = {}
     for number, name in enumerate(twins):
         twin = after | _sensed(driven, number)
         _localise(task.control_period_s, now, after, twin)
@@ -128,19 +133,19 @@ def one_step(
         )
         parts = terms(twin, plans.progress_m(steps, rows, twin))
         reward = np.asarray(sum(parts.values()))
-        outcomes[name] = Outcome(observe(task, twin, now, action), reward, parts)
+        results[name] = StepResult(observe(task, twin, now, action), reward, parts)
     return OneStep(
         rows=rows,
         now=observed,
         logged=logged,
-        twins=outcomes,
+        twins=results,
         valid=np.logical_not(driven.blown_up.any(axis=0)),
         lidar=warehouse is not None,
         unexplained=int((~adds_up).sum()),
     )
 
 
-def _sensed(driven: Driven, twin: int) -> Signals:
+def _sensed(driven: OpenLoopResult, twin: int) -> Signals:
     """What one twin senses at the end, by the names of the signals."""
     sensed = {name: values[twin, :, -1] for name, values in driven.signals.items()}
     sensed["sector_clearance_m"] = driven.sector_clearance_m[twin]

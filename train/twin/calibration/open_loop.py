@@ -1,9 +1,9 @@
 """Open loop: logged commands driven again in the twin, which is told nothing else on the way.
 
-`drive` puts robots into logged states and drives logged commands from there, one control period or
-many. `replay_segments` drives segments of a log with it: the W steps before a segment begin with
-the logged motion, and are driven only so that ramps and late commands are under way when the K
-steps begin. Then the twin's pose is put on the logged pose, and the two go their ways.
+`drive_open_loop` puts robots into logged states and drives logged commands from there, one control
+period or many. `replay_segments` drives segments of a log with it: the W steps before a segment
+begin with the logged motion, and are driven only so that ramps and late commands are under way when
+the K steps begin. Then the twin's pose is put on the logged pose, and the two go their ways.
 
 Without a floor map the floor is empty. Obstacles of a log are not known, racks of another floor are
 not there, and a pose that localisation has 3 cm wrong must not become a collision: the question is
@@ -42,7 +42,7 @@ SENSED = ("wheel_speed_mps", "wheel_yaw_rate_radps", "gyro_yaw_rate_radps", "acc
 
 
 @dataclass(frozen=True)
-class Start:
+class OpenLoopStart:
     """The states in which S robots begin, and the commands that they are given from there.
 
     `motion` are the logged wheel speed and yaw rate, gyroscope, localised speed and lateral speed,
@@ -55,13 +55,15 @@ class Start:
     command: F64  # (S, K, 2) speed m/s and yaw rate rad/s
     past: F64 | None = None  # (S, P, 2) the commands of the periods before
 
-    def take(self, which: Ints) -> Start:
+    def take(self, which: Ints) -> OpenLoopStart:
         past = None if self.past is None else self.past[which]
-        return Start(self.pose[which], rows_of(self.motion, which), self.command[which], past)
+        return OpenLoopStart(
+            self.pose[which], rows_of(self.motion, which), self.command[which], past
+        )
 
 
 @dataclass(frozen=True)
-class Driven:
+class OpenLoopResult:
     """What P twins did from S starts, without sensor noise: at the start and after each period."""
 
     signals: dict[str, F64]  # of pose, wheels, gyroscope and accelerometer, (P, S, K + 1) each
@@ -76,15 +78,15 @@ class Driven:
         return np.stack([self.signals[name] for name in POSE], axis=-1)
 
 
-def drive(
+def drive_open_loop(
     task: Task,
-    start: Start,
+    start: OpenLoopStart,
     perturbations: Sequence[Perturbation],
     *,
     warehouse: Warehouse | None = None,
     timestep_s: float = 0.01,
     nthread: int = 1,
-) -> Driven:
+) -> OpenLoopResult:
     """Drive every start's commands under every perturbation: P x S robots.
 
     The perturbations' own `timestep_s` and sensor noise are not used. The result does not depend
@@ -130,7 +132,7 @@ def drive(
         if sectors:
             clearance[ids] = see_sectors(simulation)
     signals |= {name: pose[..., i] for i, name in enumerate(POSE)}
-    return Driven(
+    return OpenLoopResult(
         signals={name: values.reshape(*shape, -1) for name, values in signals.items()},
         sliding_mps=sliding.reshape(*shape, -1),
         bumped=bumped.reshape(shape),
@@ -153,7 +155,11 @@ def see_sectors(simulation: Simulation) -> F64:
 
 
 def _place(
-    simulation: Simulation, start: Start, perturbations: Sequence[Perturbation], *, endless: bool
+    simulation: Simulation,
+    start: OpenLoopStart,
+    perturbations: Sequence[Perturbation],
+    *,
+    endless: bool,
 ) -> F64:
     """Put every robot where its log was, moving as it did; returns map less simulation (N, 2).
 
@@ -219,27 +225,29 @@ def replay_segments(
     *,
     timestep_s: float = 0.01,
     nthread: int = 1,
-) -> Driven:
-    """Drive every segment's commands under every perturbation, on an empty floor, as `drive` does.
+) -> OpenLoopResult:
+    """Drive every segment's commands under every perturbation, on an empty floor.
 
     The signals are those of poses, laid onto the log so that each first one is the logged one, and
     of motion, localised speeds too.
 
     Raises:
-        ConfigError: as `drive`.
+        ConfigError: as `drive_open_loop`.
     """
     moving = ~segments.still
     motion = {name: np.where(moving, values, 0.0) for name, values in segments.before.items()}
     motion["localised_lateral_mps"] = np.zeros(len(segments))  # the warm-up is long enough for it
-    start = Start(np.zeros((len(segments), 3)), motion, segments.command)
-    driven = drive(segments.task, start, perturbations, timestep_s=timestep_s, nthread=nthread)
+    start = OpenLoopStart(np.zeros((len(segments), 3)), motion, segments.command)
+    driven = drive_open_loop(
+        segments.task, start, perturbations, timestep_s=timestep_s, nthread=nthread
+    )
     warmup = segments.warmup_steps
     signals = {name: driven.signals[name][..., warmup:] for name in SENSED}
     forward, lateral = _localised(
         driven.pose, segments.task.control_period_s, signals["wheel_speed_mps"]
     )
     signals["localised_speed_mps"], signals["localised_lateral_mps"] = forward, lateral
-    laid = lay(driven.pose[:, :, warmup:], segments.pose[:, 0])
+    laid = lay_onto(driven.pose[:, :, warmup:], segments.pose[:, 0])
     laid[..., 2] = wrap_angle(laid[..., 2])
     signals |= {name: laid[..., i] for i, name in enumerate(POSE)}
     return replace(driven, signals=signals, sliding_mps=driven.sliding_mps[..., warmup:])
@@ -258,7 +266,7 @@ def _localised(pose: F64, period_s: float, wheel_speed: F64) -> tuple[F64, F64]:
     return localised_velocity({**now, "wheel_speed_mps": wheel_speed}, before)
 
 
-def lay(pose: F64, onto: F64) -> F64:
+def lay_onto(pose: F64, onto: F64) -> F64:
     """Poses (..., S, K + 1, 3) moved as one so that each first is `onto` (S, 3)."""
     turn = onto[:, 2] - pose[..., 0, 2]
     cos, sin = np.cos(turn)[..., None], np.sin(turn)[..., None]

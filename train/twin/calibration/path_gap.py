@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from restock.ingest.task.signals import wrap_angle
 from restock.train.twin.calibration.logged_steps import NOMINAL, LoggedSteps
-from restock.train.twin.calibration.open_loop import lay, replay_segments
+from restock.train.twin.calibration.open_loop import lay_onto, replay_segments
 from restock.train.twin.calibration.segments import LoggedSegments, log_segments
 from restock.train.twin.physics.model import body_velocity
 from restock.train.twin.physics.perturbation import Perturbation
@@ -174,7 +174,7 @@ def _gaps(
     # Of the last twin, which is the calibrated one if there is one.
     localised = path + _pose_noise(path.shape, noise, part.task.control_period_s, rng)
     sensed = _sense(signals, localised, path, noise, part.task.control_period_s, rng)
-    gaps[FLOOR] = _gap(lay(path, localised[:, 0]), signals, localised, sensed, fresh)
+    gaps[FLOOR] = _gap(lay_onto(path, localised[:, 0]), signals, localised, sensed, fresh)
     return {(source, name): gap for source, each in gaps.items() for name, gap in each.items()}
 
 
