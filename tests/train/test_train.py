@@ -225,7 +225,7 @@ def test_from_python_a_run_is_trained_and_evaluated_as_by_the_commands(
     ("argv", "complaint"),
     [
         (["train"], "give --out RUN"),
-        (["train", "--out", "{new}", "--set", "loss.gamma=1"], "unknown field `gamma`"),
+        (["train", "--out", "{new}", "--set", "loss.gamma=1"], "unknown key `loss.gamma`"),
         (["train", "--out", "{new}", "--set", "nonsense"], "'nonsense' is not key=value"),
         (["train", "--out", "{new}", "--config", "{missing}"], "cannot be read"),
         (["train", "--out", "{new}", "--device", "cuda"], "sees no CUDA device"),
