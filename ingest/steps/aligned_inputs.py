@@ -42,15 +42,11 @@ class InputColumns:
     def __init__(self, profile: Profile, topics: Mapping[str, TopicColumns]) -> None:
         self.topics = topics
         self.placed: dict[str, Placement] = {}  # of each message of an input in another frame
-        self.by_name = {
+        self.by_name: dict[str, Input] = {  # those whose topic the recording has
             name: source
             for name, source in profile.inputs.items()
             if source.topic in topics and not (source.optional and not len(topics[source.topic]))
         }
-
-    def present(self, name: str) -> Input | None:
-        """The input, if the profile names it and the recording has its topic."""
-        return self.by_name.get(name)
 
     def column(self, name: str, key: str) -> FieldColumn:
         """A field of an input as it was read."""
@@ -241,7 +237,7 @@ def transforms_of(profile: Profile, inputs: InputColumns) -> Edges:
     if frames is None:
         return Edges({}, frozenset(), {})
     edges = Edges.of(frames, inputs.topics)
-    if inputs.present("pose") is None and (why := edges.missing(frames.base, frames.fixed)):
+    if "pose" not in inputs.by_name and (why := edges.missing(frames.base, frames.fixed)):
         raise RecordingError(
             why, remedy="mend `frames` in the profile; see `restock profile check`"
         )

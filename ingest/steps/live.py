@@ -22,7 +22,7 @@ from restock.ingest.steps.align import NS, ClockSegment, Samples
 from restock.ingest.steps.aligned_inputs import AlignedInputs, InputColumns
 from restock.ingest.steps.clocks import median
 from restock.ingest.steps.needs import field_paths
-from restock.ingest.steps.steps import fill_signals
+from restock.ingest.steps.steps import Filling
 from restock.ingest.task.task import nearest_action, observe
 
 PROVENANCE = ("behaviour_policy", "true_condition", "perturbation")  # no robot acts by these
@@ -128,18 +128,17 @@ class LiveObserver:
         inputs = InputColumns(self.profile, topics)
         segment = ClockSegment(samples, self.offset_ns)
         at = [np.array(ticks, np.int64)]
-        filled = fill_signals(AlignedInputs(self.profile, inputs, [segment], at))
+        filling = Filling(AlignedInputs(self.profile, inputs, [segment], at))
+        signals = filling.fill()
         last = len(ticks) - 1
-        before = last - int(filled.follows[last])
+        before = last - int(filling.follows[last])
         now, then = (
-            {name: column[[row]] for name, column in filled.signals.items()}
-            for row in (last, before)
+            {name: column[[row]] for name, column in signals.items()} for row in (last, before)
         )
         action, _ = nearest_action(
             self.task, then["command_speed_mps"], then["command_yaw_rate_radps"]
         )
         previous = int(action[0]) if before != last else 0
-        filling = filled.filling
         problem = str(filling.problem[last] or filling.route_problem[last])
         observation = observe(self.task, now, then, np.array([previous]))[0]
         self._tick(stamp_ns)

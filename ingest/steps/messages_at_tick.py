@@ -119,7 +119,7 @@ def _of_signals(aligned: AlignedInputs) -> Iterator[_Message]:
 def _of_transforms(aligned: AlignedInputs, stamp_ns: int) -> Iterator[_Message]:
     """The transforms from the robot's frame up to the fixed one, where they give the pose."""
     tree = aligned.tree
-    if tree is None or aligned.inputs.present("pose") is not None:
+    if tree is None or "pose" in aligned.inputs.by_name:
         return
     for topic, frame, row, measured_ns in tree.way(tree.frames.base, aligned.ticks):
         columns = tree.edges.topics[f"{topic} {frame}"]

@@ -101,10 +101,10 @@ def plan_problems(plans_m: Sequence[F64]) -> list[str]:
     problems = []
     for plan in plans_m:
         if not len(plan):
-            problems.append("plan: empty")
+            problems.append("empty")
         else:
             sane = (np.abs(plan) <= LARGEST).all()  # False for NaN
-            problems.append("" if sane else "plan: not finite")
+            problems.append("" if sane else "not finite")
     return problems
 
 

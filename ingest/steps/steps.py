@@ -9,6 +9,8 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,28 +69,27 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
             not what its input needs.
     """
     aligned = align_inputs(profile, topics)
-    filled = fill_signals(aligned)
-    filling, signals = filled.filling, filled.signals
+    filling = Filling(aligned)
+    signals = filling.fill()
     action, residual = nearest_action(
         profile.task, signals["command_speed_mps"], signals["command_yaw_rate_radps"]
     )
-    policy, version, probability = filling.behaviour()
-    perturbed = filling.perturbed()
+    policies, perturbed = filling.behaviour(), filling.perturbed()
     custom = custom_signals(aligned)
     return Steps(
         signals,
         filling.segment,
-        filled.follows,
-        filled.break_reason,
+        filling.follows,
+        list(filling.break_reason),
         list(filling.problem),
         list(filling.route_problem),
         filling.routing,
         action,
         residual,
-        policy,
-        version,
-        probability,
-        filling.truth(),
+        [policy for policy, _, _ in policies],
+        [version for _, version, _ in policies],
+        [probability for _, _, probability in policies],
+        filling.texts("true_condition"),
         perturbed,
         aligned.clock,
         aligned.commands_between,
@@ -99,7 +100,7 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
 
 
 class Filling:
-    """Fills the signals of one recording. What is asked of it after `fill` is about its ticks."""
+    """Every signal at every tick, from the latest messages at it; a tick's first problem stays."""
 
     def __init__(self, aligned: AlignedInputs) -> None:
         self.aligned, self.inputs = aligned, aligned.inputs
@@ -109,17 +110,18 @@ class Filling:
         self.segment = np.repeat(np.arange(len(lengths)), lengths)
         self.problem = np.full(len(self.tick_ns), "", object)
         self.route_problem = np.full(len(self.tick_ns), "", object)
+        self.break_reason = np.full(len(self.tick_ns), "", object)  # why one does not follow
         self.signals: Signals = {"stamp_ns": self.tick_ns}
         self.routing = Routing.none(len(self.tick_ns))
 
     def fill(self) -> Signals:
-        """Every signal but the localised velocity, which needs to know the tick before."""
+        """Every signal; what else is known of the ticks is in the attributes afterwards."""
         self._numbers(
             "command", speed_mps="command_speed_mps", yaw_rate_radps="command_yaw_rate_radps"
         )
         self._pose()
         self._numbers("wheels", speed_mps="wheel_speed_mps", yaw_rate_radps="wheel_yaw_rate_radps")
-        if self.inputs.present("imu"):
+        if "imu" in self.inputs.by_name:
             self._numbers("imu", yaw_rate_radps="gyro_yaw_rate_radps", accel_x_mps2="accel_x_mps2")
         else:
             self.signals["gyro_yaw_rate_radps"] = self.signals["wheel_yaw_rate_radps"].copy()
@@ -128,16 +130,46 @@ class Filling:
         self._bumper()
         if self.task.goal == "route":
             self._route()
-        routing = self.routing
-        self.signals |= routing.signals(self.task, routing.goal, routing.plan, self.signals)
-        return self.signals
+        signals, routing = self.signals, self.routing
+        signals |= routing.signals(self.task, routing.goal, routing.plan, signals)
+        self._find_breaks()
+        before = np.arange(len(self.follows)) - self.follows  # the tick before, or itself
+        forward, lateral = localised_velocity(
+            signals, {name: signals[name][before] for name in signals if name.startswith("pose_")}
+        )
+        signals |= {"localised_speed_mps": forward, "localised_lateral_mps": lateral}
+        return signals
 
-    def continuity(self) -> tuple[Bools, list[str]]:
-        """Whether each tick follows the one before, and why not."""
-        count = len(self.tick_ns)
-        break_reason = np.full(count, "", object)
-        if count:
-            break_reason[0] = "start of the recording"
+    @property
+    def follows(self) -> Bools:
+        """(T,) whether each tick comes directly after the one before, and both are usable."""
+        return np.asarray(self.break_reason == "", np.bool_)
+
+    def behaviour(self) -> list[tuple[str, str | None, float | None]]:
+        """Who acted at each tick: policy, version, probability of the action."""
+        default = (self.profile.behaviour_policy, None, None)
+        texts = self.texts("behaviour_policy")
+        return [default if text is None else parse_policy(text) for text in texts]
+
+    def texts(self, name: str) -> list[str | None]:
+        """The latest text of an input at each tick, or None."""
+        if name not in self.inputs.by_name:
+            return [None] * len(self.tick_ns)
+        texts, latest = self.inputs.texts(name), self.aligned.latest(name)
+        rows = zip(latest.row, latest.fresh, strict=True)
+        return [texts[row] if fresh else None for row, fresh in rows]
+
+    def perturbed(self) -> Perturbed:
+        """The simulator's parameters in force at each tick, and what could not be read."""
+        if "perturbation" not in self.inputs.by_name:
+            return Perturbed.unknown(len(self.tick_ns))
+        latest = self.aligned.latest("perturbation")
+        row = np.where(latest.fresh, latest.row, -1).astype(np.int64)
+        return Perturbed.read(self.inputs.texts("perturbation"), row)
+
+    def _find_breaks(self) -> None:
+        reasons = self.break_reason
+        reasons[:1] = "start of the recording"
         x, y = self.signals["pose_x_m"], self.signals["pose_y_m"]
         jump = np.hypot(np.diff(x), np.diff(y)) > self.profile.episodes.max_pose_jump_m
         gap = np.diff(self.tick_ns) > round(self.profile.clock.max_gap_s * NS)
@@ -148,40 +180,16 @@ class Filling:
             (unusable, "unusable step"),
             (jump, "pose jump"),
         ):
-            break_reason[1:][bad & (break_reason[1:] == "")] = reason
-        return np.asarray(break_reason == "", np.bool_), list(break_reason)
-
-    def behaviour(self) -> tuple[list[str], list[str | None], list[float | None]]:
-        """Who acted at each tick: policy, version, probability of the action."""
-        count = len(self.tick_ns)
-        default = self.profile.behaviour_policy
-        if not self.inputs.present("behaviour_policy"):
-            return [default] * count, [None] * count, [None] * count
-        policies = [parse_policy(text) for text in self.inputs.texts("behaviour_policy")]
-        latest = self.aligned.latest("behaviour_policy")
-        rows = zip(latest.row, latest.fresh, strict=True)
-        acted = [policies[row] if fresh else (default, None, None) for row, fresh in rows]
-        return [a[0] for a in acted], [a[1] for a in acted], [a[2] for a in acted]
-
-    def truth(self) -> list[str | None]:
-        """The simulator's own condition at each tick: the message nearest to it."""
-        if not self.inputs.present("true_condition"):
-            return [None] * len(self.tick_ns)
-        texts, latest = self.inputs.texts("true_condition"), self.aligned.latest("true_condition")
-        rows = zip(latest.row, latest.fresh, strict=True)
-        return [texts[row] if fresh else None for row, fresh in rows]
-
-    def perturbed(self) -> Perturbed:
-        """The simulator's parameters in force at each tick, and what could not be read."""
-        if not self.inputs.present("perturbation"):
-            return Perturbed.unknown(len(self.tick_ns))
-        latest = self.aligned.latest("perturbation")
-        row = np.where(latest.fresh, latest.row, -1).astype(np.int64)
-        return Perturbed.read(self.inputs.texts("perturbation"), row)
+            reasons[1:][bad & (reasons[1:] == "")] = reason
 
     def _mark_invalid(self, bad: Bools, reason: str, *, route: bool = False) -> None:
         problems = self.route_problem if route else self.problem
         problems[bad & (problems == "")] = reason
+
+    def _mark_reasons(self, name: str, reasons: NDArray[Any], *, route: bool = False) -> None:
+        """Mark the ticks that have a reason (T,), which is "" elsewhere."""
+        for reason in sorted(set(reasons) - {""}):
+            self._mark_invalid(reasons == reason, f"{name}: {reason}", route=route)
 
     def _required(self, name: str, *, route: bool = False) -> LatestMessages:
         latest = self.aligned.latest(name)
@@ -195,52 +203,47 @@ class Filling:
         for key, signal in signal_of.items():
             values = self.inputs.numbers(name, key)
             column = values[latest.row] if len(values) else np.zeros(len(latest.row))
-            sane = np.abs(column) <= LARGEST  # False for NaN
-            self._mark_invalid(~sane, f"{name}: not finite")
-            self.signals[signal] = np.where(sane & latest.known, column, 0.0)
+            self._set(name, signal, column, latest.known)
+
+    def _set(self, name: str, signal: str, values: F64, known: Bools) -> None:
+        sane = np.abs(values) <= LARGEST  # False for NaN
+        self._mark_invalid(~sane, f"{name}: not finite")
+        self.signals[signal] = np.where(sane & known, values, 0.0)
 
     def _pose(self) -> None:
-        if self.inputs.present("pose"):
+        if "pose" in self.inputs.by_name:
             self._numbers("pose", x_m="pose_x_m", y_m="pose_y_m", yaw_rad="pose_yaw_rad")
             self.signals["pose_stamp_ns"] = self.tick_ns - self.aligned.latest("pose").age_ns
             return
         tree = self.aligned.tree
         assert tree is not None  # the profile is refused otherwise
         at = tree.place(tree.frames.base, self.aligned.ticks)
-        for reason in sorted(set(at.problem) - {""}):
-            self._mark_invalid(at.problem == reason, f"pose: {reason}")
+        self._mark_reasons("pose", at.problem)
         x, y, _ = at.translation_m.T
         for signal, values in (("x_m", x), ("y_m", y), ("yaw_rad", at.yaw_rad)):
-            sane = np.abs(values) <= LARGEST  # False for NaN
-            self._mark_invalid(~sane, "pose: not finite")
-            self.signals[f"pose_{signal}"] = np.where(sane & (at.problem == ""), values, 0.0)
+            self._set("pose", f"pose_{signal}", values, at.problem == "")
         self.signals["pose_stamp_ns"] = at.stamp_ns
 
     def _scan(self) -> None:
-        if not self.inputs.present("scan"):
-            shape = len(self.tick_ns), self.task.sectors
-            self.signals["sector_clearance_m"] = np.full(shape, float(self.task.range_max_m))
-            self.signals["clearance_m"] = np.full(shape[0], float(self.task.range_max_m))
-            return
-        latest = self._required("scan")
-        source = self.inputs.by_name["scan"]
-        fields: Fields = self.inputs.topics[source.topic].fields
-        if SECTORS not in fields:  # columns of whole scans, as no recording's reader gives them
-            fields = scan_reduction(self.task, source.topic, source.fields).apply(fields)
-        sectors = np.full((len(self.tick_ns), self.task.sectors), float(self.task.range_max_m))
-        fresh = latest.fresh
-        if fresh.any():
-            rows = latest.row[fresh]
-            beams = np.zeros(len(self.tick_ns), np.int64)
-            beams[fresh] = np.asarray(fields[BEAMS])[rows]
-            self._mark_invalid(fresh & (beams == 0), "scan: no beams")
-            sectors[fresh] = np.asarray(fields[SECTORS])[rows]
-        self.signals["sector_clearance_m"] = sectors
-        self.signals["clearance_m"] = sectors.min(axis=1)
+        count = len(self.tick_ns)
+        sectors = np.full((count, self.task.sectors), float(self.task.range_max_m))
+        source = self.inputs.by_name.get("scan")
+        if source is not None:
+            latest = self._required("scan")
+            fields: Fields = self.inputs.topics[source.topic].fields
+            if SECTORS not in fields:  # columns of whole scans, as no recording's reader gives them
+                fields = scan_reduction(self.task, source.topic, source.fields).apply(fields)
+            fresh, rows = latest.fresh, latest.row[latest.fresh]
+            if len(rows):
+                beams = np.zeros(count, np.int64)
+                beams[fresh] = np.asarray(fields[BEAMS])[rows]
+                self._mark_invalid(fresh & (beams == 0), "scan: no beams")
+                sectors[fresh] = np.asarray(fields[SECTORS])[rows]
+        self.signals |= {"sector_clearance_m": sectors, "clearance_m": sectors.min(axis=1)}
 
     def _bumper(self) -> None:
         bumped = [np.zeros(len(self.tick_ns), np.bool_)]
-        source = self.inputs.present("bumper")
+        source = self.inputs.by_name.get("bumper")
         if source is not None:
             self._required("bumper")
             pressed = self.inputs.numbers("bumper", "pressed") > 0
@@ -255,9 +258,8 @@ class Filling:
         goals, plans = self.inputs.goals, self.inputs.plans
         for name, one in latest.items():
             if name in self.inputs.placed:
-                problems = np.where(one.known, self.inputs.placed[name].problem[one.row], "")
-                for reason in sorted(set(problems) - {""}):
-                    self._mark_invalid(problems == reason, f"{name}: {reason}", route=True)
+                reasons = np.where(one.known, self.inputs.placed[name].problem[one.row], "")
+                self._mark_reasons(name, reasons, route=True)
         settings = self.profile.episodes
         goal, plan = (np.where(one.known, one.row, -1) for one in latest.values())
         if len(goals):
@@ -265,9 +267,8 @@ class Filling:
             sane = (np.abs(goals[goal]) <= LARGEST).all(axis=1)
             self._mark_invalid((goal >= 0) & ~sane, "goal: not finite", route=True)
         if len(plans):
-            problems = np.array(plan_problems(plans), object)[plan]
-            for reason in set(problems) - {""}:
-                self._mark_invalid((plan >= 0) & (problems == reason), reason, route=True)
+            reasons = np.where(plan >= 0, np.array(plan_problems(plans), object)[plan], "")
+            self._mark_reasons("plan", reasons, route=True)
         usable = self.route_problem == ""
         if usable.any():
             away = np.linalg.norm(plan_ends(plans)[plan[usable]] - goals[goal[usable]], axis=-1)
@@ -290,6 +291,7 @@ def pressed_since(bumper: Samples, pressed: Bools, tick_ns: Ints) -> Bools:
     return (since > 0) | (pressed[latest.row] & latest.known)
 
 
+@lru_cache(maxsize=1024)
 def parse_policy(text: str) -> tuple[str, str | None, float | None]:
     """`{"policy": …, "version": …, "probability": …}`, or a bare name, to the three."""
     try:
@@ -304,26 +306,3 @@ def parse_policy(text: str) -> tuple[str, str | None, float | None]:
         None if version is None else str(version),
         float(probability) if isinstance(probability, int | float) else None,
     )
-
-
-@dataclass(frozen=True)
-class Filled:
-    """The signals at T ticks, and what is asked about them afterwards."""
-
-    filling: Filling
-    signals: Signals  # every signal, leading axis T
-    follows: Bools  # (T,) comes directly after the tick before, and both are usable
-    break_reason: list[str]  # (T,) why it does not follow, or ""
-
-
-def fill_signals(aligned: AlignedInputs) -> Filled:
-    """Every signal at every tick, from the latest messages at it."""
-    filling = Filling(aligned)
-    signals = filling.fill()
-    follows, break_reason = filling.continuity()
-    before = np.arange(len(follows)) - follows  # the tick before, or itself
-    forward, lateral = localised_velocity(
-        signals, {name: signals[name][before] for name in signals if name.startswith("pose_")}
-    )
-    signals |= {"localised_speed_mps": forward, "localised_lateral_mps": lateral}
-    return Filled(filling, signals, follows, break_reason)
