@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeAlias
@@ -23,6 +23,13 @@ LARGEST_CHUNK = 4 << 30
 PLAUSIBLE_SIZE = 64 << 20
 PLAUSIBLE_RATIO = 1000
 LATEST_NS = 2**63 - 1
+STEP = 1 << 12  # of damaged data at a time: damage costs no more than what is near it
+
+_DECODERS: dict[str, Callable[[], Any]] = {
+    "zstd": lambda: zstandard.ZstdDecompressor().decompressobj(),
+    "lz4": lz4.frame.LZ4FrameDecompressor,
+}
+_DAMAGED = (zstandard.ZstdError, RuntimeError, EOFError, OSError)
 
 _HEAD = np.dtype(  # a message record up to its data
     [
@@ -139,27 +146,17 @@ def inflate_partly(chunk: Chunk, file: Buffer) -> bytes:
     """The part of a cut or damaged chunk that still decompresses; unchecked."""
     stored = file[chunk.start : chunk.stop]
     limit = min(chunk.size, max(PLAUSIBLE_SIZE, PLAUSIBLE_RATIO * len(stored)), LARGEST_CHUNK)
-    parts: list[bytes] = []
-    size = 0
-    step = 1 << 12  # small, so that damage costs no more than what is near it
     if chunk.compression == "":
-        return bytes(stored[:limit])
-    decoder: Any
-    if chunk.compression == "zstd":
-        decoder = zstandard.ZstdDecompressor().decompressobj()
-    elif chunk.compression == "lz4":
-        decoder = lz4.frame.LZ4FrameDecompressor()
-    else:
+        return stored[:limit]
+    if chunk.compression not in _DECODERS:
         return b""
-    for position in range(0, len(stored), step):
-        try:
-            part = decoder.decompress(stored[position : position + step])
-        except (zstandard.ZstdError, RuntimeError, EOFError, OSError):
-            break
-        parts.append(part)
-        size += len(part)
-        if size >= limit:
-            break
+    decoder, parts, size = _DECODERS[chunk.compression](), list[bytes](), 0
+    with suppress(*_DAMAGED):
+        for position in range(0, len(stored), STEP):
+            parts.append(decoder.decompress(stored[position : position + STEP]))
+            size += len(parts[-1])
+            if size >= limit:
+                break
     return b"".join(parts)[:limit]
 
 
@@ -174,7 +171,7 @@ def _decompress(compression: str, stored: bytes, size: int) -> bytes:
         if compression == "lz4":
             data: bytes = lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=size + 1)
             return data
-    except (zstandard.ZstdError, RuntimeError, EOFError, OSError) as error:
+    except _DAMAGED as error:
         raise BadChunk(f"its {compression} data is damaged ({error})") from error
     raise BadChunk(f"compression {compression!r} is not supported")
 

@@ -8,6 +8,7 @@ there is in a file with a wrong summary, or none. See https://mcap.dev/spec.
 from __future__ import annotations
 
 import mmap
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -46,12 +47,11 @@ class Contents:
     extras: list[Extra] = field(default_factory=list)  # attachments and metadata records
     unnamed: int = 0  # more of them
 
-    def indexed_counts(self) -> dict[int, int]:
+    def indexed_counts(self) -> Counter[int]:
         """Messages per channel as far as they are known without looking into chunks."""
-        counts = {channel: len(positions) for channel, positions in self.loose.items()}
+        counts = Counter({channel: len(positions) for channel, positions in self.loose.items()})
         for chunk in self.chunks:
-            for channel, count in chunk.counts().items():
-                counts[channel] = counts.get(channel, 0) + count
+            counts.update(chunk.counts())
         return counts
 
     def claimed_counts(self) -> dict[int, int] | None:

@@ -77,7 +77,7 @@ class McapFile:
         counts = contents.indexed_counts()
         if claimed is not None:
             indexed = all(chunk.index for chunk in contents.chunks)
-            if indexed and any(count > counts.get(number, 0) for number, count in claimed.items()):
+            if indexed and any(count > counts[number] for number, count in claimed.items()):
                 contents.distrust_index()  # it leaves messages out; look for them
                 return claimed
             more = {number for number, count in counts.items() if count > claimed.get(number, 0)}
@@ -87,7 +87,7 @@ class McapFile:
         for chunk in contents.chunks:
             if not chunk.index:
                 for number, positions in self._chunks.walk(chunk).items():
-                    counts[number] = counts.get(number, 0) + len(positions)
+                    counts[number] += len(positions)
         return counts
 
     def _channels(self) -> dict[int, Channel]:

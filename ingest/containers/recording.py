@@ -7,6 +7,7 @@ decoded and skipped is kept per topic.
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -241,11 +242,11 @@ class Recording:
 
     def _lost(self, topic: str) -> dict[str, int]:
         """Messages of a topic that damage is known to have cost, by reason."""
-        lost: dict[str, int] = {}
+        lost = Counter[str]()
         for stream in self._streams[topic]:
             for item in stream.storage.damage:
                 if count := item.messages.get(stream.channel.id):
-                    lost[item.what] = lost.get(item.what, 0) + count
+                    lost[item.what] += count
         return lost
 
     def close(self) -> None:

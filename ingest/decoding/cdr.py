@@ -7,6 +7,7 @@ alignment is relative to the byte after them. Of these layouts, ROS 2 writes pla
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -52,9 +53,9 @@ class ColumnDecoder:
         """The batch's columns; a message that does not decode is counted, by reason."""
         if self._ros1:
             every = np.arange(len(batch))
-            return self._join([self._decode_rows(batch, every, "<", 0)], {})
+            return self._join([self._decode_rows(batch, every, "<", 0)], Counter())
         small = np.nonzero(batch.stop - batch.start < HEADER)[0]
-        bad = {"mis-sized: shorter than its header": len(small)} if len(small) else {}
+        bad = Counter({"mis-sized: shorter than its header": len(small)} if len(small) else {})
         rows = np.nonzero(batch.stop - batch.start >= HEADER)[0]
         start = batch.start[rows]
         kind = batch.buffer[start].astype(np.int64) << 8 | batch.buffer[start + 1]
@@ -72,39 +73,36 @@ class ColumnDecoder:
     def _decode_rows(
         self, batch: MessageBatch, rows: NDArray[np.intp], order: Order, header: int
     ) -> Decoded:
-        bad: dict[str, int] = {}
+        bad = Counter[str]()
         for _ in range(RESTARTS):
             if not len(rows):
                 return Decoded(rows, self.empty(), bad)
             origin = batch.start[rows] + header
             frame = Frame(batch.buffer, order, origin, batch.stop[rows] - origin, rows, 0)
             try:
-                columns = self._plan.run(frame)
+                columns = self._plan.decode(frame)
                 left = frame.end - frame.position
                 if (left > (0 if self._ros1 else PADDING)).any():
                     raise BadRows(rows[left > (0 if self._ros1 else PADDING)], TOO_LONG)
             except BadRows as refused:
                 refused_rows = np.unique(refused.rows)
-                bad[refused.reason] = bad.get(refused.reason, 0) + len(refused_rows)
+                bad[refused.reason] += len(refused_rows)
                 rows = np.setdiff1d(rows, refused_rows)
                 continue
             return Decoded(rows, self._named(columns), bad)
         return self._one_by_one(batch, rows, bad)
 
     def _one_by_one(
-        self, batch: MessageBatch, rows: NDArray[np.intp], bad: dict[str, int]
+        self, batch: MessageBatch, rows: NDArray[np.intp], bad: Counter[str]
     ) -> Decoded:
         """What is wrong differs from row to row: let every row fail for itself."""
         part = batch.select(rows)
         slow = RowDecoder(self._message, self._leaves, ros1=self._ros1).decode(part)
-        for reason, count in slow.bad.items():
-            bad[reason] = bad.get(reason, 0) + count
-        return Decoded(rows[slow.rows], slow.fields, bad)
+        return Decoded(rows[slow.rows], slow.fields, bad + Counter(slow.bad))
 
-    def _join(self, parts: list[Decoded], bad: dict[str, int]) -> Decoded:
+    def _join(self, parts: list[Decoded], bad: Counter[str]) -> Decoded:
         for part in parts:
-            for reason, count in part.bad.items():
-                bad[reason] = bad.get(reason, 0) + count
+            bad.update(part.bad)
         if not parts:
             return Decoded(np.zeros(0, np.intp), self.empty(), bad)
         if len(parts) == 1:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from typing import Any
 
 import numpy as np
 
@@ -22,57 +21,57 @@ class _Compiler:
     def plan(self, name: str, prefix: str) -> CdrPlan:
         """The plan of a message whose fields' paths start with `prefix`."""
         plan = CdrPlan([], {})
-        run: list[FixedField] = []
-        self._message(name, prefix, plan, run)
-        self._close(plan, run)
+        fixed: list[FixedField] = []
+        self._message(name, prefix, plan, fixed)
+        self._close(plan, fixed)
         return plan
 
-    def _close(self, plan: CdrPlan, run: list[FixedField]) -> None:
-        if run:
-            plan.operations.append(FixedFields(list(run)))
-            run.clear()
+    def _close(self, plan: CdrPlan, fixed: list[FixedField]) -> None:
+        if fixed:
+            plan.operations.append(FixedFields(list(fixed)))
+            fixed.clear()
 
-    def _message(self, name: str, prefix: str, plan: CdrPlan, run: list[FixedField]) -> None:
+    def _message(self, name: str, prefix: str, plan: CdrPlan, fixed: list[FixedField]) -> None:
         fields = self.message.fields_of(name)
         if not fields and not self.ros1:  # C and C++ have no empty structure: it holds one byte
-            run.append(FixedField(np.dtype(np.uint8), None, 1, None))
+            fixed.append(FixedField(np.dtype(np.uint8), None, 1, None))
         for part in fields:
-            self._field(part, prefix + part.name, plan, run)
+            self._field(part, prefix + part.name, plan, fixed)
 
-    def _field(self, part: FieldType, path: str, plan: CdrPlan, run: list[FixedField]) -> None:
+    def _field(self, part: FieldType, path: str, plan: CdrPlan, fixed: list[FixedField]) -> None:
         wanted = self._wanted(path)
         if part.base and part.base != "string":
             dtype = DTYPES[part.base]
             if part.many is None or part.many.length is not None:
                 count = part.many.length if part.many else None
-                run.append(self._item(dtype, count, wanted))
+                fixed.append(FixedField(dtype, count, 1 if self.ros1 else dtype.itemsize, wanted))
                 self._note(plan, wanted, part.base, () if count is None else (count,))
                 return
-            self._close(plan, run)
+            self._close(plan, fixed)
             plan.operations.append(Primitives(dtype, wanted, self.ros1))
             self._note(plan, wanted, part.base, (None,))
         elif part.many:
-            self._repeat(part, path, plan, run)
+            self._repeat(part, path, plan, fixed)
         elif part.base:
-            self._close(plan, run)
+            self._close(plan, fixed)
             plan.operations.append(Text(wanted, self.ros1))
             self._note(plan, wanted, "string", ())
         elif part.message in TIMES:
-            self._time(str(part.message), path, ".", plan, run)
+            self._time(str(part.message), path, ".", plan, fixed)
         else:
-            self._message(str(part.message), path + ".", plan, run)
+            self._message(str(part.message), path + ".", plan, fixed)
 
-    def _repeat(self, part: FieldType, path: str, plan: CdrPlan, run: list[FixedField]) -> None:
+    def _repeat(self, part: FieldType, path: str, plan: CdrPlan, fixed: list[FixedField]) -> None:
         length = part.many.length if part.many else None
-        self._close(plan, run)
+        self._close(plan, fixed)
         if part.base:
             wanted = self._wanted(path)
             inner = CdrPlan([Text(wanted, self.ros1)], {})
             self._note(inner, wanted, "string", ())
         elif part.message in TIMES:
-            inner, inside = CdrPlan([], {}), list[FixedField]()
-            self._time(str(part.message), path, "[].", inner, inside)
-            self._close(inner, inside)
+            inner, inner_fixed = CdrPlan([], {}), list[FixedField]()
+            self._time(str(part.message), path, "[].", inner, inner_fixed)
+            self._close(inner, inner_fixed)
         else:
             inner = self.plan(str(part.message), path + "[].")
         if inner.operations or length is None:
@@ -80,7 +79,7 @@ class _Compiler:
         for inner_path, (kind, dims) in inner.paths.items():
             plan.paths[inner_path] = (kind, (length, *dims))
 
-    def _time(self, name: str, path: str, dot: str, plan: CdrPlan, run: list[FixedField]) -> None:
+    def _time(self, name: str, path: str, dot: str, plan: CdrPlan, fixed: list[FixedField]) -> None:
         """Its two fields; wanted as nanoseconds of both, or each by its own path, or all."""
         fields = self.message.fields_of(name)
         bases = [field.base for field in fields]
@@ -92,14 +91,11 @@ class _Compiler:
             align = 1 if self.ros1 else 4
             part_path = self._wanted(path + dot + one.name)
             if whole is not None:
-                run.append(FixedField(dtype, None, align, whole, part, part_path))
+                fixed.append(FixedField(dtype, None, align, whole, part, part_path))
             else:
-                run.append(FixedField(dtype, None, align, part_path))
+                fixed.append(FixedField(dtype, None, align, part_path))
             self._note(plan, part_path, str(one.base), ())
         self._note(plan, whole, "time", ())
-
-    def _item(self, dtype: np.dtype[Any], count: int | None, wanted: str | None) -> FixedField:
-        return FixedField(dtype, count, 1 if self.ros1 else dtype.itemsize, wanted)
 
     def _wanted(self, path: str) -> str | None:
         return path if path in self.wanted else None

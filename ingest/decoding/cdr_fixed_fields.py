@@ -34,41 +34,46 @@ class FixedField:
     part: str = ""  # "sec" or "nanosec" of a time
     also: str | None = None  # its own path, where both it and the whole time are wanted
 
+    @property
+    def size(self) -> int:
+        """Bytes of all its values."""
+        return self.dtype.itemsize * (1 if self.count is None else self.count)
+
 
 @dataclass
 class _Layout:
-    """A run's items laid out from one starting phase (the cursor modulo the alignment)."""
+    """The fields laid out from one starting phase (the cursor modulo the alignment)."""
 
-    size: int  # from the cursor to past the last item, padding before the first included
+    size: int  # from the cursor to past the last field, padding before the first included
     groups: list[tuple[int, dict[Order, np.dtype[Any]]]]  # first byte; byte order -> structure
 
 
 class FixedFields:
     """Consecutive fields of fixed size, gathered as structures."""
 
-    def __init__(self, items: list[FixedField]) -> None:
-        self.items = items
-        self.mask = max(item.align for item in items) - 1
+    def __init__(self, fields: list[FixedField]) -> None:
+        self.fields = fields
+        self.mask = max(field.align for field in fields) - 1
         self.layouts = [self._layout(phase) for phase in range(self.mask + 1)]
         self.sizes = np.array([layout.size for layout in self.layouts], np.int64)
-        self.first_align = items[0].align
+        self.first_align = fields[0].align
 
     def _layout(self, phase: int) -> _Layout:
         position = phase
         groups: list[list[tuple[str, FixedField, int]]] = []
         last = 0
-        for number, item in enumerate(self.items):
-            position = (position + item.align - 1) & -item.align
-            if item.path is not None:
+        for number, field in enumerate(self.fields):
+            position = (position + field.align - 1) & -field.align
+            if field.path is not None:
                 if not groups or position - last > PADDING_BETWEEN:
                     groups.append([])
-                groups[-1].append((str(number), item, position - phase))
-                last = position + item.dtype.itemsize * (1 if item.count is None else item.count)
-            position += item.dtype.itemsize * (1 if item.count is None else item.count)
+                groups[-1].append((str(number), field, position - phase))
+                last = position + field.size
+            position += field.size
         return _Layout(position - phase, [_structure(group) for group in groups])
 
-    def run(self, frame: Frame, out: Columns) -> None:
-        """Gather the run in all messages."""
+    def decode(self, frame: Frame, out: Columns) -> None:
+        """Gather the fields in all messages."""
         position = frame.position
         phase = uniform(position & self.mask)
         if isinstance(phase, int):
@@ -77,9 +82,9 @@ class FixedFields:
             self.take(frame, frame.origin + position, layout, out)
             frame.position = position + layout.size
         else:
-            self._run_phases(frame, spread(position, len(frame)), phase, out)
+            self._decode_phases(frame, spread(position, len(frame)), phase, out)
 
-    def _run_phases(self, frame: Frame, position: I64, phase: I64, out: Columns) -> None:
+    def _decode_phases(self, frame: Frame, position: I64, phase: I64, out: Columns) -> None:
         stop = position + self.sizes[phase]
         frame.check_bounds(stop)
         parts: list[Columns] = []
@@ -101,21 +106,21 @@ class FixedFields:
         for first, structures in layout.groups:
             structs = gather(frame.buffer, at + first, structures[frame.order])
             for name in structs.dtype.names or ():
-                item = self.items[int(name)]
+                field = self.fields[int(name)]
                 values = native(structs[name])
-                if item.dtype == np.bool_:
+                if field.dtype == np.bool_:
                     values = values != 0
-                if item.also is not None:
-                    out[item.also] = values
-                if item.part == "sec":
-                    times[str(item.path)] = values.astype(np.int64) * SECOND_NS
-                elif item.part:
-                    out[str(item.path)] = times[str(item.path)] + values
+                if field.also is not None:
+                    out[field.also] = values
+                if field.part == "sec":
+                    times[str(field.path)] = values.astype(np.int64) * SECOND_NS
+                elif field.part:
+                    out[str(field.path)] = times[str(field.path)] + values
                 else:
-                    out[str(item.path)] = values
+                    out[str(field.path)] = values
 
     def stride(self, phase: int) -> int | None:
-        """The size of one more run after itself, where that is the same every time."""
+        """The size of one more element of these fields, where that is the same every time."""
         size = self.layouts[phase].size
         return size if (phase + size) & self.mask == phase else None
 
@@ -125,9 +130,9 @@ def _structure(group: list[tuple[str, FixedField, int]]) -> tuple[int, dict[Orde
     structures: dict[Order, np.dtype[Any]] = {}
     for order in ORDERS:
         formats: list[Any] = []
-        for _, item, _ in group:
-            one = np.dtype(np.uint8) if item.dtype == np.bool_ else item.dtype.newbyteorder(order)
-            formats.append(one if item.count is None else (one, (item.count,)))
+        for _, field, _ in group:
+            one = np.dtype(np.uint8) if field.dtype == np.bool_ else field.dtype.newbyteorder(order)
+            formats.append(one if field.count is None else (one, (field.count,)))
         structures[order] = np.dtype(
             {
                 "names": [name for name, _, _ in group],

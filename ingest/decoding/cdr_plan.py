@@ -32,7 +32,7 @@ from restock.ingest.decoding.field_paths import DTYPES
 class Operation(Protocol):
     """Reads one or more fields of all messages of a frame into `out`."""
 
-    def run(self, frame: Frame, out: Columns) -> None: ...
+    def decode(self, frame: Frame, out: Columns) -> None: ...
 
 
 @dataclass
@@ -42,7 +42,7 @@ class CdrPlan:
     operations: list[Operation]
     paths: dict[str, tuple[str, tuple[int | None, ...]]]  # wanted -> kind, repetitions inside
 
-    def run(self, frame: Frame) -> Columns:
+    def decode(self, frame: Frame) -> Columns:
         """The wanted fields of all messages of the frame; its cursor is then past the last field.
 
         Raises:
@@ -50,7 +50,7 @@ class CdrPlan:
         """
         out: Columns = {}
         for operation in self.operations:
-            operation.run(frame, out)
+            operation.decode(frame, out)
         return out
 
     def empty(self) -> Columns:
@@ -81,7 +81,7 @@ class Text:
     path: str | None
     ros1: bool
 
-    def run(self, frame: Frame, out: Columns) -> None:
+    def decode(self, frame: Frame, out: Columns) -> None:
         """Step over the strings, or decode them."""
         length = frame.read_uint32(1 if self.ros1 else 4)
         stop = frame.position + length
@@ -107,7 +107,7 @@ class Primitives:
     path: str | None
     ros1: bool
 
-    def run(self, frame: Frame, out: Columns) -> None:
+    def decode(self, frame: Frame, out: Columns) -> None:
         """Step over the sequences, or gather them."""
         count = frame.read_uint32(1 if self.ros1 else 4)
         size = self.dtype.itemsize
@@ -145,7 +145,7 @@ class Repeat:
         only = operations[0] if len(operations) == 1 else None
         return only if isinstance(only, FixedFields) else None
 
-    def run(self, frame: Frame, out: Columns) -> None:
+    def decode(self, frame: Frame, out: Columns) -> None:
         """All elements of all messages, as far as possible at once."""
         count = self.length if self.length is not None else frame.read_uint32(1 if self.ros1 else 4)
         if not self.inner.operations:  # ROS 1: messages without fields take no bytes
@@ -166,12 +166,12 @@ class Repeat:
 
     def _fixed(self, frame: Frame, counts: I64, offsets: I64) -> Columns | None:
         """Elements of one fixed size lie at known places: one gather for all of them."""
-        run = self._only_fixed
-        if run is None:
+        fields = self._only_fixed
+        if fields is None:
             return None
-        aligned = (frame.position + (run.first_align - 1)) & -run.first_align
-        phase = uniform(aligned & run.mask)
-        stride = run.stride(phase) if isinstance(phase, int) else None
+        aligned = (frame.position + (fields.first_align - 1)) & -fields.first_align
+        phase = uniform(aligned & fields.mask)
+        stride = fields.stride(phase) if isinstance(phase, int) else None
         if stride is None or not isinstance(phase, int):
             return None
         stop = np.where(counts > 0, aligned + counts * stride, frame.position)
@@ -179,7 +179,7 @@ class Repeat:
         within = np.arange(offsets[-1]) - np.repeat(offsets[:-1], counts)
         at = np.repeat(frame.origin + aligned, counts) + within * stride
         elements: Columns = {}
-        run.take(frame, at, run.layouts[phase], elements)
+        fields.take(frame, at, fields.layouts[phase], elements)
         frame.position = uniform(stop)
         return elements
 
@@ -224,7 +224,7 @@ class _Elements:
 
     def _read_one(self, rows: NDArray[np.intp], number: I64) -> None:
         frame = self.frame.select(rows, uniform(self.position[rows]))
-        self.parts.append(self.inner.run(frame))
+        self.parts.append(self.inner.decode(frame))
         self.places.append(self.offsets[rows] + number)
         self.position[rows] = frame.position
 
@@ -240,7 +240,7 @@ class _Elements:
         position = self.position[rows][which] + within * stride[rows][which]
         frame = self.frame.select(rows[which], position)
         try:
-            columns = self.inner.run(frame)
+            columns = self.inner.decode(frame)
         except BadRows:
             return no_rows
         stop = spread(frame.position, len(position))

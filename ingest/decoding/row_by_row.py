@@ -6,6 +6,7 @@ reference in the tests; JSON and protobuf always do.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -85,7 +86,7 @@ class ParsedDecoder:
 
     def decode(self, batch: MessageBatch) -> Decoded:
         """The batch's columns; a message that does not decode is counted, by reason."""
-        parts, rows, bad = [self.empty()], list[int](), dict[str, int]()
+        parts, rows, bad = [self.empty()], list[int](), Counter[str]()
         for some in _slices(batch):
             messages, good = list[Any](), list[int]()
             for row in some:
@@ -94,7 +95,7 @@ class ParsedDecoder:
                     messages.append(self._parser.parse(payload))
                     good.append(row)
                 except Unparsable as reason:
-                    bad[str(reason)] = bad.get(str(reason), 0) + 1
+                    bad[str(reason)] += 1
             try:
                 parts.append(self._columns(messages))
                 rows += good
@@ -104,7 +105,7 @@ class ParsedDecoder:
                         parts.append(self._columns([message]))
                         rows.append(row)
                     except Unparsable as reason:
-                        bad[str(reason)] = bad.get(str(reason), 0) + 1
+                        bad[str(reason)] += 1
         fields = {leaf.path: join([part[leaf.path] for part in parts]) for leaf in self._leaves}
         return Decoded(np.asarray(rows, np.intp), fields, bad)
 
