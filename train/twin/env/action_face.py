@@ -13,11 +13,10 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import F64, Ints
 from restock.errors import ConfigError
 from restock.ingest.task.task import Task, nearest_action
 
-Ints = NDArray[np.int64]
-F64 = NDArray[np.float64]
 Face = Literal["discrete", "continuous"]
 
 

@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import F64
 from restock.errors import ConfigError
 from restock.ingest.task.scan import Body
 from restock.train.twin.env.draw import draw_map
@@ -335,7 +336,7 @@ def _walls(floor: Warehouse) -> Iterator[Part]:
         yield _BOX, tuple(middle), tuple(half), 0.0, WALL
 
 
-def _route(plan_m: NDArray[np.float64]) -> Iterator[Part]:
+def _route(plan_m: F64) -> Iterator[Part]:
     """The plan as a band on the floor, piece by piece."""
     step = np.diff(plan_m, axis=0)
     length = np.hypot(step[:, 0], step[:, 1])

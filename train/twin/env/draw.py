@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import F64
 from restock.errors import ConfigError
 from restock.train.twin.floors.layout import HEADINGS, Rect, Warehouse
 from restock.train.twin.physics.model import (
@@ -116,9 +117,7 @@ class _Canvas:
         inside = (ahead > -0.35) & (ahead < 0.35) & (aside < (0.35 - ahead) / 2)
         self._image[window][inside] = color
 
-    def _window(
-        self, x: float, y: float, reach: float
-    ) -> tuple[tuple[slice, slice], NDArray[np.float64], NDArray[np.float64]]:
+    def _window(self, x: float, y: float, reach: float) -> tuple[tuple[slice, slice], F64, F64]:
         columns = slice(*np.searchsorted(self._x, [x - reach, x + reach]))
         rows = slice(*np.searchsorted(self._y, [y - reach, y + reach]))
         return (rows, columns), self._x[None, columns] - x, self._y[rows, None] - y
@@ -132,7 +131,7 @@ class _Canvas:
         return framed
 
 
-def _dense(plan_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def _dense(plan_m: F64) -> F64:
     """A polyline with three points more in every segment."""
     share = np.arange(4)[None, :, None] / 4
     return (plan_m[:-1, None] * (1 - share) + plan_m[1:, None] * share).reshape(-1, 2)

@@ -13,6 +13,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from restock.arrays import F32, Bools, Ints
 from restock.ingest.task.signals import Signals
 from restock.toml import Checked
 
@@ -34,7 +35,7 @@ Probability = Annotated[float, Meta(ge=0, le=1)]
 Info = dict[str, Any]
 # What `step` of N environments returns: observation (N, D), reward (N,), terminated (N,),
 # truncated (N,), info.
-Step = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_], Info]
+Step = tuple[F32, F32, Bools, Bools, Info]
 
 
 class Twin(Protocol):
@@ -45,7 +46,7 @@ class Twin(Protocol):
     @property
     def signals(self) -> Signals: ...
     def set_episodes(self, specs: Iterable[EpisodeSpec], /) -> None: ...
-    def reset(self, *, seed: int | None = None) -> tuple[NDArray[np.float32], Info]: ...
+    def reset(self, *, seed: int | None = None) -> tuple[F32, Info]: ...
     def step(self, actions: NDArray[Any], /) -> Step: ...
     def state_dict(self) -> dict[str, Any]: ...
     def load_state_dict(self, state: dict[str, Any], /) -> None: ...
@@ -57,9 +58,7 @@ class Policy(Protocol):
     name: str
     version: str
 
-    def act(
-        self, env: Any, observation: NDArray[np.float32]
-    ) -> tuple[NDArray[np.int64], NDArray[Any]]:
+    def act(self, env: Any, observation: F32) -> tuple[Ints, NDArray[Any]]:
         """Actions (N,) for observations (N, D), and the probabilities (N,) they had."""
         ...
 
@@ -79,7 +78,7 @@ class LinearEpsilon(Checked, frozen=True):
 
 def epsilon_greedy(
     greedy: NDArray[Any], actions: int, epsilon: float, rng: np.random.Generator
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+) -> tuple[Ints, F32]:
     """Greedy actions (N,) to the actions to take (N,) and the probability of each (N,)."""
     explores = rng.random(len(greedy)) < epsilon
     uniform = rng.integers(actions, size=len(greedy))

@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from restock.arrays import F64, Ints
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task
 from restock.state import Stateful
@@ -19,8 +19,6 @@ from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.planner import PLAN_POINTS, BlockFinder, Closure, Planner, planners
 from restock.train.twin.physics.episode import Episode
 from restock.train.twin.physics.sensing import Sensing
-
-F64 = NDArray[np.float64]
 
 STRAYED_M = 0.6
 LOOK_M = 1.9  # something this near ahead makes the finder look at the scan
@@ -55,7 +53,7 @@ class Navigation(Stateful):
         self.plan_number[env] += 1
         self.finder.reset(np.array([env]))
 
-    def update(self, signals: Signals, offset_m: F64, sensing: Sensing) -> NDArray[np.int64]:
+    def update(self, signals: Signals, offset_m: F64, sensing: Sensing) -> Ints:
         """Look at the new signals; returns whose plan changed."""
         again = set(np.flatnonzero(offset_m > STRAYED_M).tolist())
         again |= self._find_blocks(signals, sensing)

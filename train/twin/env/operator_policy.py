@@ -9,17 +9,15 @@ count. A few percent of the actions are mistakes.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from restock.arrays import F64, Bools, Ints
 from restock.ingest.task.route import view_route
-from restock.train.twin.env.policies import Actions, SoftPolicy
+from restock.train.twin.env.policies import SoftPolicy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.planner import PLAN_POINTS
 from restock.train.twin.physics.model import PALLET_HALF_M, pallet_half_m
 from restock.train.twin.physics.traffic import RETREATING, WALKING
-
-F64 = NDArray[np.float64]
 
 BACK_STEPS = (12, 16)
 _LOOK_M = tuple(0.3 * step for step in range(14))
@@ -50,7 +48,7 @@ class Operator(SoftPolicy):
         self._still = np.zeros(count, np.int64)
         self._backing = np.zeros(count, np.int64)
 
-    def choose(self, env: WarehouseVectorEnv) -> Actions:
+    def choose(self, env: WarehouseVectorEnv) -> Ints:
         """The action that comes farthest along the way without coming too near to anything."""
         pose = env.simulation.pose()
         self._find_ways(env, pose)
@@ -88,13 +86,13 @@ class Operator(SoftPolicy):
         score[stood] = tries[stood]
         return np.asarray(score.argmax(axis=1), np.int64)
 
-    def certain(self, env: WarehouseVectorEnv) -> NDArray[np.bool_]:
+    def certain(self, env: WarehouseVectorEnv) -> Bools:
         """No mistakes right beside people."""
         people = env.simulation.traffic.position_m - env.simulation.pose()[:, None, :2]
         near = np.hypot(people[..., 0], people[..., 1]) < CAREFUL_M
         return np.asarray(near.any(axis=1), np.bool_)
 
-    def sees_trouble(self, env: WarehouseVectorEnv) -> NDArray[np.bool_]:
+    def sees_trouble(self, env: WarehouseVectorEnv) -> Bools:
         """Where (N,) pallets, people or slippery floor are still about."""
         pose = env.simulation.pose()
         plans = env.navigation.plans_m
@@ -109,13 +107,13 @@ class Operator(SoftPolicy):
         near |= (np.hypot(people[..., 0], people[..., 1]) < 1.5).any(axis=1)
         return np.asarray(near | self._icy(env, pose), np.bool_)
 
-    def _arrived(self, env: WarehouseVectorEnv, ends: F64) -> NDArray[np.bool_]:
+    def _arrived(self, env: WarehouseVectorEnv, ends: F64) -> Bools:
         """From which step on (N, A, T) the robot has been at its goal."""
         gap = ends[..., :2] - env.navigation.goals_m[:, None, None]
         at_goal = np.hypot(gap[..., 0], gap[..., 1]) < env.task.goal_radius_m - 0.05
         return np.asarray(np.logical_or.accumulate(at_goal, axis=2), np.bool_)
 
-    def _standing(self, env: WarehouseVectorEnv, pose: F64) -> NDArray[np.bool_]:
+    def _standing(self, env: WarehouseVectorEnv, pose: F64) -> Bools:
         """Who has not moved for a second, and for a few steps after."""
         moved = (np.abs(pose - self._anchor) > (0.1, 0.1, 0.2)).any(axis=1) | (env.steps == 0)
         self._anchor[moved] = pose[moved]
@@ -213,7 +211,7 @@ class Operator(SoftPolicy):
             people[ids] = gap.min(axis=1)
         return room.min(axis=3), people
 
-    def _icy(self, env: WarehouseVectorEnv, pose: F64) -> NDArray[np.bool_]:
+    def _icy(self, env: WarehouseVectorEnv, pose: F64) -> Bools:
         """Whether slippery floor lies under the robot or within .9 m of its middle, (N,)."""
         patches = env.simulation.patches
         gap = np.abs(pose[:, None, :2] - patches[:, :, :2]) - patches[:, :, 2:4]

@@ -14,11 +14,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import F32, F64, Bools, Ints
 from restock.train.twin.env.interface import Policy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-
-F64 = NDArray[np.float64]
-Actions = NDArray[np.int64]
 
 STUCK_STEPS = 15
 SLIP_STEPS = 4
@@ -35,7 +33,7 @@ class BehaviourPolicy(Policy, Protocol):
 class Overseer(BehaviourPolicy, Protocol):
     """A policy that can be called in, and knows when it is no longer needed."""
 
-    def sees_trouble(self, env: WarehouseVectorEnv) -> NDArray[np.bool_]:
+    def sees_trouble(self, env: WarehouseVectorEnv) -> Bools:
         """Where (N,) it would not hand back yet."""
         ...
 
@@ -52,15 +50,15 @@ class SoftPolicy:
         self.acting = np.array([], "U16")
         self.acting_version = np.array([], "U16")
 
-    def choose(self, env: WarehouseVectorEnv) -> Actions:
+    def choose(self, env: WarehouseVectorEnv) -> Ints:
         """The action (N,) it would take without exploration."""
         raise NotImplementedError
 
-    def certain(self, env: WarehouseVectorEnv) -> NDArray[np.bool_]:
+    def certain(self, env: WarehouseVectorEnv) -> Bools:
         """Where (N,) it does not explore; nowhere, unless a policy says so."""
         return np.zeros(env.num_envs, np.bool_)
 
-    def act(self, env: WarehouseVectorEnv, observation: NDArray[np.float32]) -> tuple[Actions, F64]:
+    def act(self, env: WarehouseVectorEnv, observation: F32) -> tuple[Ints, F64]:
         """Actions (N,) and the probabilities (N,) they had."""
         chosen = self.choose(env)
         count = len(env.task.actions)
@@ -81,7 +79,7 @@ class RandomPolicy(SoftPolicy):
     def __init__(self, *, seed: int = 0) -> None:
         super().__init__(epsilon=1.0, seed=seed)
 
-    def choose(self, env: WarehouseVectorEnv) -> Actions:
+    def choose(self, env: WarehouseVectorEnv) -> Ints:
         """Nothing in particular."""
         return np.zeros(env.num_envs, np.int64)
 
@@ -101,7 +99,7 @@ class PlannerFollower(SoftPolicy):
     def __init__(self, *, epsilon: float = 0.02, seed: int = 0) -> None:
         super().__init__(epsilon=epsilon, seed=seed)
 
-    def choose(self, env: WarehouseVectorEnv) -> Actions:
+    def choose(self, env: WarehouseVectorEnv) -> Ints:
         """The action whose velocity is nearest to the plan's."""
         signals = env.signals
         near = np.arctan2(signals["waypoint_near_y_m"], signals["waypoint_near_x_m"])
@@ -126,7 +124,7 @@ class PlannerFollower(SoftPolicy):
             action[pivot] = self._index(env, 0.0, side * 1.2)
         return action
 
-    def certain(self, env: WarehouseVectorEnv) -> NDArray[np.bool_]:
+    def certain(self, env: WarehouseVectorEnv) -> Bools:
         """Its safety stop leaves nothing to chance, nor does it where anything is near."""
         near = env.signals["clearance_m"] < self.stop_m
         return np.asarray(near | (self._front(env) < 2 * self.stop_m), np.bool_)
@@ -179,7 +177,7 @@ class Handover:
         self._slipping = np.zeros(count, np.int64)
         self._anchor = np.zeros((count, 3))
 
-    def act(self, env: WarehouseVectorEnv, observation: NDArray[np.float32]) -> tuple[Actions, F64]:
+    def act(self, env: WarehouseVectorEnv, observation: F32) -> tuple[Ints, F64]:
         """The actions of whoever drives each robot, and their probabilities."""
         if len(self._by_operator) != env.num_envs:
             self._prepare(env.num_envs)

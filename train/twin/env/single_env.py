@@ -9,10 +9,11 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
+from restock.arrays import F32
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
 
-class WarehouseEnv(gymnasium.Env[NDArray[np.float32], Any]):
+class WarehouseEnv(gymnasium.Env[F32, Any]):
     """The vector environment with N = 1; `info` holds its values without the leading axis.
 
     Takes the vector environment's keyword arguments. The one inside is `self.vector`.
@@ -34,7 +35,7 @@ class WarehouseEnv(gymnasium.Env[NDArray[np.float32], Any]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    ) -> tuple[F32, dict[str, Any]]:
         """Begin the next episode; a seed starts its sequence of episodes again."""
         super().reset(seed=seed)
         if seed is None and not self._seeded:  # unseeded environments differ, as Gymnasium's do
@@ -43,7 +44,7 @@ class WarehouseEnv(gymnasium.Env[NDArray[np.float32], Any]):
         observation, info = self.vector.reset(seed=seed)
         return observation[0], _first(info)
 
-    def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[F32, float, bool, bool, dict[str, Any]]:
         """One control period. `info["signals_before"]` are the signals that `action` answered."""
         before = self.vector.signals
         observation, reward, terminated, truncated, info = self.vector.step(np.array([action]))

@@ -39,6 +39,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import ConfigError, RunError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.signals import Signals
@@ -62,7 +63,7 @@ from restock.train.twin.physics.truth import Truth
 OBSERVATION_LIMIT = 20.0  # no sensor of this robot gives more; holds the space's bounds
 
 
-class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]], Stateful):
+class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
     """N warehouses as a Gymnasium vector environment; `docs/twin.md` explains `info`."""
 
     # What changes while episodes run; the rest (layout, noise, ways of traffic) follows from specs.
@@ -177,7 +178,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         """The floor that an environment's episode is on."""
         return self.floors[int(self.layout[env])]
 
-    def by_floor(self) -> Iterator[tuple[NDArray[np.int64], Warehouse]]:
+    def by_floor(self) -> Iterator[tuple[Ints, Warehouse]]:
         """The environments on each floor, and the floor."""
         for index in np.unique(self.layout):
             yield np.flatnonzero(self.layout == index), self.floors[index]
@@ -195,7 +196,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         """
         self.queue.set_fixed(specs)
 
-    def _begin(self, ids: NDArray[np.int64]) -> None:
+    def _begin(self, ids: Ints) -> None:
         """Start the next episode of each environment in `ids`."""
         for env in ids.tolist():
             spec, self.episode_number[env] = self.queue.next(env)
@@ -239,7 +240,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], Info]:
+    ) -> tuple[F32, Info]:
         """Begin an episode everywhere, or where `options["reset_mask"]` (N,) says."""
         super().reset(seed=seed)
         ids = np.arange(self.num_envs)
@@ -294,7 +295,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
             self._begin(np.flatnonzero(done))
         return self.observation.copy(), earned, terminated, truncated, info
 
-    def _see_new_plans(self, after: Signals, ids: NDArray[np.int64]) -> None:
+    def _see_new_plans(self, after: Signals, ids: Ints) -> None:
         rows: Signals = {name: column[ids] for name, column in after.items()}
         add_route(self.task, rows, self.navigation.plans_m[ids], self.navigation.goals_m[ids])
         for name, column in rows.items():
@@ -319,9 +320,9 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
     def _info_after(
         self,
         after: Signals,
-        progress_m: NDArray[np.float64],
-        ended: NDArray[np.bool_],
-        invalid: NDArray[np.bool_],
+        progress_m: F64,
+        ended: Bools,
+        invalid: Bools,
     ) -> Info:
         sim = self.simulation
         condition = self.truth.conclude(sim.slipped, sim.bumped, self.sensing.true_clearance_m)
@@ -393,7 +394,7 @@ class WarehouseVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         super().load_state_dict(state)
 
 
-def _bounded(observation: NDArray[np.float32]) -> NDArray[np.float32]:
+def _bounded(observation: F32) -> F32:
     return np.clip(np.nan_to_num(observation), -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
 

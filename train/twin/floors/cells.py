@@ -11,12 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from restock.arrays import Bools, Ints
 from restock.train.twin.floors.layout import AisleSegment, Axis, Rect, Warehouse
 
-Cells = NDArray[np.bool_]  # (X, Y)
+Cells = Bools  # (X, Y)
 Box = tuple[int, int, int, int]  # first and last (exclusive) column, first and last row
 
 WIDTH_M = (0.7, 2.6)  # of a corridor
@@ -185,7 +185,7 @@ def cover(blocked: Cells, limit: int) -> list[Box] | None:
     return boxes
 
 
-def _grow(total: NDArray[np.int64], i: int, j: int, order: tuple[int, int]) -> Box:
+def _grow(total: Ints, i: int, j: int, order: tuple[int, int]) -> Box:
     """The rectangle of blocked cells around one, grown along the axes in this order."""
     box = [i, i + 1, j, j + 1]
     for axis in order:
@@ -204,7 +204,7 @@ def _grow(total: NDArray[np.int64], i: int, j: int, order: tuple[int, int]) -> B
     return box[0], box[1], box[2], box[3]
 
 
-def _full(total: NDArray[np.int64], box: list[int]) -> bool:
+def _full(total: Ints, box: list[int]) -> bool:
     """Whether every cell of a rectangle is blocked."""
     a, b, c, d = box
     count = total[b, d] - total[a, d] - total[b, c] + total[a, c]

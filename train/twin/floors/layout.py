@@ -16,11 +16,10 @@ from typing import Literal
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from restock.arrays import F64, Bools, Ints
 from restock.errors import ConfigError
 
-F64 = NDArray[np.float64]
 Axis = Literal["x", "y"]
 Heading = Literal["east", "north", "west", "south"]
 
@@ -191,7 +190,7 @@ class Warehouse:
         inside[:, :-1] = _inside(boxes.reshape(-1, 4), x_m, y_m)
         return [str(name) for name in names[inside.argmax(axis=1)]]
 
-    def segment_of(self, x_m: F64, y_m: F64) -> NDArray[np.int64]:
+    def segment_of(self, x_m: F64, y_m: F64) -> Ints:
         """The index of the aisle segment each point lies in, (N,); -1 for none."""
         if not self.segments:
             return np.full(np.shape(x_m), -1, np.int64)
@@ -204,7 +203,7 @@ class Warehouse:
         return np.array([segment.area.edges for segment in self.segments]).reshape(-1, 4)
 
     @cached_property
-    def segment_along_y(self) -> NDArray[np.bool_]:
+    def segment_along_y(self) -> Bools:
         """(S,) which aisle segments run north and south."""
         return np.array([segment.along == "y" for segment in self.segments], np.bool_)
 
@@ -215,10 +214,10 @@ class Warehouse:
         return hashlib.blake2b(msgspec.json.encode(content), digest_size=6).hexdigest()
 
 
-def _inside(edges: F64, x_m: F64, y_m: F64) -> NDArray[np.bool_]:
+def _inside(edges: F64, x_m: F64, y_m: F64) -> Bools:
     """Which boxes (B, 4) hold each point, (N, B)."""
     x, y = np.asarray(x_m)[:, None], np.asarray(y_m)[:, None]
-    inside: NDArray[np.bool_] = (
+    inside: Bools = (
         (edges[:, 0] <= x) & (x <= edges[:, 2]) & (edges[:, 1] <= y) & (y <= edges[:, 3])
     )
     return inside

@@ -25,6 +25,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 from scipy import ndimage
 
+from restock.arrays import F64
 from restock.errors import ConfigError
 from restock.toml import Checked, typed
 from restock.train.twin.floors.cells import (
@@ -105,7 +106,7 @@ def _read_yaml(path: Path) -> MapDescription:
     )
 
 
-def occupancy_of(pixels: NDArray[np.float64], description: MapDescription) -> NDArray[np.int8]:
+def occupancy_of(pixels: F64, description: MapDescription) -> NDArray[np.int8]:
     """Occupancy (X, Y) in percent, -1 unknown, of pixels (H, W) in [0, 1], north first."""
     if description.mode == "raw":
         percent = np.round(pixels * 255)
@@ -245,7 +246,7 @@ def write_map(floor: Warehouse, path: Path, cell_m: float = 0.05) -> None:
         raise ConfigError(f"cannot be written: {error.strerror}", where=str(path)) from error
 
 
-def read_pgm(path: Path) -> NDArray[np.float64]:
+def read_pgm(path: Path) -> F64:
     """Pixels (H, W) in [0, 1], the first row on top.
 
     Raises:
@@ -291,7 +292,7 @@ def read_pgm(path: Path) -> NDArray[np.float64]:
         raise ConfigError(f"is cut short: {len(values):,} of {count:,} pixels", where=str(path))
     if values.max() > largest or values.min() < 0:
         raise ConfigError(f"has a pixel outside 0 to {largest}", where=str(path))
-    shares: NDArray[np.float64] = values.astype(np.float64) / largest
+    shares: F64 = values.astype(np.float64) / largest
     return shares.reshape(height, width)
 
 

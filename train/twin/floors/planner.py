@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import csgraph
 
+from restock.arrays import F64, Bools, Ints
 from restock.state import Stateful
 from restock.train.twin.floors.layout import HEADINGS, Warehouse
-
-F64 = NDArray[np.float64]
 
 CELL_M = 0.1
 PLAN_POINTS = 48
@@ -194,7 +193,7 @@ class Planner:
         row, column, value = map(np.concatenate, zip(*forth, *back, strict=True))
         return sparse.csr_matrix((value, (row, column)), shape=(free.size, free.size))
 
-    def _against_rules(self) -> list[tuple[tuple[int, int], NDArray[np.bool_]]]:
+    def _against_rules(self) -> list[tuple[tuple[int, int], Bools]]:
         """Each one-way rule: its heading, and the cells (size,) that it holds in."""
         x, y = _cell_middles(self.shape)
         rules = []
@@ -206,11 +205,11 @@ class Planner:
 
 
 def _allowed(
-    rules: list[tuple[tuple[int, int], NDArray[np.bool_]]],
+    rules: list[tuple[tuple[int, int], Bools]],
     step: tuple[int, int],
-    one: NDArray[np.int64],
-    other: NDArray[np.int64],
-) -> NDArray[np.bool_]:
+    one: Ints,
+    other: Ints,
+) -> Bools:
     """Which edges between cells a robot may take by `step`: none against a rule."""
     allowed = np.ones(len(one), np.bool_)
     for heading, inside in rules:
@@ -303,18 +302,18 @@ class BlockFinder(Stateful):
         floors = self.warehouses
         self.floors = (floors,) if isinstance(floors, Warehouse) else tuple(floors)
 
-    def reset(self, ids: NDArray[np.int64]) -> None:
+    def reset(self, ids: Ints) -> None:
         self.seen[ids] = 0
         self.place[ids] = -1
 
     def update(
         self,
-        ids: NDArray[np.int64],
+        ids: Ints,
         pose: F64,
         hits_m: F64,
-        valid: NDArray[np.bool_],
+        valid: Bools,
         heading: F64,
-        along_y: NDArray[np.bool_] | None = None,
+        along_y: Bools | None = None,
     ) -> list[tuple[int, Closure]]:
         """Look at one scan of each robot in `ids`; returns (robot, closure) of each block.
 
@@ -361,11 +360,11 @@ class BlockFinder(Stateful):
 
     def _segments_ahead(
         self,
-        ids: NDArray[np.int64],
+        ids: Ints,
         pose: F64,
         heading: F64,
-        turned: NDArray[np.bool_],
-    ) -> tuple[NDArray[np.int64], F64]:
+        turned: Bools,
+    ) -> tuple[Ints, F64]:
         """The aisle segment (n,) each robot is in, or the one just ahead of it; -1 for none.
 
         With its edges (n, 4), x and y exchanged for robots that are `turned`. Only segments that

@@ -16,16 +16,14 @@ from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from restock.arrays import F64
 from restock.errors import ConfigError
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.planner import Planner
 from restock.train.twin.physics.model import NO_PATCH, PALLET_HALF_M, PALLETS, PARKED_M, PATCHES
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.traffic import AGENTS, Walk, draw_walks
-
-F64 = NDArray[np.float64]
 
 KINDS = ("nominal", "wheel_slip", "blocked_aisle", "near_collision")
 PATH_M = (4.0, 11.0)

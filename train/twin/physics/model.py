@@ -13,12 +13,10 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from restock.arrays import F64
 from restock.ingest.task.scan import Body
 from restock.train.twin.floors.layout import Warehouse
-
-F64 = NDArray[np.float64]
 
 FLOOR_FRICTION = 0.8
 PATCHES = 4  # at most, an episode: parts of the floor with a friction of their own

@@ -10,8 +10,8 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from restock.arrays import F64
 from restock.state import Stateful
 from restock.train.twin.physics.model import (
     CHASSIS_KG,
@@ -21,8 +21,6 @@ from restock.train.twin.physics.model import (
     wheel_commands,
 )
 from restock.train.twin.physics.perturbation import Perturbation
-
-F64 = NDArray[np.float64]
 
 GRAVITY_MPS2 = 9.81
 ACCEL_LIMIT = np.array([4.0, 10.0])  # m/s2 and rad/s2

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from restock.arrays import F64, Ints
 from restock.state import Stateful
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.physics.episode import Episode
@@ -23,9 +23,6 @@ from restock.train.twin.physics.model import (
     building_boxes,
 )
 from restock.train.twin.physics.traffic import Traffic
-
-F64 = NDArray[np.float64]
-Ids = NDArray[np.int64]
 
 
 class Scenery(Stateful):
@@ -79,7 +76,7 @@ class Scenery(Stateful):
         self._show_traffic(ids)
         self.stand_still(ids)
 
-    def walk(self, ids: Ids) -> None:
+    def walk(self, ids: Ints) -> None:
         """Show traffic in `ids` where it now is, at the end of the coming block.
 
         On the way there it moves a little at every substep: a jump of a block's length would
@@ -98,7 +95,7 @@ class Scenery(Stateful):
         path = np.where(jumped, end, begin + share * (end - begin))
         self.moves[ids] = path.reshape(len(ids), substeps, -1)
 
-    def stand_still(self, ids: Ids) -> None:
+    def stand_still(self, ids: Ints) -> None:
         """Nothing moves in `ids` during the coming block."""
         self.moves[ids] = self._position[ids].reshape(len(ids), 1, self.moves.shape[2])
 
@@ -106,7 +103,7 @@ class Scenery(Stateful):
         """Bodies stand where the restored physics has them."""
         self.stand_still(np.arange(len(self.moves)))
 
-    def _show_traffic(self, ids: Ids) -> None:
+    def _show_traffic(self, ids: Ints) -> None:
         if len(ids):
             people = slice(self.handles.people.start, self.handles.forklifts.stop)
             self._position[ids, people, :2] = self.traffic.position_m[ids]

@@ -10,9 +10,9 @@ from __future__ import annotations
 from statistics import NormalDist
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from restock.arrays import F64, Ints
 from restock.ingest.task.route import view_route
 from restock.ingest.task.scan import SectorMap
 from restock.ingest.task.signals import Signals, localised_velocity, wrap_angle
@@ -21,9 +21,6 @@ from restock.state import Stateful
 from restock.train.twin.physics.model import body_velocity
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.simulation import Simulation
-
-F64 = NDArray[np.float64]
-Ids = NDArray[np.int64]
 
 FIRST_STAMP_NS = 1_000_000_000  # of an episode's first step: stamps are never 0
 DRIFT_TIME_S = 3.0
@@ -80,7 +77,7 @@ class Sensing(Stateful):
         drift[1:] *= np.sqrt(1 - keep**2)
         drift[:] = lfilter([1.0], [1.0, -keep], drift, axis=0)
 
-    def sense(self, ids: Ids, step: NDArray[np.int64]) -> Signals:
+    def sense(self, ids: Ints, step: Ints) -> Signals:
         """Everything but the route and localised speeds, for `ids` (n,) at their steps (n,)."""
         sim, task = self.simulation, self.task
         noise = self._noise[ids, step]

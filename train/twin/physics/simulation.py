@@ -16,6 +16,7 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
+from restock.arrays import F64, Bools, Ints
 from restock.errors import ConfigError
 from restock.ingest.task.task import Task
 from restock.state import Stateful
@@ -37,8 +38,6 @@ from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.robot import BaseController, RobotBody
 from restock.train.twin.physics.scenery import Scenery, quaternion
 
-F64 = NDArray[np.float64]
-Ids = NDArray[np.int64]
 Physics = Literal["mujoco", "warp"]  # warp: see `restock.train.twin.physics.warp_batch`
 
 BLOCK_S = 0.1
@@ -61,7 +60,7 @@ class BodyState:
     wheel_angle_rad: F64  # (N, 2) left, right
     wheel_speed_radps: F64  # (N, 2)
     accel_mps2: F64  # (N, 3) of the accelerometer, mean since the call before
-    bumped: NDArray[np.bool_]  # (N,) at any substep since the call before
+    bumped: Bools  # (N,) at any substep since the call before
     set_point: F64  # (N, 2) speed and yaw rate that the wheels are to reach now
 
 
@@ -198,7 +197,7 @@ class Simulation(Stateful):
         warnings = np.asarray(self.batch.warning).reshape(self.num_envs, -1)
         self.blown_up = np.asarray((warnings > 0).any(axis=1), np.bool_)
 
-    def _run(self, wheels: F64) -> NDArray[np.bool_]:
+    def _run(self, wheels: F64) -> Bools:
         """One block of substeps under wheel speeds (N, S, 2); returns whose bumper was pressed."""
         control = self._control
         control[:, :, :2] = wheels
@@ -224,7 +223,7 @@ class Simulation(Stateful):
         self.accel = accel[:, self.substeps // 2 :].mean(axis=1)
         return touched
 
-    def body_state(self, accel: F64, pressed: NDArray[np.bool_]) -> BodyState:
+    def body_state(self, accel: F64, pressed: Bools) -> BodyState:
         """The true state now."""
         pose = self.pose()
         cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
@@ -248,7 +247,7 @@ class Simulation(Stateful):
         """True x, y and heading, (N, 3)."""
         return np.column_stack([self.qpos[:, :2], yaw_of(self.qpos[:, 3:7])])
 
-    def _write_friction(self, ids: Ids, pose: F64) -> NDArray[np.bool_]:
+    def _write_friction(self, ids: Ints, pose: F64) -> Bools:
         """Friction under the wheels of `ids`; returns (n, 2) which of them stand on a patch."""
         base = self.base_friction[ids]
         friction = friction_at(self._wheel_points(pose), self.patches[ids], base)
@@ -261,7 +260,7 @@ class Simulation(Stateful):
         across = np.stack([-np.sin(pose[:, 2]), np.cos(pose[:, 2])], axis=-1) * (TRACK_M / 2)
         return np.stack([pose[:, :2] + across, pose[:, :2] - across], axis=1)
 
-    def _slipping(self, ids: Ids, slippery: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def _slipping(self, ids: Ints, slippery: Bools) -> Bools:
         """Whose wheel (n, 2) is on a patch and moves over the floor by more than .15 m/s."""
         velocity, heading = self.qvel[ids], yaw_of(self.qpos[ids, 3:7])
         cos, sin = np.cos(heading), np.sin(heading)
@@ -274,7 +273,7 @@ class Simulation(Stateful):
 
     # -- sensing --------------------------------------------------------------------------------
 
-    def cast(self, ids: Ids) -> F64:
+    def cast(self, ids: Ints) -> F64:
         """True lidar ranges (n, beams) in metres now; inf where nothing is hit."""
         heading = yaw_of(self.qpos[ids, 3:7])
         cos, sin = np.cos(heading), np.sin(heading)

@@ -11,13 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from restock.arrays import F64, Bools, Ints
 from restock.state import Stateful
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.physics.model import FORKLIFTS, PARKED_M, PEOPLE, PERSON_RADIUS_M
-
-F64 = NDArray[np.float64]
 
 AGENTS = PEOPLE + FORKLIFTS  # the people first
 WAY_POINTS = 24
@@ -170,9 +168,7 @@ class Traffic(Stateful):
                 self.attentive[env, agent] = walk.attentive
                 self._place(np.array([env]))
 
-    def advance(
-        self, robot: F64, velocity: F64, touched: NDArray[np.bool_], elapsed_s: float
-    ) -> NDArray[np.int64]:
+    def advance(self, robot: F64, velocity: F64, touched: Bools, elapsed_s: float) -> Ints:
         """Move the agents for `elapsed_s`; returns the environments where some are under way.
 
         `robot` (N, 3) is x, y, yaw, `velocity` (N, 2) in the map frame; `touched` (N,) says whose
@@ -214,7 +210,7 @@ class Traffic(Stateful):
         self._place(ids)
         return ids
 
-    def _place(self, ids: NDArray[np.int64]) -> None:
+    def _place(self, ids: Ints) -> None:
         """Positions from how far each has travelled along its way."""
         shown = self.state[ids] != HIDDEN
         share = self.travelled_m[ids] / self.length_m[ids] * (WAY_POINTS - 1)
@@ -227,7 +223,7 @@ class Traffic(Stateful):
         self.position_m[ids] = np.where(shown[..., None], point, PARKED_M[0])
         self.heading_rad[ids] = np.where(shown, np.arctan2(step[..., 1], step[..., 0]), 0.0)
 
-    def _driven_at(self, ids: NDArray[np.int64], pose: F64, velocity: F64) -> NDArray[np.bool_]:
+    def _driven_at(self, ids: Ints, pose: F64, velocity: F64) -> Bools:
         """Which agents (n, AGENTS) the robot comes nearer to by driving."""
         delta = self.position_m[ids] - pose[:, None, :2]
         distance = np.maximum(np.hypot(delta[..., 0], delta[..., 1]), 1e-9)
@@ -236,7 +232,7 @@ class Traffic(Stateful):
         ) / distance
         return np.asarray(closing > DRIVEN_AT_MPS, np.bool_)
 
-    def _gap(self, ids: NDArray[np.int64], pose: F64) -> tuple[F64, NDArray[np.bool_]]:
+    def _gap(self, ids: Ints, pose: F64) -> tuple[F64, Bools]:
         """From each agent's circle to the robot's outline, and whether it walks toward it."""
         delta = self.position_m[ids] - pose[:, None, :2]
         cos, sin = np.cos(pose[:, 2])[:, None], np.sin(pose[:, 2])[:, None]

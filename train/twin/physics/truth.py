@@ -15,12 +15,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import F64, Bools, Ints
 from restock.ingest.task.route import view_route
 from restock.ingest.task.task import Task
 from restock.state import Stateful
 from restock.train.twin.physics.model import pallet_half_m
-
-F64 = NDArray[np.float64]
 
 NAMES = np.array(["nominal", "blocked_aisle", "wheel_slip", "near_collision", "recovery"])
 NEAR_M, CLEAR_M, AFTERMATH_S = 0.15, 0.3, 2.0
@@ -39,11 +38,11 @@ class Truth(Stateful):
         self.aftermath_s = np.zeros(num_envs)  # left of it; 0: none
         self.blocked = np.zeros(num_envs, np.bool_)  # at t
 
-    def reset(self, ids: NDArray[np.int64]) -> None:
+    def reset(self, ids: Ints) -> None:
         self.aftermath_s[ids] = 0.0
         self.blocked[ids] = False
 
-    def look(self, pose: F64, plans_m: F64, pallets: F64, ids: NDArray[np.int64]) -> None:
+    def look(self, pose: F64, plans_m: F64, pallets: F64, ids: Ints) -> None:
         """Note whose plan is blocked just ahead, at the start of a step, for `ids`."""
         self.blocked[ids] = False
         gap = np.abs(pallets[ids, :, :2] - pose[ids, None, :2]).max(axis=-1).min(axis=1)
@@ -53,9 +52,7 @@ class Truth(Stateful):
                 pose[with_pallets], plans_m[with_pallets], pallets[with_pallets]
             )
 
-    def conclude(
-        self, slipped: NDArray[np.bool_], bumped: NDArray[np.bool_], clearance_m: F64
-    ) -> NDArray[np.str_]:
+    def conclude(self, slipped: Bools, bumped: Bools, clearance_m: F64) -> NDArray[np.str_]:
         """The condition (N,) of the step that ends now."""
         near = bumped | (clearance_m < NEAR_M)
         rank = np.zeros(len(near), np.int64)
@@ -69,7 +66,7 @@ class Truth(Stateful):
         return NAMES[rank]
 
 
-def _blocked(pose: F64, plans_m: F64, pallets: F64) -> NDArray[np.bool_]:
+def _blocked(pose: F64, plans_m: F64, pallets: F64) -> Bools:
     """Whether a pallet lies within the robot's breadth of the plan just ahead, (n,)."""
     view = view_route(plans_m, pose[:, 0], pose[:, 1], np.zeros(len(pose)), BLOCK_AHEAD_M)
     points = view.look_ahead_m + pose[:, None, :2]  # heading 0: offsets in the map frame

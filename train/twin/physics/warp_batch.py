@@ -23,6 +23,7 @@ import numpy as np
 from mujoco.batch import MODEL_FIELDS, Batch
 from numpy.typing import NDArray
 
+from restock.arrays import Bools
 from restock.errors import ConfigError
 
 CONTACTS, CONSTRAINTS = 64, 192  # room a simulation: four wheels, and a chassis against obstacles
@@ -163,7 +164,7 @@ class WarpBatch(Batch):  # type: ignore[misc]  # MuJoCo has no types
         self._warn((recorded["nefc"] > CONSTRAINTS).any(axis=1))
         return {name: recorded[name].astype(np.float64) for name in record}
 
-    def _warn(self, bad: NDArray[np.bool_]) -> None:
+    def _warn(self, bad: Bools) -> None:
         for name in ("qpos", "qvel"):
             # Not "greater than": NaN is neither.
             bad |= ~(np.abs(self.bind(name)) < _MOST).all(axis=1)

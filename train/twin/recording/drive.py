@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from restock.arrays import F64, Bools
 from restock.ingest.task.signals import Signals
 from restock.train.twin.recording.scene import EMPTY, Scene
-
-F64 = NDArray[np.float64]
 
 ENCODER_LSB_RAD = 2 * np.pi / 4096
 
@@ -36,7 +34,7 @@ class Motion:
     wheel_rate_radps: F64  # (M, 2)
     yaw_rate_radps: F64  # (M,)
     accel_mps2: F64  # (M, 2) of the body, forward and left
-    bumped: NDArray[np.bool_]  # (M,) the bumper touched something
+    bumped: Bools  # (M,) the bumper touched something
 
     def at(self, values: F64, time_s: F64) -> F64:
         """One of the columns above, (M,) or (M, 2), interpolated at times (n,)."""

@@ -8,8 +8,8 @@ its own behaviour policy in the store.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from restock.arrays import F32, F64, Ints
 from restock.errors import ConfigError
 from restock.train.twin.env.interface import Policy, epsilon_greedy
 from restock.train.twin.env.operator_policy import Operator
@@ -22,8 +22,6 @@ from restock.train.twin.env.policies import (
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.recording.missions import Mission
 
-F64 = NDArray[np.float64]
-Actions = NDArray[np.int64]
 _Key = tuple[str, str, bool]  # a mission's driver, its version, whether the operator takes over
 
 
@@ -45,7 +43,7 @@ class ExternalPolicy:
         self.acting = np.array([], np.str_)
         self.acting_version = np.array([], np.str_)
 
-    def act(self, env: WarehouseVectorEnv, observation: NDArray[np.float32]) -> tuple[Actions, F64]:
+    def act(self, env: WarehouseVectorEnv, observation: F32) -> tuple[Ints, F64]:
         """Actions (N,) and the probabilities (N,) they had.
 
         Raises:
@@ -94,7 +92,7 @@ class BehaviourPolicies:
         """Robot `robot` starts a mission."""
         self._keys[robot] = (mission.driver, mission.version, mission.handover)
 
-    def act(self, env: WarehouseVectorEnv) -> tuple[Actions, list[tuple[str, str]], F64]:
+    def act(self, env: WarehouseVectorEnv) -> tuple[Ints, list[tuple[str, str]], F64]:
         """Actions (N,), who chose each as (policy, version), and its probability (N,)."""
         action = np.zeros(env.num_envs, np.int64)
         probability = np.ones(env.num_envs)

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
-from numpy.typing import NDArray
 
+from restock.arrays import F32, F64, Ints
 from restock.ingest.task.signals import Signals
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
@@ -25,7 +25,6 @@ from restock.train.twin.recording.drivers import BehaviourPolicies
 from restock.train.twin.recording.missions import Mission
 from restock.train.twin.recording.scene import Scene
 
-F64 = NDArray[np.float64]
 ROBOTS = 8  # at a time
 MOTION_PERIOD_S = 0.02
 
@@ -36,9 +35,9 @@ class DrivenMission:
 
     mission: Mission
     drive: Drive
-    observation: NDArray[np.float32]  # (T + 1, D)
-    action: NDArray[np.int64]  # (T,)
-    reward: NDArray[np.float32]  # (T,)
+    observation: F32  # (T + 1, D)
+    action: Ints  # (T,)
+    reward: F32  # (T,)
     success: bool
     terminated: bool  # at its last step; else it was truncated there
     floor: Warehouse
@@ -56,7 +55,7 @@ class _Log:
     patches: F64  # (K, 5)
     motion: list[BodyState]  # of all robots
     signals: list[dict[str, Any]] = field(default_factory=list)  # T + 1 rows
-    observation: list[NDArray[np.float32]] = field(default_factory=list)  # T + 1
+    observation: list[F32] = field(default_factory=list)  # T + 1
     action: list[int] = field(default_factory=list)
     reward: list[float] = field(default_factory=list)
     policy: list[tuple[str, str, float]] = field(default_factory=list)
@@ -135,7 +134,7 @@ class Fleet:
 
     def _begin(
         self,
-        robots: NDArray[np.int64],
+        robots: Ints,
         missions: Iterator[tuple[int, Mission]],
         policies: BehaviourPolicies,
     ) -> None:

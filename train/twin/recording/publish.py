@@ -21,6 +21,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from restock.arrays import F64, Bools, Ints
 from restock.ingest.task.signals import wrap_angle
 from restock.toml import Checked
 from restock.train.twin.recording import robot_topics as topics
@@ -34,9 +35,6 @@ from restock.train.twin.recording.scene import (
     perturbation_text,
     traffic_markers,
 )
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 GYRO_LSB_RADPS = 2.0**-10
 ACCEL_LSB_MPS2 = 2.0**-8
@@ -135,7 +133,7 @@ class Robot:
     def static(
         self,
         start_ns: int,
-        occupied: NDArray[np.bool_],
+        occupied: Bools,
         cell_m: float,
         origin_m: tuple[float, float] = (0.0, 0.0),
     ) -> list[Message]:
@@ -314,9 +312,9 @@ class Robot:
         at_ns = self._start_ns + np.rint(np.asarray(measured_s) * 1e9).astype(np.int64)
         return send(topic, at_ns, data, self.rng)
 
-    def _stamps(self, time_s: F64) -> I64:
+    def _stamps(self, time_s: F64) -> Ints:
         """Header stamps, at the microsecond."""
-        stamps: I64 = self._start_ns + np.rint(time_s * 1e6).astype(np.int64) * 1000
+        stamps: Ints = self._start_ns + np.rint(time_s * 1e6).astype(np.int64) * 1000
         return stamps
 
     def _stamp(self, time_s: float) -> int:
@@ -358,7 +356,7 @@ def _between(inner: F64, outer: F64) -> F64:
 
 
 def send(
-    topic: str, measured_ns: NDArray[np.int64], data: Sequence[bytes], rng: np.random.Generator
+    topic: str, measured_ns: Ints, data: Sequence[bytes], rng: np.random.Generator
 ) -> list[Message]:
     """Messages measured at these times (n,), sent and received after the topic's delays.
 

@@ -15,13 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import F64, Bools, Ints
 from restock.train.twin.recording.bag_writer import Topic
 from restock.train.twin.recording.drive import Lidar
 from restock.train.twin.recording.messages import Exemplar, build, serialise, stamp
 from restock.train.twin.recording.scene import SCENE_TOPICS
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 TOPICS: tuple[Topic, ...] = (
     Topic("/tf_static", "tf2_msgs/msg/TFMessage", latched=True),
@@ -89,7 +87,7 @@ _TWIST, _BOOL = Exemplar("geometry_msgs/msg/Twist"), Exemplar("std_msgs/msg/Bool
 
 
 def odometry(
-    stamp_ns: I64, x_m: F64, y_m: F64, yaw_rad: F64, speed_mps: F64, yaw_rate_radps: F64
+    stamp_ns: Ints, x_m: F64, y_m: F64, yaw_rad: F64, speed_mps: F64, yaw_rate_radps: F64
 ) -> list[bytes]:
     """Dead reckoning in `odom`, twist in `base_link`."""
     return _ODOMETRY.pack(
@@ -104,7 +102,7 @@ def odometry(
     )
 
 
-def imu(stamp_ns: I64, yaw_rate_radps: F64, accel_x_mps2: F64, accel_y_mps2: F64) -> list[bytes]:
+def imu(stamp_ns: Ints, yaw_rate_radps: F64, accel_x_mps2: F64, accel_y_mps2: F64) -> list[bytes]:
     """Rates and accelerations; no orientation (covariance[0] = -1, as sensor_msgs/Imu has it)."""
     return _IMU.pack(
         {
@@ -116,12 +114,12 @@ def imu(stamp_ns: I64, yaw_rate_radps: F64, accel_x_mps2: F64, accel_y_mps2: F64
     )
 
 
-def joint_states(stamp_ns: I64, angle_rad: F64, rate_radps: F64) -> list[bytes]:
+def joint_states(stamp_ns: Ints, angle_rad: F64, rate_radps: F64) -> list[bytes]:
     """Wheel angles and rates, each (n, 2): left, right."""
     return _JOINTS.pack({"header.stamp": stamp_ns, "position": angle_rad, "velocity": rate_radps})
 
 
-def scans(stamp_ns: I64, ranges_m: F64, lidar: Lidar, scan_time_s: float) -> list[bytes]:
+def scans(stamp_ns: Ints, ranges_m: F64, lidar: Lidar, scan_time_s: float) -> list[bytes]:
     """Lidar scans: ranges (n, B), inf where nothing came back."""
     beams = ranges_m.shape[1]
     scan = Exemplar(
@@ -143,7 +141,7 @@ def commands(speed_mps: F64, yaw_rate_radps: F64) -> list[bytes]:
     return _TWIST.pack({"linear.x": speed_mps, "angular.z": yaw_rate_radps})
 
 
-def localised_poses(stamp_ns: I64, x_m: F64, y_m: F64, yaw_rad: F64) -> list[bytes]:
+def localised_poses(stamp_ns: Ints, x_m: F64, y_m: F64, yaw_rad: F64) -> list[bytes]:
     """Poses in `map`, as a localiser publishes them."""
     return _POSE.pack(
         {
@@ -156,7 +154,7 @@ def localised_poses(stamp_ns: I64, x_m: F64, y_m: F64, yaw_rad: F64) -> list[byt
 
 
 def transforms(
-    stamp_ns: I64, map_to_odom: tuple[F64, F64, F64], odom_to_base: tuple[F64, F64, F64]
+    stamp_ns: Ints, map_to_odom: tuple[F64, F64, F64], odom_to_base: tuple[F64, F64, F64]
 ) -> list[bytes]:
     """map > odom > base_link, each (x, y, yaw) of (n,) values."""
     columns: dict[str, NDArray[Any]] = {}
@@ -188,7 +186,7 @@ def static_transforms(stamp_ns: int, lidar_x_m: float, lidar_z_m: float = 0.2) -
     )
 
 
-def bumpers(pressed: NDArray[np.bool_]) -> list[bytes]:
+def bumpers(pressed: Bools) -> list[bytes]:
     """Bumper states."""
     return _BOOL.pack({"data": pressed})
 
@@ -240,7 +238,7 @@ def _path(points: int) -> Exemplar:
 
 def occupancy_map(
     stamp_ns: int,
-    occupied: NDArray[np.bool_],
+    occupied: Bools,
     resolution_m: float,
     origin_m: tuple[float, float] = (0.0, 0.0),
 ) -> bytes:

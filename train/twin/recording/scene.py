@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import F64, Bools, Ints
 from restock.train.twin.physics.model import (
     FORKLIFT_HALF_M,
     NO_PATCH,
@@ -29,9 +30,6 @@ from restock.train.twin.physics.model import (
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.recording.bag_writer import Topic
 from restock.train.twin.recording.messages import MessageLayout, build, serialise, stamp
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 MARKERS, TRAFFIC, PERTURBATION = (
     f"/ground_truth/{name}" for name in ("markers", "traffic", "perturbation")
@@ -111,7 +109,7 @@ def mission_markers(stamp_ns: int, scene: Scene, goal_m: tuple[float, float]) ->
     return serialise(build("visualization_msgs/msg/MarkerArray", markers=markers))
 
 
-def traffic_markers(stamp_ns: I64, places: F64) -> list[bytes]:
+def traffic_markers(stamp_ns: Ints, places: F64) -> list[bytes]:
     """People and forklifts at (n, A, 3) places, one message a row."""
     messages: list[bytes] = [b""] * len(places)
     shown = on_floor(places)
@@ -135,7 +133,7 @@ def traffic_markers(stamp_ns: I64, places: F64) -> list[bytes]:
     return messages
 
 
-def on_floor(places: F64) -> NDArray[np.bool_]:
+def on_floor(places: F64) -> Bools:
     """Which places (…, 2 or more) are not where bodies are parked that no episode uses."""
     return np.asarray(places[..., 0] > PARKED_M[0] / 2, np.bool_)
 
