@@ -13,7 +13,7 @@ import altair as alt
 from restock import __version__
 from restock.errors import RestockError
 from restock.report import charts
-from restock.report.blocks import Figure, Section, Table, number, words
+from restock.report.blocks import Figure, Rows, Section, Table, number, words
 from restock.report.facts import Facts
 from restock.stats import ConfidenceInterval
 from restock.train.twin.calibration.gap import AFTER, BEFORE
@@ -85,7 +85,7 @@ def gap_page(gap: TwinGap) -> dict[str, Any]:
         "title": f"Twin and logs of {about['store']}",
         "headline": headline(gap),
         "lead": f"{_count(about['rows'], 'logged step')} of {_count(about['episodes'], 'episode')},"
-        f" driven again in the twin. Judged is the {source_name(about['judged'])}.",
+        f" driven again in the twin. Verdicts are on the {source_name(about['judged'])}.",
         "cards": [
             {
                 "value": str(sum(v.verdict == kind for v in gap.verdicts)),
@@ -139,10 +139,10 @@ def gap_section(gap: TwinGap) -> Section:
     return Section(
         "twin-gap",
         "Can the twin be trusted?",
-        intro="Logged commands, driven again in the twin without a look at what the robot did."
+        intro="Logged commands, driven again in the twin open loop, without feedback from the log."
         " Odometry is the logged wheels, dead-reckoned: a twin should beat it. The floor is what a"
-        " perfect twin would show through localisation noise. Trusted is a condition in which nine"
-        f" in ten segments of {limits['horizon_s']:g} s end within {limits['position_m']:g} m of"
+        " perfect twin would show through localisation noise. A condition is trusted where nine in"
+        f" ten segments of {limits['horizon_s']:g} s end within {limits['position_m']:g} m of"
         f" the log, and the one-step reward is off by less than {limits['reward_ratio']:g} times"
         " its own spread, both with 95 % confidence over episodes.",
         callout=headline(gap) + "." if gap.untrusted else "",
@@ -158,12 +158,12 @@ def gap_section(gap: TwinGap) -> Section:
         else [],
         tables=[
             Table(rows, numbers={"segments", "episodes"}),
-            Table([{"what else to know": note} for note in gap.not_done]),
+            Table([{"notes": note} for note in gap.not_done]),
         ],
     )
 
 
-def _positions(rows: list[dict[str, Any]]) -> str:
+def _positions(rows: Rows) -> str:
     sources = charts.ordered(rows, "source", COLOURS)
     conditions = list(dict.fromkeys(row["condition"] for row in rows))
     base = charts.plot(rows).encode(
@@ -183,45 +183,37 @@ def _positions(rows: list[dict[str, Any]]) -> str:
 
 def _steps_section(gap: TwinGap) -> Section:
     """One step: reward by term, and observation by component."""
-    sources = list(gap.about["twins"])
+    twins = list(gap.about["twins"])
+    gaps = _by_source(gap.rewards, "mean_gap", "condition", "term")
+    moves = {(row["condition"], row["term"]) for row in gap.rewards if row["mean_gap"]}
     rewards = [
         {
             "condition": words(row["condition"]),
             "term": words(row["term"]),
             "logged mean": number(row["logged_mean"]),
             "logged spread": number(row["logged_spread"]),
-            **{
-                source_name(source): _cell(
-                    gap.rewards,
-                    source,
-                    "mean_gap",
-                    condition=row["condition"],
-                    term=row["term"],
-                )
-                for source in sources
-            },
+            **gaps[row["condition"], row["term"]],
         }
         for row in gap.rewards
-        if row["source"] == sources[-1]
-        and (row["term"] == "reward" or _any(gap, row["condition"], row["term"]))
+        if row["source"] == twins[-1]
+        and (row["term"] == "reward" or (row["condition"], row["term"]) in moves)
     ]
-    observed = _grouped(gap)
     return Section(
         "one-step",
         "One step from each logged state",
         intro="The twin is put into the logged state, drives the logged action for one control"
         " period, and the task's own functions make observation and reward of it. Mean absolute"
-        " differences; persistence is what saying “nothing changes” would miss.",
+        " differences; persistence is the error of predicting that nothing changes.",
         tables=[
             Table(
                 rewards,
-                numbers={"logged mean", "logged spread", *map(source_name, sources)},
+                numbers={"logged mean", "logged spread", *map(source_name, twins)},
                 title="Reward, by term",
                 caption="Terms that are the same on both sides everywhere are left out.",
             ),
             Table(
-                observed,
-                numbers={*map(source_name, sources), "persistence"},
+                _observations(gap),
+                numbers={*map(source_name, twins), "persistence"},
                 title="Observation, by component, in nominal driving",
                 caption="Sectors of the lidar are taken together; observations.parquet has each"
                 " component and condition.",
@@ -231,34 +223,41 @@ def _steps_section(gap: TwinGap) -> Section:
 
 
 def _signals_section(gap: TwinGap) -> Section:
-    sources = list(dict.fromkeys(row["source"] for row in gap.paths))
-    rows = []
-    for row in gap.paths:
-        if row["source"] == "floor":
-            key = {name: row[name] for name in ("condition", "quantity", "horizon_s")}
-            rows.append(
-                {
-                    "condition": words(row["condition"]),
-                    "signal": words(row["quantity"].rsplit("_", 1)[0]),
-                    "unit": row["unit"],
-                    "horizon": f"{row['horizon_s']:g} s",
-                    "segments": row["segments"],
-                    **{
-                        source_name(name): _cell(gap.paths, name, "median", **key)
-                        for name in sources
-                    },
-                }
-            )
+    sources = [source_name(name) for name in dict.fromkeys(row["source"] for row in gap.paths)]
+    keys = ("condition", "quantity", "horizon_s")
+    medians = _by_source(gap.paths, "median", *keys)
+    rows = [
+        {
+            "condition": words(row["condition"]),
+            "signal": words(row["quantity"].rsplit("_", 1)[0]),
+            "unit": row["unit"],
+            "horizon": f"{row['horizon_s']:g} s",
+            "segments": row["segments"],
+            **dict.fromkeys(sources, ""),
+            **medians[tuple(row[key] for key in keys)],
+        }
+        for row in gap.paths
+        if row["source"] == "floor"
+    ]
     return Section(
         "signals",
         "Pose and signals, by horizon",
         intro="Medians over segments: of a pose at the horizon's end, of a signal the root mean"
         " square on the way.",
-        tables=[Table(rows, numbers={"segments", *map(source_name, sources)})],
+        tables=[Table(rows, numbers={"segments", *sources})],
     )
 
 
-def _grouped(gap: TwinGap) -> list[dict[str, Any]]:
+def _by_source(rows: Rows, value: str, *keys: str) -> dict[tuple[Any, ...], dict[str, str]]:
+    """Values of the keys -> the name of a source -> its value."""
+    cells: dict[tuple[Any, ...], dict[str, str]] = {}
+    for row in rows:
+        key = tuple(row[name] for name in keys)
+        cells.setdefault(key, {})[source_name(row["source"])] = number(row[value])
+    return cells
+
+
+def _observations(gap: TwinGap) -> Rows:
     """Observation gaps in nominal driving, lidar sectors averaged."""
     sums: dict[str, dict[str, list[float]]] = {}
     for row in gap.observations:
@@ -272,21 +271,6 @@ def _grouped(gap: TwinGap) -> list[dict[str, Any]]:
         | {source_name(source): f"{sum(values) / len(values):.4f}" for source, values in by.items()}
         for name, by in sums.items()
     ]
-
-
-def _any(gap: TwinGap, condition: str, term: str) -> bool:
-    return any(
-        row["mean_gap"]
-        for row in gap.rewards
-        if (row["condition"], row["term"]) == (condition, term)
-    )
-
-
-def _cell(rows: list[dict[str, Any]], source: str, value: str, **key: Any) -> str:
-    for row in rows:
-        if row["source"] == source and all(row[name] == part for name, part in key.items()):
-            return number(row[value])
-    return ""
 
 
 def _count(number: int, noun: str) -> str:
