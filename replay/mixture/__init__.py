@@ -1,1 +1,1 @@
-"""What a learner is to be fed, as a file."""
+"""Mixtures: which transitions a learner samples, in which shares, as a file."""

@@ -1,4 +1,4 @@
-"""A mixture: which transitions a learner is fed, in which shares, as a TOML file.
+"""A mixture: which transitions a learner samples, in which shares, as a TOML file.
 
 Only what the file says happens: unknown keys are refused with their path, and every default is
 visible in `restock mix --dry-run`. `docs/mixture.md` explains each key.

@@ -1,4 +1,4 @@
-"""Shares of strata: what the mixture wants, within floors, caps and what the rows can bear."""
+"""Shares of strata: what the mixture wants, within floors, caps and what the rows allow."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def plan_shares(
 
     def complaints() -> str:
         return "; ".join(
-            f"{rule.name} wants {wanted[i]:.1%}, its {rows[i]} rows in {episodes[i]} episodes can"
-            f" bear {limit[i]:.1%}"
+            f"{rule.name} wants {wanted[i]:.1%}, its {rows[i]} rows in {episodes[i]} episodes allow"
+            f" {limit[i]:.1%}"
             for i, rule in enumerate(rules)
             if wanted[i] > limit[i] + 1e-12
         )
@@ -57,7 +57,7 @@ def plan_shares(
 def within_limits(
     wanted: F64, limit: F64, caps: F64, shortfall: Shortfall, complaints: Callable[[], str]
 ) -> SharePlan:
-    """What becomes of wanted shares (S,) where rows can bear no more than `limit` (S,).
+    """What becomes of wanted shares (S,) where rows allow no more than `limit` (S,).
 
     `caps` (S,) bound what a stratum takes of the others' surplus; `complaints` says who is short.
 
@@ -171,7 +171,7 @@ def row_limits(
     episodes: Ints,
     draws: float,
 ) -> F64:
-    """The largest share of `draws` each stratum's rows can bear, (S,)."""
+    """The largest share of `draws` that each stratum's rows allow, (S,)."""
     limit = np.where(rows > 0, 1.0, 0.0)
     if mixture.max_replays_per_row is not None and draws > 0:
         limit = np.minimum(limit, mixture.max_replays_per_row * rows / draws)

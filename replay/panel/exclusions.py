@@ -33,7 +33,7 @@ class LeftOut:
 
 
 def leave_out(table: pa.Table, mixture: Mixture, evaluation_split: Bools) -> LeftOut:
-    """What no stratum gets, whatever it asks for. `table` is of `read_candidates`.
+    """Rows that no stratum gets. `table` is of `read_candidates`.
 
     Raises:
         MixtureError: rows without a label, where the mixture does not say what to do with them.
@@ -56,7 +56,7 @@ def leave_out(table: pa.Table, mixture: Mixture, evaluation_split: Bools) -> Lef
     bare = ~bools(table, "labelled") & ~out.gone
     if bare.any() and mixture.unlabelled == "refuse":
         raise MixtureError(
-            f"{int(bare.sum())} rows have no coverage label: nobody knows what is on that shelf",
+            f"{int(bare.sum())} rows have no coverage label: their condition is unknown",
             remedy='`restock label` the store, or set unlabelled = "drop" (or "nominal")',
         )
     if mixture.unlabelled == "drop":
@@ -147,10 +147,10 @@ def versions_behind(table: pa.Table) -> Ints:
 
 
 def split_for_evaluation(table: pa.Table, rule: EvaluationSplit, seed: int) -> Bools:
-    """Which rows are held out, (N,): whole episodes, whole recordings, or the latest episodes.
+    """The rows of the evaluation split, (N,): whole episodes or recordings, or the latest episodes.
 
     Raises:
-        MixtureError: the rule would hold out everything, or there is only one group to split.
+        MixtureError: the rule would take everything, or there is only one group to split.
     """
     if rule.by == "none" or rule.share == 0:
         return np.zeros(len(table), np.bool_)
@@ -168,7 +168,7 @@ def split_for_evaluation(table: pa.Table, rule: EvaluationSplit, seed: int) -> B
     if len(order) < 2:
         raise MixtureError(
             f"one {rule.by if rule.by == 'recording' else 'episode'} cannot be split"
-            " into a panel and held-out data",
+            " into a panel and an evaluation split",
             remedy='ingest more, or set [evaluation_split] by = "none" in a mixture of your own',
         )
     wanted = rule.share * len(table)

@@ -85,11 +85,11 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
         return sampler_for(self.panel, self.batch_size, seed=(self.seed, 6, epoch))
 
     def _check(self, sampler: LoggedSampler) -> None:
-        """Raises MixtureError where the mixture asks for what no dataset is told."""
+        """Raises MixtureError where draws follow what a data set does not receive."""
         follows = "TD errors" if sampler.needs_td else "environment steps"
         if sampler.needs_td or sampler.controller.strata_move:
             raise MixtureError(
-                f"the mixture's draws follow {follows}, which a data set is not told",
+                f"the mixture's draws follow {follows}, which a data set does not receive",
                 where=str(self.path),
                 remedy="draw with `sampler_for(panel, …)`, which has `update` and `move_to`",
             )

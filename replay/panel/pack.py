@@ -163,7 +163,7 @@ class Packer:
         return len(target) + len(ends)
 
     def write_meta(self, meta: Path, evaluation_split: Path) -> None:
-        """Write what stands beside the rows, and the rows that are held out, in the same order."""
+        """Write what stands beside the rows, and the evaluation split, in the same order."""
         names = pa.array([line.name for line in self.plan.strata], pa.string())
         to_go = None
         if self.mixture.return_to_go:

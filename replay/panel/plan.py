@@ -1,7 +1,7 @@
 """From a mixture and a store to the rows of a panel: which, in which stratum, with which weight.
 
 DuckDB says what each row is; everything that must come out the same on every machine and version
-(the draws, the held-out episodes) is done here on transition ids, with hashes of our own.
+(the draws, the evaluation split) is done here on transition ids, with hashes of our own.
 """
 
 from __future__ import annotations

@@ -104,7 +104,7 @@ class SourceSteps:
 
     def returns_to_go(self, discount: float) -> tuple[F32, Bools]:
         """Discounted rewards to where a row's return must end, (N,), on disk; and whether that is
-        where its episode ended for good, so that nothing is missing of it, (N,)."""
+        where its episode terminated, so that nothing is missing of it, (N,)."""
         total: F32 = _on_disk(self._folder / "return_to_go", np.float32, self.rows)
         whole: Bools = _on_disk(self._folder / "whole", np.bool_, self.rows)
         after, ends_whole = 0.0, False

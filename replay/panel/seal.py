@@ -88,7 +88,7 @@ class _Version(msgspec.Struct):
 
 
 def packed_by(content: bytes) -> int | None:
-    """The version of the packing that a header names; None where it names none, or is none."""
+    """The version of the packing that a header names; None where there is none to read."""
     try:
         return msgspec.json.decode(content, type=_Version).packing_version
     except (msgspec.DecodeError, ValueError):

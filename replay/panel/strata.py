@@ -27,7 +27,7 @@ WHERE_PRIORITY = 50
 
 
 class Stratum(msgspec.Struct, frozen=True):
-    """A stratum of a panel: what it wanted, what it got, what its rows must bear."""
+    """A stratum of a panel: its wanted and actual share, and how often its rows are drawn."""
 
     name: str
     source: str  # logs, or the name of another store

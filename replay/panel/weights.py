@@ -79,7 +79,7 @@ class RowWeights:
         self._in_cell = np.bincount(self._cell, minlength=size * (size + 1)).reshape(size, size + 1)
 
     def boost(self, shares: F64) -> F64:
-        """How much oftener each stratum is drawn than it occurs, (S,); 1 where it has no rows."""
+        """How much more often a stratum is drawn than it occurs, (S,); 1 where it has no rows."""
         total = self.rows.sum()
         ones = np.ones(len(shares))
         return np.asarray(np.divide(shares * total, self.rows, out=ones, where=self.rows > 0))
@@ -192,7 +192,7 @@ class WeightsInForce:
 
 @dataclass(frozen=True)
 class RatioFit:
-    """How well outcomes are told from states and actions. Losses are of rows kept from the fit."""
+    """How well states and actions predict outcomes. Losses are of rows kept from the fit."""
 
     source: str
     strata: tuple[str, ...]
@@ -204,8 +204,8 @@ class RatioFit:
 def density_ratio(outcome: F32, boost: F64, state_aim: F64, clip: float) -> F64:
     """r(s, a) of each row (N,), in units of its state's own density and at most `clip`.
 
-    `outcome` (N, S) is P(k | s, a) of the strata it is estimated for, `boost` (S,) how much oftener
-    each stratum is drawn than it occurs, `state_aim` (N,) the same for rows of other outcomes.
+    `outcome` (N, S) is P(k | s, a) of the strata it is estimated for, `boost` (S,) how much more
+    often a stratum is drawn than it occurs, `state_aim` (N,) the same for rows of other outcomes.
     """
     drawn = outcome @ boost + (1.0 - outcome.sum(axis=1)) * state_aim
     ratio = np.divide(drawn, state_aim, out=np.ones(len(drawn)), where=state_aim > 0)

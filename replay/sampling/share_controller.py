@@ -1,9 +1,9 @@
-"""The diet of a run: which share of a batch each stratum gets now, and what each has had.
+"""The shares of a run: which part of a batch each stratum gets now, and what was drawn of each.
 
 A panel's shares are a plan for the mixture's `[planned]` draws. A run knows how much it will draw,
-at which environment step, and what its critic errs on: the diet works the mixture out for that run,
-follows its schedules and its [adaptive] rule, and counts what is drawn, so that no stratum gives
-more than its rows may give under `max_replays_per_row`.
+at which environment step, and where its TD errors are: the controller plans the mixture for that
+run, follows its schedules and its [adaptive] rule, and counts what is drawn, so that no stratum
+gives more than its rows may give under `max_replays_per_row`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class PlannedDraws:
 
 @dataclass(frozen=True)
 class SampledStratum:
-    """A stratum of a panel, as a diet needs it."""
+    """A stratum of a panel, as the controller needs it."""
 
     name: str
     source: str
@@ -130,7 +130,7 @@ class ShareController(Stateful):
     online batch, `drawn` (S,) what was drawn of each stratum.
 
     Raises:
-        MixtureError: rows that cannot bear the offline phase, or a shortfall the mixture refuses.
+        MixtureError: too few rows for the offline phase, or a shortfall the mixture refuses.
     """
 
     SAME: ClassVar[tuple[str, ...]] = ("names",)
@@ -262,7 +262,7 @@ class ShareController(Stateful):
         return self._work_out("redistribute") if stepping else False
 
     def _work_out(self, shortfall: Shortfall) -> bool:
-        """Shares for this moment, within what the rows can still bear."""
+        """Shares for this moment, within what the rows still allow."""
         if self.mixture.shortfall == "shrink":
             shortfall = "shrink"
         parts, shares, logs_share = self.parts_at(self.env_steps), np.zeros(len(self.strata)), 0.0
@@ -296,7 +296,7 @@ class ShareController(Stateful):
         def complaints() -> str:
             return "; ".join(
                 f"{rule.name} wants {wanted[i]:.1%} of {ahead:,.0f} draws, its"
-                f" {source.rows[i]:,} rows can bear {limit[i]:.1%}"
+                f" {source.rows[i]:,} rows allow {limit[i]:.1%}"
                 for i, rule in enumerate(source.rules)
                 if wanted[i] > limit[i] + 1e-12
             )
@@ -307,7 +307,7 @@ class ShareController(Stateful):
         if fill < offline - 1e-6 and not drawn.any():
             raise MixtureError(
                 f"the offline phase draws {offline:,.0f} rows of {source.name}, which its"
-                f" {source.rows.sum():,} rows cannot bear at {self.max_replays} draws each",
+                f" {source.rows.sum():,} rows do not allow at {self.max_replays} draws each",
                 remedy="lower schedule.offline_updates, raise max_replays_per_row, or ingest more",
             )
         online = ahead - offline

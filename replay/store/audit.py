@@ -248,7 +248,7 @@ def _parse(name: str, text: str, where: str) -> Audit:
             raise ConfigError(f"its header has no `-- {key}: …`", where=f"{where}/{name}.sql")
     if header["severity"] not in _OFFENDED:
         raise ConfigError(
-            f"severity {header['severity']!r} is none of error, warning, info",
+            f"severity {header['severity']!r} is not one of error, warning, info",
             where=f"{where}/{name}.sql",
         )
     return Audit(

@@ -93,18 +93,18 @@ def _of_run(trace: Trace, run: Path, row: str, where: TracePlaces) -> None:
     if audit["source"] == "fresh":
         _of_twin(trace, run, document, audit)
         return
-    fed = document.get("panel") or {}
-    panel_path = where.panel or Path(fed.get("path", ""))
+    run_panel = document.get("panel") or {}
+    panel_path = where.panel or Path(run_panel.get("path", ""))
     if not (panel_path / HEADER).is_file():
         raise PanelError(
-            "the panel that the run was fed is not there",
+            "the run's panel does not exist",
             where=str(panel_path),
             remedy="say with --panel where it is now",
         )
     panel = Panel.open(panel_path)
-    if panel.id != fed.get("id"):
+    if panel.id != run_panel.get("id"):
         raise PanelError(
-            f"is panel {panel.id}, the run was fed {fed.get('id')}",
+            f"is panel {panel.id}, the run drew from {run_panel.get('id')}",
             where=str(panel_path),
             remedy="say with --panel where that one is",
         )

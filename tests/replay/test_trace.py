@@ -223,7 +223,7 @@ def test_places_that_were_moved_are_asked_for_and_taken(places: Places, tmp_path
     assert found.origin is not None
     assert found.origin.store["path"] == str(tmp_path / "elsewhere")
     build_panel(recording_transitions(1), MIXTURE, tmp_path / "other", task=TASK)
-    with pytest.raises(PanelError, match="the run was fed"):
+    with pytest.raises(PanelError, match="the run drew from"):
         trace_row(tmp_path / "run", "7/0", TracePlaces(panel=tmp_path / "other"))
 
 

@@ -2,7 +2,7 @@
 -- needs: panel
 -- advice: Make the panel again, after `duplicate_transitions` and `repeated_steps` pass; what is held out must share nothing with what is trained on.
 -- doc: What is in the panel and held out at once: an episode; a recording, where whole ones are held out; an episode that ends after the first that is held out, where the latest are; or the same step under another id.
-WITH fed AS (
+WITH panel_steps AS (
     SELECT transitions.transition_id, stamp_ns, action, hash(observation) AS seen, episode_id
     FROM transitions
     SEMI JOIN panel.rows USING (transition_id)
@@ -30,9 +30,9 @@ WHERE 'time' IN (SELECT split_by FROM panel.evaluation_split)
 GROUP BY episode_id
 HAVING max(logged_ns) > (SELECT first_ns FROM ends)
 UNION ALL
-SELECT 'the same step under another id', fed.episode_id, count(*)
-FROM fed
+SELECT 'the same step under another id', panel_steps.episode_id, count(*)
+FROM panel_steps
 JOIN held USING (stamp_ns, action, seen)
-WHERE fed.transition_id <> held.transition_id
-GROUP BY fed.episode_id
+WHERE panel_steps.transition_id <> held.transition_id
+GROUP BY panel_steps.episode_id
 ORDER BY leak, episode_id
