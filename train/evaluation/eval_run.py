@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 import pyarrow as pa
 
-from restock.errors import ConfigError, RunError
+from restock.errors import ConfigError
 from restock.files import write_table
 from restock.ingest.profile.profile import load_profile
 from restock.train.dqn.config import TrainConfig, parse_config
@@ -104,12 +104,6 @@ def plan_evaluation(
             )
     if episodes < 1:
         raise ConfigError(f"must be at least 1, got {episodes}", where="--episodes")
-    if "agent" in policies and not run.best.exists():
-        raise RunError(
-            "has kept no policy yet: its first evaluation is still to come",
-            where=str(path),
-            remedy=f"go on with `restock train --resume {path}`",
-        )
     layouts = layouts or layouts_of_split(config.env.layouts, "test")
     floors = open_floors(layouts)
     plan = EvaluationPlan(
@@ -125,7 +119,7 @@ def plan_evaluation(
     if not plan.kinds:
         refuse_unfit(floors, KINDS)
     for name in plan.policies:
-        if _is_path("--policies", name):
+        if name == "agent" or _is_path("--policies", name):
             make_policy(name, plan)  # refused before anything is driven
     return plan
 

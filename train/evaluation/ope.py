@@ -16,7 +16,6 @@ import pyarrow as pa
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from restock.errors import RunError
 from restock.files import write_table
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
@@ -94,12 +93,6 @@ def evaluate_run_off_policy(
     """
     run = Run.open(path)
     trained = parse_config(run.document["config"], where=str(path / "config.json"))
-    if not run.best.exists():
-        raise RunError(
-            "has kept no policy yet: its first evaluation is still to come",
-            where=str(path),
-            remedy=f"go on with `restock train --resume {path}`",
-        )
     agent = load_agent(run)
     task = load_profile(trained.profile).task
     dataset = load_ope_dataset(run_panel(run.document), task, logs, seed=config.seed)

@@ -67,8 +67,14 @@ def load_agent(run: Run) -> GreedyPolicy:
     """The policy that a run kept as its best, greedy.
 
     Raises:
-        RunError: no checkpoint, a damaged one, or one of a task that the profile no longer is.
+        RunError: none kept yet, a damaged one, or one of a task that the profile no longer is.
     """
+    if not run.best.exists():
+        raise RunError(
+            "has kept no policy yet: its first evaluation is still to come",
+            where=str(run.path),
+            remedy=f"go on with `restock train --resume {run.path}`",
+        )
     config = parse_config(run.document["config"], where=str(run.path / "config.json"))
     state = checkpoint.load(run.best)
     task = load_profile(config.profile).task
