@@ -90,7 +90,7 @@ def main(
         last_obs = next_obs.copy()
         if done.any():
             last_obs[done] = info["final_obs"][done]
-        for place in np.flatnonzero(~info["invalid"]):  # a blown-up step is no experience
+        for place in np.flatnonzero(~info["invalid"]):  # a step that diverged is no experience
             row = filled % buffer_size
             buffer["obs"][row], buffer["next_obs"][row] = obs[place], last_obs[place]
             buffer["action"][row], buffer["reward"][row] = actions[place], reward[place]

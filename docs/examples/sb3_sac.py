@@ -1,4 +1,4 @@
-"""Stable-Baselines3's SAC on the twin's continuous face, unchanged.
+"""Stable-Baselines3's SAC in the twin's continuous action space, unchanged.
 
 python docs/examples/sb3_sac.py --steps 100000
 """

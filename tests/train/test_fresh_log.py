@@ -270,7 +270,7 @@ def test_a_step_that_blew_up_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     def blow_up(command: Any) -> None:
         drive(command)
-        simulation.blown_up = np.array([True, False, False])
+        simulation.diverged = np.array([True, False, False])
 
     with monkeypatch.context() as patch:
         patch.setattr(simulation, "drive", blow_up)

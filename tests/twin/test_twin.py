@@ -215,14 +215,14 @@ def test_a_blow_up_truncates_the_episode_and_is_counted(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     env.reset(seed=8)
-    count = env.blown_up
+    count = env.diverged
     env.simulation.qvel[3, 0] = np.nan
     before = env.observation.copy()
     observation, earned, terminated, truncated, info = env.step(np.full(8, 2))
     assert info["invalid"].tolist() == [index == 3 for index in range(8)]
     assert truncated[3]
     assert not terminated[3]
-    assert env.blown_up == count + 1
+    assert env.diverged == count + 1
     assert np.isfinite(observation).all()
     assert np.isfinite(earned).all()
     np.testing.assert_array_equal(info["final_obs"][3], before[3])
@@ -282,7 +282,7 @@ def test_every_shipped_perturbation_drives(name: str) -> None:
     made.reset(seed=1)
     for seen in roll(made, 15, 0):
         assert np.isfinite(seen).all()
-    assert made.blown_up == 0
+    assert made.diverged == 0
 
 
 def test_perturbations_can_differ_between_episodes() -> None:

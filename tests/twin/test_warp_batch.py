@@ -66,7 +66,7 @@ def test_what_blows_up_is_cut_and_counted(device: str) -> None:
     assert info["invalid"].tolist() == truncated.tolist() == [True, False]
     assert not terminated.any()
     assert reward[0] == 0
-    assert env.blown_up == 1
+    assert env.diverged == 1
     observation, *_, info = env.step(np.zeros(2, np.int64))
     assert np.isfinite(observation).all()
     assert not info["invalid"].any()

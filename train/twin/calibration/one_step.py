@@ -75,7 +75,7 @@ class OneStep:
     now: F32  # (n, D) the logged observation at t
     logged: StepResult
     twins: dict[str, StepResult]
-    valid: Bools  # (n,) no twin blew up
+    valid: Bools  # (n,) no twin diverged
     lidar: bool  # the floor is the twin's: otherwise lidar entries are the log's own
     unexplained: int  # logged rewards that their terms do not add up to
 
@@ -139,7 +139,7 @@ def one_step(
         now=observed,
         logged=logged,
         twins=results,
-        valid=np.logical_not(driven.blown_up.any(axis=0)),
+        valid=np.logical_not(driven.diverged.any(axis=0)),
         lidar=warehouse is not None,
         unexplained=int((~adds_up).sum()),
     )

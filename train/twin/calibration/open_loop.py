@@ -70,7 +70,7 @@ class OpenLoopResult:
     sliding_mps: F64  # (P, S, K + 1) of the faster sliding wheel over the floor, along the robot
     bumped: Bools  # (P, S) in the last period
     sector_clearance_m: F64  # (P, S, sectors) at the end; none on an empty floor
-    blown_up: Bools  # (P, S) the physics broke: the rest says nothing
+    diverged: Bools  # (P, S) the physics broke: the rest says nothing
 
     @property
     def pose(self) -> F64:
@@ -102,7 +102,7 @@ def drive_open_loop(
     pose = np.zeros((jobs, periods + 1, 3))
     signals = {name: np.zeros((jobs, periods + 1)) for name in SENSED}
     sliding = np.zeros((jobs, periods + 1))
-    bumped, blown_up = np.zeros((2, jobs), np.bool_)
+    bumped, diverged = np.zeros((2, jobs), np.bool_)
     clearance = np.zeros((jobs, sectors))
     simulation: Simulation | None = None
     for begin in range(0, jobs, ROBOTS):
@@ -117,7 +117,7 @@ def drive_open_loop(
         for step in range(periods + 1):
             if step:
                 simulation.drive(part.command[:, step - 1])
-                blown_up[ids] |= simulation.blown_up
+                diverged[ids] |= simulation.diverged
             pose[ids, step] = simulation.pose()
             pose[ids, step, :2] += offset
             velocity = simulation.qvel
@@ -137,7 +137,7 @@ def drive_open_loop(
         sliding_mps=sliding.reshape(*shape, -1),
         bumped=bumped.reshape(shape),
         sector_clearance_m=clearance.reshape(*shape, sectors),
-        blown_up=blown_up.reshape(shape),
+        diverged=diverged.reshape(shape),
     )
 
 

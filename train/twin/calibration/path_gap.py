@@ -169,7 +169,7 @@ def _gaps(
         signals = {signal: replayed.signals[signal][index] for signal in SIGNALS}
         gaps[name] = _gap(path, signals, part.pose, logged, fresh)
         for values in gaps[name].values():
-            values[replayed.blown_up[index]] = np.nan
+            values[replayed.diverged[index]] = np.nan
     gaps[ODOMETRY] = _gap(_dead_reckon(part), {}, part.pose, logged, fresh)
     # Of the last twin, which is the calibrated one if there is one.
     localised = path + _pose_noise(path.shape, noise, part.task.control_period_s, rng)

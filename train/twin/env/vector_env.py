@@ -5,7 +5,7 @@
     observation, reward, terminated, truncated, info = env.step(actions)
 
 Actions index the task's table; with `action="continuous"` they are (N, 2) speeds in m/s and yaw
-rates in rad/s over the same task: see `restock.train.twin.env.action_face`.
+rates in rad/s over the same task: see `restock.train.twin.env.action_space`.
 
 Autoreset is SAME_STEP (in the metadata): where an episode ends, `observation` is already the next
 episode's first, and the last one is in `info["final_obs"]`. Bootstrap on truncation, never on
@@ -21,9 +21,9 @@ termination.
   that are not nominal;
 - `success` (at the goal without any bump, at the episode's end), `bumps` (steps with a bump so
   far), `episode_steps`, `true_pose` (N, 3);
-- `invalid`: the physics blew up: the episode is truncated and the step must not enter replay;
+- `invalid`: the physics diverged: the episode is truncated and the step must not enter replay;
 - `final_obs`, with the mask `_final_obs`;
-- on the continuous face `action`, the nearest of the task's, and `action_residual`.
+- in the continuous action space `action`, the nearest of the task's, and `action_residual`.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task, observe, reached_goal, reward
 from restock.ingest.task.task import terminated as is_terminated
 from restock.state import Stateful
-from restock.train.twin.env.action_face import Face, action_face
+from restock.train.twin.env.action_space import ActionKind, action_space
 from restock.train.twin.env.camera import Renderer, View
 from restock.train.twin.env.episode_queue import EpisodeQueue
 from restock.train.twin.env.floor_report import refuse_unfit
@@ -70,7 +70,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
     STATE = (
         *("specs", "observation", "signals", "previous_action", "steps", "bumps", "episode_number"),
         *("episode_seed", "episode_condition", "block", "perturbation_name", "episodes_begun"),
-        *("blown_up", "queue", "simulation", "sensing", "truth", "navigation"),
+        *("diverged", "queue", "simulation", "sensing", "truth", "navigation"),
     )
     STATE_TYPES: ClassVar[Mapping[str, Any]] = {"specs": list[EpisodeSpec]}
 
@@ -93,7 +93,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         warehouse: Warehouse | None = None,
         layouts: str | Sequence[Warehouse] = DEFAULT,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
-        action: Face = "discrete",
+        action: ActionKind = "discrete",
         physics: Physics = "mujoco",
         camera: View | None = None,
     ) -> None:
@@ -140,8 +140,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
 
         limit = np.full(self.task.observation_size, OBSERVATION_LIMIT, np.float32)
         self.single_observation_space = gymnasium.spaces.Box(-limit, limit, dtype=np.float32)
-        self.face = action_face(action, self.task, num_envs)
-        self.single_action_space = self.face.space
+        self._actions = action_space(action, self.task, num_envs)
+        self.single_action_space = self._actions.space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
@@ -153,7 +153,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         self.truth = Truth(self.task, num_envs)
         self.navigation = Navigation(self.floors, num_envs, self.task)
         self.specs: list[EpisodeSpec] = [EpisodeSpec("nominal", 0)] * num_envs
-        self.blown_up = 0  # episodes that ended in a NaN or a blow-up
+        self.diverged = 0  # episodes that ended in a NaN or beyond MuJoCo's limits
         self.signals: Signals = {}
         self.observation = np.zeros((num_envs, self.task.observation_size), np.float32)
         self.previous_action = np.zeros(num_envs, np.int64)
@@ -259,10 +259,10 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
 
     def step(self, actions: NDArray[Any]) -> Step:
         """One control period everywhere. `actions` (N,) index the task's actions, or are (N, 2)."""
-        action, command, chosen = self.face.read(actions)
+        action, command, chosen = self._actions.read(actions)
         now, sim, task = self.signals, self.simulation, self.task
         everyone = np.arange(self.num_envs)
-        self.truth.look(sim.pose(), self.navigation.plans_m, sim.pallets, everyone)
+        self.truth.note_blocked(sim.pose(), self.navigation.plans_m, sim.pallets, everyone)
         sim.drive(command)
         self.steps += 1
 
@@ -273,7 +273,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         progress = now["route_remaining_m"] - after["route_remaining_m"]
         earned = reward(task, now, after, progress, action, self.previous_action)
         terminated = is_terminated(task, after)
-        invalid = sim.blown_up
+        invalid = sim.diverged
         self.bumps += sim.bumped
         changed = self.navigation.update(after, offset, self.sensing)
         if len(changed):  # a new plan counts from t + 1 on: it never makes progress jump
@@ -284,7 +284,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         observed = _bounded(observe(task, after, now, action))
         info = self._info_after(after, progress, terminated, invalid) | chosen
         if invalid.any():
-            self.blown_up += int(invalid.sum())
+            self.diverged += int(invalid.sum())
             earned = np.where(invalid, np.float32(0), earned)
             observed[invalid] = self.observation[invalid]
         self.observation, self.signals, self.previous_action = observed, after, action.copy()
@@ -325,7 +325,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         invalid: Bools,
     ) -> Info:
         sim = self.simulation
-        condition = self.truth.conclude(sim.slipped, sim.bumped, self.sensing.true_clearance_m)
+        condition = self.truth.condition(sim.slipped, sim.bumped, self.sensing.true_clearance_m)
         return self._info_now() | {
             "signals": after,
             "progress_m": progress_m,

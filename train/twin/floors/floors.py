@@ -127,7 +127,7 @@ def generate(seed: int, recipe: Recipe | None = None, *, name: str | None = None
                 if 0 < segment.aisle < aisles - 1
             ),
         )
-    return turned(made) if rng.random() < recipe.turned else made
+    return transposed(made) if rng.random() < recipe.turned else made
 
 
 def _strips(
@@ -142,7 +142,7 @@ def _strips(
     return tuple(strips), strips[-1][1]
 
 
-_TURNED: dict[Heading, Heading] = {
+_TRANSPOSED: dict[Heading, Heading] = {
     "east": "north",
     "north": "east",
     "west": "south",
@@ -150,7 +150,7 @@ _TURNED: dict[Heading, Heading] = {
 }
 
 
-def turned(floor: Warehouse) -> Warehouse:
+def transposed(floor: Warehouse) -> Warehouse:
     """With x and y exchanged: aisles that ran east run north."""
     return replace(
         floor,
@@ -165,7 +165,7 @@ def turned(floor: Warehouse) -> Warehouse:
         crossings=tuple(crossing.transposed for crossing in floor.crossings),
         cross_zones=tuple((name, zone.transposed) for name, zone in floor.cross_zones),
         docks=tuple(Dock(dock.name, dock.area.transposed) for dock in floor.docks),
-        one_way=tuple(OneWay(r.area.transposed, _TURNED[r.heading]) for r in floor.one_way),
+        one_way=tuple(OneWay(r.area.transposed, _TRANSPOSED[r.heading]) for r in floor.one_way),
     )
 
 

@@ -76,7 +76,7 @@ class Simulation(Stateful):
         "bumped",
         "slipped",
         "accel",
-        "blown_up",
+        "diverged",
         "controller",
         "_physics",
         "scenery",
@@ -121,7 +121,7 @@ class Simulation(Stateful):
         self.bumped = np.zeros(num_envs, np.bool_)  # in the last control period
         self.accel = np.zeros((num_envs, 3))  # mean over the last half block
         self.slipped = np.zeros(num_envs, np.bool_)  # on a patch, in the last control period
-        self.blown_up = np.zeros(num_envs, np.bool_)
+        self.diverged = np.zeros(num_envs, np.bool_)
         self.base_friction = np.full(num_envs, FLOOR_FRICTION)
         self.left_friction = np.ones(num_envs)
 
@@ -151,7 +151,7 @@ class Simulation(Stateful):
         self.controller.reset(env)
         self.accel[env] = 0.0
         self.time_s[env] = 0.0
-        self.bumped[env] = self.slipped[env] = self.blown_up[env] = False
+        self.bumped[env] = self.slipped[env] = self.diverged[env] = False
 
     def place_robot(self, env: int, x_m: float, y_m: float, yaw_rad: float) -> None:
         """Stand the robot still at a pose."""
@@ -195,7 +195,7 @@ class Simulation(Stateful):
             if slippery.any():
                 self.slipped[icy] |= self._slipping(icy, slippery)
         warnings = np.asarray(self.batch.warning).reshape(self.num_envs, -1)
-        self.blown_up = np.asarray((warnings > 0).any(axis=1), np.bool_)
+        self.diverged = np.asarray((warnings > 0).any(axis=1), np.bool_)
 
     def _run(self, wheels: F64) -> Bools:
         """One block of substeps under wheel speeds (N, S, 2); returns whose bumper was pressed."""
@@ -326,7 +326,7 @@ def _check_times(task: Task, timestep_s: float, substeps: int, blocks: int) -> N
 
 
 def _no_log_file() -> None:
-    """No MUJOCO_LOG.TXT wherever the user happens to stand: blow-ups are counted and reported."""
+    """No MUJOCO_LOG.TXT wherever the user happens to stand: divergence is counted and reported."""
     config = mujoco.MjLogConfig.get()
     if config.logto_file:
         config.logto_file = False

@@ -42,7 +42,7 @@ class Truth(Stateful):
         self.aftermath_s[ids] = 0.0
         self.blocked[ids] = False
 
-    def look(self, pose: F64, plans_m: F64, pallets: F64, ids: Ints) -> None:
+    def note_blocked(self, pose: F64, plans_m: F64, pallets: F64, ids: Ints) -> None:
         """Note whose plan is blocked just ahead, at the start of a step, for `ids`."""
         self.blocked[ids] = False
         gap = np.abs(pallets[ids, :, :2] - pose[ids, None, :2]).max(axis=-1).min(axis=1)
@@ -52,7 +52,7 @@ class Truth(Stateful):
                 pose[with_pallets], plans_m[with_pallets], pallets[with_pallets]
             )
 
-    def conclude(self, slipped: Bools, bumped: Bools, clearance_m: F64) -> NDArray[np.str_]:
+    def condition(self, slipped: Bools, bumped: Bools, clearance_m: F64) -> NDArray[np.str_]:
         """The condition (N,) of the step that ends now."""
         near = bumped | (clearance_m < NEAR_M)
         rank = np.zeros(len(near), np.int64)

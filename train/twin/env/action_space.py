@@ -1,6 +1,6 @@
-"""The two faces of the task's actions: an index into its table, or any command within its reach.
+"""The two action spaces of the task: an index into its table, or any command within its reach.
 
-There is one task. On the continuous face the base gets the very command of the action, while
+There is one task. In the continuous space the base gets the very command of the action, while
 the observation's previous action and the reward's change of action are those of the nearest action
 of the table: what `restock ingest` does to the continuous commands of a log.
 """
@@ -17,10 +17,10 @@ from restock.arrays import F64, Ints
 from restock.errors import ConfigError
 from restock.ingest.task.task import Task, nearest_action
 
-Face = Literal["discrete", "continuous"]
+ActionKind = Literal["discrete", "continuous"]
 
 
-class DiscreteFace:
+class DiscreteActions:
     """`actions` (N,) index the task's actions."""
 
     def __init__(self, task: Task, num_envs: int) -> None:
@@ -34,7 +34,7 @@ class DiscreteFace:
         return action, self._table[action], {}
 
 
-class ContinuousFace:
+class ContinuousActions:
     """`actions` (N, 2): forward speed in m/s and yaw rate in rad/s, clipped to the space.
 
     The space is what the table's actions span. `info["action"]` (N,) is the nearest of them, and
@@ -47,7 +47,7 @@ class ContinuousFace:
         self.space = gymnasium.spaces.Box(table.min(axis=0), table.max(axis=0), dtype=np.float32)
 
     def read(self, actions: NDArray[Any]) -> tuple[Ints, F64, dict[str, NDArray[Any]]]:
-        """As for the discrete face. Raises ConfigError for an action that is not finite."""
+        """As for discrete ones. Raises ConfigError for an action that is not finite."""
         requested = np.asarray(actions, np.float64).reshape(self._num_envs, 2)
         if not np.isfinite(requested).all():
             row = int(np.flatnonzero(~np.isfinite(requested).all(axis=1))[0])
@@ -61,12 +61,14 @@ class ContinuousFace:
         return action, command, {"action": action, "action_residual": residual}
 
 
-def action_face(face: Face, task: Task, num_envs: int) -> DiscreteFace | ContinuousFace:
-    """The face by name. Raises ConfigError for another name."""
-    if face == "discrete":
-        return DiscreteFace(task, num_envs)
-    if face == "continuous":
-        return ContinuousFace(task, num_envs)
+def action_space(
+    kind: ActionKind, task: Task, num_envs: int
+) -> DiscreteActions | ContinuousActions:
+    """The action space by name. Raises ConfigError for another name."""
+    if kind == "discrete":
+        return DiscreteActions(task, num_envs)
+    if kind == "continuous":
+        return ContinuousActions(task, num_envs)
     raise ConfigError(
-        f"unknown action space {face!r}", where="the twin", remedy="discrete, or continuous"
+        f"unknown action space {kind!r}", where="the twin", remedy="discrete, or continuous"
     )

@@ -1,4 +1,4 @@
-"""Two faces of one task: an index into the table, or any command within its reach."""
+"""Two action spaces of one task: an index into the table, or any command within its reach."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
 
 @pytest.mark.parametrize("action", ["discrete", "continuous"])
-def test_each_face_passes_gymnasiums_checker(action: str) -> None:
+def test_each_action_space_passes_gymnasiums_checker(action: str) -> None:
     made = gymnasium.make("restock/Warehouse-v0", render_mode="rgb_array", action=action)
     check_env(made.unwrapped)
 
@@ -110,7 +110,7 @@ def test_an_unknown_face_is_refused() -> None:
         WarehouseVectorEnv(1, action="velocity")
 
 
-def test_state_continues_bit_for_bit_on_the_continuous_face() -> None:
+def test_state_continues_bit_for_bit_in_the_continuous_action_space() -> None:
     def roll(env: WarehouseVectorEnv) -> np.ndarray:
         env.action_space.seed(7)
         return np.array([env.step(env.action_space.sample())[0] for _ in range(25)])
