@@ -43,10 +43,10 @@ with (
     from restock.errors import RestockError
     from restock.ingest.containers.open_recording import open_recording
     from restock.ingest.decoding.cdr import ColumnDecoder
-    from restock.ingest.decoding.channel import Channel
-    from restock.ingest.decoding.columns import MessageBatch, equal, take
+    from restock.ingest.decoding.columns import equal, take
     from restock.ingest.decoding.decoders import decoder_of, type_of
     from restock.ingest.decoding.field_paths import CannotDecode
+    from restock.ingest.decoding.messages import Channel, MessageBatch
     from restock.ingest.decoding.row_by_row import RowDecoder
     from restock.ingest.describe import describe_recording
 

@@ -10,7 +10,7 @@ import zstandard
 
 from restock.errors import RecordingError
 from restock.ingest.containers.discover import ZSTD_MAGIC
-from restock.ingest.decoding.columns import MessageBatch
+from restock.ingest.decoding.messages import MessageBatch
 
 # What decompresses to more than both is taken for an attack (or for an accident).
 PLAUSIBLE_SIZE = 256 << 20

@@ -15,8 +15,8 @@ import zstandard
 from numpy.typing import NDArray
 
 from restock.ingest.containers.mcap_records import PREFIX, Buffer, Malformed, Op, parse, walk
-from restock.ingest.decoding.channel import Channel
 from restock.ingest.decoding.columns import I64, gather
+from restock.ingest.decoding.messages import Channel
 
 # A chunk's uncompressed size is the file's claim: beyond these it is refused, not allocated.
 LARGEST_CHUNK = 4 << 30

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from restock.ingest.containers.mcap_chunk import HEAD_SIZE, Chunk, Definitions
 from restock.ingest.containers.mcap_records import MAGIC, PREFIX, Malformed, Op, parse, walk
-from restock.ingest.decoding.channel import Extra
+from restock.ingest.containers.storage import Extra
 
 FORGET_BYTES = 64 << 20  # read this much, then release it
 # What the survey keeps is bounded, whatever a file is made of.

@@ -18,8 +18,8 @@ from restock.ingest.containers.mcap_contents import FORGET_BYTES, forget, survey
 from restock.ingest.containers.mcap_group import Checks, ChunkReader, batch_of
 from restock.ingest.containers.mcap_records import MAGIC
 from restock.ingest.containers.mcap_salvage import resume
-from restock.ingest.decoding.channel import Channel, Integrity
-from restock.ingest.decoding.columns import MessageBatch
+from restock.ingest.containers.storage import Integrity
+from restock.ingest.decoding.messages import Channel, MessageBatch
 
 GROUP_BYTES = 8 << 20  # of chunks decoded together: enough to amortise numpy's calls
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from restock.ingest.containers import mcap_chunk
 from restock.ingest.containers.mcap_chunk import BadChunk, Chunk, Indexed, Messages, Positions
-from restock.ingest.decoding.channel import Damage, Integrity
-from restock.ingest.decoding.columns import MessageBatch
+from restock.ingest.containers.storage import Damage, Integrity
+from restock.ingest.decoding.messages import MessageBatch
 
 _Part: TypeAlias = tuple[Chunk, int, int]  # a chunk, and where it lies: first byte, bytes
 

@@ -18,8 +18,8 @@ from restock.ingest.containers.discover import METADATA, BagMetadata, recordings
 from restock.ingest.containers.mcap_file import McapFile
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.sqlite_file import SqliteFile
+from restock.ingest.containers.storage import Damage, Storage
 from restock.ingest.containers.topic_reading import Account, LostMessages, TopicInfo
-from restock.ingest.decoding.channel import Damage, Storage
 from restock.ingest.decoding.columns import Ragged, TopicColumns
 from restock.ingest.decoding.decoders import READABLE
 from restock.ingest.decoding.definitions import DEFAULT_DISTRO, refuse_unknown

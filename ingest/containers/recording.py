@@ -16,6 +16,7 @@ from typing import Self
 
 from restock.errors import RecordingError
 from restock.ingest.containers.compression import decompressed
+from restock.ingest.containers.storage import Damage, Extra, Integrity, Storage
 from restock.ingest.containers.topic_reading import (
     Account,
     LostMessages,
@@ -24,10 +25,10 @@ from restock.ingest.containers.topic_reading import (
     TopicReading,
     together,
 )
-from restock.ingest.decoding.channel import Channel, Damage, Extra, Integrity, Storage
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.decoding.decoders import decoder_of, type_of
 from restock.ingest.decoding.field_paths import CannotDecode, Leaf, MessageType
+from restock.ingest.decoding.messages import Channel
 from restock.ingest.decoding.row_by_row import Decoder
 
 

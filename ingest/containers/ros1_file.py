@@ -14,8 +14,8 @@ from rosbags.rosbag1 import Reader, ReaderError
 from rosbags.rosbag1.reader import Chunk, Header, IndexData, RecordType
 
 from restock.errors import RecordingError
-from restock.ingest.decoding.channel import Channel, Damage, Extra, Integrity
-from restock.ingest.decoding.columns import MessageBatch
+from restock.ingest.containers.storage import Damage, Extra, Integrity
+from restock.ingest.decoding.messages import Channel, MessageBatch
 
 # A chunk's size is the file's claim: what decompresses to more than both is refused.
 PLAUSIBLE_SIZE = 64 << 20

@@ -19,8 +19,8 @@ from urllib.parse import quote
 import numpy as np
 
 from restock.errors import RecordingError
-from restock.ingest.decoding.channel import Channel, Damage, Extra, Integrity
-from restock.ingest.decoding.columns import MessageBatch, PendingBatch
+from restock.ingest.containers.storage import Damage, Extra, Integrity
+from restock.ingest.decoding.messages import Channel, MessageBatch, PendingBatch
 
 MAGIC = b"SQLite format 3\x00"
 ROWS_PER_FETCH = 1000

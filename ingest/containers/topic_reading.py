@@ -16,12 +16,11 @@ from restock.ingest.decoding.columns import (
     FieldColumn,
     GrowingArray,
     GrowingRagged,
-    MessageBatch,
-    PendingBatch,
     TopicColumns,
     growing,
     take,
 )
+from restock.ingest.decoding.messages import MessageBatch, PendingBatch
 from restock.ingest.decoding.row_by_row import Decoded
 
 SMALL_ROWS = 1024  # batches of fewer messages are put together, up to

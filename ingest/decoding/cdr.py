@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from restock.ingest.decoding.cdr_compile import compile_plan
 from restock.ingest.decoding.cdr_frame import TOO_LONG, BadRows, Columns, Frame, Order
-from restock.ingest.decoding.columns import FieldColumn, MessageBatch, join, take
+from restock.ingest.decoding.columns import FieldColumn, join, take
 from restock.ingest.decoding.definitions import RosType
 from restock.ingest.decoding.field_paths import Leaf
+from restock.ingest.decoding.messages import MessageBatch
 from restock.ingest.decoding.row_by_row import Decoded, RowDecoder
 
 HEADER = 4  # bytes of the encapsulation header

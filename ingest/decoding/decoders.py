@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from restock.ingest.decoding.cdr import ColumnDecoder
-from restock.ingest.decoding.channel import Channel
 from restock.ingest.decoding.definitions import RosType, message_type
 from restock.ingest.decoding.field_paths import CannotDecode, Leaf, MessageType
 from restock.ingest.decoding.json_messages import JsonParser, JsonType, Sample
+from restock.ingest.decoding.messages import Channel
 from restock.ingest.decoding.row_by_row import Decoder, ParsedDecoder
 
 READABLE = ("cdr", "ros1", "json", "protobuf")

@@ -20,8 +20,8 @@ from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
 from restock.errors import RecordingError
-from restock.ingest.decoding.channel import Channel
 from restock.ingest.decoding.field_paths import DTYPES, CannotDecode, FieldType, Many, MessageType
+from restock.ingest.decoding.messages import Channel
 
 # The IDL parser's time is exponential in how deep these nest; rosidl writes none of either.
 _QUOTED = re.compile(r'"(?:\\.|[^"\\])*(?:"|\Z)|//[^\n]*|/\*.*?(?:\*/|\Z)', re.DOTALL)

@@ -18,9 +18,10 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_typestore
 from rosbags.typesys.base import normalize_fieldname
 
-from restock.ingest.decoding.columns import FieldColumn, MessageBatch, Ragged, join, offsets_of
+from restock.ingest.decoding.columns import FieldColumn, Ragged, join, offsets_of
 from restock.ingest.decoding.definitions import RosType
 from restock.ingest.decoding.field_paths import DTYPES, CannotDecode, FieldType, Leaf
+from restock.ingest.decoding.messages import MessageBatch
 
 BYTES_AT_ONCE = 1 << 20  # of payloads that are parsed, and so objects, at the same time
 

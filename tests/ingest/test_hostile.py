@@ -21,9 +21,9 @@ from support.bag_samples import write_bag, write_mcap
 from restock.cli import main
 from restock.errors import RecordingError, visible
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.decoding.channel import Channel
 from restock.ingest.decoding.definitions import message_type
 from restock.ingest.decoding.field_paths import CannotDecode
+from restock.ingest.decoding.messages import Channel
 
 # -- sqlite: programs in place of tables ----------------------------------------------------------
 

@@ -1,8 +1,4 @@
-"""What every container of messages offers: the seam between file formats and decoding.
-
-Names come out of files, and go to terminals, tables and reports: control characters in them are
-written out (`visible`) where they come in.
-"""
+"""What every container of messages offers: the seam between file formats and recordings."""
 
 from __future__ import annotations
 
@@ -11,25 +7,9 @@ from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
 from restock.errors import visible
-from restock.ingest.decoding.columns import MessageBatch
+from restock.ingest.decoding.messages import Channel, MessageBatch
 
 Integrity = Literal["verified", "unverified", "damaged"]
-
-
-@dataclass(frozen=True)
-class Channel:
-    """One stream of messages of one type in one file."""
-
-    id: int
-    topic: str
-    type: str  # "nav_msgs/msg/Odometry"
-    encoding: str  # of the messages: "cdr", "json", "protobuf", "ros1", …
-    definition_format: str = ""  # "ros2msg", "ros2idl", "ros1msg", "jsonschema", "protobuf" or ""
-    definition: bytes = b""
-
-    def __post_init__(self) -> None:
-        for name in ("topic", "type", "encoding", "definition_format"):
-            object.__setattr__(self, name, visible(getattr(self, name)))
 
 
 @dataclass

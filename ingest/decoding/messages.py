@@ -1,0 +1,104 @@
+"""Serialised messages, as containers hand them to decoders: channels, and batches of payloads.
+
+Names come out of files, and go to terminals, tables and reports: control characters in them are
+written out (`visible`) where they come in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.errors import visible
+from restock.ingest.decoding.columns import I64, offsets_of
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One stream of messages of one type in one file."""
+
+    id: int
+    topic: str
+    type: str  # "nav_msgs/msg/Odometry"
+    encoding: str  # of the messages: "cdr", "json", "protobuf", "ros1", …
+    definition_format: str = ""  # "ros2msg", "ros2idl", "ros1msg", "jsonschema", "protobuf" or ""
+    definition: bytes = b""
+
+    def __post_init__(self) -> None:
+        for name in ("topic", "type", "encoding", "definition_format"):
+            object.__setattr__(self, name, visible(getattr(self, name)))
+
+
+@dataclass(frozen=True)
+class MessageBatch:
+    """Serialised messages of one channel: slices of one buffer, in file order."""
+
+    buffer: NDArray[np.uint8]
+    start: I64  # (N,) first byte of each payload in `buffer`
+    stop: I64  # (N,) one past its last
+    log_time_ns: I64  # (N,)
+    publish_time_ns: I64  # (N,)
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    def select(self, rows: NDArray[np.intp]) -> MessageBatch:
+        """These rows, in the same buffer."""
+        return MessageBatch(
+            self.buffer,
+            self.start[rows],
+            self.stop[rows],
+            self.log_time_ns[rows],
+            self.publish_time_ns[rows],
+        )
+
+    @property
+    def size_bytes(self) -> int:
+        """Of all payloads."""
+        return int((self.stop - self.start).sum())
+
+    def payloads(self) -> list[bytes]:
+        """Each message's bytes."""
+        view = self.buffer.data
+        bounds = zip(self.start.tolist(), self.stop.tolist(), strict=True)
+        return [bytes(view[start:stop]) for start, stop in bounds]
+
+    @classmethod
+    def of(cls, payloads: Sequence[bytes], log_time_ns: Any, publish_time_ns: Any) -> MessageBatch:
+        """Payloads laid one after the other."""
+        offsets = offsets_of(np.fromiter(map(len, payloads), np.int64, len(payloads)))
+        return cls(
+            np.frombuffer(b"".join(payloads), np.uint8),
+            offsets[:-1],
+            offsets[1:],
+            np.asarray(log_time_ns, np.int64),
+            np.asarray(publish_time_ns, np.int64),
+        )
+
+
+class PendingBatch:
+    """Messages of one channel that wait for more of them, to be decoded together."""
+
+    def __init__(self) -> None:
+        self._payloads = list[bytes]()
+        self._log_time_ns, self._publish_time_ns = list[I64](), list[I64]()
+        self.size_bytes = 0
+
+    def __len__(self) -> int:
+        return len(self._payloads)
+
+    def add(self, payloads: Sequence[bytes], log_time_ns: I64, publish_time_ns: I64) -> None:
+        """Some more, in file order."""
+        self._payloads += payloads
+        self._log_time_ns.append(log_time_ns)
+        self._publish_time_ns.append(publish_time_ns)
+        self.size_bytes += sum(map(len, payloads))
+
+    def batch(self) -> MessageBatch:
+        """All of them."""
+        log, publish = np.concatenate(self._log_time_ns), np.concatenate(self._publish_time_ns)
+        return MessageBatch.of(self._payloads, log, publish)
