@@ -11,11 +11,11 @@ if TYPE_CHECKING:
     from restock.train.twin.calibration.fit import fit as fit
     from restock.train.twin.calibration.fit_solver import position_gap_m as position_gap_m
     from restock.train.twin.calibration.fitted_twin import write_fit as write_fit
-    from restock.train.twin.calibration.gap import GapConfig as GapConfig
     from restock.train.twin.calibration.gap import measure_gap as measure_gap
     from restock.train.twin.calibration.logged_steps import logged_steps as logged_steps
     from restock.train.twin.calibration.open_loop import replay_segments as replay_segments
     from restock.train.twin.calibration.segments import log_segments as log_segments
+    from restock.train.twin.calibration.twin_gap import GapConfig as GapConfig
     from restock.train.twin.calibration.twin_gap import write_gap as write_gap
     from restock.train.twin.env.policies import PlannerFollower as PlannerFollower
     from restock.train.twin.env.policies import RandomPolicy as RandomPolicy
@@ -36,11 +36,11 @@ else:
             "restock.train.twin.calibration.fit": ["FitConfig", "fit"],
             "restock.train.twin.calibration.fit_solver": ["position_gap_m"],
             "restock.train.twin.calibration.fitted_twin": ["write_fit"],
-            "restock.train.twin.calibration.gap": ["GapConfig", "measure_gap"],
+            "restock.train.twin.calibration.gap": ["measure_gap"],
             "restock.train.twin.calibration.logged_steps": ["logged_steps"],
             "restock.train.twin.calibration.open_loop": ["replay_segments"],
             "restock.train.twin.calibration.segments": ["log_segments"],
-            "restock.train.twin.calibration.twin_gap": ["write_gap"],
+            "restock.train.twin.calibration.twin_gap": ["GapConfig", "write_gap"],
             "restock.train.twin.env.policies": ["PlannerFollower", "RandomPolicy"],
             "restock.train.twin.env.single_env": ["WarehouseEnv"],
             "restock.train.twin.env.vector_env": ["WarehouseVectorEnv"],

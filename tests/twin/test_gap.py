@@ -23,7 +23,7 @@ from restock.stats import (
     NOT_KNOWN,
     ConfidenceInterval,
 )
-from restock.train.twin.calibration.gap import AFTER, BEFORE, GapConfig, measure_gap
+from restock.train.twin.calibration.gap import AFTER, BEFORE, measure_gap
 from restock.train.twin.calibration.logged_steps import (
     logged_steps,
     observations,
@@ -38,6 +38,7 @@ from restock.train.twin.calibration.twin_gap import (
     UNDECIDED,
     UNKNOWN,
     UNTRUSTED,
+    GapConfig,
     TrustLimits,
     TwinGap,
     read_gap,
@@ -172,9 +173,14 @@ def test_logged_rewards_are_the_sum_of_their_terms(stored: Path) -> None:
         steps = logged_steps(store)
         rows = np.arange(0, len(steps), 5)
         found = one_step(
-            store, steps, rebuild_plans(steps), rows, {AFTER: TRUE},
-            warehouse=default_warehouse(), timestep_s=0.01, nthread=1,
-        )  # fmt: skip
+            store,
+            steps,
+            rebuild_plans(steps),
+            rows,
+            {AFTER: TRUE},
+            default_warehouse(),
+            GapConfig(),
+        )
     assert found.unexplained == 0
     assert found.valid.all()
     np.testing.assert_allclose(sum(found.logged.terms.values()), found.logged.reward, atol=1e-3)

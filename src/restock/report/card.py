@@ -93,7 +93,7 @@ _TABLES = (
         },
     ),
     (
-        "Strata: asked for and drawn",
+        "Strata: intended and drawn",
         "strata",
         {
             "source": "source",

@@ -7,7 +7,7 @@ from typing import Any
 
 from restock.report.blocks import span, words
 from restock.report.facts import Facts, mean_success
-from restock.report.sections import critic, learning, provenance, sampled, success, where
+from restock.report.sections import critic, floor_section, learning, provenance, sampled, success
 from restock.report.twin_gap import run_section
 
 
@@ -18,7 +18,7 @@ def page(facts: Facts) -> dict[str, Any]:
         sampled(facts),
         learning(facts),
         critic(facts),
-        where(facts),
+        floor_section(facts),
         run_section(facts),
         provenance(facts),
     ]

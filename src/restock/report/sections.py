@@ -97,7 +97,7 @@ def sampled(facts: Facts) -> Section:
     figures = []
     bars = _share_bars(facts)
     if bars:
-        title = "Logs: what was there, what was asked for, what was drawn"
+        title = "Logs: available, intended and drawn"
         figures.append(Figure(charts.shares(bars), title))
     if facts.ages:
         figures.append(
@@ -293,7 +293,7 @@ def critic(facts: Facts) -> Section | None:
     )
 
 
-def where(facts: Facts) -> Section | None:
+def floor_section(facts: Facts) -> Section | None:
     """The map: where the logs have been, and where the agent failed."""
     layout = facts.floor
     if layout is None:

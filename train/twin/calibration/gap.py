@@ -10,17 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
 import numpy as np
-from msgspec import Meta
 from numpy.typing import NDArray
 
 from restock.errors import StoreError
 from restock.replay.store.store import Store
 from restock.stats import NOT_KNOWN, ConfidenceInterval, clustered_quantiles, clustered_ratio
-from restock.toml import Checked
 from restock.train.twin.calibration.logged_steps import NOMINAL, LoggedSteps, logged_steps
 from restock.train.twin.calibration.one_step import (
     AGREES,
@@ -36,6 +34,7 @@ from restock.train.twin.calibration.path_gap import (
     path_gap,
 )
 from restock.train.twin.calibration.twin_gap import (
+    GapConfig,
     Rows,
     TrustLimits,
     TwinGap,
@@ -50,25 +49,6 @@ Ints = NDArray[np.int64]
 
 BEFORE, AFTER, PERSISTENCE = "nominal", "calibrated", "persistence"
 _FLOOR_ROWS = 200  # nominal rows whose lidar says whether the floor is the twin's
-
-
-class GapConfig(Checked, frozen=True):
-    """How the gap is measured."""
-
-    horizons_s: tuple[Annotated[float, Meta(gt=0)], ...] = (1.0, 3.0, 6.0)
-    max_segments: Annotated[int, Meta(ge=1)] = 400  # a condition and horizon; steps: 5 times that
-    limits: TrustLimits = TrustLimits()
-    seed: Annotated[int, Meta(ge=0)] = 0
-    timestep_s: Annotated[float, Meta(gt=0)] = 0.01
-    nthread: Annotated[int, Meta(ge=1)] = 1
-
-    def check(self) -> None:
-        """Raises ValueError where trust is judged at a horizon that is not driven."""
-        if self.limits.horizon_s not in self.horizons_s:
-            raise ValueError(
-                f"the horizon that trust is judged at, {self.limits.horizon_s:g} s, is not driven:"
-                " make it one of the horizons"
-            )
 
 
 def measure_gap(
@@ -104,23 +84,14 @@ def measure_gap(
     paths = []
     for horizon in config.horizons_s:
         report(f"driving segments of {horizon:g} s again")
-        paths.append(
-            path_gap(
-                steps, horizon, twins, noise,
-                max_segments=config.max_segments, seed=config.seed,
-                timestep_s=config.timestep_s, nthread=config.nthread,
-            )
-        )  # fmt: skip
+        paths.append(path_gap(steps, horizon, twins, noise, config))
     report("one step from each logged state")
     rng = np.random.default_rng([config.seed, 2])
     difference = _floor_difference(store, steps, warehouse, rng)
     plans = rebuild_plans(steps)
     rows, chosen = _steps_to_compare(steps, 5 * config.max_segments, rng)
-    stepped = one_step(
-        store, steps, plans, rows, twins,
-        warehouse=None if difference > AGREES else warehouse,
-        timestep_s=config.timestep_s, nthread=config.nthread,
-    )  # fmt: skip
+    known_floor = None if difference > AGREES else warehouse
+    stepped = one_step(store, steps, plans, rows, twins, known_floor, config)
     path_rows = list(_path_rows(paths, rng))
     observation_rows = list(_observation_rows(steps, stepped, chosen, rng))
     reward_rows, ratios = _reward_rows(steps, stepped, chosen, rng)

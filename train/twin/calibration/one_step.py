@@ -39,6 +39,7 @@ from restock.train.twin.calibration.open_loop import (
     see_sectors,
 )
 from restock.train.twin.calibration.segments import POSE
+from restock.train.twin.calibration.twin_gap import GapConfig
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.simulation import Simulation
@@ -86,10 +87,8 @@ def one_step(
     plans: PlanMemory,
     rows: Ints,
     twins: dict[str, Perturbation],
-    *,
     warehouse: Warehouse | None,
-    timestep_s: float,
-    nthread: int,
+    config: GapConfig,
 ) -> OneStep:
     """Compare `rows` (n,), which must be followed by a known step.
 
@@ -116,7 +115,7 @@ def one_step(
     start = OpenLoopStart(pose, now, steps.commands(rows, 0, 1), past=steps.commands(rows, PAST, 0))
     driven = drive_open_loop(
         task, start, list(twins.values()),
-        warehouse=warehouse, timestep_s=timestep_s, nthread=nthread,
+        warehouse=warehouse, timestep_s=config.timestep_s, nthread=config.nthread,
     )  # fmt: skip
     results = {}
     for number, name in enumerate(twins):
@@ -199,7 +198,7 @@ class PlanMemory:
         The logged ones, and what the rebuilt plan says of the difference between the two poses:
         where that is small, so is what was not rebuilt exactly.
         """
-        after = {name: column[rows] for name, column in steps.after.items()}
+        after = rows_of(steps.after, rows)
         moved = self._view(self.next_plan[rows], pose)
         logged = self._view(self.next_plan[rows], after)
         return {name: after[name] + moved[name] - logged[name] for name in ROUTE}
@@ -207,7 +206,7 @@ class PlanMemory:
     def progress_m(self, steps: LoggedSteps, rows: Ints, pose: Signals) -> F64:
         """How much shorter the plan in force at t would have become, had it ended at `pose`."""
         plan = self.routing.plan[rows]
-        now, after = ({n: c[rows] for n, c in side.items()} for side in (steps.now, steps.after))
+        now, after = rows_of(steps.now, rows), rows_of(steps.after, rows)
         moved = self.routing.progress_m(self.task, plan, now, pose)
         logged = self.routing.progress_m(self.task, plan, now, after)
         return np.asarray(steps.progress_m[rows] + moved - logged, np.float64)

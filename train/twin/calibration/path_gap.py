@@ -18,6 +18,7 @@ from restock.ingest.task.signals import wrap_angle
 from restock.train.twin.calibration.logged_steps import NOMINAL, LoggedSteps
 from restock.train.twin.calibration.open_loop import lay_onto, replay_segments
 from restock.train.twin.calibration.segments import LoggedSegments, log_segments
+from restock.train.twin.calibration.twin_gap import GapConfig
 from restock.train.twin.physics.model import body_velocity
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.sensing import DRIFT_TIME_S
@@ -66,13 +67,9 @@ def path_gap(
     horizon_s: float,
     twins: Mapping[str, Perturbation],
     noise: SensorNoise,
-    *,
-    max_segments: int,
-    seed: int,
-    timestep_s: float,
-    nthread: int,
+    config: GapConfig,
 ) -> PathGap:
-    """Replay segments of `horizon_s`, which overlap by half, at most `max_segments` each.
+    """Replay segments of `horizon_s`, which overlap by half.
 
     A segment counts for every condition that holds at any of its steps; for `nominal` where none
     does. A gap of a pose is at the segment's end, of a signal its root mean square on the way.
@@ -83,12 +80,12 @@ def path_gap(
     period = steps.task.control_period_s
     stride_s = max(round(horizon_s / 2 / period), 1) * period
     cut = log_segments(steps, horizon_s, stride_s=stride_s)
-    rng = np.random.default_rng([seed, cut.horizon_steps])
-    chosen = _choose(steps, cut, max_segments, rng)
+    rng = np.random.default_rng([config.seed, cut.horizon_steps])
+    chosen = _choose(steps, cut, config.max_segments, rng)
     used = np.flatnonzero(np.any(list(chosen.values()), axis=0))
-    rng = np.random.default_rng([seed, cut.horizon_steps, 1])
+    rng = np.random.default_rng([config.seed, cut.horizon_steps, 1])
     parts = [
-        _gaps(cut.take(used[begin : begin + _AT_ONCE]), twins, noise, rng, timestep_s, nthread)
+        _gaps(cut.take(used[begin : begin + _AT_ONCE]), twins, noise, rng, config)
         for begin in range(0, len(used), _AT_ONCE)
     ]
     return PathGap(
@@ -156,11 +153,12 @@ def _gaps(
     twins: Mapping[str, Perturbation],
     noise: SensorNoise,
     rng: np.random.Generator,
-    timestep_s: float,
-    nthread: int,
+    config: GapConfig,
 ) -> dict[tuple[str, str], F64]:
     """(source, quantity) -> (S,) of these segments."""
-    replayed = replay_segments(part, list(twins.values()), timestep_s=timestep_s, nthread=nthread)
+    replayed = replay_segments(
+        part, list(twins.values()), timestep_s=config.timestep_s, nthread=config.nthread
+    )
     logged = {name: part.signals[name] for name in SIGNALS}
     fresh = part.pose_fresh[:, -1]
     gaps = {}

@@ -1,4 +1,4 @@
-"""A measured gap: rows, a verdict of each condition, and the folder that holds them.
+"""A gap: how it is measured, its rows, a verdict on each condition, and the folder of them.
 
 The folder is `gap.json`, and the rows as Parquet for any tool that reads it.
 
@@ -62,6 +62,25 @@ class TrustLimits(Checked, frozen=True):
     reward_ratio: Annotated[float, Meta(ge=0)] = 1.0  # one-step reward gap over the reward's spread
     segments: Annotated[int, Meta(ge=0)] = 20  # fewer say nothing
     episodes: Annotated[int, Meta(ge=0)] = 5
+
+
+class GapConfig(Checked, frozen=True):
+    """How the gap is measured."""
+
+    horizons_s: tuple[Annotated[float, Meta(gt=0)], ...] = (1.0, 3.0, 6.0)
+    max_segments: Annotated[int, Meta(ge=1)] = 400  # a condition and horizon; steps: 5 times that
+    limits: TrustLimits = TrustLimits()
+    seed: Annotated[int, Meta(ge=0)] = 0
+    timestep_s: Annotated[float, Meta(gt=0)] = 0.01
+    nthread: Annotated[int, Meta(ge=1)] = 1
+
+    def check(self) -> None:
+        """Raises ValueError where trust is judged at a horizon that is not driven."""
+        if self.limits.horizon_s not in self.horizons_s:
+            raise ValueError(
+                f"the horizon that trust is judged at, {self.limits.horizon_s:g} s, is not driven:"
+                " make it one of the horizons"
+            )
 
 
 @dataclass(frozen=True)

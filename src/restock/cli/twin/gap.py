@@ -78,8 +78,8 @@ class GapCommand:
         from restock.replay.store.store import Store
         from restock.report import write_gap_page
         from restock.toml import typed
-        from restock.train.twin.calibration.gap import GapConfig, measure_gap
-        from restock.train.twin.calibration.twin_gap import check_place, write_gap
+        from restock.train.twin.calibration.gap import measure_gap
+        from restock.train.twin.calibration.twin_gap import GapConfig, check_place, write_gap
         from restock.train.twin.physics.perturbation import load_perturbation
 
         if self.fit and self.perturbation is not None:
