@@ -88,5 +88,5 @@ def _date(stamp_ns: int) -> str:
     try:
         moment = datetime.fromtimestamp(stamp_ns // NANOSECONDS, UTC)
     except (OverflowError, ValueError, OSError):
-        return f"{stamp_ns} ns, which is no date"
+        return f"{stamp_ns} ns, which is not a date"
     return moment.isoformat().replace("+00:00", "Z")

@@ -102,7 +102,7 @@ class CustomSignal(Checked, frozen=True):
         except PathProblem as problem:
             return str(problem)
         if self.reduce == "yaw" and "string" in kinds:
-            return "is no quaternion"
+            return "is not a quaternion"
         return None
 
 

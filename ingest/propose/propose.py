@@ -256,7 +256,7 @@ def _input_lines(role: str, fitting: list[tuple[TopicInfo, Kind]], seconds: floa
     fields = ", ".join(f'{key} = "{path}"' for key, path in kind.fields.items())
     lines = [
         *(
-            ["# No command was recorded: what the robot did stands for what it was told."]
+            ["# No command was recorded: the measured motion is used in place of commands."]
             if motion
             else []
         ),

@@ -160,8 +160,8 @@ class Custom:
     def notes(self) -> list[str]:
         """What of them could not be used, in words."""
         return [
-            f"signals.{name}: {len(column.unread):,} of {len(column.values):,} messages say what"
-            f" is no number to it, such as {shorten(column.unread[0], 60)!r}"
+            f"signals.{name}: {len(column.unread):,} of {len(column.values):,} messages have"
+            f" a value that is not a number, such as {shorten(column.unread[0], 60)!r}"
             for name, column in self.columns.items()
             if column.unread
         ]

@@ -233,7 +233,7 @@ def _endpoint(where: str) -> str:
     endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
     if endpoint and not re.match(r"https?://[^/]", endpoint):
         raise StoreError(
-            f"AWS_ENDPOINT_URL is {endpoint!r}, which is no address of a server",
+            f"AWS_ENDPOINT_URL is {endpoint!r}, which is not the address of a server",
             where=where,
             remedy="write it like http://127.0.0.1:9000",
         )

@@ -107,7 +107,7 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
         priority, timing = condition.priority, condition.timing
     else:
         raise ConfigError(
-            f"stratum {rule.name!r} is no condition of this store and has no `where`",
+            f"stratum {rule.name!r} is not a condition of this store and has no `where`",
             where="mixture",
             remedy=f"the store knows {', '.join([NOMINAL, *sorted(known)])}",
         )

@@ -29,6 +29,7 @@ import duckdb
 
 from restock.errors import ConfigError
 from restock.replay.store.query import interruptible, values
+from restock.toml import read_toml
 
 Severity = Literal["error", "warning", "info"]
 Status = Literal["pass", "fail", "warn", "info", "skipped"]
@@ -109,14 +110,11 @@ def load_thresholds(file: str | Path | None = None) -> dict[str, dict[str, float
     thresholds: dict[str, dict[str, float | str]] = tomllib.loads(shipped)
     if file is None:
         return thresholds
-    try:
-        given = tomllib.loads(Path(file).read_text(encoding="utf-8"))
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot be read: {error}", where=str(file)) from error
+    given = read_toml(Path(file))
     for name, table in given.items():
         if not isinstance(table, dict):
             raise ConfigError(
-                f"{name!r} is no table", where=str(file), remedy="write [audit] tables of values"
+                f"{name!r} is not a table", where=str(file), remedy="write [audit] tables of values"
             )
         thresholds[name] = {**thresholds.get(name, {}), **table}
     return thresholds

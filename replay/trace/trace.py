@@ -78,7 +78,7 @@ def audited_rows(run: str | Path, limit: int = 20) -> list[dict[str, Any]]:
     """The audited rows of a run with the largest TD errors, each with its name for `trace_row`."""
     if not (Path(run) / RUN_CONFIG).is_file():
         raise RunError(
-            "is no run: only of a run can rows be listed",
+            "is not a run: rows can be listed for a run only",
             where=str(run),
             remedy="name the ROW: a row number of a panel, a transition id of a store",
         )

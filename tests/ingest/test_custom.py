@@ -110,7 +110,9 @@ def test_texts_that_are_no_number_are_counted_and_shown():
     said = np.array(["24.5", "n/a", "n/a"], object)
     steps = steps_with(signal("s", "t"), {"t": said}, [0.0, 1.0, 2.0])
     assert steps.custom.table["s"].to_pylist()[:12] == [24.5] * 5 + [None] * 7
-    assert steps.notes == ["signals.s: 2 of 3 messages say what is no number to it, such as 'n/a'"]
+    assert steps.notes == [
+        "signals.s: 2 of 3 messages have a value that is not a number, such as 'n/a'"
+    ]
     (row,) = steps.custom.rows()
     assert (row["messages"], row["found"], row["unread"], row["steps"]) == (3, 1, 2, 5)
 

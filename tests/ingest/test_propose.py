@@ -103,7 +103,7 @@ def test_without_commands_what_the_robot_did_stands_for_them(tmp_path, capsys):
 
     bag = write_bag(Uncommanded(), tmp_path / "bag")
     file = proposed(bag, tmp_path, capsys)
-    assert "# No command was recorded: what the robot did stands" in file.read_text()
+    assert "# No command was recorded: the measured motion is used" in file.read_text()
     profile = load_profile(file)
     assert profile.inputs.command.topic == "/odom"
     outcome = check(file, bag, capsys)

@@ -461,11 +461,13 @@ def test_wrong_files_of_audits_and_thresholds_are_refused(tmp_path: Path) -> Non
     with pytest.raises(ConfigError, match="no audits"):
         load_audits(tmp_path)
     (tmp_path / "t.toml").write_text("rare_condition = 3")
-    with pytest.raises(ConfigError, match="no table"):
+    with pytest.raises(ConfigError, match="not a table"):
         load_thresholds(tmp_path / "t.toml")
     (tmp_path / "t.toml").write_text("[rare")
-    with pytest.raises(ConfigError, match="cannot be read"):
+    with pytest.raises(ConfigError, match="is not TOML"):
         load_thresholds(tmp_path / "t.toml")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_thresholds(tmp_path / "missing.toml")
 
 
 def test_thresholds_are_those_the_audits_use() -> None:

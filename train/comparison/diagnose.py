@@ -334,7 +334,7 @@ def _experiment(cause: Cause, windows: Sequence[Window], limits: DiagnosisLimits
         "BOTH": f"first change the target rule alone, then the rows of {which} alone: one clock"
         " at a time",
         "DIVERGENCE": "train again with a lower optimizer.learning_rate, then with a slower"
-        " target: values above what rewards can add up to, or that say nothing, are nobody's data",
+        " target: no rows explain values above the sum of rewards, or without information",
         "UNDETERMINED": "run longer, or more seeds: the last windows or the runs do not agree",
     }[cause]
 

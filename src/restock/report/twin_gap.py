@@ -105,7 +105,7 @@ def headline(gap: TwinGap) -> str:
     if names:
         return f"Do not trust the twin in: {names}"
     if all(item.verdict == UNKNOWN for item in gap.verdicts):
-        return "Too little could be driven again to judge the twin in any condition"
+        return "Too little could be driven again to assess the twin in any condition"
     if all(item.verdict == TRUSTED for item in gap.verdicts):
         return "The twin is within its limits in every logged condition"
     return "No condition is shown to be beyond the limits; not all are shown to be within"
