@@ -121,14 +121,42 @@ def align(
             "none of the profile's topics has a header stamp",
             remedy='set [clock] alignment = "log_time" in the profile',
         )
+    jump_ns = round(clock.jump_s * NS)
     reference = max(delay, key=lambda name: (len(delay[name]), name))
-    edges = jumps(topics[reference].log_time_ns, delay[reference], round(clock.jump_s * NS))
+    edges = jumps(topics[reference].log_time_ns, delay[reference], jump_ns)
     report.jumps = len(edges)
-    segments = []
-    for index in range(len(edges) + 1):
-        segments.append(
-            _segment(topics, delay, reference, edges, index, clock, latched, transforms, report)
-        )
+
+    def segment(index: int) -> ClockSegment:
+        inside = {
+            name: np.flatnonzero(np.searchsorted(edges, columns.log_time_ns, "right") == index)
+            for name, columns in topics.items()
+        }
+        middle = median(delay[reference][inside[reference]])
+        medians = [median(delay[name][inside[name]]) for name in delay if len(inside[name])]
+        # Latency only ever adds to the clocks' offset, so the least delayed topic shows it best.
+        offset = min(median for median in medians if abs(median - middle) <= jump_ns)
+        samples = {}
+        for name, rows in inside.items():
+            columns = topics[name]
+            log_time = columns.log_time_ns[rows]
+            if STAMP not in columns.fields:
+                samples[name] = _ordered(log_time - offset, rows)
+                continue
+            stamp = np.asarray(columns.fields[STAMP], np.int64)[rows]
+            if name in transforms:
+                ahead = stamp - (log_time - offset) > AHEAD_NS
+                stamp = np.where(ahead, log_time - offset, stamp)
+            off = np.abs(log_time - stamp - middle) > jump_ns
+            if off.any() and name in latched:
+                report.restamped[name] = report.restamped.get(name, 0) + int(off.sum())
+                stamp = np.where(off, log_time - offset, stamp)
+            elif off.any():
+                report.off_clock[name] = report.off_clock.get(name, 0) + int(off.sum())
+                stamp, rows = stamp[~off], rows[~off]
+            samples[name] = _ordered(stamp, rows)
+        return ClockSegment(samples, offset)
+
+    segments = [segment(index) for index in range(len(edges) + 1)]
     report.offset_ns = segments[0].offset_ns
     low, high = np.percentile(delay[reference] - median(delay[reference]), [1, 99])
     report.spread_ns = int(high - low)
@@ -161,50 +189,8 @@ def _ordered(stamp_ns: I64, row: NDArray[np.intp]) -> Samples:
     return Samples(np.asarray(stamp_ns, np.int64)[order], row[order])
 
 
-def _segment(
-    topics: Mapping[str, TopicColumns],
-    delay: Mapping[str, I64],
-    reference: str,
-    edges: I64,
-    index: int,
-    clock: Clock,
-    latched: frozenset[str],
-    transforms: frozenset[str],
-    report: ClockReport,
-) -> ClockSegment:
-    inside = {
-        name: np.flatnonzero(np.searchsorted(edges, columns.log_time_ns, "right") == index)
-        for name, columns in topics.items()
-    }
-    jump_ns = round(clock.jump_s * NS)
-    middle = median(delay[reference][inside[reference]])
-    medians = [median(delay[name][inside[name]]) for name in delay if len(inside[name])]
-    # Latency only ever adds to the clocks' offset, so the least delayed topic shows it best.
-    offset = min(median for median in medians if abs(median - middle) <= jump_ns)
-    samples = {}
-    for name, rows in inside.items():
-        columns = topics[name]
-        log_time = columns.log_time_ns[rows]
-        if STAMP not in columns.fields:
-            samples[name] = _ordered(log_time - offset, rows)
-            continue
-        stamp = np.asarray(columns.fields[STAMP], np.int64)[rows]
-        if name in transforms:
-            ahead = stamp - (log_time - offset) > AHEAD_NS
-            stamp = np.where(ahead, log_time - offset, stamp)
-        off = np.abs(log_time - stamp - middle) > jump_ns
-        if off.any() and name in latched:
-            report.restamped[name] = report.restamped.get(name, 0) + int(off.sum())
-            stamp = np.where(off, log_time - offset, stamp)
-        elif off.any():
-            report.off_clock[name] = report.off_clock.get(name, 0) + int(off.sum())
-            stamp, rows = stamp[~off], rows[~off]
-        samples[name] = _ordered(stamp, rows)
-    return ClockSegment(samples, offset)
-
-
 def _carry_latched(segments: list[ClockSegment], latched: frozenset[str]) -> None:
-    """What a latched topic said last still holds at the start of the next segment."""
+    """The latest message of a latched topic still holds at the start of the next segment."""
     for index in range(1, len(segments)):
         topics = dict(segments[index].topics)
         start = min(int(samples.stamp_ns[0]) for samples in topics.values() if len(samples.row))
@@ -214,15 +200,3 @@ def _carry_latched(segments: list[ClockSegment], latched: frozenset[str]) -> Non
                 stamp = np.concatenate([[start], now.stamp_ns]).astype(np.int64)
                 topics[name] = Samples(stamp, np.concatenate([before.row[-1:], now.row]))
         segments[index] = ClockSegment(topics, segments[index].offset_ns)
-
-
-__all__ = [
-    "NS",
-    "STAMP",
-    "ClockReport",
-    "ClockSegment",
-    "LatestMessages",
-    "Samples",
-    "align",
-    "ticks_of",
-]

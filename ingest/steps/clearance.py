@@ -100,6 +100,3 @@ class _ScanReducer:
                 remedy="mend `inputs.scan.fields` in the profile",
             )
         return np.asarray(column, np.float64)
-
-
-__all__ = ["BEAMS", "SECTORS", "scan_reduction"]

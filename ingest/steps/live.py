@@ -214,6 +214,3 @@ def _member(value: Any, path: str) -> Any:
     for name in path.split("."):
         value = getattr(value, name)
     return value
-
-
-__all__ = ["LiveObserver", "Observed"]

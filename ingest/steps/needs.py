@@ -131,9 +131,12 @@ def input_problems(
     needed: dict[str, list[str]] = {}
     wrong: dict[str, list[str]] = {}
     fields: list[str] = []
-    for name, source in profile.inputs.items():
+    sources: dict[str, Input | CustomSignal] = dict(profile.inputs.items())
+    sources |= {f"signals.{name}": signal for name, signal in profile.signals.items()}
+    for name, source in sources.items():
         topic = available.get(source.topic)
-        if (topic is None or not topic.expected) and not source.optional:
+        required = isinstance(source, Input) and not source.optional
+        if required and (topic is None or not topic.expected):
             what = "no message of" if topic is not None else "no topic"
             needed.setdefault(f"{what} {source.topic}", []).append(name)
         elif topic is not None and topic.type != source.type:
@@ -141,14 +144,6 @@ def input_problems(
             wrong.setdefault(what, []).append(name)
         elif topic is not None and leaves is not None:
             fields += _field_problems(name, source, leaves[source.topic])
-    for name, signal in profile.signals.items():
-        topic = available.get(signal.topic)
-        if topic is not None and topic.type != signal.type:
-            what = f"{signal.topic} holds {topic.type}, not {signal.type}"
-            wrong.setdefault(what, []).append(f"signals.{name}")
-        elif topic is not None and leaves is not None:
-            problem = signal.problem(leaves[signal.topic])
-            fields += [f"`signals.{name}.path`: {signal.topic}: {problem}"] if problem else []
     hints = {what: near(what.split()[-1], available) for what in needed}
     lacking = [
         f"{what} ({', '.join(names)})" + (f": {hints[what]}" if hints.get(what) else "")
@@ -163,8 +158,11 @@ def near(topic: str, available: Mapping[str, Any]) -> str:
     return f"did you mean {close[0]}?" if close else ""
 
 
-def _field_problems(name: str, source: Input, leaves: Sequence[Leaf]) -> list[str]:
-    """The fields of an input that its topic does not have, and what it has."""
+def _field_problems(name: str, source: Input | CustomSignal, leaves: Sequence[Leaf]) -> list[str]:
+    """The fields of an input or signal that its topic does not have, and what it has."""
+    if isinstance(source, CustomSignal):
+        problem = source.problem(leaves)
+        return [f"`{name}.path`: {source.topic}: {problem}"] if problem else []
     has = {leaf.path.removesuffix("[]") for leaf in leaves}
     return [
         f"`inputs.{name}.fields`: {source.topic}: {offer(path, sorted(has))}"

@@ -358,6 +358,3 @@ def _delta_schema(schema: pa.Schema) -> pa.Schema:
             for field in schema
         ]
     )
-
-
-__all__ = ["RECORDINGS", "RETENTION_HOURS", "TRANSITIONS", "StoreWriter"]

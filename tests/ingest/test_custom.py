@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 from support.driven_robot import Drive, columns
 from support.paths import ROOT
+from support.profile_texts import WAREHOUSE as TEXT
 from support.ragged import nested, ragged
 
 from restock.cli import main
@@ -19,7 +20,6 @@ from restock.ingest.profile.custom_signal import refuse_other_signals
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.steps.steps import Steps, steps_of
 
-TEXT = (ROOT / "ingest" / "profile" / "profiles" / "warehouse_amr.toml").read_text()
 SAMPLE = ROOT / "sample_logs" / "amr_tuesday"
 
 

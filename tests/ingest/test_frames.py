@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.driven_robot import START_NS, Drive, columns
 from support.paths import ROOT, SHARED
+from support.profile_texts import framed
 
 from restock.cli import main
 from restock.errors import ConfigError, RecordingError
@@ -17,7 +18,6 @@ from restock.ingest.steps.align import NS, align
 from restock.ingest.steps.frames import FIELDS, Edges, Tree, rotations
 from restock.ingest.steps.steps import steps_of
 
-TEXT = (ROOT / "ingest" / "profile" / "profiles" / "warehouse_amr.toml").read_text()
 SAMPLE = ROOT / "sample_logs" / "amr_monday.mcap"
 
 # (time s, parent, child, x, y, z, yaw)
@@ -196,12 +196,6 @@ def test_a_quaternion_of_no_length_is_not_finite():
 
 
 # In a recording.
-
-
-def framed(text: str = TEXT, frames: str = "[frames]\n\n[clock]") -> str:
-    """The profile without a pose topic."""
-    start, end = text.index("[inputs.pose]"), text.index("[inputs.wheels]")
-    return (text[:start] + text[end:]).replace("[clock]", frames, 1)
 
 
 def drive_with_transforms(drive: Drive, *, until_s: float = 99.0) -> dict[str, TopicColumns]:

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from support.driven_robot import Drive, write_bag
 from support.paths import ROOT, SHARED
+from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
 from restock.ingest.profile.profile import load_profile
@@ -89,7 +90,7 @@ def test_unchanged_is_left_alone_and_changed_is_replaced(bag, tmp_path, run):
     assert (code, said["recordings"][0]["status"]) == (0, "unchanged")
     code, said, _ = run(bag, "--store", store, "--force")
     assert (code, said["recordings"][0]["status"]) == (0, "written")
-    text = (ROOT / "ingest" / "profile" / "profiles" / "warehouse_amr.toml").read_text()
+    text = WAREHOUSE
     other = tmp_path / "other.toml"
     other.write_text(text.replace("time_limit_steps = 240", "time_limit_steps = 5"))
     code, said, _ = run(bag, "--store", store, "--profile", other)
@@ -171,7 +172,7 @@ def test_a_truncated_file_is_refused_unless_salvaged(tmp_path, run):
 
 
 def test_the_wrong_profile_says_what_is_missing_and_what_is_there(bag, tmp_path, run):
-    text = (ROOT / "ingest" / "profile" / "profiles" / "warehouse_amr.toml").read_text()
+    text = WAREHOUSE
     other = tmp_path / "other.toml"
     other.write_text(text.replace('"/scan"', '"/front/scan"').replace('"/imu"', '"/odom"'))
     code, _, err = run(bag, "--store", tmp_path / "s", "--profile", other)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from deltalake import DeltaTable
 from support.driven_robot import Drive, write_bag
-from support.paths import ROOT
+from support.profile_texts import WAREHOUSE as TEXT
 
 from restock.cli import main
 from restock.errors import StoreError
@@ -18,7 +18,6 @@ from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.conditions import Condition, label, labels_version
 from restock.replay.store.store import Store
 
-TEXT = (ROOT / "ingest" / "profile" / "profiles" / "warehouse_amr.toml").read_text()
 # Looks ahead: at the last transition of an episode, at a step that is no row of the store.
 SOON = '\n[[condition]]\nname = "soon"\ntiming = "post"\npriority = 1\nsql = "{}"\n'
 HALF_WAY = "lead(pose_x_m) OVER episode > 2.55"

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from support.driven_robot import LATENCY_NS, Drive, columns, write_bag
 from support.paths import ROOT, SHARED
+from support.profile_texts import WAREHOUSE as TEXT
+from support.profile_texts import framed
 
 from restock.errors import RecordingError
 from restock.ingest.containers.open_recording import open_recording
@@ -23,11 +25,9 @@ from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.schema import STEP_BITS
 from restock.ingest.task.task import nearest_action
 
-TEXT = (ROOT / "ingest" / "profile" / "profiles" / "warehouse_amr.toml").read_text()
 SAMPLE = ROOT / "sample_logs" / "amr_tuesday"
 TURTLEBOT = SHARED / "turtlebot3-sim-humble"
 ROWS = 60
-FRAMES = '[frames]\nfixed = "map"\nbase = "base_link"\n\n[clock]'
 # The wheel's joint says more often than the command what time it is, and after the last of them.
 SIGNALS = """
 [signals.left_wheel_radps]
@@ -47,11 +47,12 @@ RATE = ('steps = "command"', 'steps = "rate"')
 LOG_TIME = ('alignment = "header.stamp"', 'alignment = "log_time"')
 
 
-def profile_of(*changes: tuple[str, str], framed: bool = False, signals: bool = False) -> Profile:
+def profile_of(
+    *changes: tuple[str, str], from_frames: bool = False, signals: bool = False
+) -> Profile:
     text = TEXT + (SIGNALS if signals else "")
-    if framed:
-        start, end = text.index("[inputs.pose]"), text.index("[inputs.wheels]")
-        text = (text[:start] + text[end:]).replace("[clock]", FRAMES, 1)
+    if from_frames:
+        text = framed(text)
     for old, new in changes:
         assert old in text
         text = text.replace(old, new)
@@ -62,11 +63,13 @@ PROFILES = {
     "on the command's clock": profile_of(),
     "at a fixed rate": profile_of(RATE),
     "at a fixed rate, by log time": profile_of(RATE, LOG_TIME),
-    "poses from transforms": profile_of(framed=True),
-    "poses from transforms, at a fixed rate": profile_of(RATE, framed=True),
+    "poses from transforms": profile_of(from_frames=True),
+    "poses from transforms, at a fixed rate": profile_of(RATE, from_frames=True),
     "custom signals": profile_of(signals=True),
-    "poses from transforms, by log time": profile_of(LOG_TIME, framed=True),
-    "custom signals and transforms, at a fixed rate": profile_of(RATE, framed=True, signals=True),
+    "poses from transforms, by log time": profile_of(LOG_TIME, from_frames=True),
+    "custom signals and transforms, at a fixed rate": profile_of(
+        RATE, from_frames=True, signals=True
+    ),
 }
 
 
@@ -77,18 +80,18 @@ def test_a_row_was_made_of_the_messages_at_its_tick(name: str, tmp_path: Path) -
 
 @pytest.mark.skipif(not TURTLEBOT.is_dir(), reason="../shared/bags is absent")
 @pytest.mark.parametrize("steps", ["command", "rate"])
-@pytest.mark.parametrize("framed", [False, True])
+@pytest.mark.parametrize("from_frames", [False, True])
 def test_a_row_of_a_turtlebot_was_made_of_the_messages_at_its_tick(
-    steps: str, framed: bool, tmp_path: Path
+    steps: str, from_frames: bool, tmp_path: Path
 ) -> None:
     with open_recording(TURTLEBOT) as recording:
         text = propose_profile(recording, "turtlebot").toml
     text = re.sub('steps = "[a-z]+"', f'steps = "{steps}"', text)
-    if framed:
+    if from_frames:
         text = re.sub(r"\[inputs.pose\][^[]*", "", text)
         text = text.replace("[clock]", '[frames]\nfixed = "odom"\nbase = "base_link"\n\n[clock]')
     profile = parse_profile(text, where="proposed")
-    assert (profile.inputs.pose is None, profile.clock.steps) == (framed, steps)
+    assert (profile.inputs.pose is None, profile.clock.steps) == (from_frames, steps)
     check(TURTLEBOT, profile, tmp_path)
 
 

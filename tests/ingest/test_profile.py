@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-from importlib.resources import files
 
 import numpy as np
 import pytest
+from support.profile_texts import WAREHOUSE as TEXT
 
 from restock.cli import main
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile, parse_profile, shipped_profiles
-
-TEXT = (files("restock.ingest.profile") / "profiles" / "warehouse_amr.toml").read_text("utf-8")
 
 
 def test_the_shipped_profiles_load():
