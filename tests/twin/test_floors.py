@@ -200,7 +200,7 @@ def test_a_broken_map_yaml_is_refused_with_its_key(tmp_path: Path, text: str, me
         *("no.toml", "no.yaml", "default,default", "generated:" + "9" * 30),
     ],
 )
-def test_a_layout_that_is_none_is_refused(text: str) -> None:
+def test_an_invalid_layout_is_refused(text: str) -> None:
     with pytest.raises(ConfigError):
         open_floors(text)
     with pytest.raises(ConfigError):

@@ -63,7 +63,7 @@ class EpisodeQueue(Stateful):
         self.set_conditions(self.conditions)
 
     def set_fixed(self, specs: Iterable[EpisodeSpec]) -> None:
-        """These next, in order, whichever environment asks."""
+        """These are next, in order, for any environment."""
         self.fixed, self.next_fixed = list(specs), 0
 
     def next(self, env: int) -> tuple[EpisodeSpec, int]:
@@ -83,7 +83,7 @@ class EpisodeQueue(Stateful):
         """Which floor an episode is on: by name, or by its seed.
 
         Raises:
-            ConfigError: it names none of the environment's.
+            ConfigError: the environment has no floor of that name.
         """
         if spec.layout is None:
             if len(self._floors) == 1:
@@ -91,7 +91,7 @@ class EpisodeQueue(Stateful):
             return int(np.random.default_rng([spec.seed, 2]).integers(len(self._floors)))
         if spec.layout not in self._floors:
             raise ConfigError(
-                f"an episode asks for layout {spec.layout!r}, which is not among the environment's"
+                f"an episode needs layout {spec.layout!r}, which is not among the environment's"
                 f" {len(self._floors)}",
                 where=f"episode {spec.condition}/{spec.seed}",
                 remedy="make the environment with that layout",

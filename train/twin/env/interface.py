@@ -1,6 +1,6 @@
 """What an environment and a policy know of each other, and how a policy explores.
 
-`Twin` is what training and evaluation ask of an environment, `Policy` is whatever drives in one:
+`Twin` is what training and evaluation need of an environment, `Policy` is what drives in one:
 a trained network, an ONNX file, a script, one of your own.
 """
 

@@ -217,7 +217,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         perturbation = spec.perturbation or self.perturbation
         if perturbation.timestep_s != self.simulation.timestep_s:
             raise ConfigError(
-                f"an episode asks for timestep_s = {perturbation.timestep_s}, the environment"
+                f"an episode needs timestep_s = {perturbation.timestep_s}, the environment"
                 f" runs at {self.simulation.timestep_s}",
                 where=f"episode {spec.condition}/{spec.seed}",
                 remedy="make the environment with that perturbation",

@@ -128,7 +128,7 @@ class Warehouse:
     map_origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x, y, yaw of the corner, in the map
 
     def __post_init__(self) -> None:
-        """Raises ConfigError where the numbers cannot be a floor."""
+        """Raises ConfigError where the numbers do not make a floor."""
         where = f"layout {self.name}"
         for side in (self.width_m, self.depth_m):
             if not 1.0 <= side <= MAX_SIDE_M:

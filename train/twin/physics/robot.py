@@ -85,7 +85,7 @@ def _limit(change: F64, most: F64) -> F64:
 class RobotBody:
     """What a perturbation changes of N robots, written into the batch that holds them.
 
-    Fields are made per-simulation when first needed: as long as no episode asks for it, all share
+    Fields are made per-simulation when first needed: as long as no episode needs one, all share
     the model's.
     """
 

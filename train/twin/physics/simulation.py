@@ -326,7 +326,7 @@ def _check_times(task: Task, timestep_s: float, substeps: int, blocks: int) -> N
 
 
 def _no_log_file() -> None:
-    """No MUJOCO_LOG.TXT wherever the user happens to stand: divergence is counted and reported."""
+    """No MUJOCO_LOG.TXT in the working directory: divergence is counted and reported."""
     config = mujoco.MjLogConfig.get()
     if config.logto_file:
         config.logto_file = False

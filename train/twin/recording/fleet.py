@@ -45,7 +45,7 @@ class DrivenMission:
 
 @dataclass
 class _Log:
-    """One robot's mission as it goes."""
+    """One robot's mission while it is driven."""
 
     place: int  # among the missions
     mission: Mission
@@ -185,7 +185,7 @@ class Fleet:
         log.signals.append({name: column[robot] for name, column in signals.items()})
         log.observation.append(env.observation[robot].copy())
         every = max(round(log.hardware.lidar_period_s / self.period_s), 1)
-        if tick % every == 0:  # else the robot goes on with the scan before
+        if tick % every == 0:  # else the robot keeps the scan before
             log.scan_s.append(round(tick * self.period_s, 6))
             log.ranges_m.append(env.sensing.ranges_m[robot].copy())
         traffic = env.simulation.traffic
