@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from restock.arrays import F64
 
 _WEIGHTS_AT_ONCE = 4_000_000  # in memory
 

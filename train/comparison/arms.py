@@ -15,8 +15,8 @@ from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from restock.arrays import F64
 from restock.errors import RunError
 from restock.train.comparison.comparability import Feed
 from restock.train.run.run import Run
@@ -168,7 +168,7 @@ def _feed(table: pa.Table, cells: list[str]) -> Feed:
     place = {name: index for index, name in enumerate(cells)}
     cell = np.array([place[name] for name in table["cell"].to_pylist()], np.int64)
 
-    def column(name: str) -> NDArray[np.float64]:
+    def column(name: str) -> F64:
         return np.asarray(table[name], np.float64)
 
     return Feed(

@@ -16,9 +16,9 @@ from statistics import NormalDist
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from restock.arrays import F64, Ints
+
 Verdict = Literal["comparable", "inconclusive", "incomparable"]
 _CHECKS = 30  # about as many are made of random figures
 _ORDER: list[Verdict] = ["comparable", "inconclusive", "incomparable"]
@@ -46,10 +46,10 @@ class Feed:
     """
 
     cells: list[str]  # "logs/wheel_slip", …
-    cell: NDArray[np.int64]  # (n,)
-    tenth: NDArray[np.int64]  # (n,) 0 to 9
-    episode: NDArray[np.int64]  # (n,) fresh ones are distinct over the arm's runs
-    run: NDArray[np.int64]  # (n,)
+    cell: Ints  # (n,)
+    tenth: Ints  # (n,) 0 to 9
+    episode: Ints  # (n,) fresh ones are distinct over the arm's runs
+    run: Ints  # (n,)
     drawn: F64  # (n,)
     weight: F64  # (n,) the sum of importance weights
 

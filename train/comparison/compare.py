@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from restock.arrays import F64
 from restock.errors import RunError
 from restock.stats import difference_of_arms, iqm, probability_of_improvement
 from restock.train.comparison.arms import ALLOWED, Arm, Difference, Treatment, differences, feeds
@@ -138,8 +138,8 @@ def _outcomes(
 
 def _outcome(
     cell: Cell,
-    a: NDArray[np.float64],  # (runs, episodes, 2) success and return
-    b: NDArray[np.float64],
+    a: F64,  # (runs, episodes, 2) success and return
+    b: F64,
     rng: np.random.Generator,
 ) -> dict[str, Any]:
     difference = difference_of_arms(a[..., 0], b[..., 0], rng=rng)
@@ -161,7 +161,7 @@ def _outcome(
     }
 
 
-def _scores(tables: Iterable[pa.Table]) -> dict[Cell, dict[int, NDArray[np.float64]]]:
+def _scores(tables: Iterable[pa.Table]) -> dict[Cell, dict[int, F64]]:
     """Cell -> episode seed -> (runs, 2) success and return; episodes that every run drove."""
     runs: list[dict[Cell, dict[int, tuple[float, float]]]] = []
     for table in tables:
@@ -172,7 +172,7 @@ def _scores(tables: Iterable[pa.Table]) -> dict[Cell, dict[int, NDArray[np.float
             result = float(row["success"]), float(row["return"])
             cells.setdefault(cell, {})[int(row["episode_seed"])] = result
         runs.append(cells)
-    shared: dict[Cell, dict[int, NDArray[np.float64]]] = {}
+    shared: dict[Cell, dict[int, F64]] = {}
     for cell, episodes in runs[0].items():
         for seed in episodes:
             if all(seed in run.get(cell, {}) for run in runs):

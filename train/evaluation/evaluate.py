@@ -11,15 +11,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from restock.arrays import F32, F64, Ints
 from restock.ingest.task.signals import Signals
 from restock.stats import wilson
 from restock.train.feed.fresh_log import values_entries
 from restock.train.twin.env.interface import Policy, Step, Twin
 from restock.train.twin.physics.episode import EpisodeSpec
 
-Stepper = Callable[[NDArray[np.float32], NDArray[np.int64]], Step]
+Stepper = Callable[[F32, Ints], Step]
 
 STUCK_WINDOW_S, STUCK_RADIUS_M = 10.0, 0.5
 
@@ -144,7 +144,7 @@ def run_episodes(
     return [result for result in results if result is not None]
 
 
-def _position(signals: Signals) -> NDArray[np.float64]:
+def _position(signals: Signals) -> F64:
     return np.stack([signals["pose_x_m"], signals["pose_y_m"]], axis=-1)
 
 

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
+from restock.arrays import F32, Ints
 from restock.ingest.task.conditions import Condition
 from restock.ingest.task.task import Task
 from restock.replay.ring.ring import FreshRing
@@ -58,7 +58,7 @@ class EvaluationBuffer:
             step=self._step,
         )
 
-    def _step(self, observation: NDArray[np.float32], action: NDArray[np.int64]) -> Step:
+    def _step(self, observation: F32, action: Ints) -> Step:
         collector = self._collector
         collector.observation = np.array(observation, copy=True)  # the twin writes over its own
         step: Step = collector.start(action, np.ones(len(action), np.float32))

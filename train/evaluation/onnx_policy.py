@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from restock import __version__
+from restock.arrays import F32, Ints
 from restock.errors import ConfigError, RunError
 from restock.files import write_bytes
 from restock.ingest.profile.profile import load_profile
@@ -192,9 +193,7 @@ class OnnxPolicy:
         self._path = path
         self.name, self.version = f"onnx:{path}", metadata.get("version", "")
 
-    def act(
-        self, env: Any, observation: NDArray[np.float32]
-    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    def act(self, env: Any, observation: F32) -> tuple[Ints, F32]:
         """The best action (N,) of each observation (N, D), and 1 for its probability."""
         (output,) = self._session.run([self._output], {self._input: observation})
         action = output if output.ndim == 1 else output.argmax(axis=1)
@@ -206,7 +205,7 @@ class OnnxPolicy:
         return action.astype(np.int64), np.ones(len(action), np.float32)
 
 
-def _array(tensor: torch.Tensor) -> NDArray[np.float32]:
+def _array(tensor: torch.Tensor) -> F32:
     return np.ascontiguousarray(tensor.detach().cpu().numpy())
 
 

@@ -16,6 +16,7 @@ import pyarrow as pa
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from restock.arrays import F64
 from restock.files import write_table
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
@@ -42,7 +43,6 @@ from restock.train.evaluation.policies import load_agent
 from restock.train.run.run import Run
 from restock.train.run.run_tables import TABLES
 
-F64 = NDArray[np.float64]
 ALL = "all"
 FILE = "off_policy.parquet"  # in RUN/eval
 

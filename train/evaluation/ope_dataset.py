@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import RunError, StoreError
 from restock.ingest.store.location import Location
 from restock.ingest.task.task import Task
@@ -25,8 +26,6 @@ from restock.replay.panel.panel import EVALUATION_SPLIT, HEADER, Panel
 from restock.replay.store.store import Store, passed_in
 from restock.train.dqn.fitted_q import Transitions
 
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 Measure = Literal["return", "success"]
 MODEL_ROWS = 200_000  # at most, chosen at random: bounds memory and time
 
@@ -38,7 +37,7 @@ class OpeSteps:
     rows: Transitions
     episode: Ints  # (N,) ascending, the place in `condition`
     condition: NDArray[np.str_]  # (E,) of each episode
-    probability: NDArray[np.float64]  # (N,) of the action, as logged; NaN where it is not
+    probability: F64  # (N,) of the action, as logged; NaN where it is not
     bumps: Bools  # (N,) a contact in [t, t + 1)
     bumped_before: Bools  # (N,) a contact in the episode up to t
 
@@ -195,7 +194,7 @@ def read_steps(connection: duckdb.DuckDBPyConnection, ids: Ints) -> OpeSteps:
     )
 
 
-def _matrix(column: pa.ChunkedArray) -> NDArray[np.float32]:
+def _matrix(column: pa.ChunkedArray) -> F32:
     """A list column of N rows as (N, D)."""
     lists = column.combine_chunks()
     flat = np.array(lists.flatten().to_numpy(zero_copy_only=False), np.float32)

@@ -19,11 +19,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from restock.arrays import F64, Bools
 from restock.stats import cluster_counts, percentiles
-
-F64 = NDArray[np.float64]
 
 FQE, PDWIS, WDR, LOGGED = "fqe", "pdwis", "wdr", "logged"
 _TINY = 1e-300
@@ -44,7 +42,7 @@ class OpeEpisodes:
     def __len__(self) -> int:
         return len(self.ratio)
 
-    def select(self, episodes: NDArray[np.bool_]) -> OpeEpisodes:
+    def select(self, episodes: Bools) -> OpeEpisodes:
         """Some of the episodes."""
         return replace(
             self,

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from restock.arrays import F32, Ints
 from restock.errors import ConfigError, RunError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
@@ -30,9 +30,7 @@ class GreedyPolicy:
     def __init__(self, network: Network, version: str = "") -> None:
         self.network, self.version = network, version
 
-    def act(
-        self, env: Any, observation: NDArray[np.float32]
-    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    def act(self, env: Any, observation: F32) -> tuple[Ints, F32]:
         action = greedy_actions(self.network, observation)
         return action, np.ones(len(action), np.float32)
 

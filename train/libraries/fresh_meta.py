@@ -15,12 +15,12 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from restock.arrays import Bools, Ints
 from restock.ingest.task.conditions import NOMINAL, Condition, label, primary
 from restock.ingest.task.signals import STORED_SIGNALS
 from restock.replay.ring.ring import META
 from restock.replay.ring.slots import NONE, StratumSlots
 
-Ints = NDArray[np.int64]
 EPISODES_PER_QUERY = 8  # at most: as many as there are environments
 _COMMANDS = ("command_speed_mps", "command_yaw_rate_radps")
 _NAMES = tuple(signal.name for signal in STORED_SIGNALS)
@@ -57,7 +57,7 @@ class FreshMeta:
         self,
         slots: Ints,
         envs: Ints,
-        ended: NDArray[np.bool_],
+        ended: Bools,
         *,
         env_step: int,
         gradient_step: int,
@@ -115,7 +115,7 @@ class Labelled:
     """An episode's labels: the code of each step's condition, nominal last."""
 
     key: int
-    codes: NDArray[np.int64]  # (T,)
+    codes: Ints  # (T,)
     conditions: list[str]  # that held at some step
 
 

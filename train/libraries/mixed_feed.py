@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from restock.arrays import F32, Ints
 from restock.errors import ConfigError, MixtureError, PanelError
 from restock.ingest.profile.profile import Profile, load_profile
 from restock.replay.panel.logged_sampler import BatchDraw, LoggedSampler
@@ -31,7 +32,6 @@ from restock.train.libraries.fresh_meta import FreshMeta, InfoLabels
 from restock.train.run.run import Run, now_ns, panel_document, software_versions
 from restock.train.run.run_tables import TABLES
 
-Ints = NDArray[np.int64]
 PROFILE = "warehouse_amr"
 # Of an episode that ended, by the info of its last step.
 _INFO = ("episode_seed", "perturbation", "block", "success", "bumps")
@@ -196,13 +196,13 @@ class MixedFeed:
 
     def drawn(
         self,
-        packed: NDArray[np.float32],
+        packed: F32,
         drawing: BatchDraw,
         slots: Ints,
         *,
-        weight: NDArray[np.float32] | None = None,
-        td: NDArray[np.float32] | None = None,
-        q: NDArray[np.float32] | None = None,
+        weight: F32 | None = None,
+        td: F32 | None = None,
+        q: F32 | None = None,
     ) -> None:
         """The batch of one update, logs first: packed rows (B, W), and what is known of them.
 

@@ -28,6 +28,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from restock.arrays import F32
 from restock.errors import MixtureError
 from restock.replay.panel.panel import Panel
 from restock.replay.ring.ring import FreshRing
@@ -106,14 +107,12 @@ class MixtureReplayBuffer(ReplayBuffer):
         self.feed.keep_record(self.ring)
         self.continuous = isinstance(action_space, spaces.Box)
         self._fresh_actions = np.zeros((self.buffer_size, self.action_dim), np.float32)
-        self._waiting_actions: dict[tuple[int, int], NDArray[np.float32]] = {}
+        self._waiting_actions: dict[tuple[int, int], F32] = {}
         self._steps = np.zeros(n_envs, np.int64)  # of the running episodes
         self._log_actions = self._logged_actions(panel, commands)
         self.critic: Critic | None = None
 
-    def _logged_actions(
-        self, panel: Panel | None, commands: NDArray[Any] | None
-    ) -> NDArray[np.float32] | None:
+    def _logged_actions(self, panel: Panel | None, commands: NDArray[Any] | None) -> F32 | None:
         """(n, A) as Stable-Baselines3 keeps actions: indices, or commands scaled to [-1, 1]."""
         if panel is None:
             return None
@@ -128,9 +127,7 @@ class MixtureReplayBuffer(ReplayBuffer):
                 where=str(panel.path),
             )
         low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
-        scaled: NDArray[np.float32] = np.float32(2) * (commands - low) / (high - low) - np.float32(
-            1
-        )
+        scaled: F32 = np.float32(2) * (commands - low) / (high - low) - np.float32(1)
         return np.clip(scaled, -1, 1).astype(np.float32)
 
     def size(self) -> int:
@@ -213,9 +210,7 @@ class MixtureReplayBuffer(ReplayBuffer):
         feed.drawn(packed, drawing, slots, td=td, q=q)
         return samples
 
-    def _samples(
-        self, packed: NDArray[np.float32], action: NDArray[np.float32], env: VecNormalize | None
-    ) -> ReplayBufferSamples:
+    def _samples(self, packed: F32, action: F32, env: VecNormalize | None) -> ReplayBufferSamples:
         column = self.ring.columns
         shape = (len(packed), *self.obs_shape)
 
@@ -257,7 +252,7 @@ def dqn_critic(model: Any) -> Critic:
     return critic
 
 
-def logged_commands(panel: Panel, store: str | Path) -> NDArray[np.float32]:
+def logged_commands(panel: Panel, store: str | Path) -> F32:
     """The command (m/s, rad/s) of every row of a panel, (n, 2), from its store.
 
     Raises:

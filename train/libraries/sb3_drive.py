@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
+from restock.arrays import Ints
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.train.dqn.config import TrainConfig
@@ -192,7 +192,7 @@ class _OnPolicyFeed(BaseCallback):
         self.run.flush()
 
     def _write(self) -> None:
-        codes: dict[int, NDArray[np.int64]] = {}
+        codes: dict[int, Ints] = {}
         for labelled in self.labels.label(all_of_them=True):
             codes[labelled.key] = labelled.codes
             self.ended[labelled.key][2]["conditions"] = labelled.conditions

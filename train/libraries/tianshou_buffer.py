@@ -21,12 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 from tianshou.data import Batch, ReplayBuffer, ReplayBufferManager
 
+from restock.arrays import F32, Ints
 from restock.errors import MixtureError
 from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.packed_row import row_columns, row_width
 from restock.replay.panel.logged_sampler import BatchDraw
 from restock.replay.panel.panel import Panel
-from restock.train.libraries.mixed_feed import PROFILE, FeedOptions, Ints, MixedFeed
+from restock.train.libraries.mixed_feed import PROFILE, FeedOptions, MixedFeed
 
 TIANSHOU = "tianshou"
 
@@ -166,7 +167,7 @@ class MixtureVectorReplayBuffer(ReplayBufferManager):
         td = -np.asarray(new_weight, np.float32).reshape(-1)
         self._note(td if len(td) == len(index) else None)
 
-    def _note(self, td: NDArray[np.float32] | None) -> None:
+    def _note(self, td: F32 | None) -> None:
         if self._sampled is None:
             return
         (drawing, slots), self._sampled = self._sampled, None
@@ -182,7 +183,7 @@ class MixtureVectorReplayBuffer(ReplayBufferManager):
             self._pack(packed[len(log_rows) :], slots)
         self.feed.drawn(packed, drawing, slots, weight=weight, td=td)
 
-    def _pack(self, packed: NDArray[np.float32], slots: Ints) -> None:
+    def _pack(self, packed: F32, slots: Ints) -> None:
         """Fresh rows as the record takes them; the discount only says whether it terminated."""
         column, rows = self._columns, cast(Any, self._meta)
         packed[:, column["observation"]] = rows.obs[slots]
