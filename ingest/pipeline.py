@@ -143,7 +143,7 @@ class _Ingest:
             first,
             scores,
             dict(Counter(episode.ended_by for episode in episodes.episodes).most_common()),
-            self._lost_messages(),
+            self._lost_messages(steps),
             self._notes(steps, table),
             at,
         )
@@ -157,25 +157,33 @@ class _Ingest:
             "unused": self.recording.messages - expected,
         }
 
-    def _lost_messages(self) -> list[str]:
-        return [
+    def _lost_messages(self, steps: Steps) -> list[str]:
+        lost = [
             f"{loss.topic or 'the file'}: {loss.reason}"
             + (f" ({loss.messages:,} messages)" if loss.messages is not None else "")
             for loss in self.recording.lost_messages
+        ]
+        return lost + [
+            f"{topic}: left out, their stamps are off the clock ({count:,} messages)"
+            for topic, count in steps.clock.off_clock.items()
         ]
 
     def _notes(self, steps: Steps, table: pa.Table) -> list[str]:
         clock = steps.clock
         notes = [*self.recording.notes, *steps.notes]
-        if clock.alignment == "header.stamp":
+        if clock.pace is not None:
+            notes.append(
+                f"clock: header stamps run at {clock.pace:.1%} of log time; mapped piece by piece"
+                f" by {clock.mapped_by}, within {clock.spread_ns * 1e-6:.1f} ms"
+                " (1st to 99th percentile)"
+            )
+        elif clock.alignment == "header.stamp":
             notes.append(
                 f"clock: log time is {clock.offset_ns * 1e-9:,.3f} s ahead of header stamps, "
                 f"within {clock.spread_ns * 1e-6:.1f} ms (1st to 99th percentile)"
             )
         if clock.jumps:
             notes.append(f"the alignment clock was set {clock.jumps} times; each cuts an episode")
-        for topic, count in clock.off_clock.items():
-            notes.append(f"{topic}: {count} messages left out, their stamps are off the clock")
         for topic, count in clock.restamped.items():
             notes.append(f"{topic}: {count} messages older than the recording, put at log time")
         if steps.commands_between:

@@ -6,8 +6,9 @@ on it, and nothing is ever taken from a time after the tick that asks.
 
 A topic without a header is put on a `header.stamp` clock by subtracting the recording's offset:
 the smallest, over the stamped topics, of the median of (log time - stamp). That offset is one
-constant a clock segment. It is measured over the whole segment, so it looks at later messages'
-clocks, but at nobody's values.
+constant a clock segment, unless it drifts by more than the tolerance, as it does where a simulation
+runs slower than real time: then log time is mapped piece by piece (`clock_map`). Either is measured
+over the whole segment, so it looks at later messages' clocks, but at nobody's values.
 
 Where the clock itself jumps (a simulation restarted, a clock set) a new segment starts, and no
 hold reaches across but that of latched topics.
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 
 from restock.errors import RecordingError
 from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.steps.clock_map import ClockMap, drift_ns, residual_ns, spread_ns
 from restock.ingest.steps.clocks import STAMP, jumps, median
 
 if TYPE_CHECKING:
@@ -32,6 +34,8 @@ if TYPE_CHECKING:
 I64 = NDArray[np.int64]
 NS = 1_000_000_000
 AHEAD_NS = 50_000_000  # a transform stamped further ahead counts from when it was received
+CLOCK_TOPIC, CLOCK_FIELD = "/clock", "clock"  # what a simulation says the time is
+TOLERANCE_S = 0.1  # half a control period
 
 
 @dataclass(frozen=True)
@@ -84,7 +88,9 @@ class ClockReport:
 
     alignment: str
     offset_ns: int = 0  # of the first segment
-    spread_ns: int = 0  # 1st to 99th percentile of (log time - stamp), of the reference topic
+    spread_ns: int = 0  # 1st to 99th percentile of what the offset, or the map, leaves unexplained
+    pace: float | None = None  # seconds of the robot's time in one of log time, where it drifts
+    mapped_by: str | None = None  # the topic whose times say so
     jumps: int = 0
     off_clock: dict[str, int] = field(default_factory=dict)  # messages left out, per topic
     restamped: dict[str, int] = field(default_factory=dict)  # latched ones put at their log time
@@ -95,6 +101,8 @@ def align(
     clock: Clock,
     latched: frozenset[str] = frozenset(),
     transforms: frozenset[str] = frozenset(),
+    *,
+    tolerance_s: float = TOLERANCE_S,
 ) -> tuple[list[ClockSegment], ClockReport]:
     """Every topic on the alignment clock, cut where that clock jumps.
 
@@ -105,63 +113,61 @@ def align(
     do not say what time it is, and count from when they were received.
 
     Raises:
-        RecordingError: the alignment clock is `header.stamp` and no topic has one.
+        RecordingError: the alignment clock is `header.stamp` and no topic has one, or log time
+            cannot be mapped to it within `tolerance_s`.
     """
     report = ClockReport(clock.alignment)
+    simulated = topics.get(CLOCK_TOPIC)
+    if simulated is not None and CLOCK_FIELD in simulated.fields:
+        topics = {name: columns for name, columns in topics.items() if name != CLOCK_TOPIC}
+    else:
+        simulated = None
     if clock.alignment == "log_time":
         samples = {name: _ordered(c.log_time_ns, np.arange(len(c))) for name, c in topics.items()}
         return [ClockSegment(samples, 0)], report
-    delay = {
-        name: columns.log_time_ns - np.asarray(columns.fields[STAMP], np.int64)
-        for name, columns in topics.items()
-        if STAMP in columns.fields and name not in latched | transforms and len(columns)
-    }
+    delay = delays(topics, latched | transforms)
     if not delay:
         raise RecordingError(
             "none of the profile's topics has a header stamp",
             remedy='set [clock] alignment = "log_time" in the profile',
         )
-    jump_ns = round(clock.jump_s * NS)
     reference = max(delay, key=lambda name: (len(delay[name]), name))
-    edges = jumps(topics[reference].log_time_ns, delay[reference], jump_ns)
+    edges = jumps(topics[reference].log_time_ns, delay[reference], round(clock.jump_s * NS))
     report.jumps = len(edges)
-
-    def segment(index: int) -> ClockSegment:
+    drifts = _Drifts(clock, round(tolerance_s * NS), simulated, report)
+    segments = []
+    for index in range(len(edges) + 1):
         inside = {
             name: np.flatnonzero(np.searchsorted(edges, columns.log_time_ns, "right") == index)
             for name, columns in topics.items()
         }
-        middle = median(delay[reference][inside[reference]])
-        medians = [median(delay[name][inside[name]]) for name in delay if len(inside[name])]
-        # Latency only ever adds to the clocks' offset, so the least delayed topic shows it best.
-        offset = min(median for median in medians if abs(median - middle) <= jump_ns)
-        samples = {}
-        for name, rows in inside.items():
-            columns = topics[name]
-            log_time = columns.log_time_ns[rows]
-            if STAMP not in columns.fields:
-                samples[name] = _ordered(log_time - offset, rows)
-                continue
-            stamp = np.asarray(columns.fields[STAMP], np.int64)[rows]
-            if name in transforms:
-                ahead = stamp - (log_time - offset) > AHEAD_NS
-                stamp = np.where(ahead, log_time - offset, stamp)
-            off = np.abs(log_time - stamp - middle) > jump_ns
-            if off.any() and name in latched:
-                report.restamped[name] = report.restamped.get(name, 0) + int(off.sum())
-                stamp = np.where(off, log_time - offset, stamp)
-            elif off.any():
-                report.off_clock[name] = report.off_clock.get(name, 0) + int(off.sum())
-                stamp, rows = stamp[~off], rows[~off]
-            samples[name] = _ordered(stamp, rows)
-        return ClockSegment(samples, offset)
-
-    segments = [segment(index) for index in range(len(edges) + 1)]
+        clock_map, middle = drifts.map_of(topics, delay, reference, inside, edges, index)
+        segments.append(
+            _segment(topics, inside, clock_map, middle, clock, latched, transforms, report)
+        )
     report.offset_ns = segments[0].offset_ns
-    low, high = np.percentile(delay[reference] - median(delay[reference]), [1, 99])
-    report.spread_ns = int(high - low)
+    if report.mapped_by is None:
+        report.spread_ns = spread_ns(delay[reference])
     _carry_latched(segments, latched)
     return segments, report
+
+
+def clock_drifts(topics: Mapping[str, TopicColumns], tolerance_s: float) -> bool:
+    """Whether the stamps of the topic with most of them run at another pace than log time."""
+    delay = delays(topics, frozenset())
+    reference = max(delay, key=lambda name: len(delay[name]), default=None)
+    if reference is None:
+        return False
+    return drift_ns(topics[reference].log_time_ns, delay[reference]) > round(tolerance_s * NS)
+
+
+def delays(topics: Mapping[str, TopicColumns], besides: frozenset[str]) -> dict[str, I64]:
+    """Log time - header stamp, (N,), of every stamped topic but those `besides`."""
+    return {
+        name: columns.log_time_ns - np.asarray(columns.fields[STAMP], np.int64)
+        for name, columns in topics.items()
+        if STAMP in columns.fields and name not in besides and len(columns)
+    }
 
 
 def ticks_of(command: Samples, clock: Clock, period_s: float, end_ns: int) -> tuple[I64, int]:
@@ -189,8 +195,101 @@ def _ordered(stamp_ns: I64, row: NDArray[np.intp]) -> Samples:
     return Samples(np.asarray(stamp_ns, np.int64)[order], row[order])
 
 
+@dataclass
+class _Drifts:
+    """Decides for each segment between a constant offset and a piecewise map."""
+
+    clock: Clock
+    tolerance_ns: int
+    simulated: TopicColumns | None  # `/clock`, where it was read
+    report: ClockReport
+
+    def map_of(
+        self,
+        topics: Mapping[str, TopicColumns],
+        delay: Mapping[str, I64],
+        reference: str,
+        inside: Mapping[str, NDArray[np.intp]],
+        edges: I64,
+        index: int,
+    ) -> tuple[ClockMap, int]:
+        """The map of one segment, and the median delay of the reference topic in it."""
+        jump_ns, rows = round(self.clock.jump_s * NS), inside[reference]
+        log, late = topics[reference].log_time_ns[rows], delay[reference][rows]
+        middle = median(late)
+        if drift_ns(log, late) <= self.tolerance_ns:
+            medians = [median(delay[name][inside[name]]) for name in delay if len(inside[name])]
+            # Latency only ever adds to the clocks' offset: the least delayed topic shows it best.
+            offset = min(each for each in medians if abs(each - middle) <= jump_ns)
+            return ClockMap.constant(offset), middle
+        source, knots = reference, (log, late)
+        if self.simulated is not None:
+            times = self.simulated.log_time_ns
+            behind = times - np.asarray(self.simulated.fields[CLOCK_FIELD], np.int64)
+            during = np.searchsorted(edges, times, "right") == index
+            if during.sum() > 1:
+                by_clock = ClockMap.of_delays(times[during], behind[during])
+                if abs(median(by_clock.stamped(log) - (log - late))) <= jump_ns:
+                    source, knots = CLOCK_TOPIC, (times[during], behind[during])
+        fitted = ClockMap.of_delays(*knots)
+        spread = spread_ns(residual_ns(knots[0], knots[0] - knots[1]))
+        unstamped = any(STAMP not in topics[name].fields and len(inside[name]) for name in topics)
+        if unstamped and spread > self.tolerance_ns:
+            raise RecordingError(
+                f"log time and header stamps drift apart, and {source} places a message between two"
+                f" of its own only within {spread / NS:.2f} s (1st to 99th percentile), more than"
+                f" the {self.tolerance_ns / NS:g} s of half a control period",
+                remedy='set [clock] alignment = "log_time" in the profile',
+            )
+        ahead = []  # of the map, by topic: the least delayed one shows best when it was sent
+        for name, late in delay.items():
+            log = topics[name].log_time_ns[inside[name]]
+            if len(log):
+                ahead.append(median(log - late[inside[name]] - fitted.stamped(log)))
+        shift = max((each for each in ahead if abs(each) <= jump_ns), default=0)
+        report = self.report
+        report.mapped_by = source
+        report.spread_ns = max(report.spread_ns, spread)
+        report.pace = fitted.pace if report.pace is None else report.pace
+        return fitted.ahead_by(max(shift, 0)), middle
+
+
+def _segment(
+    topics: Mapping[str, TopicColumns],
+    inside: Mapping[str, NDArray[np.intp]],
+    clock_map: ClockMap,
+    middle: int,
+    clock: Clock,
+    latched: frozenset[str],
+    transforms: frozenset[str],
+    report: ClockReport,
+) -> ClockSegment:
+    jump_ns = round(clock.jump_s * NS)
+    samples = {}
+    for name, rows in inside.items():
+        columns = topics[name]
+        log_time = columns.log_time_ns[rows]
+        received = clock_map.stamped(log_time)  # on the alignment clock
+        if STAMP not in columns.fields:
+            samples[name] = _ordered(received, rows)
+            continue
+        stamp = np.asarray(columns.fields[STAMP], np.int64)[rows]
+        if name in transforms:
+            stamp = np.where(stamp - received > AHEAD_NS, received, stamp)
+        expected = log_time - middle if clock_map.is_constant else received
+        off = np.abs(expected - stamp) > jump_ns
+        if off.any() and name in latched:
+            report.restamped[name] = report.restamped.get(name, 0) + int(off.sum())
+            stamp = np.where(off, received, stamp)
+        elif off.any():
+            report.off_clock[name] = report.off_clock.get(name, 0) + int(off.sum())
+            stamp, rows = stamp[~off], rows[~off]
+        samples[name] = _ordered(stamp, rows)
+    return ClockSegment(samples, clock_map.offset_ns)
+
+
 def _carry_latched(segments: list[ClockSegment], latched: frozenset[str]) -> None:
-    """The latest message of a latched topic still holds at the start of the next segment."""
+    """What a latched topic said last still holds at the start of the next segment."""
     for index in range(1, len(segments)):
         topics = dict(segments[index].topics)
         start = min(int(samples.stamp_ns[0]) for samples in topics.values() if len(samples.row))
@@ -200,3 +299,18 @@ def _carry_latched(segments: list[ClockSegment], latched: frozenset[str]) -> Non
                 stamp = np.concatenate([[start], now.stamp_ns]).astype(np.int64)
                 topics[name] = Samples(stamp, np.concatenate([before.row[-1:], now.row]))
         segments[index] = ClockSegment(topics, segments[index].offset_ns)
+
+
+__all__ = [
+    "CLOCK_FIELD",
+    "CLOCK_TOPIC",
+    "NS",
+    "STAMP",
+    "ClockReport",
+    "ClockSegment",
+    "LatestMessages",
+    "Samples",
+    "align",
+    "clock_drifts",
+    "ticks_of",
+]

@@ -183,8 +183,8 @@ def align_inputs(profile: Profile, topics: Mapping[str, TopicColumns]) -> Aligne
     """The inputs in a recording's columns (those `wanted_fields` asks for) on one clock.
 
     Raises:
-        RecordingError: the alignment clock is `header.stamp` and no topic has one, or no
-            transform leads to the pose.
+        RecordingError: the alignment clock is `header.stamp` and no topic has one, or log time
+            cannot be mapped to it; or no transform leads to the pose.
     """
     inputs = InputColumns(profile, topics)
     edges = transforms_of(profile, inputs)
@@ -197,6 +197,7 @@ def align_inputs(profile: Profile, topics: Mapping[str, TopicColumns]) -> Aligne
         profile.clock,
         edges.static.union(latched),
         frozenset(edges.topics),
+        tolerance_s=profile.task.control_period_s / 2,
     )
     ticks, between = [], 0
     for segment in segments:

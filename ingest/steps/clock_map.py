@@ -14,7 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.ingest.steps.clocks import smoothed
+
 I64 = NDArray[np.int64]
+WINDOW_NS = 1_000_000_000  # in which a topic's least delay is looked at
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,13 @@ class ClockMap:
         return cls(np.array([offset_ns], np.int64), np.zeros(1, np.int64))
 
     @classmethod
+    def of_delays(cls, log_ns: I64, delay_ns: I64) -> ClockMap:
+        """Through messages (N >= 1,) of these delays (log time - stamp), less single bad stamps."""
+        order = np.argsort(log_ns, kind="stable")
+        log = log_ns[order]
+        return cls.through(log, log - smoothed(delay_ns[order]))
+
+    @classmethod
     def through(cls, log_ns: I64, stamp_ns: I64) -> ClockMap:
         """Through messages (N >= 1,) that carry both times, in any order."""
         order = np.argsort(log_ns, kind="stable")
@@ -44,18 +54,24 @@ class ClockMap:
         """Stamped times (N,) of log times (N,); beyond the knots at the map's mean pace."""
         # Differences alone go through float64, which holds a time of day to 256 ns only.
         first, last = int(self.log_ns[0]), int(self.log_ns[-1])
-        start, end = int(self.stamp_ns[0]), int(self.stamp_ns[-1])
+        start = int(self.stamp_ns[0])
         if first == last:
             return np.asarray(log_ns - first + start, np.int64)
         at = np.asarray(log_ns - first, np.float64)
         inside = np.interp(at, self.log_ns - first, self.stamp_ns - start)
-        pace = (end - start) / (last - first)
-        inside += np.minimum(at, 0) * pace + np.maximum(at - (last - first), 0) * pace
+        outside = np.minimum(at, 0) + np.maximum(at - (last - first), 0)
+        inside += outside * self.pace
         return np.rint(inside).astype(np.int64) + start
 
     def ahead_by(self, shift_ns: int) -> ClockMap:
         """The same map with stamps that much later."""
         return ClockMap(self.log_ns, self.stamp_ns + shift_ns)
+
+    @property
+    def pace(self) -> float:
+        """Seconds of stamped time in one of log time, on average."""
+        log, stamp = (int(times[-1] - times[0]) for times in (self.log_ns, self.stamp_ns))
+        return stamp / log if log else 1.0
 
     @property
     def offset_ns(self) -> int:
@@ -65,6 +81,22 @@ class ClockMap:
     @property
     def is_constant(self) -> bool:
         return len(self.log_ns) == 1
+
+
+def drift_ns(log_ns: I64, delay_ns: I64) -> int:
+    """By how much the delays (N,) of a topic drift over a recording, jitter aside.
+
+    Latency only ever adds to the clocks' offset, so each second's least delay shows the offset;
+    the drift is from the 5th to the 95th percentile of those.
+    """
+    if not len(log_ns):
+        return 0
+    window = (log_ns - log_ns.min()) // WINDOW_NS
+    order = np.argsort(window, kind="stable")
+    begins = np.flatnonzero(np.diff(window[order], prepend=-1))
+    least = np.minimum.reduceat(smoothed(delay_ns)[order], begins)
+    low, high = np.percentile(least - least[0], [5, 95])
+    return int(high - low)
 
 
 def residual_ns(log_ns: I64, stamp_ns: I64) -> I64:
@@ -93,4 +125,4 @@ def spread_ns(values_ns: Iterable[int] | I64) -> int:
     return int(high - low)
 
 
-__all__ = ["ClockMap", "residual_ns", "spread_ns"]
+__all__ = ["ClockMap", "drift_ns", "residual_ns", "spread_ns"]

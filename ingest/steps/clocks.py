@@ -97,19 +97,20 @@ def median(delay_ns: I64) -> int:
     return int(np.sort(delay_ns)[len(delay_ns) // 2])
 
 
-def jumps(log_time_ns: I64, delay_ns: I64, jump_ns: int) -> I64:
-    """The log times at which a topic's clock jumps.
+def smoothed(delay_ns: I64) -> I64:
+    """The running median of five delays (N,): single bad stamps are gone."""
+    if len(delay_ns) < 5:
+        return delay_ns
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(delay_ns, 2, mode="edge"), 5)
+    smooth = delay_ns.copy()
+    for start in range(0, len(windows), _BLOCK):
+        smooth[start : start + _BLOCK] = np.sort(windows[start : start + _BLOCK], axis=1)[:, 2]
+    return smooth
 
-    A running median of five first: a single bad stamp is no jump.
-    """
+
+def jumps(log_time_ns: I64, delay_ns: I64, jump_ns: int) -> I64:
+    """The log times at which a topic's clock jumps, single bad stamps aside."""
     if not (np.abs(np.diff(delay_ns)) > jump_ns).any():
         return np.zeros(0, np.int64)  # medians of neighbours differ by no more than neighbours do
-    if len(delay_ns) >= 5:
-        padded = np.pad(delay_ns, 2, mode="edge")
-        windows = np.lib.stride_tricks.sliding_window_view(padded, 5)
-        delay_ns = delay_ns.copy()
-        for start in range(0, len(windows), _BLOCK):
-            part = np.sort(windows[start : start + _BLOCK], axis=1)
-            delay_ns[start : start + _BLOCK] = part[:, 2]
-    at = np.flatnonzero(np.abs(np.diff(delay_ns)) > jump_ns) + 1
+    at = np.flatnonzero(np.abs(np.diff(smoothed(delay_ns))) > jump_ns) + 1
     return np.asarray(log_time_ns[at], np.int64)

@@ -14,6 +14,7 @@ from restock.ingest.decoding.columns import FieldColumn, TopicColumns
 from restock.ingest.profile.custom_signal import CustomSignal
 from restock.ingest.profile.profile import Input, Profile
 from restock.ingest.profile.signal_paths import offer
+from restock.ingest.steps.align import CLOCK_FIELD, CLOCK_TOPIC, clock_drifts
 from restock.ingest.steps.clearance import scan_reduction
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.custom_columns import custom_reduction
@@ -28,6 +29,7 @@ def read_topics(
 ) -> dict[str, TopicColumns]:
     """The columns that a profile needs of a recording.
 
+    Where header stamps run at another pace than log time, `/clock` is read too: it says which.
     `reduced`: scans as clearance and messages as custom signals alone, which is all that steps
     are made of; else with all fields as they were recorded.
 
@@ -37,14 +39,17 @@ def read_topics(
     readable = {name: info for name, info in recording.topics.items() if info.skipped is None}
     leaves = {topic: recording.fields(topic) for topic in profile.topics if topic in readable}
     wanted, made = wanted_fields(profile, readable, leaves), reductions(profile, readable)
-    if reduced:
-        return recording.read(wanted, made)
-    return recording.read(
-        {
+    if not reduced:
+        wanted = {
             topic: [*paths, *(made[topic].fields if topic in made else ())]
             for topic, paths in wanted.items()
         }
-    )
+    columns = recording.read(wanted, made if reduced else {})
+    by_stamp = profile.clock.alignment == STAMP and CLOCK_TOPIC not in columns
+    half_period_s = profile.task.control_period_s / 2
+    if by_stamp and CLOCK_TOPIC in readable and clock_drifts(columns, half_period_s):
+        columns |= recording.read({CLOCK_TOPIC: [CLOCK_FIELD]})
+    return columns
 
 
 def wanted_fields(

@@ -167,7 +167,7 @@ def test_a_truncated_file_is_refused_unless_salvaged(tmp_path, run):
     code, said, _ = run(cut, "--store", tmp_path / "s", "--salvage")
     assert code == 3
     (one,) = said["recordings"]
-    assert one["lost_messages"]
+    assert one["losses"]
     assert 10 < one["transitions"] < 29
 
 

@@ -132,7 +132,7 @@ def as_json(outcome: IngestResult) -> dict[str, Any]:
             for p, r in [(score["precision"], score["recall"])]
         ],
         "endings": outcome.endings,
-        "lost_messages": outcome.lost_messages,
+        "losses": outcome.lost_messages,
         "notes": outcome.notes,
         **row,
     }
