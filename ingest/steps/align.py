@@ -289,7 +289,7 @@ def _segment(
 
 
 def _carry_latched(segments: list[ClockSegment], latched: frozenset[str]) -> None:
-    """What a latched topic said last still holds at the start of the next segment."""
+    """The latest message of a latched topic still holds at the start of the next segment."""
     for index in range(1, len(segments)):
         topics = dict(segments[index].topics)
         start = min(int(samples.stamp_ns[0]) for samples in topics.values() if len(samples.row))
