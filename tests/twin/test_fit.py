@@ -259,6 +259,8 @@ def test_what_cannot_be_fitted_is_named(known: Path, capsys: pytest.CaptureFixtu
     for names, error in (("gain,grip", "'grip' cannot be fitted"), (" ,", "no parameter is named")):
         assert cli.main(["twin", "fit", str(known), "--parameters", names]) == ExitCode.USAGE
         assert error in capsys.readouterr().err
+    assert cli.main(["twin", "fit", str(known), "--held-out", "1.5"]) == ExitCode.USAGE
+    assert "held_out must be in [0, 1), got 1.5" in capsys.readouterr().err
     with pytest.raises(ValueError, match="'grip' cannot be fitted"):
         FitConfig(parameters=("gain", "grip"))
     with pytest.raises(ValueError, match=r"held_out must be in \[0, 1\), got 1"):

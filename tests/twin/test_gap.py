@@ -228,6 +228,8 @@ def test_the_command_line(stored: Path, tmp_path: Path, capsys: pytest.CaptureFi
     assert "not a list of seconds" in capsys.readouterr().err
     assert run(stored, "--horizons", "1") == 2
     assert "not driven" in capsys.readouterr().err
+    assert run(stored, "--trust-position-m", "-1") == 2
+    assert "limits.position_m must be at least 0, got -1" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(not TURTLEBOT.is_dir(), reason=f"{TURTLEBOT.name} is not here")
