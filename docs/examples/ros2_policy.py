@@ -43,11 +43,13 @@ class PolicyNode:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1  # a small network: handing it out costs more
         self.session = onnxruntime.InferenceSession(str(policy), options)
-        said = self.session.get_modelmeta().custom_metadata_map
-        profile = load_profile(said["profile"])
-        if profile.task.hash != said["task_hash"]:
-            raise ValueError(f"{policy} is of task {said['task_hash']}, not {profile.task.hash}")
-        self.actions = json.loads(said["actions"])
+        metadata = self.session.get_modelmeta().custom_metadata_map
+        profile = load_profile(metadata["profile"])
+        if profile.task.hash != metadata["task_hash"]:
+            raise ValueError(
+                f"{policy} is of task {metadata['task_hash']}, not {profile.task.hash}"
+            )
+        self.actions = json.loads(metadata["actions"])
         self.observer = LiveObserver(profile)
         self.clock = node.get_clock()
         self.twist = message_class(profile.inputs.command.type)
@@ -106,7 +108,7 @@ class BagNode:
         self.period_ns, self.timer = round(period_s * 1e9), callback
 
     def play(self, decided: Callable[[int, float], None]) -> None:
-        """Play it all; `decided` is told of each decision's time (ns) and how long it took (s)."""
+        """Play it all; `decided` receives each decision's time (ns) and duration (s)."""
         from rosbags.highlevel import AnyReader
 
         fired_ns = -self.period_ns
@@ -123,7 +125,7 @@ class BagNode:
 
 
 def twist_class(kind: str) -> Any:
-    """A stand-in for a ROS message class: only commands are ever made here."""
+    """A substitute for a ROS message class: only commands are ever made here."""
     from types import SimpleNamespace
 
     def make() -> Any:
