@@ -1,6 +1,6 @@
 """Several recordings: one after the other, in several processes, or on a Ray cluster.
 
-A process that dies (killed, or out of memory) costs the recording it had at hand, by name; the
+A process that dies (killed, or out of memory) costs the recording it was reading, by name; the
 others go on, and another process takes its place. Processes are forked from a server that has
 imported what they need once: forking this process, with its threads, would not be safe. It imports
 that while this process does, so nothing here is imported before it is needed.
@@ -84,7 +84,7 @@ def ingest_all(
     it may start at once where it starts on this machine.
 
     Raises:
-        ConfigError: Ray is asked for and is not installed, or its cluster does not answer.
+        ConfigError: Ray is to be used and is not installed, or its cluster does not answer.
     """
     if engine == "ray":
         from restock.ingest.on_ray import run_on_ray
@@ -206,7 +206,7 @@ def _stop(*_: object) -> None:
 
 
 def _end_with(parent: int) -> None:
-    """End when the parent has: nobody would tell of what this process does."""
+    """End when the parent has: nobody reads the results of this process any more."""
     wait([parent])
     os._exit(1)
 

@@ -38,7 +38,7 @@ Status = Literal["written", "unchanged", "dry run"]
 
 @dataclass(frozen=True)
 class IngestResult:
-    """What became of one recording: the counts of its manifest, and what else is worth saying."""
+    """What became of one recording: the counts of its manifest, and its notes."""
 
     path: str
     status: Status

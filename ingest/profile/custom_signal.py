@@ -65,7 +65,7 @@ class CustomSignal(Checked, frozen=True):
         if self.reduce not in (None, "yaw") and not path.lists:
             raise ValueError(f"path {self.path!r} gives one value: there is nothing to reduce")
         if not self.unit:
-            raise ValueError('unit is empty: say "1" for what has none')
+            raise ValueError('unit is empty: write "1" for a quantity without one')
 
     @property
     def read(self) -> SignalPath:

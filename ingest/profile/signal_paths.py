@@ -150,7 +150,9 @@ class SignalPath:
         for place, path in self.beside().items():
             choice = self.steps[place].choice
             if choice and (_bare(path) in repeats) == (choice.key is not None):
-                raise PathProblem(f"{path!r} cannot tell elements apart: it is not one a element")
+                raise PathProblem(
+                    f"{path!r} cannot tell elements apart: it is not one value an element"
+                )
         return [kinds[path] for path in self.wanted(*ends)[: max(len(ends), 1)]]
 
     def find(self, columns: Mapping[str, FieldColumn], end: str | None = None) -> PathValues:

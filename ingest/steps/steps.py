@@ -55,7 +55,7 @@ class Steps:
     commands_between: int  # commands that got no tick of their own
     custom: Custom  # the profile's own signals
     clocks: list[TopicClock] = field(default_factory=list)  # of each topic that was read
-    notes: list[str] = field(default_factory=list)  # what else is worth saying
+    notes: list[str] = field(default_factory=list)  # for people
 
     def __len__(self) -> int:
         return len(self.segment)

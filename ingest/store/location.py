@@ -185,7 +185,7 @@ class Location:
         return {info.path.removeprefix(f"{folder}/") for info in infos if info.is_file}
 
     def delete(self, paths: Iterable[str]) -> None:
-        """Delete files; one that is not there is as good."""
+        """Delete files; one that does not exist is not an error."""
         if self.folder is not None:
             for path in paths:
                 (self.folder / path).unlink(missing_ok=True)

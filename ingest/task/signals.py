@@ -95,5 +95,5 @@ def yaw_of(
     x: NDArray[Any], y: NDArray[Any], z: NDArray[Any], w: NDArray[Any]
 ) -> NDArray[np.float64]:
     """Quaternions (N,) to yaw in (-pi, pi], REP 103: about z, counter-clockwise."""
-    with np.errstate(over="ignore", invalid="ignore"):  # what is no number stays none
+    with np.errstate(over="ignore", invalid="ignore"):  # NaN stays NaN
         return np.asarray(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)), np.float64)
