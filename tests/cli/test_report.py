@@ -13,13 +13,12 @@ import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from support.panels import panel_of
 from support.stores import TASK
 
 from restock import cli
 from restock.errors import RunError
 from restock.replay.mixture.mixture import parse_mixture
-from restock.replay.panel.build import build_panel
-from restock.replay.store.store import Store
 from restock.report import build_report
 from restock.report.facts import evaluation_bias, gather
 from restock.stats import ConfidenceInterval
@@ -54,8 +53,7 @@ def run(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     mixture = parse_mixture(
         "[each_condition]\nshare = 'natural'\n[evaluation_split]\nby = 'none'\n"
     )
-    with Store(store_path) as store:
-        panel = build_panel(store, mixture, root / "panel", task=TASK)
+    panel = panel_of(store_path, mixture, root / "panel", task=TASK)
     config = {"target": {"rule": "hard", "every": 500}, "replay": {"ring_capacity": 4096}}
     document = {"config": config, "panel": {"path": str(root / "panel"), "id": panel.id}}
     made = Run.create(root / "run", document)

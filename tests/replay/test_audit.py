@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from support.panels import panel_of
 from support.paths import ROOT
 from support.stores import TASK, manifest, recording_transitions, write_store
 
@@ -368,8 +369,7 @@ def test_a_copy_of_a_held_out_step_is_a_leak(tmp_path: Path) -> None:
     copy = replaced(copy, "ingest_id", ["copy"] * len(one))
     path = write_store(tmp_path / "store", [one, copy])
     mixture = parse_mixture("[each_condition]\n[evaluation_split]\nby = 'recording'\nshare = 0.4")
-    with Store(path) as store:
-        panel = build_panel(store, mixture, tmp_path / "p")
+    panel = panel_of(path, mixture, tmp_path / "p")
     finding = beside_panel(path, panel.path, "leakage")
     assert {row["leak"] for row in finding.sample} == {"the same step under another id"}
     assert finding.rows == len(one["episode_id"].unique())

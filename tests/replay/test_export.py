@@ -20,6 +20,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from support.panels import panel_of
 from support.stores import TASK, recording_transitions, write_store
 
 from restock import cli
@@ -27,8 +28,6 @@ from restock.errors import ExitCode, PanelError, QueryError, StoreError
 from restock.replay.export.dataset import FORMATS, export_dataset
 from restock.replay.export.selection import open_selection
 from restock.replay.export.trajectory import Counts, Trajectory, trajectories
-from restock.replay.mixture.mixture import parse_mixture
-from restock.replay.panel.build import build_panel
 from restock.replay.panel.panel import Panel
 
 TESTS = Path(__file__).parent
@@ -53,15 +52,12 @@ def matrix(column: pa.ChunkedArray) -> np.ndarray:
     return np.array(column.to_pylist(), np.float32)
 
 
-def panel_of(store: Path, out: Path, n_step: int, where: str = "") -> Panel:
-    from restock.replay.store.store import Store
-
-    mixture = parse_mixture(
+def n_step_panel(store: Path, out: Path, n_step: int, where: str = "") -> Panel:
+    mixture = (
         f'n_step = {n_step}\n{where}[each_condition]\nshare = "natural"\n'
         '[evaluation_split]\nby = "none"\n'
     )
-    with Store(store) as opened:
-        return build_panel(opened, mixture, out)
+    return panel_of(store, mixture, out)
 
 
 def test_whole_episodes_come_back_in_order_with_their_final_observation(
@@ -143,8 +139,8 @@ def test_a_step_whose_next_observation_is_not_the_next_steps_is_an_end() -> None
 
 
 def test_a_panel_of_n_steps_gives_back_single_steps(store_path: Path, tmp_path: Path) -> None:
-    one = panel_of(store_path, tmp_path / "one", 1)
-    three = panel_of(store_path, tmp_path / "three", 3)
+    one = n_step_panel(store_path, tmp_path / "one", 1)
+    three = n_step_panel(store_path, tmp_path / "three", 3)
     single, counts = of(one.path)
     several, counts_too = of(three.path)
     assert counts.transitions == counts_too.transitions == len(one)
@@ -157,7 +153,7 @@ def test_a_panel_of_n_steps_gives_back_single_steps(store_path: Path, tmp_path: 
 def test_a_panel_with_holes_leaves_out_and_counts_what_it_cannot_tell(
     store_path: Path, tmp_path: Path
 ) -> None:
-    holes = panel_of(store_path, tmp_path / "holes", 3, 'where = "step_index % 5 <> 4"\n')
+    holes = n_step_panel(store_path, tmp_path / "holes", 3, 'where = "step_index % 5 <> 4"\n')
     found, counts = of(holes.path)
     whole, _ = of(store_path)
     by_id = {
@@ -441,7 +437,7 @@ def test_what_cannot_be_exported_is_refused(
 
 
 def test_a_panel_has_no_commands_but_its_store_has(store_path: Path, tmp_path: Path) -> None:
-    panel = panel_of(store_path, tmp_path / "panel", 1, "where = \"zone = 'cross'\"\n")
+    panel = n_step_panel(store_path, tmp_path / "panel", 1, "where = \"zone = 'cross'\"\n")
     with pytest.raises(PanelError, match="keeps the index of the action"):
         export_dataset(panel.path, "npz", tmp_path / "a.npz", continuous=True)
     document = export_dataset(

@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from support.panels import panel_of
 from torch.utils.data import DataLoader
 
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import parse_mixture
-from restock.replay.panel.build import build_panel
 from restock.replay.panel.iterable import PanelDataset
 from restock.replay.panel.panel import Panel
-from restock.replay.store.store import Store
 
 MIXTURE = parse_mixture(
     '[[strata]]\nname = "wheel_slip"\nshare = 0.25\n[[strata]]\nname = "near_collision"\n'
@@ -25,8 +24,7 @@ MIXTURE = parse_mixture(
 
 @pytest.fixture(scope="module")
 def panel(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Panel:
-    with Store(store_path) as store:
-        return build_panel(store, MIXTURE, tmp_path_factory.mktemp("iterable") / "panel")
+    return panel_of(store_path, MIXTURE, tmp_path_factory.mktemp("iterable") / "panel")
 
 
 def batches(dataset: PanelDataset, workers: int) -> list[dict[str, torch.Tensor]]:

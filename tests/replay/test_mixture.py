@@ -11,6 +11,7 @@ import pyarrow as pa
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from support.panels import EVERY, planned
 from support.paths import ROOT
 from support.stores import CONDITIONS, TASK
 
@@ -39,13 +40,6 @@ from restock.replay.panel.build import build_panel, open_source
 from restock.replay.panel.plan import PanelPlan, plan_panel
 from restock.replay.panel.strata import ResolvedStratum, assign, resolve_strata
 from restock.replay.panel.weights import effective_count, effective_shares, importance_weights
-
-EVERY = "[each_condition]\nshare = 'natural'\n"
-
-
-def planned(transitions: pa.Table, text: str) -> PanelPlan:
-    with open_source(transitions, task=TASK, conditions=CONDITIONS) as source:
-        return plan_panel(source.connection, parse_mixture(text), source.conditions)
 
 
 def shares(plan: PanelPlan) -> dict[str, float]:

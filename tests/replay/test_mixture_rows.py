@@ -12,8 +12,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
+from support.panels import EVERY, NO_SPLIT, panel_of, planned
 from support.paths import ROOT
-from support.stores import CONDITIONS, TASK, recording_transitions, write_store
+from support.stores import CONDITIONS, recording_transitions, write_store
 
 from restock import cli
 from restock.errors import MixtureError, StoreError
@@ -25,20 +26,12 @@ from restock.replay.mixture.mixture import (
     shipped_mixtures,
     shipped_schema,
 )
-from restock.replay.panel.build import build_panel, open_source
+from restock.replay.panel.build import build_panel
 from restock.replay.panel.logged_sampler import controller_for
 from restock.replay.panel.panel import Panel
 from restock.replay.panel.plan import PanelPlan, plan_panel
 from restock.replay.sampling.share_controller import PlannedDraws
 from restock.replay.store.store import Store
-
-EVERY = "[each_condition]\nshare = 'natural'\n"
-NO_HOLD = "[evaluation_split]\nby = 'none'\n"
-
-
-def planned(transitions: pa.Table, text: str) -> PanelPlan:
-    with open_source(transitions, task=TASK, conditions=CONDITIONS) as source:
-        return plan_panel(source.connection, parse_mixture(text), source.conditions)
 
 
 def taken(plan: PanelPlan) -> pa.Table:
@@ -62,7 +55,7 @@ def test_a_stratum_of_episodes_has_all_rows_of_those_that_met_it(
 ) -> None:
     plan = planned(
         transitions,
-        NO_HOLD + f"[each_condition]\nunit = 'episode'\nmin_steps = {min_steps}\n",
+        NO_SPLIT + f"[each_condition]\nunit = 'episode'\nmin_steps = {min_steps}\n",
     )
     assert len(plan.panel_rows) == len(transitions)  # nominal is what is left
     rows = taken(plan)
@@ -87,11 +80,11 @@ def test_a_stratum_of_episodes_has_all_rows_of_those_that_met_it(
 def test_unsafe_rows_go_alone_or_with_their_episode(transitions: pa.Table) -> None:
     bumped = set(transitions.filter(transitions["bumped"])["transition_id"].to_pylist())
     assert bumped
-    rows = planned(transitions, NO_HOLD + "[safety]\nunsafe = 'bumped'\n" + EVERY)
+    rows = planned(transitions, NO_SPLIT + "[safety]\nunsafe = 'bumped'\n" + EVERY)
     assert rows.left_out == {"unsafe": len(bumped)}
     assert not bumped & set(taken(rows)["transition_id"].to_pylist())
     whole = planned(
-        transitions, NO_HOLD + "[safety]\nunsafe = 'bumped'\nleave_out = 'episodes'\n" + EVERY
+        transitions, NO_SPLIT + "[safety]\nunsafe = 'bumped'\nleave_out = 'episodes'\n" + EVERY
     )
     hit = set(transitions.filter(transitions["bumped"])["episode_id"].to_pylist())
     assert not hit & set(taken(whole)["episode_id"].to_pylist())
@@ -108,12 +101,12 @@ def test_old_versions_of_a_policy_are_left_out(transitions: pa.Table) -> None:
     changed = transitions.set_column(
         place, transitions.schema.field(place), pa.array(version.tolist(), pa.string())
     )
-    newest = planned(changed, "max_versions_behind = 0\n" + NO_HOLD + EVERY)
+    newest = planned(changed, "max_versions_behind = 0\n" + NO_SPLIT + EVERY)
     kept = taken(newest)
     assert set(kept["behaviour_version"].to_pylist()) == {"v3", None}
     gone = int(((policy == "planner") & (recording < 3)).sum())
     assert newest.left_out == {"of an old version of its policy": gone}
-    one_back = planned(changed, "max_versions_behind = 1\n" + NO_HOLD + EVERY)
+    one_back = planned(changed, "max_versions_behind = 1\n" + NO_SPLIT + EVERY)
     assert set(taken(one_back)["behaviour_version"].to_pylist()) == {"v2", "v3", None}
 
 
@@ -121,7 +114,7 @@ def test_old_versions_of_a_policy_are_left_out(transitions: pa.Table) -> None:
 def test_caps_an_episode_and_recording_hold_in_each_stratum(
     transitions: pa.Table, name: str
 ) -> None:
-    text = f"max_rows_per_{name} = 7\n" + NO_HOLD + EVERY
+    text = f"max_rows_per_{name} = 7\n" + NO_SPLIT + EVERY
     plan = planned(transitions, text)
     rows = taken(plan)
     groups = pa.table({"group": rows[f"{name}_id"], "code": plan.stratum[plan.panel_rows]})
@@ -160,10 +153,10 @@ def test_rows_without_a_label_are_refused_dropped_or_taken_for_nominal(
         ]
         table = table.set_column(place, field, pa.array(values, field.type))
     with pytest.raises(MixtureError, match=r"50 rows have no coverage label"):
-        planned(table, NO_HOLD + EVERY)
-    dropped = planned(table, "unlabelled = 'drop'\n" + NO_HOLD + EVERY)
+        planned(table, NO_SPLIT + EVERY)
+    dropped = planned(table, "unlabelled = 'drop'\n" + NO_SPLIT + EVERY)
     assert dropped.left_out == {"without a coverage label": 50}
-    nominal = planned(table, "unlabelled = 'nominal'\n" + NO_HOLD + EVERY)
+    nominal = planned(table, "unlabelled = 'nominal'\n" + NO_SPLIT + EVERY)
     assert nominal.left_out == {}
     rows = {line.name: line.rows for line in nominal.strata}
     before = {line.name: line.rows for line in dropped.strata}
@@ -231,22 +224,21 @@ def test_a_run_draws_from_both_stores_by_their_schedules(
         '"other"', f'"{two_stores}/other"'
     )
     every = "[adaptive]\nafter_updates = 0\nevery_updates = 1\nstep_size = 0.5\n" + EVERY
-    with Store(store_path) as store:
-        panel = build_panel(store, parse_mixture(text + every), two_stores / "p")
-    diet = controller_for(panel, PlannedDraws(640, 6400, 0, 1000), None)
+    panel = panel_of(store_path, text + every, two_stores / "p")
+    controller = controller_for(panel, PlannedDraws(640, 6400, 0, 1000), None)
     twin = np.array([stratum.source == "twin" for stratum in panel.strata])
-    assert diet.shares[twin].sum() == 0
-    assert diet.logs_share == pytest.approx(0.4)
-    diet.at(500)
-    assert diet.logs_share == pytest.approx(0.6)
-    assert diet.shares[twin].sum() == pytest.approx(1 / 3)
+    assert controller.shares[twin].sum() == 0
+    assert controller.logs_share == pytest.approx(0.4)
+    controller.at(500)
+    assert controller.logs_share == pytest.approx(0.6)
+    assert controller.shares[twin].sum() == pytest.approx(1 / 3)
     # A stratum of the twin that errs takes from the twin's other strata, not from the logs.
     worst = [stratum.name for stratum in panel.strata].index("twin/wheel_slip")
-    before = diet.shares.copy()
+    before = controller.shares.copy()
     everyone = np.flatnonzero(before > 0)
-    diet.observe(everyone, np.where(everyone == worst, 5.0, 1.0))
-    assert diet.shares[worst] > before[worst]
-    assert diet.shares[twin].sum() == pytest.approx(1 / 3)
+    controller.observe(everyone, np.where(everyone == worst, 5.0, 1.0))
+    assert controller.shares[worst] > before[worst]
+    assert controller.shares[twin].sum() == pytest.approx(1 / 3)
 
 
 def test_a_missing_other_store_is_named(store_path: Path, tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.panels import panel_of
 from support.stores import CONDITIONS, TASK, manifest, recording_transitions, write_store
 
 from restock import cli
@@ -213,8 +214,7 @@ def test_a_store_and_the_same_table_pack_the_same_rows(
 ) -> None:
     mixture = load_mixture("coverage")
     from_table = build_panel(transitions, mixture, tmp_path / "a", task=TASK)
-    with Store(store_path) as store:
-        from_store = build_panel(store, mixture, tmp_path / "b")
+    from_store = panel_of(store_path, mixture, tmp_path / "b")
     np.testing.assert_array_equal(from_table.rows, from_store.rows)
     assert from_table.meta.equals(from_store.meta)
     assert from_store.task == TASK

@@ -16,10 +16,10 @@ import duckdb
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from support.panels import panel_of
 
 from restock import cli
 from restock.replay.mixture.mixture import load_mixture
-from restock.replay.panel.build import build_panel
 from restock.replay.store.store import Store
 from restock.train.run.run import Run
 
@@ -135,8 +135,7 @@ def test_what_was_sampled_joins_what_was_logged(
 def test_a_panel_is_queried_by_its_tables(
     store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with Store(store_path) as store:
-        panel = build_panel(store, load_mixture("uniform"), tmp_path / "p")
+    panel = panel_of(store_path, load_mixture("uniform"), tmp_path / "p")
     query = "SELECT sum(rows) AS rows FROM strata"
     assert json.loads(out_of(capsys, str(panel.path), query, "--json")) == [{"rows": len(panel)}]
     query = "SELECT count(*) AS rows FROM panel.rows JOIN transitions USING (transition_id)"

@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from deltalake import DeltaTable, write_deltalake
+from support.panels import panel_of
 from support.paths import ROOT
 from support.stores import TASK, manifest, recording_transitions, write_store
 
@@ -54,8 +55,7 @@ class Places:
 def places(tmp_path_factory: pytest.TempPathFactory) -> Places:
     folder = tmp_path_factory.mktemp("trace")
     ingest(RECORDING, load_profile("warehouse_amr"), store=StoreWriter(folder / "store"))
-    with Store(folder / "store") as store:
-        panel = build_panel(store, MIXTURE, folder / "panel")
+    panel = panel_of(folder / "store", MIXTURE, folder / "panel")
     write_run(folder / "run", panel)
     return Places(folder / "store", folder / "panel", folder / "run")
 
@@ -209,8 +209,7 @@ def test_what_is_not_there_is_said(places: Places, tmp_path: Path) -> None:
 def test_places_that_were_moved_are_asked_for_and_taken(places: Places, tmp_path: Path) -> None:
     store, panel = tmp_path / "store", tmp_path / "panel"
     shutil.copytree(places.store, store)
-    with Store(store) as opened:
-        build_panel(opened, MIXTURE, panel)
+    panel_of(store, MIXTURE, panel)
     write_run(tmp_path / "run", Panel.open(panel))
     store.rename(tmp_path / "elsewhere")
     with pytest.raises(StoreError, match=r"--store"):
@@ -237,8 +236,7 @@ def test_another_recording_is_refused(places: Places) -> None:
 def test_a_row_that_was_labelled_again_since_says_so(tmp_path: Path) -> None:
     before = recording_transitions(1)
     writer = write_store(tmp_path / "store", [before, recording_transitions(2)])
-    with Store(writer) as store:
-        build_panel(store, MIXTURE, tmp_path / "panel")
+    panel_of(writer, MIXTURE, tmp_path / "panel")
     later = recording_transitions(1, ingest="b")
     place = later.schema.get_field_index("condition")
     named = pa.array(np.where(np.arange(len(later)) == 0, "recovery", later["condition"]))

@@ -14,10 +14,8 @@ import torch
 
 import restock  # noqa: F401 - registers the environment
 from restock.ingest.profile.profile import load_profile
-from restock.replay.mixture.mixture import parse_mixture
-from restock.replay.panel.build import build_panel
 from restock.replay.panel.panel import Panel
-from restock.replay.store.store import Store
+from support.panels import panel_of
 from support.stores import recording_transitions, write_store
 
 TASK = load_profile("warehouse_amr").task
@@ -42,8 +40,7 @@ def make_store(folder: Path) -> Path:
 
 def make_panel(store: Path, out: Path, *, n_step: int = 1, post: str = "none") -> Panel:
     """A panel of a quarter wheel slip; `post` corrects what is known only afterwards."""
-    with Store(store) as opened:
-        return build_panel(opened, parse_mixture(MIXTURE.format(n_step=n_step, post=post)), out)
+    return panel_of(store, MIXTURE.format(n_step=n_step, post=post), out)
 
 
 def run_tables(run: Path) -> dict[str, list[dict[str, Any]]]:

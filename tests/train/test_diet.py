@@ -1,4 +1,4 @@
-"""The diet of a run: its own draws, schedules, adaptive shares, and the cap a row that holds."""
+"""The shares of a run: its own draws, schedules, adaptive shares, and the cap a row that holds."""
 
 from __future__ import annotations
 
@@ -31,34 +31,38 @@ from restock.train.session import Session
 HALVES = "[[strata]]\nname = 'nominal'\nshare = 0.5\n[[strata]]\nname = 'rare'\nshare = 0.5\n"
 
 
-def diet(text: str, rows: list[int], planned: PlannedDraws, **more: Any) -> ShareController:
+def controller(text: str, rows: list[int], planned: PlannedDraws, **more: Any) -> ShareController:
     mixture = parse_mixture(text)
     names = [rule.name for rule in mixture.strata]
-    fed = [
+    strata = [
         SampledStratum(name, "logs", rule, count, 9)
         for name, rule, count in zip(names, rules_of(mixture, names), rows, strict=True)
     ]
-    return ShareController(mixture, fed, planned, **more)
+    return ShareController(mixture, strata, planned, **more)
 
 
 def test_the_cap_is_reckoned_with_the_runs_own_draws() -> None:
     text = "max_replays_per_row = 50\n[planned]\nupdates = 1\n" + HALVES
     # 100,000 online rows, half of them logs: 50,000; 100 rows x 50 are a tenth of that.
-    plan = diet(text, [10_000, 100], PlannedDraws(0, 100_000, 0, 1000))
+    plan = controller(text, [10_000, 100], PlannedDraws(0, 100_000, 0, 1000))
     np.testing.assert_allclose(plan.shares, [0.9, 0.1])
     assert plan.logs_share == 0.5
     # Twice the run: half the share.
-    plan = diet(text, [10_000, 100], PlannedDraws(0, 200_000, 0, 1000))
+    plan = controller(text, [10_000, 100], PlannedDraws(0, 200_000, 0, 1000))
     np.testing.assert_allclose(plan.shares, [0.95, 0.05])
     # All rows together bear 20,000 of 60,000: 10,000 go to the offline phase, 10,000 of 50,000 on.
-    plan = diet(text, [300, 100], PlannedDraws(10_000, 100_000, 0, 1000))
+    plan = controller(text, [300, 100], PlannedDraws(10_000, 100_000, 0, 1000))
     np.testing.assert_allclose(plan.shares, [0.75, 0.25])
     assert plan.logs_share == pytest.approx(0.1)
     with pytest.raises(MixtureError, match=r"offline phase draws 30,000 rows of logs.*400 rows"):
-        diet(text, [300, 100], PlannedDraws(30_000, 100_000, 0, 1000))
+        controller(text, [300, 100], PlannedDraws(30_000, 100_000, 0, 1000))
     with pytest.raises(MixtureError, match=r"rare wants 50\.0% of 50,000 draws, its 100 rows"):
-        diet("shortfall = 'refuse'\n" + text, [10_000, 100], PlannedDraws(0, 100_000, 0, 1000))
-    shrunk = diet("shortfall = 'shrink'\n" + text, [10_000, 100], PlannedDraws(0, 100_000, 0, 1))
+        controller(
+            "shortfall = 'refuse'\n" + text, [10_000, 100], PlannedDraws(0, 100_000, 0, 1000)
+        )
+    shrunk = controller(
+        "shortfall = 'shrink'\n" + text, [10_000, 100], PlannedDraws(0, 100_000, 0, 1)
+    )
     np.testing.assert_allclose(shrunk.shares, [5 / 6, 1 / 6])
     assert shrunk.logs_share == pytest.approx(0.3)
 
@@ -70,7 +74,7 @@ def test_shares_follow_schedules_of_sources_and_strata() -> None:
         "share = {schedule = 'piecewise', points = [[0, 0.5], [1000, 0]]}\n"
         "[[strata]]\nname = 'nominal'\n"
     )
-    plan = diet(text, [100, 1000], PlannedDraws(0, 1000, 0, 1000))
+    plan = controller(text, [100, 1000], PlannedDraws(0, 1000, 0, 1000))
     seen = []
     for env_steps in (0, 250, 500, 1000, 5000):
         plan.batches = 0  # due
@@ -79,7 +83,7 @@ def test_shares_follow_schedules_of_sources_and_strata() -> None:
     expected = [(0.8, 0.5, 0.5), (0.65, 0.375, 0.625), (0.5, 0.25, 0.75), (0.2, 0, 1), (0.2, 0, 1)]
     np.testing.assert_allclose(seen, expected, atol=1e-12)
     # A share that is given for the run stands in place of the schedule's.
-    given = diet(text, [100, 1000], PlannedDraws(0, 1000, 0, 1000), logs_share=0.3)
+    given = controller(text, [100, 1000], PlannedDraws(0, 1000, 0, 1000), logs_share=0.3)
     given.at(700)
     assert given.logs_share == pytest.approx(0.3)
 

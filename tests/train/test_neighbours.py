@@ -8,13 +8,12 @@ from typing import Any
 
 import pytest
 import torch
+from support.panels import panel_of
 from support.paths import ROOT
 from support.stores import recording_transitions, write_store
 
 from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
-from restock.replay.panel.build import build_panel
-from restock.replay.store.store import Store
 
 EXAMPLES = ROOT / "docs" / "examples"
 NEEDS = {
@@ -44,8 +43,7 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("neighbours")
     store = write_store(folder / "store", [recording_transitions(1, task=task)], task=task)
     mixture = parse_mixture('[each_condition]\nshare = "natural"\n')
-    with Store(store) as opened:
-        return build_panel(opened, mixture, folder / "panel").path
+    return panel_of(store, mixture, folder / "panel").path
 
 
 def test_every_example_is_run_and_explained() -> None:

@@ -14,13 +14,13 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from support.kept_run import kept_network, kept_run
+from support.panels import panel_of
 from support.stores import recording_transitions, write_store
 
 from restock.cli import main
 from restock.errors import RunError
 from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
-from restock.replay.panel.build import build_panel
 from restock.replay.panel.panel import Panel
 from restock.replay.store.store import Store
 from restock.train import loop
@@ -54,8 +54,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def panel(store: Path) -> Panel:
-    with Store(store) as opened:
-        return build_panel(opened, MIXTURE, store.parent / "panel")
+    return panel_of(store, MIXTURE, store.parent / "panel")
 
 
 @pytest.fixture
@@ -82,8 +81,7 @@ def test_what_was_all_learnt_from_is_refused(store: Path, tmp_path: Path) -> Non
     everything = parse_mixture(
         "[each_condition]\nshare = 'natural'\n[evaluation_split]\nby = 'none'\n"
     )
-    with Store(store) as opened:
-        panel = build_panel(opened, everything, tmp_path / "p")
+    panel = panel_of(store, everything, tmp_path / "p")
     with pytest.raises(RunError, match="no episode that the run did not learn from"):
         load_ope_dataset(panel, TASK, str(store))
     other = msgspec.structs.replace(TASK, time_limit_steps=3)

@@ -1,0 +1,34 @@
+"""Panels and plans for tests, from a table of transitions or a store."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from restock.replay.mixture.mixture import Mixture, parse_mixture
+from restock.replay.panel.build import build_panel, open_source
+from restock.replay.panel.panel import Panel
+from restock.replay.panel.plan import PanelPlan, plan_panel
+from restock.replay.store.store import Store
+from support.stores import CONDITIONS, TASK
+
+EVERY = "[each_condition]\nshare = 'natural'\n"
+NO_SPLIT = "[evaluation_split]\nby = 'none'\n"
+
+
+def planned(transitions: pa.Table, text: str) -> PanelPlan:
+    """A mixture worked out over a table."""
+    with open_source(transitions, task=TASK, conditions=CONDITIONS) as source:
+        return plan_panel(source.connection, parse_mixture(text), source.conditions)
+
+
+def panel_of(source: pa.Table | Path, mixture: Mixture | str, out: Path, **given: Any) -> Panel:
+    """A panel of a table or of a store's folder."""
+    if isinstance(mixture, str):
+        mixture = parse_mixture(mixture)
+    if isinstance(source, pa.Table):
+        return build_panel(source, mixture, out, **given)
+    with Store(source) as store:
+        return build_panel(store, mixture, out, **given)
