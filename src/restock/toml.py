@@ -163,8 +163,8 @@ def _check(name: str, kind: inspect.Type, value: Any) -> None:
 
 
 def _bounds(kind: inspect.Type) -> dict[str, float]:
-    found = {name: getattr(kind, name, None) for name in ("ge", "gt", "le", "lt")}
-    return {name: bound for name, bound in found.items() if bound is not None}
+    bounds = {name: getattr(kind, name, None) for name in ("ge", "gt", "le", "lt")}
+    return {name: bound for name, bound in bounds.items() if bound is not None}
 
 
 def _inside(value: float, bounds: Mapping[str, float]) -> bool:
@@ -192,8 +192,8 @@ def _in_words(message: str, document: Any, kind: Any, prefix: str) -> str:
     what, _, path = message.partition(" - at `$")
     path = path.rstrip("`")
     for pattern, word in (("contains unknown", "unknown"), ("missing required", "missing")):
-        if found := re.fullmatch(rf"Object {pattern} field `(.*)`", what):
-            return f"{word} key `{_join(prefix, path, found[1])}`"
+        if field := re.fullmatch(rf"Object {pattern} field `(.*)`", what):
+            return f"{word} key `{_join(prefix, path, field[1])}`"
     key = _join(prefix, path)
     if re.fullmatch(r"Expected `\w+` [<>]=? .*", what):
         place = _walk(inspect.type_info(kind), document, path)
@@ -210,8 +210,8 @@ def _walk(kind: inspect.Type, value: Any, path: str) -> tuple[dict[str, float], 
     """Bounds, value and key of what a message's path leads to; `[...]` is any item of a map."""
     if isinstance(kind, inspect.UnionType):
         for option in kind.types:
-            if found := _walk(option, value, path):
-                return found
+            if place := _walk(option, value, path):
+                return place
         return None
     if not path:
         bounds = _bounds(kind)
@@ -222,8 +222,8 @@ def _walk(kind: inspect.Type, value: Any, path: str) -> tuple[dict[str, float], 
         name = step[1:]
         if name not in fields or not isinstance(value, Mapping) or name not in value:
             return None
-        found = _walk(fields[name], value[name], rest)
-        return found and (found[0], found[1], _join(name, found[2]))
+        place = _walk(fields[name], value[name], rest)
+        return place and (place[0], place[1], _join(name, place[2]))
     item = _item(kind)
     if isinstance(kind, inspect.TupleType):
         item = kind.item_types[int(step[1:-1])]
@@ -231,13 +231,13 @@ def _walk(kind: inspect.Type, value: Any, path: str) -> tuple[dict[str, float], 
         return None
     if step == "[...]":
         for name, one in value.items() if isinstance(value, Mapping) else ():
-            if isinstance(one, int | float | Mapping | list) and (found := _walk(item, one, rest)):
-                return found[0], found[1], _join(str(name), found[2])
+            if isinstance(one, int | float | Mapping | list) and (place := _walk(item, one, rest)):
+                return place[0], place[1], _join(str(name), place[2])
         return None
     index = int(step[1:-1])
     # `[...]` may stand for another item of the map, one that is longer.
-    found = _walk(item, value[index], rest) if index < len(value) else None
-    return found and (found[0], found[1], _join(step, found[2]))
+    place = _walk(item, value[index], rest) if index < len(value) else None
+    return place and (place[0], place[1], _join(step, place[2]))
 
 
 def _has(document: Any, keys: list[str]) -> bool:
