@@ -107,9 +107,7 @@ treatment = "method"
     ]
 
 
-def test_each_comparison_is_judged_by_its_own_treatment(
-    tmp_path: Path, capsys, monkeypatch
-) -> None:
+def test_each_comparison_has_its_own_treatment(tmp_path: Path, capsys, monkeypatch) -> None:
     arm = '\n[[arms]]\nname = "again"\nbaseline = "dueling"\ntreatment = "method"'
     (tmp_path / "s.toml").write_text(SMALL + arm)
     out = tmp_path / "out"
@@ -120,14 +118,14 @@ def test_each_comparison_is_judged_by_its_own_treatment(
     dueling = Difference("config.network.dueling", "algorithm", False, True)
     own = [Difference(f"library.arguments.{n}", "algorithm", None, 1) for n in ("gamma", "tau")]
 
-    def judged(first, second, *, treatment):
+    def compared(first, second, *, treatment):
         asked.append((first[0].name, second[0].name, treatment))
         if treatment == "algorithm":
             return Comparison(treatment, "incomparable", [dueling], [dueling], [], [], None, [])
         return Comparison(treatment, "comparable", [dueling, *own], [], [], [], "evaluation", [])
 
     asked: list[tuple[str, str, str]] = []
-    monkeypatch.setattr(study_run, "compare", judged)
+    monkeypatch.setattr(study_run, "compare", compared)
     assert main(["study", str(tmp_path / "s.toml"), "--out", str(out), "--json"]) == 1
     assert asked == [("plain-0", "dueling-0", "algorithm"), ("dueling-0", "again-0", "method")]
     first, second = json.loads(capsys.readouterr().out)["comparisons"]

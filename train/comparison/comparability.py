@@ -67,6 +67,11 @@ class Check:
     high: float
     limit: float
 
+    @classmethod
+    def exact(cls, name: str, first: float, second: float, value: float, limit: float) -> Check:
+        """Of counts of the whole run, with nothing random in them."""
+        return cls(name, "whole run", first, second, value, value, value, limit)
+
     @property
     def verdict(self) -> Verdict:
         if self.high <= self.limit:
@@ -143,14 +148,8 @@ def _episodes(first: Feed, second: Feed, limits: ComparabilityLimits) -> list[Ch
             continue
         one, other = _episodes_a_run(first, index), _episodes_a_run(second, index)
         value = max(one, other) / min(one, other) if min(one, other) else math.inf
-        checks.append(
-            Check(
-                f"episodes of {cell}",
-                "whole run",
-                *(one, other, value, value, value),
-                limits.episode_ratio,
-            )
-        )
+        name = f"episodes of {cell}"
+        checks.append(Check.exact(name, one, other, value, limits.episode_ratio))
     return checks
 
 

@@ -105,7 +105,7 @@ def _deciding(treatment: Treatment, totals: list[Check], checks: list[Check]) ->
 def _total(name: str, first: float, second: float) -> Check:
     ratio = max(first, second) / max(min(first, second), 1.0)
     shown = name.replace("_", " ").replace("gradient steps", "updates")
-    return Check(shown, "whole run", first, second, ratio, ratio, ratio, _SAME_TOTAL)
+    return Check.exact(shown, first, second, ratio, _SAME_TOTAL)
 
 
 def _outcomes(

@@ -193,14 +193,12 @@ def _row(
 
 def _refused(cell: tuple[str, str], before: _Episodes, after: _Episodes) -> dict[str, Any]:
     shared = len(before.keys() & after.keys())
-    values = ("baseline", "candidate", "difference", "difference_low", "difference_high")
+    unknown = ("baseline", "candidate", "difference", "difference_low", "difference_high")
     return {
         "perturbation": cell[0],
         "condition": cell[1],
         "episodes": shared,
-        **dict.fromkeys(values),
-        "return_iqm": None,
-        "improvement": None,
+        **dict.fromkeys((*unknown, "return_iqm", "improvement")),
         "verdict": "refused",
         "reason": f"not the same episodes: {len(before)} of the baseline, {len(after)} of the"
         f" candidate, {shared} in both",

@@ -122,8 +122,6 @@ class MixedFeed:
                 tables, self.logs, fresh, audit_share=self.audit_share, seed=self.seed
             )
 
-    # -- steps ----------------------------------------------------------------------------------
-
     def take(self, envs: Ints, keys: Ints, ended: NDArray[Any], infos: Sequence[Any]) -> None:
         """One step of `envs` (n,), of the episodes `keys` (n,): labels those that ended."""
         self.env_steps += len(envs)
@@ -144,8 +142,6 @@ class MixedFeed:
             self.fresh.set_labels(labelled.key, labelled.codes)
             if labelled.key in self._episodes:
                 self._episodes[labelled.key]["conditions"] = labelled.conditions
-
-    # -- batches --------------------------------------------------------------------------------
 
     def draw_logs(self, batch_size: int) -> BatchDraw:
         """The logged rows (L,) of a batch, by the mixture; all of it where nothing is fresh.
