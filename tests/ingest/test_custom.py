@@ -167,7 +167,7 @@ def test_the_future_is_not_seen():
         (signal("s", "a[]", 'reduce = "yaw"'), "takes one quaternion"),
         (signal("s", "a[]", 'reduce = "median"'), "`signals.s.reduce`: Invalid enum value"),
         (signal("s", "a", "max_age_s = 0"), "max_age_s must be above 0"),
-        (signal("s", "a", "unit = ''"), 'unit is empty: say "1"'),
+        (signal("s", "a", "unit = ''"), 'unit is empty: write "1"'),
         (signal("s", "a", "units = 'm'"), "unknown key `signals.s.units`"),
         (signal("s", "a", "values = { a = 'b' }"), "`signals.s.values[...]`: Expected `float`"),
         ('[signals.s]\ntopic = "/x"\n', "missing key `signals.s."),
