@@ -183,16 +183,7 @@ class Learner(Stateful):
         if settings.munchausen:
             (q,) = online.forward(observation)
             slow_q, slow_next_q = slow.forward(observation, next_observation)
-            target = munchausen_target(
-                reward,
-                discount,
-                action,
-                slow_q,
-                slow_next_q,
-                scale=settings.munchausen,
-                temperature=settings.munchausen_temperature,
-                floor=settings.munchausen_floor,
-            )
+            target = self._munchausen(reward, discount, action, slow_q, slow_next_q)
         elif settings.double:  # s and s' through the online network together
             q, next_q = online.forward(observation, next_observation)
             (slow_q,) = slow.forward(next_observation)
@@ -229,16 +220,8 @@ class Learner(Stateful):
         """What Q(s, a) should be: (B,), or its quantiles (B, N)."""
         slow = slow or self.target_network
         if self.loss.munchausen:
-            return munchausen_target(
-                reward,
-                discount,
-                action,
-                slow(observation),
-                slow(next_observation),
-                scale=self.loss.munchausen,
-                temperature=self.loss.munchausen_temperature,
-                floor=self.loss.munchausen_floor,
-            )
+            slow_q, slow_next_q = slow(observation), slow(next_observation)
+            return self._munchausen(reward, discount, action, slow_q, slow_next_q)
         next_q = self.network(next_observation) if self.loss.double else None
         if self.network.quantiles:
             return quantile_target(
@@ -251,6 +234,15 @@ class Learner(Stateful):
             td_target(reward, discount, member(next_observation), next_q) for member in slow.members
         ]
         return targets[0] if len(targets) == 1 else torch.stack(targets).amin(dim=0)
+
+    def _munchausen(self, *parts: Tensor) -> Tensor:
+        """`munchausen_target` of reward, discount, action and the target network at s and s'."""
+        return munchausen_target(
+            *parts,
+            scale=self.loss.munchausen,
+            temperature=self.loss.munchausen_temperature,
+            floor=self.loss.munchausen_floor,
+        )
 
     @torch.no_grad()
     def _average(self) -> None:

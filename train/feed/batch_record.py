@@ -90,10 +90,12 @@ class FeedRecord(Stateful):
         self._age_days = (
             np.maximum(logs.as_of_ns - logs.stamp_ns, 0) / _NS_PER_DAY if logs is not None else None
         )
-        self._total: dict[str, int] = {}  # "source/stratum" -> rows since the run began
+        # Rows since the run began, by stratum: (S,) of each source.
+        sizes = {"logs": 0 if logs is None else len(logs.strata), "fresh": len(ring.conditions) + 1}
+        self._total = {name: np.zeros(size, np.int64) for name, size in sizes.items()}
         self._logged, self._fresh = SampledRows(LOGGED), SampledRows(FRESH)
         # Of batches with logged rows in the open interval: the sum (S,) of the shares in force.
-        self._quota = np.zeros(0 if logs is None else len(logs.strata))
+        self._quota = np.zeros(sizes["logs"])
         self._quota_batches = 0
 
     def batch(
@@ -220,41 +222,37 @@ class FeedRecord(Stateful):
         weight = np.bincount(stratum, rows["weight"], minlength=size)
         # Per stratum: a fresh row moves from "unlabelled" to its stratum when its episode ends.
         unique = np.bincount(np.unique(source.row * size + stratum) % size, minlength=size)
-        means = {
-            name: np.bincount(stratum, values, minlength=size) / np.maximum(drawn, 1)
-            for name, values in (
-                ("td_abs_mean", np.abs(rows["td"])),
-                ("q_mean", rows["q"]),
-                ("reward_mean", rows["reward"]),
-                ("terminal_share", rows["discount"] == 0),
-            )
-        }
-        table = []
-        for index, name in enumerate(source.strata):
-            key, count = f"{source.name}/{name}", int(drawn[index])
-            self._total[key] = self._total.get(key, 0) + count
-            table.append(
-                {
-                    **steps,
-                    "phase": phase,
-                    "source": source.name,
-                    "stratum": name,
-                    "timing": source.timings[index],
-                    "quota_share": source.quota[index],
-                    "available_rows": int(source.available[index]),
-                    "available_share": float(
-                        source.available[index] / max(source.available.sum(), 1)
-                    ),
-                    "drawn_rows": count,
-                    "drawn_share": count / len(stratum),
-                    "effective_share": float(weight[index] / max(weight.sum(), 1e-12)),
-                    "unique_rows": int(unique[index]),
-                    "replays_per_row": float(count / unique[index]) if count else None,
-                    "total_drawn_rows": self._total[key],
-                    **{k: float(v[index]) if count else None for k, v in means.items()},
-                }
-            )
-        self.run.append("strata", table)
+        replays = [n / u if u else None for n, u in zip(drawn, unique, strict=True)]
+        total = self._total[source.name]
+        total += drawn
+
+        def mean(values: NDArray[Any]) -> list[float | None]:
+            sums = np.bincount(stratum, values, minlength=size).tolist()
+            return [x / n if n else None for x, n in zip(sums, drawn.tolist(), strict=True)]
+
+        self.run.append_columns(
+            "strata",
+            {
+                **steps,
+                "phase": phase,
+                "source": source.name,
+                "stratum": source.strata,
+                "timing": source.timings,
+                "quota_share": source.quota,
+                "available_rows": source.available,
+                "available_share": source.available / max(source.available.sum(), 1),
+                "drawn_rows": drawn,
+                "drawn_share": drawn / len(stratum),
+                "effective_share": weight / max(weight.sum(), 1e-12),
+                "unique_rows": unique,
+                "replays_per_row": replays,
+                "total_drawn_rows": total.copy(),
+                "td_abs_mean": mean(np.abs(rows["td"])),
+                "q_mean": mean(rows["q"]),
+                "reward_mean": mean(rows["reward"]),
+                "terminal_share": mean(rows["discount"] == 0),
+            },
+        )
 
     def _conditions(self, source: _Source, steps: dict[str, int], phase: str) -> None:
         code, size = source.condition, len(source.conditions)

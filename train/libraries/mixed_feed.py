@@ -329,8 +329,8 @@ class PartialTables:
 def column(values: Any) -> Any:
     """A column, or one value for all rows, without NaNs."""
     if isinstance(values, np.ndarray) and values.dtype.kind == "f" and np.isnan(values).any():
-        return [known(value) for value in values.tolist()]
-    return known(values)
+        values = values.tolist()
+    return [known(value) for value in values] if isinstance(values, list) else known(values)
 
 
 def known(value: Any) -> Any:
