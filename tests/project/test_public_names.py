@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from support.paths import ROOT
 
+import restock
 from restock.public import FACES, imported, rewrite
 
 PAGES = [*sorted((ROOT / "docs").rglob("*.md")), ROOT / "README.md"]
@@ -34,6 +35,13 @@ def test_importing_the_rooms_loads_none_of_the_heavy_libraries() -> None:
     heavy = "{'torch', 'mujoco', 'duckdb', 'pyarrow', 'altair', 'msgspec', 'tyro'}"
     names = ", ".join(["restock", *ROOMS])
     assert python(f"import sys, {names}; print({heavy} & set(sys.modules))") == "set()"
+
+
+def test_importing_restock_is_enough_to_reach_a_room() -> None:
+    code = "import restock; print(restock.twin.EpisodeSpec.__name__, restock.train.train.__name__)"
+    assert python(code) == "EpisodeSpec train"
+    with pytest.raises(AttributeError, match="module 'restock' has no attribute 'nothing'"):
+        restock.nothing  # noqa: B018
 
 
 @pytest.mark.parametrize("face", ROOMS)
