@@ -22,7 +22,14 @@ from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
 from restock.errors import MixtureError
-from restock.replay.panel.logged_sampler import BatchDraw, LoggedSampler, sampler_for
+from restock.replay.panel.logged_sampler import (
+    BatchDraw,
+    LoggedSampler,
+    controller_for,
+    needs_td,
+    planned_by,
+    sampler_for,
+)
 from restock.replay.panel.panel import Panel
 
 _MOST_WORKERS = 64
@@ -63,7 +70,7 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
         self._limit = self.panel.header.mixture.max_replays_per_row
         # Passes begun by each worker, in memory that the workers of every pass share.
         self._begun = torch.zeros(_MOST_WORKERS, dtype=torch.int16).share_memory_()  # type: ignore[no-untyped-call]
-        self._check(self._sampler())
+        self._check()
 
     def set_epoch(self, epoch: int) -> None:
         """Which pass comes next; call it before iterating, on the loader's own dataset."""
@@ -73,21 +80,25 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
         worker = get_worker_info()
         number, of = (0, 1) if worker is None else (worker.id, worker.num_workers)
         sampler = self._sampler()
-        if self._limit is not None:
-            self._pass_on(sampler, number)
-        for batch in count() if self.batches is None else range(self.batches):
-            draw = self._draw(sampler)
-            if batch % of == number:
-                yield self._gather(sampler, draw)
+        try:
+            if self._limit is not None:
+                self._pass_on(sampler, number)
+            for batch in count() if self.batches is None else range(self.batches):
+                draw = self._draw(sampler)
+                if batch % of == number:
+                    yield self._gather(sampler, draw)
+        finally:
+            sampler.close()
 
     def _sampler(self) -> LoggedSampler:
         epoch = self.epoch if self._limit is None else 0
         return sampler_for(self.panel, self.batch_size, seed=(self.seed, 6, epoch))
 
-    def _check(self, sampler: LoggedSampler) -> None:
+    def _check(self) -> None:
         """Raises MixtureError where draws follow what a data set does not receive."""
-        follows = "TD errors" if sampler.needs_td else "environment steps"
-        if sampler.needs_td or sampler.controller.strata_move:
+        moving = controller_for(self.panel, planned_by(self.panel.header.mixture)).strata_move
+        if moving or needs_td(self.panel):
+            follows = "environment steps" if moving else "TD errors"
             raise MixtureError(
                 f"the mixture's draws follow {follows}, which a data set does not receive",
                 where=str(self.path),

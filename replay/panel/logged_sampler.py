@@ -199,6 +199,11 @@ class LoggedSampler(Stateful):
         controller, full = self.controller, self.controller.drawn >= self._budget
         return bool(controller.shares[full].any()) and controller.logs_share > 0
 
+    def close(self) -> None:
+        """Close the file of a panel that is read in chunks."""
+        if isinstance(self.sampler, ChunkedSampler):
+            self.sampler.close()
+
     def describe(self) -> list[dict[str, Any]]:
         """A row a stratum, for the run's table `shares`."""
         replays = self.replays
@@ -258,7 +263,7 @@ def sampler_for(
         members,
         weights=_weights(panel),
         rng=np.random.default_rng([*seeds, 3]),
-        needs_td=mixture.adaptive is not None or any(rule in ("per", "lap") for rule in within),
+        needs_td=needs_td(panel),
     )
 
 
@@ -291,6 +296,12 @@ def sampler_by_shares(
         weights=weights,
         rng=np.random.default_rng([seed, 3]),
     )
+
+
+def needs_td(panel: Panel) -> bool:
+    """Whether draws from a panel follow the TD errors of what was drawn."""
+    by_priority = any(stratum.within in ("per", "lap") for stratum in panel.strata)
+    return by_priority or panel.header.mixture.adaptive is not None
 
 
 def planned_by(mixture: Mixture) -> PlannedDraws:
