@@ -115,3 +115,25 @@ def blocks(path: Path, text: str) -> Iterator[str]:
     for block in re.findall(r"(?:^(?:    .*)?\n)+", text, re.M):
         if re.match(r"\s*(import|from) ", block):
             yield textwrap.dedent(block)
+
+
+@pytest.mark.parametrize("path", [*PAGES, ROOT / "CONTRIBUTING.md"], ids=lambda path: path.name)
+def test_files_that_docs_name_exist(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    folders = "benchmarks|docs|fuzz|ingest|replay|sample_logs|src|tests|train"
+    for name in re.findall(
+        rf"(?<![\w/.])((?:{folders})/[\w/.-]*\.(?:py|sql|toml|md|json))\b", text
+    ):
+        assert (ROOT / name).is_file(), name
+    for name in re.findall(r"\]\(([\w/.-]+\.\w+)(?:#[\w-]+)?\)", text):
+        assert (path.parent / name).is_file(), name
+
+
+def test_every_page_is_linked_from_another() -> None:
+    linked = {
+        name.rsplit("/", 1)[-1]
+        for path in PAGES
+        for name in re.findall(r"\]\(([\w/.-]+\.md)", path.read_text(encoding="utf-8"))
+        if name.rsplit("/", 1)[-1] != path.name
+    }
+    assert {path.name for path in PAGES if path.name != "README.md"} <= linked
