@@ -132,7 +132,7 @@ def test_a_plan_estimates_the_ratio_and_the_panel_keeps_what_new_shares_need(
     with open_source(transitions, mixture, task=TASK, conditions=CONDITIONS) as source:
         plan = plan_panel(source.connection, mixture, source.conditions)
     (fit,) = plan.ratios
-    assert set(fit.strata) == {s.stratum for s in plan.strata if s.timing == "post"}
+    assert set(fit.strata) == {s.name for s in plan.strata if s.timing == "post"}
     assert fit.base_log_loss > 0
     assert fit.rows > 100
     share = np.array([line.share for line in plan.strata])
