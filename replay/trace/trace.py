@@ -167,7 +167,7 @@ def _of_twin(
             "seed": trace.episode["episode_seed"],
         }
         trace.notes.append(
-            "the twin lays the episode out again from its spec; the actions taken are not kept"
+            "the twin draws the episode again from its spec; its actions are not kept"
         )
         if trace.episode["perturbation"] != "nominal":
             trace.notes.append(
