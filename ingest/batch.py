@@ -187,7 +187,7 @@ def warm_up() -> None:
 
 
 def _serve(pipe: Connection, work: Callable[[Path], T]) -> None:
-    """A worker: one recording after the other, until there is none, or nobody to answer to."""
+    """A worker: one recording after the other, until there are no more, or the parent is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the parent decides
     signal.signal(signal.SIGTERM, _stop)
     parent = multiprocessing.parent_process()
@@ -206,7 +206,7 @@ def _stop(*_: object) -> None:
 
 
 def _end_with(parent: int) -> None:
-    """End when the parent has: nobody reads the results of this process any more."""
+    """End when the parent has: its results are no longer read."""
     wait([parent])
     os._exit(1)
 

@@ -56,7 +56,7 @@ def run_on_ray(job: IngestJob, paths: Sequence[Path], *, workers: int = 1) -> It
 def cluster(workers: int) -> Iterator[Any]:
     """Ray, with a cluster to give tasks to."""
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # or Ray warns of it
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # reports to nobody unasked
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no usage reports
     try:
         import ray
     except ImportError as error:
@@ -64,7 +64,7 @@ def cluster(workers: int) -> Iterator[Any]:
             "--engine ray needs Ray, which is not installed",
             remedy="pip install 'restock[ray]'",
         ) from error
-    if ray.is_initialized():  # by whoever calls from Python
+    if ray.is_initialized():  # by the caller
         yield ray
         return
     address = os.environ.get("RAY_ADDRESS")

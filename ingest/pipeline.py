@@ -109,7 +109,7 @@ class _Ingest:
     def run(self, store: StoreWriter | None) -> IngestResult:
         profile, columns = self.profile, read_topics(self.recording, self.profile)
         steps = steps_of(profile, columns)
-        # What follows needs to know which topics said anything, and not what: let go of it.
+        # The next stages need to know which topics had messages, not their values: free those.
         columns = {name: column.times(0, 1) for name, column in columns.items()}
         episodes = split(profile.task, steps)
         if not episodes.transitions:

@@ -99,7 +99,7 @@ def train(
         panel: the folder of a panel; None: online only.
         settings: `key.path=value`, over the config.
         stop: asked between steps; True ends the run with a checkpoint.
-        notify: told of every row of `progress` and every evaluation.
+        notify: called for every row of `progress` and every evaluation.
 
     Raises:
         RunError: `out` already exists.

@@ -1,1 +1,1 @@
-"""A first profile for a robot nobody has described yet."""
+"""A first profile for an unknown robot."""

@@ -229,7 +229,7 @@ def _clock_lines(recording: Recording, roles: Roles, commands: Commands) -> list
 
 
 def _max_age_s(topic: TopicInfo, seconds: float) -> float | None:
-    """Four periods of a topic, or None (latched) for what is said a few times only."""
+    """Four periods of a topic, or None (latched) for one with few messages."""
     rate = topic.expected / seconds if seconds > 0 else 0.0
     if topic.expected < 3 or rate < 0.05:
         return None

@@ -32,7 +32,7 @@ KINDS: dict[str, tuple[Kind, ...]] = {
     "command": (
         Kind("geometry_msgs/msg/Twist", _TWIST, ("cmd_vel",)),
         Kind("geometry_msgs/msg/TwistStamped", _under("twist", _TWIST), ("cmd_vel",)),
-        # Nobody's command was recorded: what the robot did stands for what it was told.
+        # No command was recorded: the measured motion is used in its place.
         Kind("nav_msgs/msg/Odometry", _under("twist.twist", _TWIST), ("wheel", "odom")),
     ),
     "pose": (

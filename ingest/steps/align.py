@@ -8,7 +8,7 @@ A topic without a header is put on a `header.stamp` clock by subtracting the rec
 the smallest, over the stamped topics, of the median of (log time - stamp). That offset is one
 constant a clock segment, unless it drifts by more than the tolerance, as it does where a simulation
 runs slower than real time: then log time is mapped piece by piece (`clock_map`). Either is measured
-over the whole segment, so it looks at later messages' clocks, but at nobody's values.
+over the whole segment, so it uses later messages' clocks, but never their values.
 
 Where the clock itself jumps (a simulation restarted, a clock set) a new segment starts, and no
 hold reaches across but that of latched topics.

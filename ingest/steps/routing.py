@@ -31,7 +31,7 @@ class Routing:
     plans_m: Sequence[F64]  # each (P, 2), map frame
     goal: Ints  # (T,) index of a goal, the same for the same place; -1 is none
     plan: Ints  # (T,) index of a plan; -1 is none
-    order: Ints  # (T,) the message that said so: a goal may be ordered again
+    order: Ints  # (T,) the message with it: a goal may be ordered again
 
     @classmethod
     def none(cls, ticks: int) -> Routing:

@@ -49,7 +49,7 @@ class Steps:
     policy: list[str]  # (T,)
     policy_version: list[str | None]  # (T,)
     probability: list[float | None]  # (T,)
-    truth: list[str | None]  # (T,) true condition, where a simulator said it
+    truth: list[str | None]  # (T,) true condition, where a simulator published it
     perturbed: Perturbed  # (T,) a simulator's parameters in force
     clock: ClockReport
     commands_between: int  # commands that got no tick of their own

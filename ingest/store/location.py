@@ -95,7 +95,7 @@ class Location:
 
     @property
     def options(self) -> dict[str, str] | None:
-        """What Delta's library is told, beside what it takes from the environment."""
+        """Options for Delta's library, besides those of the environment."""
         if self.folder is not None:
             return None
         return {

@@ -84,7 +84,7 @@ def recorded_facts(
     episodes: Split,
     rows: EpisodeRows,
 ) -> dict[str, Any]:
-    """What `manifest_row` needs to be told of a recording."""
+    """What `manifest_row` needs to know of a recording."""
     stamps, span = steps.signals["stamp_ns"], recording.span_ns or (0, 0)
     fallbacks = fallbacks_used(profile, columns)
     return {

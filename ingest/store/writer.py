@@ -108,7 +108,7 @@ class StoreWriter:
                 ):
                     added.append(_Added(recording_id, name, len(table)))
                     added[-1].size = self._write(table, f"{what}/{name}")
-        except BaseException:  # no commit has begun, so nobody needs them
+        except BaseException:  # no commit has begun, so they are not needed
             with suppress(OSError, StoreError):
                 self.path.delete(f"{RECORDINGS}/{file.path}" for file in manifests)
                 self.path.delete(f"{TRANSITIONS}/{file.path}" for file in transitions)

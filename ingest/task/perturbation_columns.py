@@ -30,7 +30,7 @@ class Perturbed:
 
     @classmethod
     def unknown(cls, count: int) -> Perturbed:
-        """As of hardware: nobody knows its friction."""
+        """As for hardware: its friction is unknown."""
         return cls([], np.full(count, -1, np.int64))
 
     @classmethod

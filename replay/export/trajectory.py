@@ -2,7 +2,7 @@
 
 A trajectory is an unbroken run of steps of one episode with the observation after its last step.
 Where rows are missing (a query or a mixture left them out) an episode becomes several, each ended
-by a cut: truncated, for its return goes on where nobody looks.
+by a cut: truncated, for its return continues beyond it.
 """
 
 from __future__ import annotations

@@ -120,7 +120,7 @@ class EvaluationSplit(Checked, frozen=True):
 
 
 class Safety(Checked, frozen=True):
-    """Rows that nobody is to learn from."""
+    """Rows that must not be learned from."""
 
     unsafe: str  # SQL predicate over `transitions`
     leave_out: Literal["rows", "episodes"] = "rows"  # those alone, or all of their episode
@@ -159,7 +159,7 @@ class Adaptive(Checked, frozen=True):
 
 
 class StratumLimits(Checked, frozen=True, kw_only=True):
-    """What may be said of one stratum and of all at once."""
+    """Keys of one stratum and of all at once."""
 
     unit: Unit = "step"  # or all rows of the episodes that it holds in; nominal: what is left
     min_steps: AtLeastOne = 1  # of an episode in which it must hold

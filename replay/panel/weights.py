@@ -307,23 +307,23 @@ def estimate_outcomes(
         if not x.shape[1]:
             x = np.zeros((len(chosen), made.shape[1]))
         x[[place_of[int(row)] for row in at]] = made
-    kept = rows.order[chosen] % np.uint64(5) == 0  # a fifth, to judge the fit by
-    if kept.all() or not kept.any():
-        kept = np.zeros(len(chosen), np.bool_)
+    held_out = rows.order[chosen] % np.uint64(5) == 0  # a fifth, to validate the fit
+    if held_out.all() or not held_out.any():
+        held_out = np.zeros(len(chosen), np.bool_)
     y = label[chosen]
-    model = OutcomeModel(x[~kept], y[~kept], len(estimated) + 1, weight[~kept])
-    judge = kept if kept.any() else ~kept
+    model = OutcomeModel(x[~held_out], y[~held_out], len(estimated) + 1, weight[~held_out])
+    validation = held_out if held_out.any() else ~held_out
     fit = RatioFit(
         source,
         names,
-        int((~kept).sum()),
-        _log_loss(model.probability(x[judge]), y[judge], weight[judge]),
+        int((~held_out).sum()),
+        _log_loss(model.probability(x[validation]), y[validation], weight[validation]),
         _log_loss(
             np.tile(
-                np.bincount(label, minlength=len(estimated) + 1) / len(label), (judge.sum(), 1)
+                np.bincount(label, minlength=len(estimated) + 1) / len(label), (validation.sum(), 1)
             ),
-            y[judge],
-            weight[judge],
+            y[validation],
+            weight[validation],
         ),
     )
     outcome_of = np.zeros((len(rows.code), len(estimated)), np.float32)

@@ -125,7 +125,7 @@ def _ratios(
 
 
 def _unlabelled(first: Feed, second: Feed, limits: ComparabilityLimits) -> list[Check]:
-    """Rows that nobody could label when they were drawn may be anything: many show nothing."""
+    """Rows drawn before they had labels may be of any condition: many of them show nothing."""
     fresh = [name.startswith("fresh/") for name in first.cells]
     shares = []
     for feed in (first, second):

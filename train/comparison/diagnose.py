@@ -10,7 +10,7 @@ networks disagree. Steps of the evaluations (`evaluation_buffer`), in no replay,
     L    mean |Q - Q_target| / mean |Q|
     S    |TD| with the online network bootstrapping / |TD| with the target network
 
-A network that generalises, or learns few rows by heart, hides what is wrong with its replay from
+A network that generalises, or memorises few rows, hides what is wrong with its replay from
 all of these. So three figures look at the rows, not at the critic
 (`restock.train.feed.log_fidelity`): how much of replay a condition is, beside how often it is met;
 how many of its logged rows look like it; and whether their next observations follow from them.

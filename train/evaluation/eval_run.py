@@ -1,7 +1,7 @@
 """Evaluating a finished run: its kept policy beside scripted ones, on the same episodes.
 
 Every policy drives the same seeded episodes, clean and under each perturbation; blocked aisles are
-told apart by how much of the aisle is blocked. Seeds are apart from those that training drew its
+split by how much of the aisle is blocked. Seeds differ from those that training drew its
 episodes from and from those that chose the checkpoint.
 """
 

@@ -1,11 +1,11 @@
 """Whether logged rows are what their labels say, and follow from one another.
 
 A critic's errors do not show every fault of its replay: rows whose labels are wrong, or whose next
-observations are not what followed, may be learnt by heart like any others. Two questions to the
+observations are not what followed, may be memorised like any others. Two questions to the
 rows themselves do, for each condition of the logs:
 
-- *agreement*: how many of its rows a linear discriminant (Fisher 1936), told the conditions of
-  fresh, held-out steps by their observations, takes for that condition;
+- *agreement*: how many of its rows a linear discriminant (Fisher 1936), trained on the conditions
+  and observations of fresh, held-out steps, assigns to it;
 - *unexplained*: how much of the variance of its next observations a linear model of observation
   and action, fitted on half of the logs' rows, leaves unexplained on the other half. Above 1, the
   mean would be a better guess.

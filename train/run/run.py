@@ -197,7 +197,7 @@ def software_versions() -> dict[str, str]:
 
 
 def panel_document(panel: Panel) -> dict[str, Any]:
-    """What a run's `config.json` says of its panel, whoever trains."""
+    """What a run's `config.json` says of its panel, for every library."""
     header = panel.header
     return {
         "path": str(panel.path.resolve()),

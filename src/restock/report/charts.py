@@ -15,7 +15,7 @@ import vl_convert
 
 Row = Mapping[str, Any]
 
-# Okabe-Ito: told apart by colour-blind readers too.
+# Okabe-Ito: colour-blind readers can distinguish them too.
 CONDITION_COLOURS = {
     "nominal": "#6b7280",
     "wheel_slip": "#0072b2",

@@ -1,4 +1,4 @@
-"""Open loop: logged commands driven again in the twin, which is told nothing else on the way.
+"""Open loop: logged commands driven again in the twin, without any other information from the log.
 
 `drive_open_loop` puts robots into logged states and drives logged commands from there, one control
 period or many. `replay_segments` drives segments of a log with it: the W steps before a segment
