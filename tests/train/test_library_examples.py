@@ -40,7 +40,7 @@ def example(name: str) -> Any:
 @pytest.fixture(scope="module")
 def panel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     task = load_profile("warehouse_amr").task
-    folder = tmp_path_factory.mktemp("neighbours")
+    folder = tmp_path_factory.mktemp("examples")
     store = write_store(folder / "store", [recording_transitions(1, task=task)], task=task)
     mixture = parse_mixture('[each_condition]\nshare = "natural"\n')
     return panel_of(store, mixture, folder / "panel").path
