@@ -56,7 +56,7 @@ class Feed:
 
 @dataclass(frozen=True)
 class Check:
-    """One question of the gate, with its answer."""
+    """One check of comparability, with its verdict."""
 
     name: str  # "mix", "mix after weights", "share of logs/wheel_slip", …
     part: str  # "whole run", or "tenth 3"
@@ -87,7 +87,7 @@ def worst(verdicts: Sequence[Verdict]) -> Verdict:
 def check_feeds(
     first: Feed, second: Feed, limits: ComparabilityLimits, rng: np.random.Generator
 ) -> list[Check]:
-    """All checks of the gate. Both feeds must name the same cells in the same order."""
+    """All checks. Both feeds must name the same cells in the same order."""
     checks = []
     totals = [_resampled(feed, limits, rng) for feed in (first, second)]
     # Without importance weights the mix after weights is the mix.

@@ -1,4 +1,4 @@
-"""May two arms be compared, and how do they compare: the gate, then the outcomes.
+"""May two arms be compared, and how do they compare: the checks, then the outcomes.
 
 A comparison of methods that were fed differently measures the feed. It is refused, with what
 differs, unless the feed is what is compared (`treatment="mixture"`).
@@ -39,7 +39,7 @@ _SAME_TOTAL = 1.02  # ratio of environment steps, and of updates
 
 @dataclass(frozen=True)
 class Comparison:
-    """The gate's answer, and the outcomes where it let the arms through."""
+    """The verdict of the checks, and the outcomes where the arms are comparable."""
 
     treatment: Treatment
     verdict: Verdict
@@ -51,7 +51,7 @@ class Comparison:
     rows: list[dict[str, Any]]
 
     @property
-    def gate(self) -> list[Check]:
+    def deciding_checks(self) -> list[Check]:
         """The checks that the verdict is made of: of the feed too, unless it is the treatment."""
         return _deciding(self.treatment, self.totals, self.checks)
 

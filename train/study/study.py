@@ -228,7 +228,7 @@ def as_markdown(study: dict[str, Any]) -> str:
 
 
 def _refusal(comparison: dict[str, Any]) -> str:
-    """Why the gate let no outcomes through."""
+    """Why there are no outcomes."""
     if comparison["refused"]:
         return (
             f"Not compared: they differ in {', '.join(comparison['refused'])}, which"

@@ -1,4 +1,4 @@
-"""Running a study: every arm with every seed, then the comparisons through the gate.
+"""Running a study: every arm with every seed, then the comparisons.
 
 A study is a TOML file and a directory. What already exists is not done again: a panel that was
 built, a run that has ended, an evaluation that was driven. So a study that was interrupted, or got

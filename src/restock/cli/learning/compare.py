@@ -137,7 +137,7 @@ def _sentence(comparison: Comparison) -> str:
             f"REFUSED: the runs differ in {names}, which is not what --treatment"
             f" {comparison.treatment} compares"
         )
-    failed = [check for check in comparison.gate if check.verdict == comparison.verdict]
+    failed = [check for check in comparison.deciding_checks if check.verdict == comparison.verdict]
     names = ", ".join(dict.fromkeys(f"{check.name} ({check.part})" for check in failed[:4]))
     more = f" and {len(failed) - 4} more" if len(failed) > 4 else ""
     if comparison.verdict == "inconclusive":
