@@ -1,4 +1,4 @@
-"""Other libraries train in the twin unchanged: every example under docs/examples runs, shortened."""
+"""Other libraries train in the twin unchanged: each example in docs/examples runs, shortened."""
 
 from __future__ import annotations
 
