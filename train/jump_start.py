@@ -13,6 +13,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import Ints
 from restock.errors import ConfigError
 from restock.state import Stateful
 from restock.train.dqn.config import JumpStartConfig
@@ -21,7 +22,6 @@ from restock.train.dqn.network import QNetwork
 from restock.train.feed.logs import Logs
 
 POLICIES = ("dqn", "cloned")  # who acts, by its code in the ring
-Ints = NDArray[np.int64]
 
 
 class JumpStart(Stateful):

@@ -14,8 +14,9 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
+from restock.arrays import Ints
 from restock.ingest.containers.mcap_records import PREFIX, Buffer, Malformed, Op, parse, walk
-from restock.ingest.decoding.columns import I64, gather
+from restock.ingest.decoding.columns import gather
 from restock.ingest.decoding.messages import Channel
 
 # A chunk's uncompressed size is the file's claim: beyond these it is refused, not allocated.
@@ -46,7 +47,7 @@ _START = np.dtype([("op", "u1"), ("length", "<u8"), ("channel", "<u2")])
 _INDEX = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 
 
-Positions: TypeAlias = dict[int, I64]  # of message records, by channel
+Positions: TypeAlias = dict[int, Ints]  # of message records, by channel
 
 
 class BadChunk(Exception):
@@ -78,10 +79,10 @@ class Chunk:
 class Messages:
     """Messages of one channel in one buffer."""
 
-    start: I64
-    stop: I64
-    log_time_ns: I64
-    publish_time_ns: I64
+    start: Ints
+    stop: Ints
+    log_time_ns: Ints
+    publish_time_ns: Ints
 
     def __len__(self) -> int:
         return len(self.start)
@@ -219,9 +220,9 @@ def indexed_messages(
     return None if (messages.stop > base + size).any() else messages
 
 
-def _stamps(values: NDArray[np.uint64]) -> I64:
+def _stamps(values: NDArray[np.uint64]) -> Ints:
     """Times of 64 bits without a sign: what int64 cannot hold (2262) stays the last that it can."""
-    stamps: I64 = np.minimum(values, np.uint64(LATEST_NS)).astype(np.int64)
+    stamps: Ints = np.minimum(values, np.uint64(LATEST_NS)).astype(np.int64)
     return stamps
 
 
@@ -251,12 +252,12 @@ def walked_messages(part: bytes | memoryview) -> tuple[Positions, str | None]:
     return {number: at[numbers == number] for number in np.unique(numbers).tolist()}, cut
 
 
-def messages_at(buffer: NDArray[np.uint8], at: I64) -> Messages:
+def messages_at(buffer: NDArray[np.uint8], at: Ints) -> Messages:
     """Messages whose records start at these positions (which were walked, and so fit)."""
     return _messages(at, gather(buffer, at, _HEAD))
 
 
-def _messages(at: I64, head: NDArray[np.void]) -> Messages:
+def _messages(at: Ints, head: NDArray[np.void]) -> Messages:
     return Messages(
         at + HEAD_SIZE,
         at + PREFIX + head["length"].astype(np.int64),

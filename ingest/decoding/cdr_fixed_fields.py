@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import Ints
 from restock.ingest.decoding.cdr_frame import (
     ORDERS,
     Columns,
@@ -17,7 +18,7 @@ from restock.ingest.decoding.cdr_frame import (
     spread,
     uniform,
 )
-from restock.ingest.decoding.columns import I64, gather, join, take
+from restock.ingest.decoding.columns import gather, join, take
 
 PADDING_BETWEEN = 64  # unwanted bytes that are gathered along with wanted ones around them
 SECOND_NS = 1_000_000_000
@@ -84,7 +85,7 @@ class FixedFields:
         else:
             self._decode_phases(frame, spread(position, len(frame)), phase, out)
 
-    def _decode_phases(self, frame: Frame, position: I64, phase: I64, out: Columns) -> None:
+    def _decode_phases(self, frame: Frame, position: Ints, phase: Ints, out: Columns) -> None:
         stop = position + self.sizes[phase]
         frame.check_bounds(stop)
         parts: list[Columns] = []
@@ -100,7 +101,7 @@ class FixedFields:
             out[path] = take(join([part[path] for part in parts]), back)
         frame.position = stop
 
-    def take(self, frame: Frame, at: I64, layout: _Layout, out: Columns) -> None:
+    def take(self, frame: Frame, at: Ints, layout: _Layout, out: Columns) -> None:
         """The wanted items at these byte positions; they must fit."""
         times: dict[str, NDArray[np.int64]] = {}
         for first, structures in layout.groups:

@@ -11,11 +11,12 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.ingest.decoding.columns import I64, FieldColumn, Ragged, gather, offsets_of
+from restock.arrays import Ints
+from restock.ingest.decoding.columns import FieldColumn, Ragged, gather, offsets_of
 
 Order: TypeAlias = Literal["<", ">"]
 ORDERS: tuple[Order, Order] = ("<", ">")
-Position: TypeAlias = "int | I64"
+Position: TypeAlias = "int | Ints"
 Columns: TypeAlias = dict[str, FieldColumn]  # by field path
 
 TOO_SHORT = "mis-sized: it ends before its last field"
@@ -44,7 +45,7 @@ class TextBuffer:
         self._whole: bytes | None = base if isinstance(base, bytes) else None
         self._text: str | None = None
 
-    def texts(self, at: I64, stop: I64) -> list[str] | None:
+    def texts(self, at: Ints, stop: Ints) -> list[str] | None:
         """The texts at these places; None where they are not all ASCII, or not in such a buffer."""
         if self._whole is None:
             return None
@@ -67,8 +68,8 @@ class Frame:
         self,
         buffer: NDArray[np.uint8],
         order: Order,
-        origin: I64,
-        end: I64,
+        origin: Ints,
+        end: Ints,
         rows: NDArray[np.intp],
         position: Position,
         text_buffer: TextBuffer | None = None,
@@ -125,7 +126,7 @@ def uniform(values: Position) -> Position:
     return values
 
 
-def spread(value: Position, count: int) -> I64:
+def spread(value: Position, count: int) -> Ints:
     """An array of `count`, whatever it was."""
     return np.full(count, value, np.int64) if isinstance(value, int) else value
 
@@ -136,7 +137,7 @@ def native(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def gather_sequences(
-    buffer: NDArray[np.uint8], at: I64, counts: Position, dtype: np.dtype[Any]
+    buffer: NDArray[np.uint8], at: Ints, counts: Position, dtype: np.dtype[Any]
 ) -> Ragged:
     """`counts` consecutive values of `dtype` from each byte position."""
     if isinstance(counts, int):
@@ -158,7 +159,7 @@ def gather_sequences(
     return Ragged(native(gather(buffer, each, dtype)), offsets)
 
 
-def texts(frame: Frame, at: I64, lengths: Position) -> FieldColumn:
+def texts(frame: Frame, at: Ints, lengths: Position) -> FieldColumn:
     """Texts of these byte lengths as an object array of str, (N,)."""
     count = len(at)
     out = np.empty(count, object)

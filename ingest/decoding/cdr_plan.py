@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import Ints
 from restock.ingest.decoding.cdr_fixed_fields import FixedFields
 from restock.ingest.decoding.cdr_frame import (
     UNTERMINATED,
@@ -25,7 +26,7 @@ from restock.ingest.decoding.cdr_frame import (
     texts,
     uniform,
 )
-from restock.ingest.decoding.columns import I64, FieldColumn, Ragged, join, offsets_of, take
+from restock.ingest.decoding.columns import FieldColumn, Ragged, join, offsets_of, take
 from restock.ingest.decoding.field_paths import DTYPES
 
 
@@ -67,7 +68,7 @@ def empty_column(kind: str, dims: tuple[int | None, ...]) -> FieldColumn:
     return column
 
 
-def wrap(column: FieldColumn, length: int | None, rows: int, offsets: I64) -> FieldColumn:
+def wrap(column: FieldColumn, length: int | None, rows: int, offsets: Ints) -> FieldColumn:
     """Elements to rows: a fixed repetition of an array is a further axis, others are Ragged."""
     if length is not None and not isinstance(column, Ragged):
         return column.reshape(rows, length, *column.shape[1:])
@@ -164,7 +165,7 @@ class Repeat:
         for path, column in elements.items():
             out[path] = wrap(column, self.length, len(frame), offsets)
 
-    def _fixed(self, frame: Frame, counts: I64, offsets: I64) -> Columns | None:
+    def _fixed(self, frame: Frame, counts: Ints, offsets: Ints) -> Columns | None:
         """Elements of one fixed size lie at known places: one gather for all of them."""
         fields = self._only_fixed
         if fields is None:
@@ -192,11 +193,11 @@ class _Elements:
     where the next was thought to start. Where it was wrong, elements are read one by one.
     """
 
-    def __init__(self, inner: CdrPlan, frame: Frame, counts: I64, offsets: I64) -> None:
+    def __init__(self, inner: CdrPlan, frame: Frame, counts: Ints, offsets: Ints) -> None:
         self.inner, self.frame = inner, frame
         self.counts, self.offsets = counts, offsets
         self.position = spread(frame.position, len(frame)).copy()
-        self.places: list[I64] = []  # of the elements that were read, in the answer
+        self.places: list[Ints] = []  # of the elements that were read, in the answer
         self.parts: list[Columns] = []
 
     def read(self) -> Columns:
@@ -222,20 +223,20 @@ class _Elements:
             path: take(join([part[path] for part in self.parts]), back) for path in self.parts[0]
         }
 
-    def _read_one(self, rows: NDArray[np.intp], number: I64) -> None:
+    def _read_one(self, rows: NDArray[np.intp], number: Ints) -> None:
         frame = self.frame.select(rows, uniform(self.position[rows]))
         self.parts.append(self.inner.decode(frame))
         self.places.append(self.offsets[rows] + number)
         self.position[rows] = frame.position
 
-    def _guess(self, rows: NDArray[np.intp], left: I64, stride: I64) -> NDArray[np.intp]:
+    def _guess(self, rows: NDArray[np.intp], left: Ints, stride: Ints) -> NDArray[np.intp]:
         """Read what is left of these messages by the guess; the rows where it was right."""
         no_rows = np.zeros(0, np.intp)
         if not rows.size:
             return no_rows
         counts = left[rows]
         starts = offsets_of(counts)
-        within: I64 = np.arange(starts[-1]) - np.repeat(starts[:-1], counts)
+        within: Ints = np.arange(starts[-1]) - np.repeat(starts[:-1], counts)
         which = np.repeat(np.arange(len(rows)), counts)
         position = self.position[rows][which] + within * stride[rows][which]
         frame = self.frame.select(rows[which], position)

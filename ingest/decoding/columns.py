@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-I64 = NDArray[np.int64]
+from restock.arrays import Ints
 
 # The number of messages to come is the file's claim: no more than this is allocated for them.
 # Memory that is allocated and not yet written to costs nothing.
@@ -25,7 +25,7 @@ class Ragged:
     """
 
     values: NDArray[Any] | Ragged
-    offsets: I64  # (N + 1,)
+    offsets: Ints  # (N + 1,)
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
@@ -36,7 +36,7 @@ class Ragged:
         return cut(self.values, int(self.offsets[index]), int(self.offsets[index + 1]))
 
     @property
-    def lengths(self) -> I64:
+    def lengths(self) -> Ints:
         """How many values each row holds, (N,)."""
         return np.diff(self.offsets)
 
@@ -52,7 +52,7 @@ class Ragged:
 FieldColumn: TypeAlias = "NDArray[Any] | Ragged"  # leading axis: the message
 
 
-def offsets_of(lengths: NDArray[Any]) -> I64:
+def offsets_of(lengths: NDArray[Any]) -> Ints:
     """Lengths (N,) to offsets (N + 1,)."""
     offsets = np.zeros(len(lengths) + 1, np.int64)
     np.cumsum(lengths, out=offsets[1:])
@@ -99,7 +99,7 @@ def equal(left: FieldColumn, right: FieldColumn) -> bool:
     return np.array_equal(left, right, equal_nan=left.dtype.kind == "f")
 
 
-def gather(buffer: NDArray[np.uint8], at: I64, dtype: np.dtype[Any]) -> NDArray[Any]:
+def gather(buffer: NDArray[np.uint8], at: Ints, dtype: np.dtype[Any]) -> NDArray[Any]:
     """One value of `dtype` (which may be a structure or an array) at each byte position, (N, …).
 
     Positions must fit. All bytes of a value are moved at once, whatever its fields.
@@ -120,8 +120,8 @@ def gather(buffer: NDArray[np.uint8], at: I64, dtype: np.dtype[Any]) -> NDArray[
 class TopicColumns:
     """The decoded messages of one topic, in the order of their log time."""
 
-    log_time_ns: I64  # (N,) when the recorder received it
-    publish_time_ns: I64  # (N,) when the sender sent it; the log time where that is not kept
+    log_time_ns: Ints  # (N,) when the recorder received it
+    publish_time_ns: Ints  # (N,) when the sender sent it; the log time where that is not kept
     fields: dict[str, FieldColumn] = field(default_factory=dict)  # by field path
 
     def __len__(self) -> int:

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import Ints
 from restock.errors import visible
-from restock.ingest.decoding.columns import I64, offsets_of
+from restock.ingest.decoding.columns import offsets_of
 
 
 @dataclass(frozen=True)
@@ -38,10 +39,10 @@ class MessageBatch:
     """Serialised messages of one channel: slices of one buffer, in file order."""
 
     buffer: NDArray[np.uint8]
-    start: I64  # (N,) first byte of each payload in `buffer`
-    stop: I64  # (N,) one past its last
-    log_time_ns: I64  # (N,)
-    publish_time_ns: I64  # (N,)
+    start: Ints  # (N,) first byte of each payload in `buffer`
+    stop: Ints  # (N,) one past its last
+    log_time_ns: Ints  # (N,)
+    publish_time_ns: Ints  # (N,)
 
     def __len__(self) -> int:
         return len(self.start)
@@ -85,13 +86,13 @@ class PendingBatch:
 
     def __init__(self) -> None:
         self._payloads = list[bytes]()
-        self._log_time_ns, self._publish_time_ns = list[I64](), list[I64]()
+        self._log_time_ns, self._publish_time_ns = list[Ints](), list[Ints]()
         self.size_bytes = 0
 
     def __len__(self) -> int:
         return len(self._payloads)
 
-    def add(self, payloads: Sequence[bytes], log_time_ns: I64, publish_time_ns: I64) -> None:
+    def add(self, payloads: Sequence[bytes], log_time_ns: Ints, publish_time_ns: Ints) -> None:
         """Some more, in file order."""
         self._payloads += payloads
         self._log_time_ns.append(log_time_ns)

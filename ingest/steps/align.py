@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import Ints
 from restock.errors import RecordingError
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.steps.clock_map import ClockMap, drift_ns, residual_ns, spread_ns
@@ -31,7 +32,6 @@ from restock.ingest.steps.clocks import STAMP, jumps, median
 if TYPE_CHECKING:
     from restock.ingest.profile.profile import Clock
 
-I64 = NDArray[np.int64]
 NS = 1_000_000_000
 AHEAD_NS = 50_000_000  # a transform stamped further ahead counts from when it was received
 CLOCK_TOPIC, CLOCK_FIELD = "/clock", "clock"  # what a simulation says the time is
@@ -42,10 +42,10 @@ TOLERANCE_S = 0.1  # half a control period
 class Samples:
     """One topic's messages on the alignment clock, in its order."""
 
-    stamp_ns: I64  # (N,) ascending
+    stamp_ns: Ints  # (N,) ascending
     row: NDArray[np.intp]  # (N,) of the topic's columns
 
-    def hold(self, tick_ns: I64, max_age_s: float | None) -> LatestMessages:
+    def hold(self, tick_ns: Ints, max_age_s: float | None) -> LatestMessages:
         """At each tick (T,) ascending or not, the latest sample at or before it."""
         at = np.searchsorted(self.stamp_ns, tick_ns, "right") - 1
         known = at >= 0
@@ -63,7 +63,7 @@ class LatestMessages:
     """The latest message of a topic, at each of T ticks."""
 
     row: NDArray[np.intp]  # (T,) of the topic's columns; 0 where nothing is known
-    age_ns: I64  # (T,)
+    age_ns: Ints  # (T,)
     known: NDArray[np.bool_]  # (T,) something had been received
     fresh: NDArray[np.bool_]  # (T,) and not longer ago than its maximum age
 
@@ -161,7 +161,7 @@ def clock_drifts(topics: Mapping[str, TopicColumns], tolerance_s: float) -> bool
     return drift_ns(topics[reference].log_time_ns, delay[reference]) > round(tolerance_s * NS)
 
 
-def delays(topics: Mapping[str, TopicColumns], besides: frozenset[str]) -> dict[str, I64]:
+def delays(topics: Mapping[str, TopicColumns], besides: frozenset[str]) -> dict[str, Ints]:
     """Log time - header stamp, (N,), of every stamped topic but those `besides`."""
     return {
         name: columns.log_time_ns - np.asarray(columns.fields[STAMP], np.int64)
@@ -170,7 +170,7 @@ def delays(topics: Mapping[str, TopicColumns], besides: frozenset[str]) -> dict[
     }
 
 
-def ticks_of(command: Samples, clock: Clock, period_s: float, end_ns: int) -> tuple[I64, int]:
+def ticks_of(command: Samples, clock: Clock, period_s: float, end_ns: int) -> tuple[Ints, int]:
     """The ticks (T,) of the control clock in a segment, and how many commands got none.
 
     `steps = "command"`: one tick a command, but none closer than 3/4 of the period to the last.
@@ -190,7 +190,7 @@ def ticks_of(command: Samples, clock: Clock, period_s: float, end_ns: int) -> tu
     return np.array(kept, np.int64), len(stamps) - len(kept)
 
 
-def _ordered(stamp_ns: I64, row: NDArray[np.intp]) -> Samples:
+def _ordered(stamp_ns: Ints, row: NDArray[np.intp]) -> Samples:
     order = np.argsort(stamp_ns, kind="stable")  # of equal stamps the last received wins
     return Samples(np.asarray(stamp_ns, np.int64)[order], row[order])
 
@@ -207,10 +207,10 @@ class _Drifts:
     def map_of(
         self,
         topics: Mapping[str, TopicColumns],
-        delay: Mapping[str, I64],
+        delay: Mapping[str, Ints],
         reference: str,
         inside: Mapping[str, NDArray[np.intp]],
-        edges: I64,
+        edges: Ints,
         index: int,
     ) -> tuple[ClockMap, int]:
         """The map of one segment, and the median delay of the reference topic in it."""

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from restock.arrays import F64, Bools, Ints
 from restock.errors import RecordingError
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns
 from restock.ingest.profile.profile import FALLBACKS, POSE_FALLBACK, Input, Profile
@@ -26,10 +26,6 @@ from restock.ingest.steps.align import (
 )
 from restock.ingest.steps.frames import FRAME_ID, Edges, Placement, Tree, plain
 from restock.ingest.task.signals import yaw_of
-
-F64 = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 # A handover is announced on the tick it takes force; its message may arrive a moment later. Used
 # for provenance alone, never for what the robot knew.

@@ -12,11 +12,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from restock.arrays import Ints
 from restock.ingest.steps.clocks import smoothed
 
-I64 = NDArray[np.int64]
 WINDOW_NS = 1_000_000_000  # in which a topic's least delay is looked at
 
 
@@ -27,8 +26,8 @@ class ClockMap:
     A single knot is a constant offset.
     """
 
-    log_ns: I64  # (K,) ascending, no two equal
-    stamp_ns: I64  # (K,) not descending
+    log_ns: Ints  # (K,) ascending, no two equal
+    stamp_ns: Ints  # (K,) not descending
 
     @classmethod
     def constant(cls, offset_ns: int) -> ClockMap:
@@ -36,21 +35,21 @@ class ClockMap:
         return cls(np.array([offset_ns], np.int64), np.zeros(1, np.int64))
 
     @classmethod
-    def of_delays(cls, log_ns: I64, delay_ns: I64) -> ClockMap:
+    def of_delays(cls, log_ns: Ints, delay_ns: Ints) -> ClockMap:
         """Through messages (N >= 1,) of these delays (log time - stamp), less single bad stamps."""
         order = np.argsort(log_ns, kind="stable")
         log = log_ns[order]
         return cls.through(log, log - smoothed(delay_ns[order]))
 
     @classmethod
-    def through(cls, log_ns: I64, stamp_ns: I64) -> ClockMap:
+    def through(cls, log_ns: Ints, stamp_ns: Ints) -> ClockMap:
         """Through messages (N >= 1,) that carry both times, in any order."""
         order = np.argsort(log_ns, kind="stable")
         log, stamp = log_ns[order], np.maximum.accumulate(stamp_ns[order])
         last = np.append(np.diff(log) > 0, True)  # of messages received at once, the newest stamp
         return cls(log[last], stamp[last])
 
-    def stamped(self, log_ns: I64) -> I64:
+    def stamped(self, log_ns: Ints) -> Ints:
         """Stamped times (N,) of log times (N,); beyond the knots at the map's mean pace."""
         # Differences alone go through float64, which holds a time of day to 256 ns only.
         first, last = int(self.log_ns[0]), int(self.log_ns[-1])
@@ -83,7 +82,7 @@ class ClockMap:
         return len(self.log_ns) == 1
 
 
-def drift_ns(log_ns: I64, delay_ns: I64) -> int:
+def drift_ns(log_ns: Ints, delay_ns: Ints) -> int:
     """By how much the delays (N,) of a topic drift over a recording, jitter aside.
 
     Latency only ever adds to the clocks' offset, so each second's least delay shows the offset;
@@ -99,7 +98,7 @@ def drift_ns(log_ns: I64, delay_ns: I64) -> int:
     return int(high - low)
 
 
-def residual_ns(log_ns: I64, stamp_ns: I64) -> I64:
+def residual_ns(log_ns: Ints, stamp_ns: Ints) -> Ints:
     """How far messages (N,) that carry both times are from a map through their neighbours.
 
     Each half is put on a map through the other half, so the spread says how well a message
@@ -116,7 +115,7 @@ def residual_ns(log_ns: I64, stamp_ns: I64) -> I64:
     return np.concatenate(parts)
 
 
-def spread_ns(values_ns: Iterable[int] | I64) -> int:
+def spread_ns(values_ns: Iterable[int] | Ints) -> int:
     """From the 1st to the 99th percentile; 0 for no values."""
     values = np.asarray(values_ns, np.int64)
     if not len(values):

@@ -12,11 +12,10 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from restock.arrays import Ints
 from restock.ingest.decoding.columns import TopicColumns
 
-I64 = NDArray[np.int64]
 STAMP = "header.stamp"
 WIDE_NS = 100_000_000  # a spread of (log time - stamp) that is worth a look
 
@@ -92,12 +91,12 @@ def topic_clocks(topics: Mapping[str, TopicColumns], jump_s: float) -> list[Topi
     return [topic_clock(name, columns, jump_s) for name, columns in topics.items()]
 
 
-def median(delay_ns: I64) -> int:
+def median(delay_ns: Ints) -> int:
     """The (upper) median; in integers, for float64 holds a time of day to 256 ns only."""
     return int(np.sort(delay_ns)[len(delay_ns) // 2])
 
 
-def smoothed(delay_ns: I64) -> I64:
+def smoothed(delay_ns: Ints) -> Ints:
     """The running median of five delays (N,): single bad stamps are gone."""
     if len(delay_ns) < 5:
         return delay_ns
@@ -108,7 +107,7 @@ def smoothed(delay_ns: I64) -> I64:
     return smooth
 
 
-def jumps(log_time_ns: I64, delay_ns: I64, jump_ns: int) -> I64:
+def jumps(log_time_ns: Ints, delay_ns: Ints, jump_ns: int) -> Ints:
     """The log times at which a topic's clock jumps, single bad stamps aside."""
     if not (np.abs(np.diff(delay_ns)) > jump_ns).any():
         return np.zeros(0, np.int64)  # medians of neighbours differ by no more than neighbours do

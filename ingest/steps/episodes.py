@@ -13,14 +13,11 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from restock.arrays import Bools, Ints
 from restock.ingest.steps.steps import Steps
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task, terminated
-
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

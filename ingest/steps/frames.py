@@ -17,13 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import F64, Ints
 from restock.ingest.decoding.columns import Ragged, TopicColumns
 from restock.ingest.profile.profile import Frames
 from restock.ingest.steps.align import ClockSegment, LatestMessages
 from restock.ingest.steps.clocks import STAMP
-
-F64 = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 AXES = ("translation.x", "translation.y", "translation.z")
 TURN = ("rotation.x", "rotation.y", "rotation.z", "rotation.w")

@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from restock.arrays import F64, Ints
 from restock.ingest.task.route import RouteView, pad_plans, view_route
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task, clearance_ahead
 
-F64 = NDArray[np.float64]
-Ints = NDArray[np.int64]
 # A number beyond this, in any unit that a signal has, is a fault and counts as not finite.
 LARGEST = 1e6
 _CHUNK = 4096  # poses at a time: bounds memory whatever the recording's length

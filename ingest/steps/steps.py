@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import F64, Bools, Ints
 from restock.ingest.containers.topic_reading import Fields
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile
@@ -27,10 +28,6 @@ from restock.ingest.steps.routing import LARGEST, Routing, plan_ends, plan_probl
 from restock.ingest.task.perturbation_columns import Perturbed
 from restock.ingest.task.signals import Signals, localised_velocity
 from restock.ingest.task.task import nearest_action
-
-F64 = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

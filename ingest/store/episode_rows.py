@@ -8,17 +8,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from restock.arrays import Bools, Ints
 from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.episodes import Split, changed_route, with_route
 from restock.ingest.steps.steps import Steps
 from restock.ingest.task.conditions import label
 from restock.ingest.task.schema import SIGNAL_COLUMNS
 from restock.ingest.task.signals import Signals
-
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 ENDS = b"restock.episode_ends"  # key in the rows' metadata
 GROUP_ROWS = 8192  # of whole episodes that are worked out together: bounds memory

@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from restock.arrays import Bools, Ints
 from restock.errors import RecordingError
 from restock.ingest.decoding.columns import offsets_of
 from restock.ingest.profile.profile import Profile
@@ -19,9 +20,6 @@ from restock.ingest.store.episode_rows import ENDS, EpisodeRows, episode_rows, g
 from restock.ingest.task.conditions import NOMINAL, primary
 from restock.ingest.task.schema import SIGNAL_COLUMNS, STEP_BITS, transition_schema
 from restock.ingest.task.task import observe, reward
-
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

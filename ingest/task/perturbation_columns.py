@@ -13,9 +13,8 @@ from math import isfinite
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
-Ints = NDArray[np.int64]
+from restock.arrays import Ints
 
 VALUES = pa.map_(pa.string(), pa.float64())
 

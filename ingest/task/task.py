@@ -16,13 +16,10 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from restock.arrays import F32, Bools, Ints
 from restock.ingest.task.scan import Body
 from restock.ingest.task.signals import Signals
 from restock.toml import Checked
-
-F32 = NDArray[np.float32]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 # How observation and reward are computed. Raised when that changes, so that rows made by
 # different code are never mixed unseen.

@@ -18,8 +18,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from restock.arrays import F32, Bools, Ints
 from restock.errors import StoreError
-from restock.replay.mixture.packed_row import F32, Bools, Ints
 
 REQUIRED = (
     *("episode_id", "step_index", "observation", "action", "reward", "next_observation"),

@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.replay.mixture.packed_row import F32, F64, Bools, Ints
+from restock.arrays import F32, F64, Bools, Ints
 
 CONTINUES, ON_POLICY, TERMINATED = 1, 2, 4  # bits of a step's flags
 

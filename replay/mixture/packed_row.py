@@ -16,10 +16,6 @@ from numpy.typing import NDArray
 # Raised when packing changes, of a row or of what stands beside it; part of a panel's id.
 PACKING_VERSION = 3
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 SCALARS = ("action", "reward", "discount")
 

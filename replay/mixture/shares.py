@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from restock.arrays import F64, Bools, Ints
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import Mixture, Share, Shortfall, StratumRule
-from restock.replay.mixture.packed_row import F64, Bools, Ints
 from restock.replay.mixture.schedules import value_at
 
 

@@ -8,9 +8,9 @@ import duckdb
 import numpy as np
 import pyarrow as pa
 
+from restock.arrays import Bools, Ints
 from restock.errors import ConfigError, MixtureError, StoreError
 from restock.replay.mixture.mixture import Mixture
-from restock.replay.mixture.packed_row import Bools, Ints
 from restock.replay.panel.scratch import ORDER
 from restock.replay.panel.strata import ResolvedStratum
 

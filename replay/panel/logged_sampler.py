@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import F32, F64, Ints
 from restock.replay.mixture.mixture import Mixture
-from restock.replay.mixture.packed_row import F32, F64, Ints
 from restock.replay.panel.plan import outcome_column
 from restock.replay.panel.strata import rules_of
 from restock.replay.panel.weights import WeightsInForce

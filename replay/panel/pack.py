@@ -19,9 +19,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from restock.arrays import Ints
 from restock.errors import PanelError
 from restock.replay.mixture.mixture import Mixture
-from restock.replay.mixture.packed_row import Ints, row_columns, row_width
+from restock.replay.mixture.packed_row import row_columns, row_width
 from restock.replay.panel.candidates import meta_columns
 from restock.replay.panel.plan import PanelPlan
 from restock.replay.panel.scratch import BATCH_ROWS, ORDER, STRETCH, SourceSteps

@@ -19,10 +19,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from restock.arrays import F32, Ints
 from restock.errors import PanelError
 from restock.ingest.task.task import Task
 from restock.replay.mixture.mixture import Mixture
-from restock.replay.mixture.packed_row import F32, PACKING_VERSION, Ints, row_columns, row_width
+from restock.replay.mixture.packed_row import PACKING_VERSION, row_columns, row_width
 from restock.replay.panel.seal import AGAIN, FileRecord, packed_by, unseal
 from restock.replay.panel.stores import PinnedStore
 from restock.replay.panel.strata import Stratum

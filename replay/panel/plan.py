@@ -16,10 +16,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from restock.arrays import F32, Bools, Ints
 from restock.errors import MixtureError, StoreError
 from restock.ingest.task.conditions import NOMINAL, Condition
 from restock.replay.mixture.mixture import Mixture
-from restock.replay.mixture.packed_row import F32, Bools, Ints
 from restock.replay.mixture.schedules import mean_over
 from restock.replay.mixture.shares import SharePlan, plan_shares
 from restock.replay.panel.candidates import META_COLUMNS, bools, codes, one_task, read_candidates

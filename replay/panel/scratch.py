@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import PanelError
 from restock.replay.mixture.n_step import (
     CONTINUES,
@@ -24,7 +25,6 @@ from restock.replay.mixture.n_step import (
     return_to_go,
     step_flags,
 )
-from restock.replay.mixture.packed_row import F32, F64, Bools, Ints
 
 # The order of the rows of a source: the order in which a plan numbers them.
 ORDER = "ORDER BY recording_id, episode_index, step_index"

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import Bools
 from restock.errors import ConfigError
 from restock.ingest.task.conditions import NOMINAL, Condition
 from restock.replay.mixture.mixture import (
@@ -19,7 +20,6 @@ from restock.replay.mixture.mixture import (
     StratumRule,
     Within,
 )
-from restock.replay.mixture.packed_row import Bools
 
 NO_STRATUM = -1
 NOMINAL_PRIORITY = 1000

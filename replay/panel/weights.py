@@ -34,8 +34,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import log_softmax, softmax
 
+from restock.arrays import F32, F64, Ints
 from restock.replay.mixture.mixture import CorrectionRule
-from restock.replay.mixture.packed_row import F32, F64, Ints
 from restock.replay.store.store import passed_in
 
 FIT_ROWS = 20_000  # of each outcome, chosen by id

@@ -18,8 +18,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import F32, F64, Ints
 from restock.errors import MixtureError
-from restock.replay.mixture.packed_row import F32, F64, Ints, row_columns, row_width
+from restock.replay.mixture.packed_row import row_columns, row_width
 from restock.replay.ring.slots import NONE, Reserve, StratumSlots
 from restock.state import Stateful
 

@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import Ints
 from restock.errors import MixtureError
-from restock.replay.mixture.packed_row import Ints
 from restock.state import Stateful
 
 NONE = -1

@@ -20,8 +20,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from restock.arrays import F64, Ints
 from restock.errors import MixtureError
-from restock.replay.mixture.packed_row import F64, Ints
 from restock.replay.sampling.priorities import Exponents, Lap, Per, Rule
 from restock.replay.sampling.quotas import Quotas
 from restock.replay.sampling.sampler import BLOCK, another_sampler

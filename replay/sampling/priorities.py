@@ -22,9 +22,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import Prioritised, Within
-from restock.replay.mixture.packed_row import F32, F64, Bools, Ints
 from restock.replay.sampling.sampler import QuotaSampler, Sampler
 from restock.state import Stateful
 

@@ -8,8 +8,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from restock.arrays import F64, Ints
 from restock.errors import MixtureError
-from restock.replay.mixture.packed_row import F64, Ints
 from restock.state import Stateful
 
 

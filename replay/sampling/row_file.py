@@ -12,8 +12,8 @@ from typing import Self
 
 import numpy as np
 
+from restock.arrays import F32, Ints
 from restock.errors import PanelError
-from restock.replay.mixture.packed_row import F32, Ints
 
 _GAP_BYTES = 1 << 16  # rows further apart than this are read by calls of their own
 _SCRATCH_BYTES = 1 << 22

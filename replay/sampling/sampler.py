@@ -12,8 +12,8 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import F32, F64, Ints
 from restock.errors import MixtureError
-from restock.replay.mixture.packed_row import F32, F64, Ints
 from restock.replay.sampling.quotas import Quotas
 from restock.state import Stateful
 

@@ -15,9 +15,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import F64, Ints
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import Adaptive, Mixture, Shortfall, SourceShares, StratumRule
-from restock.replay.mixture.packed_row import F64, Ints
 from restock.replay.mixture.schedules import knots, mean_over, value_at
 from restock.replay.mixture.shares import scaled_within, wanted_shares, within_limits
 from restock.state import Stateful

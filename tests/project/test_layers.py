@@ -35,7 +35,7 @@ MAY_IMPORT = {
     "replay/ring": "mixture",
     "replay/panel": "mixture sampling store ingest/store ingest/task",
     "replay/trace": "replay panel store ingest/profile ingest/steps ingest/task",
-    "replay/export": "replay mixture panel store ingest/profile ingest/task",
+    "replay/export": "replay panel store ingest/profile ingest/task",
     "train": (
         "dqn evaluation feed run twin/env twin/floors twin/physics replay/panel replay/ring"
         " replay/sampling ingest/profile ingest/store ingest/task"

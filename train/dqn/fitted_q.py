@@ -16,9 +16,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from restock.arrays import F32
 from restock.train.dqn.network import Network, QNetwork, clone
 
-F32 = NDArray[np.float32]
 _PART = 8192  # rows
 
 

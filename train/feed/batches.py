@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from restock.arrays import F64, Ints
 from restock.errors import MixtureError
-from restock.replay.mixture.packed_row import F64, Ints
 from restock.replay.panel.logged_sampler import (
     BatchDraw,
     LoggedSampler,

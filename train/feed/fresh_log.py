@@ -16,14 +16,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.replay.mixture.packed_row import F32
+from restock.arrays import F32, Bools
 from restock.state import Stateful, saved
 from restock.train.run import checkpoint
 
 if TYPE_CHECKING:
     from restock.train.feed.collector import EndedEpisode
 
-Bools = NDArray[np.bool_]
 _STEP = ("action", "probability", "policy", "reward", "progress_m", "truth")
 _KINDS = {"action": "i2", "policy": "i2", "truth": "<U32"}
 

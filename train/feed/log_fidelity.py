@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.replay.mixture.packed_row import F64
+from restock.arrays import F64
 from restock.train.feed.logs import Logs
 from restock.train.feed.probe import Probe
 

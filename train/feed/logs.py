@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from restock.arrays import F32, Ints
 from restock.errors import ConfigError
-from restock.replay.mixture.packed_row import F32, Ints
 from restock.replay.panel.logged_sampler import LoggedSampler, sampler_by_shares, sampler_for
 from restock.replay.sampling.share_controller import PlannedDraws
 from restock.train.dqn.config import LossConfig

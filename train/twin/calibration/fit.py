@@ -17,8 +17,8 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
+from restock.arrays import F64
 from restock.errors import ConfigError, StoreError
 from restock.replay.store.store import Store
 from restock.stats import bootstrap, median
@@ -60,7 +60,6 @@ from restock.train.twin.calibration.segments import (
 )
 from restock.train.twin.physics.perturbation import Perturbation
 
-F64 = NDArray[np.float64]
 Report = Callable[[str], None]
 
 FEWEST_SEGMENTS = 8

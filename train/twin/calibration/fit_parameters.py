@@ -7,15 +7,13 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from restock.arrays import F64
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
 from restock.replay.store.store import Store
 from restock.train.twin.physics.perturbation import RANGES, Perturbation
-
-F64 = NDArray[np.float64]
 
 # Channel -> (unit, noise to begin with). What the log's noise is comes from the residuals later.
 CHANNELS: dict[str, tuple[str, float]] = {

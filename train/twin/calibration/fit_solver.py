@@ -23,13 +23,12 @@ from mujoco import minimize
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
+from restock.arrays import F64
 from restock.ingest.task.signals import wrap_angle
 from restock.train.twin.calibration.fit_parameters import CHANNELS, Coordinates
 from restock.train.twin.calibration.open_loop import OpenLoopResult, replay_segments
 from restock.train.twin.calibration.segments import LoggedSegments
 from restock.train.twin.physics.perturbation import Perturbation
-
-F64 = NDArray[np.float64]
 
 _KEPT = 512  # replays of single perturbations that are kept
 ENOUGH = 0.02  # of the cost: what a parameter costs a fifth of its standard deviation away

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
+from restock.arrays import F64
 from restock.stats import cluster_counts
 from restock.train.twin.calibration.fit_parameters import PARAMETERS
 from restock.train.twin.calibration.fit_solver import (
@@ -23,8 +24,6 @@ from restock.train.twin.calibration.fit_solver import (
 from restock.train.twin.calibration.fitted_twin import ParameterEstimate
 from restock.train.twin.calibration.open_loop import replay_segments
 from restock.train.twin.physics.perturbation import Perturbation
-
-F64 = NDArray[np.float64]
 
 RESAMPLES = 1000
 FEW_CLUSTERS = 8

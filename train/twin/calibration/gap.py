@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import Bools, Ints
 from restock.errors import StoreError
 from restock.replay.store.store import Store
 from restock.stats import NOT_KNOWN, ConfidenceInterval, clustered_quantiles, clustered_ratio
@@ -43,9 +44,6 @@ from restock.train.twin.calibration.twin_gap import (
 )
 from restock.train.twin.floors.layout import Warehouse, default_warehouse
 from restock.train.twin.physics.perturbation import Perturbation
-
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 BEFORE, AFTER, PERSISTENCE = "nominal", "calibrated", "persistence"
 _FLOOR_ROWS = 200  # nominal rows whose lidar says whether the floor is the twin's

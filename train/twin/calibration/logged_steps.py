@@ -20,6 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import ConfigError, StoreError
 from restock.ingest.store.episode_rows import episode_ends
 from restock.ingest.store.writer import TRANSITIONS
@@ -28,10 +29,6 @@ from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task
 from restock.replay.store.store import Store, passed_in
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 Strings = NDArray[np.str_]
 
 NOMINAL = "nominal"

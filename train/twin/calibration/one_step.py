@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import F32, F64, Bools, Ints
 from restock.ingest.steps.routing import Routing
 from restock.ingest.task.signals import Signals, localised_velocity, wrap_angle
 from restock.ingest.task.task import Task, clearance_ahead, observe, reward_parts
@@ -43,11 +44,6 @@ from restock.train.twin.calibration.twin_gap import GapConfig
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.simulation import Simulation
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 PAST = 5  # control periods of commands before the step: longer than any latency and ramp
 AGREES = 0.05  # of a clearance entry: about what noise and a pallet here and there make

@@ -18,8 +18,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from restock.arrays import F64, Bools, Ints
 from restock.ingest.task.signals import Signals, localised_velocity, wrap_angle
 from restock.ingest.task.task import Task
 from restock.train.twin.calibration.logged_steps import rows_of
@@ -30,10 +30,6 @@ from restock.train.twin.physics.model import TRACK_M, WHEEL_RADIUS_M, body_veloc
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.sensing import Sensing
 from restock.train.twin.physics.simulation import BLOCK_S, Simulation
-
-F64 = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 ROBOTS = 512  # simulated at a time
 SLIP_MPS = 0.2  # wheels and localisation this far apart: ground speed is the localised one

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import F64, Bools
 from restock.ingest.task.signals import wrap_angle
 from restock.train.twin.calibration.logged_steps import NOMINAL, LoggedSteps
 from restock.train.twin.calibration.open_loop import lay_onto, replay_segments
@@ -22,10 +23,6 @@ from restock.train.twin.calibration.twin_gap import GapConfig
 from restock.train.twin.physics.model import body_velocity
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.sensing import DRIFT_TIME_S
-
-F64 = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 SIGNALS = {
     "wheel_speed_mps": "m/s",

@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import F64, Ints
 from restock.errors import ConfigError
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task
 from restock.train.twin.calibration.logged_steps import COMMAND, LoggedSteps, rows_of
-
-F64 = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 WARMUP_S = 1.0  # longer than any latency, and than a stop on friction .2
 STILL_MPS = 0.02  # slower than this a robot stands
