@@ -27,6 +27,7 @@ from restock.train.evaluation.ope_dataset import load_ope_dataset
 from restock.train.evaluation.policies import GreedyPolicy
 from restock.train.feed.batches import ReplayBatch
 from restock.train.feed.probe import Probe
+from restock.train.finite import check_loss, check_parameters
 from restock.train.guard import enforce, falls
 from restock.train.session import Interval, Session
 from restock.train.twin.env.interface import epsilon_greedy
@@ -67,6 +68,7 @@ def train(
 
     Raises:
         TrainingInterrupted: `stop` said so.
+        NotFinite: a loss or gradient is NaN or infinite; names the rows of the batch.
     """
     config, progress, learner = session.config, session.progress, session.learner
     schedule, epsilon_at = config.schedule, config.epsilon.at
@@ -135,14 +137,14 @@ def train(
             >= config.record.checkpoint_every_env_steps
             and progress.env_steps < schedule.env_steps
         ):
-            session.save()
+            _save(session)
 
     session.run.append("episodes", session.collector.label(all_of_them=True))
     if session.interval.updates or progress.env_steps > session.interval.env_steps_before:
         _close_interval(session, "warmup" if progress.online_from is None else "online", notify)
     if progress.evaluated_at != progress.env_steps:
         _evaluate(session, notify)
-    session.save()
+    _save(session)
     return TrainResult(
         progress.env_steps,
         learner.gradient_steps,
@@ -176,9 +178,11 @@ def _update(session: Session, batch: ReplayBatch, phase: str, notify: Notify) ->
     )
     step = learner.gradient_steps
     session.feed.batch(step, session.progress.env_steps, batch, loss, learner.target.last_sync)
+    value = float(loss.value.detach())
+    check_loss(session, batch, loss, value, phase)
     session.batches.learnt(batch, loss.td)
     interval.updates += 1
-    interval.loss += float(loss.value.detach())
+    interval.loss += value
     every = session.config.record.every_updates
     rule = learner.target.rule
     last_of_interval = (step - 1) // every != (step - 1 + getattr(rule, "every", 1)) // every
@@ -203,6 +207,7 @@ def _conservative_weight(session: Session, phase: str) -> float:
 
 def _close_interval(session: Session, phase: str, notify: Notify) -> None:
     """One row of `progress`, with the feed's sums and the probe's measures."""
+    check_parameters(session)
     progress, learner, interval = session.progress, session.learner, session.interval
     means = session.feed.flush(progress.env_steps, learner.gradient_steps, phase)
     if session.probe is None and phase == "online":
@@ -264,6 +269,7 @@ def _evaluate_off_policy(session: Session) -> None:
 
 def _evaluate(session: Session, notify: Notify) -> None:
     """The fixed episodes, greedily; the policy is kept if it is the best so far."""
+    check_parameters(session)
     config, progress, learner = session.config, session.progress, session.learner
     names = list(config.env.conditions)  # also those with a share of 0: never trained on, yet met
     specs = fixed_episodes(names, config.evaluation.episodes, config.evaluation.seed)
@@ -288,6 +294,11 @@ def _evaluate(session: Session, notify: Notify) -> None:
         notify("guard", {"action": enforce(session, fallen), "falls": fallen})
 
 
+def _save(session: Session) -> None:
+    check_parameters(session)
+    session.save()
+
+
 def _time_left(session: Session) -> bool:
     seconds = session.config.schedule.seconds
     return seconds is None or session.wall_s < seconds
@@ -295,7 +306,7 @@ def _time_left(session: Session) -> bool:
 
 def _interrupt(session: Session, stop: Callable[[], bool]) -> None:
     if stop():
-        session.save()
+        _save(session)
         raise TrainingInterrupted(
             f"interrupted after {session.progress.env_steps:,} environment steps and"
             f" {session.learner.gradient_steps:,} updates; a checkpoint was written",

@@ -20,6 +20,7 @@ from restock.train.dqn.learner import open_device
 from restock.train.dqn.manual_backprop import update_path
 from restock.train.dqn.target import describe
 from restock.train.feed.logs import Logs
+from restock.train.finite import STOPPED
 from restock.train.loop import Notify, TrainResult
 from restock.train.run.checkpoint import check_earlier, go_back
 from restock.train.run.run import Run, check_free, now_ns, panel_document, software_versions
@@ -48,6 +49,8 @@ class Prepared:
     def open(self) -> Session:
         """Make the run directory (or take up the old one), the twin and the learner."""
         run = self.resumed or Run.create(self.path, self.document)
+        if self.resumed is not None:
+            (self.path / STOPPED).unlink(missing_ok=True)
         if self.from_env_steps is not None:
             go_back(run.latest, self.from_env_steps)
         return open_session(
@@ -185,12 +188,12 @@ def prepare_resumed(
 
 
 def open_panel(path: Path, config: TrainConfig, profile: Profile) -> Panel:
-    """A panel, checked against the twin's task and the config's discount.
+    """A panel, every byte of it checked, and against the twin's task and the config's discount.
 
     Raises:
-        PanelError: it does not fit; says which side says what.
+        PanelError: it is damaged, or does not fit; says which side says what.
     """
-    panel = Panel.open(path)
+    panel = Panel.open(path, verify=True)
     if panel.task_hash != profile.task.hash:
         raise PanelError(
             f"its rows are of task {panel.task_hash}, the twin's ({profile.name}) is"

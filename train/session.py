@@ -33,7 +33,7 @@ from restock.train.feed.logs import Logs, LogTerms
 from restock.train.feed.probe import Probe
 from restock.train.jump_start import POLICIES, JumpStart
 from restock.train.run import checkpoint
-from restock.train.run.checkpoint import earlier, keep
+from restock.train.run.checkpoint import keep, newest_whole
 from restock.train.run.run import Events, Run
 from restock.train.twin.env.interface import Twin
 
@@ -161,12 +161,12 @@ class Session(Stateful):
         try:
             return checkpoint.load(self.run.latest)
         except RunError as error:
-            if not (kept := earlier(self.run.latest)):
+            if (whole := newest_whole(self.run.latest)) is None:
                 raise
             raise RunError(
                 error.what,
                 where=error.where,
-                remedy=f"go back to an earlier one: --from-env-steps {max(kept)}",
+                remedy=f"go back to an earlier one: --from-env-steps {whole}",
             ) from error
 
     def save_best(self, results: Score) -> None:

@@ -244,6 +244,11 @@ class Learner(Stateful):
             floor=self.loss.munchausen_floor,
         )
 
+    @property
+    def is_finite(self) -> bool:
+        """Whether every parameter is: a gradient that is not finite leaves its mark on them."""
+        return bool(torch.isfinite(self._flat.values).all())
+
     @torch.no_grad()
     def _average(self) -> None:
         """`policy_network`, the one that is evaluated and kept, follows as an average of weights.

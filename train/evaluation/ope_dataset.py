@@ -142,9 +142,9 @@ def _open(logs: str | None, trained: Panel | None, task: Task) -> tuple[Store, I
         folder = location.folder
         panel = Panel.open(folder) if folder is not None and (folder / HEADER).is_file() else None
     if panel is not None:
-        ids = pq.read_table(panel.path / EVALUATION_SPLIT, columns=["transition_id"])[
-            "transition_id"
-        ]
+        split = panel.path / EVALUATION_SPLIT
+        panel.header.files[EVALUATION_SPLIT].check(split, verify=True)
+        ids = pq.read_table(split, columns=["transition_id"])["transition_id"]
         store, tasks = _store_of(panel), {panel.task_hash}
     else:
         store = Store(location)

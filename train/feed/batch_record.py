@@ -97,6 +97,10 @@ class FeedRecord(Stateful):
         # Of batches with logged rows in the open interval: the sum (S,) of the shares in force.
         self._quota = np.zeros(sizes["logs"])
         self._quota_batches = 0
+        # Of the last two batches: rows of the panel, the ring's episodes, and their steps.
+        none: NDArray[np.int64] = np.empty(0, np.int64)
+        self._last: tuple[NDArray[np.int64], ...] = (none, none, none)
+        self._before: tuple[NDArray[np.int64], ...] = self._last
 
     def batch(
         self, step: int, env_steps: int, batch: ReplayBatch, loss: Loss, last_sync: int
@@ -121,12 +125,14 @@ class FeedRecord(Stateful):
             )
             self._quota += batch.quota
             self._quota_batches += 1
+        meta = self.ring.meta
+        episode, episode_step = meta["episode"][slots], meta["episode_step"][slots]
+        self._before, self._last = self._last, (batch.log_rows, episode, episode_step)
         if len(slots):
-            meta = self.ring.meta
             self._fresh.append(
                 self.ring.condition(slots),
-                meta["episode"][slots],
-                meta["episode_step"][slots],
+                episode,
+                episode_step,
                 meta["behaviour_policy"][slots],
                 env_steps - meta["env_step"][slots],
                 step - meta["gradient_step"][slots],
@@ -138,6 +144,18 @@ class FeedRecord(Stateful):
             )
         if self._rng.random() < self.audit_share:
             self._audit(step, batch, last_sync)
+
+    def last_batch(self, *, before: bool = False) -> list[dict[str, Any]]:
+        """The ids of the rows of the batch last kept, or of the one before it, in its order."""
+        batch = self._before if before else self._last
+        panel_row, episode, episode_step = (values.tolist() for values in batch)
+        known = [] if self.logs is None else self.logs.transition_id[batch[0]].tolist()
+        logged = zip(panel_row, known, strict=True)
+        fresh = zip(episode, episode_step, strict=True)
+        return [
+            *({"source": "logs", "panel_row": row, "transition_id": key} for row, key in logged),
+            *({"source": "fresh", "episode": key, "episode_step": step} for key, step in fresh),
+        ]
 
     def flush(self, env_steps: int, gradient_steps: int, phase: str) -> dict[str, float | None]:
         """Write the interval's sums; returns its means, for `progress`."""

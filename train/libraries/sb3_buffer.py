@@ -84,7 +84,7 @@ class MixtureReplayBuffer(ReplayBuffer):
         self.handle_timeout_termination = handle_timeout_termination
         self.buffer_size = max(buffer_size, n_envs * n_step)
         size = int(np.prod(self.obs_shape))
-        panel = Panel.open(panel) if isinstance(panel, str | Path) else panel
+        panel = Panel.open(panel, verify=True) if isinstance(panel, str | Path) else panel
         if panel is not None and not ignore_weights and weighted(panel):
             raise MixtureError(
                 "its rows have importance weights, and Stable-Baselines3's losses take none",

@@ -58,7 +58,7 @@ class MixtureVectorReplayBuffer(ReplayBufferManager):
         commands: NDArray[Any] | None = None,
         **options: Unpack[FeedOptions],
     ) -> None:
-        panel = Panel.open(panel) if isinstance(panel, str | Path) else panel
+        panel = Panel.open(panel, verify=True) if isinstance(panel, str | Path) else panel
         if panel is not None and panel.n_step != 1:
             raise MixtureError(
                 f"its rows span {panel.n_step} steps, and Tianshou makes its own returns",

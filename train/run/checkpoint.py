@@ -1,13 +1,14 @@
 """Checkpoints: one file, tensors and JSON only, written so that a kill leaves the old or the new.
 
-A checkpoint is a safetensors file whose metadata carries a JSON document. Loading one executes
-nothing. State is a nested mapping whose leaves are tensors, numpy arrays, numbers, strings,
-booleans, None or lists of those; `save` takes the arrays out into tensors named by their path and
-`load` puts them back.
+A checkpoint is a safetensors file whose metadata carries a JSON document, and a checksum over it
+and every tensor: one that changed since is refused. Loading one executes nothing. State is a nested
+mapping whose leaves are tensors, numpy arrays, numbers, strings, booleans, None or lists of those;
+`save` takes the arrays out into tensors named by their path and `load` puts them back.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -22,9 +23,10 @@ from safetensors.torch import save_file
 
 from restock.errors import RunError
 
-FORMAT = "restock-checkpoint/2"
-_EARLIER = ("restock-checkpoint/1",)
+FORMAT = "restock-checkpoint/3"
+_EARLIER = ("restock-checkpoint/1", "restock-checkpoint/2")
 _ARRAY, _STRINGS, _NUMPY = "__array__", "__strings__", "numpy"
+_RESTORE = "put back a copy of it, or train again"
 _PREFIX, _SUFFIX = "env_steps_", ".safetensors"
 
 
@@ -35,8 +37,8 @@ def save(path: Path, state: Mapping[str, Any]) -> None:
         TypeError: a leaf of another kind than those above; names its path.
     """
     tensors: dict[str, torch.Tensor] = {}
-    document = _take_apart(state, "", tensors)
-    metadata = {"format": FORMAT, "state": json.dumps(document)}
+    document = json.dumps(_take_apart(state, "", tensors))
+    metadata = {"format": FORMAT, "state": document, "blake2b": _checksum(document, tensors)}
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -73,12 +75,30 @@ def load(path: Path) -> dict[str, Any]:
             if form != FORMAT:
                 raise RunError("is not a checkpoint of Restock", where=str(path))
             tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+        document, expected = metadata.get("state", ""), metadata.get("blake2b", "none")
+        if (actual := _checksum(document, tensors)) != expected:
+            raise RunError(
+                f"is damaged: its checksum is {actual}, not {expected}",
+                where=str(path),
+                remedy=_RESTORE,
+            )
     except (SafetensorError, OSError) as error:
-        raise RunError(f"is damaged: {error}", where=str(path)) from error
-    restored = _put_together(json.loads(metadata["state"]), tensors)
+        raise RunError(f"is damaged: {error}", where=str(path), remedy=_RESTORE) from error
+    restored = _put_together(json.loads(document), tensors)
     if not isinstance(restored, dict):
         raise RunError("holds no state", where=str(path))
     return restored
+
+
+def _checksum(document: str, tensors: Mapping[str, torch.Tensor]) -> str:
+    """blake2b of all that a checkpoint holds, 32 hex digits."""
+    digest = hashlib.blake2b(document.encode(), digest_size=16)
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        digest.update(f"\n{name} {tensor.dtype} {list(tensor.shape)}\n".encode())
+        if tensor.numel():
+            digest.update(tensor.contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
 
 
 def _take_apart(value: Any, path: str, tensors: dict[str, torch.Tensor]) -> Any:
@@ -133,6 +153,17 @@ def earlier(latest: Path) -> dict[int, Path]:
     return dict(sorted(kept.items()))
 
 
+def newest_whole(latest: Path) -> int | None:
+    """The environment steps of the newest earlier checkpoint that is not damaged; None: none is."""
+    for steps, path in reversed(earlier(latest).items()):
+        try:
+            load(path)
+        except RunError:
+            continue
+        return steps
+    return None
+
+
 def keep(latest: Path, env_steps: int, count: int) -> None:
     """Before the latest, taken after `env_steps`, is replaced: of `count` in all, keep it as one.
 
@@ -166,9 +197,10 @@ def go_back(latest: Path, env_steps: int) -> None:
     """Make an earlier checkpoint the latest; those after it are forgotten.
 
     Raises:
-        RunError: see `check_earlier`.
+        RunError: see `check_earlier`; or it is damaged: then nothing is changed.
     """
     kept = check_earlier(latest, env_steps)
+    load(kept[env_steps])
     _put(kept[env_steps], latest)
     for steps, path in kept.items():
         if steps >= env_steps:

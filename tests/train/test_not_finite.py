@@ -1,0 +1,186 @@
+"""A run that meets numbers that are not finite stops, names the rows, and leaves what was whole."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+from support.kept_run import TASK
+from support.stores import recording_transitions
+from support.toy_run import assert_same_run, config, logs, run_to_end, session
+
+from restock.cli import main
+from restock.errors import RunError
+from restock.replay.mixture.mixture import parse_mixture
+from restock.replay.panel.build import build_panel
+from restock.train.finite import STOPPED, NotFinite, check_parameters
+from restock.train.loop import train
+from restock.train.run import checkpoint
+from restock.train.run.run import Run
+
+TINY = [
+    *("--set", "env.num_envs=4", "--set", "schedule.offline_updates=30"),
+    *("--set", "network.hidden=[32, 32]", "--set", "evaluation.episodes=1"),
+    *("--set", "record.every_updates=20", "--set", "record.tensorboard=false"),
+    *("--set", "replay.batch_size=32", "--env-steps", "80"),
+]
+
+
+@pytest.fixture(scope="module")
+def panel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("panels") / "panel"
+    mixture = parse_mixture(
+        "[each_condition]\nshare = 'natural'\n[evaluation_split]\nby = 'none'\n"
+    )
+    build_panel(recording_transitions(1, episodes=40, task=TASK), mixture, path, task=TASK)
+    return path
+
+
+def test_a_changed_byte_of_the_panel_is_refused_before_anything_is_written(
+    panel: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    rows = panel / "rows.f32"
+    whole = rows.read_bytes()
+    rows.chmod(0o644)
+    try:
+        at = 6003  # the exponent of a number between two of the blocks that every opening looks at
+        rows.write_bytes(whole[:at] + bytes([whole[at] ^ 0x7F]) + whole[at + 1 :])
+        for argv in (["--dry-run"], []):
+            assert main(["train", "--panel", str(panel), "--out", str(out), *TINY, *argv]) == 2
+            said = capsys.readouterr().err
+            assert f"{rows}: its checksum is" in said
+            assert "make it again with `restock mix`" in said
+            assert not out.exists()
+    finally:
+        rows.write_bytes(whole)
+    assert main(["train", "--panel", str(panel), "--out", str(out), *TINY]) == 0
+    header = json.loads((panel / "panel.json").read_text())
+    recorded = json.loads((out / "config.json").read_text())["panel"]["blake2b"]
+    assert recorded == {name: file["blake2b"] for name, file in header["files"].items()}
+
+    # Going on reads them again, so they are checked again.
+    rows.write_bytes(whole[:at] + bytes([whole[at] ^ 0x7F]) + whole[at + 1 :])
+    try:
+        assert main(["train", "--resume", str(out), "--env-steps", "120"]) == 2
+        assert "its checksum is" in capsys.readouterr().err
+    finally:
+        rows.write_bytes(whole)
+
+
+def test_a_loss_that_is_not_finite_ends_the_run_with_exit_code_2(
+    panel: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    argv = ["train", "--panel", str(panel), "--out", str(out), *TINY]
+    assert main([*argv, "--set", "optimizer.learning_rate=1e30"]) == 2
+    said = capsys.readouterr().err
+    assert f"{out}: the loss is " in said
+    assert "panel row" in said
+    assert "lower optimizer.learning_rate" in said
+    assert "Traceback" not in said
+    stopped = json.loads((out / STOPPED).read_text())
+    assert len(stopped["rows"]) == len(stopped["rows_before"]) == 32
+    Run.open(out)  # every table is there
+    assert main(["sql", str(out), "FROM progress"]) == 0
+    assert not (out / "checkpoints").exists()  # nothing of it was kept
+
+
+def test_a_row_that_is_not_finite_is_named(tmp_path: Path) -> None:
+    given = logs()
+    rows = given.rows.clone()
+    rows[77, 2] = float("nan")
+    live = session(tmp_path / "run", config(), logs=dataclasses.replace(given, rows=rows))
+    with pytest.raises(NotFinite, match=r"1 of the 32 rows .* panel row 77 \(transition 1077\)"):
+        train(live)
+    live.close()
+    stopped = json.loads((live.run.path / STOPPED).read_text())
+    assert [row["panel_row"] for row in stopped["rows"] if row["named"]] == [77]
+    assert stopped["gradient_steps"] == live.learner.gradient_steps
+
+
+def test_a_fresh_row_is_named_by_its_episode_and_step(tmp_path: Path) -> None:
+    live = session(tmp_path / "run", config(), logs=None)
+    ring = live.ring
+
+    def break_one(event: str, values: dict[str, object]) -> None:
+        if event == "progress" and values["phase"] == "warmup":
+            ring.rows[5, 0] = np.inf
+
+    with pytest.raises(NotFinite, match=r"hold values that are not finite: step \d+ of the twin's"):
+        train(live, notify=break_one)
+    live.close()
+    stopped = json.loads((live.run.path / STOPPED).read_text())
+    named = {(row["episode"], row["episode_step"]) for row in stopped["rows"] if row["named"]}
+    assert named == {(int(ring.meta["episode"][5]), int(ring.meta["episode_step"][5]))}
+
+
+def test_a_network_that_is_not_finite_is_neither_recorded_nor_kept(tmp_path: Path) -> None:
+    settings = config()
+    live = session(tmp_path / "run", settings)
+    seen: list[str] = []
+
+    def break_it(event: str, values: dict[str, object]) -> None:
+        seen.append(event)
+        if len(seen) == 6:
+            with torch.no_grad():
+                next(live.learner.network.parameters())[0, 0] = float("nan")
+
+    with pytest.raises(NotFinite):
+        train(live, notify=break_it)
+    with pytest.raises(NotFinite, match=r"the gradient was not finite.* rows of the batch gave it"):
+        check_parameters(live)
+    live.close()
+    for kept in (live.run.latest, live.run.best):
+        state = checkpoint.load(kept)
+        network = state["learner"]["network"] if "learner" in state else state["network"]
+        assert all(torch.isfinite(value).all() for value in network.values())
+    losses = pq.read_table(live.run.path / "progress.parquet")["loss"].drop_null().to_numpy()
+    assert np.isfinite(losses).all()
+    # What was whole goes on: as if it had never stopped.
+    again = session(tmp_path / "run", settings, resume=True)
+    train(again)
+    again.close()
+    assert_same_run(run_to_end(tmp_path / "whole", settings), again)
+
+
+@pytest.mark.parametrize("at", [0.3, 0.7])
+def test_a_damaged_checkpoint_is_refused_by_name(
+    panel: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], at: float
+) -> None:
+    out = tmp_path / "run"
+    assert main(["train", "--panel", str(panel), "--out", str(out), *TINY]) == 0
+    run = Run.open(out)
+    for file, argv in (
+        (run.latest, ["train", "--resume", str(out), "--env-steps", "120"]),
+        (run.best, ["eval", str(out), "--episodes", "1"]),
+    ):
+        content = bytearray(file.read_bytes())
+        content[int(at * len(content))] ^= 1
+        file.write_bytes(content)
+        capsys.readouterr()
+        assert main(argv) == 2
+        said = capsys.readouterr().err
+        assert f"{file}: is damaged" in said
+        assert "put back a copy of it, or train again" in said
+
+
+def test_going_back_to_a_damaged_checkpoint_changes_nothing(tmp_path: Path) -> None:
+    live = run_to_end(tmp_path / "run", config())
+    latest = live.run.latest
+    (older, first), (newer, second) = checkpoint.earlier(latest).items()
+    before = latest.read_bytes()
+    assert checkpoint.newest_whole(latest) == newer
+    second.write_bytes(second.read_bytes()[:-9])
+    assert checkpoint.newest_whole(latest) == older  # what a failed resume proposes
+    first.write_bytes(b"half")
+    assert checkpoint.newest_whole(latest) is None
+    with pytest.raises(RunError, match="is damaged"):
+        checkpoint.go_back(latest, older)
+    assert latest.read_bytes() == before
+    assert list(checkpoint.earlier(latest)) == [older, newer]

@@ -1,0 +1,107 @@
+"""Numbers that are not finite end a run with an error that names the rows of the batch.
+
+A loss or gradient that is NaN or infinite makes every value NaN within an update, and nothing that
+is learnt, evaluated or kept after it means anything. The loss of each update is looked at, which
+costs nothing: it is summed anyway. A gradient that is not finite under a loss that is shows in the
+parameters: they are looked at before an interval is closed, a policy is evaluated and a checkpoint
+is written, so that none of them is ever of NaN.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any, NoReturn
+
+import numpy as np
+
+from restock.arrays import Bools
+from restock.errors import RunError
+from restock.files import write_text
+from restock.train.dqn.loss import Loss
+from restock.train.feed.batches import ReplayBatch
+from restock.train.session import Session
+
+STOPPED = "not_finite.json"  # in the run's directory
+_NAMED = 8  # rows in the message; the file has all of them
+_LEAVE_OUT = (
+    "`restock trace PANEL PANEL_ROW` shows where such a row is from; leave it out by the mixture's"
+    " `where`, mix again and train again"
+)
+_SLOWER = (
+    "train with a lower optimizer.learning_rate, or a smaller optimizer.max_grad_norm;"
+    " checkpoints and tables up to here are whole"
+)
+
+
+class NotFinite(RunError):
+    """A loss, gradient or parameter was NaN or infinite."""
+
+
+def check_loss(session: Session, batch: ReplayBatch, loss: Loss, value: float, phase: str) -> None:
+    """Of the update just made, whose batch `session.feed` has kept.
+
+    Raises:
+        NotFinite: `value`, its loss, is not finite; names the rows.
+    """
+    if math.isfinite(value):
+        return
+    bad_rows = ~np.isfinite(batch.rows.cpu().numpy()).all(axis=1)
+    td = loss.td.cpu().numpy()
+    bad = bad_rows | ~np.isfinite(td)
+    if not bad.any():  # finite one by one, and too large together
+        bad = np.abs(td) == np.abs(td).max()
+    what = f"the loss is {value} ({phase})"
+    if bad_rows.any():
+        _stop(session, what, bad_rows, "hold values that are not finite", _LEAVE_OUT)
+    if bad.all():
+        why = "have such TD errors, after an update that left no parameter whole"
+        _stop(session, what, bad, why, _SLOWER, before=True)
+    _stop(session, what, bad, "have such TD errors, or the largest", _SLOWER)
+
+
+def check_parameters(session: Session) -> None:
+    """Before they are recorded, evaluated or kept.
+
+    Raises:
+        NotFinite: one is not finite; names the rows of the last batch.
+    """
+    if session.learner.is_finite:
+        return
+    everything = np.ones(len(session.feed.last_batch()), np.bool_)
+    what = "the gradient was not finite, and with it the network's parameters"
+    _stop(session, what, everything, "gave it", _SLOWER)
+
+
+def _stop(
+    session: Session, what: str, bad: Bools, why: str, remedy: str, *, before: bool = False
+) -> NoReturn:
+    """Leave the run's tables whole, write down the rows, and raise."""
+    rows = session.feed.last_batch()
+    session.run.flush()
+    document = {
+        **session.steps,
+        "what": what,
+        "rows": [{**row, "named": bool(is_bad)} for row, is_bad in zip(rows, bad, strict=True)],
+        "rows_before": session.feed.last_batch(before=True) if before else [],
+    }
+    write_text(session.run.path / STOPPED, json.dumps(document, indent=1) + "\n")
+    named = [row for row, is_bad in zip(rows, bad, strict=True) if is_bad]
+    shown = ", ".join(map(_name, named[:_NAMED]))
+    more = f" and {len(named) - _NAMED} more" if len(named) > _NAMED else ""
+    raise NotFinite(
+        f"{what} at update {session.learner.gradient_steps}; {len(named)} of the {len(rows)} rows"
+        f" of the batch {why}: {shown}{more}; all are in {STOPPED}"
+        + (", with those of the batch before" if before else ""),
+        where=str(session.run.path),
+        remedy=remedy,
+    )
+
+
+def _name(row: dict[str, Any]) -> str:
+    if row["source"] == "logs":
+        return f"panel row {row['panel_row']} (transition {row['transition_id']})"
+    return f"step {row['episode_step']} of the twin's episode {row['episode']}"
+
+
+__all__ = ["STOPPED", "NotFinite", "check_loss", "check_parameters"]
