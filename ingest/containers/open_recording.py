@@ -17,7 +17,8 @@ from restock.ingest.containers.compression import decompress_file
 from restock.ingest.containers.discover import METADATA, BagMetadata, recordings_in
 from restock.ingest.containers.mcap_file import McapFile
 from restock.ingest.containers.recording import Recording
-from restock.ingest.containers.sqlite_file import SqliteFile
+from restock.ingest.containers.sqlite_file import SqliteFile, open_sqlite
+from restock.ingest.containers.sqlite_salvage import SalvagedSqliteFile
 from restock.ingest.containers.storage import Damage, Storage
 from restock.ingest.containers.topic_reading import Account, LostMessages, TopicInfo
 from restock.ingest.decoding.columns import Ragged, TopicColumns
@@ -117,7 +118,7 @@ class _Opening:
         elif kind == "mcap":
             self._add("mcap", McapFile(file, salvage=self.salvage))
         elif kind == "sqlite3":
-            self._add("sqlite3", SqliteFile(file, salvage=self.salvage))
+            self._add("sqlite3", open_sqlite(file, salvage=self.salvage))
         else:
             from restock.ingest.containers.ros1_file import Ros1File
 
@@ -157,7 +158,7 @@ class _Opening:
         ros2 = [
             storage
             for storage in self.storages
-            if isinstance(storage, SqliteFile)
+            if isinstance(storage, SqliteFile | SalvagedSqliteFile)
             or (isinstance(storage, McapFile) and storage.profile == "ros2")
         ]
         encodings = {channel.encoding for storage in ros2 for channel in storage.channels.values()}

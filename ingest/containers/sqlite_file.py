@@ -7,11 +7,12 @@ queries are bounded, and only plain tables are read.
 
 from __future__ import annotations
 
-import os
+import re
 import shutil
 import sqlite3
 import tempfile
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -19,35 +20,67 @@ from urllib.parse import quote
 import numpy as np
 
 from restock.errors import RecordingError
+from restock.ingest.containers.sqlite_salvage import SalvagedSqliteFile
 from restock.ingest.containers.storage import Damage, Extra, Integrity
 from restock.ingest.decoding.messages import Channel, MessageBatch, PendingBatch
 
 MAGIC = b"SQLite format 3\x00"
 ROWS_PER_FETCH = 1000
 BYTES_PER_BATCH = 8 << 20
-LONGEST_GAP = 64 << 30  # of a short file, filled with holes in a private copy
+MOST_FOUND = 10  # by the check: one is enough to refuse the file
 STEPS_PER_BYTE = 64  # of sqlite's machine; reading rows of a few bytes takes one or two
 FEWEST_STEPS = 10_000_000
 STEPS_AT_ONCE = 100_000
+# What the check says of values, not of pages: those are read as they are.
+_OF_VALUES = re.compile(r"\S+ value in |\S+ constraint |CHECK ")
+
+
+def open_sqlite(path: Path, *, salvage: bool) -> SqliteFile | SalvagedSqliteFile:
+    """Open a sqlite3 storage file.
+
+    Raises:
+        RecordingError: it is not rosbag2's, or it is damaged and not to be salvaged.
+    """
+    try:
+        return SqliteFile(path)
+    except DamagedSqliteError as damage:
+        if not salvage:
+            raise
+        return SalvagedSqliteFile(path, damage.what, _merged(path))
+
+
+class DamagedSqliteError(RecordingError):
+    """A sqlite3 file that is cut short, or that SQLite finds damaged."""
+
+    def __init__(self, what: str, path: Path) -> None:
+        super().__init__(
+            what, where=str(path), remedy="`--salvage` reads what can still be read of it"
+        )
 
 
 class SqliteFile:
-    """One sqlite3 storage file, read only. rosbag2 keeps no checksums: it is never verified.
+    """One whole sqlite3 storage file, read only. rosbag2 keeps no checksums: it is never verified,
+    but SQLite's own check of its pages must pass.
 
     Rows that a writer left in a `-wal` or `-journal` file beside it count too: such a file is
     read from a private copy, so that nothing next to the user's recording is ever written.
+
+    Raises:
+        DamagedSqliteError: its check fails.
+        RecordingError: it is not rosbag2's.
     """
 
-    def __init__(self, path: Path, *, salvage: bool = False) -> None:
-        self.path, self.salvage = path, salvage
+    def __init__(self, path: Path) -> None:
+        self.path = path
         self.integrity: Integrity = "unverified"
         self.damage: list[Damage] = []
         self.notes: list[str] = []
         self.extras: list[Extra] = []
         self._copy: tempfile.TemporaryDirectory[str] | None = None
-        self._full_size = self._refuse_short()
+        self._refuse_short()
         self._connection = self._connect()
         try:
+            self._refuse_damaged()
             refuse_programs(self._connection, ("topics", "messages", "message_definitions"))
             self.channels = self._read_channels()
             self._connection.execute("SELECT id, topic_id, timestamp, data FROM messages LIMIT 0")
@@ -59,9 +92,11 @@ class SqliteFile:
                 where=str(path),
                 remedy="rosbag2's sqlite3 files have the tables `topics` and `messages`",
             ) from error
+        except RecordingError:
+            self.close()
+            raise
 
-    def _refuse_short(self) -> int:
-        """How long the file should be, by its own header."""
+    def _refuse_short(self) -> None:
         size = self.path.stat().st_size
         with self.path.open("rb") as file:
             head = file.read(100)
@@ -69,40 +104,40 @@ class SqliteFile:
         page = 65536 if page == 1 else page
         # The page count in the header is only right when the two change counters agree.
         pages = int.from_bytes(head[28:32], "big") if head[24:28] == head[92:96] else 0
-        if len(head) == 100 and size >= page * pages:
-            return size
-        what = f"cut short: {size:,} bytes of {page * pages:,}"
-        if not self.salvage or len(head) < 100:
+        if len(head) < 100:
             raise RecordingError(
-                what, where=str(self.path), remedy="`--salvage` reads what can still be read of it"
+                f"cut short: {size:,} bytes, less than its header", where=str(self.path)
             )
-        self.damage.append(Damage(what))
-        self.integrity = "damaged"
-        return min(page * pages, LONGEST_GAP + size)
+        if size < page * pages:
+            raise DamagedSqliteError(f"cut short: {size:,} bytes of {page * pages:,}", self.path)
+
+    def _refuse_damaged(self) -> None:
+        """SQLite's quick check: of every page, and that each has its place. It costs about what
+        reading all rows costs."""
+        self._connection.execute("PRAGMA ignore_check_constraints = ON")  # those are programs
+        try:
+            found = self._connection.execute(f"PRAGMA quick_check({MOST_FOUND})").fetchall()
+        except sqlite3.DatabaseError as error:
+            raise DamagedSqliteError(f"SQLite finds it damaged: {error}", self.path) from error
+        lines = [line for (text,) in found for line in str(text).splitlines()]
+        lines = [line for line in lines if line != "ok" and not _OF_VALUES.match(line)]
+        lines = [line for line in lines if not line.startswith("***")] or lines
+        if lines:
+            more = f" (and {len(lines) - 1} more)" if len(lines) > 1 else ""
+            raise DamagedSqliteError(f"SQLite finds it damaged: {lines[0]}{more}", self.path)
 
     def _connect(self) -> sqlite3.Connection:
-        path = self.path
-        sidecars = [path.with_name(path.name + end) for end in ("-wal", "-journal")]
-        sidecars = [item for item in sidecars if item.is_file() and item.stat().st_size]
-        immutable = "&immutable=1"
-        short = self._full_size > path.stat().st_size
-        if sidecars or short:
-            self._copy = tempfile.TemporaryDirectory(prefix="restock-")
-            for item in (path, *sidecars):
-                shutil.copyfile(item, Path(self._copy.name) / item.name)
+        path, immutable = self.path, "&immutable=1"
+        self._copy = _private_copy(path)
+        if self._copy:
             path, immutable = Path(self._copy.name) / path.name, ""
-            if short:  # sqlite refuses a short file outright: give it the pages, as holes
-                os.truncate(path, self._full_size)
-            if sidecars:
-                names = ", ".join(item.name for item in sidecars)
-                self.notes.append(f"{names}: read too, the writer had not merged it")
-        mode = "ro" if immutable else "rw"
-        uri = f"file:{quote(str(path.absolute()))}?mode={mode}{immutable}"
+            names = ", ".join(item.name for item in _sidecars(self.path))
+            self.notes.append(f"{names}: read too, the writer had not merged it")
         try:
-            connection = sqlite3.connect(uri, uri=True, check_same_thread=False)
-            guard(connection, sum(item.stat().st_size for item in (self.path, *sidecars)))
+            connection = _connection(path, immutable)
+            guard(connection, _size(self.path))
         except sqlite3.DatabaseError as error:
-            raise RecordingError(str(error), where=str(self.path)) from error
+            raise DamagedSqliteError(str(error), self.path) from error
         return connection
 
     def _read_channels(self) -> dict[int, Channel]:
@@ -117,8 +152,11 @@ class SqliteFile:
                 str(name): (str(form), text if isinstance(text, bytes) else str(text).encode())
                 for name, form, text in rows
             }
+        names = {row[1] for row in self._connection.execute("PRAGMA table_info(topics)")}
+        # Before rosbag2 0.0.5 there was no such column: all was CDR.
+        encoding = "serialization_format" if "serialization_format" in names else "'cdr'"
         rows = self._connection.execute(
-            "SELECT id, name, type, serialization_format FROM topics WHERE typeof(id) = 'integer'"
+            f"SELECT id, name, type, {encoding} FROM topics WHERE typeof(id) = 'integer'"
         )
         return {
             number: Channel(
@@ -134,39 +172,18 @@ class SqliteFile:
     def _count(self) -> tuple[dict[int, int], tuple[int, int] | None]:
         counts = dict.fromkeys(self.channels, 0)
         stamps = list[int]()
-        try:
-            for number, count, first, last in self._connection.execute(
-                "SELECT topic_id, count(*), min(stamp), max(stamp) FROM (SELECT topic_id, CASE"
-                " typeof(timestamp) WHEN 'integer' THEN timestamp END AS stamp FROM messages)"
-                " GROUP BY 1"
-            ):
-                if number not in self.channels:
-                    what = f"{count} messages of topic id {number}, which no topic has"
-                    self.damage.append(Damage(what, {number: count}))
-                    continue
-                counts[number] = count
-                stamps += [stamp for stamp in (first, last) if stamp is not None]
-        except sqlite3.DatabaseError:
-            if not self.salvage:
-                raise
-            # Which rows are whole is only known by reading them one after the other.
-            for number, stamp in self._whole_rows("topic_id, timestamp"):
-                if number in counts:
-                    counts[number] += 1
-                    stamps += [stamp] if isinstance(stamp, int) else []
+        for number, count, first, last in self._connection.execute(
+            "SELECT topic_id, count(*), min(stamp), max(stamp) FROM (SELECT topic_id, CASE"
+            " typeof(timestamp) WHEN 'integer' THEN timestamp END AS stamp FROM messages)"
+            " GROUP BY 1"
+        ):
+            if number not in self.channels:
+                what = f"{count} messages of topic id {number}, which no topic has"
+                self.damage.append(Damage(what, {number: count}))
+                continue
+            counts[number] = count
+            stamps += [stamp for stamp in (first, last) if stamp is not None]
         return counts, (min(stamps), max(stamps)) if stamps else None
-
-    def _whole_rows(self, columns: str) -> Iterator[tuple[int, int]]:
-        cursor = self._connection.execute(f"SELECT {columns} FROM messages NOT INDEXED ORDER BY id")
-        while True:
-            try:
-                row = cursor.fetchone()
-            except sqlite3.DatabaseError as error:
-                self._damaged(f"rows after the damage are lost: {error}")
-                return
-            if row is None:
-                return
-            yield row
 
     def _damaged(self, what: str) -> None:
         self.integrity = "damaged"
@@ -198,10 +215,9 @@ class SqliteFile:
 
     def _fetch(self, cursor: sqlite3.Cursor, row_bytes: int) -> list[tuple[int, int, Any]]:
         """Some rows, fewer of larger ones: how large they are shows in those before."""
-        # A failing fetch loses all its rows: where damage is expected, one row at a time.
         some = min(max(BYTES_PER_BATCH // max(row_bytes, 1), 1), ROWS_PER_FETCH)
         try:
-            return cursor.fetchmany(1 if self.salvage else some)
+            return cursor.fetchmany(some)
         except sqlite3.DatabaseError as error:
             self._damaged(f"rows after the damage are lost: {error}")
             return []
@@ -211,6 +227,46 @@ class SqliteFile:
         self._connection.close()
         if self._copy:
             self._copy.cleanup()
+
+
+def _sidecars(path: Path) -> list[Path]:
+    """What a writer left beside a file, to be merged into it."""
+    beside = [path.with_name(path.name + end) for end in ("-wal", "-journal")]
+    return [item for item in beside if item.is_file() and item.stat().st_size]
+
+
+def _size(path: Path) -> int:
+    return sum(item.stat().st_size for item in (path, *_sidecars(path)))
+
+
+def _private_copy(path: Path) -> tempfile.TemporaryDirectory[str] | None:
+    """A copy of a file with what lies beside it, where anything does."""
+    if not (sidecars := _sidecars(path)):
+        return None
+    folder = tempfile.TemporaryDirectory(prefix="restock-")
+    for item in (path, *sidecars):
+        shutil.copyfile(item, Path(folder.name) / item.name)
+    return folder
+
+
+def _merged(path: Path) -> tempfile.TemporaryDirectory[str] | None:
+    """A private copy into which SQLite merged what lies beside the file, as far as it can."""
+    copy = _private_copy(path)
+    if copy:
+        with suppress(sqlite3.DatabaseError):
+            connection = _connection(Path(copy.name) / path.name, "")
+            try:
+                guard(connection, _size(path))
+                connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+            finally:
+                connection.close()
+    return copy
+
+
+def _connection(path: Path, immutable: str) -> sqlite3.Connection:
+    mode = "ro" if immutable else "rw"
+    uri = f"file:{quote(str(path.absolute()))}?mode={mode}{immutable}"
+    return sqlite3.connect(uri, uri=True, check_same_thread=False)
 
 
 def _add_rows(rows: list[tuple[int, int, Any]], pending: dict[int, PendingBatch]) -> int:
