@@ -17,18 +17,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from restock.arrays import Bools, Ints
 from restock.errors import RecordingError
 from restock.ingest.containers.storage import Damage, Extra, Integrity
-from restock.ingest.decoding.columns import I64
 from restock.ingest.decoding.messages import Channel, MessageBatch, PendingBatch
 
 BYTES_PER_BATCH = 8 << 20
 SMALLEST_ROW = 12  # bytes of a message's row
 PIECE_ROWS = 4096
 LEAF, INTERIOR = 0x0D, 0x05  # of a table
-SMALLEST_CELL = 4  # bytes of a row, at the least
+SMALLEST_CELL = 4  # bytes
 INT_SIZES = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 8: 0, 9: 0}  # by serial type
 
 
@@ -67,7 +66,7 @@ class SalvagedSqliteFile:
         stamps = self._rows[:, 2]
         self.span_ns = (int(stamps.min()), int(stamps.max())) if len(stamps) else None
 
-    def _survey(self) -> I64:
+    def _survey(self) -> Ints:
         """Row number, topic, stamp, page and place in it of every message, by one pass."""
         pieces, rows = [np.zeros((0, 5), np.int64)], list[tuple[int, int, int, int, int]]()
         leaves, interiors = list[tuple[int, int]](), list[list[tuple[int, int]]]()
@@ -101,7 +100,7 @@ class SalvagedSqliteFile:
                 topic, stamp = integer(cell, 1), integer(cell, 2)
                 if topic is not None and stamp is not None:
                     yield cell.rowid, topic, stamp, page, place
-            elif len(cell.types) >= 3 and cell.types[0] == 0 and all(map(is_text, cell.types[1:])):
+            elif len(cell.types) >= 3 and cell.types[0] == 0 and all(map(_is_text, cell.types[1:])):
                 self._texts.append(cell)
 
     def _channels(self) -> dict[int, Channel]:
@@ -123,7 +122,7 @@ class SalvagedSqliteFile:
             for number, (name, kind, encoding) in topics.items()
         }
 
-    def _known(self, rows: I64) -> I64:
+    def _known(self, rows: Ints) -> Ints:
         """The messages of topics in the order of their row numbers; the rest is counted."""
         _, first = np.unique(rows[:, 0], return_index=True)
         rows = rows[first]
@@ -177,7 +176,7 @@ def _is_message(types: tuple[int, ...]) -> bool:
         and types[0] == 0
         and types[1] in INT_SIZES
         and types[2] in INT_SIZES
-        and is_blob(types[3])
+        and _is_blob(types[3])
     )
 
 
@@ -200,8 +199,8 @@ class NotAPage(Exception):
 class Moves:
     """By how many pages what is named as page `named` lies further on: at some pages, in order."""
 
-    named: I64
-    by: I64
+    named: Ints
+    by: Ints
 
     def of(self, page: int) -> int | None:
         """How far a page moved; None where those around it moved differently."""
@@ -271,7 +270,7 @@ class Pages:
         overflow = int.from_bytes(page[stop : stop + 4], "big") if local < size else 0
         return Cell(rowid, *_types(content, size), size, content, overflow)
 
-    def payload(self, cell: Cell, moves: Moves, taken: NDArray[np.bool_]) -> bytes | None:
+    def payload(self, cell: Cell, moves: Moves, taken: Bools) -> bytes | None:
         """The whole content of a row; None where pages of it are missing, or not surely its own.
 
         `taken` marks the pages that belong to something; those of this row are added.
@@ -338,9 +337,11 @@ def integer(cell: Cell, column: int) -> int | None:
     kind = cell.types[column]
     if kind not in INT_SIZES or at + INT_SIZES[kind] > len(cell.local):
         return None
-    if kind in (8, 9):
-        return kind - 8
-    return int.from_bytes(cell.local[at : at + INT_SIZES[kind]], "big", signed=True)
+    return (
+        kind - 8
+        if kind in (8, 9)
+        else int.from_bytes(cell.local[at : at + INT_SIZES[kind]], "big", signed=True)
+    )
 
 
 def column(cell: Cell, payload: bytes, number: int) -> bytes:
@@ -349,13 +350,11 @@ def column(cell: Cell, payload: bytes, number: int) -> bytes:
     return payload[at : at + _size(cell.types[number])]
 
 
-def is_blob(kind: int) -> bool:
-    """Whether a serial type is a blob's."""
+def _is_blob(kind: int) -> bool:
     return kind >= 12 and kind % 2 == 0
 
 
-def is_text(kind: int) -> bool:
-    """Whether a serial type is a text's."""
+def _is_text(kind: int) -> bool:
     return kind >= 13 and kind % 2 == 1
 
 
