@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, field
 
+import duckdb
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
@@ -15,8 +16,10 @@ from restock.replay.mixture.mixture import EvaluationSplit, Mixture
 from restock.replay.mixture.packed_row import GOLDEN, splitmix64
 from restock.replay.panel.candidates import bools, codes
 from restock.replay.panel.strata import NO_STRATUM, ResolvedStratum
+from restock.replay.store.query import repeated_rows
 
 DAY_NS = 86_400 * 10**9
+EPISODE_REPEATS = 3  # rows that an episode shares with the evaluation split, to be left out whole
 
 
 @dataclass
@@ -63,6 +66,43 @@ def leave_out(table: pa.Table, mixture: Mixture, evaluation_split: Bools) -> Lef
     if mixture.unlabelled == "drop":
         out.add("without a coverage label", bare)
     return out
+
+
+def repeats_of(
+    connection: duckdb.DuckDBPyConnection, table: pa.Table, evaluation_split: Bools
+) -> Bools:
+    """Rows (N,) outside the evaluation split that show its steps again, under other ids.
+
+    A recording and a part of it, or a drive that was recorded again, may both be in the store.
+    Where `EPISODE_REPEATS` rows or more of an episode are in the split, all of the episode counts.
+
+    Raises:
+        MixtureError: nothing else is left.
+    """
+    repeated = np.zeros(len(table), np.bool_)
+    if not evaluation_split.any():
+        return repeated
+    connection.execute(repeated_rows())
+    found = connection.sql(
+        "SELECT transition_id, same_as_transition_id FROM repeated_rows(1)"
+    ).to_arrow_table()
+    copy, original = (found[name].to_numpy() for name in found.column_names)
+    ids = table["transition_id"].to_numpy()
+    held = ids[evaluation_split]
+    shown = np.union1d(original[np.isin(copy, held)], original[np.isin(original, held)])
+    same = np.concatenate([shown, copy[np.isin(original, shown)]])
+    repeated = np.isin(ids, same) & ~evaluation_split
+    episode = codes(table, "episode_id")
+    whole = np.bincount(episode[repeated], minlength=1) >= EPISODE_REPEATS
+    repeated |= np.isin(episode, np.flatnonzero(whole)) & ~evaluation_split
+    if repeated.any() and (repeated | evaluation_split).all():
+        raise MixtureError(
+            f"all {int(repeated.sum())} rows outside the evaluation split repeat its steps:"
+            " the same drive is in the store more than once",
+            remedy="take the repeated recordings out (`restock audit` names them:"
+            " `repeated_steps`), or ingest more",
+        )
+    return repeated
 
 
 def leave_out_of_strata(

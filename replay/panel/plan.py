@@ -27,6 +27,7 @@ from restock.replay.panel.exclusions import (
     LeftOut,
     leave_out,
     leave_out_of_strata,
+    repeats_of,
     scramble,
     split_for_evaluation,
 )
@@ -114,6 +115,7 @@ def plan_panel(
     stratum, state_code = assign(member, strata), assign(state, strata, only_pre=True)
     evaluation_split = split_for_evaluation(table, mixture.evaluation_split, mixture.seed)
     out = leave_out(table, mixture, evaluation_split)
+    out.add("same steps as the evaluation split", repeats_of(connection, table, evaluation_split))
     for other in others:
         if other.repeated_rows:
             out.reasons[f"of {other.name!r}, in a store before it too"] = other.repeated_rows

@@ -25,11 +25,16 @@ def install(connection: duckdb.DuckDBPyConnection, observation_type: str) -> Non
 
 
 def definitions(observation_type: str = "FLOAT[]") -> str:
-    """views.sql and macros.sql, with the type that observations are cast to."""
+    """views.sql, macros.sql and repeated_rows.sql, with the type that observations are cast to."""
     folder = files("restock.replay.store")
     views = (folder / "views.sql").read_text(encoding="utf-8")
     macros = (folder / "macros.sql").read_text(encoding="utf-8")
-    return views.replace("::FLOAT[] ", f"::{observation_type} ") + "\n" + macros
+    return views.replace("::FLOAT[] ", f"::{observation_type} ") + f"\n{macros}\n{repeated_rows()}"
+
+
+def repeated_rows() -> str:
+    """The statement that makes the macro `repeated_rows`, over any `transitions`."""
+    return (files("restock.replay.store") / "repeated_rows.sql").read_text(encoding="utf-8")
 
 
 def query(

@@ -368,9 +368,14 @@ def test_a_copy_of_a_held_out_step_is_a_leak(tmp_path: Path) -> None:
     copy = replaced(copy, "transition_id", (np.int64(7) << 25) + np.arange(len(one)))
     copy = replaced(copy, "ingest_id", ["copy"] * len(one))
     path = write_store(tmp_path / "store", [one, copy])
-    mixture = parse_mixture("[each_condition]\n[evaluation_split]\nby = 'recording'\nshare = 0.4")
-    panel = panel_of(path, mixture, tmp_path / "p")
-    finding = beside_panel(path, panel.path, "leakage")
+    # A panel leaves such steps out itself: one of a store without the copy, and one beside it.
+    mixture = parse_mixture("[each_condition]\n[evaluation_split]\nby = 'none'")
+    panel = panel_of(write_store(tmp_path / "alone", [one]), mixture, tmp_path / "p")
+    spoil = (
+        "CREATE OR REPLACE VIEW panel.evaluation_split AS SELECT *,"
+        f" 'recording' AS split_by FROM transitions WHERE recording_id = '{7:016x}'"
+    )
+    finding = beside_panel(path, panel.path, "leakage", spoil)
     assert {row["leak"] for row in finding.sample} == {"the same step under another id"}
     assert finding.rows == len(one["episode_id"].unique())
 

@@ -2,13 +2,19 @@
 -- needs: panel
 -- advice: Make the panel again, after `duplicate_transitions` and `repeated_steps` pass; what is held out must share nothing with what is trained on.
 -- doc: What is in the panel and held out at once: an episode; a recording, where whole ones are held out; an episode that ends after the first that is held out, where the latest are; or the same step under another id.
-WITH panel_steps AS (
-    SELECT transitions.transition_id, stamp_ns, action, hash(observation) AS seen, episode_id
-    FROM transitions
-    SEMI JOIN panel.rows USING (transition_id)
+WITH repeated AS (
+    FROM repeated_rows(1)
+), copies AS (
+    SELECT transition_id, same_as_transition_id AS step FROM repeated
+    UNION
+    SELECT same_as_transition_id, same_as_transition_id FROM repeated
+), panel_steps AS (
+    SELECT DISTINCT step, episode_id
+    FROM copies
+    JOIN panel.rows USING (transition_id)
 ), held AS (
-    SELECT transitions.transition_id, stamp_ns, action, hash(observation) AS seen, episode_id
-    FROM transitions
+    SELECT DISTINCT step
+    FROM copies
     SEMI JOIN panel.evaluation_split USING (transition_id)
 ), ends AS (
     SELECT min(ended_ns) AS first_ns
@@ -30,9 +36,8 @@ WHERE 'time' IN (SELECT split_by FROM panel.evaluation_split)
 GROUP BY episode_id
 HAVING max(logged_ns) > (SELECT first_ns FROM ends)
 UNION ALL
-SELECT 'the same step under another id', panel_steps.episode_id, count(*)
+SELECT 'the same step under another id', episode_id, count(*)
 FROM panel_steps
-JOIN held USING (stamp_ns, action, seen)
-WHERE panel_steps.transition_id <> held.transition_id
-GROUP BY panel_steps.episode_id
+SEMI JOIN held USING (step)
+GROUP BY episode_id
 ORDER BY leak, episode_id

@@ -1,18 +1,18 @@
 -- severity: error
--- advice: A bag and a part of it, or a copy cut otherwise, were both ingested: take one of the two recordings out, or these steps weigh twice and may be trained on and held out at once.
--- doc: Recordings that hold the same steps as another one: equal stamp, action and observation under another id.
-WITH steps AS (
-    SELECT recording_id, source_file, stamp_ns, action, hash(observation) AS seen
-    FROM transitions
-)
+-- advice: A bag and a part of it, a copy cut otherwise or a drive that was recorded again were both ingested: take one of the two recordings out, or these steps weigh twice.
+-- doc: Recordings that hold the same steps as another one: equal action, observation and pose, at one constant shift of their clocks (`repeated_rows`).
 SELECT
-    one.recording_id,
+    repeated.same_as AS recording_id,
     any_value(one.source_file) AS source_file,
-    other.recording_id AS same_as,
+    repeated.recording_id AS same_as,
     any_value(other.source_file) AS same_as_file,
-    count(*) AS rows
-FROM steps AS one
-JOIN steps AS other USING (stamp_ns, action, seen)
-WHERE one.recording_id < other.recording_id
-GROUP BY one.recording_id, other.recording_id
-ORDER BY rows DESC, one.recording_id, same_as
+    count(*) AS rows,
+    count(*) / least(any_value(one.transitions), any_value(other.transitions)) AS share,
+    any_value(shift_ns) / 1e9 AS later_s
+FROM repeated_rows($min_rows) AS repeated
+JOIN (SELECT recording_id, any_value(source_file) AS source_file, count(*) AS transitions FROM transitions GROUP BY recording_id) AS one
+    ON one.recording_id = repeated.same_as
+JOIN (SELECT recording_id, any_value(source_file) AS source_file, count(*) AS transitions FROM transitions GROUP BY recording_id) AS other
+    ON other.recording_id = repeated.recording_id
+GROUP BY repeated.same_as, repeated.recording_id
+ORDER BY rows DESC, repeated.same_as, repeated.recording_id

@@ -1,0 +1,84 @@
+-- Rows of a recording that are those of another one under other ids: a bag and a part of it, a copy
+-- cut otherwise, or a drive that was replayed and recorded again.
+--
+-- They are found by content (task, action, observation and pose, rounded to a thousandth), not by stamp:
+-- each ingest estimates its own clock. Of two recordings one constant shift between their stamps is
+-- taken out, and matches within half a control period of it count. What looks the same more than
+-- once in a recording (a robot that stands still) proves nothing and is left aside. Each row
+-- is given with the one of the first recording, by id, that has it.
+CREATE OR REPLACE MACRO repeated_rows(min_rows) AS TABLE
+WITH places AS (
+    -- Few rows pass this, and only theirs are read whole.
+    SELECT hash(task_hash, action, round(pose_x_m, 3), round(pose_y_m, 3)) AS place
+    FROM transitions
+    GROUP BY place
+    HAVING min(recording_id) < max(recording_id)
+), distinctive AS (
+    SELECT
+        recording_id,
+        content,
+        any_value(transition_id) AS transition_id,
+        any_value(episode_id) AS episode_id,
+        any_value(stamp_ns) AS stamp_ns
+    FROM (
+        SELECT
+            recording_id,
+            transition_id,
+            episode_id,
+            stamp_ns,
+            hash(
+                task_hash,
+                action,
+                list_transform(observation::FLOAT[], lambda x: round(x, 3)),
+                round(pose_x_m, 3),
+                round(pose_y_m, 3)
+            ) AS content
+        FROM transitions
+        WHERE hash(task_hash, action, round(pose_x_m, 3), round(pose_y_m, 3)) IN (FROM places)
+    )
+    GROUP BY recording_id, content
+    HAVING count(*) = 1
+), shared AS (
+    SELECT content, min(recording_id) AS same_as
+    FROM distinctive
+    GROUP BY content
+    HAVING count(*) > 1
+), matches AS (
+    SELECT
+        other.transition_id,
+        other.recording_id,
+        other.episode_id,
+        one.transition_id AS same_as_transition_id,
+        one.recording_id AS same_as,
+        other.stamp_ns - one.stamp_ns AS later_ns
+    FROM shared
+    JOIN distinctive AS one ON one.content = shared.content AND one.recording_id = shared.same_as
+    JOIN distinctive AS other
+        ON other.content = shared.content AND other.recording_id > shared.same_as
+), shifts AS (
+    SELECT recording_id, same_as, quantile_disc(later_ns, 0.5) AS shift_ns
+    FROM matches
+    GROUP BY recording_id, same_as
+), periods AS (
+    SELECT recording_id, median((end_ns - start_ns) / steps) AS period_ns
+    FROM (
+        SELECT
+            recording_id,
+            min(stamp_ns) AS start_ns,
+            max(stamp_ns) AS end_ns,
+            max(step_index) - min(step_index) AS steps
+        FROM transitions
+        WHERE recording_id IN (SELECT recording_id FROM matches)
+        GROUP BY recording_id, episode_id
+    )
+    WHERE steps > 0
+    GROUP BY recording_id
+)
+SELECT matches.*, shift_ns
+FROM matches
+JOIN shifts USING (recording_id, same_as)
+LEFT JOIN periods USING (recording_id)
+-- An episode of one step has no period: a tenth of a second.
+WHERE abs(later_ns - shift_ns) <= coalesce(period_ns, 0.1e9) / 2
+QUALIFY count(*) OVER (PARTITION BY recording_id, same_as) >= min_rows
+ORDER BY matches.transition_id;

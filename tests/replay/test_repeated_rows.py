@@ -1,0 +1,165 @@
+"""The same drive in two recordings is found by content, never trained on and held out at once."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from support.panels import EVERY, NO_SPLIT, panel_of, planned
+from support.paths import ROOT, SHARED
+from support.stores import recording_transitions, write_store
+
+from restock.cli import main
+from restock.errors import MixtureError
+from restock.replay.store.store import Store
+
+MONDAY = ROOT / "sample_logs" / "amr_monday.mcap"
+NEATO = SHARED / "fleet-neato"
+
+
+def printed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> list[dict[str, object]]:
+    """What `restock sql STORE QUERY --json` prints."""
+    assert main(["sql", *map(str, arguments), "--json"]) == 0
+    rows: list[dict[str, object]] = json.loads(capsys.readouterr().out)
+    return rows
+
+
+def audited(store: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, list[dict[str, object]]]:
+    """The first rows of each audit that failed."""
+    capsys.readouterr()
+    assert main(["audit", str(store), "--json"]) == 1
+    findings = json.loads(capsys.readouterr().out)["audits"]
+    return {one["audit"]: one["sample"] for one in findings if one["status"] == "fail"}
+
+
+def copy_of(
+    table: pa.Table, recording: int, *, later_ns: int = 0, jitter_ns: int = 0, first: int = 0
+) -> pa.Table:
+    """The same steps as another ingest would write them, from the row `first` on."""
+    part = table.slice(first)
+    rows, name = len(part), f"{recording:016x}"
+    moved = np.random.default_rng(0).integers(-jitter_ns, jitter_ns + 1, rows) + later_ns
+    values: dict[str, object] = {
+        "recording_id": [name] * rows,
+        "episode_id": [f"{name}/{index}" for index in part["episode_index"].to_pylist()],
+        "transition_id": (np.int64(recording) << 25) + np.arange(rows),
+        "ingest_id": [f"{name}-a"] * rows,
+        "source_file": [f"logs/{recording}.mcap"] * rows,
+        "stamp_ns": part["stamp_ns"].to_numpy() + moved,
+    }
+    for column, value in values.items():
+        place = part.schema.get_field_index(column)
+        field = part.schema.field(place)
+        part = part.set_column(place, field, pa.array(value, field.type))
+    return part
+
+
+def test_a_salvaged_part_and_the_whole_recording(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = MONDAY.read_bytes()
+    (tmp_path / "part.mcap").write_bytes(content[: len(content) // 5])
+    store = str(tmp_path / "store")
+    assert main(["ingest", str(tmp_path / "part.mcap"), "--salvage", "--store", store]) == 3
+    assert main(["ingest", str(MONDAY), "--store", store]) == 0
+    (found,) = audited(Path(store), capsys)["repeated_steps"]
+    query = "SELECT min(transitions) AS rows FROM recordings"
+    (part,) = printed(capsys, store, query)
+    assert found["rows"] == part["rows"]
+    assert found["share"] == 1.0
+    # Each ingest estimates the offset of its clocks: not one stamp is the same.
+    same = "SELECT stamp_ns FROM transitions GROUP BY ALL HAVING count(*) > 1"
+    assert printed(capsys, store, same) == []
+
+
+@pytest.mark.skipif(not NEATO.is_dir(), reason="needs ../shared/bags/fleet-neato")
+def test_a_drive_that_was_replayed_and_recorded_again_a_year_later(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    profile, store = str(tmp_path / "neato.toml"), str(tmp_path / "store")
+    (original,) = (NEATO / "2022-original").iterdir()
+    assert main(["profile", "new", str(original), "--out", profile]) == 0
+    folders = ["2022-original", "2023-replayed", "2024-danpark"]
+    paths = [str(NEATO / folder) for folder in folders]
+    assert main(["ingest", *paths, "--profile", profile, "--store", store]) in (0, 3)
+    (found,) = audited(Path(store), capsys)["repeated_steps"]
+    names = {Path(str(found[name])).name for name in ("source_file", "same_as_file")}
+    assert names == {"macfirst_floor_take_2", "mac_take_2_bag"}
+    assert float(str(found["share"])) > 0.95
+
+
+@pytest.mark.parametrize("later_s", [0, 33_194_320, -3600])
+def test_a_constant_shift_and_a_jitter_of_the_clocks(tmp_path: Path, later_s: int) -> None:
+    one = recording_transitions(1)
+    copy = copy_of(one, 5, later_ns=later_s * 10**9, jitter_ns=90_000_000, first=100)
+    with Store(write_store(tmp_path / "store", [one, copy])) as store:
+        rows = store.sql("FROM repeated_rows(3)").fetchall()
+    assert len(rows) == len(one) - 100
+
+
+def test_steps_at_other_times_of_the_drive_do_not_count(tmp_path: Path) -> None:
+    """Steps 1 s apart from where the rest of the copy puts them are a chance, not a copy."""
+    one = recording_transitions(1)
+    copy = copy_of(one, 5)
+    stamps = copy["stamp_ns"].to_numpy().copy()
+    stamps[:40] += 10**9
+    copy = copy.set_column(copy.schema.get_field_index("stamp_ns"), "stamp_ns", pa.array(stamps))
+    with Store(write_store(tmp_path / "store", [one, copy])) as store:
+        assert len(store.sql("FROM repeated_rows(3)").fetchall()) == len(one) - 40
+
+
+def test_robots_that_stand_still_alike_are_two(tmp_path: Path) -> None:
+    def standing(recording: int) -> pa.Table:
+        table = recording_transitions(recording)
+        for name in ("observation", "action", "pose_x_m", "pose_y_m"):
+            place = table.schema.get_field_index(name)
+            same = pa.array([recording_transitions(1)[name][0].as_py()] * len(table))
+            table = table.set_column(place, name, same.cast(table.schema.field(place).type))
+        return table
+
+    with Store(write_store(tmp_path / "store", [standing(1), standing(2)])) as store:
+        assert store.sql("FROM repeated_rows(1)").fetchall() == []
+
+
+def test_a_panel_leaves_out_what_its_evaluation_split_shows(tmp_path: Path) -> None:
+    one, other = recording_transitions(1), recording_transitions(2)
+    copy = copy_of(one, 5, later_ns=10**15, jitter_ns=2000)
+    store = write_store(tmp_path / "store", [one, other, copy])
+    panel = panel_of(store, EVERY + "[evaluation_split]\nshare = 0.2", tmp_path / "panel")
+    kept = panel.meta
+    held = pq.read_table(panel.path / "evaluation_split.parquet")
+    steps = {
+        (number % 2**25, recording)
+        for number, recording in zip(
+            held["transition_id"].to_pylist(), held["recording_id"].to_pylist(), strict=True
+        )
+        if recording != f"{2:016x}"
+    }
+    twins = {f"{1:016x}": f"{5:016x}", f"{5:016x}": f"{1:016x}"}
+    shown = {(number, twins[recording]) for number, recording in steps} - steps
+    trained = {
+        (number % 2**25, recording)
+        for number, recording in zip(
+            kept["transition_id"].to_pylist(), kept["recording_id"].to_pylist(), strict=True
+        )
+    }
+    assert shown
+    assert not shown & trained
+    assert panel.header.left_out["same steps as the evaluation split"] == len(shown)
+
+
+def test_a_panel_of_one_drive_twice_is_refused() -> None:
+    one = recording_transitions(1)
+    both = pa.concat_tables([one, copy_of(one, 5)])
+    with pytest.raises(MixtureError, match="the same drive is in the store more than once"):
+        planned(both, EVERY + "[evaluation_split]\nby = 'recording'\nshare = 0.4")
+
+
+def test_without_an_evaluation_split_copies_stay() -> None:
+    one = recording_transitions(1)
+    plan = planned(pa.concat_tables([one, copy_of(one, 5)]), EVERY + NO_SPLIT)
+    assert len(plan.panel_rows) == 2 * len(one)
