@@ -173,18 +173,23 @@ class _Opening:
                 )
 
     def _compare(self, recording: Recording, metadata: BagMetadata) -> None:
-        """metadata.yaml's counts are a claim about the files: differences are noted."""
+        """metadata.yaml's counts are a claim about the files: what it counts and they do not hold
+        is lost; what they hold beyond it is noted."""
         for topic in metadata.topics:
             if topic.name is None or topic.messages is None:
                 continue
             name = visible(topic.name)  # as the files' names are
             info = recording.topics.get(name)
             counted = info.expected if info else 0
-            if counted != topic.messages:
-                recording.notes.append(
-                    f"{METADATA} counts {topic.messages} messages on {name},"
-                    f" the files hold {counted}"
-                )
+            if counted == topic.messages:
+                continue
+            what = (
+                f"{METADATA} counts {topic.messages} messages on {name}, the files hold {counted}"
+            )
+            if counted < topic.messages:
+                recording.damage_of_bag(Damage(what, {-1: topic.messages - counted}))
+            else:
+                recording.notes.append(what)
 
 
 __all__ = [

@@ -22,6 +22,7 @@ from support.bag_samples import (
 )
 from support.paths import SHARED
 
+from restock.cli import main
 from restock.errors import RecordingError
 from restock.ingest.containers.open_recording import (
     Recording,
@@ -378,8 +379,15 @@ def test_metadata_is_not_believed(tmp_path: Path) -> None:
         )
     metadata.write_text(text.replace("message_count: 20", "message_count: 21"))
     with open_recording(bag) as recording:
-        assert any("counts 21 messages on /odom" in note for note in recording.notes)
+        lost = {loss.reason: loss.messages for loss in recording.lost_messages}
+        assert lost["metadata.yaml counts 21 messages on /odom, the files hold 20"] == 1
         assert recording.topics["/odom"].expected == 20
+    assert main(["info", str(bag)]) == 3
+    metadata.write_text(text.replace("message_count: 20", "message_count: 19"))
+    with open_recording(bag) as recording:  # more than it counts: nothing is lost
+        assert any("counts 19 messages on /odom" in note for note in recording.notes)
+        assert not recording.lost_messages
+    assert main(["info", str(bag)]) == 0
     metadata.write_text("a: [unclosed")
     with open_recording(bag) as recording:
         assert recording.messages == 140
