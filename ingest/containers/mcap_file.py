@@ -71,23 +71,24 @@ class McapFile:
     # -- contents ---------------------------------------------------------------------
 
     def _count(self) -> dict[int, int]:
-        """By the statistics where there are any, else by the index, else by walking chunks."""
+        """By the statistics where there are any, else by walking chunks: of a message index that is
+        missing nothing else would tell."""
         contents = self._contents
         claimed = contents.claimed_counts()
         counts = contents.indexed_counts()
         if claimed is not None:
-            indexed = all(chunk.index for chunk in contents.chunks)
-            if indexed and any(count > counts[number] for number, count in claimed.items()):
+            if any(count > counts[number] for number, count in claimed.items()):
                 contents.distrust_index()  # it leaves messages out; look for them
                 return claimed
             more = {number for number, count in counts.items() if count > claimed.get(number, 0)}
             if more:
                 self.notes.append("its statistics count fewer messages than it holds")
             return {**claimed, **{number: counts[number] for number in more}}
+        contents.distrust_index()
+        counts = contents.indexed_counts()
         for chunk in contents.chunks:
-            if not chunk.index:
-                for number, positions in self._chunks.walk(chunk).items():
-                    counts[number] += len(positions)
+            for number, positions in self._chunks.walk(chunk).items():
+                counts[number] += len(positions)
         return counts
 
     def _channels(self) -> dict[int, Channel]:

@@ -413,6 +413,32 @@ def test_statistics_that_count_more_than_there_is(tmp_path: Path) -> None:
         assert recording.lost_messages[0].reason == "counted by the container, but not in it"
 
 
+def without_summary(path: Path, *, missing: int) -> Path:
+    """The file without what comes after its data, and without one of its message indexes."""
+    from restock.ingest.containers.mcap_records import MAGIC, PREFIX, Op, walk
+
+    content = path.read_bytes()
+    kept, indexes = [MAGIC], 0
+    for opcode, start, stop in walk(content, len(MAGIC), len(content) - len(MAGIC)):
+        indexes += opcode == Op.MESSAGE_INDEX
+        if opcode != Op.MESSAGE_INDEX or indexes != missing:
+            kept.append(content[start - PREFIX : stop])
+        if opcode == Op.DATA_END:
+            break
+    footer = bytes([Op.FOOTER]) + (20).to_bytes(8, "little") + bytes(20)
+    path.write_bytes(b"".join([*kept, footer, MAGIC]))
+    return path
+
+
+@pytest.mark.parametrize("missing", [1, 9, 20])
+def test_a_missing_message_index_loses_no_message(missing: int, tmp_path: Path) -> None:
+    file = without_summary(write_mcap(tmp_path / "run.mcap"), missing=missing)
+    with open_recording(file) as recording:
+        assert recording.messages == 140
+        assert sum(len(columns) for columns in everything(recording).values()) == 140
+        assert not recording.lost_messages
+
+
 def test_an_unknown_type_skips_its_topic_by_name(tmp_path: Path) -> None:
     file = next(write_bag(tmp_path / "run").glob("*.db3"))
     with sqlite3.connect(file) as base:
