@@ -5,6 +5,7 @@ from __future__ import annotations
 import bz2
 import io
 import struct
+from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from restock.ingest.decoding.messages import Channel, MessageBatch
 PLAUSIBLE_SIZE = 64 << 20
 PLAUSIBLE_RATIO = 1000
 
+_MESSAGE, _CONNECTION = bytes([RecordType.MSGDATA]), bytes([RecordType.CONNECTION])
 _BROKEN = (
     *(ReaderError, AssertionError, ValueError, KeyError, IndexError, struct.error),
     *(OSError, EOFError, RuntimeError, OverflowError),
@@ -59,63 +61,111 @@ class Ros1File:
             )
             for connection in self._reader.connections
         }
-        self.counts = {item.id: item.msgcount for item in self._reader.connections}
+        self._counts = self._by_index()  # messages of each channel in each chunk
+        self.counts = dict.fromkeys(self.channels, 0)
+        for counts in self._counts.values():
+            for channel in counts.keys() & self.channels.keys():
+                self.counts[channel] += counts[channel]
         stamps = [
-            (index[0].time, index[-1].time) for index in self._reader.indexes.values() if index
-        ]
+            (info.start_time, info.end_time - 1)
+            for info in self._reader.chunk_infos
+            if info.connection_counts
+        ] + [(index[0].time, index[-1].time) for index in self._reader.indexes.values() if index]
         self.span_ns = (
             (min(low for low, _ in stamps), max(high for _, high in stamps)) if stamps else None
         )
 
+    def _by_index(self) -> dict[int, Counter[int]]:
+        """Messages per chunk and channel, by the bag's two indexes; by walking a chunk of which
+        they say different things."""
+        counts = {position: Counter[int]() for position in self._reader.chunks}
+        for channel, index in self._reader.indexes.items():
+            for entry in index:
+                counts[entry.chunk_pos][channel] += 1
+        for info in self._reader.chunk_infos:
+            claimed = Counter(info.connection_counts)
+            if counts[info.pos] != claimed or claimed.keys() - self.channels.keys():
+                self.notes.append(
+                    f"chunk at byte {info.pos:,}: its indexes contradict each other; walked"
+                )
+                try:
+                    found, _ = _walk(self._reader.inflated(info.pos))
+                    counts[info.pos] = Counter({key: len(rows) for key, rows in found.items()})
+                except _BROKEN:  # said when it is read
+                    counts[info.pos] |= claimed
+        return counts
+
     def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
-        """Chunk by chunk; a chunk that is damaged costs only its own messages."""
-        places: dict[int, dict[int, list[int]]] = {}  # chunk -> channel -> offsets in it
-        for channel in channels:
-            for entry in self._reader.indexes.get(channel, []):
-                places.setdefault(entry.chunk_pos, {}).setdefault(channel, []).append(entry.offset)
-        for position in sorted(places):
-            wanted = places[position]
+        """Chunk by chunk, by what it holds, whatever the index says; one that is damaged costs
+        only its own messages."""
+        wanted = set(channels)
+        for position in sorted(self._reader.chunks):
+            counts = {key: self._counts[position][key] for key in sorted(wanted)}
             try:
                 data = self._reader.inflated(position)
-                batches = [(channel, _batch(data, channel, at)) for channel, at in wanted.items()]
             except _BROKEN as error:
-                self.integrity = "damaged"
-                what = f"chunk at byte {position:,} is lost: {error}"
-                counts = {channel: len(offsets) for channel, offsets in wanted.items()}
-                self.damage.append(Damage(what, counts))
+                lost = {key: count for key, count in counts.items() if count}
+                self._damaged(f"chunk at byte {position:,} is lost: {error}", lost)
                 continue
-            yield from batches
+            found, cut = _walk(data)
+            for key, rows in found.items():
+                if key in wanted:
+                    yield key, _batch(data, rows)
+                elif key not in self.channels:
+                    what = f"{len(rows)} messages of connection {key}, which the bag never names"
+                    self._damaged(f"chunk at byte {position:,}: {what}", {key: len(rows)})
+            if cut is not None:
+                fewer = {key: count - len(found.get(key, ())) for key, count in counts.items()}
+                lost = {key: count for key, count in fewer.items() if count > 0}
+                self._damaged(f"chunk at byte {position:,}: damaged at its byte {cut:,}", lost)
+
+    def _damaged(self, what: str, messages: dict[int, int]) -> None:
+        self.integrity = "damaged"
+        if all(item.what != what for item in self.damage):
+            self.damage.append(Damage(what, messages))
 
     def close(self) -> None:
         """Close the file."""
         self._reader.close()
 
 
-def _batch(data: bytes, channel: int, offsets: list[int]) -> MessageBatch:
-    """The messages of one connection whose records are at these offsets of a chunk."""
-    file = io.BytesIO(data)
-    start, stop, stamps = list[int](), list[int](), list[int]()
-    for offset in sorted(offsets):
-        file.seek(offset)
-        header = Header.read(file)
-        while header.get_uint8("op") == RecordType.CONNECTION:  # some stand before their message
-            file.seek(_uint32(file), io.SEEK_CUR)
-            header = Header.read(file)
-        if header.get_uint8("op") != RecordType.MSGDATA or header.get_uint32("conn") != channel:
-            raise ReaderError("its index is wrong")
-        length, at = _uint32(file), file.tell()
-        if at + length > len(data):
-            raise ReaderError("a message reaches beyond it")
-        start.append(at)
-        stop.append(at + length)
-        stamps.append(header.get_time("time"))
-    times = np.asarray(stamps, np.int64)
-    bounds = np.asarray(start, np.int64), np.asarray(stop, np.int64)
-    return MessageBatch(np.frombuffer(data, np.uint8), *bounds, times, times)
+def _walk(data: bytes) -> tuple[dict[int, list[tuple[int, int, int]]], int | None]:
+    """Start, end and stamp of every message of a chunk, by connection; and where it is damaged."""
+    found: dict[int, list[tuple[int, int, int]]] = {}
+    at, end = 0, len(data)
+    while at < end:
+        start = at + 4 + int.from_bytes(data[at : at + 4], "little")
+        stop = start + 4 + int.from_bytes(data[start : start + 4], "little")
+        if start + 4 > end or stop > end:
+            return found, at
+        fields = _fields(data, at + 4, start)
+        kind = fields.get(b"op", b"")
+        if kind == _MESSAGE and len(fields.get(b"conn", b"")) == 4 == len(fields[b"time"]) // 2:
+            seconds, nanoseconds = struct.unpack("<II", fields[b"time"])
+            channel = int.from_bytes(fields[b"conn"], "little")
+            rows = found.setdefault(channel, [])
+            rows.append((start + 4, stop, seconds * 1_000_000_000 + nanoseconds))
+        elif kind != _CONNECTION:
+            return found, at
+        at = stop
+    return found, None
 
 
-def _uint32(file: io.BytesIO) -> int:
-    return int.from_bytes(file.read(4), "little")
+def _fields(data: bytes, at: int, stop: int) -> dict[bytes, bytes]:
+    """The fields of a record's header."""
+    fields = {b"time": b""}
+    while at < stop:
+        end = at + 4 + int.from_bytes(data[at : at + 4], "little")
+        name, _, value = data[at + 4 : min(end, stop)].partition(b"=")
+        fields[name] = value
+        at = end
+    return fields
+
+
+def _batch(data: bytes, rows: list[tuple[int, int, int]]) -> MessageBatch:
+    """The messages that lie at these places of a chunk."""
+    start, stop, times = np.array(rows, np.int64).T
+    return MessageBatch(np.frombuffer(data, np.uint8), start, stop, times, times)
 
 
 class _Bag(Reader):
