@@ -25,6 +25,7 @@ from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundErr
 from deltalake.fs import DeltaStorageHandler
 
 from restock.errors import StoreError
+from restock.files import first_line
 
 # An endpoint that is down or silent is given up after a minute at most.
 CONNECT_S, REQUEST_S, RETRIES, RETRY_S = 5, 30, 4, 30
@@ -216,11 +217,6 @@ class Location:
             if isinstance(error, FileNotFoundError):
                 raise
             raise StoreError(first_line(error), where=self.text) from error
-
-
-def first_line(error: Exception) -> str:
-    """What an error says first; Delta's library says the rest below it, drawn as a tree."""
-    return next(iter(str(error).splitlines()), type(error).__name__)
 
 
 def _region() -> str | None:

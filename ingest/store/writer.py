@@ -28,8 +28,9 @@ from deltalake.exceptions import CommitFailedError, DeltaError
 from deltalake.transaction import AddAction, RemoveAction
 
 from restock.errors import StoreError
+from restock.files import first_line
 from restock.ingest.profile.custom_signal import refuse_other_signals
-from restock.ingest.store.location import Location, first_line
+from restock.ingest.store.location import Location
 from restock.ingest.task.schema import recording_schema
 
 TRANSITIONS, RECORDINGS = "transitions", "recordings"

@@ -10,17 +10,18 @@ A directory that never changes once it is there:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from restock.arrays import F32, Ints
 from restock.errors import PanelError
+from restock.files import read_table
 from restock.ingest.task.task import Task
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.packed_row import PACKING_VERSION, row_columns, row_width
@@ -137,7 +138,14 @@ class Panel:
         """The task that made these rows. Raises PanelError where the source did not say."""
         if not self.header.task_json:
             raise PanelError("it does not carry its task", where=str(self.path))
-        return msgspec.json.decode(self.header.task_json, type=Task)
+        try:
+            return msgspec.json.decode(self.header.task_json, type=Task)
+        except msgspec.MsgspecError as error:
+            raise PanelError(
+                f"its task cannot be read: {error}",
+                where=str(self.path / HEADER),
+                remedy=f"a newer Restock wrote it; or {AGAIN}",
+            ) from error
 
     @property
     def observation_size(self) -> int:
@@ -164,14 +172,18 @@ class Panel:
         return_to_go and return_to_go_whole (it ran to a termination); and what adaptive shares
         need (state_code, probability_of_…)."""
         if self._meta is None:
-            self._meta = pq.read_table(self.path / META).unify_dictionaries()
+            self._meta = self._read(META).unify_dictionaries()
         return self._meta
 
     def meta_column(self, name: str) -> NDArray[Any]:
         """One column of `meta` (n,), without reading the others."""
         if self._meta is not None:
             return np.asarray(self._meta[name].to_numpy())
-        return np.asarray(pq.read_table(self.path / META, columns=[name])[name].to_numpy())
+        return np.asarray(self._read(META, [name])[name].to_numpy())
+
+    def _read(self, name: str, columns: Sequence[str] | None = None) -> pa.Table:
+        """Raises PanelError where the file is damaged."""
+        return read_table(self.path / name, columns=columns, error=PanelError, remedy=AGAIN)
 
     @property
     def stratum_code(self) -> NDArray[np.int16]:

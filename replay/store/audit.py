@@ -27,7 +27,8 @@ from xml.etree import ElementTree
 
 import duckdb
 
-from restock.errors import ConfigError
+from restock.errors import ConfigError, StoreError
+from restock.files import first_line
 from restock.replay.store.query import interruptible, values
 from restock.toml import read_toml
 
@@ -206,6 +207,11 @@ def _run(
     try:
         columns, rows = interruptible(connection, run)
     except duckdb.Error as error:
+        if type(error) is duckdb.Error or isinstance(error, duckdb.OperationalError):
+            raise StoreError(
+                f"is damaged or cannot be read: {first_line(error)}",
+                remedy="restore its files from a copy, or ingest the recordings again",
+            ) from error
         raise ConfigError(f"its SQL does not run: {error}", where=where) from error
     sample = [dict(zip(columns, row, strict=True)) for row in rows[:SAMPLE_ROWS]]
     status: Status = _OFFENDED[audit.severity] if rows else "pass"

@@ -61,6 +61,7 @@ def export_views(store: Store, out: str | Path) -> Path:
         raise StoreError("it holds no recordings to look at", where=str(store.path))
     partial = out.with_name(f".{out.name}.partial")
     partial.unlink(missing_ok=True)
+    out.parent.mkdir(parents=True, exist_ok=True)
     try:
         if out.suffix == ".sql":
             partial.write_text(init_script(store), encoding="utf-8")

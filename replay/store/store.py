@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
 from urllib.parse import unquote
 
 import duckdb
@@ -21,11 +22,14 @@ import pyarrow.dataset
 from deltalake import DeltaTable
 
 from restock.errors import StoreError
+from restock.files import first_line
 from restock.ingest.store.location import Location
 from restock.ingest.store.writer import OWN_PATH, RECORDINGS, TRANSITIONS
 from restock.ingest.task.conditions import Condition
 from restock.ingest.task.task import Task
 from restock.replay.store.query import install, query
+
+T = TypeVar("T")
 
 
 class Store:
@@ -101,7 +105,7 @@ class Store:
         ).fetchall()
         if not rows:
             return ()
-        return tuple(msgspec.json.decode(rows[0][0], type=list[Condition], strict=False))
+        return tuple(self._decode(rows[0][0], list[Condition], "conditions"))
 
     def task_json(self, task_hash: str | None = None) -> str:
         """The task of the store's rows as JSON.
@@ -123,7 +127,22 @@ class Store:
 
     def task(self, task_hash: str | None = None) -> Task:
         """The task of the store's rows. Raises StoreError as `task_json` does."""
-        return msgspec.json.decode(self.task_json(task_hash), type=Task)
+        return self._decode(self.task_json(task_hash), Task, "task")
+
+    def _decode(self, text: str, kind: type[T], name: str) -> T:
+        """What a manifest keeps as JSON.
+
+        Raises StoreError where another Restock wrote it, or it is damaged.
+        """
+        try:
+            return msgspec.json.decode(text, type=kind, strict=False)
+        except msgspec.MsgspecError as error:
+            raise StoreError(
+                f"the {name} in its recordings' manifests cannot be read: {error}",
+                where=str(self.path),
+                remedy="a newer Restock wrote it (use that one), or the file is damaged (ingest the"
+                " recordings again)",
+            ) from error
 
     def _read_tasks(self) -> dict[str, str]:
         rows = self.connection.sql(
@@ -134,9 +153,7 @@ class Store:
 
     def _observation_type(self) -> str:
         """Fixed-size where all tasks agree on the size: DuckDB reads Delta's lists as FLOAT[]."""
-        sizes = {
-            msgspec.json.decode(text, type=Task).observation_size for text in self._tasks.values()
-        }
+        sizes = {self._decode(text, Task, "task").observation_size for text in self._tasks.values()}
         return f"FLOAT[{sizes.pop()}]" if len(sizes) == 1 else "FLOAT[]"
 
     def _present(
@@ -228,8 +245,20 @@ def read_parquet(
     *,
     schema: str = "main",
 ) -> None:
-    """A view over Parquet files; columns that only some have are null in the others."""
-    connection.execute(parquet_view(view, files, schema=schema))
+    """A view over Parquet files; columns that only some have are null in the others.
+
+    Raises:
+        StoreError: one of them is missing or damaged.
+    """
+    try:
+        connection.execute(parquet_view(view, files, schema=schema))
+    except duckdb.Error as error:
+        where = str(files[0]) if len(files) == 1 else os.path.commonpath([str(f) for f in files])
+        raise StoreError(
+            f"cannot be read: {first_line(error)}",
+            where=where,
+            remedy="restore the file from a copy, or make it again with the verb that wrote it",
+        ) from error
 
 
 def parquet_view(

@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 
 from restock.errors import ConfigError, StoreError
+from restock.files import first_line
 from restock.ingest.profile.profile import Profile, load_profile
 from restock.ingest.steps.messages_at_tick import MessageAtTick, messages_at_tick
 from restock.ingest.task.schema import STEP_BITS
@@ -145,9 +146,22 @@ def _read(source: StoreVersion, transition: int) -> Origin | None:
 def rows_of(
     connection: duckdb.DuckDBPyConnection, sql: str, parameters: Mapping[str, Any]
 ) -> list[dict[str, Any]]:
-    """The rows that a query gives, by column."""
-    relation = connection.sql(sql, params=dict(parameters))
-    return [dict(zip(relation.columns, row, strict=True)) for row in relation.fetchall()]
+    """The rows that a query gives, by column.
+
+    Raises:
+        StoreError: the file that it asks (its parameter `file`) cannot be read.
+    """
+    try:
+        relation = connection.sql(sql, params=dict(parameters))
+        return [dict(zip(relation.columns, row, strict=True)) for row in relation.fetchall()]
+    except duckdb.Error as error:
+        if (file := parameters.get("file")) is None:
+            raise
+        raise StoreError(
+            f"is damaged or cannot be read: {first_line(error)}",
+            where=str(file),
+            remedy="restore the file from a copy, or train the run again",
+        ) from error
 
 
 def _changes(row: Mapping[str, Any], now: Origin | None) -> list[str]:

@@ -6,7 +6,6 @@ A run, a panel and a store each name the next one down, so a trace can begin at 
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +15,7 @@ import duckdb
 import numpy as np
 
 from restock.errors import PanelError, RunError, StoreError
+from restock.files import read_json
 from restock.replay.panel.panel import HEADER, Panel
 from restock.replay.places import RUN_CONFIG
 from restock.replay.store.store import is_store
@@ -88,7 +88,7 @@ def audited_rows(run: str | Path, limit: int = 20) -> list[dict[str, Any]]:
 
 
 def _of_run(trace: Trace, run: Path, row: str, where: TracePlaces) -> None:
-    document = json.loads((run / RUN_CONFIG).read_text(encoding="utf-8"))
+    document = read_json(run / RUN_CONFIG, error=RunError)
     trace.audit = audit = _audit_row(run, row)
     if audit["source"] == "fresh":
         _of_twin(trace, run, document, audit)

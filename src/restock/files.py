@@ -1,19 +1,85 @@
-"""Files that are replaced in one step: a reader sees the old one or the new one, never a part."""
+"""Files that are replaced in one step, and read with an error that names them.
+
+A reader sees the old file or the new one, never a part. What cannot be read (missing, cut, of other
+bytes) is a `RestockError` of the caller's kind that says which file it is and what to do.
+"""
 
 from __future__ import annotations
 
+import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from restock.errors import RestockError
+
+
+def read_table(
+    path: Path,
+    schema: pa.Schema | None = None,
+    *,
+    columns: Sequence[str] | None = None,
+    error: type[RestockError] = RestockError,
+    remedy: str | None = None,
+) -> pa.Table:
+    """The rows of a Parquet file; checksums of its pages are verified where it has them.
+
+    Raises:
+        RestockError: (of the kind `error`) there is no such file, or it is damaged.
+    """
+    try:
+        return pq.read_table(
+            path,
+            schema=schema,
+            columns=None if columns is None else list(columns),
+            partitioning=None,
+            page_checksum_verification=True,
+        )
+    except (pa.ArrowException, OSError) as problem:
+        raise _unreadable(path, problem, error, remedy) from problem
+
+
+def read_json(
+    path: Path, *, error: type[RestockError] = RestockError, remedy: str | None = None
+) -> dict[str, Any]:
+    """The JSON object in a file.
+
+    Raises:
+        RestockError: (of the kind `error`) there is no such file, or it holds no JSON object.
+    """
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as problem:
+        raise _unreadable(path, problem, error, remedy) from problem
+    if not isinstance(document, dict):
+        said = f"is damaged: it holds a {type(document).__name__}, no JSON object"
+        raise error(said, where=str(path), remedy=remedy)
+    return document
+
+
+def _unreadable(
+    path: Path, problem: Exception, error: type[RestockError], remedy: str | None
+) -> RestockError:
+    if not path.exists():
+        return error("does not exist", where=str(path), remedy=remedy)
+    said = getattr(problem, "strerror", None) or first_line(problem)
+    return error(f"is damaged or cannot be read: {said}", where=str(path), remedy=remedy)
+
+
+def first_line(error: BaseException) -> str:
+    """What an error says first; libraries say the rest below it."""
+    return next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
+
 
 def write_table(table: pa.Table, path: Path) -> None:
-    """Replace a Parquet file in one step."""
+    """Replace a Parquet file in one step, with a checksum a page."""
     temporary = _temporary(path)
     try:
-        pq.write_table(table, temporary, compression="zstd")
+        pq.write_table(table, temporary, compression="zstd", write_page_checksum=True)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -46,4 +112,4 @@ def _temporary(path: Path) -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}.tmp")
 
 
-__all__ = ["write_bytes", "write_table", "write_text"]
+__all__ = ["first_line", "read_json", "read_table", "write_bytes", "write_table", "write_text"]

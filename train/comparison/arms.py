@@ -123,6 +123,13 @@ class Arm:
     @cached_property
     def totals(self) -> dict[str, float]:
         """What a run of this arm did, in the mean: environment steps and updates."""
+        for run in self.runs:
+            if not run.table("progress").num_rows:
+                raise RunError(
+                    "is missing or has no rows, which say how far the run came",
+                    where=str(run.path / "progress.parquet"),
+                    remedy="restore the file from a copy, or train the run again",
+                )
         last = [
             run.table("progress").slice(run.table("progress").num_rows - 1) for run in self.runs
         ]
@@ -141,8 +148,8 @@ class Arm:
         parts = []
         with duckdb.connect() as connection:
             for number, run in enumerate(self.runs):
-                path = str(run.path / "sampled_episodes.parquet")
-                table: pa.Table = connection.sql(query, params={"fed": path}).to_arrow_table()
+                connection.register("fed", run.table("sampled_episodes"))
+                table: pa.Table = connection.sql(query).to_arrow_table()
                 runs = pa.array([number] * table.num_rows, pa.int64())
                 parts.append(table.append_column("run", runs))
         return pa.concat_tables(parts)

@@ -1,7 +1,7 @@
 -- What one run's critic was fed, by episode, cell (source/stratum) and tenth of its training.
--- $fed is the run's sampled_episodes.parquet.
-WITH fed AS (
-    SELECT *, max(gradient_steps) OVER () AS whole FROM read_parquet($fed)
+-- `fed` is the run's sampled_episodes.
+WITH drawn AS (
+    SELECT *, max(gradient_steps) OVER () AS whole FROM fed
 )
 SELECT source || '/' || stratum AS cell,
        least((gradient_steps * 10 - 1) // whole, 9)::BIGINT AS tenth,
@@ -9,6 +9,6 @@ SELECT source || '/' || stratum AS cell,
        episode,
        sum(drawn_rows)::DOUBLE AS drawn,
        sum(weight)::DOUBLE AS weight
-FROM fed
+FROM drawn
 GROUP BY ALL
 ORDER BY ALL

@@ -15,11 +15,11 @@ from typing import Any, Literal
 import duckdb
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Bools, Ints
-from restock.errors import RunError, StoreError
+from restock.errors import PanelError, RunError, StoreError
+from restock.files import read_table
 from restock.ingest.store.location import Location
 from restock.ingest.task.task import Task
 from restock.replay.panel.panel import EVALUATION_SPLIT, HEADER, Panel
@@ -144,7 +144,7 @@ def _open(logs: str | None, trained: Panel | None, task: Task) -> tuple[Store, I
     if panel is not None:
         split = panel.path / EVALUATION_SPLIT
         panel.header.files[EVALUATION_SPLIT].check(split, verify=True)
-        ids = pq.read_table(split, columns=["transition_id"])["transition_id"]
+        ids = read_table(split, columns=["transition_id"], error=PanelError)["transition_id"]
         store, tasks = _store_of(panel), {panel.task_hash}
     else:
         store = Store(location)

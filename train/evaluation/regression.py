@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from restock.errors import RunError
-from restock.files import write_table
+from restock.files import read_table, write_table
 from restock.stats import iqm, mean_over_strata, paired_improvement
 from restock.train.evaluation.evaluate import cell_name
 from restock.train.run.run import Run
@@ -69,13 +69,12 @@ def of_baseline(name: str) -> Evaluated:
             where=name,
             remedy="`restock eval RUN --save-as-baseline NAME` keeps one",
         )
+    remedy = "save it again with --save-as-baseline"
     try:
-        table = pq.read_table(file, schema=EVAL_EPISODES)
         about = json.loads((pq.read_schema(file).metadata or {})[_KEY])
-    except (pa.ArrowException, KeyError, ValueError) as error:
-        raise RunError(
-            "is not a baseline", where=str(file), remedy="save it again with --save-as-baseline"
-        ) from error
+        table = read_table(file, EVAL_EPISODES, error=RunError, remedy=remedy)
+    except (pa.ArrowException, OSError, KeyError, ValueError) as error:
+        raise RunError("is not a baseline", where=str(file), remedy=remedy) from error
     return Evaluated(f"{name} ({about['run']})", about["task_hash"], _cells(table))
 
 
@@ -210,7 +209,9 @@ def agent_episodes(run: Run) -> pa.Table | None:
     path = run.path / "eval" / "episodes.parquet"
     if not path.is_file():
         return None
-    table = pq.read_table(path, schema=EVAL_EPISODES)
+    table = read_table(
+        path, EVAL_EPISODES, error=RunError, remedy=f"run `restock eval {run.path}` again"
+    )
     agent = table.filter(pa.compute.equal(table["policy"], "agent"))
     return agent if len(agent) else None
 

@@ -82,9 +82,9 @@ def load(path: Path) -> dict[str, Any]:
                 where=str(path),
                 remedy=_RESTORE,
             )
-    except (SafetensorError, OSError) as error:
+        restored = _put_together(json.loads(document), tensors)
+    except (SafetensorError, OSError, ValueError, LookupError) as error:
         raise RunError(f"is damaged: {error}", where=str(path), remedy=_RESTORE) from error
-    restored = _put_together(json.loads(document), tensors)
     if not isinstance(restored, dict):
         raise RunError("holds no state", where=str(path))
     return restored

@@ -18,10 +18,9 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from restock.errors import RunError
-from restock.files import write_table, write_text
+from restock.files import read_json, read_table, write_table, write_text
 from restock.train.run.run_tables import TABLES
 
 if TYPE_CHECKING:
@@ -30,14 +29,27 @@ if TYPE_CHECKING:
 FORMAT = "restock-run/2"
 _EARLIER = ("restock-run/1",)
 _LONG_TABLE = 4096  # rows
+_AGAIN = "restore the file from a copy, or train the run again"
 Rows = Sequence[Mapping[str, Any]]
+
+
+class _Document(dict[str, Any]):
+    """What `config.json` says; a key that it lacks is an error that names the file."""
+
+    def __init__(self, values: Mapping[str, Any], path: Path) -> None:
+        super().__init__(values)
+        self._path = path
+
+    def __missing__(self, key: str) -> Any:
+        raise RunError(f"says nothing of {key!r}", where=str(self._path), remedy=_AGAIN)
 
 
 class Run:
     """A run directory. `create` makes a new one, `open` takes an existing one."""
 
     def __init__(self, path: Path, document: dict[str, Any]) -> None:
-        self.path, self.document = path, document
+        self.path = path
+        self.document: dict[str, Any] = _Document(document, path / "config.json")
         self._written: dict[str, pa.Table] = {}
         self._pending: dict[str, list[pa.Table]] = {name: [] for name in TABLES}
         self._on_disk: dict[str, int] = {}  # rows per table
@@ -63,20 +75,18 @@ class Run:
         """An existing run.
 
         Raises:
-            RunError: there is none at `path`, or of a format this version does not know.
+            RunError: there is none at `path`, or of a format this version does not know. What is
+            wrong with one of its tables is said when that is asked for.
         """
         config = path / "config.json"
-        try:
-            document = json.loads(config.read_text(encoding="utf-8"))
-        except FileNotFoundError as error:
+        if not config.exists():
             raise RunError(
                 "is not a run directory: it has no config.json",
                 where=str(path),
                 remedy="give the directory that `restock train --out` wrote",
-            ) from error
-        except (OSError, ValueError) as error:
-            raise RunError(f"cannot be read: {error}", where=str(config)) from error
-        form = document.get("format") if isinstance(document, dict) else None
+            )
+        document = read_json(config, error=RunError, remedy=_AGAIN)
+        form = document.get("format")
         if form in _EARLIER:
             raise RunError(
                 f"was written by an earlier Restock ({form}, this one reads {FORMAT})",
@@ -85,14 +95,7 @@ class Run:
             )
         if form != FORMAT:
             raise RunError(f"has format {form!r}, this Restock reads {FORMAT!r}", where=str(config))
-        run = cls(path, document)
-        for name, schema in TABLES.items():
-            file = path / f"{name}.parquet"
-            run._written[name] = (
-                pq.read_table(file, schema=schema) if file.exists() else schema.empty_table()
-            )
-            run._on_disk[name] = run._written[name].num_rows
-        return run
+        return cls(path, document)
 
     @property
     def latest(self) -> Path:
@@ -122,10 +125,27 @@ class Run:
         self._pending[table].append(_to_table(columns, TABLES[table]))
 
     def table(self, name: str) -> pa.Table:
-        """A table with all rows appended so far, flushed or not."""
+        """A table with all rows appended so far, flushed or not.
+
+        Raises:
+            RunError: its file is damaged.
+        """
+        written = self._flushed(name)
         if self._pending[name]:
-            self._written[name] = pa.concat_tables([self._written[name], *self._pending[name]])
+            self._written[name] = written = pa.concat_tables([written, *self._pending[name]])
             self._pending[name] = []
+        return written
+
+    def _flushed(self, name: str) -> pa.Table:
+        """A table without what was appended since; of an opened run read when it is asked for."""
+        if name not in self._written:
+            file, schema = self.path / f"{name}.parquet", TABLES[name]
+            self._written[name] = (
+                read_table(file, schema, error=RunError, remedy=_AGAIN)
+                if file.exists()
+                else schema.empty_table()
+            )
+            self._on_disk[name] = self._written[name].num_rows
         return self._written[name]
 
     def flush(self, *, everything: bool = True) -> None:
@@ -136,7 +156,7 @@ class Run:
         """
         for name in TABLES:
             path = self.path / f"{name}.parquet"
-            rows = self._written[name].num_rows + sum(part.num_rows for part in self._pending[name])
+            rows = self._flushed(name).num_rows + sum(part.num_rows for part in self._pending[name])
             on_disk = self._on_disk.get(name, 0)
             new = rows - on_disk
             due = new and (everything or on_disk < _LONG_TABLE or new >= on_disk / 16)

@@ -55,8 +55,8 @@ with quotas for rare conditions, and fine-tunes a DQN in a MuJoCo twin.
 {verbs}
 
 `restock VERB --help` explains one. Exit codes: 0 done, 1 an audit failed or a comparison was
-refused, 2 wrong usage or bad input (nothing written), 3 written but data was lost or skipped,
-130 interrupted."""
+refused, 2 any other failure: wrong usage, bad input, a file that cannot be read or written,
+3 written but data was lost or skipped, 130 interrupted. RESTOCK_TRACEBACK=1 prints tracebacks."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -64,9 +64,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = list(sys.argv[1:] if argv is None else argv)
     try:
         return _dispatch(args)
-    except RestockError as error:
-        _complain(str(error))
-        return int(error.exit_code)
     except KeyboardInterrupt:
         _complain("interrupted; nothing is left half-written")
         return int(ExitCode.INTERRUPTED)
@@ -74,6 +71,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         # The reader of our stdout went away (`| head`): no complaint, and none at exit either.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return int(ExitCode.OK)
+    except Exception as error:  # noqa: BLE001  (the one place that maps what nobody foresaw)
+        from restock.cli.failures import as_restock_error
+
+        known = as_restock_error(error, args)
+        _complain(str(known))
+        return int(known.exit_code)
 
 
 def _dispatch(args: list[str]) -> int:

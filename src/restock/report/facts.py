@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import duckdb
-import pyarrow.parquet as pq
 
 from restock.errors import RestockError, RunError
+from restock.files import read_table
 from restock.replay.panel.panel import Panel
 from restock.replay.panel.strata import Stratum
-from restock.replay.store.store import Store, read_parquet
+from restock.replay.store.store import Store
 from restock.report.blocks import Rows, words
 from restock.stats import wilson
 from restock.train.run.run import Run
@@ -23,6 +23,9 @@ from restock.train.twin.floors.layout import DEFAULT, Warehouse
 
 CELL_M = 0.25
 MOST_DOTS = 1500
+_TABLES = (  # of a run, that run.sql asks
+    *("strata", "conditions", "ages", "policies", "evaluations", "probe", "progress"),
+)
 
 
 @dataclass
@@ -78,14 +81,14 @@ def gather(path: Path) -> Facts:
     """
     run = Run.open(path)
     with duckdb.connect() as connection:
-        for file in sorted(path.glob("*.parquet")):
-            read_parquet(connection, file.stem, [file])
-        if not (path / "conditions.parquet").exists():  # a run from before it was kept
-            connection.register("conditions", run.table("conditions"))
+        for name in _TABLES:
+            connection.register(name, run.table(name))
         file = path / "eval" / "episodes.parquet"
         evaluated = EVAL_EPISODES.empty_table()
         if file.exists():
-            evaluated = pq.read_table(file, schema=EVAL_EPISODES)
+            evaluated = read_table(
+                file, EVAL_EPISODES, error=RunError, remedy=f"run `restock eval {path}` again"
+            )
         connection.register("evaluated", evaluated)
         rows = {
             name: _as_dicts(connection.execute(sql)) for name, sql in _queries("run.sql").items()

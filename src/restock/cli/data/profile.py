@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from restock.errors import ConfigError, ExitCode, RecordingError
+from restock.files import write_text
 
 
 @dataclass
@@ -61,7 +62,7 @@ class ProfileCommand:
         with open_recording(self.paths[0], typestore=self.typestore) as recording:
             proposal = propose_profile(recording, re.sub(r"\W+", "_", stem).strip("_") or "robot")
         if self.out is not None:
-            self.out.write_text(proposal.toml, encoding="utf-8")
+            write_text(self.out, proposal.toml)
         if self.json:
             output.print_json(
                 {"toml": proposal.toml, "missing": proposal.missing, "signals": proposal.signals}

@@ -1,0 +1,76 @@
+"""What goes wrong that no part of Restock foresaw, as a message and exit 2, without a traceback.
+
+Files are damaged, disks are full and folders are missing in more ways than any reader names. One
+place turns what libraries raise into what, where and what to do. `RESTOCK_TRACEBACK=1` prints the
+traceback as well, for those who develop Restock.
+"""
+
+from __future__ import annotations
+
+import os
+import traceback
+from collections.abc import Sequence
+
+from restock.errors import RestockError, StoreError
+from restock.files import first_line
+
+TRACEBACK = "RESTOCK_TRACEBACK"
+_CHECK = "a file that it reads is damaged, or is not what the command line says it is"
+# package of an exception -> what to do
+_REMEDIES = {
+    "duckdb": _CHECK,
+    "_duckdb": _CHECK,
+    "pyarrow": _CHECK,
+    "json": _CHECK,
+    "msgspec": f"{_CHECK}; or a newer Restock wrote it",
+    "deltalake": "the store's log or files are damaged: restore them, or ingest again",
+    "safetensors_rust": "the checkpoint is damaged: restore it, or train the run again",
+}
+
+
+def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
+    """Any exception as one of ours; prints its traceback where the environment asks for it."""
+    if os.environ.get(TRACEBACK):
+        traceback.print_exception(error)
+    where = f"restock {' '.join(args)}"
+    if isinstance(error, StoreError) and error.where is None:  # raised where only rows were known
+        return StoreError(error.what, where=where, remedy=error.remedy)
+    if isinstance(error, RestockError):
+        return error
+    kind = type(error)
+    if isinstance(error, MemoryError):
+        return RestockError(
+            "there is not enough memory", where=where, remedy="free some, or ask for less at once"
+        )
+    if isinstance(error, OSError) and error.strerror:
+        files = [str(name) for name in (error.filename, error.filename2) if name is not None]
+        return RestockError(
+            f"cannot be read or written: {error.strerror}",
+            where=" -> ".join(files) or where,
+            remedy="is the path right, does this user have the permission, and is there room?",
+        )
+    package = kind.__module__.split(".")[0]
+    remedy = _REMEDIES.get(package)
+    if remedy is None and isinstance(error, OSError | UnicodeDecodeError):
+        remedy = _CHECK
+    if remedy is None:  # our own mistake, or that of a library
+        return RestockError(
+            f"an unexpected {kind.__name__}: {first_line(error)}",
+            where=where,
+            remedy=f"{_at(error)}{TRACEBACK}=1 shows the traceback; if the files are whole, this is"
+            " a bug: please report it",
+        )
+    return RestockError(first_line(error), where=where, remedy=remedy)
+
+
+def _at(error: Exception) -> str:
+    """The innermost line of Restock that it came through."""
+    lines = [
+        f"in {frame.f_globals.get('__name__')}:{number}; "
+        for frame, number in traceback.walk_tb(error.__traceback__)
+        if str(frame.f_globals.get("__name__", "")).startswith("restock.")
+    ]
+    return lines[-1] if lines else ""
+
+
+__all__ = ["TRACEBACK", "as_restock_error"]

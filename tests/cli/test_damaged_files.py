@@ -1,0 +1,273 @@
+"""What is missing, cut or of other bytes is said by every verb: its path, a remedy, exit 2.
+
+No traceback and no exit 1: that one means that an audit failed or a comparison was refused.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from support.panels import panel_of
+from support.stores import recording_transitions, write_store
+
+from restock import cli
+from restock.errors import RunError
+from restock.files import read_json, read_table, write_table
+from restock.ingest.profile.profile import load_profile
+from restock.train.run.run_tables import EVAL_EPISODES
+
+TINY = [
+    *("--env-steps", "40", "--set", "env.num_envs=4", "--set", "schedule.warmup_env_steps=40"),
+    *("--set", "schedule.offline_updates=20", "--set", "network.hidden=[8]"),
+    *("--set", "evaluation.episodes=1", "--set", "record.every_updates=10"),
+    *("--set", "record.tensorboard=false", "--set", "replay.batch_size=16"),
+    *("--set", "record.audit_share=0.5", "--set", "replay.ring_capacity=100"),
+    *("--set", "env.conditions={nominal=1.0}"),
+]
+DAMAGES = ("missing", "empty", "cut", "garbage")
+FILES = (
+    "config.json",
+    *("progress.parquet", "strata.parquet", "audit.parquet", "evaluations.parquet"),
+    *("sampled_episodes.parquet", "evaluation_buffer.parquet", "guard.parquet"),
+    *("eval/episodes.parquet", "checkpoints/best.safetensors", "checkpoints/latest.safetensors"),
+)
+
+
+def damage(path: Path, how: str) -> None:
+    content = path.read_bytes()
+    path.chmod(0o644)
+    left = {"empty": b"", "cut": content[: len(content) // 2], "garbage": bytes(range(256)) * 4}
+    if how == "missing":
+        path.unlink()
+    else:
+        path.write_bytes(left[how])
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store, a panel of it and a run on that, each as small as it can be."""
+    root = tmp_path_factory.mktemp("whole")
+    task = load_profile("warehouse_amr").task
+    rows = [recording_transitions(number, episodes=6, task=task) for number in (1, 2)]
+    store = write_store(root / "store", rows, task=task)
+    panel_of(store, "[each_condition]\nshare = 'natural'\n", root / "panel")
+    argv = ["train", "--panel", str(root / "panel"), "--out", str(root / "run")]
+    assert cli.main([*argv, *TINY]) == 0
+    evaluated = {
+        "policy": "agent",
+        "perturbation": "none",
+        "condition": "nominal",
+        "block": "none",
+        "episode_seed": 10_000,
+        "success": True,
+        "return": 1.0,
+        **{"bumps": 0, "time_s": 9.0, "layout": "default", "end_x_m": 1.0, "end_y_m": 2.0},
+    }
+    table = pa.Table.from_pylist([evaluated], schema=EVAL_EPISODES)
+    write_table(table, root / "run" / "eval" / "episodes.parquet")
+    return root
+
+
+def run_verbs(run: Path, root: Path, out: Path) -> dict[str, list[str]]:
+    """A command line a verb that reads a run."""
+    path = str(run)
+    return {
+        "eval": ["eval", path, "--dry-run", "--policies", "agent"],
+        "baseline": ["eval", path, "--no-drive", "--save-as-baseline", str(out / "b.parquet")],
+        "report": ["report", path, "--out", str(out / "r.html")],
+        "card": ["report", path, "--card"],
+        "compare": ["compare", path, str(root / "run")],
+        "diagnose": ["diagnose", path],
+        "trace": ["trace", path],
+        "sql": ["sql", path, "FROM audit LIMIT 1"],
+        "train": ["train", "--resume", path, "--env-steps", "40"],
+        "export": ["export", path, "--to", "onnx", "--out", str(out / "policy.onnx")],
+    }
+
+
+def check(argv: list[str], named: Path, capsys: pytest.CaptureFixture[str]) -> int:
+    """Run a command: 0, or 2 with a message that names the place; 1 for a refused comparison."""
+    code = cli.main(argv)
+    said = capsys.readouterr().err
+    assert "Traceback" not in said, argv
+    assert "an unexpected" not in said, (argv, said)
+    if code:
+        assert code == 2 or (code == 1 and argv[0] == "compare"), (argv, code, said)
+    if code == 2:
+        assert str(named) in said, (argv, said)
+    return code
+
+
+@pytest.mark.parametrize("turn", range(len(DAMAGES)))
+@pytest.mark.parametrize("name", FILES)
+def test_a_damaged_run_is_said_by_every_verb(
+    name: str, turn: int, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = run_verbs(root / "run", root, tmp_path)
+    for number, verb in enumerate(whole):
+        if number % len(DAMAGES) != turn:  # every verb meets every file, each damage in turn
+            continue
+        run = tmp_path / verb
+        shutil.copytree(root / "run", run)
+        damage(run / name, DAMAGES[(number + FILES.index(name)) % len(DAMAGES)])
+        check(run_verbs(run, root, tmp_path)[verb], run, capsys)
+
+
+@pytest.mark.parametrize("how", DAMAGES)
+def test_what_a_verb_needs_is_named_by_its_file(
+    how: str, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    needed = {
+        "report": "strata.parquet",
+        "train": "checkpoints/latest.safetensors",
+        "eval": "checkpoints/best.safetensors",
+        "trace": "audit.parquet",
+        "compare": "sampled_episodes.parquet",
+    }
+    for verb, name in needed.items():
+        run = tmp_path / verb
+        shutil.copytree(root / "run", run)
+        damage(run / name, how)
+        # A table that an earlier Restock did not write is empty, so a page can be made without it.
+        place = run / name if how != "missing" else run
+        code = check(run_verbs(run, root, tmp_path)[verb], place, capsys)
+        assert code == 2 or (verb, how) == ("report", "missing")
+
+
+def test_a_file_that_is_not_needed_stops_no_verb(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(root / "run", run)
+    for name in ("ages.parquet", "audit.parquet", "guard.parquet"):
+        damage(run / name, "cut")
+    for verb in ("eval", "baseline", "compare"):
+        assert check(run_verbs(run, root, tmp_path)[verb], run, capsys) < 2
+
+
+def test_config_json_that_lacks_a_key_is_said(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(root / "run", run)
+    document = json.loads((run / "config.json").read_text())
+    for rest in ({"format": document["format"]}, ["a list"]):
+        (run / "config.json").write_text(json.dumps(rest))
+        for verb in ("eval", "diagnose", "train", "export"):
+            argv = run_verbs(run, root, tmp_path)[verb]
+            assert check(argv, run / "config.json", capsys) == 2
+
+
+def store_verbs(store: Path, out: Path) -> list[list[str]]:
+    path = str(store)
+    return [
+        ["sql", path, "SELECT sum(reward), count(conditions) FROM transitions, coverage"],
+        ["audit", path],
+        ["audit", path, "--capacity"],
+        ["mix", path, "--mixture", "coverage", "--out", str(out / "panel")],
+        ["export", path, "--to", "npz", "--out", str(out / "x.npz")],
+        ["trace", path, str(1 << 32)],
+    ]
+
+
+@pytest.mark.parametrize("table", ["recordings", "transitions"])
+@pytest.mark.parametrize("how", [*DAMAGES, "a page"])
+def test_a_store_with_a_damaged_file_is_said(
+    table: str, how: str, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = tmp_path / "store"
+    shutil.copytree(root / "store", store)
+    file = sorted((store / table).glob("*.parquet"))[0]
+    if how == "a page":  # the footer is whole: seen only once it is read
+        content = file.read_bytes()
+        file.write_bytes(content[:8] + bytes(byte ^ 0x55 for byte in content[8:40]) + content[40:])
+    else:
+        damage(file, how)
+    codes = [check(argv, store, capsys) for argv in store_verbs(store, tmp_path)[:5]]
+    assert 2 in codes
+    if how != "a page":
+        assert set(codes) == {2}
+
+
+@pytest.mark.parametrize("task", ["a key", "{", ""])
+def test_a_task_of_another_restock_is_said(
+    task: str, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = tmp_path / "store"
+    shutil.copytree(root / "store", store)
+    for file in (store / "recordings").glob("*.parquet"):
+        table = pq.read_table(file, partitioning=None)
+        rows = table.to_pylist()
+        for row in rows:
+            newer = json.dumps({**json.loads(row["task_json"]), "hover_m": 3})
+            row["task_json"] = newer if task == "a key" else task
+        pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), file)
+    for argv in store_verbs(store, tmp_path):
+        assert cli.main(argv) == 2, argv
+        said = capsys.readouterr().err
+        assert f"{store}: the task in its recordings' manifests cannot be read" in said
+        assert "newer Restock" in said
+
+
+def writers(root: Path, out: Path) -> list[list[str]]:
+    store, run = str(root / "store"), str(root / "run")
+    return [
+        ["sql", store, "--export", str(out / "views.sql")],
+        ["sql", store, "--export", str(out / "views.duckdb")],
+        ["export", store, "--to", "npz", "--out", str(out / "x.npz")],
+        ["export", run, "--to", "onnx", "--out", str(out / "x.onnx")],
+        ["mix", store, "--mixture", "coverage", "--out", str(out / "panel")],
+        ["report", run, "--out", str(out / "r.html")],
+        ["eval", run, "--no-drive", "--save-as-baseline", str(out / "b.parquet")],
+    ]
+
+
+def test_a_folder_that_is_not_there_is_made(root: Path, tmp_path: Path) -> None:
+    for number, argv in enumerate(writers(root, tmp_path / "a" / "new")):
+        assert cli.main(argv) == 0, (number, argv)
+
+
+def test_a_target_that_cannot_be_written_is_said(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("a file, where a folder is asked for")
+    for argv in [*writers(root, tmp_path / "file"), ["train", "--out", str(tmp_path / "file/run")]]:
+        assert check(argv, tmp_path / "file", capsys) == 2
+    assert (tmp_path / "file").read_text().startswith("a file")
+
+
+def test_what_nobody_foresaw_exits_2_and_developers_see_where(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(args: list[str]) -> int:
+        return {}["a key"]  # type: ignore[no-any-return]
+
+    monkeypatch.setattr(cli, "_dispatch", broken)
+    assert cli.main(["info", "a.mcap"]) == 2
+    said = capsys.readouterr().err
+    assert "restock info a.mcap: an unexpected KeyError: 'a key'" in said
+    assert "RESTOCK_TRACEBACK=1" in said
+    assert "Traceback" not in said
+    monkeypatch.setenv("RESTOCK_TRACEBACK", "1")
+    assert cli.main(["info", "a.mcap"]) == 2
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_the_guarded_readers_name_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "x.parquet"
+    with pytest.raises(RunError, match=r"x\.parquet: does not exist"):
+        read_table(file, error=RunError)
+    write_table(pa.table({"a": list(range(1000))}), file)
+    content = bytearray(file.read_bytes())
+    content[60] ^= 1  # within a page: its checksum says so
+    file.write_bytes(content)
+    with pytest.raises(RunError, match=r"x\.parquet: is damaged"):
+        read_table(file, error=RunError, remedy="make it again")
+    (tmp_path / "x.json").write_text("[" * 100_000)
+    with pytest.raises(RunError, match=r"x\.json: is damaged"):
+        read_json(tmp_path / "x.json", error=RunError)
