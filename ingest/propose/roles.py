@@ -25,6 +25,7 @@ class Kind:
     fields: dict[str, str]
     words: tuple[str, ...] = ()  # in the topic's name, they speak for it
     must: bool = False  # … and without one of them it is not taken
+    never: tuple[str, ...] = ()  # in the topic's name, they speak against it
 
 
 # Best first.
@@ -32,20 +33,20 @@ KINDS: dict[str, tuple[Kind, ...]] = {
     "command": (
         Kind("geometry_msgs/msg/Twist", _TWIST, ("cmd_vel",)),
         Kind("geometry_msgs/msg/TwistStamped", _under("twist", _TWIST), ("cmd_vel",)),
-        # No command was recorded: the measured motion is used in its place.
-        Kind("nav_msgs/msg/Odometry", _under("twist.twist", _TWIST), ("wheel", "odom")),
     ),
     "pose": (
         Kind(
             "geometry_msgs/msg/PoseWithCovarianceStamped",
             _under("pose.pose", _POSE),
             ("amcl", "pose", "local"),
+            never=("initial", "goal"),
         ),
         Kind(
             "geometry_msgs/msg/PoseStamped",
             _under("pose", _POSE),
-            ("robot_pose", "tracked_pose", "slam"),
+            ("robot_pose", "tracked_pose", "slam", "pose"),
             must=True,
+            never=("goal", "target", "initial", "waypoint"),
         ),
         Kind("nav_msgs/msg/Odometry", _under("pose.pose", _POSE), ("filtered", "map", "odom")),
     ),
@@ -92,6 +93,10 @@ KINDS: dict[str, tuple[Kind, ...]] = {
     ),
     "perturbation": (Kind("std_msgs/msg/String", {"text": "data"}, ("perturbation",), must=True),),
 }
+# Where that is asked for: the measured motion in place of commands that were not recorded.
+ODOMETRY_AS_COMMAND = (
+    Kind("nav_msgs/msg/Odometry", _under("twist.twist", _TWIST), ("wheel", "odom")),
+)
 REQUIRED = ("command", "wheels", "pose")
 MOTION = "nav_msgs/msg/Odometry"
 FIXED_FRAMES = ("map", "odom", "world")  # best first
@@ -110,7 +115,8 @@ def topics_for(
     for rank, kind in enumerate(kinds):
         for topic in topics.values():
             named = [place for place, word in enumerate(kind.words) if word in topic.name.lower()]
-            if topic.type == kind.type and (named or not kind.must):
+            against = any(word in topic.name.lower() for word in kind.never)
+            if topic.type == kind.type and not against and (named or not kind.must):
                 order = (rank, min(named, default=len(kind.words)), -topic.expected, topic.name)
                 fitting.append((order, topic, kind))
     return [(topic, kind) for _, topic, kind in sorted(fitting, key=lambda item: item[0])]

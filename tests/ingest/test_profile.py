@@ -151,14 +151,14 @@ def test_a_proposal_says_what_no_topic_fills(tmp_path, capsys):
             return topics
 
     bag = write_bag(Blind(), tmp_path / "bag")
-    assert main(["profile", "new", str(bag)]) == 0
+    assert main(["profile", "new", str(bag)]) == 3
     out, err = capsys.readouterr()
     assert "MISSING, and required" in out
     assert 'goal = "none"' in out
     assert "# [inputs.imu]  # no topic seen; instead: gyro yaw rate taken from the wheels" in out
     assert "no topic of nav_msgs/msg/Odometry." in out
     assert "no topic for wheels" in err
-    assert main(["profile", "new", str(bag), "--json"]) == 0
+    assert main(["profile", "new", str(bag), "--json"]) == 3
     assert json.loads(capsys.readouterr().out)["missing"] == ["wheels"]
 
 

@@ -6,12 +6,18 @@ import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from restock.errors import ConfigError, ExitCode, RecordingError
 from restock.files import write_text
+
+if TYPE_CHECKING:
+    from restock.ingest.pipeline import IngestResult
+    from restock.ingest.profile.profile import Profile
+
+OFTEN = 0.5  # of the transitions: a label that holds on more is worth a look
 
 
 @dataclass
@@ -25,20 +31,29 @@ class ProfileCommand:
 
     `restock profile check PROFILE RECORDING` shows what would be used, what is missing (and what
     the recording has instead), how many transitions there would be and what each condition would
-    label. Nothing is written. Exit code 2 where the profile does not fit.
+    label, and what removes most rows, with what to try. Nothing is written.
+
+    Exit codes of `new`: 3 where the proposal cannot be used as it is (it is written, and says why);
+    of `check`: 2 where the profile does not fit.
     """
 
     action: Annotated[Literal["new", "check"], tyro.conf.Positional]
     """new RECORDING, or check PROFILE RECORDING."""
     paths: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     """The recording; for `check`, the profile (a file or a shipped name) first."""
+    footprint: Annotated[str | None, tyro.conf.arg(metavar="LxW")] = None
+    """The robot's length and width in metres for `new`, as 0.6x0.5; without it from the recording's
+    /robot_description or its costmap's footprint, else a guess."""
+    odometry_as_command: bool = False
+    """Let `new` take odometry for commands where none was recorded: what the robot did then stands
+    for what it was told."""
     out: Path | None = None
     """Where `new` writes the profile. Nothing is overwritten."""
     typestore: str | None = None
     """Distribution whose message definitions serve recordings without their own (humble)."""
     json: bool = False
-    """Print one JSON document: `new`: {"toml", "missing", "signals"}; `check`: {"inputs",
-    "problems", "outcome", …}."""
+    """Print one JSON document: `new`: {"toml", "missing", "signals", "ticks", "transitions",
+    "problems", "advice"}; `check`: {"inputs", "problems", "advice", "outcome", …}."""
 
     def run(self) -> int:
         """Do one of the two."""
@@ -54,24 +69,41 @@ class ProfileCommand:
     def _new(self) -> int:
         from restock.cli import output
         from restock.ingest.containers.open_recording import open_recording
+        from restock.ingest.propose.footprint import parse_footprint
         from restock.ingest.propose.propose import propose_profile
 
         if self.out is not None and self.out.exists():
             raise ConfigError("already exists", where=str(self.out), remedy="name another --out")
+        footprint = None if self.footprint is None else parse_footprint(self.footprint)
         stem = (self.out or Path(self.paths[0])).stem
         with open_recording(self.paths[0], typestore=self.typestore) as recording:
-            proposal = propose_profile(recording, re.sub(r"\W+", "_", stem).strip("_") or "robot")
+            proposal = propose_profile(
+                recording,
+                re.sub(r"\W+", "_", stem).strip("_") or "robot",
+                footprint=footprint,
+                odometry_as_command=self.odometry_as_command,
+            )
         if self.out is not None:
             write_text(self.out, proposal.toml)
         if self.json:
             output.print_json(
-                {"toml": proposal.toml, "missing": proposal.missing, "signals": proposal.signals}
+                {
+                    "toml": proposal.toml,
+                    "missing": proposal.missing,
+                    "signals": proposal.signals,
+                    "ticks": proposal.ticks,
+                    "transitions": proposal.transitions,
+                    "problems": proposal.problems,
+                    "advice": [{"key": each.key, "text": each.text} for each in proposal.advice],
+                }
             )
         elif self.out is None:
             sys.stdout.write(proposal.toml)
-        for name in proposal.missing:
-            output.say(f"no topic for {name}, which every profile needs")
-        return ExitCode.OK
+        for each in proposal.advice:
+            output.say(str(each))
+        for problem in proposal.problems:
+            sys.stderr.write(f"restock: {self.paths[0]}: cannot be used yet: {problem}\n")
+        return ExitCode.LOSSY if proposal.problems else ExitCode.OK
 
     def _check(self) -> int:
         from restock.cli import output
@@ -91,21 +123,45 @@ class ProfileCommand:
         if not self.json:
             output.print_table(inputs)
         outcome, code = None, ExitCode.OK
+        advice: list[str] = []
         if not problems:
             try:
                 outcome = ingest(self.paths[1], profile, store=None, typestore=self.typestore)
             except RecordingError as error:
                 problems = [error.what]
+            advice = self._advice(profile, outcome)
         if problems:
             code = ExitCode.USAGE
         if self.json:
-            document |= {"problems": problems, "outcome": as_json(outcome) if outcome else None}
+            document |= {"problems": problems, "advice": advice}
+            document["outcome"] = as_json(outcome) if outcome else None
             output.print_json(document)
         elif outcome is not None:
             show(outcome)
+        for line in () if self.json else advice:
+            sys.stdout.write(f"try: {line}\n")
         for problem in problems:
             sys.stderr.write(f"restock: {self.paths[1]}: {problem}\n")
         return code
+
+    def _advice(self, profile: Profile, outcome: IngestResult | None) -> list[str]:
+        """What of the profile removes most rows or labels most of them, and what to try."""
+        from restock.ingest.containers.open_recording import open_recording
+        from restock.ingest.propose.trial import try_profile
+        from restock.ingest.steps.needs import read_topics
+        from restock.ingest.task.conditions import NOMINAL
+
+        with open_recording(self.paths[1], typestore=self.typestore) as recording:
+            trial = try_profile(profile, read_topics(recording, profile))
+        lines = [str(each) for each in trial.advice]
+        rows = outcome.manifest["transitions"] if outcome else 0
+        lines += [
+            f"`{name}` holds on {count:,} of {rows:,} transitions: is its SQL right for this robot,"
+            " and is [task.body] its outline?"
+            for name, count in (outcome.conditions if outcome else {}).items()
+            if name != NOMINAL and count > OFTEN * rows
+        ]
+        return lines
 
 
 def _inputs(profile: Any, topics: Any) -> list[dict[str, Any]]:

@@ -1,0 +1,147 @@
+"""The clock of a proposed profile: which time, which ticks, and how long a command holds.
+
+All of it is taken from the recording: the gaps between commands say how often there is a tick,
+how long a command may hold and which gap ends an episode. Where header stamps run at another pace
+than log time the gaps are put in the robot's own (stamped) time, if messages without a stamp can
+be placed in it within half a control period; else log time is proposed, and why is said.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from restock.errors import RecordingError
+from restock.ingest.containers.recording import Recording
+from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.profile.profile import Clock
+from restock.ingest.steps.align import CLOCK_FIELD, CLOCK_TOPIC, ClockReport, align
+from restock.ingest.steps.clocks import STAMP, odd, topic_clock
+
+FASTEST_S, SLOWEST_S = 0.08, 0.5  # control periods that are proposed
+STEADY_S = (0.08, 0.5)  # commands this far apart make the ticks themselves
+PAUSE = 5.0  # a gap of more median gaps is a pause in driving
+LONGEST_HOLD_S = 5.0
+MOST_OFF_CLOCK = 0.05  # of a topic's messages
+
+
+@dataclass(frozen=True)
+class Gaps:
+    """What lies between the commands of a recording, in log time."""
+
+    count: int = 0  # of commands
+    period_s: float | None = None  # the median gap
+    driving_s: float = 0.0  # the longest gap that is no pause
+    longest_s: float = 0.0
+
+    @classmethod
+    def of(cls, columns: TopicColumns) -> Gaps:
+        gaps = np.asarray(np.diff(np.sort(columns.log_time_ns)), np.float64) * 1e-9
+        if not len(gaps):
+            return cls(len(columns))
+        period = float(np.median(gaps))
+        driving = gaps[gaps <= PAUSE * max(period, 0.02)]
+        return cls(len(columns), period, float(driving.max(initial=period)), float(gaps.max()))
+
+
+@dataclass(frozen=True)
+class ClockChoice:
+    """The `[clock]`, control period and hold of a command that are proposed, and why."""
+
+    alignment: str
+    steps: str
+    period_s: float  # on the alignment clock
+    max_gap_s: float
+    command_age_s: float
+    pace: float = 1.0  # seconds of the alignment clock in one of log time
+    every_s: float | None = None  # between two commands, mostly; on the alignment clock
+    ahead_s: float | None = None  # log time of the alignment clock
+    comments: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, gaps: Gaps, alignment: str, pace: float = 1.0) -> ClockChoice:
+        """What gaps in log time mean on an alignment clock that runs at this pace."""
+        middle = None if gaps.period_s is None else gaps.period_s * pace
+        steady = middle is not None and STEADY_S[0] <= middle <= STEADY_S[1]
+        period = round(float(np.clip(middle or 0.2, FASTEST_S, SLOWEST_S)), 2)
+        driving = gaps.driving_s * pace
+        return cls(
+            alignment,
+            "command" if steady else "rate",
+            period,
+            max(0.5, _up(max(2.5 * period, 1.2 * driving if steady else 0.0))),
+            float(np.clip(_up(max(2.5 * period, 1.2 * driving)), 0.2, LONGEST_HOLD_S)),
+            pace,
+            middle,
+        )
+
+
+def _up(seconds: float) -> float:
+    """Rounded up to a tenth of a second."""
+    return float(np.ceil(round(seconds * 10, 6)) / 10)
+
+
+def choose_clock(
+    recording: Recording, used: Sequence[str], latched: frozenset[str], gaps: Gaps, *, stamped: bool
+) -> ClockChoice:
+    """The clock that works for the topics `used`; `stamped` where sensors carry header stamps.
+
+    `latched` topics may have been published before the recording began.
+    """
+    if not stamped:
+        return ClockChoice.of(gaps, "log_time")
+    with_stamp = {name for name in used if STAMP in recording.leaves(name)}
+    clock = recording.topics.get(CLOCK_TOPIC)
+    wanted = {name: [STAMP] if name in with_stamp else [] for name in used}
+    if clock is not None and clock.skipped is None and CLOCK_FIELD in recording.leaves(CLOCK_TOPIC):
+        wanted[CLOCK_TOPIC] = [CLOCK_FIELD]
+    columns = recording.read(wanted)
+    seen = [topic_clock(name, columns[name], 1.0) for name in sorted(with_stamp - latched)]
+    comments = [f"{one.topic}: {what}" for one in seen if (what := odd(one.as_row()))]
+    choice, why_not = _by_stamp(columns, latched, gaps)
+    if why_not:
+        return by_log_time(replace(choice, comments=tuple(comments)), gaps, why_not)
+    if choice.pace != 1.0:
+        comments += [
+            f"Header stamps run at {choice.pace:.2%} of log time: periods, gaps and ages are in",
+            "the robot's own time.",
+        ]
+    ahead = [one.offset_ns * 1e-9 for one in seen if one.offset_ns is not None]
+    return replace(choice, comments=tuple(comments), ahead_s=min(ahead, default=None))
+
+
+def by_log_time(stamped: ClockChoice, gaps: Gaps, why: str) -> ClockChoice:
+    """Log time, where header stamps do not work; with what was seen of them."""
+    comments = (*stamped.comments, f"Log time, as header stamps do not work: {why}.")
+    return replace(ClockChoice.of(gaps, "log_time"), comments=comments)
+
+
+def _by_stamp(
+    columns: dict[str, TopicColumns], latched: frozenset[str], gaps: Gaps
+) -> tuple[ClockChoice, str]:
+    """The choice on header stamps, and why that does not work, or ""."""
+    choice = ClockChoice.of(gaps, STAMP)
+    for _ in range(3):  # the period is known when the pace is, and the tolerance when the period is
+        try:
+            _, report = align(columns, Clock(), latched, tolerance_s=choice.period_s / 2)
+        except RecordingError as error:
+            return choice, error.what
+        pace = 1.0 if report.pace is None else report.pace
+        if pace <= 0:
+            return choice, f"they run at {pace:.1%} of log time"
+        before, choice = choice, ClockChoice.of(gaps, STAMP, pace)
+        if before.period_s == choice.period_s:
+            break
+    return choice, _left_out(columns, report)
+
+
+def _left_out(columns: dict[str, TopicColumns], report: ClockReport) -> str:
+    """What alignment leaves out, where that is much of a topic."""
+    lost = [
+        f"{count:,} of {len(columns[topic]):,} of {topic} are off the clock"
+        for topic, count in report.off_clock.items()
+        if count > MOST_OFF_CLOCK * len(columns[topic])
+    ]
+    return ", ".join(lost)

@@ -1,0 +1,247 @@
+"""The text of a proposed profile: TOML with a comment at each guess."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+
+import numpy as np
+
+from restock.errors import visible
+from restock.ingest.containers.recording import Recording
+from restock.ingest.containers.topic_reading import TopicInfo
+from restock.ingest.profile.profile import FALLBACKS
+from restock.ingest.propose.candidates import Candidate
+from restock.ingest.propose.clock_choice import ClockChoice, Gaps
+from restock.ingest.propose.footprint import Footprint
+from restock.ingest.propose.roles import KINDS, LATCHED, REQUIRED, FrameGuess, Kind, Roles
+from restock.ingest.propose.trial import Trial
+
+GUESS = Footprint(0.6, 0.5, "A GUESS, as nothing in the recording says: MEASURE IT")
+
+
+@dataclass(frozen=True)
+class Commands:
+    """What the commands of a recording say about the robot."""
+
+    speed_mps: float = 0.5
+    yaw_rate_radps: float = 1.0
+    backs: bool = False
+    count: int = 0
+    topic: str = ""
+    measured: bool = False  # they are odometry, in place of commands
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a recording says of its robot."""
+
+    recording: Recording
+    roles: Roles
+    frames: FrameGuess | None
+    poses_from_frames: bool
+    commands: Commands
+    clock: ClockChoice
+    gaps: Gaps
+    driven_s: float
+    footprint: Footprint | None
+    footprint_notes: list[str]
+    signals: list[Candidate]
+
+
+def profile_lines(
+    seen: Evidence, name: str, problems: list[str], trial: Trial | None = None
+) -> list[str]:
+    """The TOML of a profile; with what a `trial` of it made of the recording."""
+    recording, seconds = seen.recording, seen.driven_s
+    trial = trial or Trial()
+    lines = [
+        f"# Proposed from {recording.path.name}: check what stands in comments, then run",
+        f"# restock profile check THIS_FILE {recording.path.name}",
+        *(f"# NOT USABLE YET: {problem}" for problem in problems),
+        *_trial_lines(trial),
+        "#",
+        *_topic_lines(recording, seen.roles, seconds),
+        f'name = "{name}"',
+        'conditions = ["recovery", "near_collision", "wheel_slip", "blocked_aisle"]',
+        'behaviour_policy = "unknown"  # who drove, where no topic says',
+        "",
+        *_task_lines(seen, trial),
+        *_clock_lines(seen.clock, trial),
+    ]
+    for role, fitting in seen.roles.items():
+        if role == "pose" and seen.poses_from_frames:
+            lines += ["# [inputs.pose]  # from transforms, by [frames]", ""]
+        else:
+            lines += _input_lines(role, fitting, seen, trial)
+    if seen.frames is not None:
+        lines += seen.frames.lines(used=seen.poses_from_frames)
+    if seen.signals:
+        lines += [
+            "# Custom signals: columns of the table, for conditions and queries. To have one, take",
+            "# away the first # of its lines; docs/profile.md says what a path may be.",
+            "",
+        ]
+    for signal in seen.signals:
+        lines += ["# " + line for line in signal.toml(_max_age_s(signal.topic, seconds))] + [""]
+    # Names are of a stranger: a line break in one starts no key.
+    return [visible(line) for line in [*lines, *_ENDING]]
+
+
+_ENDING = [
+    "# A condition of your own: one SQL expression over the steps of an episode:",
+    "# [[condition]]",
+    '# name = "tight"',
+    '# timing = "pre"  # "post" may look ahead',
+    '# sql = "clearance_m < 0.3 AND command_speed_mps > 0"',
+    "",
+    "# Named rectangles of the map, for coverage by place:",
+    "# [[zone]]",
+    '# name = "aisle_1"',
+    "# box_m = [0.0, 0.0, 10.0, 1.8]  # x0, y0, x1, y1",
+    "",
+]
+
+
+def _trial_lines(trial: Trial) -> list[str]:
+    """What the profile makes of the recording it is proposed from."""
+    if not trial.ticks:
+        return []
+    most = [f"{reason} {count:,}" for reason, count in list(trial.dropped.items())[:3]]
+    dropped = f" (dropped: {', '.join(most)})" if most else ""
+    return [f"# Of it come {trial.transitions:,} transitions, of {trial.ticks:,} ticks{dropped}."]
+
+
+def _said(trial: Trial, *keys: str) -> list[str]:
+    """What the trial says of these keys, as comments."""
+    return [f"# {each.text}." for each in trial.advice if each.key in keys]
+
+
+def _topic_lines(recording: Recording, roles: Roles, seconds: float) -> list[str]:
+    """Every topic with its rate and what it is taken for, as a comment."""
+    taken: dict[str, list[str]] = {}
+    for role, found in roles.items():
+        if found:
+            taken.setdefault(found[0][0].name, []).append(role)
+    width = max((len(name) for name in recording.topics), default=0)
+    kinds = max((len(topic.type) for topic in recording.topics.values()), default=0)
+    lines = []
+    for name, topic in recording.topics.items():
+        rate = f"{topic.expected / seconds:7.1f} Hz" if seconds > 0 else " " * 10
+        why = f"skipped: {topic.skipped}" if topic.skipped else ", ".join(taken.get(name, []))
+        lines.append(f"# {name:<{width}}  {topic.type:<{kinds}}  {rate}  {why}".rstrip())
+    return [*lines, ""]
+
+
+def _task_lines(seen: Evidence, trial: Trial) -> list[str]:
+    roles, commands = seen.roles, seen.commands
+    routed, (low, high) = bool(roles["goal"]), _lidar_range(seen.recording, roles)
+    speed, turn = commands.speed_mps, commands.yaw_rate_radps
+    actions = [(0.0, 0.0), (speed / 2, 0.0), (speed, 0.0)]
+    actions += [(0.8 * speed, 0.6 * turn), (0.8 * speed, -0.6 * turn), (0.0, turn), (0.0, -turn)]
+    actions += [(-speed / 2, 0.0)] if commands.backs else []
+    kind = "speeds" if commands.measured else "commands"
+    origin = f"from {commands.count} {kind} of {commands.topic}" if commands.count else "a guess"
+    return [
+        "[task]",
+        f'goal = "{"route" if routed else "none"}"'
+        + ("" if routed else "  # no goal and plan seen: progress is forward displacement"),
+        f"control_period_s = {seen.clock.period_s:g}",
+        f"range_min_m = {low:g}",
+        f"range_max_m = {high:g}  # lidar ranges beyond it count as free",
+        f"actions = [  # (m/s, rad/s), {origin}; the first must be stop",
+        *(f"  [{v:.3g}, {w:.3g}]," for v, w in actions),
+        "]",
+        "",
+        *_body_lines(seen, trial),
+    ]
+
+
+def _body_lines(seen: Evidence, trial: Trial) -> list[str]:
+    footprint = seen.footprint or GUESS
+    x, yaw = footprint.lidar_x_m, footprint.lidar_yaw_rad
+    return [
+        "[task.body]  # it decides what is near",
+        f"# {footprint.source}" + ("" if seen.footprint else ", or say --footprint LENGTHxWIDTH"),
+        *(f"# {note}" for note in seen.footprint_notes),
+        *_said(trial, "task.body"),
+        f"length_m = {round(footprint.length_m, 4):g}",
+        f"width_m = {round(footprint.width_m, 4):g}",
+        f"lidar_x_m = {round(x or 0.0, 3):g}  # of the lidar, ahead of the middle"
+        + ("; a guess" if x is None else ""),
+        *([f"lidar_yaw_rad = {round(yaw, 4):g}"] if yaw and abs(yaw) > 1e-3 else []),
+        "",
+    ]
+
+
+def _lidar_range(recording: Recording, roles: Roles) -> tuple[float, float]:
+    """The nearest and the farthest that the lidar says it sees; at most 4 m, where it matters."""
+    if not roles["scan"]:
+        return 0.05, 4.0
+    topic = roles["scan"][0][0].name
+    columns = recording.read({topic: ["range_min", "range_max"]})[topic].fields
+    low, high = (float(np.median(np.asarray(columns[f"range_{end}"]))) for end in ("min", "max"))
+    sane = 0 <= low < high < np.inf
+    return (round(low, 3), min(round(high, 3), 4.0)) if sane else (0.05, 4.0)
+
+
+def _clock_lines(clock: ClockChoice, trial: Trial) -> list[str]:
+    offset = "" if clock.ahead_s is None else f"  # log time is {clock.ahead_s:,.3f} s ahead of it"
+    why = "no commands seen" if clock.every_s is None else f"a command every {clock.every_s:.2f} s"
+    return [
+        "[clock]",
+        *(f"# {comment}" for comment in clock.comments),
+        f'alignment = "{clock.alignment}"' + offset,
+        *_said(trial, "clock.steps"),
+        f'steps = "{clock.steps}"  # {why}' + ("" if clock.every_s is None else ", mostly"),
+        *_said(trial, "clock.max_gap_s"),
+        f"max_gap_s = {clock.max_gap_s:g}  # a longer one ends an episode",
+        "",
+    ]
+
+
+def _max_age_s(topic: TopicInfo, seconds: float) -> float | None:
+    """Four periods of a topic, or None (latched) for one with few messages."""
+    rate = topic.expected / seconds if seconds > 0 else 0.0
+    if topic.expected < 3 or rate < 0.05:
+        return None
+    return float(np.clip(round(4 / rate, 1), 0.2, 10.0))
+
+
+def _input_lines(
+    role: str, fitting: list[tuple[TopicInfo, Kind]], seen: Evidence, trial: Trial
+) -> list[str]:
+    if not fitting:
+        if role in REQUIRED:
+            fits = " or ".join(dict.fromkeys(kind.type for kind in KINDS[role]))
+            if role == "pose":
+                fits += ", or transforms that join two frames"
+            return [
+                f"# MISSING, and required: no topic of {fits}.",
+                f"# [inputs.{role}]",
+                "",
+            ]
+        fallback = FALLBACKS.get(role, "progress without a goal")
+        return [f"# [inputs.{role}]  # no topic seen; instead: {fallback}", ""]
+    topic, kind = fitting[0]
+    rate = topic.expected / seen.driven_s if seen.driven_s > 0 else 0.0
+    others = ", ".join(other.name for other, _ in fitting[1:4])
+    fields = ", ".join(f'{key} = "{path}"' for key, path in kind.fields.items())
+    lines = [
+        *(
+            ["# No command was recorded: the measured motion is used in place of commands."]
+            if role == "command" and seen.commands.measured
+            else []
+        ),
+        f"[inputs.{role}]  # {rate:.1f} Hz" + (f"; or {others}?" if others else ""),
+        f"topic = {json.dumps(topic.name)}",
+        f'type = "{topic.type}"',
+        f"fields = {{ {fields} }}",
+    ]
+    if role not in LATCHED:
+        age = float(np.clip(round(seen.clock.pace * 4 / rate, 2) if rate else 1.0, 0.2, 1.0))
+        age = max(age, seen.clock.command_age_s) if role == "command" else age
+        lines += [*_said(trial, f"inputs.{role}.max_age_s"), f"max_age_s = {age:g}"]
+    if role in FALLBACKS:
+        lines.append("optional = true")
+    return [*lines, ""]

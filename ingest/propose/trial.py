@@ -1,0 +1,182 @@
+"""A profile tried on a recording: what each of its choices costs, and what to try instead.
+
+Every count here is of transitions that the profile, with that one choice changed, makes of the
+recording: nothing is estimated.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import msgspec
+import numpy as np
+
+from restock.errors import RecordingError
+from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.profile.profile import Profile
+from restock.ingest.steps.align import NS
+from restock.ingest.steps.aligned_inputs import align_inputs
+from restock.ingest.steps.episodes import Split, split
+from restock.ingest.steps.steps import Steps, steps_of
+
+MUCH = 0.1  # of the ticks: what costs so many is worth a word
+GAIN = 1.1  # times the transitions: what gives so many is worth a try
+NEAR_M = 0.14  # as of the shipped conditions near_collision and recovery
+OFTEN_NEAR = 0.4  # of the ticks: more than that says that the outline is wrong
+OFTEN_INSIDE = 0.02
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What a choice costs, and what to try."""
+
+    key: str  # of the profile, as `inputs.command.max_age_s`
+    text: str
+
+    def __str__(self) -> str:
+        return f"`{self.key}`: {self.text}"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a profile makes of a recording."""
+
+    ticks: int = 0
+    transitions: int = 0
+    dropped: dict[str, int] = field(default_factory=dict)  # ticks in no episode, by reason
+    endings: dict[str, int] = field(default_factory=dict)  # episodes by what ended them
+    advice: list[Advice] = field(default_factory=list)
+    problem: str = ""  # why there is nothing
+
+
+def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
+    """Try a profile on the columns of a recording (those `read_topics` reads for it)."""
+    try:
+        steps = steps_of(profile, topics)
+    except RecordingError as error:
+        return Trial(problem=f"{error.what}; {error.remedy}" if error.remedy else error.what)
+    if not len(steps):
+        return Trial(problem="it holds no command, so the control clock has no tick")
+    episodes = split(profile.task, steps)
+    endings = Counter(episode.ended_by for episode in episodes.episodes)
+    asked = _Advisor(profile, topics, steps, episodes)
+    advice = [*asked.ages(), *asked.gaps(), *asked.ticks(), *asked.outline()]
+    worst = sorted(episodes.dropped.items(), key=lambda item: -item[1])
+    why = "; ".join(f"{reason}: {count} of {len(steps)} ticks" for reason, count in worst)
+    problem = "" if episodes.transitions else f"no transition: {why}"
+    return Trial(
+        len(steps), episodes.transitions, dict(worst), dict(endings.most_common()), advice, problem
+    )
+
+
+class _Advisor:
+    """Changes one choice at a time and counts what comes of it."""
+
+    def __init__(
+        self, profile: Profile, topics: Mapping[str, TopicColumns], steps: Steps, episodes: Split
+    ) -> None:
+        self.profile, self.topics, self.steps = profile, topics, steps
+        self.dropped, self.now = episodes.dropped, episodes.transitions
+        self.cuts = Counter(episode.ended_by for episode in episodes.episodes)
+
+    def ages(self) -> list[Advice]:
+        """Of each input that is often stale: how old it is, and what another age gives."""
+        found = []
+        for reason, count in sorted(self.dropped.items(), key=lambda item: -item[1]):
+            name, _, what = reason.partition(": ")
+            if what != "stale" or count < MUCH * len(self.steps):
+                continue
+            source = dict(self.profile.inputs.items()).get(name)
+            if source is None or source.max_age_s is None:
+                continue
+            latest = align_inputs(self.profile, self.topics).latest(name)
+            ages = latest.age_ns[latest.known] * 1e-9
+            most = float(np.ceil(np.percentile(ages, 95) * 10) / 10) if len(ages) else 0.0
+            tried = [
+                f"{age:g} s makes {number:,}" if age else f"without it (latched) {number:,}"
+                for age in dict.fromkeys((most if most > source.max_age_s else None, None))
+                if (number := self._with_age(name, age)) > GAIN * self.now
+            ]
+            text = (
+                f"{source.max_age_s:g} s drops {count:,} of {len(self.steps):,} ticks:"
+                f" {source.topic} is up to {ages.max(initial=0.0):.1f} s old;"
+                f" {self.now:,} transitions" + "".join(f", {one}" for one in tried)
+            )
+            if name == "command" and tried:
+                text += " (right only where the robot drives on with its last command)"
+            found.append(Advice(f"inputs.{name}.max_age_s", text))
+        return found
+
+    def gaps(self) -> list[Advice]:
+        """Whether a longer gap within an episode gives much more."""
+        lone = self.dropped.get("a single step between two cuts", 0)
+        if not self.cuts["gap"] + lone or self.cuts["gap"] + lone < MUCH * len(self.steps):
+            return []
+        stamps = self.steps.signals["stamp_ns"]
+        gaps = np.diff(stamps)[np.diff(self.steps.segment) == 0] / NS
+        limit = self.profile.clock.max_gap_s
+        over = gaps[gaps > limit]
+        for longer in (2 * limit, 4 * limit, 8 * limit):
+            number = self._count(_changed(self.profile, clock={"max_gap_s": longer}))
+            if number > GAIN * self.now:
+                text = (
+                    f"{limit:g} s cuts at {len(over):,} gaps of {over.min():.2f} s and more;"
+                    f" {self.now:,} transitions, {longer:g} s makes {number:,}"
+                )
+                return [Advice("clock.max_gap_s", text)]
+        return []
+
+    def ticks(self) -> list[Advice]:
+        """Whether a tick every period, and commands that hold, give much more."""
+        if self.profile.clock.steps != "command":
+            return []
+        changed = _changed(self.profile, clock={"steps": "rate"})
+        held = _held(changed, "command", None)
+        number = self._count(held)
+        if number <= 2 * self.now:
+            return []
+        text = (
+            f"a tick a command makes {self.now:,} transitions; if the robot drives on with its last"
+            f' command, steps = "rate" and no inputs.command.max_age_s make {number:,}'
+        )
+        return [Advice("clock.steps", text)]
+
+    def outline(self) -> list[Advice]:
+        """Whether the lidar sees things inside the robot's outline, or all but touching it."""
+        scan = self.profile.inputs.scan
+        if scan is None or scan.topic not in self.topics:
+            return []
+        usable = np.array([problem == "" for problem in self.steps.problem], np.bool_)
+        clearance = self.steps.signals["clearance_m"][usable]
+        inside, near = int((clearance <= 0).sum()), int((clearance < NEAR_M).sum())
+        often = inside > OFTEN_INSIDE * len(clearance) or near > OFTEN_NEAR * len(clearance)
+        if not len(clearance) or not often:
+            return []
+        body = self.profile.task.body
+        text = (
+            f"by an outline of {body.length_m:g} x {body.width_m:g} m the lidar sees something"
+            f" nearer than {NEAR_M:g} m at {near:,} of {len(clearance):,} ticks, inside the robot"
+            f" at {inside:,}: these become near_collision and recovery. Measure it"
+        )
+        return [Advice("task.body", text)]
+
+    def _with_age(self, name: str, age_s: float | None) -> int:
+        return self._count(_held(self.profile, name, age_s))
+
+    def _count(self, profile: Profile) -> int:
+        try:
+            return split(profile.task, steps_of(profile, self.topics)).transitions
+        except RecordingError:
+            return 0
+
+
+def _held(profile: Profile, name: str, age_s: float | None) -> Profile:
+    source = msgspec.structs.replace(getattr(profile.inputs, name), max_age_s=age_s)
+    inputs = msgspec.structs.replace(profile.inputs, **{name: source})
+    return msgspec.structs.replace(profile, inputs=inputs)
+
+
+def _changed(profile: Profile, *, clock: Mapping[str, float | str]) -> Profile:
+    return msgspec.structs.replace(profile, clock=msgspec.structs.replace(profile.clock, **clock))

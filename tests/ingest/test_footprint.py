@@ -1,0 +1,102 @@
+"""A robot's outline from its description, its costmap, or the command line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.paths import SHARED
+
+from restock.errors import ConfigError
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.propose.footprint import (
+    footprint_of,
+    of_polygon,
+    of_text,
+    of_urdf,
+    parse_footprint,
+)
+
+URDF = """<robot name="cart">
+  <link name="base_footprint"/>
+  <link name="base_link">
+    <visual><geometry><mesh filename="package://cart/cart.stl"/></geometry></visual>
+    <collision><origin xyz="0.1 0 0.2"/><geometry><box size="0.6 0.4 0.3"/></geometry></collision>
+  </link>
+  <link name="wheel">
+    <collision><geometry><cylinder radius="0.1" length="0.06"/></geometry></collision>
+  </link>
+  <link name="lidar"/>
+  <link name="arm"><collision><geometry><box size="3 3 3"/></geometry></collision></link>
+  <joint name="a" type="fixed"><parent link="base_footprint"/><child link="base_link"/></joint>
+  <joint name="b" type="continuous"><parent link="base_link"/><child link="wheel"/>
+    <origin xyz="0 0.25 0.1" rpy="-1.5707963267948966 0 0"/></joint>
+  <joint name="c" type="fixed"><parent link="base_link"/><child link="lidar"/>
+    <origin xyz="0.3 0 0.4" rpy="0 0 3.141592653589793"/></joint>
+  <joint name="d" type="revolute"><parent link="base_link"/><child link="arm"/></joint>
+</robot>"""
+
+
+def test_shapes_of_the_base_and_its_wheels_make_the_outline():
+    found = of_urdf(URDF, "lidar", source="/robot_description")
+    assert not isinstance(found, str)
+    # The box from -.2 to .4 ahead; .2 m to the right of the middle, the wheel to .28 m on the left.
+    assert (found.length_m, found.width_m) == pytest.approx((0.6, 0.48))
+    assert found.lidar_x_m == pytest.approx(0.3 - 0.1)  # ahead of the box's middle
+    assert abs(found.lidar_yaw_rad or 0) == pytest.approx(np.pi)
+    assert found.source == "shapes of 2 links in /robot_description"
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("<robot", "is no XML"),
+        ("<robot><link name='x'/></robot>", "none of the links base_link"),
+        ("<!DOCTYPE a [<!ENTITY b 'c'>]><robot/>", "no entities"),
+        (URDF.replace("box", "mesh"), "a mesh's size is not in the recording"),
+        (URDF.replace("0.6 0.4 0.3", "nan 1e400 x"), "a mesh's size"),
+        (" " * 5_000_000, "too long"),
+    ],
+)
+def test_a_description_of_no_use_is_said_to_be_one(text, why):
+    found = of_urdf(text, source="/robot_description")
+    assert isinstance(found, str)
+    assert why in found
+
+
+def test_footprints_of_a_costmap():
+    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
+    box = np.array([[0.4, 0.25], [0.4, -0.25], [-0.4, -0.25], [-0.4, 0.25]])
+    found = of_polygon(box @ turn.T + [7.0, 3.0], "the polygon")
+    assert found is not None
+    assert (found.length_m, found.width_m) == pytest.approx((0.8, 0.5))
+    assert of_polygon(box[:2], "") is None
+    found = of_text("[[0.3, 0.2], [0.3, -0.2], [-0.1, -0.2], [-0.1, 0.2]]", "footprint")
+    assert found is not None
+    assert (found.length_m, found.width_m) == pytest.approx((0.4, 0.4))
+    assert of_text("[[1], 2]", "") is of_text("[" * 5000, "") is of_text("", "") is None
+
+
+def test_a_footprint_on_the_command_line():
+    found = parse_footprint("0.281x0.306")
+    assert (found.length_m, found.width_m) == (0.281, 0.306)
+    for text in ("0.3", "1.2.3x4", "0x1", "900x1", "-1x1"):
+        with pytest.raises(ConfigError, match="is not LENGTHxWIDTH in metres"):
+            parse_footprint(text)
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
+@pytest.mark.parametrize(
+    ("bag", "length_m", "width_m"),
+    [
+        ("fleet-turtlebot3/full-topics/rosbag2_2025_11_06-16_53_28", 0.140, 0.178),  # a Burger
+        ("turtlebot3-sim-humble", 0.281, 0.306),  # a Waffle Pi
+        ("sim-time-husky", 0.990, 0.670),
+    ],
+)
+def test_outlines_are_those_of_the_makers(bag, length_m, width_m):
+    with open_recording(SHARED / bag) as recording:
+        found, notes = footprint_of(recording, "base_scan")
+    assert found is not None
+    assert notes == []
+    assert found.length_m == pytest.approx(length_m, abs=0.02)
+    assert found.width_m == pytest.approx(width_m, abs=0.02)

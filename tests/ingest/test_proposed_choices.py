@@ -1,0 +1,172 @@
+"""What a proposal chooses by the recording, and what it says that its choices cost."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.driven_robot import BEAMS, START_NS, Drive, scans, write_bag
+from support.paths import SHARED
+
+from restock.cli import main
+from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.steps.align import NS
+
+PACES = [0.5, 0.9, 0.97, 1.0, 1.1]
+
+
+@dataclass
+class Commanded(Drive):
+    """Commands at these times (s), received while the robot's clock ran at `pace` of log time."""
+
+    times_s: tuple[float, ...] = ()
+    pace: float = 1.0
+    nearest_m: float = 3.0
+
+    def topics(self) -> dict[str, TopicColumns]:
+        topics = super().topics()
+        del topics["/plan"], topics["/goal_pose"], topics["/behaviour_policy"]
+        scan = topics["/scan"]
+        scan.fields.update(scans(np.full((len(scan), BEAMS), self.nearest_m)))
+        if self.times_s:
+            at = START_NS + np.rint(np.array(self.times_s) * NS).astype(np.int64)
+            count = len(at)
+            fields = {"linear.x": np.full(count, 0.4), "angular.z": np.zeros(count)}
+            topics["/cmd_vel"] = TopicColumns(at, at, fields)
+        return {name: self._received(columns) for name, columns in topics.items()}
+
+    def _received(self, columns: TopicColumns) -> TopicColumns:
+        log = START_NS + np.rint((columns.log_time_ns - START_NS) / self.pace).astype(np.int64)
+        return TopicColumns(log, log, columns.fields)
+
+
+def propose(
+    drive: Drive, folder: Path, capsys: pytest.CaptureFixture[str], *options: str, code: int = 0
+) -> tuple[Path, dict[str, Any], Path]:
+    """The bag, what `profile new --json` says, and the profile as a file."""
+    bag = write_bag(drive, folder / "bag")
+    assert main(["profile", "new", str(bag), "--json", *options]) == code
+    said = json.loads(capsys.readouterr().out)
+    file = folder / "proposed.toml"
+    file.write_text(said["toml"])
+    return bag, said, file
+
+
+def test_commands_twice_a_second_make_no_gaps(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    times = 0.5 * np.arange(56) + rng.uniform(0, 0.04, 56)
+    _, said, file = propose(Commanded(30.0, times_s=tuple(times)), tmp_path, capsys)
+    assert (said["ticks"], said["transitions"]) == (56, 55)
+    profile = load_profile(file)
+    assert profile.task.control_period_s == pytest.approx(0.5)
+    assert profile.clock.max_gap_s > 2 * profile.task.control_period_s
+    assert said["advice"] == [
+        {"key": "task.body", "text": "a guess, as nothing in the recording says: --footprint"}
+    ]
+
+
+def test_a_hold_that_drops_most_ticks_says_what_another_one_gives(tmp_path, capsys):
+    times = (*np.arange(0, 1, 0.1), 6.0, 17.0)
+    bag, said, file = propose(Commanded(20.0, times_s=tuple(times)), tmp_path, capsys)
+    (advice,) = [each for each in said["advice"] if each["key"] == "clock.steps"]
+    assert "if the robot drives on with its last command" in advice["text"]
+    assert advice["text"] in said["toml"]
+    strict = file.read_text().replace('steps = "command"', 'steps = "rate"')
+    file.write_text(strict)
+    assert main(["profile", "check", str(file), str(bag), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    (line,) = [line for line in said["advice"] if "inputs.command.max_age_s" in line]
+    before = said["outcome"]["transitions"]
+    assert f"{before:,} transitions" in line
+    promised = int(line.split("without it (latched) ")[1].split()[0])
+    held = strict.split("[inputs.command]")
+    held[1] = held[1].replace("max_age_s", "# max_age_s", 1)
+    file.write_text("[inputs.command]".join(held))
+    assert main(["profile", "check", str(file), str(bag), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["outcome"]["transitions"] == promised > 3 * before
+
+
+def test_an_outline_that_the_lidar_contradicts_is_said(tmp_path, capsys):
+    bag, said, file = propose(Commanded(10.0, nearest_m=0.28), tmp_path, capsys)
+    texts = [each["text"] for each in said["advice"] if each["key"] == "task.body"]
+    assert "inside the robot at 50" in texts[0]
+    assert main(["profile", "check", str(file), str(bag)]) == 0
+    out = capsys.readouterr().out
+    assert "try: `recovery` holds on 49 of 49 transitions" in out
+    assert "try: `task.body`: by an outline of 0.6 x 0.5 m" in out
+    other = tmp_path / "small"
+    other.mkdir()
+    small = Commanded(10.0, nearest_m=0.28)
+    _, said, file = propose(small, other, capsys, "--footprint", "0.2x0.2")
+    assert said["advice"] == []
+    body = load_profile(file).task.body
+    assert (body.length_m, body.width_m) == (0.2, 0.2)
+
+
+@pytest.mark.parametrize("pace", PACES)
+def test_periods_are_in_the_robots_own_time(pace, tmp_path, capsys):
+    drive = Commanded(30.0, pace=pace)
+    bag, said, file = propose(drive, tmp_path, capsys)
+    profile = load_profile(file)
+    assert profile.clock.alignment == "header.stamp"
+    assert profile.task.control_period_s == pytest.approx(0.2)
+    assert said["transitions"] == 149
+    assert ("Header stamps run at" in said["toml"]) == (pace != 1.0)
+    assert main(["profile", "check", str(file), str(bag), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["outcome"]["transitions"] == said["transitions"]
+
+
+def test_log_time_where_stamps_cannot_be_followed(tmp_path, capsys):
+    class Erratic(Commanded):
+        def _received(self, columns: TopicColumns) -> TopicColumns:
+            since = (columns.log_time_ns - START_NS) / NS
+            log = since * 1.5 + 0.35 * np.floor(since / 0.7)  # and stands still now and then
+            stamps = START_NS + np.rint(log * NS).astype(np.int64)
+            return TopicColumns(stamps, stamps, columns.fields)
+
+        def topics(self) -> dict[str, TopicColumns]:
+            topics = super().topics()
+            slow = np.arange(0, len(topics["/odom"]), 30)
+            for name in ("/imu", "/amcl_pose", "/scan"):
+                del topics[name]
+            odom = topics["/odom"]
+            fields = {path: np.asarray(column)[slow] for path, column in odom.fields.items()}
+            topics["/odom"] = TopicColumns(odom.log_time_ns[slow], odom.log_time_ns[slow], fields)
+            return topics
+
+    _, said, file = propose(Erratic(40.0), tmp_path, capsys, code=3)
+    assert "[inputs.pose]" in said["toml"]
+    assert load_profile(file).clock.alignment == "log_time"
+    assert "Log time, as header stamps do not work: " in said["toml"]
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
+@pytest.mark.parametrize(
+    ("bag", "transitions", "options"),
+    [
+        ("sim-time-husky", 86, ()),
+        ("sim-time-mobrob", 41, ("--odometry-as-command",)),
+        ("sim-time-robot-kf", 547, ("--odometry-as-command",)),
+        ("robots/turtlebot3-sim/rosbag_test", 125, ()),
+        ("robots/turtlebot3-sim-clock/ros2bag", 17, ()),
+    ],
+)
+def test_of_simulations(bag, transitions, options, capsys):
+    assert main(["profile", "new", str(SHARED / bag), "--json", *options]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["transitions"] == transitions
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
+def test_a_small_robots_rows_are_not_all_recovery(tmp_path, capsys):
+    file = tmp_path / "p.toml"
+    bag = str(SHARED / "turtlebot3-sim-humble")
+    assert main(["profile", "new", bag, "--out", str(file)]) == 0
+    assert main(["profile", "check", str(file), bag, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["outcome"]["conditions"]["recovery"] == 2  # was 124
