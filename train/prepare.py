@@ -50,6 +50,7 @@ class Prepared:
         """Make the run directory (or take up the old one), the twin and the learner."""
         run = self.resumed or Run.create(self.path, self.document)
         if self.resumed is not None:
+            run.remove_leftovers()
             (self.path / STOPPED).unlink(missing_ok=True)
         if self.from_env_steps is not None:
             go_back(run.latest, self.from_env_steps)

@@ -19,6 +19,7 @@ import pyarrow as pa
 
 from restock import __version__
 from restock.errors import PanelError, StoreError
+from restock.files import is_running
 from restock.ingest.store.location import Location
 from restock.ingest.task.conditions import NOMINAL, Condition, labels_version, shipped
 from restock.ingest.task.task import Task
@@ -206,23 +207,13 @@ def _building(out: Path) -> Iterator[Path]:
         of_this_host = (
             left.name.startswith(prefix) and host == platform.node() and process.isdigit()
         )
-        if of_this_host and not _alive(int(process)):
+        if of_this_host and not is_running(int(process)):
             shutil.rmtree(left, ignore_errors=True)
     partial = Path(tempfile.mkdtemp("", f"{prefix}{platform.node()}~{os.getpid()}~", out.parent))
     try:
         yield partial
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-
-
-def _alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        pass
-    return True
 
 
 def _finish(path: Path) -> None:

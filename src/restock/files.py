@@ -109,7 +109,48 @@ def write_bytes(path: Path, content: bytes, *, exclusive: bool = False) -> None:
 
 def _temporary(path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
+    return temporary_name(path)
+
+
+def temporary_name(path: Path) -> Path:
+    """Where a file is written before it is put in place: beside it, under this process's name."""
     return path.with_name(f".{path.name}.{os.getpid()}.tmp")
 
 
-__all__ = ["first_line", "read_json", "read_table", "write_bytes", "write_table", "write_text"]
+def remove_leftovers(folder: Path, pattern: str) -> list[Path]:
+    """Remove what killed processes left of files in `folder` whose names match; returns them.
+
+    Only names that `temporary_name` gives, and not those of another process that still runs.
+    """
+    removed = []
+    for path in folder.glob(f".{pattern}.*.tmp"):
+        process = path.name.removesuffix(".tmp").rpartition(".")[2]
+        ours = process.isdigit() and not path.is_symlink() and path.is_file()
+        if ours and (int(process) == os.getpid() or not is_running(int(process))):
+            path.unlink(missing_ok=True)
+            removed.append(path)
+    return removed
+
+
+def is_running(process: int) -> bool:
+    """Whether this machine has a process of that id."""
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        pass
+    return True
+
+
+__all__ = [
+    "first_line",
+    "is_running",
+    "read_json",
+    "read_table",
+    "remove_leftovers",
+    "temporary_name",
+    "write_bytes",
+    "write_table",
+    "write_text",
+]

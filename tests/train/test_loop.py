@@ -18,6 +18,8 @@ from support.toy_twin import CELLS, TASK
 from restock.errors import ConfigError, RunError
 from restock.ingest.task.conditions import Condition
 from restock.train.dqn.learner import Learner
+from restock.train.evaluation.evaluate import fixed_episodes
+from restock.train.evaluation.policies import GreedyPolicy
 from restock.train.feed.logs import Logs, LogTerms
 from restock.train.loop import TrainingInterrupted, train
 from restock.train.run import checkpoint
@@ -244,6 +246,23 @@ def test_the_critic_is_measured_on_steps_that_no_replay_has(undisturbed: Session
     assert all(row["rows"] > 0 and row["td_abs_mean"] > 0 for row in measured)
     mean = [sum(row["td_abs_mean"] for row in rows) / len(rows) for rows in (first, last)]
     assert mean[1] < mean[0]  # it learnt
+
+
+def test_an_evaluation_is_measured_alike_whatever_was_driven_before(tmp_path: Path) -> None:
+    live = session(tmp_path / "a", config())
+    policy = GreedyPolicy(live.learner.policy_network)
+    specs = fixed_episodes(["nominal", "wheel_slip"], 4, 7)  # 8 episodes in 3 corridors
+
+    def measured() -> tuple[int, list[dict[str, Any]]]:
+        driven = live.evaluation_buffer.drive(policy, specs)
+        steps = round(sum(result.time_s for result in driven) / TASK.control_period_s)
+        return steps, live.evaluation_buffer.measure(live.learner)
+
+    steps, first = measured()
+    assert measured() == (steps, first)
+    # Of the steps that environments drive on, once their episodes are done, none is counted.
+    assert sum(row["rows_met"] for row in first) == steps
+    live.close()
 
 
 def test_audit_rows_hold_what_the_row_was(undisturbed: Session) -> None:

@@ -102,8 +102,18 @@ def test_resuming_in_the_twin_is_bit_exact(tmp_path: Path, panel: Path) -> None:
     base = ["train", "--panel", str(panel), *TINY]
     assert main([*base, "--out", str(tmp_path / "whole"), "--env-steps", "400"]) == 0
     assert main([*base, "--out", str(tmp_path / "parts"), "--env-steps", "240"]) == 0
+    path = tmp_path / "parts"
+    # What a kill while a checkpoint or a table is written leaves behind …
+    (path / "checkpoints" / f".latest.safetensors.{2**22 + 1}.tmp").write_bytes(b"half")
+    (path / f".progress.parquet.{2**22 + 1}.tmp").write_bytes(b"half")
+    # … and what is another's, or still being written.
+    kept = [path / ".mine.tmp", path / "checkpoints" / ".mine.safetensors.x.tmp"]
+    kept.append(path / f".progress.parquet.{os.getppid()}.tmp")
+    for file in kept:
+        file.write_bytes(b"not of that process")
     # A run whose budget is raised goes on; only its closing evaluation at 240 is extra.
     assert main(["train", "--resume", str(tmp_path / "parts"), "--env-steps", "400"]) == 0
+    assert {file for file in path.rglob(".*") if file.is_file()} == set(kept)
     whole = checkpoint.load(tmp_path / "whole" / "checkpoints" / "latest.safetensors")
     parts = checkpoint.load(tmp_path / "parts" / "checkpoints" / "latest.safetensors")
     for name, value in whole["learner"]["network"].items():
@@ -162,11 +172,39 @@ def test_a_run_killed_at_any_instant_goes_on_bit_exactly(tmp_path: Path, rows: i
     for name, value in whole["learner"]["network"].items():
         assert torch.equal(value, killed["learner"]["network"][name]), name
     np.testing.assert_equal(whole["ring"], killed["ring"])
-    for name in ("strata", "audit", "evaluations", "episodes"):
+    for name in ("strata", "audit", "evaluations", "episodes", "evaluation_buffer"):
         one, two = (
             pq.read_table(tmp_path / run / f"{name}.parquet") for run in ("whole", "killed")
         )
         assert one.equals(two), name
+
+
+@pytest.mark.slow
+def test_what_a_run_measures_on_fresh_steps_does_not_depend_on_a_kill(tmp_path: Path) -> None:
+    class Killed(Exception):
+        pass
+
+    settings = [*TINY, "--env-steps", "120", "--set", "evaluation.every_env_steps=40"]
+    settings += ["--set", "record.checkpoint_every_env_steps=40", "--set", "evaluation.episodes=5"]
+    overrides = [value for value in settings if "=" in value]
+
+    def trained(path: Path, kill_at: int | None) -> list[dict[str, object]]:
+        def notify(event: str, values: dict[str, object]) -> None:
+            if event == "evaluation" and values["env_steps"] == kill_at:
+                raise Killed
+
+        given = [*overrides, "schedule.env_steps=120"]
+        if kill_at is not None:
+            with pytest.raises(Killed):
+                restock.train.train(out=path, settings=given, notify=notify)
+            assert main(["train", "--resume", str(path)]) == 0
+        else:
+            restock.train.train(out=path, settings=given)
+        return list(pq.read_table(path / "evaluation_buffer.parquet").to_pylist())
+
+    whole = trained(tmp_path / "whole", None)
+    assert {row["env_steps"] for row in whole} == {40, 80, 120}
+    assert trained(tmp_path / "killed", 80) == whole
 
 
 def test_eval_drives_everyone_through_the_same_episodes(

@@ -62,7 +62,10 @@ class EvaluationBuffer:
         collector = self._collector
         collector.observation = np.array(observation, copy=True)  # the twin writes over its own
         step: Step = collector.start(action, np.ones(len(action), np.float32))
-        collector.finish(env_steps=0, gradient_steps=0, acting_step=0)
+        ended = collector.finish(env_steps=0, gradient_steps=0, acting_step=0)
+        number = step[4]["episode_number"]
+        # Beyond the fixed episodes an environment drives on, and nobody asked for those.
+        collector.forget([episode for episode in ended if number[episode.env] < 0])
         return step
 
     def measure(self, learner: Learner) -> list[dict[str, Any]]:

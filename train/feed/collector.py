@@ -265,6 +265,11 @@ class Collector(Stateful):
                 ring.rows[order[-1]] = ring.rows[order[-2]]
             self.invalid_steps += 1
 
+    def forget(self, episodes: Sequence[EndedEpisode]) -> None:
+        """Never label these ended episodes: their rows belong to no condition."""
+        keys = {episode.key for episode in episodes}
+        self._unlabelled = [episode for episode in self._unlabelled if episode.key not in keys]
+
     def label(self, *, all_of_them: bool = False) -> list[dict[str, Any]]:
         """Label the ended episodes once enough are waiting; rows for the run's `episodes`."""
         waiting = self._unlabelled

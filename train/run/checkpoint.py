@@ -22,6 +22,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from restock.errors import RunError
+from restock.files import temporary_name
 
 FORMAT = "restock-checkpoint/3"
 _EARLIER = ("restock-checkpoint/1", "restock-checkpoint/2")
@@ -40,7 +41,7 @@ def save(path: Path, state: Mapping[str, Any]) -> None:
     document = json.dumps(_take_apart(state, "", tensors))
     metadata = {"format": FORMAT, "state": document, "blake2b": _checksum(document, tensors)}
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = temporary_name(path)
     try:
         save_file(tensors, temporary, metadata=metadata)
         with temporary.open("rb") as written:
@@ -209,7 +210,7 @@ def go_back(latest: Path, env_steps: int) -> None:
 
 def _put(source: Path, target: Path) -> None:
     """The same file under another name, in one step; a copy where the disk has no hard links."""
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    temporary = temporary_name(target)
     temporary.unlink(missing_ok=True)
     try:
         try:

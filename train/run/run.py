@@ -20,7 +20,7 @@ import msgspec
 import pyarrow as pa
 
 from restock.errors import RunError
-from restock.files import read_json, read_table, write_table, write_text
+from restock.files import read_json, read_table, remove_leftovers, write_table, write_text
 from restock.train.run.run_tables import TABLES
 
 if TYPE_CHECKING:
@@ -167,6 +167,16 @@ class Run:
         table = self.table(name)
         write_table(table, self.path / f"{name}.parquet")
         self._on_disk[name] = table.num_rows
+
+    def remove_leftovers(self) -> None:
+        """Remove what a killed process left of the tables and checkpoints that it was writing."""
+        for folder, pattern in (
+            (self.path, "*.parquet"),
+            (self.path, "*.json"),
+            (self.latest.parent, "*.safetensors"),
+            (self.path / "fresh", "*.safetensors"),
+        ):
+            remove_leftovers(folder, pattern)
 
     def row_counts(self) -> dict[str, int]:
         """Rows per table, for a checkpoint."""
