@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Generic, Literal, TypeVar, Union
 from restock.errors import RecordingError, RestockError
 
 if TYPE_CHECKING:
-    from restock.ingest.pipeline import IngestResult
+    from restock.ingest.pipeline import IngestResult, OnRepeat
     from restock.ingest.profile.profile import Profile
 
 Result = tuple[Path, Union["IngestResult", RestockError]]
@@ -45,6 +45,7 @@ class IngestJob:
     force: bool = False
     salvage: bool = False
     typestore: str | None = None
+    repeated: OnRepeat = "keep"  # a recording that is in the store under another id
 
     def run(self, path: Path) -> Result:
         """Ingest one recording; an error is returned, so that the others continue."""
@@ -59,6 +60,7 @@ class IngestJob:
                 force=self.force,
                 salvage=self.salvage,
                 typestore=self.typestore,
+                repeated=self.repeated,
             )
         except RestockError as error:
             return path, error

@@ -28,12 +28,14 @@ from restock.ingest.store.manifest import (
     recorded_facts,
     software_version,
 )
+from restock.ingest.store.repeated import Repeat
 from restock.ingest.store.transitions import Provenance, recording_table
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.conditions import NOMINAL, LabelScore, label_scores
 from restock.ingest.task.schema import recording_schema
 
 Status = Literal["written", "unchanged", "dry run"]
+OnRepeat = Literal["keep", "refuse"]
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,7 @@ class IngestResult:
     lost_messages: list[str] = field(default_factory=list)  # or lost bytes, and why
     notes: list[str] = field(default_factory=list)
     version: int | None = None  # of the store's transitions, where they were written
+    repeats: Repeat | None = None  # a recording of the store that largely holds the same rows
 
     @property
     def lossy(self) -> bool:
@@ -66,15 +69,17 @@ def ingest(
     force: bool = False,
     salvage: bool = False,
     typestore: str | None = None,
+    repeated: OnRepeat = "keep",
 ) -> IngestResult:
     """Read one recording and write its transitions to the store (None: a dry run).
 
     A recording that is in the store as this profile, these conditions and this software would
-    put it there is left alone, unless `force`.
+    put it there is left alone, unless `force`. One whose rows are largely those of another
+    recording in the store (a part of it, a copy) is kept and said, or refused, by `repeated`.
 
     Raises:
-        RecordingError: no recording, damaged (unless `salvage`), not of this profile, or it
-            gives no transition. The store is as it was.
+        RecordingError: no recording, damaged (unless `salvage`), not of this profile, it gives
+            no transition, or it is repeated and to be refused. The store is as it was.
         StoreError: the store cannot be written.
     """
     with open_recording(path, typestore=typestore, salvage=salvage) as recording:
@@ -83,7 +88,7 @@ def ingest(
             if same is not None:
                 return IngestResult(str(path), "unchanged", same)
         try:
-            return _Ingest(str(path), recording, profile).run(store)
+            return _Ingest(str(path), recording, profile, repeated).run(store)
         except RecordingError as error:
             if error.where:
                 raise
@@ -102,8 +107,11 @@ def _unchanged(store: StoreWriter, recording: Recording, profile: Profile) -> di
 class _Ingest:
     """The stages over one open recording."""
 
-    def __init__(self, path: str, recording: Recording, profile: Profile) -> None:
+    def __init__(
+        self, path: str, recording: Recording, profile: Profile, repeated: OnRepeat
+    ) -> None:
         self.path, self.recording, self.profile = path, recording, profile
+        self.repeated = repeated
         self.ingest_id = uuid.uuid4().hex[:16]
 
     def run(self, store: StoreWriter | None) -> IngestResult:
@@ -127,11 +135,7 @@ class _Ingest:
         scores = label_scores(table, rows.labels)
         facts = recorded_facts(self.recording, profile, columns, steps, episodes, rows)
         manifest = manifest_row(profile, provenance, table, scores, episodes.dropped, **facts)
-        at = (
-            store.write(pa.Table.from_pylist([manifest], recording_schema()), table)
-            if store
-            else None
-        )
+        at, repeats = self._write(store, manifest, table) if store else (None, None)
         counts = {name: int(holds[rows.starts].sum()) for name, holds in rows.labels.items()}
         counts[NOMINAL] = first[NOMINAL]
         return IngestResult(
@@ -144,9 +148,25 @@ class _Ingest:
             scores,
             dict(Counter(episode.ended_by for episode in episodes.episodes).most_common()),
             self._lost_messages(steps),
-            self._notes(steps, table),
+            self._notes(steps, table, repeats),
             at,
+            repeats,
         )
+
+    def _write(
+        self, store: StoreWriter, manifest: dict[str, Any], table: pa.Table
+    ) -> tuple[int, Repeat | None]:
+        """The store's version with these rows, and a recording that has them under other ids."""
+        period_s = self.profile.task.control_period_s
+        if self.repeated == "refuse" and (found := store.repeated(table, period_s)):
+            raise RecordingError(
+                str(found),
+                where=self.path,
+                remedy="leave it out; --repeated keep ingests it all the same",
+            )
+        at = store.write(pa.Table.from_pylist([manifest], recording_schema()), table)
+        # Looked for after the commit: another process may have written the same drive meanwhile.
+        return at, store.repeated(table, period_s)
 
     def _messages(self) -> dict[str, int]:
         accounts = self.recording.accounts.values()
@@ -168,7 +188,7 @@ class _Ingest:
             for topic, count in steps.clock.off_clock.items()
         ]
 
-    def _notes(self, steps: Steps, table: pa.Table) -> list[str]:
+    def _notes(self, steps: Steps, table: pa.Table, repeats: Repeat | None) -> list[str]:
         clock = steps.clock
         notes = [*self.recording.notes, *steps.notes]
         if clock.pace is not None:
@@ -195,6 +215,8 @@ class _Ingest:
                 f"{far} of {len(residual)} commands are more than .25 from the nearest action "
                 f"(median {np.median(residual):.2f}, largest {residual.max():.2f}, scaled)"
             )
+        if repeats is not None:
+            notes.append(f"{repeats}; the audit `repeated_steps` fails until one is taken out")
         return notes
 
 

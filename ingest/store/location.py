@@ -177,6 +177,11 @@ class Location:
         with self.translate_errors(), self.files.open_input_file(path) as file:
             return pq.read_table(file, partitioning=None)
 
+    def read_schema(self, path: str) -> pa.Schema:
+        """A Parquet file's schema, with its metadata. Raises as `read` does."""
+        with self.translate_errors(), self.files.open_input_file(path) as file:
+            return pq.read_schema(file)
+
     def listing(self, folder: str) -> set[str]:
         """The files below a folder of the store, by their paths in that folder."""
         with self.translate_errors():

@@ -17,6 +17,7 @@ import random
 import re
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +32,15 @@ from restock.errors import StoreError
 from restock.files import first_line
 from restock.ingest.profile.custom_signal import refuse_other_signals
 from restock.ingest.store.location import Location
+from restock.ingest.store.repeated import (
+    SKETCH,
+    UNREADABLE,
+    Repeat,
+    Sketch,
+    find_repeat,
+    read_sketch,
+    sketch,
+)
 from restock.ingest.task.schema import recording_schema
 
 TRANSITIONS, RECORDINGS = "transitions", "recordings"
@@ -39,6 +49,7 @@ ATTEMPTS = 12  # at a commit, when other writers are faster; Delta's library tri
 # and a reader that opened an older version may be about to read them.
 RETENTION_HOURS = 7 * 24
 ROW_GROUP_ROWS = 32_768
+READERS = 16  # of small files at once, which on S3 are a wait each
 CHECKPOINT_COMMITS = 20  # a reader of the log opens at most so many files
 _JITTER = random.SystemRandom()
 T = TypeVar("T")
@@ -71,6 +82,26 @@ class StoreWriter:
         """One recording's transitions, as they were written."""
         return self.path.read(f"{TRANSITIONS}/{recording_id}/{ingest_id}.parquet")
 
+    def repeated(self, rows: pa.Table, period_s: float) -> Repeat | None:
+        """The recording that holds most of these rows under other ids, if one largely does.
+
+        `period_s` is the control period: rows further apart than half of it do not count.
+        Recordings that older software wrote are not looked at; the audit `repeated_steps` does.
+        """
+        if not self.path.has_table(TRANSITIONS):
+            return None
+        own = rows["recording_id"][0].as_py()
+        others = [f for f in _files(self.path.open_table(TRANSITIONS)) if f.recording_id != own]
+        with ThreadPoolExecutor(READERS) as pool:
+            sketches = list(pool.map(self._sketch, others))
+        return find_repeat(rows, sketches, self.rows, period_s)
+
+    def _sketch(self, file: _File) -> Sketch:
+        metadata = None
+        with suppress(*UNREADABLE):  # another recording, which `restock sql` reports
+            metadata = self.path.read_schema(f"{RECORDINGS}/{file.path}").metadata
+        return Sketch(file.recording_id, file.ingest_id, read_sketch(metadata))
+
     def write(self, manifest: pa.Table, rows: pa.Table) -> int:
         """Write one recording's manifest row and transitions, replacing its old ones.
 
@@ -101,6 +132,7 @@ class StoreWriter:
             for manifest, rows in recordings:
                 recording_id = manifest["recording_id"][0].as_py()
                 name = f"{recording_id}/{manifest['ingest_id'][0].as_py()}.parquet"
+                manifest = manifest.replace_schema_metadata({SKETCH: sketch(rows)})
                 self._create(RECORDINGS, recording_schema())
                 self._create(TRANSITIONS, _delta_schema(rows.schema))
                 for table, what, added in (

@@ -10,9 +10,6 @@ n a row has. Truncation is no termination: such a row bootstraps, with the n it 
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 # Raised when packing changes, of a row or of what stands beside it; part of a panel's id.
 PACKING_VERSION = 3
 
@@ -35,11 +32,3 @@ def row_columns(observation_size: int) -> dict[str, slice]:
 
 
 GOLDEN = 0x9E3779B97F4A7C15  # 2**64 over the golden ratio: the step between splitmix64's states
-
-
-def splitmix64(states: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """A mixing of 64-bit numbers (Steele, Lea and Flood, OOPSLA 2014), alike on every machine."""
-    mixed = (states ^ (states >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    result: NDArray[np.uint64] = mixed ^ (mixed >> np.uint64(31))
-    return result

@@ -10,10 +10,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from restock.arrays import Bools, Ints
+from restock.arrays import Bools, Ints, splitmix64
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import EvaluationSplit, Mixture
-from restock.replay.mixture.packed_row import GOLDEN, splitmix64
+from restock.replay.mixture.packed_row import GOLDEN
 from restock.replay.panel.candidates import bools, codes
 from restock.replay.panel.strata import NO_STRATUM, ResolvedStratum
 from restock.replay.store.query import repeated_rows

@@ -1,4 +1,7 @@
-"""Arrays by the type of their entries. Their shapes stand in comments, where they are declared."""
+"""Arrays by the type of their entries, and a mixing of their numbers.
+
+Their shapes stand in comments, where they are declared.
+"""
 
 from __future__ import annotations
 
@@ -10,4 +13,13 @@ F64 = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-__all__ = ["F32", "F64", "Bools", "Ints"]
+
+def splitmix64(states: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """A mixing of 64-bit numbers (Steele, Lea and Flood, OOPSLA 2014), alike on every machine."""
+    mixed = (states ^ (states >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    result: NDArray[np.uint64] = mixed ^ (mixed >> np.uint64(31))
+    return result
+
+
+__all__ = ["F32", "F64", "Bools", "Ints", "splitmix64"]

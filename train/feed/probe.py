@@ -16,7 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from restock.replay.mixture.packed_row import GOLDEN, splitmix64
+from restock.arrays import splitmix64
+from restock.replay.mixture.packed_row import GOLDEN
 from restock.replay.ring.ring import FreshRing
 from restock.train.dqn.learner import Learner
 from restock.train.dqn.target import value_lag

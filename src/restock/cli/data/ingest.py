@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -41,6 +41,10 @@ class IngestCommand:
     """Ingest unchanged recordings again, too."""
     salvage: bool = False
     """Read what is intact of truncated or damaged files (exit code 3)."""
+    repeated: Literal["keep", "refuse"] = "keep"
+    """What to do with a recording whose rows are largely those of another one in the store (a
+    part of it, a copy, a drive recorded again): keep it and say so (the audit `repeated_steps`
+    fails), or refuse it."""
     typestore: str | None = None
     """Distribution whose message definitions serve recordings without their own (humble)."""
     workers: int = 1
@@ -72,7 +76,7 @@ class IngestCommand:
         store = None if self.dry_run else self.store
         if store is not None:
             StoreWriter(store).reach()  # or say now why not, and not once a recording
-        job = IngestJob(profile, store, self.force, self.salvage, self.typestore)
+        job = IngestJob(profile, store, self.force, self.salvage, self.typestore, self.repeated)
         paths, failures = self._recordings()
         outcomes: list[dict[str, Any]] = []
         lossy = False
@@ -134,6 +138,7 @@ def as_json(outcome: IngestResult) -> dict[str, Any]:
         "endings": outcome.endings,
         "losses": outcome.lost_messages,
         "notes": outcome.notes,
+        "repeats": asdict(outcome.repeats) if outcome.repeats else None,
         **row,
     }
 

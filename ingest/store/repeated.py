@@ -1,0 +1,170 @@
+"""Whether a recording is already in the store under another id: a part of it, or a copy.
+
+Ids come from bytes, so a salvaged part, another cut or a drive that was replayed and recorded again
+has another one. Rows are compared by what they hold. Beside each manifest lies a sketch of its
+recording, the smallest hashes of its rows (bottom-k, Broder 1997), so that an ingest reads the rows
+of those recordings alone that look alike. The audit `repeated_steps` finds the same in SQL.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from restock.arrays import Bools, Ints, splitmix64
+from restock.errors import StoreError
+
+SKETCH = b"restock.sketch"  # key in the metadata of a manifest
+SKETCH_HASHES = 256
+LEAST_HASHES = 3  # that two recordings must share
+LARGELY = 0.5  # of the smaller recording's rows
+# Replaced meanwhile, or damaged: no fault of the recording that is being ingested.
+UNREADABLE = (OSError, StoreError, pa.ArrowException)
+PART_ROWS = 8192  # hashed at a time: bounds memory
+_LARGE = 2e15  # what stands for infinity
+Hashes = NDArray[np.uint64]
+
+
+@dataclass(frozen=True)
+class Repeat:
+    """A recording of the store that holds the same rows."""
+
+    recording_id: str
+    source_file: str
+    rows: int  # of the new recording that it holds too
+    share: float  # of the new recording's rows
+    share_of_other: float  # of its own rows
+
+    def __str__(self) -> str:
+        return (
+            f"{self.rows:,} transitions ({self.share:.0%}) are those of {self.source_file}"
+            f" (recording {self.recording_id}, {self.share_of_other:.0%} of it) under other ids:"
+            " the same drive twice"
+        )
+
+
+@dataclass(frozen=True)
+class Sketch:
+    """The smallest hashes of a stored recording, (k,) ascending, and where its rows are."""
+
+    recording_id: str
+    ingest_id: str
+    hashes: Hashes
+
+
+def sketch(rows: pa.Table) -> bytes:
+    """The sketch of a recording's transitions, for `SKETCH`."""
+    return distinctive_hashes(rows)[:SKETCH_HASHES].astype("<u8").tobytes().hex().encode()
+
+
+def read_sketch(metadata: dict[bytes, bytes] | None) -> Hashes:
+    """Of a manifest's metadata; empty where older software wrote it."""
+    text = (metadata or {}).get(SKETCH, b"").decode()
+    return np.frombuffer(bytes.fromhex(text), "<u8")
+
+
+def row_hashes(rows: pa.Table) -> Hashes:
+    """A hash of each row's task, action, observation and pose, (N,), to a thousandth."""
+    parts = [_hashes(rows.slice(first, PART_ROWS)) for first in range(0, len(rows), PART_ROWS)]
+    return np.concatenate([np.zeros(0, np.uint64), *parts])
+
+
+def _hashes(rows: pa.Table) -> Hashes:
+    count = len(rows)
+    observation = rows["observation"].combine_chunks().flatten().to_numpy(zero_copy_only=False)
+    pose = [rows[name].to_numpy()[:, None] for name in ("pose_x_m", "pose_y_m")]
+    numbers = np.concatenate([observation.reshape(count, -1), *pose], axis=1, dtype=np.float64)
+    numbers = np.nan_to_num(numbers * 1000, posinf=_LARGE, neginf=-_LARGE).clip(-_LARGE, _LARGE)
+    whole = np.concatenate(
+        [np.rint(numbers).astype(np.int64), rows["action"].to_numpy()[:, None]], axis=1
+    ).view(np.uint64)
+    factors = splitmix64(np.arange(1, whole.shape[1] + 1, dtype=np.uint64)) | np.uint64(1)
+    total = (whole * factors).sum(axis=1, dtype=np.uint64)
+    tasks = rows["task_hash"].combine_chunks().dictionary_encode()
+    seeds = [hashlib.blake2b(str(t).encode(), digest_size=8).digest() for t in tasks.dictionary]
+    total ^= np.frombuffer(b"".join(seeds), "<u8")[tasks.indices.to_numpy()]
+    return splitmix64(total)  # mixed: the smallest are a random sample of the rows
+
+
+def looks_alike(mine: Hashes, other: Sketch) -> bool:
+    """Whether the rows (N,) and a sketch may be largely the same."""
+    if not len(other.hashes):
+        return False
+    # Below its largest hash, a full sketch has all of its recording's.
+    full = len(other.hashes) == SKETCH_HASHES
+    compared = mine[mine <= other.hashes[-1]] if full else mine
+    both = len(np.intersect1d(compared, other.hashes))
+    least = min(len(compared), len(other.hashes))
+    return both >= LEAST_HASHES and both >= LARGELY / 2 * least
+
+
+def compare(rows: pa.Table, other: pa.Table, period_s: float) -> Repeat | None:
+    """What the new rows have in common with those of another recording, if they largely do.
+
+    One constant shift between the stamps of the two is taken out; rows further apart than half a
+    control period do not count.
+    """
+    mine, at = _distinctive(row_hashes(rows))
+    theirs, there = _distinctive(row_hashes(other))
+    _, here, where = np.intersect1d(mine, theirs, assume_unique=True, return_indices=True)
+    if not len(here):
+        return None
+    later = _stamps(rows)[at[here]] - _stamps(other)[there[where]]
+    shift = np.sort(later)[len(later) // 2]
+    same = int((np.abs(later - shift) <= period_s * 1e9 / 2).sum())
+    least = min(len(mine), len(theirs))
+    if same < LEAST_HASHES or same < LARGELY * least:
+        return None
+    return Repeat(
+        str(other["recording_id"][0]),
+        str(other["source_file"][0]),
+        same,
+        same / len(rows),
+        same / len(other),
+    )
+
+
+def find_repeat(
+    rows: pa.Table,
+    sketches: Iterable[Sketch],
+    read: Callable[[str, str], pa.Table],
+    period_s: float,
+) -> Repeat | None:
+    """The recording that holds the most of the rows, of those that `compare` finds the same.
+
+    `read(recording_id, ingest_id)` gives the rows of one whose sketch looks alike.
+    """
+    mine = distinctive_hashes(rows)
+    found = []
+    for one in sketches:
+        if looks_alike(mine, one):
+            with suppress(*UNREADABLE):
+                other = read(one.recording_id, one.ingest_id)
+                found.append(compare(rows, other, period_s))
+    return max(
+        (repeat for repeat in found if repeat is not None),
+        key=lambda repeat: (repeat.rows, repeat.recording_id),
+        default=None,
+    )
+
+
+def distinctive_hashes(rows: pa.Table) -> Hashes:
+    """The hashes of the rows that look like no other of their recording, ascending."""
+    return _distinctive(row_hashes(rows))[0]
+
+
+def _distinctive(hashes: Hashes) -> tuple[Hashes, Ints]:
+    """Hashes that occur once, ascending, and their rows. A robot that stands proves nothing."""
+    found, first, counts = np.unique(hashes, return_index=True, return_counts=True)
+    once: Bools = counts == 1
+    return found[once], first[once].astype(np.int64)
+
+
+def _stamps(rows: pa.Table) -> Ints:
+    return np.asarray(rows["stamp_ns"].to_numpy(), np.int64)

@@ -1,0 +1,108 @@
+"""An ingest says, or refuses, a recording whose rows are in the store under another id."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from support.paths import ROOT, SHARED
+from support.stores import manifest, recording_transitions
+
+from restock.cli import main
+from restock.ingest.store.repeated import SKETCH_HASHES, row_hashes
+from restock.ingest.store.writer import StoreWriter
+
+MONDAY = ROOT / "sample_logs" / "amr_monday.mcap"
+NEATO = SHARED / "fleet-neato"
+
+
+def ingested(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> dict[str, Any]:
+    """What `restock ingest … --json` says of one recording."""
+    capsys.readouterr()
+    main(["ingest", *map(str, arguments), "--json"])
+    (one,) = json.loads(capsys.readouterr().out)["recordings"]
+    return dict(one)
+
+
+@pytest.fixture(scope="module")
+def part(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first fifth of a recording, as a crash would leave it."""
+    path = tmp_path_factory.mktemp("part") / "part.mcap"
+    content = MONDAY.read_bytes()
+    path.write_bytes(content[: len(content) // 5])
+    return path
+
+
+def test_the_whole_after_a_part_is_said(
+    part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = tmp_path / "store"
+    first = ingested(capsys, part, "--salvage", "--store", store)
+    assert first["repeats"] is None
+    whole = ingested(capsys, MONDAY, "--store", store)
+    assert whole["status"] == "written"
+    assert whole["repeats"] == {
+        "recording_id": first["recording_id"],
+        "source_file": str(part),
+        "rows": first["transitions"],
+        "share": first["transitions"] / whole["transitions"],
+        "share_of_other": 1.0,
+    }
+    assert any(str(part) in note and "same drive twice" in note for note in whole["notes"])
+
+
+def test_a_part_after_the_whole_is_refused_where_asked(
+    part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = tmp_path / "store"
+    whole = ingested(capsys, MONDAY, "--store", store)
+    refuse = ["ingest", str(part), "--salvage", "--store", str(store), "--repeated", "refuse"]
+    assert main(refuse) == 2
+    error = capsys.readouterr().err
+    assert whole["recording_id"] in error
+    assert "--repeated keep" in error
+    assert len(StoreWriter(store).live()) == 1
+    # Ingesting the very recording again replaces its own rows: that is no repeat.
+    again = ingested(capsys, MONDAY, "--store", store, "--force", "--repeated", "refuse")
+    assert again["status"] == "written"
+    assert again["repeats"] is None
+
+
+@pytest.mark.skipif(not NEATO.is_dir(), reason="needs ../shared/bags/fleet-neato")
+def test_a_drive_that_was_replayed_and_recorded_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    profile, store = tmp_path / "neato.toml", tmp_path / "store"
+    (original,) = (NEATO / "2022-original").iterdir()
+    assert main(["profile", "new", str(original), "--out", str(profile)]) == 0
+    first = ingested(capsys, original, "--profile", profile, "--store", store)
+    replayed = ingested(capsys, NEATO / "2023-replayed", "--profile", profile, "--store", store)
+    assert replayed["repeats"]["recording_id"] == first["recording_id"]
+    assert replayed["repeats"]["share"] > 0.95
+
+
+def test_other_drives_are_not_repeats(tmp_path: Path) -> None:
+    store = StoreWriter(tmp_path / "store")
+    for index in (1, 2):
+        rows = recording_transitions(index, episodes=40)
+        assert len(rows) > 2 * SKETCH_HASHES
+        assert store.repeated(rows, 0.2) is None
+        store.write(manifest(rows), rows)
+
+
+def test_hashes_see_a_thousandth_and_no_less() -> None:
+    rows = recording_transitions(1)
+    place = rows.schema.get_field_index("observation")
+
+    def moved(by: float) -> pa.Table:
+        values = np.round(np.stack(rows["observation"].to_numpy()), 3)
+        values[:, 3] += by
+        column = pa.array(list(values.astype(np.float32)), rows.schema.field(place).type)
+        return rows.set_column(place, rows.schema.field(place), column)
+
+    assert (row_hashes(moved(0.0)) == row_hashes(moved(0.0002))).all()
+    assert (row_hashes(moved(0.0)) != row_hashes(moved(0.0011))).all()
