@@ -14,6 +14,7 @@ import pytest
 from restock.cli import main
 from restock.train.dqn.config import TrainConfig
 from restock.train.run.run import Run
+from restock.train.study.study import as_markdown
 
 UPDATES, ENV_STEPS = 10_000, 40_000
 EXTRA = ("update_path",)
@@ -56,10 +57,11 @@ def make_run(
     updates: int = UPDATES,
     fresh_episodes: int = 4000,
     first_episode_seed: int = 90_000,
+    episodes: int = 40,
 ) -> Path:
     """A finished run: half its rows from logs by quota, half fresh, each episode of one kind."""
     seed = whole["config"]["seed"]
-    rng = np.random.default_rng([seed, round(1000 * success)])
+    rng = np.random.default_rng([seed, abs(round(1000 * success))])
     run = Run.create(path, whole)
     for part in range(1, 11):
         clocks = {"env_steps": ENV_STEPS * part // 10, "gradient_steps": updates * part // 10}
@@ -96,7 +98,7 @@ def make_run(
             },
         )
     for condition, bonus in (("nominal", 0.2), ("wheel_slip", 0.0)):
-        won = rng.random(40) < success + bonus
+        won = rng.random(episodes) < success + bonus
         run.append_columns(
             "evaluations",
             {
@@ -104,7 +106,7 @@ def make_run(
                 "gradient_steps": updates,
                 "condition": condition,
                 "block": "none",
-                "episode_seed": first_episode_seed + np.arange(40),
+                "episode_seed": first_episode_seed + np.arange(episodes),
                 "success": won,
                 "bumps": 0,
                 "time_s": 10.0,
@@ -238,6 +240,47 @@ def test_few_episodes_are_inconclusive_and_more_seeds_are_asked_for(tmp_path, ca
     said = " ".join(capsys.readouterr().err.split())
     assert "REFUSED, inconclusive: too few episodes" in said
     assert "add seeds" in said
+
+
+def test_a_run_against_itself_is_comparable_by_identity(tmp_path, capsys) -> None:
+    (run,) = arm(tmp_path, "a", range(2, 3), fresh_episodes=400)  # too few for any other run
+    assert main(["compare", run, run, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["verdict"], found["identical"]) == ("comparable", True)
+    assert {row["difference"] for row in found["outcomes"]} == {0.0}
+    assert main(["compare", run, str(Path(run) / ".." / Path(run).name)]) == 0
+    assert "COMPARABLE: both sides are the same runs" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize(
+    ("seeds", "episodes", "why"),
+    [
+        (1, 40, "1 run an arm, at least 3 are needed"),
+        (2, 40, "2 runs an arm, at least 3 are needed"),
+        (3, 1, "1 episode, at least 10 are needed"),
+        (3, 40, "every run ended every episode alike: resamples do not vary"),
+    ],
+)
+def test_too_little_gives_values_without_intervals(tmp_path, capsys, seeds, episodes, why) -> None:
+    given = {"episodes": episodes}
+    first = arm(tmp_path, "a", range(seeds), success=2.0, **given)
+    second = arm(tmp_path, "b", range(3, 3 + seeds), success=-1.0, **given)
+    code, found = compared(capsys, first, second, "--treatment", "mixture")
+    assert code == 0
+    for row in found["outcomes"]:
+        assert row["difference"] == -1.0
+        assert (row["difference_low"], row["difference_high"]) == (None, None)
+        assert row["no_interval"] == why
+    assert main(["compare", *first, "--against", *second, "--treatment", "mixture"]) == 0
+    shown = capsys.readouterr()
+    assert "-1.00" in shown.out
+    assert "[-1.00" not in shown.out
+    assert why in " ".join(shown.err.split())
+    names = {"arm": "b", "baseline": "a", **found}
+    study = {"doc": "", "runs": {"a": first, "b": second}, "seeds": [0], "comparisons": [names]}
+    page = as_markdown(study)
+    assert "| -1.00 |" in page
+    assert "**" not in page
 
 
 def test_people_read_what_differs_and_why_it_is_refused(tmp_path, capsys) -> None:

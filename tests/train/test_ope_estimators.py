@@ -141,6 +141,7 @@ def test_doubly_robust_mends_a_wrong_model_and_the_model_alone_stays_wrong() -> 
     wrong = np.where(np.arange(STATES)[:, None] == STATES - 1, 0.0, CHAIN.q(TARGET) + 0.5)
     answers = {e.estimator: e for e in _estimates(logged(4000, 2, wrong))}
     assert answers["fqe"].value == pytest.approx(TRUTH + 0.5, abs=1e-6)
+    assert (answers["fqe"].low, answers["fqe"].high) == (None, None)  # it would leave that .5 out
     assert answers["wdr"].value == pytest.approx(TRUTH, abs=0.05)
 
 

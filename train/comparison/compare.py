@@ -5,8 +5,9 @@ differs, unless the feed is what is compared (`treatment="mixture"`).
 
 Outcomes are differences with intervals, paired by episode. Runs (seeds) are resampled within each
 arm and episodes jointly for both (the pairing), so that an interval holds both what another seed
-and what other episodes would have changed. The probability of improvement and the interquartile
-mean are those of arXiv:2108.13264.
+and what other episodes would have changed. From fewer than `LEAST_RUNS` runs an arm or
+`LEAST_EPISODES` episodes there is none, nor where every resample is the same: only values. The
+probability of improvement and the interquartile mean are those of arXiv:2108.13264.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import pyarrow as pa
 
 from restock.arrays import F64
 from restock.errors import RunError
-from restock.stats import difference_of_arms, iqm, probability_of_improvement
+from restock.stats import ConfidenceInterval, difference_of_arms, iqm, probability_of_improvement
 from restock.train.comparison.arms import ALLOWED, Arm, Difference, Treatment, differences, feeds
 from restock.train.comparison.comparability import (
     Check,
@@ -35,6 +36,8 @@ from restock.train.run.run import Run
 
 Cell = tuple[str, str]  # perturbation, condition (with the kind of block)
 _SAME_TOTAL = 1.02  # ratio of environment steps, and of updates
+LEAST_RUNS = 3  # seeds of each arm, and …
+LEAST_EPISODES = 10  # … of a cell, that both arms drove: fewer give no interval
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,7 @@ class Comparison:
     checks: list[Check]  # of the feed
     source: str | None  # of the outcomes: restock eval, or the training's own evaluations
     rows: list[dict[str, Any]]
+    identical: bool = False  # both arms are the same runs: comparable whatever the checks show
 
     @property
     def deciding_checks(self) -> list[Check]:
@@ -60,6 +64,7 @@ class Comparison:
         return {
             "treatment": self.treatment,
             "verdict": self.verdict,
+            "identical": self.identical,
             "refused": [difference.setting for difference in self.refused],
             "differences": [asdict(difference) for difference in self.differences],
             "checks": [
@@ -80,6 +85,8 @@ def compare(
 ) -> Comparison:
     """Compare the runs of two arms.
 
+    The same runs on both sides are comparable by identity.
+
     Raises:
         RunError: a run is missing, has no updates, or does not belong to its arm.
     """
@@ -91,9 +98,18 @@ def compare(
     totals = [_total(name, *(arm.totals[name] for arm in arms)) for name in arms[0].totals]
     checks = check_feeds(*feeds(*arms), limits, rng)
     deciding = _deciding(treatment, totals, checks)
+    identical = _paths(arms[0]) == _paths(arms[1])
     verdict = "incomparable" if refused else worst([check.verdict for check in deciding])
+    if identical:  # what was fed is the same by identity: there is nothing to estimate
+        verdict = "comparable"
     source, rows = _outcomes(*arms, rng) if verdict == "comparable" else (None, [])
-    return Comparison(treatment, verdict, differing, refused, totals, checks, source, rows)
+    return Comparison(
+        treatment, verdict, differing, refused, totals, checks, source, rows, identical
+    )
+
+
+def _paths(arm: Arm) -> set[Path]:
+    return {run.path.resolve() for run in arm.runs}
 
 
 def _deciding(treatment: Treatment, totals: list[Check], checks: list[Check]) -> list[Check]:
@@ -143,6 +159,7 @@ def _outcome(
     rng: np.random.Generator,
 ) -> dict[str, Any]:
     difference = difference_of_arms(a[..., 0], b[..., 0], rng=rng)
+    missing = _why_no_interval(a, b, difference)
     # Episode by episode, over all pairs of runs.
     better = [
         probability_of_improvement(b[:, index, 1], a[:, index, 1]) for index in range(a.shape[1])
@@ -154,11 +171,24 @@ def _outcome(
         "runs": [len(a), len(b)],
         "success": [float(a[..., 0].mean()), float(b[..., 0].mean())],
         "difference": difference.value,
-        "difference_low": difference.low,
-        "difference_high": difference.high,
+        "difference_low": None if missing else difference.low,
+        "difference_high": None if missing else difference.high,
+        "no_interval": missing,
         "return_iqm": [iqm(a[..., 1]), iqm(b[..., 1])],
         "improvement": float(np.mean(better)),
     }
+
+
+def _why_no_interval(a: F64, b: F64, difference: ConfidenceInterval) -> str | None:
+    """What an interval would claim too much of, or None. A, b as of `_outcome`."""
+    runs, episodes = min(len(a), len(b)), a.shape[1]
+    if runs < LEAST_RUNS:
+        return f"{runs} run{'s' * (runs > 1)} an arm, at least {LEAST_RUNS} are needed"
+    if episodes < LEAST_EPISODES:
+        return f"{episodes} episode{'s' * (episodes > 1)}, at least {LEAST_EPISODES} are needed"
+    if difference.low == difference.high:
+        return "every run ended every episode alike: resamples do not vary"
+    return None
 
 
 def _scores(tables: Iterable[pa.Table]) -> dict[Cell, dict[int, F64]]:

@@ -166,7 +166,7 @@ class OpeEstimate:
 
     estimator: str
     value: float | None
-    low: float | None = None  # None: a single episode has no interval
+    low: float | None = None  # None: a single episode has no interval, nor has FQE
     high: float | None = None
     refused: str | None = None
 
@@ -182,8 +182,8 @@ def estimate(
 ) -> list[OpeEstimate]:
     """Every estimator, with a percentile bootstrap interval over whole episodes.
 
-    The interval holds what other episodes would have changed. The model was fitted on others and
-    stays as it is, so what is wrong with it is in no interval.
+    The interval holds what other episodes would have changed. FQE has none: it is the model's word
+    on the starts, and an interval over them would leave out what is wrong with the model.
     """
     near = logged.until(horizon)
     refused = gate.refusal(near)
@@ -199,8 +199,10 @@ def estimate(
             answers.append(OpeEstimate(name, None, refused=refused))
             continue
         value = float(estimator(of, once(len(logged)))[0])
-        draws = estimator(of, counts)
-        interval = percentiles(draws, confidence) if len(logged) > 1 else (None, None)
+        if name == FQE or len(logged) < 2:
+            answers.append(OpeEstimate(name, value))
+            continue
+        interval = percentiles(estimator(of, counts), confidence)
         answers.append(OpeEstimate(name, value, *interval))
     return answers
 

@@ -168,7 +168,11 @@ TABLES: dict[str, pa.Schema] = {
         ("condition", _S, "of the episode, or all"),
         ("estimator", _S, "logged | fqe | pdwis | wdr"),
         ("value", _F, "the estimate; null where it is refused"),
-        ("low", _F, "lower end of its 95 % interval, over episodes"),
+        (
+            "low",
+            _F,
+            "lower end of its 95 % interval, over episodes; null of fqe",
+        ),
         ("high", _F, "upper end"),
         ("refused", _S, "why, or null"),
         ("episodes", _I, "of the logs"),

@@ -12,7 +12,7 @@ import msgspec
 
 from restock.toml import Checked, read_toml, typed
 from restock.train.comparison.arms import Treatment
-from restock.train.comparison.compare import Comparison
+from restock.train.comparison.compare import LEAST_EPISODES, LEAST_RUNS, Comparison
 from restock.train.dqn.config import as_overrides
 from restock.train.libraries.library_arm import Library
 
@@ -200,7 +200,9 @@ def as_markdown(study: dict[str, Any]) -> str:
     lines += [study["doc"], ""] if study["doc"] else []
     lines += [
         f"Seeds of each arm: {', '.join(map(str, study['seeds']))}. All are evaluated on the same"
-        " episodes. Intervals are 95 %, over seeds and episodes; bold where they exclude 0.",
+        " episodes. Intervals are 95 %, over seeds and episodes; bold where they exclude 0. From"
+        f" fewer than {LEAST_RUNS} seeds or {LEAST_EPISODES} episodes, and where resamples do not"
+        " vary, there are values alone.",
     ]
     for comparison in study["comparisons"]:
         baseline, treatment = comparison["baseline"], comparison["treatment"]
@@ -218,11 +220,13 @@ def as_markdown(study: dict[str, Any]) -> str:
         ]
         for row in comparison["outcomes"]:
             low, high = row["difference_low"], row["difference_high"]
-            apart = "**" if low > 0 or high < 0 else ""
+            known = low is not None
+            apart = "**" if known and (low > 0 or high < 0) else ""
+            interval = f" [{low:+.2f}, {high:+.2f}]" if known else ""
             lines.append(
                 f"| {row['perturbation']} | {row['condition']} | {row['success'][0]:.2f}"
                 f" | {row['success'][1]:.2f} | {apart}{row['difference']:+.2f}"
-                f" [{low:+.2f}, {high:+.2f}]{apart} | {row['improvement']:.2f} |"
+                f"{interval}{apart} | {row['improvement']:.2f} |"
             )
     return "\n".join(lines) + "\n"
 

@@ -94,6 +94,9 @@ def _show(comparison: Comparison, all_checks: bool) -> None:
             [_outcome(row) for row in comparison.rows],
             title=f"success on the same episodes, from {of}",
         )
+        for reason in dict.fromkeys(row["no_interval"] for row in comparison.rows):
+            if reason is not None:
+                say(f"no interval: {reason}")
 
 
 def _check(check: Any) -> dict[str, Any]:
@@ -117,12 +120,15 @@ def _outcome(row: dict[str, Any]) -> dict[str, Any]:
         "episodes": row["episodes"],
         "first": f"{row['success'][0]:.2f}",
         "second": f"{row['success'][1]:.2f}",
-        "difference [95 %]": f"{row['difference']:+.2f} [{low:+.2f}, {high:+.2f}]",
+        "difference [95 %]": f"{row['difference']:+.2f}"
+        + ("" if low is None else f" [{low:+.2f}, {high:+.2f}]"),
         "P(second better)": f"{row['improvement']:.2f}",
     }
 
 
 def _sentence(comparison: Comparison) -> str:
+    if comparison.identical:
+        return "COMPARABLE: both sides are the same runs, which differ in nothing"
     if comparison.verdict == "comparable":
         what = {
             "mixture": "settings, steps",

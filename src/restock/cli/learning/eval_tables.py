@@ -40,6 +40,11 @@ def show_off_policy(path: Path, result: OpeResult, config: OpeConfig, *, as_json
         if row["condition"] == "all" and row["estimator"] == "pdwis" and row["refused"]:
             longest = f"; --horizon {row['ess_steps']} is enough" if row["ess_steps"] else ""
             say(f"{row['measure']}: pdwis and wdr are refused: {row['refused']}{longest}")
+    if any(row["estimator"] == "fqe" for row in result.rows):
+        say(
+            "fqe is the fitted model's value of the starts: it has no interval, since how wrong the"
+            " model is cannot be told from these logs"
+        )
     estimated = result.rows[0]["estimated_share"] if result.rows else 0.0
     if estimated:
         say(
