@@ -39,6 +39,7 @@ def recordings_in(path: Path | str) -> list[Path]:
     path = Path(path)
     if path.is_file():
         return [path]
+    _refuse_special(path)
     if path.is_dir():
         recordings = _in_folder(path)
         if not recordings:
@@ -49,10 +50,26 @@ def recordings_in(path: Path | str) -> list[Path]:
             )
         return recordings
     matches = sorted(Path(name) for name in glob.glob(str(path), recursive=True))  # noqa: PTH207
-    if matches:
-        every = [item for match in matches for item in _matched(match)]
-        return list(dict.fromkeys(every))
+    every = list(dict.fromkeys(item for match in matches for item in _matched(match)))
+    if matches and not every:
+        raise RecordingError(
+            f"none of the {len(matches):,} files and folders that match is a recording",
+            where=str(path),
+            remedy=f"recordings end in {', '.join(ENDINGS[:3])} or are rosbag2 folders",
+        )
+    if every:
+        return every
     raise RecordingError("no such file or folder", where=str(path))
+
+
+def _refuse_special(path: Path) -> None:
+    """Reading a pipe, a socket or a device would wait, or never end."""
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise RecordingError(
+            "a pipe, a socket or a device, not a file",
+            where=str(path),
+            remedy="write it to a file first: recordings are read from several places at once",
+        )
 
 
 def _matched(match: Path) -> list[Path]:
@@ -176,6 +193,7 @@ def kind_of(path: Path) -> Kind | Literal["zstd"]:
         RecordingError: it is missing, empty, a Git LFS pointer or not a recording.
     """
     where = str(path)
+    _refuse_special(path)
     try:
         with path.open("rb") as file:
             head = file.read(64)

@@ -233,13 +233,15 @@ def walked_messages(part: bytes | memoryview) -> tuple[Positions, str | None]:
     length_at = struct.Struct("<xQ").unpack_from  # after the opcode
     position, end = 0, len(part)
     last = end - (PREFIX + 2)
-    while position <= last:
+    while position <= last and part[position]:  # no record has opcode 0
         note(position)
         position += PREFIX + length_at(part, position)[0]
     if position > end:  # the last record is not whole
         position = places.pop()
     cut = None
-    if (
+    if position < end and not part[position]:
+        cut = f"zeros or noise, {end - position:,} bytes before its end"
+    elif (
         position != end
         and position + PREFIX + int.from_bytes(part[position + 1 : position + PREFIX], "little")
         != end

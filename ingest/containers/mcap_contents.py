@@ -7,20 +7,28 @@ there is in a file with a wrong summary, or none. See https://mcap.dev/spec.
 
 from __future__ import annotations
 
-import mmap
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from restock.ingest.containers.mcap_chunk import HEAD_SIZE, Chunk, Definitions
-from restock.ingest.containers.mcap_records import MAGIC, PREFIX, Malformed, Op, parse, walk
+from restock.ingest.containers.mcap_records import (
+    MAGIC,
+    PREFIX,
+    FileBytes,
+    Malformed,
+    Op,
+    parse,
+    walk,
+)
 from restock.ingest.containers.storage import Extra
 
-FORGET_BYTES = 64 << 20  # read this much, then release it
 # What the survey keeps is bounded, whatever a file is made of.
 MOST_CHUNKS = 1_000_000
 MOST_NAMED = 10_000  # attachments and metadata records; the others are counted
 MOST_DAMAGED = 100
+MOST_OTHERS = 1_000_000  # records beside those of messages
+_MANY = (Op.MESSAGE, Op.CHUNK, Op.MESSAGE_INDEX, Op.CHUNK_INDEX)
 
 
 class Statistics(NamedTuple):
@@ -67,17 +75,19 @@ class Contents:
         self.chunks = [replace(chunk, index={}) for chunk in self.chunks]
 
 
-def survey(file: mmap.mmap) -> Contents:
+def survey(file: FileBytes) -> Contents:
     """Walk the file's top-level records."""
     contents = Contents()
     end = len(file)
     finished = False
-    walked = 0
+    others = 0
     try:
         for opcode, at, stop in walk(file, len(MAGIC), end):
-            if at - walked > FORGET_BYTES:
-                forget(file, walked, at)
-                walked = at
+            others += opcode not in _MANY
+            if others > MOST_OTHERS:
+                raise Malformed(
+                    f"more than {MOST_OTHERS:,} records of other kinds than messages", at
+                )
             if opcode == Op.FOOTER:
                 finished = file[stop : stop + len(MAGIC)] == MAGIC
                 break
@@ -97,7 +107,7 @@ def survey(file: mmap.mmap) -> Contents:
     return contents
 
 
-def take_record(contents: Contents, file: mmap.mmap, opcode: int, at: int, stop: int) -> None:
+def take_record(contents: Contents, file: FileBytes, opcode: int, at: int, stop: int) -> None:
     """Add a top-level record, whose content is file[at:stop].
 
     Raises:
@@ -130,7 +140,7 @@ def take_record(contents: Contents, file: mmap.mmap, opcode: int, at: int, stop:
         contents.profile = parse(Op.HEADER, file, at, stop)["profile"]
 
 
-def statistics_at(file: mmap.mmap, at: int, stop: int) -> Statistics:
+def statistics_at(file: FileBytes, at: int, stop: int) -> Statistics:
     """The statistics record whose content is file[at:stop]."""
     record = parse(Op.STATISTICS, file, at, stop)
     return Statistics(record["message_count"], record["channel_message_counts"])
@@ -143,7 +153,7 @@ def _name(contents: Contents, extra: Extra) -> None:
         contents.unnamed += 1
 
 
-def _chunk(file: mmap.mmap, at: int, stop: int) -> Chunk:
+def _chunk(file: FileBytes, at: int, stop: int) -> Chunk:
     record = parse(Op.CHUNK, file, at, stop)
     return Chunk(
         at,
@@ -156,7 +166,7 @@ def _chunk(file: mmap.mmap, at: int, stop: int) -> Chunk:
     )
 
 
-def cut_chunk_at(file: mmap.mmap, at: int, end: int) -> Chunk | None:
+def cut_chunk_at(file: FileBytes, at: int, end: int) -> Chunk | None:
     """The chunk at a place, whatever its record's length field is: its fields, and what there is of
     its records before `end`. None where that is nothing."""
     if at < 0 or at + PREFIX + 40 > end or file[at] != Op.CHUNK:
@@ -174,17 +184,3 @@ def cut_chunk_at(file: mmap.mmap, at: int, end: int) -> Chunk | None:
     stored = int.from_bytes(file[records - 8 : records], "little")
     stop = min(records + stored, end)
     return Chunk(at, records, stop, size, crc, compression, (start_ns, end_ns))
-
-
-def forget(file: mmap.mmap, start: int = 0, stop: int | None = None) -> None:
-    """Release the pages of file[start:stop]; reading them again brings them back.
-
-    Until then each page that was read counts as this process' memory, whatever the system's
-    cache does with it: a large recording would look like a leak, and hit a limit like one.
-    """
-    if not hasattr(mmap, "MADV_DONTNEED"):  # no such advice on this system
-        return
-    low = -(-start // mmap.PAGESIZE) * mmap.PAGESIZE
-    high = len(file) if stop is None else min(stop // mmap.PAGESIZE * mmap.PAGESIZE, len(file))
-    if low < high:
-        file.madvise(mmap.MADV_DONTNEED, low, high - low)

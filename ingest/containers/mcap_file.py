@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import mmap
 import zlib
 from collections.abc import Collection, Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +12,9 @@ from numpy.typing import NDArray
 from restock.errors import RecordingError
 from restock.ingest.containers import mcap_chunk
 from restock.ingest.containers.mcap_chunk import LATEST_NS, Chunk, Messages
-from restock.ingest.containers.mcap_contents import FORGET_BYTES, forget, survey
+from restock.ingest.containers.mcap_contents import survey
 from restock.ingest.containers.mcap_group import Checks, ChunkReader, batch_of
-from restock.ingest.containers.mcap_records import MAGIC
+from restock.ingest.containers.mcap_records import MAGIC, PREFIX, FileBytes
 from restock.ingest.containers.mcap_salvage import resume
 from restock.ingest.containers.storage import Integrity
 from restock.ingest.decoding.messages import Channel, MessageBatch
@@ -35,11 +33,9 @@ class McapFile:
         self.path = path
         self._checks = Checks()
         self.damage, self.notes = self._checks.damage, self._checks.notes
-        with path.open("rb") as file:
-            self._file = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        self._file = FileBytes(path)
         if self._file[: len(MAGIC)] != MAGIC:
             raise RecordingError("not an MCAP file: its first bytes are wrong", where=str(path))
-        self._buffer: NDArray[np.uint8] = np.frombuffer(self._file, np.uint8)
         self._contents = survey(self._file)
         self.profile = self._contents.profile
         for what in self._contents.damaged:
@@ -107,7 +103,7 @@ class McapFile:
         contents = self._contents
         # A chunk without messages has the span 0 to 0.
         spans = [chunk.span_ns for chunk in contents.chunks if any(chunk.span_ns)]
-        for _, messages in self._loose(contents.loose):
+        for _, _, messages in self._loose(contents.loose):
             stamps = messages.log_time_ns
             spans.append((int(stamps.min()), int(stamps.max())))
         if not spans or not any(self.counts.values()):
@@ -129,10 +125,9 @@ class McapFile:
             self._checks.unchecked += 1
             return
         computed = 0
-        for start in range(0, position, FORGET_BYTES):
-            stop = min(start + FORGET_BYTES, position)
-            computed = zlib.crc32(self._buffer[start:stop].data, computed)
-            forget(self._file, start, stop)
+        for start in range(0, position, GROUP_BYTES):
+            stop = min(start + GROUP_BYTES, position)
+            computed = zlib.crc32(self._file[start:stop], computed)
         if computed == crc:
             self._checks.verified += 1
         else:
@@ -149,13 +144,14 @@ class McapFile:
         loose = wanted & self._contents.loose.keys()
         if loose:
             self._check_loose()
-        for channel, messages in self._loose(loose):
-            yield channel, batch_of(self._buffer, [messages])
+        for channel, buffer, messages in self._loose(loose):
+            yield channel, batch_of(buffer, [messages])
         for group in self._groups(wanted):
             yield from self._chunks.read(group, wanted)
-            forget(self._file, group[0].at, group[-1].stop)
 
-    def _loose(self, channels: Collection[int]) -> Iterator[tuple[int, Messages]]:
+    def _loose(
+        self, channels: Collection[int]
+    ) -> Iterator[tuple[int, NDArray[np.uint8], Messages]]:
         """These channels' messages outside chunks, from about 8 MiB of the file at a time."""
         places = {c: np.asarray(self._contents.loose[c], np.int64) for c in sorted(channels)}
         if not places:
@@ -163,11 +159,16 @@ class McapFile:
         end = max(int(at[-1]) for at in places.values()) + 1
         for start in range(min(int(at[0]) for at in places.values()), end, GROUP_BYTES):
             stop = start + GROUP_BYTES
-            for channel, at in places.items():
-                low, high = np.searchsorted(at, (start, stop)).tolist()
-                if low < high:
-                    yield channel, mcap_chunk.messages_at(self._buffer, at[low:high])
-            forget(self._file, start, stop)
+            some = {
+                channel: at[low:high]
+                for channel, at in places.items()
+                for low, high in [np.searchsorted(at, (start, stop)).tolist()]
+                if low < high
+            }
+            ends = [_record_end(self._file, int(at[-1])) for at in some.values()]
+            buffer = np.frombuffer(self._file[start : max(ends, default=start)], np.uint8)
+            for channel, at in some.items():
+                yield channel, buffer, mcap_chunk.messages_at(buffer, at - start)
 
     def _groups(self, wanted: set[int]) -> Iterator[list[Chunk]]:
         group: list[Chunk] = []
@@ -187,6 +188,8 @@ class McapFile:
     def close(self) -> None:
         """Close the file; the arrays that were read from it stay valid."""
         self._contents.loose.clear()
-        del self._buffer
-        with suppress(BufferError):  # a batch still looks into it: closed when that goes
-            self._file.close()
+        self._file.close()
+
+
+def _record_end(file: FileBytes, at: int) -> int:
+    return at + PREFIX + int.from_bytes(file[at + 1 : at + PREFIX], "little")

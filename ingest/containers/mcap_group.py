@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import mmap
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TypeAlias
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from restock.ingest.containers import mcap_chunk
 from restock.ingest.containers.mcap_chunk import BadChunk, Chunk, Indexed, Messages, Positions
+from restock.ingest.containers.mcap_records import FileBytes
 from restock.ingest.containers.storage import Damage, Integrity
 from restock.ingest.decoding.messages import MessageBatch
 
@@ -52,7 +52,7 @@ class Checks:
 class ChunkReader:
     """Reads the chunks of one file. `cut` is the one in which the file ends, if it ends so."""
 
-    def __init__(self, file: mmap.mmap, checks: Checks, cut: Chunk | None) -> None:
+    def __init__(self, file: FileBytes, checks: Checks, cut: Chunk | None) -> None:
         self.walked: dict[int, Positions] = {}  # chunk.at -> its messages, where it has no index
         self._file, self._checks, self._cut = file, checks, cut
         self._scratch = np.zeros(0, np.uint8)

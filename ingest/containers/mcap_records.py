@@ -2,15 +2,91 @@
 
 from __future__ import annotations
 
-import mmap
 import struct
 from collections.abc import Iterator
 from enum import IntEnum
-from typing import Any, TypeAlias
+from pathlib import Path
+from typing import Any, TypeAlias, overload
+
+from restock.errors import RecordingError
 
 MAGIC = b"\x89MCAP0\r\n"
-Buffer: TypeAlias = "bytes | mmap.mmap"
+Buffer: TypeAlias = "bytes | FileBytes"
 PREFIX = 9  # every record: opcode (1 byte), length of its content (8 bytes)
+
+
+class FileBytes:
+    """A file's bytes, read where they are asked for.
+
+    It is not mapped into memory: where a file that is mapped shrinks, reading it kills the process.
+    """
+
+    WINDOW = 16 << 10  # bytes kept of the last small read: fields are read one by one
+    PIECE = 8 << 20  # searched at a time
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file = path.open("rb", buffering=0)
+        self._size = path.stat().st_size
+        self._window, self._from = b"", 0
+
+    def __len__(self) -> int:
+        return self._size
+
+    @overload
+    def __getitem__(self, key: int) -> int: ...
+    @overload
+    def __getitem__(self, key: slice) -> bytes: ...
+    def __getitem__(self, key: int | slice) -> int | bytes:
+        """As of bytes.
+
+        Raises:
+            RecordingError: the file is shorter than it was when it was opened.
+        """
+        if isinstance(key, int):
+            if not 0 <= key < self._size:
+                raise IndexError(key)
+            return self._read(key, key + 1)[0]
+        start, stop, _ = key.indices(self._size)
+        return self._read(start, stop)
+
+    def _read(self, start: int, stop: int) -> bytes:
+        at = start - self._from
+        if at >= 0 and stop - self._from <= len(self._window):
+            return self._window[at : stop - self._from]
+        if stop - start > self.WINDOW:
+            return self._read_file(start, stop)
+        self._window = self._read_file(start, min(start + self.WINDOW, self._size))
+        self._from = start
+        return self._window[: max(stop - start, 0)]
+
+    def _read_file(self, start: int, stop: int) -> bytes:
+        self._file.seek(start)
+        parts, left = list[bytes](), stop - start
+        while left > 0:
+            part = self._file.read(left)
+            if not part:
+                raise RecordingError(
+                    f"it shrank while it was read: {self._size:,} bytes when it was opened, and"
+                    f" {self.path.stat().st_size:,} now",
+                    where=str(self.path),
+                    remedy="read it when nothing writes it any more, or read a copy",
+                )
+            parts.append(part)
+            left -= len(part)
+        return parts[0] if len(parts) == 1 else b"".join(parts)
+
+    def find(self, what: bytes, start: int) -> int:
+        """Where these bytes are next, from a place on; -1 where they are not."""
+        for at in range(start, self._size, self.PIECE):
+            found = self[at : at + self.PIECE + len(what) - 1].find(what)
+            if found >= 0:
+                return at + found
+        return -1
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
 
 
 class Malformed(Exception):
@@ -119,14 +195,16 @@ def walk(buffer: Buffer, start: int, stop: int) -> Iterator[tuple[int, int, int]
     """Each record's opcode and the (start, stop) of its content, from `start` to `stop`.
 
     Raises:
-        Malformed: a record ends beyond `stop`; whatever came before it was whole.
+        Malformed: a record has opcode 0, or ends beyond `stop`; whatever came before it was whole.
     """
-    unpack = struct.Struct("<BQ").unpack_from
+    unpack = struct.Struct("<BQ").unpack
     position = start
     while position < stop:
         if position + PREFIX > stop:
             raise Malformed("cut within a record's first bytes", position)
-        opcode, length = unpack(buffer, position)
+        opcode, length = unpack(buffer[position : position + PREFIX])
+        if not opcode:
+            raise Malformed("opcode 0, which no record has: zeros, or noise", position)
         end = position + PREFIX + length
         if end > stop:
             raise Malformed(

@@ -7,7 +7,6 @@ compression and two lengths that must agree. Its CRC is checked when it is read,
 
 from __future__ import annotations
 
-import mmap
 import zlib
 from collections.abc import Iterator
 from typing import Any
@@ -20,14 +19,22 @@ from restock.ingest.containers.mcap_contents import (
     statistics_at,
     take_record,
 )
-from restock.ingest.containers.mcap_records import MAGIC, PREFIX, Malformed, Op, parse, walk
+from restock.ingest.containers.mcap_records import (
+    MAGIC,
+    PREFIX,
+    FileBytes,
+    Malformed,
+    Op,
+    parse,
+    walk,
+)
 
 FOOTER_SIZE = PREFIX + 20
 BEFORE_COMPRESSION = PREFIX + 28  # of a chunk's record: times, size, CRC
 _NAMES = (b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4")
 
 
-def resume(file: mmap.mmap, contents: Contents) -> list[str]:
+def resume(file: FileBytes, contents: Contents) -> list[str]:
     """Add what lies beyond the place where the walk ended; what is lost, in words.
 
     Where nothing can be proven, the file is read up to the damage, and what there is of the
@@ -52,7 +59,7 @@ class _Summary:
         self.start = 0
 
 
-def _summary(file: mmap.mmap) -> _Summary | None:
+def _summary(file: FileBytes) -> _Summary | None:
     """The summary section, if it is whole."""
     end = len(file) - len(MAGIC)
     at = end - FOOTER_SIZE
@@ -63,12 +70,9 @@ def _summary(file: mmap.mmap) -> _Summary | None:
     summary.start = footer["summary_start"]
     if not len(MAGIC) <= summary.start <= at:
         return None
-    checked = memoryview(file)[summary.start : at + PREFIX + 16]
-    try:
-        if footer["summary_crc"] and zlib.crc32(checked) != footer["summary_crc"]:
-            return None
-    finally:
-        checked.release()
+    checked = file[summary.start : at + PREFIX + 16]
+    if footer["summary_crc"] and zlib.crc32(checked) != footer["summary_crc"]:
+        return None
     try:
         for opcode, start, stop in walk(file, summary.start, at):
             if opcode == Op.CHUNK_INDEX:
@@ -82,7 +86,7 @@ def _summary(file: mmap.mmap) -> _Summary | None:
     return summary
 
 
-def _by_index(file: mmap.mmap, contents: Contents, summary: _Summary, cut: int) -> list[str]:
+def _by_index(file: FileBytes, contents: Contents, summary: _Summary, cut: int) -> list[str]:
     """The chunks are those of the chunk index whose records agree with it."""
     lost = []
     chunks = []
@@ -117,7 +121,7 @@ def _within(at: int, chunks: list[Chunk]) -> bool:
     return any(chunk.at <= at < chunk.stop for chunk in chunks)
 
 
-def _by_scan(file: mmap.mmap, contents: Contents, cut: int) -> list[str]:
+def _by_scan(file: FileBytes, contents: Contents, cut: int) -> list[str]:
     """Go on at each next chunk that can be recognised, walking from it to the next damage."""
     lost = []
     for at in _recognised(file, cut + 1):
@@ -144,7 +148,7 @@ def _by_scan(file: mmap.mmap, contents: Contents, cut: int) -> list[str]:
     return [*lost, f"{len(file) - cut:,} bytes from byte {cut:,} on are lost"]
 
 
-def _recognised(file: mmap.mmap, start: int) -> Iterator[int]:
+def _recognised(file: FileBytes, start: int) -> Iterator[int]:
     """Where chunks with a compression by name are, by two lengths that agree."""
     nearest = {name: file.find(name, start) for name in _NAMES}
     while places := {at: name for name, at in nearest.items() if at >= 0}:
