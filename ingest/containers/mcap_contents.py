@@ -85,9 +85,7 @@ def survey(file: FileBytes) -> Contents:
         for opcode, at, stop in walk(file, len(MAGIC), end):
             others += opcode not in _MANY
             if others > MOST_OTHERS:
-                raise Malformed(
-                    f"more than {MOST_OTHERS:,} records of other kinds than messages", at
-                )
+                raise Malformed(f"more than {MOST_OTHERS:,} records of no messages", at)
             if opcode == Op.FOOTER:
                 finished = file[stop : stop + len(MAGIC)] == MAGIC
                 break
