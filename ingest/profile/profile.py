@@ -56,6 +56,8 @@ FALLBACKS: dict[str, str] = {
     "true_condition": "unknown: labels are not scored",
     "perturbation": "unknown: null, as of hardware",
 }
+MOTION = "nav_msgs/msg/Odometry"  # what was measured: commands are of other types
+COMMAND_FALLBACK = "the measured motion of {topic} in place of commands"
 POSE_FALLBACK = "from transforms, by [frames]"
 ROUTE_FALLBACK = "none: the task has no goal, progress is forward displacement"
 
@@ -187,6 +189,8 @@ class Profile(Checked, frozen=True):
         """Inputs the profile leaves out -> what is used instead of each."""
         given = dict(self.inputs.items())
         fallbacks = {name: how for name, how in FALLBACKS.items() if name not in given}
+        if self.inputs.command.type == MOTION:
+            fallbacks["command"] = COMMAND_FALLBACK.format(topic=self.inputs.command.topic)
         if self.inputs.pose is None:
             fallbacks["pose"] = POSE_FALLBACK
         if self.task.goal == "none":

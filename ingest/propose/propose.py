@@ -14,7 +14,7 @@ import numpy as np
 
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.recording import Recording
-from restock.ingest.profile.profile import parse_profile
+from restock.ingest.profile.profile import MOTION, parse_profile
 from restock.ingest.propose.candidates import candidates
 from restock.ingest.propose.clock_choice import Gaps, by_log_time, choose_clock
 from restock.ingest.propose.footprint import Footprint, footprint_of
@@ -22,7 +22,6 @@ from restock.ingest.propose.proposal_lines import Commands, Evidence, profile_li
 from restock.ingest.propose.roles import (
     KINDS,
     LATCHED,
-    MOTION,
     ODOMETRY_AS_COMMAND,
     REQUIRED,
     SPENT,

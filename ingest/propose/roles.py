@@ -98,7 +98,6 @@ ODOMETRY_AS_COMMAND = (
     Kind("nav_msgs/msg/Odometry", _under("twist.twist", _TWIST), ("wheel", "odom")),
 )
 REQUIRED = ("command", "wheels", "pose")
-MOTION = "nav_msgs/msg/Odometry"
 FIXED_FRAMES = ("map", "odom", "world")  # best first
 BASE_FRAMES = ("base_link", "base_footprint", "base")
 LATCHED = ("goal", "plan", "behaviour_policy", "perturbation")

@@ -212,6 +212,7 @@ class Mixture(Checked, frozen=True):
     # Which rows may be drawn.
     where: str | None = None  # SQL predicate: only these transitions
     safety: Safety | None = None
+    odometry_as_command: bool = False  # also rows whose action is measured motion, not a command
     max_age_days: Annotated[float, Meta(ge=0)] | None = (
         None  # against the newest transition of the store
     )

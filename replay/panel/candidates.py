@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import duckdb
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from restock.arrays import Bools, Ints
 from restock.errors import ConfigError, MixtureError, StoreError
@@ -109,6 +110,33 @@ def _blame(connection: duckdb.DuckDBPyConnection, predicates: dict[str, tuple[st
                 f"its SQL does not run over `transitions`: {str(cause).splitlines()[0]}",
                 where=f"mixture, {place}",
             ) from cause
+
+
+def without_measured_actions(
+    connection: duckdb.DuckDBPyConnection, table: pa.Table
+) -> tuple[pa.Table, int]:
+    """The rows whose actions were commanded, and how many are of odometry in place of a command.
+
+    Raises:
+        MixtureError: none was commanded.
+    """
+    views = connection.sql("SELECT table_name FROM information_schema.tables").fetchall()
+    if ("recordings",) not in views:  # rows without recordings: nothing says otherwise
+        return table, 0
+    measured = connection.sql(
+        "SELECT DISTINCT recording_id FROM recordings"
+        " WHERE list_contains(list_transform(stand_ins, lambda one: one.input), 'command')"
+    ).fetchall()
+    if not measured:
+        return table, 0
+    ids = pa.array([recording for (recording,) in measured], pa.string())
+    kept = table.filter(pc.invert(pc.is_in(table["recording_id"].cast(pa.string()), ids)))
+    if not len(kept):
+        raise MixtureError(
+            "the action of every transition is odometry in place of a command",
+            remedy="record the commands, or set odometry_as_command = true in the mixture",
+        )
+    return kept, len(table) - len(kept)
 
 
 def one_task(table: pa.Table) -> str:

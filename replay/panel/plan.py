@@ -22,7 +22,14 @@ from restock.ingest.task.conditions import NOMINAL, Condition
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.schedules import mean_over
 from restock.replay.mixture.shares import SharePlan, plan_shares
-from restock.replay.panel.candidates import META_COLUMNS, bools, codes, one_task, read_candidates
+from restock.replay.panel.candidates import (
+    META_COLUMNS,
+    bools,
+    codes,
+    one_task,
+    read_candidates,
+    without_measured_actions,
+)
 from restock.replay.panel.exclusions import (
     LeftOut,
     leave_out,
@@ -96,6 +103,9 @@ def plan_panel(
     table = read_candidates(connection, mixture, strata, several_stores=bool(others))
     if not len(table):
         raise StoreError("it holds no transitions", remedy="`restock ingest` recordings first")
+    measured = 0
+    if not mixture.odometry_as_command:
+        table, measured = without_measured_actions(connection, table)
     task_hash = one_task(table)
     ids = table["transition_id"].to_numpy()
     if len(np.unique(ids)) != len(ids):
@@ -116,6 +126,8 @@ def plan_panel(
     evaluation_split = split_for_evaluation(table, mixture.evaluation_split, mixture.seed)
     out = leave_out(table, mixture, evaluation_split)
     out.add("same steps as the evaluation split", repeats_of(connection, table, evaluation_split))
+    if measured:
+        out.reasons["odometry in place of a command"] = measured
     for other in others:
         if other.repeated_rows:
             out.reasons[f"of {other.name!r}, in a store before it too"] = other.repeated_rows

@@ -102,5 +102,9 @@ def _attach(connection: duckdb.DuckDBPyConnection, stores: Sequence[Store]) -> l
             f" JOIN (SELECT ingest_id, clock_offset_ns FROM {schema}.stored_recordings)"
             f" USING (ingest_id) WHERE NOT ({known})"
         )
+    manifests = " UNION ALL BY NAME ".join(
+        f'FROM "store_{number}".stored_recordings' for number in range(len(stores))
+    )
+    connection.execute(f"CREATE VIEW recordings AS {manifests}")
     connection.execute("CREATE VIEW transitions AS " + " UNION ALL BY NAME ".join(parts))
     return repeated
