@@ -175,6 +175,11 @@ def many_drops(table: pa.Table, recordings: pa.Table) -> Tables:
     return table, replaced(recordings, "drops", drops)
 
 
+def measured(table: pa.Table, recordings: pa.Table) -> Tables:
+    stand_ins = [[{"input": "command", "instead": "odometry"}], []]
+    return table, replaced(recordings, "stand_ins", stand_ins)
+
+
 def far_operator(table: pa.Table, recordings: pa.Table) -> Tables:
     operator = rows_where(table, "behaviour_policy", "operator")
     return replaced(table, "action_residual", np.where(operator, 0.4, 0.0)), recordings
@@ -229,6 +234,7 @@ PLANTS: list[tuple[str, Plant, int, dict[str, object]]] = [
     ("stratum_of_failures", failures, 1, {"condition": "wheel_slip", "success_share": 0.0}),
     ("unsafe_data", bumping_operator, 1, {"behaviour_policy": "operator"}),
     ("dropped_ticks", many_drops, 1, {"dropped": 2000}),
+    ("odometry_as_command", measured, 1, {"instead": "odometry"}),
     ("far_actions", far_operator, 1, {"behaviour_policy": "operator", "far_share": 1.0}),
     ("repeated_steps", bag_and_a_part_of_it, 1, {"same_as_file": "logs/part.mcap", "rows": 60}),
     ("observation_drift", drifting_clearance, 2, {"signal": "clearance_m"}),
