@@ -32,7 +32,7 @@ def test_the_page_on_the_sample_logs(tmp_path, monkeypatch, capsys):
     assert main(["profile", "new", "sample_logs/amr_tuesday", "--out", "amr.toml"]) == 0
     profile, sql = Path("amr.toml"), Path("sagging.sql")
     name = "diagnostics_battery_voltage_v"
-    assert f"take in `[signals.{name}]` as `battery_v`" in PAGE
+    assert f"uncomment `[signals.{name}]` as `battery_v`" in PAGE
     text = profile.read_text().replace("length_m = 0.6", "length_m = 0.7")
     table = re.search(rf"^# \[signals\.{name}\].*?(?=\n\n)", text, re.M | re.S)
     assert table is not None
@@ -48,7 +48,7 @@ def test_the_page_on_the_sample_logs(tmp_path, monkeypatch, capsys):
     for path, one in first.items():
         assert re.search(rf"^     {re.escape(path)} .* {one['transitions']:,}$", PAGE, re.M)
 
-    assert "With 26.25 V in the file instead" in PAGE
+    assert "With 26.25 V in the file" in PAGE
     sql.write_text(sql.read_text().replace("25.8", "26.25"))
     assert main([*ingest[:1], "sample_logs/amr_tuesday", *ingest[2:], "--json"]) == 0
     capsys.readouterr()

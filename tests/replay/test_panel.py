@@ -474,7 +474,7 @@ from restock.replay.panel.build import build_panel
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.store.store import Store
 
-text = "n_step = 3\\nreturn_to_go = true\\nheld_out = {by = 'none'}\\n[each_condition]"
+text = "n_step = 3\\nreturn_to_go = true\\nevaluation_split = {by = 'none'}\\n[each_condition]"
 mixture = parse_mixture(text)
 with Store(sys.argv[1], memory_limit="110MB") as store:
     store.sql("SET threads = 1")
