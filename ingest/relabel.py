@@ -30,8 +30,11 @@ from restock.ingest.task.conditions import (
     label_scores,
     labels_version,
     primary,
+    runnable,
 )
 from restock.ingest.task.schema import recording_schema
+
+TWIN = "twin"  # format of the recordings that training makes of its episodes
 
 
 @dataclass(frozen=True)
@@ -99,6 +102,9 @@ def _one(
             remedy="ingest the recording again",
         )
     stored = rows.select(ends.column_names)  # the signals, and the profile's own
+    every_condition = conditions
+    if row["format"] == TWIN:  # which fills none of the profile's own signals
+        conditions = runnable(stored, conditions)
     try:
         every = label(pa.concat_tables([stored, ends.cast(stored.schema)]), conditions)
     except ConfigError as error:
@@ -111,7 +117,7 @@ def _one(
     labels = {name: holds[: len(rows)] for name, holds in every.items()}
     named = primary(labels, conditions) or [NOMINAL] * len(rows)
     before = rows["condition"].to_pylist()
-    version = labels_version(conditions)
+    version = labels_version(every_condition)
     ingest_id = uuid.uuid4().hex[:16]
     new = {
         "condition": named,
@@ -131,7 +137,7 @@ def _one(
         "ingested_at": dt.datetime.now(dt.UTC),
         "labels_version": version,
         "label_scores": score_rows(scores),
-        "conditions_json": conditions_json(conditions),
+        "conditions_json": conditions_json(every_condition),
     }
     outcome = Relabelled(
         row["recording_id"],

@@ -19,6 +19,7 @@ from restock.train.dqn.config import TrainConfig, apply_overrides, load_config, 
 from restock.train.dqn.learner import open_device
 from restock.train.dqn.manual_backprop import update_path
 from restock.train.dqn.target import describe
+from restock.train.feed.collector import conditions_in_twin
 from restock.train.feed.logs import Logs
 from restock.train.finite import STOPPED
 from restock.train.loop import Notify, TrainResult
@@ -58,7 +59,7 @@ class Prepared:
             run,
             self.config,
             task=self.profile.task,
-            conditions=self.profile.conditions,
+            conditions=conditions_in_twin(self.profile.conditions, self.profile.signals)[0],
             env=make_twin(self.config, self.profile, self.config.env.num_envs),
             evaluation_env=make_twin(
                 self.config,
@@ -83,6 +84,11 @@ class Prepared:
             f" {schedule.env_steps:,} environment steps"
             + (f" or {schedule.seconds:g} s" if schedule.seconds is not None else "")
             + f"; seed {config.seed}, {config.device}"
+            + "".join(
+                f"\ncondition {name!r} is not evaluated in the twin, which has no"
+                f" {', '.join(signals)}: its stratum is of logs alone"
+                for name, signals in self.document.get("not_evaluated", {}).items()
+            )
             + "".join(f"\n{line}" for line in sealed(open_floors(config.env.layouts)))
         )
 
@@ -289,6 +295,8 @@ def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dic
         "task_hash": profile.task.hash,
         "labels_version": profile.labels_version,
         "profile": {"name": profile.name, "hash": profile.hash},
+        # Conditions of logs alone, with the signals that the twin does not fill.
+        "not_evaluated": conditions_in_twin(profile.conditions, profile.signals)[1],
         "seeds": {"run": config.seed, "evaluation": config.evaluation.seed},
         "versions": software_versions(),
     }

@@ -127,7 +127,9 @@ def transition_table(
             remedy="split the recording",
         )
     last = rows.is_end[begin + 1]
-    named = primary(rows.labels, profile.conditions) or [NOMINAL] * len(rows.tick)
+    # The twin evaluates no condition over signals that it does not fill.
+    evaluated = [one for one in profile.conditions if one.name in rows.labels]
+    named = primary(rows.labels, evaluated) or [NOMINAL] * len(rows.tick)
     number = int(provenance.recording_id, 16) >> (64 - (63 - STEP_BITS))
     columns: dict[str, Any] = {
         "transition_id": (number << STEP_BITS) + tick,

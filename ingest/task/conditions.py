@@ -18,6 +18,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -126,6 +127,16 @@ def label(steps: pa.Table, conditions: Sequence[Condition]) -> dict[str, NDArray
             )
         labels[condition.name] = np.asarray(column.fill_null(False).combine_chunks(), np.bool_)
     return labels
+
+
+def runnable(steps: pa.Table, conditions: Sequence[Condition]) -> list[Condition]:
+    """The conditions whose SQL runs over steps with these columns; `label` says why another not."""
+    run = []
+    for condition in conditions:
+        with suppress(ConfigError):
+            label(steps.slice(0, 0), [condition])
+            run.append(condition)
+    return run
 
 
 def _query(connection: duckdb.DuckDBPyConnection, conditions: Sequence[Condition]) -> pa.Table:

@@ -6,7 +6,8 @@ several episodes per query.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from restock.ingest.task.conditions import NOMINAL, Condition, label, primary
+from restock.ingest.task.conditions import NOMINAL, Condition, label, primary, runnable
+from restock.ingest.task.schema import steps_schema
 from restock.ingest.task.signals import STORED_SIGNALS, Signals
 from restock.ingest.task.task import Task
 from restock.replay.ring.ring import FreshRing
@@ -323,6 +325,29 @@ class Collector(Stateful):
         super().load_state_dict(state)
         self._unlabelled = [EndedEpisode(**episode) for episode in state["unlabelled"]]
         self._saved_log = state["log"]
+
+
+def conditions_in_twin(
+    conditions: Sequence[Condition], signals: Collection[str]
+) -> tuple[list[Condition], dict[str, list[str]]]:
+    """The conditions that the twin's signals can say, and of the others the `signals` they need.
+
+    The twin fills Restock's own signals and none of a profile's `[signals.*]`: a condition over
+    those labels logs, and is not evaluated on fresh episodes, where it would be a guess.
+
+    Raises:
+        ConfigError: one does not run for another reason.
+    """
+    steps = steps_schema().empty_table()
+    evaluated = runnable(steps, conditions)
+    needed: dict[str, list[str]] = {}
+    for condition in conditions:
+        if condition not in evaluated:
+            words = {word.lower() for word in re.findall(r"\w+", condition.sql)}
+            needed[condition.name] = sorted(words & set(signals))
+            if not needed[condition.name]:
+                label(steps, [condition])  # says why
+    return evaluated, needed
 
 
 def ring_conditions(conditions: Sequence[Condition]) -> list[str]:

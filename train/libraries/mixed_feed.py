@@ -26,6 +26,7 @@ from restock.replay.panel.panel import Panel
 from restock.train.dqn.loss import Loss
 from restock.train.feed.batch_record import FeedRecord
 from restock.train.feed.batches import ReplayBatch
+from restock.train.feed.collector import conditions_in_twin
 from restock.train.feed.fresh_log import values_entries
 from restock.train.feed.logs import Logs
 from restock.train.libraries.fresh_meta import FreshMeta, InfoLabels
@@ -90,7 +91,9 @@ class MixedFeed:
         self.logs = Logs.of_panel(panel) if panel is not None else None
         self.seed, self.log_every, self.audit_share = seed, log_every, audit_share
         self.rng = np.random.default_rng([seed, 1])
-        self.labels = InfoLabels(definition.conditions, num_envs)
+        self.labels = InfoLabels(
+            conditions_in_twin(definition.conditions, definition.signals)[0], num_envs
+        )
         self.num_envs, self.library = num_envs, library
         self.env_steps = self.batches = self.invalid_steps = 0
         self._sampler: LoggedSampler | None = None
@@ -306,6 +309,7 @@ def create_run(
             "task_hash": profile.task.hash,
             "labels_version": profile.labels_version,
             "profile": {"name": profile.name, "hash": profile.hash},
+            "not_evaluated": conditions_in_twin(profile.conditions, profile.signals)[1],
             "seeds": seeds,
             "versions": software_versions() | {name: version(name)},
         },

@@ -22,6 +22,7 @@ from restock.arrays import Ints
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.train.dqn.config import TrainConfig
+from restock.train.feed.collector import conditions_in_twin
 from restock.train.libraries.fresh_meta import InfoLabels
 from restock.train.libraries.library_arm import Evaluations, as_network
 from restock.train.libraries.mixed_feed import PartialTables, episode_row
@@ -152,7 +153,9 @@ class _OnPolicyFeed(BaseCallback):
         rollout = model.n_steps * model.n_envs
         self.updates_a_rollout = self.epochs * math.ceil(rollout / model.batch_size)
         self.updates = self.shown = self.calls = self.fed_calls = 0
-        self.labels = InfoLabels(definition.conditions, self.count)
+        self.labels = InfoLabels(
+            conditions_in_twin(definition.conditions, definition.signals)[0], self.count
+        )
         self.keys = np.arange(self.count)
         self.began = np.zeros(self.count, np.int64)  # the call that each episode began with
         self.ended: dict[int, tuple[int, int, dict[str, Any]]] = {}  # key -> first, steps, row

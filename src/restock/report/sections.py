@@ -334,6 +334,10 @@ def floor_section(facts: Facts) -> Section | None:
 
 def provenance(facts: Facts) -> Section:
     tables = []
+    unlabelled = [
+        f"The twin has no {', '.join(signals)}: condition {name} was not evaluated there."
+        for name, signals in facts.config.get("not_evaluated", {}).items()
+    ]
     if facts.panel is not None:
         header = facts.panel.header
         left_out = [f"{count:,} {reason}" for reason, count in header.left_out.items() if count]
@@ -365,7 +369,7 @@ def provenance(facts: Facts) -> Section:
     return Section(
         "provenance",
         "Where does all of this come from?",
-        intro=" ".join(facts.missing),
+        intro=" ".join([*facts.missing, *unlabelled]),
         tables=tables,
         details=pretty(facts.config),
         details_title="The whole configuration of the run",
