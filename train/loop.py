@@ -125,7 +125,7 @@ def train(
         progress.env_steps += session.env.num_envs
         for episode in ended:
             session.interval.episodes += 1
-            session.interval.successes += episode.success
+            session.interval.successes += bool(episode.success)
             session.interval.returns += episode.undiscounted_return
         session.run.append("episodes", session.collector.label())
 
@@ -239,7 +239,7 @@ def _close_interval(session: Session, phase: str, notify: Notify) -> None:
         "steps_since_sync": learner.gradient_steps - learner.target.last_sync,
         "ring_rows": len(session.ring),
         "episodes": episodes,
-        "success": interval.successes / episodes if episodes else None,
+        "success": interval.successes / episodes if episodes and session.collector.goal else None,
         "return_mean": interval.returns / episodes if episodes else None,
         "env_steps_per_s": steps / elapsed_s,
         "updates_per_s": interval.updates / elapsed_s,
@@ -287,7 +287,10 @@ def _evaluate(session: Session, notify: Notify) -> None:
         [{**session.steps, **result.row, "best": best} for result in results],
     )
     session.run.flush(everything=False)
-    summary = {**session.last.success, "mean": session.last.success_mean}
+    summary = {
+        **session.last.success,
+        "mean": session.last.success_mean if session.last.success else None,
+    }
     session.events.scalars(progress.env_steps, "evaluation", summary)
     notify("evaluation", {"env_steps": progress.env_steps, "best": best, **summary})
     if fallen := falls(session.last, session.best, config.guard):

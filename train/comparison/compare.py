@@ -169,8 +169,8 @@ def _outcome(
         "condition": cell[1],
         "episodes": a.shape[1],
         "runs": [len(a), len(b)],
-        "success": [float(a[..., 0].mean()), float(b[..., 0].mean())],
-        "difference": difference.value,
+        "success": [_known(a[..., 0].mean()), _known(b[..., 0].mean())],
+        "difference": _known(difference.value),
         "difference_low": None if missing else difference.low,
         "difference_high": None if missing else difference.high,
         "no_interval": missing,
@@ -179,8 +179,15 @@ def _outcome(
     }
 
 
+def _known(value: float) -> float | None:
+    """None where the task has no goal: its success is NaN."""
+    return None if np.isnan(value) else float(value)
+
+
 def _why_no_interval(a: F64, b: F64, difference: ConfidenceInterval) -> str | None:
     """What an interval would claim too much of, or None. A, b as of `_outcome`."""
+    if np.isnan(difference.value):
+        return "the task has no goal: compare the returns"
     runs, episodes = min(len(a), len(b)), a.shape[1]
     if runs < LEAST_RUNS:
         return f"{runs} run{'s' * (runs > 1)} an arm, at least {LEAST_RUNS} are needed"
@@ -199,7 +206,8 @@ def _scores(tables: Iterable[pa.Table]) -> dict[Cell, dict[int, F64]]:
         for row in table.to_pylist():
             block = f" ({row['block']})" if row["block"] in ("partial", "full") else ""
             cell = (row.get("perturbation", "none"), row["condition"] + block)
-            result = float(row["success"]), float(row["return"])
+            success = float("nan") if row["success"] is None else float(row["success"])
+            result = success, float(row["return"])
             cells.setdefault(cell, {})[int(row["episode_seed"])] = result
         runs.append(cells)
     shared: dict[Cell, dict[int, F64]] = {}

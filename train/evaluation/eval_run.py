@@ -198,6 +198,7 @@ def drive_evaluation(
             [spec for _, spec in episodes],
             control_period_s=task.control_period_s,
             time_limit_steps=task.time_limit_steps,
+            goal=task.goal != "none",
             progress=progress,
         )
         for (perturbation, _), result in zip(episodes, driven, strict=True):

@@ -31,7 +31,7 @@ class EpisodeResult:
     condition: str
     block: str  # none | partial | full
     episode_seed: int
-    success: bool
+    success: bool | None  # None: the task has no goal
     bumps: int  # contacts begun
     time_s: float
     undiscounted_return: float
@@ -75,12 +75,14 @@ def run_episodes(
     *,
     control_period_s: float,
     time_limit_steps: int,
+    goal: bool = True,
     step: Stepper | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[EpisodeResult]:
     """Drive every episode to its end, N at a time; results in the order of `specs`.
 
-    `step` makes a step in place of `env.step`, given the observations (N, D) as well.
+    `step` makes a step in place of `env.step`, given the observations (N, D) as well. Without a
+    `goal` success is None, and an episode fails by a bump alone.
     """
     results: list[EpisodeResult | None] = [None] * len(specs)
     env.set_episodes(specs)
@@ -114,7 +116,7 @@ def run_episodes(
                 count = int(steps[place])
                 end = track[place, min(count, time_limit_steps)]
                 before = track[place, max(count - window, 0)]
-                success = bool(info["success"][place])
+                success = bool(info["success"][place]) if goal else None
                 values = info.get("perturbation_values")
                 results[index] = EpisodeResult(
                     perturbation=str(info["perturbation"][place]),
@@ -130,7 +132,7 @@ def run_episodes(
                     end_x_m=float(end[0]),
                     end_y_m=float(end[1]),
                     failure=None
-                    if success
+                    if success or (success is None and not bumps[place])
                     else _failure(
                         bool(terminated[place]),
                         count < time_limit_steps,
@@ -161,8 +163,8 @@ def _failure(terminated: bool, early: bool, still: bool) -> str:
 class Score:
     """What a greedy evaluation came to."""
 
-    success: dict[str, float]  # per condition
-    success_mean: float  # over conditions, each counting the same
+    success: dict[str, float]  # per condition; empty where the task has no goal
+    success_mean: float  # over conditions, each counting the same; 0 where there is no goal
     return_mean: float
 
     def beats(self, other: Score | None) -> bool:
@@ -177,9 +179,14 @@ def score(results: Sequence[EpisodeResult]) -> Score:
     """Means over episodes within a condition, then over conditions."""
     conditions = dict.fromkeys(result.condition for result in results)
     by = {name: [r for r in results if r.condition == name] for name in conditions}
-    success = {name: float(np.mean([r.success for r in group])) for name, group in by.items()}
+    success = {
+        name: float(np.mean([bool(r.success) for r in group]))
+        for name, group in by.items()
+        if all(r.success is not None for r in group)
+    }
     returns = [float(np.mean([r.undiscounted_return for r in group])) for group in by.values()]
-    return Score(success, float(np.mean(list(success.values()))), float(np.mean(returns)))
+    average = float(np.mean(list(success.values()))) if success else 0.0
+    return Score(success, average, float(np.mean(returns)))
 
 
 def summary_rows(
@@ -187,7 +194,7 @@ def summary_rows(
 ) -> list[dict[str, Any]]:
     """Per (policy, perturbation) and condition, blocked aisles by partial and full: a table's rows.
 
-    Success comes with its Wilson 95 % interval.
+    Success comes with its Wilson 95 % interval; all three are None where the task has no goal.
     """
     rows = []
     for (policy, perturbation), episodes in results.items():
@@ -196,8 +203,9 @@ def summary_rows(
             cells.setdefault(cell_name(result.condition, result.block), []).append(result)
         for cell in sorted(cells, key=_cell_order):
             group = cells[cell]
-            successes = sum(result.success for result in group)
-            low, high = wilson(successes, len(group))
+            successes = sum(bool(result.success) for result in group)
+            goal = all(result.success is not None for result in group)
+            low, high = wilson(successes, len(group)) if goal else (None, None)
             arrived = [result.time_s for result in group if result.success]
             rows.append(
                 {
@@ -205,7 +213,7 @@ def summary_rows(
                     "perturbation": perturbation,
                     "condition": cell,
                     "episodes": len(group),
-                    "success": successes / len(group),
+                    "success": successes / len(group) if goal else None,
                     "success_low": low,
                     "success_high": high,
                     "bumps_per_episode": float(np.mean([r.bumps for r in group])),

@@ -55,6 +55,7 @@ class EvaluationBuffer:
             specs,
             control_period_s=self._task.control_period_s,
             time_limit_steps=self._task.time_limit_steps,
+            goal=self._task.goal != "none",
             step=self._step,
         )
 

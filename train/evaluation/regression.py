@@ -230,6 +230,12 @@ def _cells(table: pa.Table) -> dict[tuple[str, str], _Episodes]:
     cells: dict[tuple[str, str], _Episodes] = {}
     for row in table.to_pylist():
         cell = row["perturbation"], cell_name(row["condition"], row["block"])
+        if row["success"] is None:
+            raise RunError(
+                "its task has no goal: there is no success to compare",
+                where="restock eval",
+                remedy="compare the returns, which `restock eval RUN --json` prints",
+            )
         result = float(row["success"]), float(row["return"])
         key = int(row["episode_seed"]), str(sorted(row["perturbation_values"] or ()))
         cells.setdefault(cell, {})[key] = result

@@ -44,7 +44,7 @@ class EndedEpisode:
     true_condition: str
     block: str
     undiscounted_return: float
-    success: bool
+    success: bool | None  # None: the task has no goal
     bumps: int
     steps: int
     signals: Signals  # (steps + 1,) each
@@ -81,6 +81,7 @@ class Collector(Stateful):
         executor: Executor | None,
     ) -> None:
         self.env, self.ring, self.task = env, ring, task
+        self.goal = task.goal != "none"  # else success is not defined
         self.conditions = list(conditions)
         self._codes = {name: code for code, name in enumerate(ring.conditions)}
         self._executor = executor
@@ -228,7 +229,7 @@ class Collector(Stateful):
                     true_condition=str(info["episode_condition"][place]),
                     block=str(info["block"][place]),
                     undiscounted_return=float(self._return[place]),
-                    success=bool(info["success"][place]),
+                    success=bool(info["success"][place]) if self.goal else None,
                     bumps=int(self._bumps[place]),
                     steps=count,
                     signals={

@@ -155,6 +155,7 @@ class Evaluations:
             self.specs,
             control_period_s=self.task.control_period_s,
             time_limit_steps=self.task.time_limit_steps,
+            goal=self.task.goal != "none",
         )
         self.at, evaluated = env_steps, score(results)
         clocks = {"env_steps": env_steps, "gradient_steps": gradient_steps}

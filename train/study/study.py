@@ -224,11 +224,15 @@ def as_markdown(study: dict[str, Any]) -> str:
             apart = "**" if known and (low > 0 or high < 0) else ""
             interval = f" [{low:+.2f}, {high:+.2f}]" if known else ""
             lines.append(
-                f"| {row['perturbation']} | {row['condition']} | {row['success'][0]:.2f}"
-                f" | {row['success'][1]:.2f} | {apart}{row['difference']:+.2f}"
+                f"| {row['perturbation']} | {row['condition']} | {_cell(row['success'][0], '.2f')}"
+                f" | {_cell(row['success'][1], '.2f')} | {apart}{_cell(row['difference'], '+.2f')}"
                 f"{interval}{apart} | {row['improvement']:.2f} |"
             )
     return "\n".join(lines) + "\n"
+
+
+def _cell(value: float | None, form: str) -> str:
+    return "no goal" if value is None else format(value, form)
 
 
 def _refusal(comparison: dict[str, Any]) -> str:

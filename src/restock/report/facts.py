@@ -22,6 +22,7 @@ from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 
 CELL_M = 0.25
+NO_GOAL = "The task has no goal: success is not defined, and no evaluation shows it."
 MOST_DOTS = 1500
 _TABLES = (  # of a run, that run.sql asks
     *("strata", "conditions", "ages", "policies", "evaluations", "probe", "progress"),
@@ -66,6 +67,11 @@ class Facts:
             return f"Polyak τ {rule['tau']:g}"
         return f"hard, every {rule['every']:,}" if rule.get("rule") == "hard" else "?"
 
+    @property
+    def no_goal(self) -> bool:
+        """Whether the task has no goal: success is not defined."""
+        return bool(self.cells) and all(row["success"] is None for row in self.cells)
+
     def clean_cells(self, policy: str = "agent") -> Rows:
         """The evaluation of a policy without perturbation."""
         return [
@@ -100,8 +106,10 @@ def gather(path: Path) -> Facts:
             remedy="let it train past its first logging interval",
         )
     for row in rows["cells"]:
-        row["success"] = row["successes"] / row["episodes"]
-        row["low"], row["high"] = wilson(int(row["successes"]), int(row["episodes"]))
+        row["success"] = row["low"] = row["high"] = None
+        if row["successes"] is not None:
+            row["success"] = row["successes"] / row["episodes"]
+            row["low"], row["high"] = wilson(int(row["successes"]), int(row["episodes"]))
     kept = rows.pop("kept")
     facts = Facts(run=path, config=run.document, kept=kept[0] if kept else None, **rows)  # type: ignore[arg-type]
     facts.off_policy = [
@@ -171,6 +179,8 @@ def mean_success(cells: Rows) -> float:
 def evaluation_bias(facts: Facts) -> str:
     """The imbalance most likely to make the evaluation look better than deployment."""
     cells = facts.clean_cells()
+    if facts.no_goal:
+        return NO_GOAL
     if not cells or not facts.logged:
         return ""
     by_condition: dict[str, Rows] = {}

@@ -38,6 +38,9 @@ def _headline(facts: Facts) -> str:
     cells = facts.clean_cells()
     if not cells:
         return f"Run {facts.run.name}: trained, not yet evaluated"
+    if facts.no_goal:
+        mean = sum(row["mean_return"] for row in cells) / len(cells)
+        return f"No goal, so no success: mean return {mean:.2f} over {len(cells)} kinds of episode"
     average = mean_success(cells)
     worst = min(cells, key=lambda row: row["success"])
     return (
@@ -54,7 +57,7 @@ def _lead(facts: Facts) -> str:
         f" {last['gradient_steps']:,} updates in {span(last['wall_s'])}."
     )
     planner, random = facts.clean_cells("planner"), facts.clean_cells("random")
-    if planner and random:
+    if planner and random and not facts.no_goal:
         text += (
             f" On the same episodes the scripted planner reaches {mean_success(planner):.0%}"
             f" and a random policy {mean_success(random):.0%}."
@@ -81,7 +84,8 @@ def _cards(facts: Facts) -> list[dict[str, str]]:
     if kept is not None:
         cards.append(
             {
-                "value": f"{kept['success']:.0%} at {kept['env_steps']:,}",
+                "value": ("no goal" if kept["success"] is None else f"{kept['success']:.0%}")
+                + f" at {kept['env_steps']:,}",
                 "label": "kept checkpoint: greedy success, at environment step",
             }
         )

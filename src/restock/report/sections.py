@@ -20,7 +20,7 @@ from restock.report.blocks import (
     span,
     words,
 )
-from restock.report.facts import CELL_M, Facts, evaluation_bias
+from restock.report.facts import CELL_M, NO_GOAL, Facts, evaluation_bias
 
 
 def success(facts: Facts) -> Section | None:
@@ -40,8 +40,10 @@ def success(facts: Facts) -> Section | None:
             "policy": row["policy"],
             "perturbation": row["perturbation"],
             "kind of episode": row["cell"],
-            "success": f"{row['success']:.0%}",
-            "95 % interval": f"{row['low']:.0%} to {row['high']:.0%}",
+            "success": "no goal" if row["success"] is None else f"{row['success']:.0%}",
+            "95 % interval": ""
+            if row["success"] is None
+            else f"{row['low']:.0%} to {row['high']:.0%}",
             "episodes": row["episodes"],
             "collisions per episode": f"{row['bumps']:.2f}",
             "time to goal": "" if row["time_s"] is None else f"{row['time_s']:.1f} s",
@@ -54,10 +56,12 @@ def success(facts: Facts) -> Section | None:
     return Section(
         "success",
         "Does it reach the goal?",
-        intro="Success per kind of episode, on the same seeded episodes for every policy, clean and"
+        intro=NO_GOAL
+        if facts.no_goal
+        else "Success per kind of episode, on the same seeded episodes for every policy, clean and"
         " under each perturbation. Lines are 95 % Wilson intervals.",
-        callout="; ".join(_regressions(facts)),
-        figures=[Figure(charts.success(shown))],
+        callout="" if facts.no_goal else "; ".join(_regressions(facts)),
+        figures=[] if facts.no_goal else [Figure(charts.success(shown))],
         tables=[_table(rows, texts, title="The agent, cell by cell")],
     )
 
@@ -189,7 +193,7 @@ def _short(value: int) -> str:
 
 def learning(facts: Facts) -> Section:
     figures = []
-    if facts.learning:
+    if any(row["success"] is not None for row in facts.learning):
         figures.append(
             Figure(
                 charts.lines(

@@ -118,12 +118,16 @@ def _outcome(row: dict[str, Any]) -> dict[str, Any]:
         "perturbation": row["perturbation"],
         "condition": row["condition"],
         "episodes": row["episodes"],
-        "first": f"{row['success'][0]:.2f}",
-        "second": f"{row['success'][1]:.2f}",
-        "difference [95 %]": f"{row['difference']:+.2f}"
+        "first": _success(row["success"][0]),
+        "second": _success(row["success"][1]),
+        "difference [95 %]": ("" if row["difference"] is None else f"{row['difference']:+.2f}")
         + ("" if low is None else f" [{low:+.2f}, {high:+.2f}]"),
         "P(second better)": f"{row['improvement']:.2f}",
     }
+
+
+def _success(value: float | None) -> str:
+    return "no goal" if value is None else f"{value:.2f}"
 
 
 def _sentence(comparison: Comparison) -> str:

@@ -123,7 +123,9 @@ class EvalCommand:
                         name: row[name]
                         for name in ("perturbation", "condition", "policy", "episodes")
                     },
-                    "success": f"{row['success']:.2f} [{row['success_low']:.2f}, "
+                    "success": "no goal"
+                    if row["success"] is None
+                    else f"{row['success']:.2f} [{row['success_low']:.2f}, "
                     f"{row['success_high']:.2f}]",
                     **{name: row[name] for name in ("bumps_per_episode", "time_s", "return")},
                 }

@@ -175,6 +175,7 @@ def _evaluation_line(values: dict[str, Any], wall_s: float) -> str:
     skip = ("env_steps", "best", "mean")
     cells = "  ".join(f"{name} {value:.2f}" for name, value in values.items() if name not in skip)
     mark = "  <- best so far" if values["best"] else ""
+    cells = cells or "no goal"
     return f"{wall_s:6.0f} s {values['env_steps']:>9,} steps  success: {cells}{mark}"
 
 
@@ -188,12 +189,17 @@ def _print(
     path = str(prepared.path)
     if as_json:
         fresh = {"flushed": asdict(flushed)} if flushed is not None else {}
-        print_json({"run": path, "panel": prepared.document["panel"], **asdict(outcome), **fresh})
+        scores = asdict(outcome)
+        for kept in (scores["best"], scores["last"]):
+            if kept is not None and not kept["success"]:  # the task has no goal
+                kept["success_mean"] = None
+        print_json({"run": path, "panel": prepared.document["panel"], **scores, **fresh})
         return
     rows = []
     for name, result in (("best (kept)", outcome.best), ("last", outcome.last)):
         if result is not None:
-            rows.append({"policy": name, **result.success, "mean": result.success_mean})
+            mean = result.success_mean if result.success else "no goal"
+            rows.append({"policy": name, **result.success, "mean": mean})
     print_table(rows, title="success on the fixed episodes, greedy")
     if flushed is not None:
         say(
