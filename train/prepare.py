@@ -68,7 +68,7 @@ class Prepared:
                 nthread=0,
                 layouts=_evaluation_layouts(self.config),
             ),
-            logs=_logs(self.panel, self.config) if self.panel is not None else None,
+            logs=_logs(self.panel, self.config, self.document) if self.panel is not None else None,
             resume=self.resumed is not None,
         )
 
@@ -269,8 +269,13 @@ def planned_draws(config: TrainConfig) -> PlannedDraws:
     )
 
 
-def _logs(panel: Panel, config: TrainConfig) -> Logs:
-    return Logs.of_panel(panel, planned_draws(config), config.loss.huber_delta)
+def _logs(panel: Panel, config: TrainConfig, document: dict[str, Any]) -> Logs:
+    return Logs.of_panel(
+        panel,
+        planned_draws(config),
+        config.loss.huber_delta,
+        as_of_ns=int(document["created_ns"]),
+    )
 
 
 def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import itertools
 import json
 import re
 import tomllib
+from datetime import UTC, datetime, timedelta
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -213,9 +214,8 @@ class Mixture(Checked, frozen=True):
     where: str | None = None  # SQL predicate: only these transitions
     safety: Safety | None = None
     odometry_as_command: bool = False  # also rows whose action is measured motion, not a command
-    max_age_days: Annotated[float, Meta(ge=0)] | None = (
-        None  # against the newest transition of the store
-    )
+    max_age_days: Annotated[float, Meta(ge=0)] | None = None  # of a logged row, at `as_of`
+    as_of: Annotated[datetime, Meta(tz=True)] | None = None  # ages count to it; None: to the mixing
     max_versions_behind: Count | None = None  # of its behaviour policy's newest; 0: only that one
     max_age_env_steps: Count | None = None  # of fresh rows
     max_rows_per_episode: AtLeastOne | None = None  # of one stratum
@@ -308,6 +308,11 @@ def shipped_schema() -> str:
     names it to Taplo and to VS Code's Even Better TOML.
     """
     return (_SHIPPED / SCHEMA_FILE).read_text(encoding="utf-8")
+
+
+def nanoseconds(moment: datetime) -> int:
+    """Since 1970, exactly."""
+    return (moment - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
 
 
 def mixture_schema() -> str:

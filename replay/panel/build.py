@@ -281,6 +281,7 @@ def _header(
         packing_version=PACKING_VERSION,
         restock_version=__version__,
         newest_ns=plan.newest_ns,
+        as_of_ns=plan.as_of_ns,
         logs_share=plan.logs_share,
         conditions=[*(c.name for c in by_priority), NOMINAL],
         left_out=plan.left_out,

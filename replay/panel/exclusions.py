@@ -36,11 +36,12 @@ class LeftOut:
         self.gone |= rows
 
 
-def leave_out(table: pa.Table, mixture: Mixture, evaluation_split: Bools) -> LeftOut:
-    """Rows that no stratum gets. `table` is of `read_candidates`.
+def leave_out(table: pa.Table, mixture: Mixture, evaluation_split: Bools, as_of_ns: int) -> LeftOut:
+    """Rows that no stratum gets. `table` is of `read_candidates`, ages are at `as_of_ns`.
 
     Raises:
-        MixtureError: rows without a label, where the mixture does not say what to do with them.
+        MixtureError: every row is too old; rows without a label, where the mixture does not say
+            what to do with them.
     """
     out = LeftOut(np.zeros(len(table), np.bool_))
     out.add("refused by the mixture's `where`", ~bools(table, "admitted"))
@@ -52,7 +53,16 @@ def leave_out(table: pa.Table, mixture: Mixture, evaluation_split: Bools) -> Lef
         out.add("unsafe", unsafe)
     logged = table["logged_ns"].to_numpy()
     if mixture.max_age_days is not None:
-        out.add("too old", logged < int(logged.max()) - int(mixture.max_age_days * DAY_NS))
+        too_old = logged < as_of_ns - int(mixture.max_age_days * DAY_NS)
+        if too_old.all():
+            youngest = (as_of_ns - int(logged.max())) / DAY_NS
+            raise MixtureError(
+                f"every row is older than max_age_days = {mixture.max_age_days:g}: the newest is"
+                f" {youngest:,.1f} days old",
+                remedy="raise it, or say in the mixture when ages count to:"
+                " as_of = 2026-01-31T00:00:00Z",
+            )
+        out.add("too old", too_old)
     if mixture.max_versions_behind is not None:
         behind = versions_behind(table)
         out.add("of an old version of its policy", behind > mixture.max_versions_behind)

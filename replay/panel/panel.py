@@ -56,7 +56,7 @@ class Header(msgspec.Struct, frozen=True):
     n_step: int
     packing_version: int
     restock_version: str
-    newest_ns: int  # when its newest row was logged: ages of rows are against it, from logged_ns
+    newest_ns: int  # when its newest row was logged
     logs_share: float  # of a batch
     conditions: list[str]  # by priority, nominal last
     left_out: dict[str, int]  # rows of the source that are not in the panel, by reason
@@ -66,6 +66,7 @@ class Header(msgspec.Struct, frozen=True):
     others: list[PinnedStore]  # stores besides the first
     ratios: list[RatioFit]  # how well density ratios were estimated, where a correction uses them
     files: dict[str, FileRecord]
+    as_of_ns: int | None = None  # what the mixture's max_age_days counted to, where it has one
 
 
 class Panel:

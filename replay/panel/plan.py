@@ -6,6 +6,7 @@ DuckDB says what each row is; everything that must come out the same on every ma
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from restock.arrays import F32, Bools, Ints
 from restock.errors import MixtureError, StoreError
 from restock.ingest.task.conditions import NOMINAL, Condition
-from restock.replay.mixture.mixture import Mixture
+from restock.replay.mixture.mixture import Mixture, nanoseconds
 from restock.replay.mixture.schedules import mean_over
 from restock.replay.mixture.shares import SharePlan, plan_shares
 from restock.replay.panel.candidates import (
@@ -69,6 +70,7 @@ class PanelPlan:
     left_out: dict[str, int]  # rows not in the panel, by reason
     effective_rows: float  # rows drawn equally often that the weighted draw is worth
     newest_ns: int  # when the newest row was logged
+    as_of_ns: int | None  # what max_age_days counted to, where there is one
     others: tuple[PinnedStore, ...] = ()  # besides the first store
     ratios: tuple[RatioFit, ...] = ()  # where a correction is by density ratio
 
@@ -124,7 +126,12 @@ def plan_panel(
                 state[:, index] |= ~bools(table, "labelled")
     stratum, state_code = assign(member, strata), assign(state, strata, only_pre=True)
     evaluation_split = split_for_evaluation(table, mixture.evaluation_split, mixture.seed)
-    out = leave_out(table, mixture, evaluation_split)
+    as_of_ns = (
+        time.time_ns() // 10**9 * 10**9  # which `as_of` can say again
+        if mixture.as_of is None
+        else nanoseconds(mixture.as_of)
+    )
+    out = leave_out(table, mixture, evaluation_split, as_of_ns)
     out.add("same steps as the evaluation split", repeats_of(connection, table, evaluation_split))
     if measured:
         out.reasons["odometry in place of a command"] = measured
@@ -136,7 +143,16 @@ def plan_panel(
     given = _sources(mixture, table, stratum, state_code)
     worked_out = [plan_source(connection, mixture, strata, source) for source in given]
     return _joined(
-        mixture, strata, table, task_hash, evaluation_split, out, given, worked_out, others
+        mixture,
+        strata,
+        table,
+        task_hash,
+        evaluation_split,
+        out,
+        given,
+        worked_out,
+        others,
+        as_of_ns,
     )
 
 
@@ -174,6 +190,7 @@ def _joined(
     given: Sequence[SourceRows],
     worked_out: Sequence[SourcePlan],
     others: Sequence[PinnedStore],
+    as_of_ns: int,
 ) -> PanelPlan:
     """All sources as one plan: the strata of source k are k * S and on."""
     size = len(strata)
@@ -228,6 +245,7 @@ def _joined(
         left_out=left_out,
         effective_rows=effective_count(drawn * weight[chosen]),
         newest_ns=int(table["logged_ns"].to_numpy().max()),
+        as_of_ns=None if mixture.max_age_days is None else as_of_ns,
         others=tuple(others),
         ratios=tuple(plan.fit for plan in worked_out if plan.fit is not None),
     )

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from support.panels import EVERY, planned
+from support.panels import EVERY, moment, planned
 from support.paths import ROOT
 from support.stores import CONDITIONS, TASK
 
@@ -215,8 +215,11 @@ def test_rows_of_no_stratum_are_refused_unless_dropped(transitions: pa.Table) ->
 
 def test_old_and_refused_rows_are_left_out_and_counted(transitions: pa.Table) -> None:
     # The three recordings begin an hour apart.
+    now = moment(int(transitions["stamp_ns"].to_numpy().max()))
     text = (
-        "max_age_days = 0.05\nwhere = 'action <> 4'\n" + EVERY + "[evaluation_split]\nby = 'none'\n"
+        f"as_of = {now}\nmax_age_days = 0.05\nwhere = 'action <> 4'\n"
+        + EVERY
+        + "[evaluation_split]\nby = 'none'\n"
     )
     plan = planned(transitions, text)
     kept = plan.rows.take(pa.array(plan.panel_rows))

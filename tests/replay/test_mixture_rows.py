@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
-from support.panels import EVERY, NO_SPLIT, panel_of, planned
+from support.panels import EVERY, NO_SPLIT, moment, panel_of, planned
 from support.paths import ROOT
 from support.stores import CONDITIONS, recording_transitions, write_store
 
@@ -39,8 +39,9 @@ def taken(plan: PanelPlan) -> pa.Table:
 
 
 def test_every_row_is_in_one_stratum_or_left_out_for_one_reason(transitions: pa.Table) -> None:
+    now = moment(int(transitions["stamp_ns"].to_numpy().max()))
     text = (
-        "max_rows_per_episode = 20\nmax_age_days = 0.05\nwhere = 'action <> 4'\n"
+        f"max_rows_per_episode = 20\nas_of = {now}\nmax_age_days = 0.05\nwhere = 'action <> 4'\n"
         "[safety]\nunsafe = 'bumped'\n" + EVERY
     )
     plan = planned(transitions, text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,11 @@ from support.stores import CONDITIONS, TASK
 
 EVERY = "[each_condition]\nshare = 'natural'\n"
 NO_SPLIT = "[evaluation_split]\nby = 'none'\n"
+
+
+def moment(stamp_ns: int) -> str:
+    """A time as TOML writes it."""
+    return datetime.fromtimestamp(stamp_ns // 10**9, UTC).isoformat()
 
 
 def planned(transitions: pa.Table, text: str) -> PanelPlan:

@@ -79,8 +79,13 @@ class Logs:
         panel: Panel,
         planned: PlannedDraws = _UNPLANNED,
         huber_delta: float = 1.0,
+        *,
+        as_of_ns: int | None = None,
     ) -> Logs:
-        """A panel's rows in memory (memory-mapped where it is larger than 4 GiB)."""
+        """A panel's rows in memory (memory-mapped where it is larger than 4 GiB).
+
+        Their ages are against `as_of_ns`, when training began; None: against their newest.
+        """
         rows = np.asarray(panel.rows)
         if rows.nbytes <= _IN_MEMORY_BYTES and panel.header.mixture.sampling == "memory":
             rows = np.array(rows)
@@ -96,7 +101,7 @@ class Logs:
             stratum_rows=panel.stratum_rows(),
             shares=np.array([stratum.share for stratum in panel.strata]),
             weights=None if np.all(weights == 1) else weights,
-            as_of_ns=panel.header.newest_ns,
+            as_of_ns=panel.header.newest_ns if as_of_ns is None else as_of_ns,
             transition_id=np.asarray(meta["transition_id"], np.int64),
             stamp_ns=np.asarray(meta["logged_ns"], np.int64),
             condition=Coded.of(meta["condition"]),

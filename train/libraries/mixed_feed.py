@@ -88,7 +88,8 @@ class MixedFeed:
         self.logs_share = logs_share
         if panel is not None:
             _check(panel, definition.task.hash, profile, observation_size)
-        self.logs = Logs.of_panel(panel) if panel is not None else None
+        began_ns = now_ns()
+        self.logs = Logs.of_panel(panel, as_of_ns=began_ns) if panel is not None else None
         self.seed, self.log_every, self.audit_share = seed, log_every, audit_share
         self.rng = np.random.default_rng([seed, 1])
         self.labels = InfoLabels(

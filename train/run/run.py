@@ -236,6 +236,7 @@ def panel_document(panel: Panel) -> dict[str, Any]:
         "store_version": panel.store_version,
         "others": [msgspec.structs.asdict(store) for store in header.others],
         "rows": len(panel),
+        "newest_ns": header.newest_ns,
         "n_step": panel.n_step,
         "discount": panel.discount,
         "labels_version": header.labels_version,
@@ -244,7 +245,7 @@ def panel_document(panel: Panel) -> dict[str, Any]:
 
 
 def now_ns() -> int:
-    """Wall time, to which the ages of logged rows refer."""
+    """Wall time, to which the ages of logged rows refer: that of a run's start, `created_ns`."""
     return time.time_ns()
 
 

@@ -220,7 +220,7 @@ TABLES: dict[str, pa.Schema] = {
         ("ring_slot", _I, "of a fresh row"),
         ("episode", _S, "of logs: episode_id; fresh: the ring's key"),
         ("episode_step", _I, "of a fresh row; of a logged one the store has it"),
-        ("age_days", _F, "of a logged row, against the newest of its store"),
+        ("age_days", _F, "of a logged row, when training began (`created_ns` of config.json)"),
         ("age_env_steps", _I, "of a fresh row: environment steps since it was collected"),
         ("age_gradient_steps", _I, "of a fresh row: updates since its action was chosen"),
         ("stratum", _S, "by which it was drawn"),

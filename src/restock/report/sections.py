@@ -108,8 +108,8 @@ def sampled(facts: Facts) -> Section:
             Figure(
                 charts.ages(_age_rows(facts)),
                 "How old the sampled rows were",
-                "Logs age by the calendar (days); fresh rows by environment steps since they were"
-                " collected. The two are never pooled.",
+                "Logs age by the calendar (days before training began); fresh rows by environment"
+                " steps since they were collected. The two are never pooled.",
             )
         )
     if facts.policies:
