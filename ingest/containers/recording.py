@@ -31,6 +31,8 @@ from restock.ingest.decoding.field_paths import CannotDecode, Leaf, MessageType
 from restock.ingest.decoding.messages import Channel
 from restock.ingest.decoding.row_by_row import Decoder
 
+MOST_DEFINED_BYTES = 8 << 20  # parsing takes about a second a MB
+
 
 @dataclass(frozen=True)
 class _Stream:
@@ -71,7 +73,9 @@ class Recording:
         self.notes = [*notes, *(note for storage in self._storages for note in storage.notes)]
         self._bag_damage, self._cleanup = list(damage), tuple(cleanup)
         self._streams: dict[str, list[_Stream]] = {}
-        self._types: dict[tuple[int, int], MessageType] = {}  # by storage and channel
+        # By storage and channel: what its messages are, or why they cannot be decoded.
+        self._types: dict[tuple[int, int], MessageType | CannotDecode] = {}
+        self._defined: dict[tuple[str, str, int], int] = {}  # bytes of definitions, each once
         for storage in self._storages:
             for channel in storage.channels.values():
                 self._streams.setdefault(channel.topic, []).append(_Stream(storage, channel))
@@ -105,8 +109,24 @@ class Recording:
     def _type(self, stream: _Stream) -> MessageType:
         key = self._storages.index(stream.storage), stream.channel.id
         if key not in self._types:
-            self._types[key] = type_of(stream.channel, self.distro, stream.payloads)
-        return self._types[key]
+            try:
+                self._bound_definitions(stream.channel)
+                self._types[key] = type_of(stream.channel, self.distro, stream.payloads)
+            except CannotDecode as reason:  # found out once: parsing takes time
+                self._types[key] = reason
+        kind = self._types[key]
+        if isinstance(kind, CannotDecode):
+            raise kind
+        return kind
+
+    def _bound_definitions(self, channel: Channel) -> None:
+        self._defined[channel.type, channel.definition_format, hash(channel.definition)] = len(
+            channel.definition
+        )
+        if sum(self._defined.values()) > MOST_DEFINED_BYTES:
+            raise CannotDecode(
+                f"the definitions up to its own have more than {MOST_DEFINED_BYTES:,} bytes"
+            )
 
     @property
     def size_bytes(self) -> int:

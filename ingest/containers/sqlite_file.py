@@ -7,6 +7,7 @@ queries are bounded, and only plain tables are read.
 
 from __future__ import annotations
 
+import itertools
 import re
 import shutil
 import sqlite3
@@ -14,7 +15,7 @@ import tempfile
 from collections.abc import Collection, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 from urllib.parse import quote
 
 import numpy as np
@@ -27,12 +28,16 @@ from restock.ingest.decoding.messages import Channel, MessageBatch, PendingBatch
 MAGIC = b"SQLite format 3\x00"
 ROWS_PER_FETCH = 1000
 BYTES_PER_BATCH = 8 << 20
+LARGE_ROW = 1 << 20  # bytes: larger ones are not fetched some at a time
+LARGEST_MESSAGE = 256 << 20
 MOST_FOUND = 10  # by the check: one is enough to refuse the file
 STEPS_PER_BYTE = 64  # of sqlite's machine; reading rows of a few bytes takes one or two
 FEWEST_STEPS = 10_000_000
 STEPS_AT_ONCE = 100_000
 # What the check says of values, not of pages: those are read as they are.
 _OF_VALUES = re.compile(r"\S+ value in |\S+ constraint |CHECK ")
+
+_Row: TypeAlias = tuple[int, int, Any, int | None, int]  # topic, stamp, data, its size, row number
 
 
 def open_sqlite(path: Path, *, salvage: bool) -> SqliteFile | SalvagedSqliteFile:
@@ -194,26 +199,54 @@ class SqliteFile:
         """One pass in rowid order, which is the order of arrival."""
         wanted = [channel for channel in channels if channel in self.channels]
         marks = ",".join("?" * len(wanted))
-        query = (
-            "SELECT topic_id, timestamp, data FROM messages NOT INDEXED"
-            f" WHERE topic_id IN ({marks}) AND typeof(timestamp) = 'integer' ORDER BY id"
+        query = (  # large ones are fetched one by one
+            "SELECT topic_id, timestamp, CASE WHEN length(data) <= ? THEN data END, length(data),"
+            f" id FROM messages NOT INDEXED WHERE topic_id IN ({marks})"
+            " AND typeof(timestamp) = 'integer' ORDER BY id"
         )
         try:
-            cursor = self._connection.execute(query, wanted)
+            cursor = self._connection.execute(query, (LARGE_ROW, *wanted))
         except sqlite3.DatabaseError as error:
             self._damaged(f"its rows are lost: {error}")
             return
-        pending: dict[int, PendingBatch] = {}
-        size = count = 0
-        while rows := self._fetch(cursor, size // count if count else BYTES_PER_BATCH // 16):
-            if size >= BYTES_PER_BATCH:
+        pending, size = dict[int, PendingBatch](), 0
+        for rows in self._rows(cursor):
+            if size + sum(row[3] or 0 for row in rows) > BYTES_PER_BATCH:
                 yield from ((channel, some.batch()) for channel, some in pending.items())
-                pending, size, count = {}, 0, 0
+                pending, size = {}, 0
             size += _add_rows(rows, pending)
-            count += len(rows)
         yield from ((channel, some.batch()) for channel, some in pending.items())
 
-    def _fetch(self, cursor: sqlite3.Cursor, row_bytes: int) -> list[tuple[int, int, Any]]:
+    def _rows(self, cursor: sqlite3.Cursor) -> Iterator[list[_Row]]:
+        """Rows in their order, some at a time; a large one alone."""
+        row_bytes = BYTES_PER_BATCH // 16
+        while rows := self._fetch(cursor, row_bytes):
+            row_bytes = sum(row[3] or 0 for row in rows) // len(rows) + 64
+            for large, some in itertools.groupby(rows, lambda row: (row[3] or 0) > LARGE_ROW):
+                if not large:
+                    yield list(some)
+                    continue
+                for row in some:
+                    if whole := self._large(row):
+                        yield whole
+
+    def _large(self, row: _Row) -> list[_Row]:
+        """A row with its data, which may have some hundred MB; none where it has more than that."""
+        topic, stamp, _, size, number = row
+        if size is not None and size <= LARGEST_MESSAGE:
+            query = "SELECT data FROM messages WHERE id = ?"
+            try:
+                (data,) = self._connection.execute(query, (number,)).fetchone()
+            except sqlite3.DatabaseError as error:
+                self._damaged(f"row {number:,} is lost: {error}")
+                return []
+            return [(topic, stamp, data, size, number)]
+        what = f"row {number:,} is not read: its message of {size:,} bytes is too large"
+        if len(self.damage) < MOST_FOUND and all(item.what != what for item in self.damage):
+            self.damage.append(Damage(what, {topic: 1}))
+        return []
+
+    def _fetch(self, cursor: sqlite3.Cursor, row_bytes: int) -> list[_Row]:
         """Some rows, fewer of larger ones: how large they are shows in those before."""
         some = min(max(BYTES_PER_BATCH // max(row_bytes, 1), 1), ROWS_PER_FETCH)
         try:
@@ -269,9 +302,9 @@ def _connection(path: Path, immutable: str) -> sqlite3.Connection:
     return sqlite3.connect(uri, uri=True, check_same_thread=False)
 
 
-def _add_rows(rows: list[tuple[int, int, Any]], pending: dict[int, PendingBatch]) -> int:
+def _add_rows(rows: list[_Row], pending: dict[int, PendingBatch]) -> int:
     """Sort (topic, stamp, data) rows by topic; returns how many bytes they take."""
-    topics, stamps, payloads = zip(*rows, strict=True)
+    topics, stamps, payloads, _, _ = zip(*rows, strict=True)
     if set(map(type, payloads)) != {bytes}:
         payloads = tuple(
             data if isinstance(data, bytes) else str(data or "").encode() for data in payloads

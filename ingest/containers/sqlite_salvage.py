@@ -24,7 +24,7 @@ from restock.ingest.containers.storage import Damage, Extra, Integrity
 from restock.ingest.decoding.messages import Channel, MessageBatch, PendingBatch
 
 BYTES_PER_BATCH = 8 << 20
-SMALLEST_ROW = 12  # bytes of a message's row
+LARGEST_MESSAGE = 256 << 20
 PIECE_ROWS = 4096
 LEAF, INTERIOR = 0x0D, 0x05  # of a table
 SMALLEST_CELL = 4  # bytes
@@ -128,10 +128,10 @@ class SalvagedSqliteFile:
         rows = rows[first]
         named = np.isin(rows[:, 1], list(self.channels))
         if lost := int((~named).sum()):
-            self._lost(f"{lost:,} messages of topics that it does not name", lost)
+            self._lost(f"{lost:,} messages of topics without a name", lost)
         last = max(self._last, int(rows[-1, 0]) if len(rows) else 0)
         missing = last - int((rows[:, 0] > 0).sum())
-        room = self._pages.count * self._pages.page_size // SMALLEST_ROW
+        room = self._pages.count * self._pages.page_size // SMALLEST_CELL
         if missing > 0 and last <= room:
             self._lost(f"at least {missing:,} messages are missing, by their row numbers", missing)
         return rows[named]
@@ -148,7 +148,8 @@ class SalvagedSqliteFile:
         for _, topic, stamp, number, place in self._rows[np.isin(self._rows[:, 1], wanted)]:
             if number != page:
                 page, cells = int(number), self._pages.cells(self._pages.page(int(number)))
-            payload = self._pages.payload(cells[place], self._moves, taken)
+            whole = cells[place].size <= LARGEST_MESSAGE
+            payload = self._pages.payload(cells[place], self._moves, taken) if whole else None
             if payload is None:
                 lost[int(topic)] = lost.get(int(topic), 0) + 1
                 continue
@@ -160,7 +161,7 @@ class SalvagedSqliteFile:
                 pending, size = {}, 0
         yield from ((channel, some.batch()) for channel, some in pending.items())
         if lost:
-            self.damage.append(Damage("pages of these messages are missing or damaged", lost))
+            self.damage.append(Damage("their pages are missing, damaged or too many", lost))
 
     def close(self) -> None:
         """Close the file."""

@@ -111,3 +111,38 @@ def test_small_records_without_end_are_refused(tmp_path: Path) -> None:
     path.write_bytes(head + record * 1_100_000)
     with pytest.raises(RecordingError, match="more than 1,000,000 records of no messages"):
         open_recording(path)
+
+
+def test_large_blobs_of_a_sqlite_bag_are_read_one_by_one(tmp_path: Path) -> None:
+    """Of 60 MB, and of 300: that is too large, and counted."""
+    file = tmp_path / "run.db3"
+    base = sqlite3.connect(file)
+    base.executescript(
+        "CREATE TABLE topics (id INTEGER PRIMARY KEY, name, type, serialization_format);"
+        "CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id, timestamp, data);"
+        "INSERT INTO topics VALUES (1, '/t', 'std_msgs/msg/String', 'cdr')"
+    )
+    sizes = [9, 60 << 20, 60 << 20, 9, 60 << 20, 300 << 20, 60 << 20, 9]
+    for stamp, size in enumerate(sizes):
+        base.execute("INSERT INTO messages VALUES (NULL, 1, ?, zeroblob(?))", (stamp, size))
+    base.commit()
+    base.close()
+    code = (
+        "import re, sys\n"
+        "from restock.ingest.containers.open_recording import open_recording\n"
+        "with open_recording(sys.argv[1]) as recording:\n"
+        "    (storage,) = recording._storages\n"
+        "    for _, batch in storage.batches([1]):\n"
+        "        print(*batch.log_time_ns.tolist())\n"
+        "        del batch\n"
+        "    print([loss.reason for loss in recording.lost_messages])\n"
+        "    text = open('/proc/self/status').read()\n"
+        "    print(int(re.search('VmHWM:\\\\s+([0-9]+)', text)[1]) // 1024)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(file)], capture_output=True, text=True, check=True
+    )
+    *stamps, said, peak_mb = done.stdout.splitlines()
+    assert " ".join(stamps).split() == ["0", "1", "2", "3", "4", "6", "7"]
+    assert said == "['row 6 is not read: its message of 314,572,800 bytes is too large']"
+    assert int(peak_mb) < 450
