@@ -107,7 +107,7 @@ def _of_query(
             raise QueryError(f"its {name} is a {kind}, not a list of numbers", where=where)
     by_command = ", ".join(f"min({name}), max({name})" for name in COMMAND) if continuous else "0"
     hashes = "list(DISTINCT task_hash)" if "task_hash" in columns else "NULL"
-    _, rows = fetch(
+    _, rows, _ = fetch(
         connection, f"SELECT count(*), {hashes}, {by_command} FROM ({text})", where=where
     )
     facts = rows[0]

@@ -72,19 +72,24 @@ def query(
 
 
 def fetch(
-    connection: duckdb.DuckDBPyConnection, text: str, *, where: str
-) -> tuple[list[str], list[tuple[Any, ...]]]:
-    """Column names and rows of one query; Ctrl-C stops it.
+    connection: duckdb.DuckDBPyConnection, text: str, *, where: str, at_most: int | None = None
+) -> tuple[list[str], list[tuple[Any, ...]], int]:
+    """Column names, rows (the first `at_most`), and how many there are; Ctrl-C stops it.
 
     Raises:
         QueryError: as `query` does, also for what goes wrong while it runs.
         KeyboardInterrupt: the query was stopped.
     """
 
-    def run() -> tuple[list[str], list[tuple[Any, ...]]]:
+    def run() -> tuple[list[str], list[tuple[Any, ...]], int]:
         relation = query(connection, text, where=where)
         try:
-            return relation.columns, values(relation)
+            if at_most is None:
+                rows = values(relation)
+                return relation.columns, rows, len(rows)
+            rows = values(relation.limit(at_most + 1))
+            count = len(rows) if len(rows) <= at_most else len(relation)
+            return relation.columns, rows[:at_most], count
         except duckdb.Error as error:
             raise QueryError(_message(error), where=where, remedy=_hint(error)) from error
 

@@ -106,3 +106,37 @@ def test_a_title_wider_than_its_table_stays_on_one_line(
     title = "success [bold] against the baseline, " + "paired by episode, " * 20
     print_table([{"a": 1}], title=title)
     assert capsys.readouterr().out.splitlines()[0] == title.rstrip()
+
+
+def test_many_rows_are_cut_on_a_terminal_and_whole_in_a_pipe(sample_rows, monkeypatch, capsys):
+    store, query = sample_rows
+    capsys.readouterr()
+    assert cli.main(["sql", str(store), query]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2 + 100  # a header, a rule, and every row on one line
+    assert lines[0].split() == ["number", "numbers", "text"]
+    assert lines[-1].split()[0] == "99"
+    assert lines[-1].endswith(r"[a]\nb")
+    assert lines[-1].count(",") == 29
+    few = f"FROM ({query}) LIMIT 3"
+    assert cli.main(["sql", str(store), few]) == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[2:5:2]] == ["0", "1"]
+
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
+    assert cli.main(["sql", str(store), query]) == 0
+    shown, said = capsys.readouterr()
+    assert "… 30 in all" in shown
+    assert " 39 " in shown
+    assert " 40 " not in shown
+    assert "100 rows, 40 shown" in said
+
+
+@pytest.fixture
+def sample_rows(tmp_path):
+    """A store, and a query of 100 rows with a list of 30 and a text of two lines."""
+    from support.driven_robot import Drive, write_bag
+
+    bag, store = write_bag(Drive(), tmp_path / "bag"), tmp_path / "store"
+    assert cli.main(["ingest", str(bag), "--store", str(store)]) == 0
+    columns = "i AS number, range(30) AS numbers, '[a]' || chr(10) || 'b' AS text"
+    return store, f"SELECT {columns} FROM range(100) AS t(i)"

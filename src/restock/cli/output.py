@@ -94,6 +94,27 @@ def print_table(
     sys.stdout.write(text.strip("\n") + "\n")
 
 
+def print_plain(rows: Sequence[Row], columns: Sequence[str]) -> None:
+    """A table for files and pipes, as `print_table` lays it out: a line a row, however wide."""
+    numeric = [any(_is_number(row[name]) for row in rows) for name in columns]
+    texts = [
+        [cell(row[name]).replace(r"\[", "[").replace("\n", r"\n") for name in columns]
+        for row in rows
+    ]
+    widths = [
+        max([len(name), *(len(line[place]) for line in texts)])
+        for place, name in enumerate(columns)
+    ]
+
+    def line(cells: Sequence[str]) -> str:
+        parts = zip(cells, widths, numeric, strict=True)
+        padded = (c.rjust(width) if right else c.ljust(width) for c, width, right in parts)
+        return f" {'   '.join(padded)}".rstrip() + "\n"
+
+    rule = " " + "─" * (sum(widths) + 3 * max(len(widths) - 1, 0)) + "\n"
+    sys.stdout.writelines([line(list(columns)), rule, *(line(one) for one in texts)])
+
+
 CLOCK_COLUMNS = ["log - stamp s", "clock"]
 
 

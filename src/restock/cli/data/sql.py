@@ -15,7 +15,10 @@ from restock.errors import QueryError
 if TYPE_CHECKING:
     import duckdb
 
+SHOWN_ROWS = 40  # on a terminal; a file or a pipe gets all
 EXPANDED_ROWS = 20  # at most so many rows too wide for the terminal are printed one below the other
+
+CUT_TO = 4  # values of a list that are shown, where it has more than twice as many
 
 
 @dataclass
@@ -27,6 +30,7 @@ class SqlCommand:
     and label_scores; `restock sql STORE "FROM columns"` lists every column with its meaning. A run
     has its tables (progress, strata, ages, audit, …), a panel `rows`, `strata` and
     `evaluation_split`.
+    A terminal shows the first 40 rows and cuts long lists; a file or a pipe gets all.
     Queries are read-only, and Ctrl-C stops one. Without a query there is a prompt.
     """
 
@@ -69,13 +73,27 @@ class SqlCommand:
         from restock.cli import output
         from restock.replay.store.query import fetch
 
-        columns, values = fetch(connection, text, where=str(self.path))
+        terminal = sys.stdout.isatty() and not (self.json or self.csv)
+        columns, values, count = fetch(
+            connection, text, where=str(self.path), at_most=SHOWN_ROWS if terminal else None
+        )
         rows = [dict(zip(columns, row, strict=True)) for row in values]
         if self.json:
             output.print_json(rows)
         elif self.csv:
             output.print_csv(rows, columns)
-        elif _too_wide(rows, columns) and len(rows) <= EXPANDED_ROWS:
+        elif not terminal and len(rows) > EXPANDED_ROWS:
+            output.print_plain(rows, columns)
+        else:
+            self._show([_cut(row) for row in rows] if terminal else rows, columns)
+        if count > len(rows):
+            output.say(f"{count:,} rows, {len(rows)} shown; all of them go to a file or a pipe")
+
+    def _show(self, rows: list[dict[str, Any]], columns: list[str]) -> None:
+        """A table, or the rows one below the other where that would not fit."""
+        from restock.cli import output
+
+        if len(rows) <= EXPANDED_ROWS and _too_wide(rows, columns):
             for number, row in enumerate(rows, start=1):
                 lines = [
                     {"column": name, "value": output.cell(row[name]).replace(r"\[", "[")}
@@ -115,6 +133,16 @@ class SqlCommand:
         with Store(self.path) as store:
             export_views(store, out)
             output.say(f"views of {self.path}, version {store.version} -> {out}")
+
+
+def _cut(row: dict[str, Any]) -> dict[str, Any]:
+    """The row with long lists cut, as a terminal shows it."""
+    return {
+        name: [*value[:CUT_TO], f"… {len(value):,} in all"]
+        if isinstance(value, list | tuple) and len(value) > 2 * CUT_TO
+        else value
+        for name, value in row.items()
+    }
 
 
 def _too_wide(rows: list[dict[str, Any]], columns: list[str]) -> bool:
