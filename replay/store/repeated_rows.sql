@@ -82,3 +82,9 @@ LEFT JOIN periods USING (recording_id)
 WHERE abs(later_ns - shift_ns) <= coalesce(period_ns, 0.1e9) / 2
 QUALIFY count(*) OVER (PARTITION BY recording_id, same_as) >= min_rows
 ORDER BY matches.transition_id;
+
+-- Each row of them, the first ones too: rows of one `step` are the same step under several ids.
+CREATE OR REPLACE MACRO same_steps() AS TABLE
+SELECT transition_id, same_as_transition_id AS step FROM repeated_rows(1)
+UNION
+SELECT same_as_transition_id, same_as_transition_id FROM repeated_rows(1);

@@ -11,11 +11,12 @@ import pyarrow.parquet as pq
 import pytest
 from support.panels import EVERY, NO_SPLIT, panel_of, planned
 from support.paths import ROOT, SHARED
-from support.stores import recording_transitions, write_store
+from support.stores import TASK, recording_transitions, write_store
 
 from restock.cli import main
 from restock.errors import MixtureError
 from restock.replay.store.store import Store
+from restock.train.evaluation.ope_dataset import load_ope_dataset
 
 MONDAY = ROOT / "sample_logs" / "amr_monday.mcap"
 NEATO = SHARED / "fleet-neato"
@@ -163,3 +164,12 @@ def test_without_an_evaluation_split_copies_stay() -> None:
     one = recording_transitions(1)
     plan = planned(pa.concat_tables([one, copy_of(one, 5)]), EVERY + NO_SPLIT)
     assert len(plan.panel_rows) == 2 * len(one)
+
+
+def test_episodes_that_a_run_learnt_under_another_id_are_not_held_out(tmp_path: Path) -> None:
+    one, other = recording_transitions(1), recording_transitions(2)
+    learnt = panel_of(write_store(tmp_path / "learnt", [one]), EVERY + NO_SPLIT, tmp_path / "p")
+    logs = write_store(tmp_path / "logs", [one, other, copy_of(one, 5, later_ns=10**12)])
+    dataset = load_ope_dataset(learnt, TASK, str(logs))
+    assert len(dataset.evaluation.rows) == len(other)
+    assert f"{2 * len(one['episode_id'].unique())} episodes left aside" in dataset.notes[0]

@@ -212,12 +212,23 @@ def _store_of(panel: Panel) -> Store:
 
 
 def _unseen(store: Store, trained: Panel, ids: Ints) -> tuple[Ints, int]:
-    """Those of the rows whose episode has no row in the panel; and how many episodes had."""
-    episodes = pa.table({"episode_id": trained.meta["episode_id"].cast(pa.string())})
+    """Those of the rows whose episode has no row in the panel; and how many episodes had.
+
+    An episode that shows a row of the panel again, under another id, has one.
+    """
+    meta = trained.meta
+    learnt = pa.table({"transition_id": meta["transition_id"]})
+    with passed_in(store.connection, learnt=learnt):
+        copies = store.connection.sql(
+            "SELECT DISTINCT episode_id FROM transitions WHERE transition_id IN (SELECT"
+            " transition_id FROM same_steps() WHERE step IN (SELECT step FROM same_steps()"
+            " SEMI JOIN learnt USING (transition_id)))"
+        ).fetchnumpy()["episode_id"]
+    episodes = np.union1d(meta["episode_id"].unique().to_numpy(zero_copy_only=False), copies)
     with passed_in(
         store.connection,
         wanted=pa.table({"transition_id": ids}),
-        trained=episodes.group_by("episode_id").aggregate([]),
+        trained=pa.table({"episode_id": pa.array(episodes.tolist(), pa.string())}),
     ):
         ((left_out,),) = store.connection.sql(
             "SELECT count(DISTINCT episode_id) FROM transitions"

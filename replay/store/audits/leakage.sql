@@ -2,12 +2,8 @@
 -- needs: panel
 -- advice: Make the panel again, after `duplicate_transitions` and `repeated_steps` pass; what is held out must share nothing with what is trained on.
 -- doc: What is in the panel and held out at once: an episode; a recording, where whole ones are held out; an episode that ends after the first that is held out, where the latest are; or the same step under another id.
-WITH repeated AS (
-    FROM repeated_rows(1)
-), copies AS (
-    SELECT transition_id, same_as_transition_id AS step FROM repeated
-    UNION
-    SELECT same_as_transition_id, same_as_transition_id FROM repeated
+WITH copies AS (
+    FROM same_steps()
 ), panel_steps AS (
     SELECT DISTINCT step, episode_id
     FROM copies
