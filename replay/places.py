@@ -101,6 +101,6 @@ def _keep(connection: duckdb.DuckDBPyConnection, schema: str, name: str, table: 
 def _list_columns(connection: duckdb.DuckDBPyConnection) -> None:
     """The view `columns` of a run or panel: names, types, and meanings where a run has them."""
     connection.execute(
-        'CREATE VIEW columns AS SELECT table_name AS "view", column_name AS "column",'
+        'CREATE VIEW columns AS SELECT table_name AS "view", column_name,'
         ' data_type AS "type", comment AS meaning FROM duckdb_columns() WHERE NOT internal'
     )

@@ -74,19 +74,19 @@ def install_columns(connection: duckdb.DuckDBPyConnection) -> None:
     order = list(view_docs())
     columns = [(view, column, kind) for view, column, kind in columns if view in order]
     of_columns = [
-        ("columns", name, "VARCHAR") for name in ("view", "column", "type", "unit", "meaning")
+        ("columns", name, "VARCHAR") for name in ("view", "column_name", "type", "unit", "meaning")
     ]
     rows = [
         {
             "view": view,
-            "column": column,
+            "column_name": column,
             "type": kind,
             "unit": own_units.get((view, column)) or unit(column),
             "meaning": docs.get((view, column)) or docs.get(("shared", column)),
         }
         for view, column, kind in sorted(columns, key=lambda row: order.index(row[0])) + of_columns
     ]
-    names = ("view", "column", "type", "unit", "meaning")
+    names = ("view", "column_name", "type", "unit", "meaning")
     schema = pa.schema([pa.field(name, pa.string()) for name in names])
     connection.register("columns", pa.Table.from_pylist(rows, schema=schema))
 

@@ -32,7 +32,7 @@ def init_script(store: Store) -> str:
             ),
             definitions(store.observation_type),
             f"CREATE OR REPLACE VIEW columns AS FROM (VALUES {columns})"
-            ' AS columns ("view", "column", "type", "unit", "meaning");',
+            ' AS columns ("view", "column_name", "type", "unit", "meaning");',
             "",
         ]
     )

@@ -266,7 +266,7 @@ def test_they_are_columns_of_the_table_with_units(store, capsys):
     assert 20 < row["battery"] < 30
     assert row["follows"] > 0.5
     docs = ask(store, "FROM columns WHERE view = 'transitions'", capsys)
-    said = {doc["column"]: (doc["type"], doc["unit"], doc["meaning"]) for doc in docs}
+    said = {doc["column_name"]: (doc["type"], doc["unit"], doc["meaning"]) for doc in docs}
     assert said["left_radps"] == ("DOUBLE", "rad/s", "velocity[left_wheel_joint] of /joint_states")
     assert said["beams_m"] == ("FLOAT[]", "m", "some beams")
     (file,) = (store / "transitions").glob("*/*.parquet")

@@ -210,7 +210,7 @@ def test_every_column_of_every_view_is_documented(store: Store) -> None:
         ).fetchall()
     } - {"stored_transitions", "stored_recordings"}
     assert views == set(view_docs())
-    there = {(row["view"], row["column"]) for row in rows(store, "FROM columns")}
+    there = {(row["view"], row["column_name"]) for row in rows(store, "FROM columns")}
     assert {key for key in column_docs() if key[0] != "shared"} <= there  # no doc of nothing
 
 

@@ -106,11 +106,11 @@ def test_a_runs_columns_are_listed_with_their_meanings(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Run.create(tmp_path / "run", {})
-    query = "SELECT * FROM columns WHERE \"column\" = 'row_hash'"
+    query = "SELECT * FROM columns WHERE column_name = 'row_hash'"
     assert json.loads(out_of(capsys, str(tmp_path / "run"), query, "--json")) == [
         {
             "view": "audit",
-            "column": "row_hash",
+            "column_name": "row_hash",
             "type": "VARCHAR",
             "meaning": "of the packed row, 16 hex digits: `restock trace` checks it",
         }
