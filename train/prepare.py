@@ -10,10 +10,11 @@ from typing import Any
 import msgspec
 
 from restock.errors import PanelError, RunError
-from restock.ingest.profile.profile import Profile, load_profile
+from restock.ingest.profile.profile import Profile, load_profile, shipped_profiles
 from restock.replay.panel.logged_sampler import controller_for
 from restock.replay.panel.panel import Panel
 from restock.replay.sampling.share_controller import PlannedDraws
+from restock.toml import read_toml
 from restock.train import loop
 from restock.train.dqn.config import TrainConfig, apply_overrides, load_config, parse_config
 from restock.train.dqn.learner import open_device
@@ -139,19 +140,24 @@ def prepare_new(
     Raises:
         RunError: `out` already exists.
         ConfigError: a config that cannot be used, or no such device.
-        PanelError: a panel made for another task or discount than the twin's.
+        PanelError: a panel of another discount, or of a profile that is not at hand.
     """
     check_free(out)
     if isinstance(config, TrainConfig):
         document = apply_overrides(msgspec.to_builtins(config), overrides)
+        chosen = document["profile"] != TrainConfig().profile
         config = parse_config(document, where="TrainConfig")
     else:
-        config = load_config(config, overrides)
+        file, config = config, load_config(config, overrides)
+        chosen = "profile" in apply_overrides({} if file is None else read_toml(file), overrides)
     open_device(config.device)
     for layouts in {config.env.layouts, _evaluation_layouts(config)}:
         # What is wrong with one is reported before anything is written. Evaluation drives all kinds
         # that are named, whatever their share.
         refuse_unfit(open_floors(layouts), config.env.conditions)
+    if panel_path is not None and not chosen:
+        name = profile_of_panel(Panel.open(panel_path))
+        config = msgspec.structs.replace(config, profile=name)
     profile = load_profile(config.profile)
     panel = open_panel(panel_path, config, profile) if panel_path is not None else None
     config = resolve_config(config, panel)
@@ -194,6 +200,26 @@ def prepare_resumed(
     return Prepared(path, config, profile, panel, run.document, run, from_env_steps)
 
 
+def profile_of_panel(panel: Panel) -> str:
+    """The profile whose task the panel's rows are of, where the config names none.
+
+    Raises:
+        PanelError: it is of one that does not come with Restock.
+    """
+    shipped = [n for n in shipped_profiles() if load_profile(n).task.hash == panel.task_hash]
+    if not shipped:
+        name = panel.header.profile
+        raise PanelError(
+            f"its rows are of task {panel.task_hash}"
+            + (f", of profile {name!r}" if name else "")
+            + ": no profile that comes with Restock has it",
+            where=str(panel.path),
+            remedy="give the file of the profile that its logs were ingested with: --set"
+            f" profile={name or 'my_robot'}.toml; if that changed since, ingest and mix again",
+        )
+    return panel.header.profile if panel.header.profile in shipped else shipped[0]
+
+
 def open_panel(path: Path, config: TrainConfig, profile: Profile) -> Panel:
     """A panel, every byte of it checked, and against the twin's task and the config's discount.
 
@@ -206,7 +232,8 @@ def open_panel(path: Path, config: TrainConfig, profile: Profile) -> Panel:
             f"its rows are of task {panel.task_hash}, the twin's ({profile.name}) is"
             f" {profile.task.hash}: observation, action or reward differ",
             where=str(path),
-            remedy=f"ingest the logs again with `--profile {profile.name}` and mix again",
+            remedy="leave `profile` out of the config, and the panel's is taken; or ingest the logs"
+            f" again with `--profile {profile.name}` and mix again",
         )
     if abs(panel.discount - config.loss.discount) > 1e-9:
         raise PanelError(

@@ -44,6 +44,7 @@ class TransitionSource:
     task_json: Callable[[str], str]  # task hash -> the task as JSON; "" where nothing is known
     conditions: tuple[Condition, ...]
     others: tuple[PinnedStore, ...] = ()  # whose rows are in the view too
+    profile: Callable[[str], str] = lambda task_hash: ""  # task hash -> the profile's name
 
 
 @contextmanager
@@ -73,6 +74,7 @@ def open_source(
                 transitions.task_json,
                 named,
                 stores.others,
+                transitions.profile_name,
             )
         return
     with duckdb.connect() as connection:
@@ -273,6 +275,7 @@ def _header(
         store_version=source.version,
         task_hash=plan.task_hash,
         task_json=task_json,
+        profile=source.profile(plan.task_hash),
         labels_version=labels_version(source.conditions),
         observation_size=observation_size,
         rows=len(plan.panel_rows),

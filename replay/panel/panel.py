@@ -66,6 +66,7 @@ class Header(msgspec.Struct, frozen=True):
     others: list[PinnedStore]  # stores besides the first
     ratios: list[RatioFit]  # how well density ratios were estimated, where a correction uses them
     files: dict[str, FileRecord]
+    profile: str = ""  # the name of the one that read its rows; "" where the source did not say
     as_of_ns: int | None = None  # what the mixture's max_age_days counted to, where it has one
 
 

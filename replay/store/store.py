@@ -107,6 +107,15 @@ class Store:
             return ()
         return tuple(self._decode(rows[0][0], list[Condition], "conditions"))
 
+    def profile_name(self, task_hash: str) -> str:
+        """The profile that read the rows of a task, by the newest ingest; "" where none did."""
+        rows = self.connection.execute(
+            "SELECT profile FROM recordings WHERE task_hash = ?"
+            " ORDER BY ingested_at DESC, ingest_id LIMIT 1",
+            [task_hash],
+        ).fetchall()
+        return str(rows[0][0]) if rows and rows[0][0] else ""
+
     def task_json(self, task_hash: str | None = None) -> str:
         """The task of the store's rows as JSON.
 

@@ -220,6 +220,8 @@ def test_a_store_and_the_same_table_pack_the_same_rows(
     assert from_store.task == TASK
     assert from_store.task_hash == TASK.hash
     assert from_store.store_version == 2
+    assert from_store.header.profile == "warehouse_amr"  # by whose name training finds its task
+    assert from_table.header.profile == ""
 
 
 def test_the_id_names_the_content(transitions: pa.Table, tmp_path: Path) -> None:

@@ -297,16 +297,40 @@ def test_wrong_input_gives_one_clear_message_and_writes_nothing(
     assert not (tmp_path / "new").exists()
 
 
-def test_a_panel_of_another_task_is_refused(
+def test_a_panel_of_a_task_that_no_profile_has_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     build_panel(recording_transitions(1, episodes=40), MIXTURE, tmp_path / "panel")
     argv = ["train", "--panel", str(tmp_path / "panel"), "--out", str(tmp_path / "run")]
     assert main(argv) == 2
     said = capsys.readouterr().err
+    assert "no profile that comes with Restock has it" in said
+    assert "--set profile=my_robot.toml" in said
+    assert main([*argv, "--set", "profile=warehouse_amr"]) == 2
+    said = capsys.readouterr().err
     assert "observation, action or reward differ" in said
+    assert "leave `profile` out of the config" in said
     assert load_profile("warehouse_amr").task.hash in said
     assert not (tmp_path / "run").exists()
+
+
+def test_a_panel_brings_its_profile(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    task = load_profile("turtlebot3").task
+    rows = recording_transitions(1, episodes=40, task=task)
+    build_panel(rows, MIXTURE, tmp_path / "panel", task=task)
+    out = tmp_path / "run"
+    argv = ["train", "--panel", str(tmp_path / "panel"), "--out", str(out), *TINY]
+    argv += ["--set", f"loss.discount={MIXTURE.discount}"]
+    assert main([*argv, "--env-steps", "40"]) == 0
+    document = json.loads((out / "config.json").read_text())
+    assert document["config"]["profile"] == document["profile"]["name"] == "turtlebot3"
+    assert document["task_hash"] == task.hash
+    assert main(["train", "--resume", str(out), "--env-steps", "80"]) == 0
+    # One that the config names stays in force.
+    other = [*argv, "--out", str(tmp_path / "b"), "--set", "profile=warehouse_amr"]
+    capsys.readouterr()
+    assert main(other) == 2
+    assert "observation, action or reward differ" in capsys.readouterr().err
 
 
 def test_a_dry_run_writes_nothing(
