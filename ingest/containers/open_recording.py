@@ -8,6 +8,7 @@ columns["/odom"].fields["twist.twist.linear.x"]  # (N,) float64
 from __future__ import annotations
 
 import tempfile
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -80,12 +81,11 @@ class _Opening:
         for file in files:
             self._open_file(file)
         self._refuse_serialisation(metadata)
-        recording = Recording(
+        self._compare(metadata)
+        return Recording(
             *(self.path, self._format(), files, self.storages, self.distro),
             *(self.damage, self.notes, self.cleanup),
         )
-        self._compare(recording, metadata)
-        return recording
 
     def _bag(self) -> tuple[list[Path], BagMetadata]:
         if not discover.is_bag(self.path):
@@ -172,24 +172,27 @@ class _Opening:
                     remedy="`ros2 bag convert` with that middleware installed rewrites it as cdr",
                 )
 
-    def _compare(self, recording: Recording, metadata: BagMetadata) -> None:
+    def _compare(self, metadata: BagMetadata) -> None:
         """metadata.yaml's counts are a claim about the files: what it counts and they do not hold
         is lost; what they hold beyond it is noted."""
+        counts = Counter[str]()
+        for storage in self.storages:
+            for channel in storage.channels.values():
+                counts[channel.topic] += storage.counts.get(channel.id, 0)
         for topic in metadata.topics:
             if topic.name is None or topic.messages is None:
                 continue
             name = visible(topic.name)  # as the files' names are
-            info = recording.topics.get(name)
-            counted = info.expected if info else 0
+            counted = counts[name]
             if counted == topic.messages:
                 continue
             what = (
                 f"{METADATA} counts {topic.messages} messages on {name}, the files hold {counted}"
             )
             if counted < topic.messages:
-                recording.damage_of_bag(Damage(what, {-1: topic.messages - counted}))
+                self.damage.append(Damage(what, {-1: topic.messages - counted}))
             else:
-                recording.notes.append(what)
+                self.notes.append(what)
 
 
 __all__ = [

@@ -159,10 +159,6 @@ class Recording:
         """What of its files could not be read."""
         return self._bag_damage + [item for storage in self._storages for item in storage.damage]
 
-    def damage_of_bag(self, damage: Damage) -> None:
-        """Add what is missing of the bag as a whole, beside what its files miss."""
-        self._bag_damage.append(damage)
-
     @property
     def extras(self) -> list[Extra]:
         """What its files hold besides messages: attachments and metadata records, by name."""
