@@ -5,10 +5,18 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pyarrow as pa
 import pytest
 from support.kept_run import kept_run
 
 from restock.cli import main
+from restock.files import write_table
+from restock.train.run.kept_evaluations import (
+    add_evaluation,
+    read_evaluations,
+    shown_evaluation,
+)
+from restock.train.run.run_tables import EVAL_EPISODES
 from restock.train.twin.physics.episode import KINDS
 
 
@@ -52,3 +60,49 @@ def test_a_floor_is_evaluated_on_the_kinds_that_fit_it(
     hall.write_text("width_m = 2.0\ndepth_m = 2.0\nracks = []\n")
     assert main(line) == 2
     assert "has no room for episodes of nominal" in capsys.readouterr().err
+
+
+def test_evaluations_add_up_and_the_newest_floors_are_shown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = kept_run(tmp_path / "a")
+    hall = tmp_path / "hall.toml"
+    hall.write_text("width_m = 12.0\ndepth_m = 10.0\nracks = [[5.8, 0.0, 6.2, 10.0]]\n")
+    line = ["eval", str(run), "--episodes", "1", "--perturbations", "none", "--layouts", str(hall)]
+    for policy, seed, rows in (
+        ("agent", 1, 3),
+        ("random", 1, 6),
+        ("random", 50, 9),
+        ("random", 50, 9),  # driven again: the same episodes
+    ):
+        assert main([*line, "--policies", policy, "--seed", str(seed)]) == 0
+        assert read_evaluations(run).num_rows == rows
+    kept = read_evaluations(run)
+    other = kept.slice(0, 3).set_column(
+        kept.schema.get_field_index("layouts"), "layouts", pa.array(["elsewhere"] * 3)
+    )
+    place = other.schema.get_field_index("version")
+    newer = other.set_column(place, "version", pa.array(["a@9"] * 3))
+    add_evaluation(run, other.cast(kept.schema))
+    add_evaluation(run, newer.cast(kept.schema))
+    assert read_evaluations(run).num_rows == 15
+    shown, said = shown_evaluation(run)
+    assert (shown.num_rows, set(shown["version"].to_pylist())) == (3, {"a@9"})
+    assert said == (
+        "3 of 15 episodes that `restock eval` drove: floors elsewhere, policy a@9, seeds 1 to 1."
+    )
+    capsys.readouterr()
+    assert main(["sql", str(run), "SELECT count(*) AS n FROM eval_episodes", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == [{"n": 15}]
+
+
+def test_what_an_earlier_restock_evaluated_is_still_shown(tmp_path: Path) -> None:
+    run = kept_run(tmp_path / "a")
+    assert shown_evaluation(run)[0].num_rows == 0
+    names = [name for name in EVAL_EPISODES.names if name not in ("version", "layouts")]
+    row = {"policy": "agent", "condition": "nominal", "episode_seed": 3, "success": True}
+    schema = pa.schema([EVAL_EPISODES.field(name) for name in names])
+    write_table(pa.Table.from_pylist([row], schema=schema), run / "eval" / "episodes.parquet")
+    shown, said = shown_evaluation(run)
+    assert shown.num_rows == 1
+    assert "floors not named, policy not named, seeds 3 to 3" in said

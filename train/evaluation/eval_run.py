@@ -7,7 +7,7 @@ episodes from and from those that chose the checkpoint.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,6 @@ import msgspec
 import pyarrow as pa
 
 from restock.errors import ConfigError
-from restock.files import write_table
 from restock.ingest.profile.profile import load_profile
 from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.evaluation.evaluate import (
@@ -25,6 +24,7 @@ from restock.train.evaluation.evaluate import (
     summary_rows,
 )
 from restock.train.evaluation.policies import load_agent, load_policy
+from restock.train.run.kept_evaluations import add_evaluation
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES
 from restock.train.twin.env.floor_report import refuse_unfit, unfit_kinds
@@ -169,7 +169,7 @@ def evaluate(
 def drive_evaluation(
     plan: EvaluationPlan, progress: Callable[[int], None] | None = None
 ) -> Results:
-    """Drive all episodes, and write them to the run's `eval/episodes.parquet`."""
+    """Drive all episodes, and add them to the run's `eval/episodes.parquet`."""
     from restock.train.twin.env.interface import DEFAULT_CONDITIONS
     from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
@@ -191,10 +191,13 @@ def drive_evaluation(
         for kind in plan.kinds
     ]
     results: Results = {}
+    versions: dict[str, str] = {}
     for policy in plan.policies:
+        driver = make_policy(policy, plan)
+        versions[policy] = driver.version
         driven = run_episodes(
             env,
-            make_policy(policy, plan),
+            driver,
             [spec for _, spec in episodes],
             control_period_s=task.control_period_s,
             time_limit_steps=task.time_limit_steps,
@@ -203,7 +206,7 @@ def drive_evaluation(
         )
         for (perturbation, _), result in zip(episodes, driven, strict=True):
             results.setdefault((policy, perturbation), []).append(result)
-    write_table(episodes_table(results), plan.run.path / "eval" / "episodes.parquet")
+    add_evaluation(plan.run.path, episodes_table(results, plan, versions))
     return results
 
 
@@ -244,7 +247,7 @@ def make_policy(name: str, plan: EvaluationPlan) -> Policy:
     return RandomPolicy(seed=plan.first_seed) if named is None else named
 
 
-def episodes_table(results: Results) -> pa.Table:
+def episodes_table(results: Results, plan: EvaluationPlan, versions: Mapping[str, str]) -> pa.Table:
     """One row an episode."""
     rows = [
         {
@@ -254,6 +257,8 @@ def episodes_table(results: Results) -> pa.Table:
             "end_x_m": result.end_x_m,
             "end_y_m": result.end_y_m,
             "failure": result.failure,
+            "version": versions[policy],
+            "layouts": plan.layouts,
         }
         for (policy, perturbation), episodes in results.items()
         for result in episodes

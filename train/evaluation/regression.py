@@ -22,6 +22,7 @@ from restock.errors import RunError
 from restock.files import read_table, write_table
 from restock.stats import iqm, mean_over_strata, paired_improvement
 from restock.train.evaluation.evaluate import cell_name
+from restock.train.run.kept_evaluations import shown_evaluation
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES
 
@@ -121,7 +122,7 @@ def regression(
         pairs = []
         for cell in sorted(key for key in baseline.cells if key[0] == perturbation):
             before, after = baseline.cells[cell], candidate.cells.get(cell, {})
-            if before.keys() != after.keys():
+            if not before.keys() <= after.keys():  # more of them are no hindrance
                 rows.append(_refused(cell, before, after))
                 continue
             pair = np.array([[before[key], after[key]] for key in sorted(before)])
@@ -206,12 +207,7 @@ def _refused(cell: tuple[str, str], before: _Episodes, after: _Episodes) -> dict
 
 def agent_episodes(run: Run) -> pa.Table | None:
     """What `restock eval` wrote of the run's own policy; None where it did not drive."""
-    path = run.path / "eval" / "episodes.parquet"
-    if not path.is_file():
-        return None
-    table = read_table(
-        path, EVAL_EPISODES, error=RunError, remedy=f"run `restock eval {run.path}` again"
-    )
+    table, _ = shown_evaluation(run.path)
     agent = table.filter(pa.compute.equal(table["policy"], "agent"))
     return agent if len(agent) else None
 

@@ -272,6 +272,8 @@ EVAL_EPISODES = _schema(
     ("end_x_m", _F, "where it ended"),
     ("end_y_m", _F, "where it ended"),
     ("failure", _S, "null | stuck | timeout | bump | cut"),
+    ("version", _S, "of the policy; null from an earlier Restock"),
+    ("layouts", _S, "floors that were asked for; null from an earlier Restock"),
 )
 
 

@@ -74,6 +74,7 @@ def replay_card(facts: Facts) -> dict[str, Any]:
             *("ess", "horizon", "epsilon", "estimated_share"),
         ),
         "left_out": dict(panel.header.left_out) if panel is not None else None,
+        "evaluation": facts.evaluation or None,
         "imbalance": evaluation_bias(facts) or None,
         "missing": list(facts.missing),
     }
@@ -141,6 +142,7 @@ def as_markdown(card: dict[str, Any]) -> str:
         f" {', '.join(card['corrections']['post_strata']) or 'none'}; weights moved"
         f" {_percent(card['corrections']['moved_by_weights'])} of the logs' mix",
         "Left out of the panel": _words(card["left_out"]),
+        "Evaluation shown": _or_none(card["evaluation"]),
     }
     lines += ["| | |", "| --- | --- |"]
     lines += [f"| {name} | {_cell(value)} |" for name, value in facts.items()]

@@ -10,14 +10,13 @@ from typing import Any
 import duckdb
 
 from restock.errors import RestockError, RunError
-from restock.files import read_table
 from restock.replay.panel.panel import Panel
 from restock.replay.panel.strata import Stratum
 from restock.replay.store.store import Store
 from restock.report.blocks import Rows, words
 from restock.stats import wilson
+from restock.train.run.kept_evaluations import shown_evaluation
 from restock.train.run.run import Run
-from restock.train.run.run_tables import EVAL_EPISODES
 from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 
@@ -47,6 +46,7 @@ class Facts:
     cells: Rows  # of `restock eval`, with Wilson intervals as low and high
     failures: Rows
     panel: Panel | None = None
+    evaluation: str = ""  # which of the episodes that were driven are shown
     floor: Warehouse | None = None  # that the run drives on, where it is one
     visited: Rows = field(default_factory=list)
     rare: Rows = field(default_factory=list)
@@ -89,12 +89,7 @@ def gather(path: Path) -> Facts:
     with duckdb.connect() as connection:
         for name in _TABLES:
             connection.register(name, run.table(name))
-        file = path / "eval" / "episodes.parquet"
-        evaluated = EVAL_EPISODES.empty_table()
-        if file.exists():
-            evaluated = read_table(
-                file, EVAL_EPISODES, error=RunError, remedy=f"run `restock eval {path}` again"
-            )
+        evaluated, shown = shown_evaluation(path)
         connection.register("evaluated", evaluated)
         rows = {
             name: _as_dicts(connection.execute(sql)) for name, sql in _queries("run.sql").items()
@@ -112,6 +107,7 @@ def gather(path: Path) -> Facts:
             row["low"], row["high"] = wilson(int(row["successes"]), int(row["episodes"]))
     kept = rows.pop("kept")
     facts = Facts(run=path, config=run.document, kept=kept[0] if kept else None, **rows)  # type: ignore[arg-type]
+    facts.evaluation = shown
     facts.off_policy = [
         row for row in run.table("off_policy").to_pylist() if row["condition"] == "all"
     ]

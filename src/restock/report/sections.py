@@ -59,7 +59,7 @@ def success(facts: Facts) -> Section | None:
         intro=NO_GOAL
         if facts.no_goal
         else "Success per kind of episode, on the same seeded episodes for every policy, clean and"
-        " under each perturbation. Lines are 95 % Wilson intervals.",
+        f" under each perturbation. Lines are 95 % Wilson intervals. {facts.evaluation}",
         callout="" if facts.no_goal else "; ".join(_regressions(facts)),
         figures=[] if facts.no_goal else [Figure(charts.success(shown))],
         tables=[_table(rows, texts, title="The agent, cell by cell")],

@@ -15,7 +15,7 @@ class EvalCommand:
 
     Every policy drives the same seeded episodes of every condition that its floors have room for,
     clean and under each perturbation. Prints success with 95 % Wilson intervals, contacts, time and
-    return, with partly and wholly blocked aisles apart, and writes RUN/eval/episodes.parquet.
+    return, with partly and wholly blocked aisles apart, and adds to RUN/eval/episodes.parquet.
 
     With --baseline it is compared with another run or a saved baseline on the same episodes.
     With --on-logs nothing drives: off-policy evaluation on logged episodes that it did not
@@ -132,7 +132,7 @@ class EvalCommand:
                 for row in _by_cell(rows)
             ]
             print_table(shown, title="success [95 % Wilson interval]; time of the successful ones")
-            say(f"written to {self.run_path / 'eval' / 'episodes.parquet'}")
+            say(f"added to {self.run_path / 'eval' / 'episodes.parquet'}")
         if "regression" in document:
             show_regression(document["regression"], document["baseline"], self.margin)
         if "saved" in document:
