@@ -68,7 +68,7 @@ def test_fresh_rows_are_what_the_environment_gave(tmp_path: Path) -> None:
 def test_sac_trains_on_the_continuous_face_with_logs(
     panel: Panel, store: Path, tmp_path: Path, given: str
 ) -> None:
-    commands = logged_commands(panel, store) if given == "store" else None
+    commands = logged_commands(panel.path, store) if given == "store" else None
     model = sb3.SAC(
         "MlpPolicy",
         sb3_envs(1, action="continuous"),

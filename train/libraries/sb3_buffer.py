@@ -252,12 +252,14 @@ def dqn_critic(model: Any) -> Critic:
     return critic
 
 
-def logged_commands(panel: Panel, store: str | Path) -> F32:
-    """The command (m/s, rad/s) of every row of a panel, (n, 2), from its store.
+def logged_commands(panel: Panel | str | Path, store: str | Path) -> F32:
+    """The command (m/s, rad/s) of every row of a panel (or its folder), (n, 2), from its store.
 
     Raises:
         MixtureError: the store lacks rows of the panel.
     """
+    if not isinstance(panel, Panel):
+        panel = Panel.open(panel)
     with Store(store) as opened:
         opened.connection.register("wanted", panel.meta.select(["transition_id"]))
         table = opened.connection.sql(
