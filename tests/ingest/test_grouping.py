@@ -138,6 +138,9 @@ class Kept:
         self.manifest, self.rows = manifest, rows
         return 1
 
+    def repeated(self, rows: Any, period_s: float) -> None:
+        """Nothing is in it that could be repeated."""
+
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_any_grouping_gives_the_same_table(storage: str, tmp_path: Path) -> None:
