@@ -72,7 +72,8 @@ class Contents:
 
     def distrust_index(self) -> None:
         """Forget the message indexes: every chunk is then walked."""
-        self.chunks = [replace(chunk, index={}) for chunk in self.chunks]
+        # One without an index stays the very chunk: it may be the one that was cut short.
+        self.chunks = [replace(c, index={}) if c.index else c for c in self.chunks]
 
 
 def survey(file: FileBytes) -> Contents:
