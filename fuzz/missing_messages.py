@@ -130,14 +130,12 @@ def main(argv: list[str] | None = None) -> int:
             for salvage in (False, True):
                 result = reported(path, salvage)
                 if result is None:
-                    outcomes[
-                        "refused" + (", though messages are left" if salvage and there else "")
-                    ] += 1
+                    left = salvage and there
+                    outcomes["refused, though messages are left" if left else "refused"] += 1
                     continue
                 counts, lost = result
-                missing = there - counts
                 outcomes["lost, and said so" if lost else "whole"] += 1
-                if missing and not lost:
+                if there.total() > counts.total() and not lost:
                     outcomes["MISSING"] += 1
                     options.out.mkdir(parents=True, exist_ok=True)
                     copy = options.out / f"{kept}-{file.stem}{file.suffix}"
