@@ -28,7 +28,7 @@ from restock.ingest.store.manifest import (
     recorded_facts,
     software_version,
 )
-from restock.ingest.store.repeated import Repeat
+from restock.ingest.store.repeated import RepeatedDrive
 from restock.ingest.store.transitions import Provenance, recording_table
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.conditions import NOMINAL, LabelScore, label_scores
@@ -53,7 +53,7 @@ class IngestResult:
     lost_messages: list[str] = field(default_factory=list)  # or lost bytes, and why
     notes: list[str] = field(default_factory=list)
     version: int | None = None  # of the store's transitions, where they were written
-    repeats: Repeat | None = None  # a recording of the store that largely holds the same rows
+    repeats: RepeatedDrive | None = None  # one in the store with largely the same rows
 
     @property
     def lossy(self) -> bool:
@@ -155,7 +155,7 @@ class _Ingest:
 
     def _write(
         self, store: StoreWriter, manifest: dict[str, Any], table: pa.Table
-    ) -> tuple[int, Repeat | None]:
+    ) -> tuple[int, RepeatedDrive | None]:
         """The store's version with these rows, and a recording that has them under other ids."""
         period_s = self.profile.task.control_period_s
         if self.repeated == "refuse" and (found := store.repeated(table, period_s)):
@@ -188,7 +188,7 @@ class _Ingest:
             for topic, count in steps.clock.off_clock.items()
         ]
 
-    def _notes(self, steps: Steps, table: pa.Table, repeats: Repeat | None) -> list[str]:
+    def _notes(self, steps: Steps, table: pa.Table, repeats: RepeatedDrive | None) -> list[str]:
         clock = steps.clock
         notes = [*self.recording.notes, *steps.notes]
         if clock.pace is not None:

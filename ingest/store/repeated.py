@@ -32,7 +32,7 @@ Hashes = NDArray[np.uint64]
 
 
 @dataclass(frozen=True)
-class Repeat:
+class RepeatedDrive:
     """A recording of the store that holds the same rows."""
 
     recording_id: str
@@ -104,7 +104,7 @@ def looks_alike(mine: Hashes, other: Sketch) -> bool:
     return both >= LEAST_HASHES and both >= LARGELY / 2 * least
 
 
-def compare(rows: pa.Table, other: pa.Table, period_s: float) -> Repeat | None:
+def compare(rows: pa.Table, other: pa.Table, period_s: float) -> RepeatedDrive | None:
     """What the new rows have in common with those of another recording, if they largely do.
 
     One constant shift between the stamps of the two is taken out; rows further apart than half a
@@ -121,7 +121,7 @@ def compare(rows: pa.Table, other: pa.Table, period_s: float) -> Repeat | None:
     least = min(len(mine), len(theirs))
     if same < LEAST_HASHES or same < LARGELY * least:
         return None
-    return Repeat(
+    return RepeatedDrive(
         str(other["recording_id"][0]),
         str(other["source_file"][0]),
         same,
@@ -135,7 +135,7 @@ def find_repeat(
     sketches: Iterable[Sketch],
     read: Callable[[str, str], pa.Table],
     period_s: float,
-) -> Repeat | None:
+) -> RepeatedDrive | None:
     """The recording that holds the most of the rows, of those that `compare` finds the same.
 
     `read(recording_id, ingest_id)` gives the rows of one whose sketch looks alike.

@@ -35,7 +35,7 @@ from restock.ingest.store.location import Location
 from restock.ingest.store.repeated import (
     SKETCH,
     UNREADABLE,
-    Repeat,
+    RepeatedDrive,
     Sketch,
     find_repeat,
     read_sketch,
@@ -82,7 +82,7 @@ class StoreWriter:
         """One recording's transitions, as they were written."""
         return self.path.read(f"{TRANSITIONS}/{recording_id}/{ingest_id}.parquet")
 
-    def repeated(self, rows: pa.Table, period_s: float) -> Repeat | None:
+    def repeated(self, rows: pa.Table, period_s: float) -> RepeatedDrive | None:
         """The recording that holds most of these rows under other ids, if one largely does.
 
         `period_s` is the control period: rows further apart than half of it do not count.
