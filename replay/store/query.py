@@ -14,6 +14,10 @@ from restock.replay.store.column_docs import install_columns
 
 T = TypeVar("T")
 
+# In their order: a view may use those before it.
+VIEWS = ("views.sql",)
+MACROS = ("macros.sql", "repeated_rows.sql")
+
 # Statements that leave files as they are; CREATE makes tables and macros in memory.
 _ALLOWED = {"SELECT", "EXPLAIN", "CREATE", "DROP", "SET", "VARIABLE_SET", "PRAGMA", "CALL"}
 
@@ -25,11 +29,10 @@ def install(connection: duckdb.DuckDBPyConnection, observation_type: str) -> Non
 
 
 def definitions(observation_type: str = "FLOAT[]") -> str:
-    """views.sql, macros.sql and repeated_rows.sql, with the type that observations are cast to."""
+    """The text of VIEWS and MACROS, with the type that observations are cast to."""
     folder = files("restock.replay.store")
-    views = (folder / "views.sql").read_text(encoding="utf-8")
-    macros = (folder / "macros.sql").read_text(encoding="utf-8")
-    return views.replace("::FLOAT[] ", f"::{observation_type} ") + f"\n{macros}\n{repeated_rows()}"
+    text = [(folder / name).read_text(encoding="utf-8") for name in (*VIEWS, *MACROS)]
+    return "\n".join(text).replace("::FLOAT[] AS", f"::{observation_type} AS")
 
 
 def repeated_rows() -> str:

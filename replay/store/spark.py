@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from restock.errors import StoreError
 from restock.ingest.store.location import Location
 from restock.ingest.store.writer import RECORDINGS, TRANSITIONS
+from restock.replay.store.query import VIEWS
 from restock.replay.store.store import is_store
 
 # The view that no rule translates: DuckDB adds the columns that rows of an older store lack.
@@ -95,8 +96,9 @@ def install_views(session: SparkSession | Any, store: str | Path, *, scheme: str
 
 
 def statements() -> Iterator[str]:
-    """The statements of views.sql in Spark's SQL, in their order, without comments."""
-    text = (files("restock.replay.store") / "views.sql").read_text(encoding="utf-8")
+    """The statements of VIEWS in Spark's SQL, in their order, without comments."""
+    folder = files("restock.replay.store")
+    text = "\n".join((folder / name).read_text(encoding="utf-8") for name in VIEWS)
     text = re.sub(r" *--.*", "", text)
     for pattern, spark in _RULES:
         text = re.sub(pattern, spark, text)
