@@ -31,7 +31,8 @@ from restock.ingest.store.manifest import (
 from restock.ingest.store.repeated import RepeatedDrive
 from restock.ingest.store.transitions import Provenance, recording_table
 from restock.ingest.store.writer import StoreWriter
-from restock.ingest.task.conditions import NOMINAL, LabelScore, label_scores
+from restock.ingest.task.conditions import NOMINAL
+from restock.ingest.task.label_scores import LabelScore, label_scores
 from restock.ingest.task.schema import recording_schema
 
 Status = Literal["written", "unchanged", "dry run"]

@@ -25,13 +25,12 @@ from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.conditions import (
     NOMINAL,
     Condition,
-    LabelScore,
     label,
-    label_scores,
     labels_version,
     primary,
     runnable,
 )
+from restock.ingest.task.label_scores import LabelScore, label_scores
 from restock.ingest.task.schema import recording_schema
 
 TWIN = "twin"  # format of the recordings that training makes of its episodes

@@ -20,7 +20,7 @@ from restock.ingest.store.episode_rows import EpisodeRows
 from restock.ingest.store.manifest import definitions, manifest_row, software_version
 from restock.ingest.store.transitions import Provenance, TransitionValues, transition_table
 from restock.ingest.store.writer import StoreWriter
-from restock.ingest.task.conditions import label_scores
+from restock.ingest.task.label_scores import label_scores
 from restock.ingest.task.perturbation_columns import Perturbed
 from restock.ingest.task.schema import SIGNAL_COLUMNS, recording_schema
 from restock.train.feed.fresh_log import FreshEpisode, read_episodes

@@ -19,7 +19,8 @@ from restock.ingest.steps.episodes import Split
 from restock.ingest.steps.steps import Steps
 from restock.ingest.store.episode_rows import EpisodeRows
 from restock.ingest.store.transitions import Provenance
-from restock.ingest.task.conditions import Condition, LabelScore
+from restock.ingest.task.conditions import Condition
+from restock.ingest.task.label_scores import LabelScore
 
 UNUSED = "not used by the profile"
 

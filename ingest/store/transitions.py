@@ -18,6 +18,7 @@ from restock.ingest.steps.episodes import Split
 from restock.ingest.steps.steps import Steps
 from restock.ingest.store.episode_rows import ENDS, EpisodeRows, episode_rows, groups, packed
 from restock.ingest.task.conditions import NOMINAL, primary
+from restock.ingest.task.label_scores import true_names, truth_text
 from restock.ingest.task.schema import SIGNAL_COLUMNS, STEP_BITS, transition_schema
 from restock.ingest.task.task import observe, reward
 
@@ -101,7 +102,7 @@ def transitions(
         residual=steps.residual[tick],
         terminates=terminates[rows.episode[begin]],
         zone=profile.zone_of(now["pose_x_m"], now["pose_y_m"]),
-        truth=[steps.truth[index] for index in tick],
+        truth=[_sorted_truth(steps.truth[index]) for index in tick],
         policy=[steps.policy[index] for index in tick],
         policy_version=[steps.policy_version[index] for index in tick],
         probability=[steps.probability[index] for index in tick],
@@ -168,6 +169,10 @@ def transition_table(
     arrays = [column_array(columns[field.name], field.type, count) for field in schema]
     table = pa.table(arrays, schema=schema)
     return table.replace_schema_metadata({ENDS: packed(rows.ends_table())})
+
+
+def _sorted_truth(text: str | None) -> str | None:
+    return None if text is None else truth_text(true_names(text))
 
 
 def _vectors(rows: NDArray[np.float32]) -> pa.Array:

@@ -10,16 +10,16 @@ says what it may look at:
 
 The difference matters to replay: boosting a `post` stratum resamples the outcome of an action and
 biases what the critic learns, unless it is corrected for. What else a condition may not say is in
-`restock.ingest.task.condition_sql`. Where a simulator says the truth, labels are scored against it.
+`restock.ingest.task.condition_sql`. Where a simulator says the truth, labels are scored against it:
+`restock.ingest.task.label_scores`.
 """
 
 from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
@@ -37,7 +37,6 @@ from restock.toml import Checked
 Timing = Literal["pre", "post"]
 NOMINAL = "nominal"
 LARGEST_BYTES = 100_000  # of a condition's file
-GOOD = 0.8  # precision and recall, for a label to be trusted
 
 
 class Condition(Checked, frozen=True):
@@ -204,65 +203,3 @@ def _read(entry: dict[str, Any], key: str, folder: Path | None, where: str) -> d
         raise refused(f"cannot be read: {name}: {error}") from error
     stem = {"name": path.stem} if path.stem.isidentifier() else {}
     return stem | settings_of(text) | {k: value for k, value in entry.items() if k != "file"}
-
-
-@dataclass(frozen=True)
-class LabelScore:
-    """One label against the truth, over the transitions whose truth is known."""
-
-    condition: str
-    precision: float | None  # None: the label was never given
-    recall: float | None  # None: it was never true
-    labelled: int  # transitions that got the label
-    support: int  # transitions where it is true
-    known: int  # transitions whose truth is known
-
-    @property
-    def shortfall(self) -> str:
-        """By how much it falls short of .8, and from how many rows; "" where it does not."""
-        short = [
-            f"{name} {GOOD - value:.2f} short of {GOOD}"
-            for name, value in (("precision", self.precision), ("recall", self.recall))
-            if value is not None and value < GOOD
-        ]
-        if not short:
-            return ""
-        rate = self.support / max(self.known, 1)
-        return f"{', '.join(short)}; true in {rate:.1%} of steps"
-
-
-def score(labels: Mapping[str, NDArray[Any]], truth: Sequence[str | None]) -> list[LabelScore]:
-    """Labels (N,) by name against the true condition of each transition (N).
-
-    A truth may name several conditions, separated by commas. A label that no truth ever names
-    and that was never given is left out; nothing is scored where no truth is known.
-    """
-    known = np.array([text is not None for text in truth], np.bool_)
-    if not known.any():
-        return []
-    named = [
-        set() if text is None else {part.strip() for part in text.split(",")} for text in truth
-    ]
-    scores = []
-    for name, given in labels.items():
-        true = np.array([name in names for names in named], np.bool_)
-        labelled, support = int((given & known).sum()), int(true.sum())
-        both = int((given & true & known).sum())
-        if labelled or support:
-            scores.append(
-                LabelScore(
-                    name,
-                    both / labelled if labelled else None,
-                    both / support if support else None,
-                    labelled,
-                    support,
-                    int(known.sum()),
-                )
-            )
-    return scores
-
-
-def label_scores(rows: pa.Table, names: Iterable[str]) -> list[LabelScore]:
-    """How well the one condition of each transition agrees with the true one, for these labels."""
-    named = np.array(rows["condition"].to_pylist(), object)
-    return score({name: named == name for name in names}, rows["true_condition"].to_pylist())

@@ -49,7 +49,12 @@ TRANSITION: tuple[Column, ...] = (
 COVERAGE: tuple[Column, ...] = (
     Column("condition", pa.string(), "the one condition of highest priority, or 'nominal'"),
     Column("conditions", pa.list_(pa.string()), "every condition that holds; empty if nominal"),
-    Column("true_condition", pa.string(), "from the simulator, to score labels", nullable=True),
+    Column(
+        "true_condition",
+        pa.string(),
+        "all that a simulator knows to be so, sorted, commas between; or nominal",
+        nullable=True,
+    ),
     Column("perturbation", pa.string(), "name of the twin's parameters in force", nullable=True),
     Column(
         "perturbation_values",

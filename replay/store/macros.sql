@@ -45,7 +45,7 @@ ORDER BY step_index;
 -- least `min_steps` steps, the one that held longest; else nominal. The true condition, where known.
 CREATE OR REPLACE MACRO episode_kinds(min_steps) AS TABLE
 WITH held AS (
-    SELECT episode_id, true_condition AS kind
+    SELECT episode_id, unnest(string_split(true_condition, ',')) AS kind
     FROM transitions
     WHERE true_condition IS NOT NULL AND true_condition <> 'nominal'
     UNION ALL

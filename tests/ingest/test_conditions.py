@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from restock.errors import ConfigError
-from restock.ingest.task.conditions import Condition, label, labels_version, primary, score, shipped
+from restock.ingest.task.conditions import Condition, label, labels_version, primary, shipped
 from restock.ingest.task.schema import SIGNAL_COLUMNS
 
 SHIPPED = list(shipped().values())
@@ -275,18 +275,3 @@ def test_the_version_names_what_the_conditions_say():
     assert labels_version([one]) == labels_version([one])
     assert labels_version([one]) != labels_version([Condition("a", "post", "true")])
     assert labels_version([one, SHIPPED[0]]) == labels_version([SHIPPED[0], one])
-
-
-def test_scores_by_hand():
-    given_ = {"slip": np.array([True, True, False, False, True, False])}
-    truth = ["slip", "nominal", "slip, blocked", "nominal", None, "slip"]
-    (one,) = score(given_, truth)
-    assert (one.labelled, one.support, one.known) == (2, 3, 5)
-    assert one.precision == pytest.approx(1 / 2)
-    assert one.recall == pytest.approx(1 / 3)
-    assert one.shortfall == (
-        "precision 0.30 short of 0.8, recall 0.47 short of 0.8; true in 60.0% of steps"
-    )
-    assert score(given_, [None] * 6) == []
-    never = score({"slip": np.zeros(2, np.bool_)}, ["nominal", "nominal"])
-    assert never == []

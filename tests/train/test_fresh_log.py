@@ -189,7 +189,7 @@ def episodes_of(rows: pa.Table, profile: Profile) -> list[FreshEpisode]:
                 probability=part["action_probability"].to_numpy(),
                 reward=part["reward"].to_numpy(),
                 progress_m=part["progress_m"].to_numpy(),
-                truth=np.array(part["true_condition"].to_pylist(), "<U32"),
+                truth=np.array(part["true_condition"].to_pylist(), "<U64"),
                 signals={name: signals[name].to_numpy() for name in names},
                 labels={name: np.array([name in held for held in named]) for name in conditions},
                 perturbation="nominal",

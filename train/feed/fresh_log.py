@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from restock.train.feed.collector import EndedEpisode
 
 _STEP = ("action", "probability", "policy", "reward", "progress_m", "truth")
-_KINDS = {"action": "i2", "policy": "i2", "truth": "<U32"}
+_KINDS = {"action": "i2", "policy": "i2", "truth": "<U64"}
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class FreshEpisode:
     policy: NDArray[np.int16]  # (T,) the ring's code of who chose the action
     reward: F32  # (T,)
     progress_m: F32  # (T,)
-    truth: NDArray[np.str_]  # (T,) the true condition
+    truth: NDArray[np.str_]  # (T,) the true conditions
     signals: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # (T + 1,) each
     labels: Mapping[str, Bools] = field(default_factory=dict)  # (T + 1,) each
 

@@ -153,7 +153,8 @@ def ordinary_driving(segments: LoggedSegments) -> tuple[LoggedSegments, dict[str
     near = ~touched & (segments.signals["clearance_m"] < TOUCHING_M).any(axis=1)
     # A label is about what the wheels did, also on a floor that is slippery all over.
     known = segments.true_condition != ""
-    slips = np.where(known, segments.true_condition, segments.condition) == "wheel_slip"
+    truth = np.char.find(np.char.add(segments.true_condition, ","), "wheel_slip,") >= 0
+    slips = np.where(known, truth, segments.condition == "wheel_slip")
     slippery = ~touched & ~near & slips.any(axis=1)
     needed = [segments.command.reshape(len(segments), -1)]
     needed += [segments.signals[name] for name in (*POSE, *BEFORE)]

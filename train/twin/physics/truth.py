@@ -1,13 +1,14 @@
-"""The true condition of every step, from simulator truth: kept apart from labels, to score them.
+"""The true conditions of every step, from simulator truth: kept apart from labels, to score them.
 
-A step's condition is what was physically so over [t, t + 1), by the contract's names:
+A step's conditions are what was physically so over [t, t + 1), by the contract's names:
 
 - wheel_slip: a wheel stood on a slippery patch and moved over the floor by more than .15 m/s;
 - near_collision: at t + 1 something was nearer than .15 m to the body, or the bumper was pressed;
 - recovery: after such an event until .3 m of room or 2 s, known at t;
 - blocked_aisle: at t, pallets lay on the plan within `BLOCK_AHEAD_M` of the robot's middle.
 
-Where several hold the step has the first of recovery, near_collision, wheel_slip, blocked_aisle.
+Several may hold at once: the text of a step names all of them, sorted, with commas between, and is
+"nominal" where none holds. `restock.ingest.task.label_scores.primary_of` makes it one.
 """
 
 from __future__ import annotations
@@ -16,12 +17,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
+from restock.ingest.task.label_scores import truth_text
 from restock.ingest.task.route import view_route
 from restock.ingest.task.task import Task
 from restock.state import Stateful
 from restock.train.twin.physics.model import pallet_half_m
 
-NAMES = np.array(["nominal", "blocked_aisle", "wheel_slip", "near_collision", "recovery"])
+NAMES = ("blocked_aisle", "near_collision", "recovery", "wheel_slip")
+# The text of every set of conditions: bit i of its place is NAMES[i].
+_TEXTS = np.array(
+    [
+        truth_text(name for bit, name in enumerate(NAMES) if place >> bit & 1)
+        for place in range(1 << len(NAMES))
+    ]
+)
 NEAR_M, CLEAR_M, AFTERMATH_S = 0.15, 0.3, 2.0
 BLOCK_AHEAD_M = (0.2, 0.4, 0.6, 0.8, 1.0, 1.2)
 REACH_M = BLOCK_AHEAD_M[-1] + 1.5  # a pallet farther off than this is not just ahead
@@ -53,17 +62,14 @@ class Truth(Stateful):
             )
 
     def condition(self, slipped: Bools, bumped: Bools, clearance_m: F64) -> NDArray[np.str_]:
-        """The condition (N,) of the step that ends now."""
+        """All conditions (N,) of the step that ends now, as one text each."""
         near = bumped | (clearance_m < NEAR_M)
-        rank = np.zeros(len(near), np.int64)
-        rank[self.blocked] = 1
-        rank[slipped] = 2
-        rank[near] = 3
-        rank[self.aftermath_s > 0] = 4
+        held = np.stack([self.blocked, near, self.aftermath_s > 0, slipped])  # as NAMES
+        which = (held << np.arange(len(NAMES))[:, None]).sum(axis=0)
         left = np.maximum(self.aftermath_s - self._period_s, 0.0)
         left[(clearance_m > CLEAR_M) & ~near] = 0.0
         self.aftermath_s = np.where(near, AFTERMATH_S, left)
-        return NAMES[rank]
+        return _TEXTS[which]
 
 
 def _blocked(pose: F64, plans_m: F64, pallets: F64) -> Bools:

@@ -19,6 +19,7 @@ import msgspec
 import numpy as np
 
 from restock.errors import ConfigError
+from restock.ingest.task.label_scores import primary_of
 from restock.toml import typed
 from restock.train.twin.env.interface import Policy
 from restock.train.twin.floors.cells import cells_of
@@ -219,7 +220,7 @@ def record(
             kind = driven.mission.spec.condition
             summary.missions[kind] += 1
             summary.succeeded[kind] += driven.success
-            summary.steps.update(driven.drive.true_condition)
+            summary.steps.update(map(primary_of, driven.drive.true_condition))
             who = [f"{name} {version}" for name, version, _ in driven.drive.policy]
             summary.policies.update(who)
             summary.handovers += sum(a != b for a, b in pairwise(who))

@@ -116,7 +116,7 @@ class IngestCommand:
 
 def as_json(outcome: IngestResult) -> dict[str, Any]:
     """An outcome as `--json` prints it."""
-    from restock.ingest.task.conditions import GOOD
+    from restock.ingest.task.label_scores import GOOD
 
     row = {
         key: value
