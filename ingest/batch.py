@@ -14,8 +14,8 @@ import signal
 import threading
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext, SpawnContext
@@ -46,6 +46,7 @@ class IngestJob:
     salvage: bool = False
     typestore: str | None = None
     repeated: OnRepeat = "keep"  # a recording that is in the store under another id
+    tags: Mapping[str, str] = field(default_factory=dict)  # of every recording
 
     def run(self, path: Path) -> Result:
         """Ingest one recording; an error is returned, so that the others continue."""
@@ -61,6 +62,7 @@ class IngestJob:
                 salvage=self.salvage,
                 typestore=self.typestore,
                 repeated=self.repeated,
+                tags=self.tags,
             )
         except RestockError as error:
             return path, error

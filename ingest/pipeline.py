@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import uuid
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -19,6 +20,7 @@ from restock.errors import RecordingError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.profile import Profile
+from restock.ingest.profile.tag_rules import Told, resolve_tags
 from restock.ingest.steps.episodes import Split, split
 from restock.ingest.steps.needs import read_topics
 from restock.ingest.steps.steps import Steps, steps_of
@@ -35,7 +37,7 @@ from restock.ingest.task.conditions import NOMINAL
 from restock.ingest.task.label_scores import LabelScore, label_scores
 from restock.ingest.task.schema import recording_schema
 
-Status = Literal["written", "unchanged", "dry run"]
+Status = Literal["written", "tagged", "unchanged", "dry run"]
 OnRepeat = Literal["keep", "refuse"]
 
 
@@ -71,47 +73,73 @@ def ingest(
     salvage: bool = False,
     typestore: str | None = None,
     repeated: OnRepeat = "keep",
+    tags: Mapping[str, str] | None = None,
 ) -> IngestResult:
     """Read one recording and write its transitions to the store (None: a dry run).
 
     A recording that is in the store as this profile, these conditions and this software would
     put it there is left alone, unless `force`. One whose rows are largely those of another
     recording in the store (a part of it, a copy) is kept and said, or refused, by `repeated`.
+    `tags` say whose drive it is, before what the recording says itself; "" takes a tag off. Where
+    only tags are new, the rows that are there are written with them: the status is "tagged".
 
     Raises:
         RecordingError: no recording, damaged (unless `salvage`), not of this profile, it gives
-            no transition, or it is repeated and to be refused. The store is as it was.
+            no transition, its sources contradict each other about a tag, or it is repeated and to
+            be refused. The store is as it was.
         StoreError: the store cannot be written.
     """
     with open_recording(path, typestore=typestore, salvage=salvage) as recording:
-        if store is not None and not force:
-            same = _unchanged(store, recording, profile)
-            if same is not None:
-                return IngestResult(str(path), "unchanged", same)
+        before = _before(store, recording)
+        told = resolve_tags({}, tags or {}, (before or {}).get("tags") or {}, str(path))
+        if store is not None and before is not None and not force and _unchanged(before, profile):
+            if told.tags == (before["tags"] or {}):
+                return IngestResult(str(path), "unchanged", before)
+            version = _tag(store, before, told.tags)
+            manifest = before | {"tags": told.tags}
+            return IngestResult(str(path), "tagged", manifest, notes=told.notes, version=version)
         try:
-            return _Ingest(str(path), recording, profile, repeated).run(store)
+            return _Ingest(str(path), recording, profile, told, repeated).run(store)
         except RecordingError as error:
             if error.where:
                 raise
             raise RecordingError(error.what, where=str(path), remedy=error.remedy) from error
 
 
-def _unchanged(store: StoreWriter, recording: Recording, profile: Profile) -> dict[str, Any] | None:
-    """The manifest row of the same recording ingested by the same definitions, if it is there."""
-    key = {"recording_id": recording.recording_id, **definitions(profile)}
-    for row in store.live(recording.recording_id).to_pylist():
-        if all(row[name] == value for name, value in key.items()):
-            return dict(row)
-    return None
+def _before(store: StoreWriter | None, recording: Recording) -> dict[str, Any] | None:
+    """The manifest row of the same recording, if it is in the store."""
+    if store is None:
+        return None
+    rows = store.live(recording.recording_id).to_pylist(maps_as_pydicts="strict")
+    return dict(rows[0]) if rows else None
+
+
+def _unchanged(before: Mapping[str, Any], profile: Profile) -> bool:
+    """Whether the rows of this manifest were made by the same definitions."""
+    return all(before[name] == value for name, value in definitions(profile).items())
+
+
+def _tag(store: StoreWriter, before: Mapping[str, Any], tags: Mapping[str, str]) -> int:
+    """Write a recording's rows again with other tags; returns the store's version with them."""
+    ingest_id = uuid.uuid4().hex[:16]
+    manifest = {**before, "ingest_id": ingest_id, "tags": tags}
+    rows = store.rows(before["recording_id"], before["ingest_id"])
+    place = rows.schema.get_field_index("ingest_id")
+    column = pa.array([ingest_id] * len(rows), rows.schema.field(place).type)
+    rows = rows.set_column(place, rows.schema.field(place), column)
+    return store.write_all(
+        [(pa.Table.from_pylist([manifest], recording_schema()), rows)],
+        instead_of={before["recording_id"]: before["ingest_id"]},
+    )
 
 
 class _Ingest:
     """The stages over one open recording."""
 
     def __init__(
-        self, path: str, recording: Recording, profile: Profile, repeated: OnRepeat
+        self, path: str, recording: Recording, profile: Profile, told: Told, repeated: OnRepeat
     ) -> None:
-        self.path, self.recording, self.profile = path, recording, profile
+        self.path, self.recording, self.profile, self.told = path, recording, profile, told
         self.repeated = repeated
         self.ingest_id = uuid.uuid4().hex[:16]
 
@@ -135,6 +163,7 @@ class _Ingest:
         first = {name: named[name] for name in (*rows.labels, NOMINAL)}
         scores = label_scores(table, rows.labels)
         facts = recorded_facts(self.recording, profile, columns, steps, episodes, rows)
+        facts["tags"] = self.told.tags
         manifest = manifest_row(profile, provenance, table, scores, episodes.dropped, **facts)
         at, repeats = self._write(store, manifest, table) if store else (None, None)
         counts = {name: int(holds[rows.starts].sum()) for name, holds in rows.labels.items()}
@@ -191,7 +220,7 @@ class _Ingest:
 
     def _notes(self, steps: Steps, table: pa.Table, repeats: RepeatedDrive | None) -> list[str]:
         clock = steps.clock
-        notes = [*self.recording.notes, *steps.notes]
+        notes = [*self.recording.notes, *self.told.notes, *steps.notes]
         if clock.pace is not None:
             notes.append(
                 f"clock: header stamps run at {clock.pace:.1%} of log time; mapped piece by piece"

@@ -20,6 +20,7 @@ from msgspec import Meta
 from restock.errors import StoreError
 from restock.ingest.profile.signal_paths import PathProblem, SignalPath
 from restock.ingest.task.schema import COLUMNS
+from restock.ingest.task.tags import NAMED
 from restock.toml import Checked
 
 if TYPE_CHECKING:
@@ -29,7 +30,10 @@ Reduce = Literal["min", "max", "mean", "sum", "count", "yaw"]
 NUMBER = pa.float64()
 LIST = pa.list_(pa.field("element", pa.float32()))
 # Columns that a store's views add to a transition's, and that labelling adds.
-_TAKEN = {"logged_ns", "row_"} | {column.name for column in COLUMNS}
+_TAKEN = {
+    *("logged_ns", "stamp_time", "logged_time", "pose_stamp_time", "tags", *NAMED, "row_"),
+    *(column.name for column in COLUMNS),
+}
 QUATERNION = ("x", "y", "z", "w")
 
 

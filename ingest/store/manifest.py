@@ -54,7 +54,7 @@ def manifest_row(
     """The row of `recordings` for these transitions, by `restock.ingest.task.schema`.
 
     `dropped` are ticks in no episode by reason; `recorded` is what only who made the steps knows:
-    format, clock and counts.
+    format, clock, counts and tags.
     """
     drops = sorted(dropped.items(), key=lambda item: (-item[1], item[0]))
     return {
@@ -64,6 +64,7 @@ def manifest_row(
         "source_file": provenance.source_file,
         "profile": profile.name,
         **definitions(profile),
+        "tags": {},
         "transitions": len(table),
         "drops": [{"reason": reason, "count": count} for reason, count in drops],
         "topics": [],

@@ -140,6 +140,12 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
     Column("task_hash", pa.string(), "of the definition of observation, action and reward"),
     Column("labels_version", pa.string(), "of the conditions that labelled it"),
     Column("restock_version", pa.string(), "of the software that wrote it"),
+    Column(
+        "tags",
+        pa.map_(pa.string(), pa.string()),
+        "whose drive it is: robot, site, … and any other; null: from before there were tags",
+        nullable=True,
+    ),
     Column("ticks", pa.int64(), "of the control clock = transitions + episode_ends + drops"),
     Column("steps", pa.int64(), "ticks that belong to an episode"),
     Column("episodes", pa.int64(), "of one transition or more"),

@@ -13,6 +13,7 @@ import msgspec
 from restock.errors import StoreError
 from restock.replay.mixture.mixture import Mixture, OtherStore
 from restock.replay.panel.candidates import STORE_COLUMN
+from restock.replay.store.query import definitions
 from restock.replay.store.store import Store, parquet_view
 
 
@@ -78,11 +79,12 @@ def _open(wanted: OtherStore, folder: Path | None) -> Store:
 
 def _attach(connection: duckdb.DuckDBPyConnection, stores: Sequence[Store]) -> list[int]:
     """Make the view; returns how many rows of each other store are in one before it."""
-    parts, repeated = [], []
+    tables: dict[str, list[str]] = {"stored_transitions": [], "stored_recordings": []}
+    repeated = []
     for number, store in enumerate(stores):
         schema = f'"store_{number}"'
         connection.execute(f"CREATE SCHEMA {schema}")
-        for table in ("stored_transitions", "stored_recordings"):
+        for table in tables:
             if not store.files[table]:
                 raise StoreError("it holds no transitions", where=str(store.path))
             connection.execute(parquet_view(table, store.files[table], schema=f"store_{number}"))
@@ -95,16 +97,11 @@ def _attach(connection: duckdb.DuckDBPyConnection, stores: Sequence[Store]) -> l
         if number:
             count = f"SELECT count(*) FROM {schema}.stored_transitions WHERE {known}"
             repeated.append(int(connection.sql(count).fetchall()[0][0]))
-        parts.append(
-            f"SELECT {number} AS {STORE_COLUMN}, * EXCLUDE (clock_offset_ns),"
-            " stamp_ns + coalesce(clock_offset_ns, 0) AS logged_ns"
-            f" FROM {schema}.stored_transitions"
-            f" JOIN (SELECT ingest_id, clock_offset_ns FROM {schema}.stored_recordings)"
-            f" USING (ingest_id) WHERE NOT ({known})"
-        )
-    manifests = " UNION ALL BY NAME ".join(
-        f'FROM "store_{number}".stored_recordings' for number in range(len(stores))
-    )
-    connection.execute(f"CREATE VIEW recordings AS {manifests}")
-    connection.execute("CREATE VIEW transitions AS " + " UNION ALL BY NAME ".join(parts))
+        for table in tables:
+            tables[table].append(
+                f"SELECT *, {number} AS {STORE_COLUMN} FROM {schema}.{table} WHERE NOT ({known})"
+            )
+    for table, parts in tables.items():
+        connection.execute(f"CREATE VIEW {table} AS " + " UNION ALL BY NAME ".join(parts))
+    connection.execute(definitions(names=["rows.sql"]))
     return repeated

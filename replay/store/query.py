@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
 from typing import Any, TypeVar
@@ -15,7 +15,7 @@ from restock.replay.store.column_docs import install_columns
 T = TypeVar("T")
 
 # In their order: a view may use those before it.
-VIEWS = ("views.sql",)
+VIEWS = ("rows.sql", "views.sql")
 MACROS = ("macros.sql", "repeated_rows.sql")
 
 # Statements that leave files as they are; CREATE makes tables and macros in memory.
@@ -28,10 +28,10 @@ def install(connection: duckdb.DuckDBPyConnection, observation_type: str) -> Non
     install_columns(connection)
 
 
-def definitions(observation_type: str = "FLOAT[]") -> str:
-    """The text of VIEWS and MACROS, with the type that observations are cast to."""
+def definitions(observation_type: str = "FLOAT[]", names: Sequence[str] = (*VIEWS, *MACROS)) -> str:
+    """The text of these SQL files, with the type that observations are cast to."""
     folder = files("restock.replay.store")
-    text = [(folder / name).read_text(encoding="utf-8") for name in (*VIEWS, *MACROS)]
+    text = [(folder / name).read_text(encoding="utf-8") for name in names]
     return "\n".join(text).replace("::FLOAT[] AS", f"::{observation_type} AS")
 
 

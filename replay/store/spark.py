@@ -1,4 +1,4 @@
-"""A store through Spark's API: the same Delta tables, and views.sql in Spark's SQL.
+"""A store through Spark's API: the same Delta tables, and its views in Spark's SQL.
 
 Works with any session that reads Delta: a Spark cluster with the Delta package, or Sail (`pip
 install 'restock[spark]'`), which speaks Spark's protocol without a JVM.
@@ -14,17 +14,42 @@ from typing import TYPE_CHECKING, Any
 from restock.errors import StoreError
 from restock.ingest.store.location import Location
 from restock.ingest.store.writer import RECORDINGS, TRANSITIONS
+from restock.ingest.task.tags import NAMED
 from restock.replay.store.query import VIEWS
 from restock.replay.store.store import is_store
 
-# The view that no rule translates: DuckDB adds the columns that rows of an older store lack.
+
+def _moment(stamp_ns: str) -> str:
+    return f"timestamp_micros(CAST(({stamp_ns}) DIV 1000 AS BIGINT))"
+
+
+# rows.sql, which no rule translates: DuckDB adds the columns that rows of an older store lack.
+_NAMED = ", ".join(f"tags['{name}'] AS {name}" for name in NAMED)
 _BY_HAND = {
-    "transitions": """
+    "recordings": f"""
+CREATE OR REPLACE TEMPORARY VIEW recordings AS
+SELECT
+    *,
+    {_NAMED},
+    {_moment("start_stamp_ns")} AS start_stamp_time,
+    {_moment("end_stamp_ns")} AS end_stamp_time,
+    {_moment("start_stamp_ns + coalesce(clock_offset_ns, 0)")} AS logged_start_time,
+    {_moment("end_stamp_ns + coalesce(clock_offset_ns, 0)")} AS logged_end_time
+FROM stored_recordings
+WHERE ingest_id IN (SELECT ingest_id FROM stored_transitions)""",
+    "transitions": f"""
 CREATE OR REPLACE TEMPORARY VIEW transitions AS
-SELECT stored_transitions.*, stamp_ns + coalesce(clock_offset_ns, 0) AS logged_ns
+SELECT
+    stored_transitions.*,
+    stamp_ns + coalesce(clock_offset_ns, 0) AS logged_ns,
+    {_moment("stamp_ns")} AS stamp_time,
+    {_moment("stamp_ns + coalesce(clock_offset_ns, 0)")} AS logged_time,
+    {_moment("pose_stamp_ns")} AS pose_stamp_time,
+    {", ".join(NAMED)},
+    tags
 FROM stored_transitions
-JOIN (SELECT ingest_id AS of_ingest, clock_offset_ns FROM stored_recordings) AS offsets
-    ON stored_transitions.ingest_id = offsets.of_ingest"""
+JOIN (SELECT ingest_id AS of_ingest, clock_offset_ns, tags, {_NAMED} FROM stored_recordings) AS told
+    ON stored_transitions.ingest_id = told.of_ingest""",
 }
 
 # What Spark calls by another name, as patterns of the text of views.sql.
@@ -52,8 +77,11 @@ _RULES = (
     (r"\bANTI JOIN", "LEFT ANTI JOIN"),
 )
 _LATER = {
-    "perturbation": "CAST(NULL AS STRING) AS perturbation",
-    "perturbation_values": "CAST(NULL AS MAP<STRING, DOUBLE>) AS perturbation_values",
+    TRANSITIONS: {
+        "perturbation": "CAST(NULL AS STRING) AS perturbation",
+        "perturbation_values": "CAST(NULL AS MAP<STRING, DOUBLE>) AS perturbation_values",
+    },
+    RECORDINGS: {"tags": "CAST(NULL AS MAP<STRING, STRING>) AS tags"},
 }
 
 if TYPE_CHECKING:
@@ -86,10 +114,9 @@ def install_views(session: SparkSession | Any, store: str | Path, *, scheme: str
             else f"{scheme}://{place.table(name).removeprefix('s3://')}"
         )
         table = session.read.format("delta").load(address)
-        if name == TRANSITIONS:  # rows of an older store have no such columns: null
-            table = table.selectExpr(
-                "*", *(sql for column, sql in _LATER.items() if column not in table.columns)
-            )
+        # Rows of an older store have no such columns: null.
+        later = (sql for column, sql in _LATER[name].items() if column not in table.columns)
+        table = table.selectExpr("*", *later)
         table.createOrReplaceTempView(f"stored_{name}")
     for statement in statements():
         session.sql(statement)

@@ -1,28 +1,7 @@
--- The views of a store, over stored_transitions and stored_recordings (its Parquet as it lies).
+-- The views of a store, over its `recordings` and `transitions` (rows.sql).
 -- Every column is documented in columns.toml (those of `transitions` in ingest/schema.py), and a
 -- test holds that. `spark.py` translates these statements into Spark's SQL, by its table of rules and
 -- of the few that no rule translates.
-
--- A recording's manifest row is committed before its transitions: an ingest that was cut between
--- the two is in stored_recordings and in no view.
-CREATE OR REPLACE VIEW recordings AS
-SELECT *
-FROM stored_recordings
-WHERE ingest_id IN (SELECT ingest_id FROM stored_transitions);
-
--- Stamps can be a simulator's, which begin at zero: logged_ns is the same moment by log time.
-CREATE OR REPLACE VIEW transitions AS
-SELECT
-    * EXCLUDE (clock_offset_ns)
-    REPLACE (observation::FLOAT[] AS observation, next_observation::FLOAT[] AS next_observation),
-    stamp_ns + coalesce(clock_offset_ns, 0) AS logged_ns
-FROM (
-    FROM stored_transitions
-    UNION ALL BY NAME -- rows of an older store have no such columns: null
-    SELECT NULL::VARCHAR AS perturbation, NULL::MAP(VARCHAR, DOUBLE) AS perturbation_values
-    WHERE false
-)
-JOIN (SELECT ingest_id, clock_offset_ns FROM stored_recordings) USING (ingest_id);
 
 -- The discrete actions of each task, from the definition the recordings carry.
 CREATE OR REPLACE VIEW actions AS
@@ -66,51 +45,60 @@ SELECT 'nominal', 'pre', 1000, 'none of the others', labels_version
 FROM (SELECT * FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1);
 
 CREATE OR REPLACE VIEW episodes AS
-SELECT
-    recording_id,
-    episode_id,
-    any_value(episode_index) AS episode_index,
-    any_value(task_hash) AS task_hash,
-    min(stamp_ns) AS start_ns,
-    max(stamp_ns) AS end_ns,
-    count(*) AS steps,
-    max(step_index) - min(step_index) + 1 - count(*) AS missing_steps,
-    (max(stamp_ns) - min(stamp_ns)) / 1e9 AS duration_s,
-    sum(reward) AS return,
-    CASE
-        WHEN bool_or(terminated) THEN 'terminated'
-        WHEN bool_or(truncated) THEN 'truncated'
-        ELSE 'open'
-    END AS ended,
-    -- Terminated with the goal's reward: a bump may terminate too, and is no success.
-    CASE WHEN any_value(has_goal)
-        THEN bool_or(terminated AND reward > goal_reward / 2)
-    END AS success,
-    sum(progress_m) AS progress_m,
-    count(*) FILTER (WHERE bumped) AS bumped_steps,
-    min(clearance_m) AS clearance_min_m,
-    list_sort(list_distinct(flatten(list(conditions)))) AS conditions,
-    list_sort(list(DISTINCT behaviour_policy)) AS behaviour_policies,
-    arg_min(behaviour_policy, step_index) AS first_policy,
-    count(*) FILTER (WHERE handover) AS handovers,
-    list_sort(list(DISTINCT zone)) AS zones
+SELECT *
 FROM (
     SELECT
-        *,
-        row_number() OVER (PARTITION BY episode_id ORDER BY step_index) > 1
-        AND behaviour_policy IS DISTINCT FROM lag(behaviour_policy) OVER (
-            PARTITION BY episode_id ORDER BY step_index
-        ) AS handover
-    FROM transitions
-    LEFT JOIN (
-        SELECT DISTINCT
-            task_hash AS of_task,
-            CAST(json_extract_string(task_json, '$.rewards.goal') AS DOUBLE) AS goal_reward,
-            json_extract_string(task_json, '$.goal') = 'route' AS has_goal
-        FROM recordings
-    ) AS tasks ON transitions.task_hash = tasks.of_task
+        recording_id,
+        episode_id,
+        any_value(episode_index) AS episode_index,
+        any_value(task_hash) AS task_hash,
+        min(stamp_ns) AS start_ns,
+        max(stamp_ns) AS end_ns,
+        min(stamp_time) AS start_time,
+        max(stamp_time) AS end_time,
+        min(logged_time) AS logged_start_time,
+        max(logged_time) AS logged_end_time,
+        count(*) AS steps,
+        max(step_index) - min(step_index) + 1 - count(*) AS missing_steps,
+        (max(stamp_ns) - min(stamp_ns)) / 1e9 AS duration_s,
+        sum(reward) AS return,
+        CASE
+            WHEN bool_or(terminated) THEN 'terminated'
+            WHEN bool_or(truncated) THEN 'truncated'
+            ELSE 'open'
+        END AS ended,
+        -- Terminated with the goal's reward: a bump may terminate too, and is no success.
+        CASE WHEN any_value(has_goal)
+            THEN bool_or(terminated AND reward > goal_reward / 2)
+        END AS success,
+        sum(progress_m) AS progress_m,
+        count(*) FILTER (WHERE bumped) AS bumped_steps,
+        min(clearance_m) AS clearance_min_m,
+        list_sort(list_distinct(flatten(list(conditions)))) AS conditions,
+        list_sort(list(DISTINCT behaviour_policy)) AS behaviour_policies,
+        arg_min(behaviour_policy, step_index) AS first_policy,
+        count(*) FILTER (WHERE handover) AS handovers,
+        list_sort(list(DISTINCT zone)) AS zones
+    FROM (
+        SELECT
+            *,
+            row_number() OVER (PARTITION BY episode_id ORDER BY step_index) > 1
+            AND behaviour_policy IS DISTINCT FROM lag(behaviour_policy) OVER (
+                PARTITION BY episode_id ORDER BY step_index
+            ) AS handover
+        FROM transitions
+        LEFT JOIN (
+            SELECT DISTINCT
+                task_hash AS of_task,
+                CAST(json_extract_string(task_json, '$.rewards.goal') AS DOUBLE) AS goal_reward,
+                json_extract_string(task_json, '$.goal') = 'route' AS has_goal
+            FROM recordings
+        ) AS tasks ON transitions.task_hash = tasks.of_task
+    )
+    GROUP BY recording_id, episode_id
 )
-GROUP BY recording_id, episode_id;
+JOIN (SELECT recording_id, robot, site, firmware, map, shift, tags FROM recordings)
+    USING (recording_id);
 
 -- Each cell of what was seen. Cells never seen are in missing_cells: GROUP BY cannot show them.
 CREATE OR REPLACE VIEW coverage AS

@@ -14,6 +14,7 @@ from support.stores import TASK, manifest, recording_transitions, write_store
 
 import restock
 from restock.errors import QueryError, StoreError
+from restock.ingest.task.tags import NAMED
 from restock.ingest.task.task import Task
 from restock.replay.store.column_docs import column_docs, rewrite, view_docs
 from restock.replay.store.store import Store, is_store
@@ -32,7 +33,8 @@ def rows(store: Store, query: str) -> list[dict[str, object]]:
 def test_transitions_are_those_that_were_written(store: Store, transitions: pa.Table) -> None:
     read = store.sql("FROM transitions ORDER BY transition_id").to_arrow_table()
     expected = transitions.sort_by("transition_id")
-    assert read.column_names == [*expected.column_names, "logged_ns"]
+    added = ["logged_ns", "stamp_time", "logged_time", "pose_stamp_time", *NAMED, "tags"]
+    assert read.column_names == [*expected.column_names, *added]
     for name in expected.column_names:
         assert read[name].to_pylist() == expected[name].to_pylist(), name
     assert pa.types.is_fixed_size_list(read.schema.field("observation").type)

@@ -45,6 +45,11 @@ class IngestCommand:
     """What to do with a recording whose rows are largely those of another one in the store (a
     part of it, a copy, a drive recorded again): keep it and say so (the audit `repeated_steps`
     fails), or refuse it."""
+    tag: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="KEY=VALUE")
+    ] = ()
+    """Whose drive the recordings are: robot, site, firmware, map, shift, or any other name. Decides
+    over what a recording or its path says; KEY= takes a tag off. May be given several times."""
     typestore: str | None = None
     """Distribution whose message definitions serve recordings without their own (humble)."""
     workers: int = 1
@@ -65,6 +70,7 @@ class IngestCommand:
         from restock.ingest.batch import IngestJob, ingest_all
         from restock.ingest.profile.profile import load_profile
         from restock.ingest.store.writer import StoreWriter
+        from restock.ingest.task.tags import parse_tags
 
         if not self.paths:
             raise RecordingError("no path given", remedy="restock ingest PATH --store STORE")
@@ -72,11 +78,14 @@ class IngestCommand:
             raise ConfigError("no store given", remedy="say --store STORE, or --dry-run")
         if self.workers < 1:
             raise ConfigError(f"--workers must be 1 or more, got {self.workers}")
+        tags = parse_tags(self.tag, empty=True)
         profile = load_profile(self.profile)
         store = None if self.dry_run else self.store
         if store is not None:
             StoreWriter(store).reach()  # or say now why not, and not once a recording
-        job = IngestJob(profile, store, self.force, self.salvage, self.typestore, self.repeated)
+        job = IngestJob(
+            *(profile, store, self.force, self.salvage, self.typestore, self.repeated, tags)
+        )
         paths, failures = self._recordings()
         outcomes: list[dict[str, Any]] = []
         lossy = False
@@ -147,6 +156,7 @@ def show(outcome: IngestResult) -> None:
     """One recording's counts, as tables on stdout."""
     from restock.cli import output
     from restock.ingest.store.manifest import UNUSED
+    from restock.ingest.task.tags import in_words
 
     row = outcome.manifest
     console = output.stdout()
@@ -157,13 +167,21 @@ def show(outcome: IngestResult) -> None:
         soft_wrap=True,
     )
     episodes = f"{_count(row['transitions'], 'transition')} in {_count(row['episodes'], 'episode')}"
-    if outcome.status == "unchanged":
+    tags = in_words(row["tags"] or {})
+    if outcome.status in ("unchanged", "tagged"):
+        how = f"now with tags {tags or 'none'}, " if outcome.status == "tagged" else ""
         console.print(
-            f"unchanged: {episodes} are in the store already (--force ingests them again)\n"
+            f"{outcome.status}: {how}{episodes} are in the store already"
+            " (--force ingests them again)",
+            markup=False,
+            soft_wrap=True,
         )
+        console.print("\n".join(outcome.notes), markup=False, soft_wrap=True)
         return
     into = f"{outcome.status}: {episodes}, profile {row['profile']} {row['profile_hash']}"
     console.print(into + (f", store version {outcome.version}" if outcome.version else ""))
+    if tags:
+        console.print(f"tags: {tags}", markup=False, soft_wrap=True)
     used = [topic for topic in row["topics"] if topic["reason"] != UNUSED]
     clocks = {clock["topic"]: clock for clock in row["clocks"] or []}
     used = [{**topic, **output.clock_cells(clocks.get(topic["topic"]))} for topic in used]

@@ -1,0 +1,72 @@
+"""Tags: whose drive a recording is. Text by name, one of each a recording.
+
+`robot`, `site`, `firmware`, `map` and `shift` are columns of the views; all, with any other names,
+are in their column `tags`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+
+from restock.errors import ConfigError
+
+NAMED = ("robot", "site", "firmware", "map", "shift")  # columns of the views
+MOST_TAGS = 64  # of a recording
+LONGEST_NAME, LONGEST_VALUE = 64, 256  # characters
+_NAME = re.compile(rf"[A-Za-z_][A-Za-z0-9_.-]{{0,{LONGEST_NAME - 1}}}")
+
+
+def parse_tags(texts: Iterable[str], *, flag: str = "--tag", empty: bool = False) -> dict[str, str]:
+    """Tags of `KEY=VALUE` texts, as the command line has them.
+
+    Args:
+        texts: such as `robot=amr-07`.
+        flag: the option, for errors.
+        empty: whether a value may be empty (`KEY=`): it then takes the tag off.
+
+    Raises:
+        ConfigError: a text of another form, a name or value that is too long, or a name with two
+            values.
+    """
+    tags: dict[str, str] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        value = value.strip()
+        if not equals or not (value or empty):
+            raise ConfigError(
+                f"{text!r} is not KEY=VALUE", where=flag, remedy=f"such as {flag} robot=amr-07"
+            )
+        if problem := tag_problem(name, value):
+            raise ConfigError(problem, where=flag)
+        if tags.setdefault(name, value) != value:
+            raise ConfigError(
+                f"{name} is given twice, as {tags[name]!r} and as {value!r}",
+                where=flag,
+                remedy="a recording has one value of a tag: ingest those of each by itself",
+            )
+    if len(tags) > MOST_TAGS:
+        raise ConfigError(
+            f"{len(tags)} tags are more than the {MOST_TAGS} there may be", where=flag
+        )
+    return tags
+
+
+def tag_problem(name: str, value: str) -> str | None:
+    """Why this cannot be a tag, or None."""
+    if not _NAME.fullmatch(name):
+        return (
+            f"{name[: LONGEST_NAME + 1]!r} is no name of a tag: at most {LONGEST_NAME} letters,"
+            " digits, _, . and -, a letter or _ first"
+        )
+    if len(value) > LONGEST_VALUE:
+        return f"the value of {name} has {len(value):,} characters, more than {LONGEST_VALUE}"
+    if not value.isprintable():
+        return f"the value of {name} has control characters"
+    return None
+
+
+def in_words(tags: Mapping[str, str]) -> str:
+    """Tags on one line, the named ones first."""
+    names = [*(name for name in NAMED if name in tags), *sorted(tags.keys() - set(NAMED))]
+    return ", ".join(f"{name}={tags[name]}" for name in names)

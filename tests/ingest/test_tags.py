@@ -1,0 +1,152 @@
+"""Tags: whose drive a recording is, by who says so, and what becomes of it in a store."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pytest
+from deltalake import write_deltalake
+from support.driven_robot import Drive, write_bag
+from support.profile_texts import WAREHOUSE
+from support.stores import manifest, recording_transitions
+
+from restock.cli import main
+from restock.errors import ConfigError
+from restock.ingest.task.tags import MOST_TAGS, parse_tags
+from restock.replay.store.store import Store
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bags")
+    (folder / "amr.toml").write_text(WAREHOUSE)
+    write_bag(Drive(), folder / "bag")
+    return folder / "bag"
+
+
+def ingest(bag: Path, store: Path, *options: str) -> int:
+    profile = str(bag.parent / "amr.toml")
+    return main(["ingest", str(bag), "--store", str(store), "--profile", profile, *options])
+
+
+def asked(store: Path, query: str) -> list[tuple[Any, ...]]:
+    with Store(store) as opened:
+        return opened.sql(query).fetchall()
+
+
+def test_tags_of_the_command_line_are_on_every_view(bag, tmp_path, capsys):
+    store = tmp_path / "store"
+    assert ingest(bag, store, "--tag", "robot=amr-07", "--tag", "line=b = c", "--json") == 0
+    (row,) = json.loads(capsys.readouterr().out)["recordings"]
+    tags = {"robot": "amr-07", "line": "b = c"}
+    assert (row["status"], row["tags"]) == ("written", tags)
+    for view in ("recordings", "transitions", "episodes"):
+        query = f"SELECT DISTINCT robot, site, firmware, map, shift, tags FROM {view}"
+        assert asked(store, query) == [("amr-07", None, None, None, None, tags)]
+
+
+def test_times_are_the_nanoseconds_beside_them(bag, tmp_path):
+    store = tmp_path / "store"
+    assert ingest(bag, store) == 0
+    for view, pairs in {
+        "transitions": ["stamp", "logged", "pose_stamp"],
+        "recordings": ["start_stamp", "end_stamp"],
+        "episodes": ["start", "end"],
+    }.items():
+        for name in pairs:
+            told = f"SELECT epoch_us({name}_time) - {name}_ns // 1000, typeof({name}_time)"
+            assert asked(store, f"{told} FROM {view} GROUP BY ALL") == [(0, "TIMESTAMP")]
+    begun = "SELECT min(logged_time), max(logged_time) FROM transitions"
+    assert asked(store, begun) == asked(
+        store, "SELECT logged_start_time, logged_end_time FROM episodes"
+    )
+
+
+def test_new_tags_alone_change_no_row(bag, tmp_path, capsys):
+    store, others = tmp_path / "store", "FROM (SELECT * EXCLUDE (ingest_id, tags, robot, site)"
+    assert ingest(bag, store, "--tag", "site=oslo") == 0
+    rows = asked(store, f"{others} FROM transitions) ORDER BY transition_id")
+    capsys.readouterr()
+    assert ingest(bag, store, "--tag", "robot=amr-07", "--json") == 0
+    (row,) = json.loads(capsys.readouterr().out)["recordings"]
+    assert (row["status"], row["version"]) == ("tagged", 2)
+    assert row["tags"] == {"robot": "amr-07", "site": "oslo"}
+    assert row["notes"] == [
+        "tags kept from the ingest before: site=oslo (--tag NAME= takes one off)"
+    ]
+    assert asked(store, f"{others} FROM transitions) ORDER BY transition_id") == rows
+    assert asked(store, "SELECT DISTINCT robot, site FROM transitions") == [("amr-07", "oslo")]
+    capsys.readouterr()
+    assert ingest(bag, store) == 0  # who says nothing changes nothing
+    assert "unchanged" in capsys.readouterr().out
+    assert ingest(bag, store, "--force") == 0
+    assert asked(store, "SELECT DISTINCT robot, site FROM recordings") == [("amr-07", "oslo")]
+    assert ingest(bag, store, "--tag", "site=") == 0
+    assert asked(store, "SELECT robot, site, tags FROM recordings") == [
+        ("amr-07", None, {"robot": "amr-07"})
+    ]
+
+
+def test_relabelling_keeps_the_tags(bag, tmp_path):
+    store = tmp_path / "store"
+    assert ingest(bag, store, "--tag", "robot=amr-07") == 0
+    other = tmp_path / "other.toml"
+    other.write_text(WAREHOUSE + '\n[[condition]]\nname = "never"\ntiming = "pre"\nsql = "false"\n')
+    assert main(["label", str(store), "--profile", str(other)]) == 0
+    assert asked(store, "SELECT DISTINCT robot FROM transitions") == [("amr-07",)]
+
+
+@pytest.mark.parametrize(
+    ("texts", "says"),
+    [
+        (["robot"], "'robot' is not KEY=VALUE"),
+        (["robot="], "'robot=' is not KEY=VALUE"),
+        (["=amr"], "'' is no name of a tag"),
+        (["my robot=a"], "'my robot' is no name of a tag"),
+        (["robot=a", "robot=b"], "robot is given twice, as 'a' and as 'b'"),
+        ([f"robot={'x' * 257}"], "the value of robot has 257 characters, more than 256"),
+        (["robot=\x1b[2J"], "the value of robot has control characters"),
+        ([f"t{n}=x" for n in range(MOST_TAGS + 1)], "65 tags are more than the 64 there may be"),
+    ],
+)
+def test_tags_of_another_form_are_refused(texts, says):
+    with pytest.raises(ConfigError) as refused:
+        parse_tags(texts)
+    assert says in refused.value.what
+
+
+def test_a_wrong_tag_writes_nothing(bag, tmp_path, capsys):
+    assert ingest(bag, tmp_path / "store", "--tag", "robot") == 2
+    assert "such as --tag robot=amr-07" in capsys.readouterr().err
+    assert not (tmp_path / "store").exists()
+
+
+def without_tags(transitions: pa.Table) -> pa.Table:
+    return manifest(transitions).drop_columns(["tags"])
+
+
+def test_a_store_from_before_there_were_tags(tmp_path):
+    """Opens with null; gets them by the next ingest, beside recordings that have none."""
+    path = tmp_path / "store"
+    for number in (1, 2):
+        rows = recording_transitions(number)
+        write_deltalake(str(path / "recordings"), without_tags(rows), mode="append")
+        write_deltalake(str(path / "transitions"), rows, mode="append")
+    for view in ("recordings", "transitions", "episodes"):
+        assert asked(path, f"SELECT DISTINCT robot, tags FROM {view}") == [(None, None)]
+    newer = without_tags(recording_transitions(3))
+    entry = pa.array([{"robot": "amr-07"}], pa.map_(pa.string(), pa.string()))
+    write_deltalake(
+        str(path / "recordings"),
+        newer.append_column("tags", entry),
+        mode="append",
+        schema_mode="merge",
+    )
+    write_deltalake(str(path / "transitions"), recording_transitions(3), mode="append")
+    assert sorted(asked(path, "SELECT DISTINCT robot FROM episodes"), key=str) == [
+        ("amr-07",),
+        (None,),
+    ]
