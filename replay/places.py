@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 
 from restock.errors import StoreError
 from restock.ingest.store.location import Location
+from restock.ingest.store.version import Version
 from restock.replay.panel.panel import EVALUATION_SPLIT, HEADER, META, Panel
 from restock.replay.store.store import Store, is_store, read_parquet
 
@@ -26,6 +27,7 @@ def open_place(
     beside: Mapping[str, str | Path] | None = None,
     memory_limit: str | None = None,
     only_store: bool = False,
+    version: Version | None = None,
 ) -> Iterator[duckdb.DuckDBPyConnection]:
     """A connection with the views of a store, a run or a panel.
 
@@ -35,17 +37,20 @@ def open_place(
             `run.audit`. Runs and panels only.
         memory_limit: of DuckDB, for a store.
         only_store: take nothing but a store.
+        version: of a store; the newest.
 
     Raises:
-        StoreError: there is nothing that can be queried.
+        StoreError: there is nothing that can be queried, or no such version.
     """
     place = Location.of(path)
     if only_store or place.folder is None or is_store(place):
-        with Store(place, memory_limit=memory_limit) as store:
+        with Store(place, version=version, memory_limit=memory_limit) as store:
             _add_all(store.connection, beside)
             yield store.connection
         return
     path = place.folder
+    if version is not None:
+        raise StoreError("only a store has versions", where=str(path), remedy="leave --version out")
     with duckdb.connect() as connection:
         if not _add(connection, path, "main"):
             raise StoreError(

@@ -13,6 +13,7 @@ import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from deltalake.fs import DeltaStorageHandler
 
 from restock.errors import StoreError
 from restock.files import first_line
+from restock.ingest.store.version import Version, version_at
 
 # An endpoint that is down or silent is given up after a minute at most.
 CONNECT_S, REQUEST_S, RETRIES, RETRY_S = 5, 30, 4, 30
@@ -122,14 +124,24 @@ class Location:
         with self.translate_errors():
             return bool(DeltaTable.is_deltatable(self.table(name), self.options))
 
-    def open_table(self, name: str, version: int | None = None) -> DeltaTable:
-        """One of its tables, at a version or at its newest.
+    def open_table(self, name: str, version: Version | None = None) -> DeltaTable:
+        """One of its tables, at a version (or the newest of a moment) or at its newest.
 
         Raises:
             StoreError: no such table or version, or the place cannot be reached.
         """
         try:
             with self.translate_errors():
+                table = DeltaTable(self.table(name), storage_options=self.options)
+                if isinstance(version, datetime):
+                    version = version_at(table, version, where=self.text)
+                newest = table.version()
+                if version is None or version == newest:
+                    return table
+                if not 0 <= version <= newest:
+                    raise StoreError(
+                        f"has no version {version}: its newest is {newest}", where=self.text
+                    )
                 return DeltaTable(self.table(name), version=version, storage_options=self.options)
         except (TableNotFoundError, DeltaError, ValueError) as error:
             raise StoreError(

@@ -11,6 +11,7 @@ import os
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 from urllib.parse import unquote
@@ -24,12 +25,27 @@ from deltalake import DeltaTable
 from restock.errors import StoreError
 from restock.files import first_line
 from restock.ingest.store.location import Location
-from restock.ingest.store.writer import OWN_PATH, RECORDINGS, TRANSITIONS
+from restock.ingest.store.version import Version
+from restock.ingest.store.writer import OWN_PATH, RECORDINGS, RETENTION_HOURS, TRANSITIONS
 from restock.ingest.task.conditions import Condition
 from restock.ingest.task.task import Task
-from restock.replay.store.query import install, query
+from restock.replay.store.query import definitions, install, query
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """The files of one table at the version that is open."""
+
+    name: str
+    schema: pa.Schema
+    paths: Sequence[str]  # in the table
+    hold: bool = False  # in memory, where the store lies on S3
+
+    @property
+    def view(self) -> str:
+        return f"stored_{self.name}"
 
 
 class Store:
@@ -37,7 +53,8 @@ class Store:
 
     Args:
         path: the store's directory, or `s3://bucket/prefix`.
-        version: of its transitions table; default the newest.
+        version: of its transitions table, a number or the moment whose newest it was; default the
+            newest.
         memory_limit: what DuckDB may hold in memory, e.g. "4GB"; default DuckDB's own (80 %).
 
     `version` is of the transitions table, `files` the Parquet files of each table.
@@ -50,7 +67,7 @@ class Store:
         self,
         path: str | Path | Location,
         *,
-        version: int | None = None,
+        version: Version | None = None,
         memory_limit: str | None = None,
     ) -> None:
         self.path = Location.of(path)
@@ -66,10 +83,25 @@ class Store:
             self._set_memory(memory_limit)
         rows = _paths(transitions)
         manifests = _manifests(self.path, recordings, rows)
+        self._tables = (
+            _Stored(RECORDINGS, pa.schema(recordings.schema().to_arrow()), manifests, hold=True),
+            _Stored(TRANSITIONS, pa.schema(transitions.schema().to_arrow()), rows),
+        )
         self.files = {
-            "stored_recordings": self._present(RECORDINGS, recordings, manifests, hold=True),
-            "stored_transitions": self._present(TRANSITIONS, transitions, rows),
+            table.view: [f"{self.path.table(table.name)}/{path}" for path in table.paths]
+            for table in self._tables
         }
+        try:
+            self._present_all(self.connection, "main")
+        except StoreError as error:
+            if version is None:
+                raise
+            raise StoreError(
+                f"its version {self.version} cannot be read any more: {error.what}",
+                where=str(self.path),
+                remedy=f"files are kept for {RETENTION_HOURS // 24} days after their rows were"
+                " replaced: name a newer version, or restore them from a copy",
+            ) from error
         self._tasks = self._read_tasks()
         self.observation_type = self._observation_type()
         install(self.connection, self.observation_type)
@@ -115,6 +147,10 @@ class Store:
             [task_hash],
         ).fetchall()
         return str(rows[0][0]) if rows and rows[0][0] else ""
+
+    def task_hashes(self) -> list[str]:
+        """Of the store's rows, sorted; more than one where profiles of several tasks read them."""
+        return sorted(self._tasks)
 
     def task_json(self, task_hash: str | None = None) -> str:
         """The task of the store's rows as JSON.
@@ -165,32 +201,50 @@ class Store:
         sizes = {self._decode(text, Task, "task").observation_size for text in self._tasks.values()}
         return f"FLOAT[{sizes.pop()}]" if len(sizes) == 1 else "FLOAT[]"
 
-    def _present(
-        self, name: str, table: DeltaTable, paths: Sequence[str], *, hold: bool = False
-    ) -> list[str]:
-        """A view `stored_…` of a table's files; returns their full paths.
+    def attach(self, connection: duckdb.DuckDBPyConnection, schema: str) -> None:
+        """Views and macros of this store in a schema of another connection, beside other stores'.
+
+        Raises StoreError where a file is missing or damaged.
+        """
+        connection.execute(f'CREATE SCHEMA "{schema}"; USE "{schema}"')
+        try:
+            self._present_all(connection, schema)
+            connection.execute(definitions(self.observation_type))
+        finally:
+            connection.execute("USE main")
+
+    def _present_all(self, connection: duckdb.DuckDBPyConnection, schema: str) -> None:
+        """A view `stored_…` of the files of each table.
 
         What lies on S3 is read at each query, or once, to be held in memory.
         """
-        view, schema = f"stored_{name}", pa.schema(table.schema().to_arrow())
-        files = [f"{self.path.table(name)}/{path}" for path in paths]
-        if not files:
-            self.connection.register(view, schema.empty_table())
-        elif self.path.folder is not None:
-            read_parquet(self.connection, view, files)
-        else:
-            parquet = pa.dataset.ParquetFileFormat(
-                default_fragment_scan_options=pa.dataset.ParquetFragmentScanOptions(pre_buffer=True)
-            )
-            remote = pa.dataset.FileSystemDataset(
-                [parquet.make_fragment(f"{name}/{path}", self.path.files) for path in paths],
-                schema,
-                parquet,
-                self.path.files,
-            )
+        for table in self._tables:
+            files = self.files[table.view]
+            if files and self.path.folder is not None:
+                read_parquet(connection, table.view, files, schema=schema)
+                continue
+            name = table.view if schema == "main" else f"{schema}_{table.view}"
             with self.path.translate_errors():
-                self.connection.register(view, remote.to_table() if hold else remote)
-        return files
+                connection.register(name, self._arrow(table))
+            if name != table.view:
+                connection.execute(f'CREATE VIEW "{schema}".{table.view} AS FROM "{name}"')
+
+    def _arrow(self, table: _Stored) -> pa.Table | pa.dataset.Dataset:
+        if not table.paths:
+            return table.schema.empty_table()
+        parquet = pa.dataset.ParquetFileFormat(
+            default_fragment_scan_options=pa.dataset.ParquetFragmentScanOptions(pre_buffer=True)
+        )
+        remote = pa.dataset.FileSystemDataset(
+            [
+                parquet.make_fragment(f"{table.name}/{path}", self.path.files)
+                for path in table.paths
+            ],
+            table.schema,
+            parquet,
+            self.path.files,
+        )
+        return remote.to_table() if table.hold else remote
 
     def _set_memory(self, limit: str) -> None:
         try:

@@ -37,6 +37,8 @@ class AuditCommand:
     """Instead of auditing, show how coverage grows with the rows kept, and how many are enough."""
     strict: bool = False
     """Let warnings fail, too."""
+    version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
+    """Audit the store as it was: a version's number, or a time (2026-11-01T08:00Z); the newest."""
     rows: int = 5
     """Offending rows shown per audit, 10 at most; `restock sql` shows them all."""
     json: bool = False
@@ -47,6 +49,7 @@ class AuditCommand:
     def run(self) -> int:
         """Run the audits, print them, and say with the exit code whether one failed."""
         from restock.cli import output
+        from restock.ingest.store.version import given_version
         from restock.replay.places import RUN_CONFIG, open_place
         from restock.replay.store.audit import junit_xml, load_audits, load_thresholds, run_audits
 
@@ -57,7 +60,8 @@ class AuditCommand:
         if self.run_dir is not None and not (self.run_dir / RUN_CONFIG).is_file():
             raise RunError("is not a run directory", where=str(self.run_dir))
         audits, thresholds = load_audits(self.audits), load_thresholds(self.thresholds)
-        with open_place(self.store, beside=given, only_store=True) as connection:
+        version = given_version(self.version)
+        with open_place(self.store, beside=given, only_store=True, version=version) as connection:
             findings = run_audits(connection, audits, thresholds, beside=given)
         failing = {"fail", "warn"} if self.strict else {"fail"}
         failed = [finding for finding in findings if finding.status in failing]
@@ -83,10 +87,12 @@ class AuditCommand:
 
     def _capacity(self) -> int:
         from restock.cli import output
+        from restock.ingest.store.version import given_version
         from restock.replay.places import open_place
         from restock.replay.store.capacity import recommend_capacity
 
-        with open_place(self.store, only_store=True) as connection:
+        version = given_version(self.version)
+        with open_place(self.store, only_store=True, version=version) as connection:
             capacity = recommend_capacity(connection)
         if self.json:
             output.print_json({"store": str(self.store), "capacity": asdict(capacity)})

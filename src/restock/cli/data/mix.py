@@ -39,8 +39,8 @@ class MixCommand:
     """Only show the plan; write nothing."""
     force: bool = False
     """Replace an existing panel."""
-    version: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Version of the store (default: the newest)."""
+    version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
+    """The store as it was: a version's number, or a time (2026-11-01T08:00Z); the newest."""
     memory_limit: Annotated[str | None, tyro.conf.arg(metavar="SIZE")] = None
     """Limit of DuckDB's memory, e.g. 1GB; packing needs little more, whatever the panel's
     size."""
@@ -54,6 +54,7 @@ class MixCommand:
     def run(self) -> None:
         """Plan, and unless it is a dry run, pack."""
         from restock.cli import output
+        from restock.ingest.store.version import given_version
         from restock.replay.mixture.mixture import load_mixture, shipped_schema
         from restock.replay.panel.build import open_source, write_panel
         from restock.replay.panel.plan import plan_panel
@@ -72,7 +73,9 @@ class MixCommand:
         mixture = load_mixture(self.mixture)
         folder = Path(self.mixture).parent
         with (
-            Store(self.store, version=self.version, memory_limit=self.memory_limit) as store,
+            Store(
+                self.store, version=given_version(self.version), memory_limit=self.memory_limit
+            ) as store,
             open_source(store, mixture, folder=folder) as source,
         ):
             plan = plan_panel(source.connection, mixture, source.conditions, source.others)

@@ -42,6 +42,8 @@ class SqlCommand:
     """A run whose tables are joined as run.audit, run.strata, …"""
     panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
     """A panel whose tables are joined as panel.rows, panel.strata."""
+    version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
+    """Ask the store as it was: a version's number, or a time (2026-11-01T08:00Z); the newest."""
     json: bool = False
     """Print a list of row objects."""
     csv: bool = False
@@ -53,6 +55,7 @@ class SqlCommand:
 
     def run(self) -> None:
         """Run the query and print its rows."""
+        from restock.ingest.store.version import given_version
         from restock.replay.places import open_place
 
         if self.json and self.csv:
@@ -62,7 +65,12 @@ class SqlCommand:
             return
         beside = {"run": self.run_dir, "panel": self.panel}
         given = {name: path for name, path in beside.items() if path is not None}
-        with open_place(self.path, beside=given, memory_limit=self.memory_limit) as connection:
+        with open_place(
+            self.path,
+            beside=given,
+            memory_limit=self.memory_limit,
+            version=given_version(self.version),
+        ) as connection:
             if self.query is None and sys.stdin.isatty():
                 self._prompt(connection)
             else:
@@ -127,10 +135,11 @@ class SqlCommand:
 
     def _export(self, out: Path) -> None:
         from restock.cli import output
+        from restock.ingest.store.version import given_version
         from restock.replay.store.export_views import export_views
         from restock.replay.store.store import Store
 
-        with Store(self.path) as store:
+        with Store(self.path, version=given_version(self.version)) as store:
             export_views(store, out)
             output.say(f"views of {self.path}, version {store.version} -> {out}")
 

@@ -1,0 +1,363 @@
+"""Two stores, or two versions of one: what came, what went, and what changed on the way.
+
+Episodes are matched by recording and first stamp, whatever ingest wrote them; rows by id. Shares
+and signals are compared as samples of episodes, with intervals.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any
+
+import duckdb
+import numpy as np
+
+from restock.errors import StoreError
+from restock.ingest.task.signals import STORED_SIGNALS
+from restock.replay.fleet.two_sample import (
+    LEAST_EPISODES,
+    Shift,
+    false_discovery_adjusted,
+    share_differences,
+    shift,
+)
+from restock.replay.store.query import values
+from restock.replay.store.store import Store
+
+# Columns of `transitions` whose values' shares are compared, as far as both stores have them.
+SHARES_OF = ("condition", "zone", "behaviour_policy", "robot", "site", "shift")
+_NOT_COMPARED = ("stamp_ns", "pose_x_m", "pose_y_m")  # where and when, which shares of zones say
+Rows = list[dict[str, Any]]
+
+# Those that differ: the same rows under another ingest are no difference.
+_RECORDINGS = """
+SELECT * FROM (
+    SELECT
+        any_value(pair.change) AS change,
+        recording_id,
+        any_value(source_file) AS source_file,
+        count(*) FILTER (rows_a > 0) AS episodes_a,
+        count(*) FILTER (rows_b > 0) AS episodes_b,
+        coalesce(sum(rows_a), 0)::BIGINT AS rows_a,
+        coalesce(sum(rows_b), 0)::BIGINT AS rows_b,
+        count(*) FILTER (episode.change <> 'same') AS episodes_changed
+    FROM recording_pairs AS pair
+    LEFT JOIN episode_pairs AS episode USING (recording_id)
+    WHERE pair.change <> 'same'
+    GROUP BY recording_id
+)
+LEFT JOIN (
+    SELECT recording_id, count(*) AS rows_relabelled
+    FROM row_pairs
+    WHERE condition_a IS DISTINCT FROM condition_b
+        OR list_sort(conditions_a) IS DISTINCT FROM list_sort(conditions_b)
+    GROUP BY recording_id
+) USING (recording_id)
+WHERE change <> 'written again' OR episodes_changed > 0 OR rows_relabelled > 0
+ORDER BY change, source_file, recording_id
+"""
+
+
+@dataclass(frozen=True)
+class StoreDifference:
+    """All of it; `document` has it as plain values."""
+
+    sides: dict[
+        str, dict[str, Any]
+    ]  # a and b: path, version, task, recordings, episodes, rows, hours
+    definitions: Rows  # of conditions, labels, profiles: those that differ
+    recordings: Rows  # that are not the same in both
+    episodes: Rows  # that are not the same in both
+    same_episodes: int
+    rows_paired: int  # of recordings that were written again, in both
+    labels: Rows  # from, to, rows, episodes
+    other_labels: int  # rows whose main condition stayed and whose other ones changed
+    shares: Rows
+    signals_of: dict[str, Any]  # which episodes the signals are compared over
+    signals: Rows
+
+    @property
+    def different(self) -> bool:
+        """Whether anything but the version is."""
+        return bool(self.definitions or self.recordings or self.labels or self.other_labels)
+
+    def document(self) -> dict[str, Any]:
+        """What `restock diff --json` prints."""
+        changed = {
+            change: sum(row["change"] == change for row in self.episodes)
+            for change in ("in", "out", "changed")
+        }
+        return {
+            "kind": "store",
+            "different": self.different,
+            **self.sides,
+            "definitions": self.definitions,
+            "recordings": self.recordings,
+            "episodes": {**changed, "same": self.same_episodes, "changes": self.episodes},
+            "labels": {
+                "rows_compared": self.rows_paired,
+                "rows_changed": sum(row["rows"] for row in self.labels),
+                "rows_with_other_changes": self.other_labels,
+                "changes": self.labels,
+            },
+            "shares": self.shares,
+            "signals": {**self.signals_of, "shifts": self.signals},
+        }
+
+
+def diff_stores(first: Store, second: Store, *, seed: int = 0) -> StoreDifference:
+    """What is different in `second`.
+
+    Raises:
+        StoreError: their rows are of different tasks, or cannot be read.
+    """
+    _same_task(first, second)
+    with (
+        tempfile.TemporaryDirectory(prefix="restock-") as spill,
+        duckdb.connect(config={"temp_directory": spill}) as connection,
+    ):
+        try:
+            first.attach(connection, "a")
+            second.attach(connection, "b")
+            script = files("restock.replay.fleet").joinpath("between.sql")
+            connection.execute(script.read_text(encoding="utf-8"))
+            return _difference(connection, first, second, np.random.default_rng(seed))
+        except duckdb.OperationalError as error:
+            raise StoreError(
+                f"cannot be read: {str(error).splitlines()[0]}",
+                where=f"{first.path} or {second.path}",
+                remedy="`restock audit` says which; restore its files, or ingest again",
+            ) from error
+
+
+def _same_task(first: Store, second: Store) -> None:
+    tasks = [store.task_hashes() for store in (first, second)]
+    if all(tasks) and tasks[0] != tasks[1]:
+        names = [
+            ", ".join(f"{task} (profile {store.profile_name(task)})" for task in sorted(hashes))
+            for store, hashes in zip((first, second), tasks, strict=True)
+        ]
+        raise StoreError(
+            f"its rows are of task {names[1]}, those of {first.path} version {first.version} of"
+            f" {names[0]}: their observations, actions and rewards do not mean the same",
+            where=f"{second.path} version {second.version}",
+            remedy="ingest the recordings of one again with the other's profile"
+            " (`restock ingest … --profile`), into a store of its own",
+        )
+
+
+def _difference(
+    connection: duckdb.DuckDBPyConnection, first: Store, second: Store, rng: np.random.Generator
+) -> StoreDifference:
+    episodes = _rows(
+        connection,
+        "SELECT change, recording_id, episode_a, episode_b, rows_a, rows_b FROM episode_pairs"
+        " WHERE change <> 'same' ORDER BY change, recording_id, number",
+    )
+    total = connection.sql("SELECT count(*) FROM episode_pairs").fetchall()[0][0]
+    recordings = _rows(connection, _RECORDINGS)
+    labels = _rows(
+        connection,
+        'SELECT condition_a AS "from", condition_b AS "to", count(*) AS rows,'
+        " count(DISTINCT episode_id) AS episodes FROM row_pairs"
+        " WHERE condition_a IS DISTINCT FROM condition_b GROUP BY ALL"
+        " ORDER BY rows DESC, condition_a, condition_b",
+    )
+    pairs, others = connection.sql(
+        "SELECT count(*), count(*) FILTER (condition_a IS NOT DISTINCT FROM condition_b AND"
+        " list_sort(conditions_a) IS DISTINCT FROM list_sort(conditions_b)) FROM row_pairs"
+    ).fetchall()[0]
+    compared, signals = _signals(connection)
+    return StoreDifference(
+        sides={
+            "a": _side(connection, first, "a"),
+            "b": _side(connection, second, "b"),
+        },
+        definitions=_definitions(connection),
+        recordings=recordings,
+        episodes=episodes,
+        same_episodes=int(total) - len(episodes),
+        rows_paired=int(pairs),
+        labels=labels,
+        other_labels=int(others),
+        shares=_shares(connection, rng),
+        signals_of=compared,
+        signals=signals,
+    )  # fmt: skip
+
+
+def _side(connection: duckdb.DuckDBPyConnection, store: Store, name: str) -> dict[str, Any]:
+    counted = _rows(
+        connection,
+        f"SELECT count(DISTINCT recording_id) AS recordings, count(*) AS episodes,"
+        f" coalesce(sum(rows_{name}), 0)::BIGINT AS rows,"
+        f" coalesce(sum(duration_{name}_s), 0) / 3600 AS hours"
+        f" FROM episode_pairs WHERE episode_{name} IS NOT NULL",
+    )[0]
+    tasks = sorted(store.task_hashes())
+    return {"path": str(store.path), "version": store.version, "tasks": tasks, **counted}
+
+
+def _definitions(connection: duckdb.DuckDBPyConnection) -> Rows:
+    """Conditions whose definition differs, and labels, profiles and software of the rows."""
+    found = _rows(
+        connection,
+        "SELECT 'condition ' || condition AS what,"
+        " one.timing || ', priority ' || one.priority || ': ' || one.sql AS a,"
+        " other.timing || ', priority ' || other.priority || ': ' || other.sql AS b"
+        " FROM a.conditions AS one FULL JOIN b.conditions AS other USING (condition) ORDER BY what",
+    )
+    for column in ("labels_version", "profile_hash", "restock_version"):
+        texts = [
+            connection.sql(
+                f"SELECT string_agg(one, ', ') FROM (SELECT DISTINCT {column} AS one"
+                f" FROM {schema}.versions ORDER BY one)"
+            ).fetchall()[0][0]
+            for schema in "ab"
+        ]
+        found.append({"what": column, "a": texts[0], "b": texts[1]})
+    return [row for row in found if row["a"] != row["b"]]
+
+
+def _shares(connection: duckdb.DuckDBPyConnection, rng: np.random.Generator) -> Rows:
+    """One row a value of each column: rows and share in either, and the difference."""
+    from scipy.sparse import csr_array
+
+    dimensions = _in_both(connection, SHARES_OF)
+    lines: Rows = []
+    groups: list[slice] = []
+    places: dict[str, list[Any]] = {side: [] for side in "ab"}  # (episode, value, rows)
+    for dimension in dimensions:
+        counted = {
+            side: connection.sql(
+                f"SELECT number, coalesce(CAST({dimension} AS VARCHAR), '(none)') AS value,"
+                f" count(*) AS rows FROM {side}.transitions"
+                f" JOIN episode_pairs ON episode_{side} = episode_id GROUP BY ALL"
+            ).fetchnumpy()
+            for side in "ab"
+        }
+        names = sorted({str(name) for found in counted.values() for name in found["value"]})
+        if names == ["(none)"]:
+            continue
+        place = {name: len(lines) + index for index, name in enumerate(names)}
+        groups.append(slice(len(lines), len(lines) + len(names)))
+        lines += [{"of": dimension, "value": name} for name in names]
+        for side, found in counted.items():
+            at = np.array([place[str(name)] for name in found["value"]], np.int64)
+            places[side].append((np.asarray(found["number"]), at, np.asarray(found["rows"])))
+    if not lines:
+        return []
+    episodes = int(connection.sql("SELECT count(*) FROM episode_pairs").fetchall()[0][0])
+    rows = {}
+    for side, parts in places.items():
+        number, column, count = (np.concatenate([part[i] for part in parts]) for i in range(3))
+        shape = (episodes, len(lines))
+        rows[side] = csr_array((count.astype(np.float64), (number.astype(np.int64), column)), shape)
+    differences = share_differences(rows["a"], rows["b"], groups, rng=rng)
+    totals = {side: np.asarray(matrix.sum(axis=0)).ravel() for side, matrix in rows.items()}
+    for group in groups:
+        for index in range(group.start, group.stop):
+            line, difference = lines[index], differences[index]
+            for side in "ab":
+                line[f"rows_{side}"] = int(totals[side][index])
+                whole = float(totals[side][group].sum())
+                line[f"share_{side}"] = float(totals[side][index]) / whole if whole else None
+            line |= {
+                "difference": difference.value,
+                "difference_low": difference.low,
+                "difference_high": difference.high,
+            }
+    return lines
+
+
+def _signals(connection: duckdb.DuckDBPyConnection) -> tuple[dict[str, Any], Rows]:
+    """Episode means of each signal: those that are only in b against those of a.
+
+    Where b has no episode of its own, those that are only in a against those of b.
+    """
+    counts = dict(
+        connection.sql("SELECT change, count(*) FROM episode_pairs GROUP BY ALL").fetchall()
+    )
+    new = counts.get("in", 0) >= LEAST_EPISODES
+    if new and sum(counts.values()) > counts["in"]:
+        of_a, of_b = "change <> 'in'", "change = 'in'"
+        words = "the episodes that are new in b against those of a"
+    elif counts.get("out", 0) >= LEAST_EPISODES and sum(counts.values()) > counts["out"]:
+        of_a, of_b = "change = 'out'", "change <> 'out'"
+        words = "the episodes of b against those that are no longer there"
+    else:
+        return {"compared": None}, []
+    columns = _in_both(
+        connection, [signal.name for signal in STORED_SIGNALS if signal.name not in _NOT_COMPARED]
+    )
+    columns += _in_both(connection, ["reward", "action_residual"])
+    columns += _custom(connection)
+    means = ", ".join(f'avg(CAST("{name}" AS DOUBLE)) AS "{name}"' for name in columns)
+    samples = [
+        connection.sql(
+            f"SELECT {means} FROM {side}.transitions JOIN episode_pairs"
+            f" ON episode_{side} = episode_id WHERE {which} GROUP BY episode_id"
+        ).fetchnumpy()
+        for side, which in (("a", of_a), ("b", of_b))
+    ]
+    shifts = {name: shift(*(_known(sample[name]) for sample in samples)) for name in columns}
+    adjusted = false_discovery_adjusted([one.p_value for one in shifts.values()])
+    rows = [
+        _signal(name, one, p_value)
+        for (name, one), p_value in zip(shifts.items(), adjusted, strict=True)
+        if min(one.episodes)
+    ]
+    rows.sort(key=lambda row: -abs(np.nan_to_num(row["standardised"], posinf=1e9, neginf=-1e9)))
+    episodes = [len(next(iter(sample.values()))) for sample in samples]
+    return {"compared": words, "episodes_a": episodes[0], "episodes_b": episodes[1]}, rows
+
+
+def _signal(name: str, one: Shift, adjusted: float) -> dict[str, Any]:
+    return {
+        "signal": name,
+        "episodes_a": one.episodes[0],
+        "episodes_b": one.episodes[1],
+        "mean_a": one.mean[0],
+        "mean_b": one.mean[1],
+        "standardised": one.standardised.value,
+        "standardised_low": one.standardised.low,
+        "standardised_high": one.standardised.high,
+        "ks": one.ks,
+        "p_value": one.p_value,
+        "p_adjusted": adjusted,
+    }
+
+
+def _known(values_: Any) -> Any:
+    return np.ma.filled(np.ma.asarray(values_, np.float64), np.nan)
+
+
+def _in_both(connection: duckdb.DuckDBPyConnection, names: Sequence[str]) -> list[str]:
+    columns = [set(connection.sql(f"FROM {side}.transitions LIMIT 0").columns) for side in "ab"]
+    return [name for name in names if all(name in found for found in columns)]
+
+
+def _custom(connection: duckdb.DuckDBPyConnection) -> list[str]:
+    """A profile's own signals that are numbers, of both stores."""
+    names = [
+        str(name)
+        for side in "ab"
+        for (name,) in connection.sql(
+            "SELECT DISTINCT signal.name FROM (SELECT unnest(signals) AS signal"
+            f" FROM {side}.recordings) ORDER BY ALL"
+        ).fetchall()
+    ]
+    numeric = {"FLOAT", "DOUBLE", "BIGINT", "INTEGER", "SMALLINT", "BOOLEAN"}
+    relation = connection.sql("FROM b.transitions LIMIT 0")
+    kinds = dict(zip(relation.columns, map(str, relation.types), strict=True))
+    return [
+        name for name in _in_both(connection, list(dict.fromkeys(names))) if kinds[name] in numeric
+    ]
+
+
+def _rows(connection: duckdb.DuckDBPyConnection, query: str) -> Rows:
+    relation = connection.sql(query)
+    return [dict(zip(relation.columns, row, strict=True)) for row in values(relation)]
