@@ -18,6 +18,11 @@ import numpy as np
 import pyarrow as pa
 
 from restock.errors import ConfigError, StoreError
+from restock.ingest.profile.profile_text import (
+    profile_toml,
+    read_profile_toml,
+    with_conditions,
+)
 from restock.ingest.store.episode_rows import episode_ends
 from restock.ingest.store.manifest import conditions_json, score_rows
 from restock.ingest.store.transitions import column_array, names_of
@@ -137,6 +142,7 @@ def _one(
         "labels_version": version,
         "label_scores": score_rows(scores),
         "conditions_json": conditions_json(every_condition),
+        "profile_toml": _with_conditions(row["profile_toml"], every_condition),
     }
     outcome = Relabelled(
         row["recording_id"],
@@ -149,6 +155,16 @@ def _one(
         scores,
     )
     return pa.Table.from_pylist([manifest], recording_schema()), rows, outcome
+
+
+def _with_conditions(text: str | None, conditions: Sequence[Condition]) -> str | None:
+    """The text of a manifest's profile with the conditions that label its rows now; None where it
+    has none, or one that only a newer Restock can read."""
+    try:
+        profile = read_profile_toml(text or "", where="the manifest's profile")
+    except ConfigError:
+        return None
+    return profile_toml(with_conditions(profile, conditions))
 
 
 def open_for_relabel(path: Path | str) -> StoreWriter:

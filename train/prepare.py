@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from restock.errors import PanelError, RunError
-from restock.ingest.profile.profile import Profile, load_profile, shipped_profiles
+from restock.ingest.profile.profile import Profile, load_profile
 from restock.replay.panel.logged_sampler import controller_for
 from restock.replay.panel.panel import Panel
 from restock.replay.sampling.share_controller import PlannedDraws
@@ -26,6 +26,12 @@ from restock.train.finite import STOPPED
 from restock.train.loop import Notify, TrainResult
 from restock.train.run.checkpoint import check_earlier, go_back
 from restock.train.run.run import Run, check_free, now_ns, panel_document, software_versions
+from restock.train.run.run_profile import (
+    carries_profile,
+    profile_document,
+    profile_of_panel,
+    profile_of_run,
+)
 from restock.train.session import Session, open_session
 from restock.train.twin.env.floor_report import refuse_unfit, sealed
 from restock.train.twin.env.interface import AFTER_LOGS, Twin
@@ -155,10 +161,12 @@ def prepare_new(
         # What is wrong with one is reported before anything is written. Evaluation drives all kinds
         # that are named, whatever their share.
         refuse_unfit(open_floors(layouts), config.env.conditions)
-    if panel_path is not None and not chosen:
-        name = profile_of_panel(Panel.open(panel_path))
-        config = msgspec.structs.replace(config, profile=name)
-    profile = load_profile(config.profile)
+    fed = Panel.open(panel_path) if panel_path is not None else None
+    if fed is not None and (not chosen or carries_profile(fed, config.profile)):
+        profile = profile_of_panel(fed)
+        config = msgspec.structs.replace(config, profile=profile.name)
+    else:
+        profile = load_profile(config.profile)
     panel = open_panel(panel_path, config, profile) if panel_path is not None else None
     config = resolve_config(config, panel)
     return Prepared(out, config, profile, panel, _document(config, profile, panel))
@@ -178,7 +186,8 @@ def prepare_resumed(
     stored = run.document["config"]
     config = parse_config(apply_overrides(stored, overrides), where=str(path / "config.json"))
     open_device(config.device)
-    profile = load_profile(config.profile)
+    given = config.profile != stored.get("profile")
+    profile = load_profile(config.profile) if given else profile_of_run(run)
     if profile.task.hash != run.document["task_hash"]:
         raise RunError(
             f"was trained on task {run.document['task_hash']}, profile {config.profile!r} now"
@@ -198,26 +207,6 @@ def prepare_resumed(
     if from_env_steps is not None:
         check_earlier(run.latest, from_env_steps)
     return Prepared(path, config, profile, panel, run.document, run, from_env_steps)
-
-
-def profile_of_panel(panel: Panel) -> str:
-    """The profile whose task the panel's rows are of, where the config names none.
-
-    Raises:
-        PanelError: it is of one that does not come with Restock.
-    """
-    shipped = [n for n in shipped_profiles() if load_profile(n).task.hash == panel.task_hash]
-    if not shipped:
-        name = panel.header.profile
-        raise PanelError(
-            f"its rows are of task {panel.task_hash}"
-            + (f", of profile {name!r}" if name else "")
-            + ": no profile that comes with Restock has it",
-            where=str(panel.path),
-            remedy="give the file of the profile that its logs were ingested with: --set"
-            f" profile={name or 'my_robot'}.toml; if that changed since, ingest and mix again",
-        )
-    return panel.header.profile if panel.header.profile in shipped else shipped[0]
 
 
 def open_panel(path: Path, config: TrainConfig, profile: Profile) -> Panel:
@@ -324,9 +313,7 @@ def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dic
         "panel": fed,
         "target": describe(config.target),
         "update_path": update_path(config.network, config.device),
-        "task_hash": profile.task.hash,
-        "labels_version": profile.labels_version,
-        "profile": {"name": profile.name, "hash": profile.hash},
+        **profile_document(profile),
         # Conditions of logs alone, with the signals that the twin does not fill.
         "not_evaluated": conditions_in_twin(profile.conditions, profile.signals)[1],
         "seeds": {"run": config.seed, "evaluation": config.evaluation.seed},

@@ -196,6 +196,7 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
     ),
     Column("task_json", pa.string(), "the task, as JSON"),
     Column("conditions_json", pa.string(), "the conditions: name, timing, priority, sql, as JSON"),
+    Column("profile_toml", pa.string(), "the profile, the SQL of its files in it", nullable=True),
 )  # fmt: skip
 
 

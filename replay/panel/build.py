@@ -31,7 +31,7 @@ from restock.replay.panel.plan import PanelPlan, plan_panel
 from restock.replay.panel.scratch import SourceSteps
 from restock.replay.panel.seal import FileRecord, seal
 from restock.replay.panel.stores import AllStores, PinnedStore, all_stores
-from restock.replay.store.store import Store
+from restock.replay.store.store import Store, StoredProfile, profiles_of
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,8 @@ class TransitionSource:
     task_json: Callable[[str], str]  # task hash -> the task as JSON; "" where nothing is known
     conditions: tuple[Condition, ...]
     others: tuple[PinnedStore, ...] = ()  # whose rows are in the view too
-    profile: Callable[[str], str] = lambda task_hash: ""  # task hash -> the profile's name
+    # task hash -> the profiles that read its rows, newest ingest first
+    profiles: Callable[[str], list[StoredProfile]] = lambda task_hash: []
 
 
 @contextmanager
@@ -74,7 +75,7 @@ def open_source(
                 transitions.task_json,
                 named,
                 stores.others,
-                transitions.profile_name,
+                lambda task_hash: profiles_of(stores.connection, task_hash),
             )
         return
     with duckdb.connect() as connection:
@@ -268,6 +269,7 @@ def _header(
     observation_size: int,
     partial: Path,
 ) -> Header:
+    read_by = (*source.profiles(plan.task_hash), StoredProfile("", "", ""))[0]
     by_priority = sorted(source.conditions, key=lambda c: (c.priority, c.name))
     return Header(
         id=identity,
@@ -275,7 +277,8 @@ def _header(
         store_version=source.version,
         task_hash=plan.task_hash,
         task_json=task_json,
-        profile=source.profile(plan.task_hash),
+        profile=read_by.name,
+        profile_toml=read_by.toml,
         labels_version=labels_version(source.conditions),
         observation_size=observation_size,
         rows=len(plan.panel_rows),

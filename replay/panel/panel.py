@@ -67,6 +67,7 @@ class Header(msgspec.Struct, frozen=True):
     ratios: list[RatioFit]  # how well density ratios were estimated, where a correction uses them
     files: dict[str, FileRecord]
     profile: str = ""  # the name of the one that read its rows; "" where the source did not say
+    profile_toml: str = ""  # its text, for who has not its file; "" where the source did not say
     as_of_ns: int | None = None  # what the mixture's max_age_days counted to, where it has one
 
 

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 from urllib.parse import unquote
 
 import duckdb
@@ -46,6 +46,14 @@ class _Stored:
     @property
     def view(self) -> str:
         return f"stored_{self.name}"
+
+
+class StoredProfile(NamedTuple):
+    """A profile as the manifests of its recordings keep it."""
+
+    name: str
+    hash: str
+    toml: str  # "" where an older Restock wrote them
 
 
 class Store:
@@ -141,12 +149,8 @@ class Store:
 
     def profile_name(self, task_hash: str) -> str:
         """The profile that read the rows of a task, by the newest ingest; "" where none did."""
-        rows = self.connection.execute(
-            "SELECT profile FROM recordings WHERE task_hash = ?"
-            " ORDER BY ingested_at DESC, ingest_id LIMIT 1",
-            [task_hash],
-        ).fetchall()
-        return str(rows[0][0]) if rows and rows[0][0] else ""
+        profiles = profiles_of(self.connection, task_hash)
+        return profiles[0].name if profiles else ""
 
     def task_hashes(self) -> list[str]:
         """Of the store's rows, sorted; more than one where profiles of several tasks read them."""
@@ -253,6 +257,20 @@ class Store:
             raise StoreError(
                 f"no memory limit {limit!r}", remedy='write it like "4GB" or "512MB"'
             ) from error
+
+
+def profiles_of(connection: duckdb.DuckDBPyConnection, task_hash: str) -> list[StoredProfile]:
+    """The profiles that read the rows of a task, of a connection with a view `recordings`; that of
+    the newest ingest first."""
+    # Recordings of an older store carry no text: null.
+    rows = connection.execute(
+        "SELECT profile, profile_hash, arg_max(coalesce(profile_toml, ''), ingested_at)"
+        " FROM (FROM recordings UNION ALL BY NAME SELECT NULL::VARCHAR AS profile_toml WHERE false)"
+        " WHERE task_hash = ? AND profile <> ''"
+        " GROUP BY profile, profile_hash ORDER BY max(ingested_at) DESC, profile_hash",
+        [task_hash],
+    ).fetchall()
+    return [StoredProfile(*row) for row in rows]
 
 
 def is_store(path: str | Path | Location) -> bool:

@@ -17,6 +17,7 @@ import numpy as np
 from restock.errors import ConfigError, StoreError
 from restock.files import first_line
 from restock.ingest.profile.profile import Profile, load_profile
+from restock.ingest.profile.profile_text import read_profile_toml
 from restock.ingest.steps.messages_at_tick import MessageAtTick, messages_at_tick
 from restock.ingest.task.schema import STEP_BITS
 from restock.ingest.task.task import Task, reward_parts
@@ -26,7 +27,8 @@ from restock.replay.store.store import Store, is_store
 # some take longer than others to be received.
 WINDOW_S = (-1.0, 0.1)
 _RELABELLED = ("condition", "conditions", "labels_version", "profile_hash", "ingest_id", "reward")
-_LEFT_OUT = ("task_json", "conditions_json", "topics", "label_scores")  # of a manifest: long
+# Of a manifest: long.
+_LEFT_OUT = ("task_json", "conditions_json", "profile_toml", "topics", "label_scores")
 
 
 @dataclass(frozen=True)
@@ -251,16 +253,24 @@ def _reward_parts(
 
 
 def _profile(origin: Origin, manifest: Mapping[str, Any], given: str | None) -> Profile | None:
-    """The profile that read the recording: the one given, or the shipped one of that name."""
-    name = given or manifest["profile"]
+    """The profile that read the recording: the one given, the manifest's own, or the shipped one
+    of that name."""
+    name, text = given or manifest["profile"], manifest.get("profile_toml")
     try:
-        profile = load_profile(name)
-    except ConfigError:
+        if given is None and text:
+            profile = read_profile_toml(text, where=f"profile {name!r}")
+        else:
+            profile = load_profile(name)
+    except ConfigError as error:
         if given is not None:
             raise
         origin.notes.append(
-            f"profile {name!r} does not come with Restock: give its file with --profile to see"
-            " which topics were read"
+            (
+                f"profile {name!r} cannot be read from the store ({error.what})"
+                if text
+                else f"profile {name!r} does not come with Restock"
+            )
+            + ": give its file with --profile to see which topics were read"
         )
         return None
     if profile.hash != manifest["profile_hash"]:

@@ -63,7 +63,7 @@ def parse_toml(text: str, *, where: str) -> dict[str, Any]:
     """
     try:
         return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ConfigError(f"is not TOML: {error}", where=where) from error
 
 
@@ -100,15 +100,20 @@ def typed(
 
 
 def toml_value(value: Any) -> str:
-    """A string, number, boolean, list or mapping (its keys bare) as TOML on one line."""
+    """A string, number, boolean, list or mapping as TOML on one line."""
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key} = {toml_value(item)}" for key, item in value.items()) + "}"
+        items = (f"{_key(key)} = {toml_value(item)}" for key, item in value.items())
+        return "{" + ", ".join(items) + "}"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(toml_value, value)) + "]"
     if isinstance(value, float):
         return repr(float(value))  # JSON has no inf and nan
     # JSON would escape what is beyond 16 bits in two halves, and leave DEL as it is.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else toml_value(name)
 
 
 @functools.cache

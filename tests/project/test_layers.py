@@ -42,14 +42,14 @@ MAY_IMPORT = {
         " replay/sampling ingest/profile ingest/store ingest/task"
     ),
     "train/dqn": "twin/env twin/physics",
-    "train/run": "replay/panel ingest/task",
+    "train/run": "replay/panel ingest/profile ingest/task",
     "train/feed": (
         "dqn run twin/env twin/floors replay/mixture replay/panel replay/ring replay/sampling"
         " ingest/task"
     ),
     "train/evaluation": (
         "dqn feed run twin/env twin/floors twin/physics replay/panel replay/ring replay/store"
-        " ingest/profile ingest/store ingest/task"
+        " ingest/store ingest/task"
     ),
     "train/comparison": "train dqn evaluation run",
     "train/libraries": (

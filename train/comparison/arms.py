@@ -49,7 +49,7 @@ _KINDS: dict[str, Kind] = {
     "config.threads": "free",
     "config.record": "free",
     "config.env.overlap": "free",
-    "config.profile": "task",
+    "config.profile": "free",  # a name or a file: `profile` says what it held
     "config.target": "target",
     "config.evaluation.off_policy": "free",
     "config.evaluation": "evaluation",
@@ -74,7 +74,7 @@ _KINDS: dict[str, Kind] = {
     "versions": "software",
 }
 _NO_SETTING = frozenset(  # or it follows from the config
-    {"format", "created_ns", "target", "seeds", "update_path"}
+    {"format", "created_ns", "target", "seeds", "update_path", "profile_toml"}
 )
 
 

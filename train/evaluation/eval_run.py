@@ -16,7 +16,6 @@ import msgspec
 import pyarrow as pa
 
 from restock.errors import ConfigError
-from restock.ingest.profile.profile import load_profile
 from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.evaluation.evaluate import (
     EpisodeResult,
@@ -26,6 +25,7 @@ from restock.train.evaluation.evaluate import (
 from restock.train.evaluation.policies import load_agent, load_policy
 from restock.train.run.kept_evaluations import add_evaluation
 from restock.train.run.run import Run
+from restock.train.run.run_profile import profile_of_run
 from restock.train.run.run_tables import EVAL_EPISODES
 from restock.train.twin.env.floor_report import refuse_unfit, unfit_kinds
 from restock.train.twin.env.interface import Policy
@@ -173,7 +173,7 @@ def drive_evaluation(
     from restock.train.twin.env.interface import DEFAULT_CONDITIONS
     from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
-    profile = load_profile(plan.config.profile)
+    profile = profile_of_run(plan.run)
     task = profile.task
     env = WarehouseVectorEnv(
         plan.num_envs,
@@ -243,7 +243,7 @@ def make_policy(name: str, plan: EvaluationPlan) -> Policy:
         return load_agent(plan.run)
     if name == "planner":
         return PlannerFollower(epsilon=0.0, seed=plan.first_seed)
-    named = load_policy(name, load_profile(plan.config.profile).task)
+    named = load_policy(name, profile_of_run(plan.run).task)
     return RandomPolicy(seed=plan.first_seed) if named is None else named
 
 

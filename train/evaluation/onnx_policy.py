@@ -20,12 +20,11 @@ from restock import __version__
 from restock.arrays import F32, Ints
 from restock.errors import ConfigError, RunError
 from restock.files import write_bytes
-from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
-from restock.train.dqn.config import parse_config
 from restock.train.dqn.network import Network, QNetwork
 from restock.train.evaluation.policies import load_agent
 from restock.train.run.run import Run
+from restock.train.run.run_profile import profile_of_run
 
 FORMAT = "restock-policy/1"
 _OPSET = 18
@@ -44,7 +43,7 @@ def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
     if out.exists():
         raise RunError("already exists", where=str(out), remedy="choose another --out")
     agent = load_agent(run)
-    profile = load_profile(parse_config(run.document["config"], where=str(run_path)).profile)
+    profile = profile_of_run(run)
     model = to_onnx(agent.network)
     metadata = {
         "format": FORMAT,

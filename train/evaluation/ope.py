@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64
 from restock.files import write_table
-from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
 from restock.toml import Checked
 from restock.train.dqn.config import parse_config
@@ -41,6 +40,7 @@ from restock.train.evaluation.ope_dataset import (
 from restock.train.evaluation.ope_estimators import EssGate, OpeEpisodes, estimate
 from restock.train.evaluation.policies import load_agent
 from restock.train.run.run import Run
+from restock.train.run.run_profile import profile_of_run
 from restock.train.run.run_tables import TABLES
 
 ALL = "all"
@@ -94,7 +94,7 @@ def evaluate_run_off_policy(
     run = Run.open(path)
     trained = parse_config(run.document["config"], where=str(path / "config.json"))
     agent = load_agent(run)
-    task = load_profile(trained.profile).task
+    task = profile_of_run(run).task
     dataset = load_ope_dataset(run_panel(run.document), task, logs, seed=config.seed)
     rows = evaluate_off_policy(
         agent.network,

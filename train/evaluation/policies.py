@@ -11,7 +11,6 @@ import numpy as np
 
 from restock.arrays import F32, Ints
 from restock.errors import ConfigError, RunError
-from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
 from restock.train.dqn.config import parse_config
 from restock.train.dqn.learner import greedy_actions
@@ -19,6 +18,7 @@ from restock.train.dqn.network import Network, make_network
 from restock.train.evaluation.evaluate import Score
 from restock.train.run import checkpoint
 from restock.train.run.run import Run
+from restock.train.run.run_profile import profile_of_run
 from restock.train.twin.env.interface import Policy
 
 
@@ -51,7 +51,7 @@ def load_policy(name: str, task: Task) -> Policy | None:
         return None
     run = Run.open(Path(path))
     agent = load_agent(run)
-    trained = load_profile(parse_config(run.document["config"], where=path).profile).task
+    trained = profile_of_run(run).task
     if trained.hash != task.hash:
         raise ConfigError(
             f"was trained on task {trained.hash}, this is {task.hash}",
@@ -75,7 +75,7 @@ def load_agent(run: Run) -> GreedyPolicy:
         )
     config = parse_config(run.document["config"], where=str(run.path / "config.json"))
     state = checkpoint.load(run.best)
-    task = load_profile(config.profile).task
+    task = profile_of_run(run).task
     if state["task_hash"] != task.hash:
         raise RunError(
             f"its policy was trained on task {state['task_hash']}, profile"

@@ -31,6 +31,7 @@ from restock.train.feed.fresh_log import values_entries
 from restock.train.feed.logs import Logs
 from restock.train.libraries.fresh_meta import FreshMeta, InfoLabels
 from restock.train.run.run import Run, now_ns, panel_document, software_versions
+from restock.train.run.run_profile import profile_document, profile_of_panel
 from restock.train.run.run_tables import TABLES
 
 PROFILE = "warehouse_amr"
@@ -42,11 +43,12 @@ NO_LOGS = BatchDraw(_NO_ROWS, _NO_ROWS, None, np.empty(0))
 
 class FeedOptions(TypedDict, total=False):
     """What every library's buffer takes by keyword; each may be left out. Defaults: no run, the
-    panel's own share, warehouse_amr, seed 0, a hundredth of the batches, 500 batches."""
+    panel's own share and profile (without a panel warehouse_amr), seed 0, a hundredth of the
+    batches, 500 batches."""
 
     run: str | Path | None  # the run directory to make; None, the default: no record is kept
     logs_share: float | None  # of a batch; default the panel's own
-    profile: str  # whose task and conditions the environment has; default "warehouse_amr"
+    profile: str  # whose task and conditions the environment has; default the panel's own
     seed: int  # of the draws and of which batches are audited; default 0
     audit_share: float  # of all batches, each row of which is written down; default 0.01
     log_every: int  # batches summed into one row of each table; default 500
@@ -77,17 +79,17 @@ class MixedFeed:
         panel: Panel | None,
         run: str | Path | None = None,
         logs_share: float | None = None,
-        profile: str = PROFILE,
+        profile: str | None = None,
         seed: int = 0,
         audit_share: float = 0.01,
         log_every: int = 500,
     ) -> None:
-        definition, self.panel = load_profile(profile), panel
+        definition, self.panel = environment_profile(profile, panel), panel
         if logs_share is not None and not 0 <= logs_share <= 1:
             raise ConfigError(f"logs_share must be in [0, 1], got {logs_share:g}")
         self.logs_share = logs_share
         if panel is not None:
-            _check(panel, definition.task.hash, profile, observation_size)
+            _check(panel, definition, observation_size)
         began_ns = now_ns()
         self.logs = Logs.of_panel(panel, as_of_ns=began_ns) if panel is not None else None
         self.seed, self.log_every, self.audit_share = seed, log_every, audit_share
@@ -270,13 +272,22 @@ class MixedFeed:
         )
 
 
-def _check(panel: Panel, task_hash: str, profile: str, observation_size: int) -> None:
+def environment_profile(name: str | None, panel: Panel | None) -> Profile:
+    """The profile of this name; without one the panel's, without a panel warehouse_amr."""
+    if name is None and panel is not None:
+        return profile_of_panel(panel)
+    return load_profile(name or PROFILE)
+
+
+def _check(panel: Panel, profile: Profile, observation_size: int) -> None:
+    task_hash = profile.task.hash
     if panel.task_hash != task_hash or panel.observation_size != observation_size:
         raise PanelError(
             f"its rows are of task {panel.task_hash} ({panel.observation_size} entries an"
-            f" observation), the environment's ({profile}) is {task_hash} ({observation_size})",
+            f" observation), the environment's ({profile.name}) is {task_hash}"
+            f" ({observation_size})",
             where=str(panel.path),
-            remedy=f"ingest the logs with `--profile {profile}` and mix again",
+            remedy=f"ingest the logs with `--profile {profile.name}` and mix again",
         )
 
 
@@ -307,9 +318,7 @@ def create_run(
             "config": config,
             "panel": mixed,
             **more,
-            "task_hash": profile.task.hash,
-            "labels_version": profile.labels_version,
-            "profile": {"name": profile.name, "hash": profile.hash},
+            **profile_document(profile),
             "not_evaluated": conditions_in_twin(profile.conditions, profile.signals)[1],
             "seeds": seeds,
             "versions": software_versions() | {name: version(name)},

@@ -23,11 +23,10 @@ from tianshou.data import Batch, ReplayBuffer, ReplayBufferManager
 
 from restock.arrays import F32, Ints
 from restock.errors import MixtureError
-from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.packed_row import row_columns, row_width
 from restock.replay.panel.logged_sampler import BatchDraw
 from restock.replay.panel.panel import Panel
-from restock.train.libraries.mixed_feed import PROFILE, FeedOptions, MixedFeed
+from restock.train.libraries.mixed_feed import FeedOptions, MixedFeed, environment_profile
 
 TIANSHOU = "tianshou"
 
@@ -69,7 +68,7 @@ class MixtureVectorReplayBuffer(ReplayBufferManager):
         parts = [ReplayBuffer(size) for _ in range(buffer_num)]
         logs = [ReplayBuffer(len(panel))] if panel is not None else []
         super().__init__([*parts, *logs])
-        task = load_profile(options.get("profile", PROFILE)).task
+        task = environment_profile(options.get("profile"), panel).task
         observation_size = task.observation_size
         self.feed = MixedFeed(TIANSHOU, buffer_num, observation_size, panel=panel, **options)
         self.fresh = self.feed.fresh_meta(size * buffer_num)

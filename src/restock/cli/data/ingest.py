@@ -123,15 +123,15 @@ class IngestCommand:
         return list(paths), failures
 
 
+# Of a manifest, as printed: definitions, and what is said in other words.
+_LEFT_OUT = ("task_json", "conditions_json", "profile_toml", "source_file", "label_scores")
+
+
 def as_json(outcome: IngestResult) -> dict[str, Any]:
     """An outcome as `--json` prints it."""
     from restock.ingest.task.label_scores import GOOD
 
-    row = {
-        key: value
-        for key, value in outcome.manifest.items()
-        if key not in ("task_json", "conditions_json", "source_file", "label_scores")
-    }
+    row = {key: value for key, value in outcome.manifest.items() if key not in _LEFT_OUT}
     return {
         "path": outcome.path,
         "status": outcome.status,

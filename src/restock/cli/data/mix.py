@@ -80,6 +80,8 @@ class MixCommand:
         ):
             plan = plan_panel(source.connection, mixture, source.conditions, source.others)
             document = describe(plan) | {"store_version": store.version, "mixture": self.mixture}
+            read_by = source.profiles(plan.task_hash)
+            document["profiles"] = [{"name": p.name, "hash": p.hash} for p in read_by]
             if self.out is not None and not self.dry_run:
                 with output.progress("packing", len(plan.rows)) as advance:
                     panel = write_panel(
@@ -206,6 +208,11 @@ def _summary(document: dict[str, Any]) -> list[str]:
         f" {document['effective_rows']:,.0f} equally weighted rows; largest weight"
         f" {document['largest_weight']:.3g}",
     ]
+    if len(read_by := [f"{p['name']} {p['hash']}" for p in document["profiles"]]) > 1:
+        lines.append(
+            f"profiles of this task: {', '.join(read_by)}; the panel carries {read_by[0]}, of the"
+            " newest ingest"
+        )
     rules = dict.fromkeys(line["within"] for line in document["strata"])
     of_rule = {
         rule: [line["stratum"] for line in document["strata"] if line["within"] == rule]

@@ -1,0 +1,186 @@
+"""A profile of one's own goes with its rows: store, panel and run carry its text."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.paths import ROOT
+from support.profile_texts import WAREHOUSE
+
+from restock.cli import main
+from restock.errors import ConfigError, PanelError
+from restock.ingest.profile.custom_signal import CustomSignal
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.profile.profile_text import profile_toml, read_profile_toml, with_conditions
+from restock.replay.panel.panel import Panel
+from restock.replay.store.store import Store
+from restock.train.prepare import prepare_new, prepare_resumed
+from restock.train.run.run import Run
+from restock.train.run.run_profile import profile_of_panel, profile_of_run
+
+SHORTER = WAREHOUSE.replace("time_limit_steps = 240", "time_limit_steps = 60")  # another task
+OWN = """
+[[condition]]
+file = "creeping.sql"
+
+[signals.battery_v]
+topic = "/diagnostics"
+type = "diagnostic_msgs/msg/DiagnosticArray"
+path = "status[name=battery].values[key=voltage].value"
+unit = "V"
+values = {"not known" = -1.0}
+"""
+CREEPING = """-- timing: pre
+-- priority: 35
+abs(wheel_speed_mps) < 0.3
+"""
+TINY = [
+    *("schedule.env_steps=200", "schedule.offline_updates=5", "schedule.warmup_env_steps=40"),
+    *("env.num_envs=4", "evaluation.episodes=1", "evaluation.every_env_steps=200"),
+    *("record.tensorboard=false", "network.hidden=[8]", "replay.batch_size=16"),
+    "env.conditions={nominal=1.0}",
+]
+TUESDAY, MONDAY = str(ROOT / "sample_logs/amr_tuesday"), str(ROOT / "sample_logs/amr_monday.mcap")
+
+
+def ingest(folder: Path, name: str, recording: str, store: Path) -> None:
+    """By a profile of this name, whose files are gone afterwards."""
+    profile = folder / f"{name}.toml"
+    profile.write_text(SHORTER.replace('name = "warehouse_amr"', f'name = "{name}"', 1) + OWN)
+    (folder / "creeping.sql").write_text(CREEPING)
+    assert main(["ingest", recording, "--profile", str(profile), "--store", str(store)]) == 0
+    profile.unlink()
+    (folder / "creeping.sql").unlink()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store, its panel and a run of it, by a profile whose files are gone."""
+    folder = tmp_path_factory.mktemp("carried")
+    ingest(folder, "mine", TUESDAY, folder / "store")
+    assert main(["mix", str(folder / "store"), "--out", str(folder / "panel")]) == 0
+    tiny = [word for text in TINY for word in ("--set", text)]
+    given = ["--panel", str(folder / "panel"), "--out", str(folder / "run")]
+    assert main(["train", *given, *tiny]) == 0
+    return folder
+
+
+def carrying(folder: Path, text: str) -> Panel:
+    """That panel, with another text of its profile."""
+    panel = Panel.open(folder / "panel")
+    header = msgspec.structs.replace(panel.header, profile_toml=text)
+    return Panel(panel.path, header, panel.rows)
+
+
+def test_store_panel_and_run_carry_the_profile_with_the_text_of_its_files(folder: Path) -> None:
+    with Store(folder / "store") as store:
+        rows = store.sql("SELECT profile_toml, profile_hash FROM recordings").fetchall()
+    carried = read_profile_toml(rows[0][0], where="test")
+    assert (carried.name, carried.hash) == ("mine", rows[0][1])
+    assert [c.sql for c in carried.own_conditions] == ["abs(wheel_speed_mps) < 0.3"]
+    assert profile_of_panel(Panel.open(folder / "panel")) == carried
+    run = Run.open(folder / "run")
+    assert profile_of_run(run) == carried
+    assert run.document["config"]["profile"] == "mine"
+
+
+def test_a_run_is_evaluated_and_resumed_without_its_profile(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drive = ["eval", str(folder / "run"), "--episodes", "1", "--perturbations", "none"]
+    assert main([*drive, "--policies", "agent", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["results"]
+    resumed = prepare_resumed(folder / "run", ["schedule.env_steps=210"])
+    assert resumed.profile.name == "mine"
+    # The run's config names the profile as the panel does: its settings make the same run again.
+    again = prepare_new(folder / "again", folder / "panel", None, [*TINY, "profile=mine"])
+    assert again.profile == resumed.profile
+
+
+def test_a_trace_reads_the_messages_by_the_carried_profile(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Store(folder / "store") as store:
+        row = store.sql("SELECT min(transition_id) FROM transitions").fetchall()[0][0]
+    assert main(["trace", str(folder / "store"), str(row), "--recording", TUESDAY, "--json"]) == 0
+    traced = json.loads(capsys.readouterr().out)
+    assert {message["input"] for message in traced["messages"]} >= {"command", "scan"}
+    assert traced["notes"] == []
+
+
+def test_another_task_is_refused_though_the_panel_carries_its_own(folder: Path) -> None:
+    with pytest.raises(PanelError, match="leave `profile` out of the config"):
+        prepare_new(folder / "other", folder / "panel", None, [*TINY, "profile=warehouse_amr"])
+
+
+def test_mix_says_which_of_two_profiles_of_a_task_the_panel_carries(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, recording in (("first", TUESDAY), ("second", MONDAY)):
+        ingest(tmp_path, name, recording, tmp_path / "store")
+    capsys.readouterr()
+    assert main(["mix", str(tmp_path / "store"), "--out", str(tmp_path / "panel")]) == 0
+    assert "the panel carries second" in " ".join(capsys.readouterr().out.split())
+    assert profile_of_panel(Panel.open(tmp_path / "panel")).name == "second"
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("[[condition]]\nfile = 'other.sql'", "needs a profile that is a file"),
+        (
+            "[[condition]]\nname = 'reads'\ntiming = 'pre'\n"
+            "sql = \"EXISTS (FROM read_text('/etc/hostname'))\"",
+            "reads",
+        ),
+        ("x = " + "[" * 100_000, "is not TOML"),
+        ("unknown = 1\n", "unknown"),
+    ],
+)
+def test_a_carried_text_may_do_no_more_than_a_profile_file(
+    folder: Path, text: str, problem: str
+) -> None:
+    whole = profile_toml(load_profile("warehouse_amr")).replace("condition = []\n", "")
+    text = whole + text if "[[" in text else text + whole
+    with pytest.raises(ConfigError, match=problem):
+        read_profile_toml(text, where="a panel")
+    with pytest.raises(PanelError, match=r"that it carries cannot be read") as error:
+        profile_of_panel(carrying(folder, text))
+    assert error.value.remedy is not None
+    assert "--set profile=mine.toml" in error.value.remedy
+
+
+def test_a_panel_without_the_text_needs_the_file_as_before(folder: Path) -> None:
+    with pytest.raises(PanelError, match=r"comes with Restock has it\n"):
+        profile_of_panel(carrying(folder, ""))
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    doc=st.text(),
+    age_s=st.one_of(st.none(), st.just(float("inf")), st.floats(1e-9, 1e9)),
+    values=st.dictionaries(st.text(), st.floats(allow_nan=False)),
+)
+def test_a_profile_comes_back_from_its_text_as_it_was(
+    doc: str, age_s: float | None, values: dict[str, Any]
+) -> None:
+    signal = CustomSignal("/a", "a/msg/B", "data", "V", max_age_s=age_s, values=values, doc=doc)
+    profile = msgspec.structs.replace(
+        load_profile("warehouse_amr"), signals={"voltage_v": signal}, doc=doc
+    )
+    assert read_profile_toml(profile_toml(profile), where="test") == profile
+
+
+def test_conditions_that_come_with_restock_go_by_their_names() -> None:
+    profile = load_profile("warehouse_amr")
+    assert with_conditions(profile, profile.conditions) == profile
+    other = msgspec.structs.replace(profile.conditions[0], sql="false")
+    changed = with_conditions(profile, [other])
+    assert (changed.shipped_conditions, changed.own_conditions) == ([], [other])
+    assert changed.hash == profile.hash

@@ -1,0 +1,76 @@
+"""The profile of a run or a panel: its own text, else the profile of its name that is at hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from restock.errors import ConfigError, PanelError, RunError
+from restock.ingest.profile.profile import Profile, load_profile, shipped_profiles
+from restock.ingest.profile.profile_text import profile_toml, read_profile_toml
+from restock.replay.panel.panel import HEADER, Panel
+from restock.train.run.run import Run
+
+
+def profile_document(profile: Profile) -> dict[str, object]:
+    """What a run's `config.json` says of its profile, for every library."""
+    return {
+        "task_hash": profile.task.hash,
+        "labels_version": profile.labels_version,
+        "profile": {"name": profile.name, "hash": profile.hash},
+        "profile_toml": profile_toml(profile),
+    }
+
+
+def profile_of_run(run: Run) -> Profile:
+    """The profile that a run was trained with: the text that it keeps.
+
+    Raises:
+        RunError: that text cannot be read.
+        ConfigError: the run keeps none, as one of an older Restock, and its profile is not at hand.
+    """
+    text = run.document.get("profile_toml", "")
+    if not text:
+        return load_profile(run.document["config"]["profile"])
+    try:
+        return read_profile_toml(text, where="profile_toml")
+    except ConfigError as error:
+        raise RunError(
+            f"the profile in it cannot be read: {error.what}",
+            where=str(run.path / "config.json"),
+            remedy="a newer Restock wrote it (use that one), or restore the file from a copy",
+        ) from error
+
+
+def carries_profile(panel: Panel, name: str) -> bool:
+    """Whether this names the profile that the panel carries, and no other."""
+    own = panel.header.profile_toml and name == panel.header.profile
+    return bool(own) and name not in shipped_profiles() and not Path(name).is_file()
+
+
+def profile_of_panel(panel: Panel) -> Profile:
+    """The profile whose task the panel's rows are of, where no other is named.
+
+    Raises:
+        PanelError: the panel carries none that can be used, and none that comes with Restock has
+            its task.
+    """
+    name, problem = panel.header.profile, ""
+    if panel.header.profile_toml:
+        try:
+            own = read_profile_toml(panel.header.profile_toml, where=str(panel.path / HEADER))
+            if own.task.hash == panel.task_hash:
+                return own
+            problem = f"; the profile that it carries defines {own.task.hash} now"
+        except ConfigError as error:
+            problem = f"; the profile that it carries cannot be read: {error.what}"
+    fitting = [p for p in map(load_profile, shipped_profiles()) if p.task.hash == panel.task_hash]
+    if not fitting:
+        raise PanelError(
+            f"its rows are of task {panel.task_hash}"
+            + (f", of profile {name!r}" if name else "")
+            + f": no profile that comes with Restock has it{problem}",
+            where=str(panel.path),
+            remedy="give the file of the profile that its logs were ingested with: --set"
+            f" profile={name or 'my_robot'}.toml; if that changed since, ingest and mix again",
+        )
+    return next((profile for profile in fitting if profile.name == name), fitting[0])
