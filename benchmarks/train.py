@@ -45,6 +45,7 @@ from restock.train.dqn.learner import Learner
 from restock.train.dqn.manual_backprop import UpdatePath
 from restock.train.feed.batch_record import FeedRecord
 from restock.train.feed.batches import Batches
+from restock.train.feed.held_rows import EpisodeLabels
 from restock.train.feed.logs import Coded, Logs
 from restock.train.run.run import Run
 
@@ -85,7 +86,19 @@ class Restock:
             seed=0,
             device=torch.device("cpu"),
         )
-        self.feed = FeedRecord(run, shelf, ring, audit_share=0.01, seed=0) if run else None
+        ring.strata.move(np.arange(ROWS), 1)  # as where episodes have ended
+        self.feed = None
+        if run is not None:
+            self.feed = FeedRecord(
+                run,
+                shelf,
+                ring,
+                audit_share=0.01,
+                seed=0,
+                actions=[f"action {index}" for index in range(ACTIONS)],
+                greedy=self.learner.greedy,
+                labels=EpisodeLabels(),
+            )
 
     @staticmethod
     def _logs(rows: torch.Tensor) -> Logs:

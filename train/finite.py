@@ -78,7 +78,7 @@ def _stop(
 ) -> NoReturn:
     """Leave the run's tables whole, write down the rows, and raise."""
     rows = session.feed.last_batch()
-    session.run.flush()
+    session.write_held()
     document = {
         **session.steps,
         "what": what,

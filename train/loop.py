@@ -145,6 +145,7 @@ def train(
     if progress.evaluated_at != progress.env_steps:
         _evaluate(session, notify)
     _save(session)
+    session.write_held()
     return TrainResult(
         progress.env_steps,
         learner.gradient_steps,
@@ -310,6 +311,7 @@ def _time_left(session: Session) -> bool:
 def _interrupt(session: Session, stop: Callable[[], bool]) -> None:
     if stop():
         _save(session)
+        session.write_held()
         raise TrainingInterrupted(
             f"interrupted after {session.progress.env_steps:,} environment steps and"
             f" {session.learner.gradient_steps:,} updates; a checkpoint was written",

@@ -138,6 +138,14 @@ class Session(Stateful):
         tables = self.run.row_counts()
         checkpoint.save(self.run.latest, {**self.state_dict(), "tables": tables})
 
+    def write_held(self) -> None:
+        """Write also what waits for its episodes' end; a run that goes on from here takes it back.
+
+        Call after `save`: rows beyond the checkpoint's are removed when the run is resumed.
+        """
+        self.feed.write_held()
+        self.run.flush()
+
     def restore(self) -> None:
         """Go on from the run's latest checkpoint.
 
@@ -238,6 +246,9 @@ def open_session(
             ring,
             audit_share=config.record.audit_share,
             seed=seed,
+            actions=task.action_names,
+            greedy=learner.greedy,
+            labels=collector.labels,
             perturbations=collector.perturbations,
         ),
         events=Events(run.path / "tensorboard", enabled=False),

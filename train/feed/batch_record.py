@@ -2,58 +2,45 @@
 
 A batch's rows, strata, TD errors and values are kept as they are sampled (no statistics inside the
 update loop) and summed once an interval. The sums go to the run's tables `strata`, `conditions`,
-`ages`, `sampled_episodes` and `policies`; the rows of audited batches to `audit`.
+`actions`, `ages`, `sampled_episodes` and `policies`; the rows of audited batches to `audit`. Fresh
+rows are written once their episodes have ended, when their conditions are known.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import F32, Ints
 from restock.replay.ring.ring import FreshRing
 from restock.state import Stateful
 from restock.train.dqn.loss import Loss
+from restock.train.feed import interval_tables
 from restock.train.feed.batches import ReplayBatch
 from restock.train.feed.fresh_log import FreshPerturbations
+from restock.train.feed.held_rows import WAITING, EpisodeLabels, HeldInterval
+from restock.train.feed.interval_tables import GreedyRows, SourceRows
 from restock.train.feed.logs import Logs
 from restock.train.feed.sampled_rows import (
     FRESH,
+    GREEDY,
     LOGGED,
     Columns,
     SampledRows,
-    episode_sums,
     fresh_audit,
     logged_audit,
+    named,
     row_hashes,
 )
 from restock.train.run.run import Run
 
 UNLABELLED = "unlabelled"
 _NS_PER_DAY = 86_400e9
+_MOST_HELD = 1 << 21  # fresh rows; beyond, the oldest interval is written as it is
 _MEANS = ("td_abs_mean", "q_mean", "q_abs_max", "reward_mean", "logs_share")
-
-
-@dataclass(frozen=True)
-class _Source:
-    """The rows (n,) of an interval that came from one source, and what their codes name."""
-
-    name: str  # logs | fresh
-    rows: Mapping[str, NDArray[Any]]  # td, q, weight, reward, discount
-    stratum: NDArray[np.int64]
-    strata: Sequence[str]
-    row: NDArray[np.int64]  # which row of the source each was
-    available: NDArray[np.int64]  # (S,) rows of each stratum that the source has
-    timings: Sequence[str | None]  # (S,)
-    quota: Sequence[float | None]  # (S,)
-    condition: NDArray[np.int64]
-    conditions: Sequence[str]
-    episode: NDArray[np.int64]
-    policy: NDArray[np.int64]
-    policies: Sequence[str]
 
 
 class FeedRecord(Stateful):
@@ -61,6 +48,9 @@ class FeedRecord(Stateful):
 
     Args:
         audit_share: of all batches, chosen by `seed`.
+        actions: names of the task's; without them there are no rows in `actions`.
+        greedy: the policy's action (B,) for observations (B, D), asked for audited batches.
+        labels: of the ring's episodes as they end; None: nobody tells, and no row waits for them.
         perturbations: in force in the ring's episodes, where they are known.
     """
 
@@ -69,6 +59,9 @@ class FeedRecord(Stateful):
         "_total",
         "_logged",
         "_fresh",
+        "_greedy",
+        "_audits",
+        "_held",
         "_quota",
         "_quota_batches",
     )
@@ -81,10 +74,14 @@ class FeedRecord(Stateful):
         *,
         audit_share: float,
         seed: int,
+        actions: Sequence[str] | None = None,
+        greedy: Callable[[F32], Ints] | None = None,
+        labels: EpisodeLabels | None = None,
         perturbations: FreshPerturbations | None = None,
     ) -> None:
         self.run, self.logs, self.ring = run, logs, ring
-        self.perturbations = perturbations
+        self.actions, self.greedy = actions, greedy
+        self.labels, self.perturbations = labels, perturbations
         self.audit_share = audit_share
         self._rng = np.random.default_rng([seed, 4])
         self._age_days = (
@@ -94,6 +91,10 @@ class FeedRecord(Stateful):
         sizes = {"logs": 0 if logs is None else len(logs.strata), "fresh": len(ring.conditions) + 1}
         self._total = {name: np.zeros(size, np.int64) for name, size in sizes.items()}
         self._logged, self._fresh = SampledRows(LOGGED), SampledRows(FRESH)
+        # Of audited batches in the open interval: logged rows, and columns of the fresh ones.
+        self._greedy = SampledRows(GREEDY)
+        self._audits: list[dict[str, Any]] = []
+        self._held: list[HeldInterval] = []  # closed intervals, the oldest first
         # Of batches with logged rows in the open interval: the sum (S,) of the shares in force.
         self._quota = np.zeros(sizes["logs"])
         self._quota_batches = 0
@@ -112,7 +113,8 @@ class FeedRecord(Stateful):
         slots, logged = batch.slots, batch.logged
         td, q = loss.td.cpu().numpy(), loss.q.cpu().numpy()
         weight = np.ones_like(td) if batch.weight is None else batch.weight.cpu().numpy()
-        tail = batch.rows[:, -2:].cpu().numpy().copy()  # the buffer is filled again
+        tail = batch.rows[:, -3:].cpu().numpy().copy()  # the buffer is filled again
+        action, reward, discount = tail[:, 0].astype(np.int16), tail[:, 1], tail[:, 2]
         if logged:
             self._logged.append(
                 batch.log_rows,
@@ -120,8 +122,9 @@ class FeedRecord(Stateful):
                 td[:logged],
                 q[:logged],
                 weight[:logged],
-                tail[:logged, 0],
-                tail[:logged, 1],
+                action[:logged],
+                reward[:logged],
+                discount[:logged],
             )
             self._quota += batch.quota
             self._quota_batches += 1
@@ -139,8 +142,9 @@ class FeedRecord(Stateful):
                 td[logged:],
                 q[logged:],
                 weight[logged:],
-                tail[logged:, 0],
-                tail[logged:, 1],
+                action[logged:],
+                reward[logged:],
+                discount[logged:],
             )
         if self._rng.random() < self.audit_share:
             self._audit(step, batch, last_sync)
@@ -158,217 +162,190 @@ class FeedRecord(Stateful):
         ]
 
     def flush(self, env_steps: int, gradient_steps: int, phase: str) -> dict[str, float | None]:
-        """Write the interval's sums; returns its means, for `progress`."""
-        steps = {"env_steps": env_steps, "gradient_steps": gradient_steps}
-        sources = [*self._of_logs(), *self._of_ring()]
-        for source in sources:
-            self._strata(source, steps, phase)
-            self._conditions(source, steps, phase)
-            self._ages(source, steps)
-            self._episodes(source, steps)
-            self._policies(source, steps)
-        if not sources:
-            return dict.fromkeys(_MEANS)
-        td, q, reward = (
-            np.concatenate([source.rows[name] for source in sources])
-            for name in ("td", "q", "reward")
-        )
-        means: dict[str, float | None] = {
-            "td_abs_mean": float(np.abs(td).mean()),
-            "q_mean": float(q.mean()),
-            "q_abs_max": float(np.abs(q).max()),
-            "reward_mean": float(reward.mean()),
-            "logs_share": len(self._logged) / len(td),
-        }
-        self._logged.clear()
-        self._fresh.clear()
+        """Close an interval and write what is known of it; returns its means, for `progress`."""
+        clocks = {"env_steps": env_steps, "gradient_steps": gradient_steps}
+        logged, fresh = self._logged.columns, self._fresh.columns
+        drawn = len(self._logged) + len(self._fresh)
+        means: dict[str, float | None] = dict.fromkeys(_MEANS)
+        if drawn:
+            td, q, reward = (
+                np.concatenate([logged[name], fresh[name]]) for name in ("td", "q", "reward")
+            )
+            means = {
+                "td_abs_mean": float(np.abs(td).mean()),
+                "q_mean": float(q.mean()),
+                "q_abs_max": float(np.abs(q).max()),
+                "reward_mean": float(reward.mean()),
+                "logs_share": len(self._logged) / drawn,
+            }
+        if self.logs is not None and len(self._logged):
+            self._write(self._of_logs(self.logs), clocks, phase)
+        if len(self._fresh):
+            self._held.append(self._closed(clocks, phase))
+        self._release()
+        for rows in (self._logged, self._fresh, self._greedy):
+            rows.clear()
+        self._audits = []
         self._quota[:], self._quota_batches = 0.0, 0
         return means
 
-    def _of_logs(self) -> list[_Source]:
-        logs, rows = self.logs, self._logged.columns
-        if logs is None or not len(self._logged):
-            return []
-        row = rows["row"]
-        return [
-            _Source(
-                name="logs",
-                rows=rows,
-                stratum=rows["stratum"],
-                strata=logs.strata,
-                row=row,
-                available=np.array([len(members) for members in logs.stratum_rows]),
-                timings=logs.timings,
-                quota=(self._quota / self._quota_batches).tolist(),
-                condition=logs.condition.codes[row],
-                conditions=logs.condition.names,
-                episode=logs.episode.codes[row],
-                policy=logs.behaviour_policy.codes[row],
-                policies=logs.behaviour_policy.names,
-            )
-        ]
+    def write_held(self) -> None:
+        """Write what waits for its episodes' end as it is: the run ends, or is left."""
+        for interval in self._held:
+            self._write_fresh(interval)
+        self._held = []
 
-    def _of_ring(self) -> list[_Source]:
-        ring, rows = self.ring, self._fresh.columns
-        if not len(self._fresh):
-            return []
-        names, labelled = [*ring.conditions, UNLABELLED], ring.strata.counts
-        condition = rows["condition"].astype(np.int64)
-        stratum = np.where(condition < 0, len(ring.conditions), condition)
-        unknown = [None] * len(names)
-        return [
-            _Source(
-                name="fresh",
-                rows=rows,
-                stratum=stratum,  # a ring's strata are conditions
-                strata=names,
-                row=(rows["episode"] << 20) | rows["episode_step"],
-                available=np.append(labelled, len(ring) - labelled.sum()),
-                timings=unknown,
-                quota=unknown,
-                condition=stratum,
-                conditions=names,
-                episode=rows["episode"],
-                policy=rows["policy"],
-                policies=ring.behaviour_policies,
-            )
-        ]
+    def restored(self) -> None:
+        """Intervals that wait, of what a checkpoint says of them."""
+        held: Sequence[Any] = self._held
+        self._held = [HeldInterval(**interval) for interval in held]
 
-    def _strata(self, source: _Source, steps: dict[str, int], phase: str) -> None:
-        size, stratum, rows = len(source.strata), source.stratum, source.rows
-        drawn = np.bincount(stratum, minlength=size)
-        weight = np.bincount(stratum, rows["weight"], minlength=size)
-        # Per stratum: a fresh row moves from "unlabelled" to its stratum when its episode ends.
-        unique = np.bincount(np.unique(source.row * size + stratum) % size, minlength=size)
-        replays = [n / u if u else None for n, u in zip(drawn, unique, strict=True)]
-        total = self._total[source.name]
-        total += drawn
+    def _closed(self, clocks: dict[str, int], phase: str) -> HeldInterval:
+        """The fresh rows of the open interval."""
+        ring, labelled = self.ring, self.ring.strata.counts
+        open_rows = {}
+        if self.labels is not None:
+            slots = np.flatnonzero(ring.strata.stratum[: len(ring)] == WAITING)
+            open_rows = {name: ring.meta[name][slots] for name in ("episode", "episode_step")}
+            open_rows["condition"] = np.full(len(slots), WAITING, np.int16)
+        available = np.append(labelled, len(ring) - labelled.sum())
+        rows = dict(self._fresh.columns)
+        return HeldInterval(clocks, phase, rows, available, open_rows, self._audits)
 
-        def mean(values: NDArray[Any]) -> list[float | None]:
-            sums = np.bincount(stratum, values, minlength=size).tolist()
-            return [x / n if n else None for x, n in zip(sums, drawn.tolist(), strict=True)]
+    def _release(self) -> None:
+        """Write the intervals whose rows have their conditions by now, in their order."""
+        if self.labels is None:
+            self.write_held()
+            return
+        for interval in self._held:
+            interval.fill(self.labels)
+        self.labels.clear()
+        rows = sum(len(interval.rows["td"]) for interval in self._held)
+        while self._held and (rows > _MOST_HELD or not self._held[0].waits):
+            interval = self._held.pop(0)
+            rows -= len(interval.rows["td"])
+            self._write_fresh(interval)
 
-        self.run.append_columns(
-            "strata",
-            {
-                **steps,
-                "phase": phase,
-                "source": source.name,
-                "stratum": source.strata,
-                "timing": source.timings,
-                "quota_share": source.quota,
-                "available_rows": source.available,
-                "available_share": source.available / max(source.available.sum(), 1),
-                "drawn_rows": drawn,
-                "drawn_share": drawn / len(stratum),
-                "effective_share": weight / max(weight.sum(), 1e-12),
-                "unique_rows": unique,
-                "replays_per_row": replays,
-                "total_drawn_rows": total.copy(),
-                "td_abs_mean": mean(np.abs(rows["td"])),
-                "q_mean": mean(rows["q"]),
-                "reward_mean": mean(rows["reward"]),
-                "terminal_share": mean(rows["discount"] == 0),
-            },
-        )
+    def _write_fresh(self, interval: HeldInterval) -> None:
+        self._write(self._of_ring(interval), interval.clocks, interval.phase)
+        for audit in interval.audits:
+            columns = named(audit, self.ring.conditions, UNLABELLED)
+            self.run.append_columns("audit", columns)
 
-    def _conditions(self, source: _Source, steps: dict[str, int], phase: str) -> None:
-        code, size = source.condition, len(source.conditions)
-        drawn = np.bincount(code, minlength=size)
-        weight, td, q = (
-            np.bincount(code, values, minlength=size)
-            for values in (source.rows["weight"], np.abs(source.rows["td"]), source.rows["q"])
-        )
-        met = np.flatnonzero(drawn)
-        self.run.append_columns(
-            "conditions",
-            {
-                **steps,
-                "phase": phase,
-                "source": source.name,
-                "condition": np.array(source.conditions, object)[met],
-                "drawn_rows": drawn[met],
-                "drawn_share": drawn[met] / len(code),
-                "effective_share": weight[met] / max(weight.sum(), 1e-12),
-                "td_abs_mean": td[met] / drawn[met],
-                "q_mean": q[met] / drawn[met],
-            },
-        )
-
-    def _ages(self, source: _Source, steps: dict[str, int]) -> None:
-        ages = {
-            unit: source.rows[f"age_{unit}"].astype(np.float64)
-            for unit in ("env_steps", "gradient_steps")
-            if source.name == "fresh"
+    def _write(self, source: SourceRows, clocks: Mapping[str, int], phase: str) -> None:
+        first, total = source.first_of_row, self._total[source.name]
+        total += np.bincount(source.stratum, minlength=len(total))
+        of_phase = {**clocks, "phase": phase}
+        tables: dict[str, tuple[Mapping[str, Any], Columns]] = {
+            "strata": (of_phase, interval_tables.strata(source, first, total.copy())),
+            "conditions": (of_phase, interval_tables.conditions(source)),
+            "sampled_episodes": (clocks, interval_tables.sampled_episodes(source)),
+            "policies": (clocks, interval_tables.policies(source)),
         }
-        if source.name == "logs" and self._age_days is not None:
-            ages["days"] = self._age_days[source.row]
-        for unit, age in ages.items():
-            bucket = np.where(age < 1, -1, np.floor(np.log2(np.maximum(age, 1)))).astype(np.int32)
-            buckets, counts = np.unique(bucket, return_counts=True)
-            quantiles = np.quantile(age, [0.5, 0.9, 0.99]).tolist()
-            self.run.append_columns(
-                "ages",
-                {
-                    **steps,
-                    "source": source.name,
-                    "unit": unit,
-                    "bucket": buckets,
-                    "count": counts,
-                    **dict(zip(("p50", "p90", "p99"), quantiles, strict=True)),
-                },
-            )
+        if self.actions is not None:
+            rows = interval_tables.actions(source, first, self.actions)
+            tables["actions"] = of_phase, rows
+        for name, (steps, columns) in tables.items():
+            self.run.append_columns(name, {**steps, **columns})
+        for unit, age in source.ages.items():
+            columns = {"source": source.name, **interval_tables.ages(unit, age)}
+            self.run.append_columns("ages", {**clocks, **columns})
 
-    def _episodes(self, source: _Source, steps: dict[str, int]) -> None:
-        sums = episode_sums(
-            source.episode, source.stratum, source.rows["weight"], len(source.strata)
-        )
-        key = sums["episode"]
-        if source.name == "logs" and self.logs is not None:
-            episode = np.array(self.logs.episode.names, object)[key]
-        else:
-            episode = key.astype(str)
-        stratum = np.array(source.strata, object)[sums["stratum"]]
-        self.run.append_columns(
-            "sampled_episodes",
-            {**steps, "source": source.name, **sums, "stratum": stratum, "episode": episode},
+    def _of_logs(self, logs: Logs) -> SourceRows:
+        rows, greedy = self._logged.columns, self._greedy.columns
+        row = rows["row"]
+        return SourceRows(
+            name="logs",
+            rows=rows,
+            stratum=rows["stratum"],
+            strata=logs.strata,
+            row=row,
+            available=np.array([len(members) for members in logs.stratum_rows]),
+            timings=logs.timings,
+            quota=(self._quota / self._quota_batches).tolist(),
+            condition=logs.condition.codes[row],
+            conditions=logs.condition.names,
+            episode=logs.episode.codes[row],
+            episodes=logs.episode.names,
+            policy=logs.behaviour_policy.codes[row],
+            policies=logs.behaviour_policy.names,
+            ages={} if self._age_days is None else {"days": self._age_days[row]},
+            greedy=None
+            if self.greedy is None
+            else GreedyRows(
+                greedy["stratum"], logs.condition.codes[greedy["row"]], greedy["action"]
+            ),
         )
 
-    def _policies(self, source: _Source, steps: dict[str, int]) -> None:
-        counts = np.bincount(source.policy, minlength=len(source.policies)).tolist()
-        rows = [
-            {**steps, "source": source.name, "behaviour_policy": name, "rows": count}
-            for name, count in zip(source.policies, counts, strict=True)
-            if count
-        ]
-        self.run.append("policies", rows)
+    def _of_ring(self, interval: HeldInterval) -> SourceRows:
+        ring, rows = self.ring, interval.rows
+        names = [*ring.conditions, UNLABELLED]
+        stratum = self._stratum(rows["condition"])  # a ring's strata are conditions
+        available = interval.available.copy()
+        if interval.open_rows:
+            available[-1] = 0
+            found = self._stratum(interval.open_rows["condition"])
+            available += np.bincount(found, minlength=len(names))
+        audited = [self._stratum(audit["condition"]) for audit in interval.audits]
+        wanted = [audit["greedy_action"] for audit in interval.audits]
+        none: list[Ints] = [np.empty(0, np.int64)]
+        of_greedy = np.concatenate(none + audited)
+        return SourceRows(
+            name="fresh",
+            rows=rows,
+            stratum=stratum,
+            strata=names,
+            row=(rows["episode"] << 20) | rows["episode_step"],
+            available=available,
+            timings=[None] * len(names),
+            quota=[None] * len(names),
+            condition=stratum,
+            conditions=names,
+            episode=rows["episode"],
+            episodes=None,
+            policy=rows["policy"],
+            policies=ring.behaviour_policies,
+            ages={
+                unit: rows[f"age_{unit}"].astype(np.float64)
+                for unit in ("env_steps", "gradient_steps")
+            },
+            greedy=None
+            if self.greedy is None
+            else GreedyRows(of_greedy, of_greedy, np.concatenate(none + wanted)),
+        )
+
+    def _stratum(self, condition: NDArray[Any]) -> Ints:
+        """Codes of conditions (n,), with a last one for rows that have none."""
+        unlabelled = len(self.ring.conditions)
+        return np.where(condition < 0, unlabelled, condition).astype(np.int64)
 
     def _audit(self, step: int, batch: ReplayBatch, last_sync: int) -> None:
-        """Every row of the batch last kept."""
+        """Every row of the batch last kept: logged ones are written, fresh ones wait."""
         packed, logged = batch.rows.cpu().numpy(), batch.logged
-        hashes, action = row_hashes(packed), packed[:, -3].astype(np.int16)
-        parts: list[tuple[slice, Columns]] = []
+        hashes, place = row_hashes(packed), np.arange(len(packed))
+        greedy = None
+        if self.greedy is not None:
+            observations = packed[:, self.ring.columns["observation"]]
+            greedy = self.greedy(observations)
+
+        def whole(part: slice, columns: Columns) -> Columns:
+            return {
+                "gradient_step": step,
+                "batch_row": place[part],
+                **columns,
+                "greedy_action": None if greedy is None else greedy[part],
+                "last_target_sync": last_sync,
+                "row_hash": hashes[part],
+            }
+
         if logged and self.logs is not None and self._age_days is not None:
             rows = logged_audit(self._logged.last, self.logs, self._age_days)
-            parts.append((slice(logged), rows))
+            self.run.append_columns("audit", whole(slice(logged), rows))
+            if greedy is not None:
+                self._greedy.append(batch.log_rows, batch.log_stratum, greedy[:logged])
         if len(batch.slots):
-            rows = fresh_audit(
-                self._fresh.last, batch.slots, self.ring, UNLABELLED, self.perturbations
-            )
-            parts.append((slice(logged, len(packed)), rows))
-        place = np.arange(len(packed))
-        for part, columns in parts:
-            self.run.append_columns(
-                "audit",
-                {
-                    "gradient_step": step,
-                    "batch_row": place[part],
-                    **columns,
-                    "action": action[part],
-                    "last_target_sync": last_sync,
-                    "row_hash": hashes[part],
-                },
-            )
+            rows = fresh_audit(self._fresh.last, batch.slots, self.ring, self.perturbations)
+            self._audits.append(whole(slice(logged, len(packed)), rows))
 
 
 __all__ = ["UNLABELLED", "FeedRecord"]

@@ -24,6 +24,7 @@ from restock.ingest.task.task import Task
 from restock.replay.ring.ring import FreshRing
 from restock.state import Stateful, saved
 from restock.train.feed.fresh_log import FreshLog, FreshPerturbations, values_entries
+from restock.train.feed.held_rows import EpisodeLabels
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.floors.layout import DEFAULT
 
@@ -69,6 +70,7 @@ class Collector(Stateful):
         "invalid_steps",
         "_history",
         "perturbations",
+        "labels",
         "_unlabelled",
     )
 
@@ -101,6 +103,7 @@ class Collector(Stateful):
         self._future: Future[Any] | None = None
         self._result: Any = None
         self.perturbations = FreshPerturbations()
+        self.labels = EpisodeLabels()  # of the episodes that ended, until the record takes them
         self.log: FreshLog | None = None
         self._saved_log: Mapping[str, Any] | None = None
 
@@ -271,6 +274,8 @@ class Collector(Stateful):
     def forget(self, episodes: Sequence[EndedEpisode]) -> None:
         """Never label these ended episodes: their rows belong to no condition."""
         keys = {episode.key for episode in episodes}
+        for key in sorted(keys):
+            self.labels.give_up(key)
         self._unlabelled = [episode for episode in self._unlabelled if episode.key not in keys]
 
     def label(self, *, all_of_them: bool = False) -> list[dict[str, Any]]:
@@ -289,10 +294,9 @@ class Collector(Stateful):
         for episode in waiting:
             inside = slice(begin, begin + episode.steps)  # the last step is no transition
             begin += episode.steps + 1
-            self.ring.set_labels(
-                episode.key,
-                codes[inside] if len(codes) else np.zeros(episode.steps, np.int64),
-            )
+            of_steps = codes[inside] if len(codes) else np.zeros(episode.steps, np.int64)
+            self.ring.set_labels(episode.key, of_steps)
+            self.labels.note(episode.key, of_steps)
             rows.append(
                 {
                     "env_steps": episode.env_steps,

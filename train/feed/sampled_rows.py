@@ -7,7 +7,7 @@ for the few batches whose every row is written down.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,10 +19,15 @@ from restock.train.feed.fresh_log import FreshPerturbations
 from restock.train.feed.logs import Coded, Logs
 
 _MOST_CELLS = 1 << 22  # of a dense count; wider ranges of episodes are sorted instead
-_BATCH: dict[str, DTypeLike] = dict.fromkeys(("td", "q", "weight", "reward", "discount"), "f4")
+_BATCH: dict[str, DTypeLike] = {
+    **dict.fromkeys(("td", "q", "weight"), "f4"),
+    "action": "i2",
+    **dict.fromkeys(("reward", "discount"), "f4"),
+}
 LOGGED: dict[str, DTypeLike] = {"row": "i8", "stratum": "i8", **_BATCH}  # row: of the panel
+GREEDY: dict[str, DTypeLike] = {"row": "i8", "stratum": "i8", "action": "i8"}  # audited, of logs
 FRESH: dict[str, DTypeLike] = {
-    "condition": "i2",  # -1 while unlabelled
+    "condition": "i2",  # held_rows.WAITING while its episode goes on
     "episode": "i8",  # the ring's key
     "episode_step": "i4",
     "policy": "i2",
@@ -137,24 +142,21 @@ def fresh_audit(
     rows: Arrays,
     slots: NDArray[np.int64],  # (n,) of the ring
     ring: FreshRing,
-    unlabelled: str,
     perturbations: FreshPerturbations | None = None,
 ) -> Columns:
-    """The same of its fresh rows; `unlabelled` is the stratum of a row without a condition yet."""
-    codes, keys = rows["condition"].tolist(), rows["episode"]
-    conditions = [None if code < 0 else ring.conditions[code] for code in codes]
+    """The same of its fresh rows, without the names of conditions: `named` adds those."""
+    keys = rows["episode"]
     return {
         "source": "fresh",
         "transition_id": None,
         "panel_row": None,
         "ring_slot": slots,
-        "episode": [str(key) for key in keys.tolist()],
+        "key": keys,
         "episode_step": rows["episode_step"],
         "age_days": None,
         "age_env_steps": rows["age_env_steps"],
         "age_gradient_steps": rows["age_gradient_steps"],
-        "stratum": [unlabelled if name is None else name for name in conditions],
-        "condition": conditions,
+        "condition": rows["condition"].copy(),
         "behaviour_policy": [ring.behaviour_policies[code] for code in rows["policy"].tolist()],
         "behaviour_version": [str(v) for v in ring.meta["policy_version"][slots].tolist()],
         "perturbation": perturbations.names(keys) if perturbations else None,
@@ -163,8 +165,35 @@ def fresh_audit(
     }
 
 
+def named(audit: Columns, conditions: Sequence[str], unlabelled: str) -> Columns:
+    """What `fresh_audit` gave, once conditions are known; `unlabelled` is the stratum of others."""
+    codes = audit["condition"].tolist()
+    names = [conditions[code] if code >= 0 else None for code in codes]
+    values = audit["perturbation_values"]  # a checkpoint gives back lists
+    columns = {
+        **audit,
+        "episode": [str(key) for key in audit["key"].tolist()],
+        "stratum": [unlabelled if name is None else name for name in names],
+        "condition": names,
+        "perturbation_values": None
+        if values is None
+        else [None if of is None else [tuple(pair) for pair in of] for of in values],
+    }
+    del columns["key"]
+    return columns
+
+
 def _names(coded: Coded, rows: NDArray[np.int64]) -> list[str]:
     return [str(coded.names[code]) for code in coded.codes[rows].tolist()]
 
 
-__all__ = ["FRESH", "LOGGED", "SampledRows", "episode_sums", "fresh_audit", "logged_audit"]
+__all__ = [
+    "FRESH",
+    "GREEDY",
+    "LOGGED",
+    "SampledRows",
+    "episode_sums",
+    "fresh_audit",
+    "logged_audit",
+    "named",
+]

@@ -134,21 +134,26 @@ class InfoLabels:
         self._ended: list[tuple[int, list[dict[str, Any]]]] = []
         self.unlabelled_episodes = 0
 
-    def step(self, env: int, info: Mapping[str, Any], *, ended: bool, key: int) -> None:
-        """Take one environment's step; `key` names its episode."""
+    def step(self, env: int, info: Mapping[str, Any], *, ended: bool, key: int) -> bool:
+        """Take one environment's step; `key` names its episode.
+
+        Returns whether the episode will have labels, as far as is known.
+        """
         steps = self._running[env]
         before, after = info.get("signals_before"), info.get("signals")
         if before is not None and after is not None:
             row = {name: before[name] for name in _NAMES}
             steps.append(row | {name: after[name] for name in _COMMANDS})
         if not ended:
-            return
-        if steps and after is not None:
+            return True
+        whole = bool(steps) and after is not None
+        if whole and after is not None:
             steps.append({name: after[name] for name in _NAMES})
             self._ended.append((key, steps))
         else:
             self.unlabelled_episodes += 1
         self._running[env] = []
+        return whole
 
     def label(self, *, all_of_them: bool = False) -> list[Labelled]:
         """Label the ended episodes, once enough wait to be worth a query."""

@@ -28,6 +28,7 @@ from restock.train.feed.batch_record import FeedRecord
 from restock.train.feed.batches import ReplayBatch
 from restock.train.feed.collector import conditions_in_twin
 from restock.train.feed.fresh_log import values_entries
+from restock.train.feed.held_rows import EpisodeLabels
 from restock.train.feed.logs import Logs
 from restock.train.libraries.fresh_meta import FreshMeta, InfoLabels
 from restock.train.run.run import Run, now_ns, panel_document, software_versions
@@ -98,7 +99,9 @@ class MixedFeed:
             conditions_in_twin(definition.conditions, definition.signals)[0], num_envs
         )
         self.num_envs, self.library = num_envs, library
+        self.action_names = definition.task.action_names
         self.env_steps = self.batches = self.invalid_steps = 0
+        self.episode_labels = EpisodeLabels()
         self._sampler: LoggedSampler | None = None
         self._td_missing = False  # of the TD errors of the batch before
         self._phase = "offline"
@@ -125,7 +128,13 @@ class MixedFeed:
         if self.run is not None:
             tables: Any = PartialTables(self.run)
             self.record = FeedRecord(
-                tables, self.logs, fresh, audit_share=self.audit_share, seed=self.seed
+                tables,
+                self.logs,
+                fresh,
+                audit_share=self.audit_share,
+                seed=self.seed,
+                actions=self.action_names,
+                labels=self.episode_labels,
             )
 
     def take(self, envs: Ints, keys: Ints, ended: NDArray[Any], infos: Sequence[Any]) -> None:
@@ -134,7 +143,8 @@ class MixedFeed:
         for env, key, over, info in zip(
             envs.tolist(), keys.tolist(), np.asarray(ended).tolist(), infos, strict=True
         ):
-            self.labels.step(env, info, ended=bool(over), key=key)
+            if not self.labels.step(env, info, ended=bool(over), key=key):
+                self.episode_labels.give_up(key)
             if over and self.run is not None:
                 self._episodes[key] = episode_row(env, key, info) | {
                     "env_steps": self.env_steps,
@@ -146,6 +156,7 @@ class MixedFeed:
         """Label what ended."""
         for labelled in self.labels.label(all_of_them=all_of_them):
             self.fresh.set_labels(labelled.key, labelled.codes)
+            self.episode_labels.note(labelled.key, labelled.codes)
             if labelled.key in self._episodes:
                 self._episodes[labelled.key]["conditions"] = labelled.conditions
 
@@ -218,7 +229,7 @@ class MixedFeed:
                 self._sampler.update(drawing.rows, drawing.strata, td_abs)
         phase = "online" if len(slots) else "offline"
         if phase != self._phase:
-            self.flush()  # an interval is of one phase
+            self._close_interval()  # an interval is of one phase
             self._phase = phase
         self.batches += 1
         if self.record is None:
@@ -240,10 +251,19 @@ class MixedFeed:
         self.record.batch(self.batches, self.env_steps, batch, loss, 0)
         self._open += 1
         if self._open >= self.log_every:
-            self.flush()
+            self._close_interval()
 
     def flush(self) -> None:
-        """Write the rows of the open interval; the run's files are whole after it."""
+        """Write the rows of the open interval, and those whose episodes go on without conditions.
+
+        The run's files are whole after it.
+        """
+        self._close_interval()
+        if self.record is not None and self.run is not None:
+            self.record.write_held()
+            self.run.flush()
+
+    def _close_interval(self) -> None:
         if self.record is None or self.run is None:
             return
         self.label(all_of_them=True)

@@ -111,6 +111,7 @@ class MixtureVectorReplayBuffer(ReplayBufferManager):
 
     def reset(self, keep_statistics: bool = False) -> None:
         """Empties the fresh part; the logs stay."""
+        self.feed.flush()  # no labels will come of episodes that are cut off here
         super().reset(keep_statistics=keep_statistics)
         self.fresh.forget()
         if self.feed.panel is not None:
@@ -124,6 +125,8 @@ class MixtureVectorReplayBuffer(ReplayBufferManager):
         names = ("obs", "act", "rew", "terminated", "truncated", "obs_next")
         step = Batch({name: batch[name] for name in names})
         step["done"] = np.logical_or(batch.terminated, batch.truncated)
+        if self.feed.record is not None and np.ndim(batch.act) > 1:  # commands: they have no names
+            self.feed.record.actions = None
         placed = super().add(cast(Any, step), envs)
         slots = np.asarray(placed[0], np.int64).ravel()
         ended = np.asarray(step["done"], np.bool_)

@@ -1,0 +1,191 @@
+"""A fresh row's condition, known once its episode has ended, is in every table that has one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.toy_run import config, run_to_end, session, tables
+from support.toy_twin import TASK
+
+from restock.train.feed.held_rows import NEVER, WAITING, EpisodeLabels
+from restock.train.loop import TrainingInterrupted, train
+from restock.train.session import Session
+
+# Every batch is audited, so that the sums can be counted from the audited rows.
+EVERY_BATCH = {"record": {"audit_share": 1.0}}
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory: pytest.TempPathFactory) -> Session:
+    return run_to_end(tmp_path_factory.mktemp("run") / "a", config(**EVERY_BATCH))
+
+
+def rows(run: Session, query: str) -> list[dict[str, Any]]:
+    with duckdb.connect() as connection:
+        for name, table in tables(run.run.path).items():
+            connection.register(name, table)
+        found: list[dict[str, Any]] = connection.sql(query).to_arrow_table().to_pylist()
+    return found
+
+
+def test_only_rows_of_episodes_that_never_ended_have_no_condition(live: Session) -> None:
+    (whole,) = rows(
+        live,
+        "SELECT count(*) AS fresh, count(*) FILTER (condition IS NULL) AS unknown,"
+        " count(*) FILTER ((condition IS NULL) <> (ended.episode IS NULL)) AS wrong FROM audit"
+        " LEFT JOIN (SELECT episode FROM episodes) ended ON audit.episode = ended.episode::VARCHAR"
+        " WHERE source = 'fresh'",
+    )
+    assert whole["fresh"] > 1000
+    assert whole["wrong"] == 0
+    assert whole["unknown"] < 0.02 * whole["fresh"]
+    (open_ones,) = rows(
+        live,
+        "SELECT count(DISTINCT episode) AS episodes FROM audit"
+        " WHERE source = 'fresh' AND condition IS NULL",
+    )
+    assert open_ones["episodes"] <= live.config.env.num_envs
+
+
+def test_a_condition_is_that_of_the_step_in_its_episode(live: Session) -> None:
+    slipped = rows(
+        live,
+        "SELECT condition, count(DISTINCT (episode, episode_step)) AS steps,"
+        " bool_and(action = 1) AS forward FROM audit WHERE source = 'fresh' GROUP BY condition",
+    )
+    by_name = {row["condition"]: row for row in slipped}
+    assert by_name["wheel_slip"]["steps"] > 20
+    assert by_name["wheel_slip"]["forward"]  # only a forward command can slip
+    kinds = rows(
+        live,
+        "SELECT DISTINCT audit.condition, list_contains(conditions, audit.condition) AS held"
+        " FROM audit JOIN episodes ON audit.episode = episodes.episode::VARCHAR"
+        " WHERE source = 'fresh' AND condition <> 'nominal'",
+    )
+    assert kinds
+    assert all(row["held"] for row in kinds)
+
+
+@pytest.mark.parametrize(
+    ("table", "condition", "measure"),
+    [
+        ("strata", "stratum", "drawn_rows"),
+        ("conditions", "condition", "drawn_rows"),
+        ("sampled_episodes", "stratum", "drawn_rows"),
+        ("actions", "condition", "drawn_rows"),
+    ],
+)
+def test_every_table_counts_the_same_rows(
+    live: Session, table: str, condition: str, measure: str
+) -> None:
+    every = live.config.record.every_updates
+    assert rows(
+        live,
+        f"SELECT gradient_steps, {condition} AS condition, sum({measure})::BIGINT AS n"
+        f" FROM {table} WHERE source = 'fresh' AND {measure} > 0 GROUP BY ALL ORDER BY ALL",
+    ) == rows(
+        live,
+        # An interval is closed every so many updates, and when the run ends.
+        f"SELECT least(ceil(gradient_step / {every})::BIGINT * {every},"
+        " (SELECT max(gradient_steps) FROM progress)) AS gradient_steps,"
+        " coalesce(condition, 'unlabelled') AS condition, count(*) AS n"
+        " FROM audit WHERE source = 'fresh' GROUP BY ALL ORDER BY ALL",
+    )
+
+
+def test_what_the_ring_held_is_by_condition_too(live: Session) -> None:
+    available = rows(
+        live,
+        "SELECT gradient_steps, sum(available_rows) AS available,"
+        " any_value(ring_rows) AS ring_rows,"
+        " sum(available_rows) FILTER (stratum = 'unlabelled') AS unknown"
+        " FROM strata JOIN progress USING (gradient_steps)"
+        " WHERE source = 'fresh' GROUP BY ALL ORDER BY ALL",
+    )
+    assert all(row["available"] == row["ring_rows"] for row in available)
+    assert all(row["unknown"] == 0 for row in available[:-3])  # their episodes have ended since
+
+
+def test_actions_are_counted_with_what_the_policy_wants(live: Session) -> None:
+    per_cell = rows(
+        live,
+        "SELECT source, condition, action, name, sum(drawn_rows)::BIGINT AS drawn,"
+        " sum(greedy_rows)::BIGINT AS wanted, sum(audited_rows)::BIGINT AS audited"
+        " FROM actions GROUP BY ALL ORDER BY ALL",
+    )
+    assert [row["name"] for row in per_cell[:3]] == TASK.action_names
+    counted = rows(
+        live,
+        "SELECT source, coalesce(condition, 'unlabelled') AS condition, action,"
+        " count(*) AS drawn FROM audit GROUP BY ALL",
+    )
+    drawn = {(r["source"], r["condition"], r["action"]): r["drawn"] for r in counted}
+    wanted = rows(
+        live,
+        "SELECT source, coalesce(condition, 'unlabelled') AS condition, greedy_action AS action,"
+        " count(*) AS n FROM audit GROUP BY ALL",
+    )
+    greedy = {(r["source"], r["condition"], r["action"]): r["n"] for r in wanted}
+    for row in per_cell:
+        key = row["source"], row["condition"], row["action"]
+        assert row["drawn"] == drawn.get(key, 0)
+        assert row["wanted"] == greedy.get(key, 0)
+    # Wheels slip on a forward command only: no other action was ever drawn there.
+    slip = [row for row in per_cell if row["condition"] == "wheel_slip"]
+    assert {row["name"] for row in slip if not row["drawn"]} == {"stop", TASK.action_names[2]}
+    (shares,) = rows(
+        live,
+        "SELECT max(abs(total - 1)) AS off FROM (SELECT sum(drawn_share) AS total FROM actions"
+        " GROUP BY gradient_steps, source, stratum, condition)",
+    )
+    assert shares["off"] < 1e-9
+
+
+def test_what_waits_is_written_when_a_run_is_interrupted_and_taken_back(
+    live: Session, tmp_path: Path
+) -> None:
+    calls = iter(range(200))
+    cut = session(tmp_path / "cut", config(**EVERY_BATCH))
+    with pytest.raises(TrainingInterrupted):
+        train(cut, stop=lambda: next(calls, None) is None)
+    cut.close()
+    count = "SELECT sum(drawn_rows)::BIGINT AS n FROM strata"
+    assert rows(cut, count) == rows(
+        cut, f"SELECT (sum(updates) * {cut.config.replay.batch_size})::BIGINT AS n FROM progress"
+    )
+    again = session(tmp_path / "cut", config(**EVERY_BATCH), resume=True)
+    train(again)
+    again.close()
+    whole = tables(live.run.path)
+    for name, table in tables(again.run.path).items():
+        assert table.equals(whole[name]), name
+
+
+@given(st.data())
+def test_labels_reach_their_rows_whatever_their_order(data: st.DataObject) -> None:
+    lengths = data.draw(st.dictionaries(st.integers(0, 30), st.integers(1, 9), max_size=8))
+    known = data.draw(st.sets(st.sampled_from(sorted(lengths)))) if lengths else set()
+    lost = data.draw(st.sets(st.integers(31, 35)))
+    labels = EpisodeLabels()
+    for of in known:
+        labels.note(of, (np.arange(lengths[of]) + of) % 5)
+    for of in sorted(lost):
+        labels.give_up(of)
+    steps = [(key, step) for key, length in lengths.items() for step in range(length)]
+    drawn = data.draw(st.lists(st.sampled_from(steps))) if steps else []
+    drawn += [(of, 0) for of in sorted(lost)]
+    condition = np.full(len(drawn), WAITING, np.int16)
+    key = np.array([one for one, _ in drawn], np.int64)
+    step = np.array([one for _, one in drawn], np.int32)
+    labels.fill(condition, key, step)
+    for code, (of, at) in zip(condition.tolist(), drawn, strict=True):
+        if of in known:
+            assert code == (at + of) % 5
+        else:
+            assert code == (NEVER if of in lost else WAITING)
