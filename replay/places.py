@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib import resources
 from pathlib import Path
 
 import duckdb
@@ -11,7 +12,8 @@ import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from restock.errors import StoreError
+from restock.errors import RunError, StoreError
+from restock.files import read_json
 from restock.ingest.store.location import Location
 from restock.ingest.store.version import Version
 from restock.replay.panel.panel import EVALUATION_SPLIT, HEADER, META, Panel
@@ -94,7 +96,21 @@ def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> bool
                 connection.execute(
                     f'COMMENT ON COLUMN "{schema}"."{view}"."{field.name}" IS \'{text}\''
                 )
+    if "audit" in files:
+        _add_replay_audit(connection, path, schema)
     return True
+
+
+def _add_replay_audit(connection: duckdb.DuckDBPyConnection, run: Path, schema: str) -> None:
+    """The view `replay_audit` of a run, with the names of its actions."""
+    names = read_json(run / RUN_CONFIG, error=RunError).get("actions", [])
+    table = {
+        "action": pa.array(range(len(names)), pa.int16()),
+        "name": pa.array(names, pa.string()),
+    }
+    _keep(connection, schema, "action_names", pa.table(table))
+    text = resources.files("restock.replay").joinpath("replay_audit.sql").read_text("utf-8")
+    connection.execute(text.replace("{schema}", schema))
 
 
 def _keep(connection: duckdb.DuckDBPyConnection, schema: str, name: str, table: pa.Table) -> None:

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
         MixtureVectorReplayBuffer as MixtureVectorReplayBuffer,
     )
     from restock.train.prepare import train as train
+    from restock.train.run.replay_audit import ReplayAuditRecord as ReplayAuditRecord
+    from restock.train.run.replay_audit import replay_audit as replay_audit
     from restock.train.run.run import Run as Run
     from restock.train.study.study import StudyPlan as StudyPlan
     from restock.train.study.study import load_study as load_study
@@ -40,6 +42,7 @@ else:
             "restock.train.libraries.sb3_buffer": ["MixtureReplayBuffer", "dqn_critic"],
             "restock.train.libraries.tianshou_buffer": ["MixtureVectorReplayBuffer"],
             "restock.train.prepare": ["train"],
+            "restock.train.run.replay_audit": ["ReplayAuditRecord", "replay_audit"],
             "restock.train.run.run": ["Run"],
             "restock.train.study.study": ["StudyPlan", "load_study"],
             "restock.train.study.study_run": ["run_study"],

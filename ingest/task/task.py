@@ -211,10 +211,15 @@ def _nearness(clearance_m: NDArray[Any], range_max_m: float) -> NDArray[Any]:
 
 
 def _action_name(speed_mps: float, yaw_rate_radps: float) -> str:
+    """As the view `actions` of a store makes it, in replay/store/views.sql."""
     if speed_mps == 0 and yaw_rate_radps == 0:
         return "stop"
-    turn = f"{'left' if yaw_rate_radps > 0 else 'right'} {abs(yaw_rate_radps):g}"
+    turn = f"{'left' if yaw_rate_radps > 0 else 'right'} {_three_places(yaw_rate_radps)}"
     if speed_mps == 0:
         return f"turn {turn}"
-    drive = f"{'drive' if speed_mps > 0 else 'back'} {abs(speed_mps):g}"
+    drive = f"{'drive' if speed_mps > 0 else 'back'} {_three_places(speed_mps)}"
     return f"{drive} {turn}" if yaw_rate_radps else drive
+
+
+def _three_places(value: float) -> str:
+    return f"{round(abs(value), 3):.10g}"

@@ -8,17 +8,45 @@ CREATE OR REPLACE VIEW actions AS
 SELECT
     task_hash,
     action,
-    list_extract(list_extract(commands, action + 1), 1) AS speed_mps,
-    list_extract(list_extract(commands, action + 1), 2) AS yaw_rate_radps
+    speed_mps,
+    yaw_rate_radps,
+    -- As restock.ingest.task.task names it, e.g. drive 0.8 left 0.7.
+    CASE
+        WHEN speed_mps = 0 AND yaw_rate_radps = 0 THEN 'stop'
+        WHEN speed_mps = 0 THEN concat('turn ', turn)
+        WHEN yaw_rate_radps = 0 THEN drive
+        ELSE concat(drive, ' ', turn)
+    END AS name
 FROM (
-    SELECT task_hash, commands, CAST(position AS SMALLINT) AS action
+    SELECT
+        *,
+        concat(
+            CASE WHEN speed_mps > 0 THEN 'drive ' ELSE 'back ' END,
+            regexp_replace(CAST(round(abs(speed_mps), 3) AS VARCHAR), '[.]0$', '')
+        ) AS drive,
+        concat(
+            CASE WHEN yaw_rate_radps > 0 THEN 'left ' ELSE 'right ' END,
+            regexp_replace(CAST(round(abs(yaw_rate_radps), 3) AS VARCHAR), '[.]0$', '')
+        ) AS turn
     FROM (
-        SELECT task_hash, commands, unnest(range(len(commands))) AS position
+        SELECT
+            task_hash,
+            action,
+            list_extract(list_extract(commands, action + 1), 1) AS speed_mps,
+            list_extract(list_extract(commands, action + 1), 2) AS yaw_rate_radps
         FROM (
-            SELECT DISTINCT
-                task_hash,
-                from_json(json_extract_string(task_json, '$.actions'), '[["DOUBLE"]]') AS commands
-            FROM recordings
+            SELECT task_hash, commands, CAST(position AS SMALLINT) AS action
+            FROM (
+                SELECT task_hash, commands, unnest(range(len(commands))) AS position
+                FROM (
+                    SELECT DISTINCT
+                        task_hash,
+                        from_json(
+                            json_extract_string(task_json, '$.actions'), '[["DOUBLE"]]'
+                        ) AS commands
+                    FROM recordings
+                )
+            )
         )
     )
 );

@@ -42,7 +42,7 @@ MAY_IMPORT = {
         " replay/sampling ingest/profile ingest/store ingest/task"
     ),
     "train/dqn": "twin/env twin/physics",
-    "train/run": "replay/panel ingest/profile ingest/task",
+    "train/run": "replay replay/panel ingest/profile ingest/task",
     "train/feed": (
         "dqn run twin/env twin/floors replay/mixture replay/panel replay/ring replay/sampling"
         " ingest/task"

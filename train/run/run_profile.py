@@ -15,6 +15,7 @@ def profile_document(profile: Profile) -> dict[str, object]:
     """What a run's `config.json` says of its profile, for every library."""
     return {
         "task_hash": profile.task.hash,
+        "actions": profile.task.action_names,
         "labels_version": profile.labels_version,
         "profile": {"name": profile.name, "hash": profile.hash},
         "profile_toml": profile_toml(profile),

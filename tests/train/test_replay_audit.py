@@ -1,0 +1,127 @@
+"""The replay audit record: of a run, in one line of Python, and the same in SQL."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import duckdb
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from support.stores import recording_transitions, write_store
+from support.toy_run import config, logs, run_to_end
+from support.toy_twin import TASK
+
+from restock import cli
+from restock.errors import RunError
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.task import Task
+from restock.replay.store.store import Store
+from restock.train import ReplayAuditRecord, replay_audit
+from restock.train.run.run_profile import profile_document
+
+FIELDS = (
+    *("transition_id", "age_steps", "age_days", "condition"),
+    *("behavior_policy", "action", "reward", "target_sync_step"),
+)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("runs") / "a"
+    run_to_end(path, config(schedule={"env_steps": 800}))
+    document = json.loads((path / "config.json").read_text("utf-8"))
+    named = document | {"actions": TASK.action_names}
+    (path / "config.json").write_text(json.dumps(named), "utf-8")
+    return path
+
+
+def test_every_sampled_row_is_a_record(run: Path) -> None:
+    records = replay_audit(run)
+    audit = pq.read_table(run / "audit.parquet").sort_by(
+        [("gradient_step", "ascending"), ("batch_row", "ascending")]
+    )
+    assert ReplayAuditRecord.__struct_fields__ == FIELDS
+    assert records.to_arrow().column_names == list(FIELDS)
+    assert len(records) == len(audit) == len(list(records)) > 500
+    assert records[3:5][1] == records[4] == list(records)[4]
+    assert records[-1] == list(records)[-1]
+    with pytest.raises(IndexError):
+        records[len(records)]
+    for record, row in zip(records, audit.to_pylist(), strict=True):
+        assert record.condition == row["condition"]
+        assert record.behavior_policy == row["behaviour_policy"]
+        assert record.action == TASK.action_names[row["action"]]
+        assert record.reward == row["reward"]
+        assert record.target_sync_step == row["last_target_sync"]
+        assert (record.age_steps is None) == (row["source"] == "logs") != (record.age_days is None)
+
+
+def test_fresh_rows_have_ids_of_their_own(run: Path) -> None:
+    audit = pq.read_table(run / "audit.parquet").sort_by(
+        [("gradient_step", "ascending"), ("batch_row", "ascending")]
+    )
+    fresh, known = {}, set(logs().transition_id.tolist())
+    for record, row in zip(replay_audit(run), audit.to_pylist(), strict=True):
+        if row["source"] == "logs":
+            assert record.transition_id in known
+        else:
+            assert record.transition_id < 0
+            key = row["episode"], row["episode_step"]
+            assert fresh.setdefault(record.transition_id, key) == key
+    assert len(fresh) == len(set(fresh.values())) > 100
+
+
+def test_the_view_is_the_record(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    query = f"SELECT {', '.join(FIELDS)} FROM replay_audit LIMIT 40"
+    assert cli.main(["sql", str(run), query, "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert [ReplayAuditRecord(**row) for row in shown] == list(replay_audit(run)[:40])
+    of_view = "SELECT column_name, meaning FROM columns WHERE view = 'replay_audit'"
+    assert cli.main(["sql", str(run), of_view, "--json"]) == 0
+    assert all(row["meaning"] for row in json.loads(capsys.readouterr().out))
+
+
+def test_an_older_run_has_the_index_of_an_action_and_no_more(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    older = tmp_path / "older"
+    older.mkdir()
+    document = json.loads((run / "config.json").read_text("utf-8"))
+    del document["actions"]
+    (older / "config.json").write_text(json.dumps(document), "utf-8")
+    audit = pq.read_table(run / "audit.parquet").drop_columns(["last_target_sync", "age_days"])
+    pq.write_table(audit, older / "audit.parquet")
+    first = replay_audit(older)[0]
+    assert first.action in {f"action {index}" for index in range(len(TASK.actions))}
+    assert first.target_sync_step is None
+    (older / "audit.parquet").unlink()
+    with pytest.raises(RunError, match=r"no audit\.parquet"):
+        replay_audit(older)
+    with pytest.raises(RunError, match="not a run"):
+        replay_audit(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "actions",
+    [load_profile("warehouse_amr").task.actions, ((0.0, 0.0), (-0.125, 0.3456), (12.0, -1 / 3))],
+)
+def test_a_store_names_actions_as_runs_do(
+    tmp_path: Path, actions: tuple[tuple[float, float], ...]
+) -> None:
+    task = Task(body=load_profile("warehouse_amr").task.body, actions=actions)
+    with Store(write_store(tmp_path / "store", [recording_transitions(1)])) as store:
+        text = store.connection.sql("SELECT sql FROM duckdb_views() WHERE view_name = 'actions'")
+        ((view,),) = text.fetchall()
+    with duckdb.connect() as connection:
+        commands = json.dumps({"actions": [list(action) for action in actions]})
+        connection.register("recordings", pa.table({"task_hash": ["t"], "task_json": [commands]}))
+        connection.execute(view)
+        names = connection.sql("SELECT name FROM actions ORDER BY action").fetchall()
+    assert [name for (name,) in names] == task.action_names
+
+
+def test_a_run_says_how_its_actions_are_called() -> None:
+    profile = load_profile("warehouse_amr")
+    assert profile_document(profile)["actions"] == profile.task.action_names

@@ -1,0 +1,74 @@
+"""The replay audit of a run: what each sampled transition was, for people, notebooks and tests."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import overload
+
+import msgspec
+import pyarrow as pa
+
+from restock.errors import RunError
+from restock.replay.places import open_place
+from restock.train.run.run import Run
+
+
+class ReplayAuditRecord(msgspec.Struct, frozen=True):
+    """One sampled transition, of a seeded sample of batches."""
+
+    transition_id: int  # of a logged row as in the store; of a fresh row negative
+    age_steps: int | None  # of a fresh row: environment steps since it was collected
+    age_days: float | None  # of a logged row: days before training began
+    condition: str | None  # None: the episode of a fresh row had not ended with the run
+    behavior_policy: str  # who acted
+    action: str  # its name
+    reward: float  # the n-step return
+    target_sync_step: int  # gradient step after which the target network had last moved
+
+
+class ReplayAudit(Sequence[ReplayAuditRecord]):
+    """The audited rows of a run, by batch and place in it."""
+
+    def __init__(self, table: pa.Table) -> None:
+        self._table = table
+
+    def __len__(self) -> int:
+        return int(self._table.num_rows)
+
+    @overload
+    def __getitem__(self, place: int) -> ReplayAuditRecord: ...
+    @overload
+    def __getitem__(self, place: slice) -> ReplayAudit: ...
+    def __getitem__(self, place: int | slice) -> ReplayAuditRecord | ReplayAudit:
+        rows = range(len(self))[place]  # raises IndexError as a list does
+        if isinstance(rows, range):
+            return ReplayAudit(self._table.take(pa.array(rows, pa.int64())))
+        return ReplayAuditRecord(**self._table.slice(rows, 1).to_pylist()[0])
+
+    def __iter__(self) -> Iterator[ReplayAuditRecord]:
+        for batch in self._table.to_batches(max_chunksize=4096):
+            for row in batch.to_pylist():
+                yield ReplayAuditRecord(**row)
+
+    def to_arrow(self) -> pa.Table:
+        """The records as a table, a column a field."""
+        return self._table
+
+
+def replay_audit(run: Path | str) -> ReplayAudit:
+    """The replay audit of a run: `restock sql RUN "FROM replay_audit"` in Python.
+
+    Raises:
+        RunError: no run there, or one without audited rows' table.
+    """
+    path = Path(run)
+    Run.open(path)
+    if not (path / "audit.parquet").is_file():
+        raise RunError("it has no audit.parquet", where=str(path), remedy="was it trained at all?")
+    fields = ", ".join(ReplayAuditRecord.__struct_fields__)
+    with open_place(path) as connection:
+        return ReplayAudit(connection.sql(f"SELECT {fields} FROM replay_audit").to_arrow_table())
+
+
+__all__ = ["ReplayAudit", "ReplayAuditRecord", "replay_audit"]
