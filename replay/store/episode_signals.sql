@@ -1,0 +1,322 @@
+-- What drift is looked for in: one value an episode of each signal (episode_signals), and how often
+-- each condition began (episode_conditions). drift.sql compares them over weeks. docs/drift.md says what
+-- each signal tells. Not in Spark's list of views.
+
+-- What is compared: the part of the robot that a signal tells of, and the least change that matters.
+-- A `ratio` is compared as now / before, a `difference` as now - before, a `spread` as a difference in
+-- units of the reference's standard deviation between episodes.
+CREATE OR REPLACE VIEW drift_signals AS
+SELECT signal, part, compared, CAST(matters AS DOUBLE) AS matters, min_steps
+FROM (VALUES
+    ('odometry_scale', 'wheels', 'ratio', 1.02, 10),
+    ('wheel_yaw_scale', 'wheels', 'ratio', 1.03, 5),
+    ('wheel_pull_radpm', 'wheels', 'difference', 0.02, 10),
+    ('command_gain', 'drive', 'ratio', 1.03, 5),
+    ('command_response', 'drive', 'ratio', 1.2, 2),
+    ('gyro_bias_radps', 'gyro', 'difference', 0.01, 10),
+    ('accel_bias_mps2', 'accelerometer', 'difference', 0.1, 10),
+    ('localiser_jitter_mps', 'localiser', 'ratio', 1.4, 10),
+    ('localiser_age_s', 'localiser', 'difference', 0.05, 1),
+    ('lidar_noise_m', 'lidar', 'ratio', 1.3, 10),
+    ('blind_sectors', 'lidar', 'difference', 0.5, 10),
+    ('vibration_mps2', 'floor', 'ratio', 1.4, 10),
+    ('wheel_speed_mps', 'driving', 'spread', 0.8, 1),
+    ('wheel_yaw_rate_radps', 'driving', 'spread', 0.8, 1),
+    ('gyro_yaw_rate_radps', 'driving', 'spread', 0.8, 1),
+    ('localised_speed_mps', 'driving', 'spread', 0.8, 1),
+    ('localised_lateral_mps', 'driving', 'spread', 0.8, 1),
+    ('accel_x_mps2', 'driving', 'spread', 0.8, 1),
+    ('command_speed_mps', 'driving', 'spread', 0.8, 1),
+    ('command_yaw_rate_radps', 'driving', 'spread', 0.8, 1),
+    ('clearance_m', 'driving', 'spread', 0.8, 1),
+    ('clearance_ahead_m', 'driving', 'spread', 0.8, 1),
+    ('reward', 'driving', 'spread', 0.8, 1)
+) AS known (signal, part, compared, matters, min_steps);
+
+-- One value an episode of each signal, and the steps that it is from: none where those are too few
+-- or the robot has no such sensor. What tells of the robot leaves slipping steps out. Recordings without
+-- tags are taken for one robot, "untagged".
+CREATE OR REPLACE VIEW episode_signals AS
+WITH tasks AS (
+    SELECT DISTINCT
+        task_hash,
+        top_mps,
+        top_radps,
+        CAST(json_extract_string(task_json, '$.sectors') AS INTEGER) AS sectors,
+        CAST(json_extract_string(task_json, '$.control_period_s') AS DOUBLE) AS period_s,
+        CAST(json_extract_string(task_json, '$.range_max_m') AS DOUBLE) AS range_max_m
+    FROM recordings
+    JOIN (
+        SELECT task_hash, max(abs(speed_mps)) AS top_mps, max(abs(yaw_rate_radps)) AS top_radps
+        FROM actions
+        GROUP BY task_hash
+    ) USING (task_hash)
+), cleared AS (
+    SELECT
+        * EXCLUDE (observation, next_observation),
+        list_transform(
+            observation[-2 * sectors:-sectors - 1], lambda nearness: nearness * nearness * range_max_m
+        ) AS sector_m
+    FROM transitions
+    JOIN tasks USING (task_hash)
+), steps AS (
+    SELECT
+        *,
+        lag(sector_m) OVER episode AS sector_before_m,
+        lag(sector_m, 2) OVER episode AS sector_long_before_m,
+        (stamp_ns - lag(stamp_ns) OVER episode) / 1e9 AS elapsed_s,
+        (wheel_speed_mps + lag(wheel_speed_mps) OVER episode) / 2 AS mean_wheel_mps,
+        (wheel_yaw_rate_radps + lag(wheel_yaw_rate_radps) OVER episode) / 2 AS mean_wheel_radps,
+        (gyro_yaw_rate_radps + lag(gyro_yaw_rate_radps) OVER episode) / 2 AS mean_gyro_radps,
+        wheel_speed_mps - lag(wheel_speed_mps) OVER episode AS wheel_change_mps,
+        (pose_yaw_rad - lag(pose_yaw_rad) OVER episode + 3 * pi()) % (2 * pi()) - pi() AS turned_rad,
+        lag(command_speed_mps) OVER episode AS command_mps, -- in force until this step
+        lag(command_speed_mps, 2) OVER episode AS command_before_mps,
+        lag(command_speed_mps, 3) OVER episode AS command_long_before_mps,
+        -- Where there is no new pose, or no gyroscope, the wheels stand in for it.
+        localised_speed_mps <> wheel_speed_mps AS has_pose,
+        gyro_yaw_rate_radps <> wheel_yaw_rate_radps AS has_gyro,
+        NOT list_contains(conditions, 'wheel_slip') AS grips
+    FROM cleared
+    WINDOW episode AS (PARTITION BY episode_id ORDER BY step_index)
+), kinds AS (
+    SELECT
+        *,
+        grips AND elapsed_s < 1.5 * period_s
+        AND greatest(abs(mean_wheel_radps), abs(wheel_yaw_rate_radps)) < 0.1 * top_radps AS straight,
+        least(abs(mean_wheel_mps), abs(wheel_speed_mps)) > 0.3 * top_mps AS moving,
+        grips AND has_gyro AND abs(wheel_yaw_rate_radps) > 0.3 * top_radps AS turning,
+        grips AND command_mps > 0.3 * top_mps
+        AND command_mps = command_before_mps AND command_mps = command_long_before_mps AS held,
+        grips AND abs(command_mps - command_before_mps) > 0.3 * top_mps
+        AND command_before_mps = command_long_before_mps AS stepped
+    FROM steps
+), flagged AS (
+    SELECT
+        *,
+        straight AND moving AND has_pose AS tracked,
+        straight AND has_gyro AS gyro_straight,
+        straight AND moving AND abs(wheel_change_mps) < 0.05 * top_mps AND accel_x_mps2 <> 0 AS steady,
+        -- A straight wall's range changes evenly: what is left of the change is noise.
+        CASE WHEN straight THEN list_median(list_transform(
+            list_zip(sector_m, sector_before_m, sector_long_before_m),
+            lambda m: CASE WHEN greatest(m[1], m[2], m[3]) < range_max_m
+                THEN abs(m[1] - 2 * m[2] + m[3]) END
+        )) END AS unevenness_m
+    FROM kinds
+), blind AS (
+    SELECT episode_id, count(*) FILTER (spread_m < 0.005) AS blind_sectors
+    FROM (
+        SELECT episode_id, sector, max(m) - min(m) AS spread_m
+        FROM (
+            SELECT episode_id, unnest(sector_m) AS m, generate_subscripts(sector_m, 1) AS sector
+            FROM cleared
+        )
+        GROUP BY episode_id, sector
+    )
+    GROUP BY episode_id
+), summed AS (
+    SELECT
+        any_value(robot) AS robot,
+        any_value(site) AS site,
+        recording_id,
+        episode_id,
+        min(logged_time) AS start_time,
+        unnest([
+            {
+                signal: 'odometry_scale',
+                value: sum(localised_speed_mps) FILTER (tracked) / sum(mean_wheel_mps) FILTER (tracked),
+                steps: count(*) FILTER (tracked)
+            },
+            {
+                signal: 'wheel_yaw_scale',
+                value: median(gyro_yaw_rate_radps / wheel_yaw_rate_radps) FILTER (turning),
+                steps: count(*) FILTER (turning)
+            },
+            {
+                signal: 'wheel_pull_radpm',
+                value: sum(turned_rad - mean_wheel_radps * elapsed_s) FILTER (tracked)
+                    / sum(abs(mean_wheel_mps) * elapsed_s) FILTER (tracked),
+                steps: count(*) FILTER (tracked)
+            },
+            {
+                signal: 'command_gain',
+                value: sum(wheel_speed_mps) FILTER (held) / sum(command_mps) FILTER (held),
+                steps: count(*) FILTER (held)
+            },
+            {
+                signal: 'command_response',
+                value: sum(wheel_change_mps * sign(command_mps - command_before_mps)) FILTER (stepped)
+                    / sum(abs(command_mps - command_before_mps)) FILTER (stepped),
+                steps: count(*) FILTER (stepped)
+            },
+            {
+                signal: 'gyro_bias_radps',
+                value: sum(mean_gyro_radps * elapsed_s - turned_rad) FILTER (gyro_straight)
+                    / sum(elapsed_s) FILTER (gyro_straight),
+                steps: count(*) FILTER (gyro_straight)
+            },
+            {
+                signal: 'accel_bias_mps2',
+                value: median(accel_x_mps2) FILTER (steady),
+                steps: count(*) FILTER (steady)
+            },
+            {
+                signal: 'vibration_mps2', -- normal noise has a median of .6745 standard deviations
+                value: mad(accel_x_mps2) FILTER (steady) / 0.6745,
+                steps: count(*) FILTER (steady)
+            },
+            {
+                signal: 'localiser_jitter_mps',
+                value: median(abs(localised_lateral_mps)) FILTER (tracked),
+                steps: count(*) FILTER (tracked)
+            },
+            {
+                signal: 'localiser_age_s',
+                value: avg((stamp_ns - pose_stamp_ns) / 1e9),
+                steps: count(pose_stamp_ns)
+            },
+            {
+                signal: 'lidar_noise_m',
+                value: median(unevenness_m) / 0.6745 / sqrt(6),
+                steps: count(unevenness_m)
+            },
+            {signal: 'blind_sectors', value: any_value(blind_sectors)::DOUBLE, steps: count(*)},
+            {signal: 'wheel_speed_mps', value: avg(wheel_speed_mps), steps: count(wheel_speed_mps)},
+            {
+                signal: 'wheel_yaw_rate_radps',
+                value: avg(wheel_yaw_rate_radps),
+                steps: count(wheel_yaw_rate_radps)
+            },
+            {
+                signal: 'gyro_yaw_rate_radps',
+                value: avg(gyro_yaw_rate_radps),
+                steps: count(*) FILTER (has_gyro)
+            },
+            {signal: 'localised_speed_mps', value: avg(localised_speed_mps), steps: count(*) FILTER (has_pose)},
+            {
+                signal: 'localised_lateral_mps',
+                value: avg(localised_lateral_mps),
+                steps: count(*) FILTER (has_pose)
+            },
+            {signal: 'accel_x_mps2', value: avg(accel_x_mps2), steps: count(nullif(accel_x_mps2, 0))},
+            {signal: 'command_speed_mps', value: avg(command_speed_mps), steps: count(command_speed_mps)},
+            {
+                signal: 'command_yaw_rate_radps',
+                value: avg(command_yaw_rate_radps),
+                steps: count(command_yaw_rate_radps)
+            },
+            {signal: 'clearance_m', value: avg(clearance_m), steps: count(clearance_m)},
+            {signal: 'clearance_ahead_m', value: avg(clearance_ahead_m), steps: count(clearance_ahead_m)},
+            {signal: 'reward', value: avg(reward), steps: count(reward)}
+        ], recursive := true)
+    FROM flagged
+    LEFT JOIN blind USING (episode_id)
+    GROUP BY recording_id, episode_id
+)
+SELECT
+    coalesce(robot, 'untagged') AS robot,
+    coalesce(site, 'untagged') AS site,
+    recording_id,
+    episode_id,
+    start_time,
+    part,
+    signal,
+    value,
+    steps
+FROM summed
+JOIN drift_signals USING (signal)
+WHERE isfinite(value) AND steps >= min_steps AND (compared <> 'ratio' OR value > 0);
+
+-- How each signal is distributed, between the episodes of a robot's week.
+CREATE OR REPLACE VIEW signal_weeks AS
+SELECT
+    robot,
+    site,
+    CAST(date_trunc('week', start_time) AS DATE) AS week,
+    part,
+    signal,
+    count(DISTINCT recording_id) AS recordings,
+    count(*) AS episodes,
+    CAST(sum(steps) AS BIGINT) AS steps,
+    quantile_cont(value, 0.05) AS p05,
+    quantile_cont(value, 0.25) AS p25,
+    quantile_cont(value, 0.5) AS median,
+    quantile_cont(value, 0.75) AS p75,
+    quantile_cont(value, 0.95) AS p95
+FROM episode_signals
+GROUP BY ALL
+ORDER BY robot, signal, week;
+
+-- Steps and events (runs of steps) of each condition in an episode, by zone: those in which it never
+-- held included. The zone null is all of them together.
+CREATE OR REPLACE VIEW episode_conditions AS
+WITH steps AS (
+    SELECT
+        robot,
+        site,
+        recording_id,
+        episode_id,
+        zone,
+        logged_time,
+        conditions,
+        lag(conditions) OVER (PARTITION BY episode_id ORDER BY step_index) AS conditions_before,
+        CAST(json_extract_string(task_json, '$.control_period_s') AS DOUBLE) / 3600 AS step_h
+    FROM transitions
+    JOIN (SELECT DISTINCT task_hash, task_json FROM recordings) USING (task_hash)
+), driven AS (
+    SELECT
+        any_value(robot) AS robot,
+        any_value(site) AS site,
+        recording_id,
+        episode_id,
+        zone,
+        min(logged_time) AS start_time,
+        sum(step_h) AS driven_h
+    FROM steps
+    GROUP BY GROUPING SETS ((recording_id, episode_id, zone), (recording_id, episode_id))
+), held AS (
+    SELECT
+        episode_id,
+        zone,
+        condition,
+        count(*) AS steps,
+        count(*) FILTER (NOT list_contains(coalesce(conditions_before, []), condition)) AS events
+    FROM (SELECT *, unnest(conditions) AS condition FROM steps)
+    GROUP BY GROUPING SETS ((episode_id, zone, condition), (episode_id, condition))
+)
+SELECT
+    coalesce(robot, 'untagged') AS robot,
+    coalesce(site, 'untagged') AS site,
+    recording_id,
+    driven.episode_id,
+    start_time,
+    kinds.condition,
+    driven.zone,
+    driven_h,
+    coalesce(held.steps, 0) AS steps,
+    coalesce(held.events, 0) AS events
+FROM driven
+CROSS JOIN (SELECT condition FROM conditions WHERE condition <> 'nominal') AS kinds
+LEFT JOIN held
+    ON held.episode_id = driven.episode_id
+    AND held.zone IS NOT DISTINCT FROM driven.zone
+    AND held.condition = kinds.condition;
+
+-- How often each condition began, by robot, zone (null: all together) and week.
+CREATE OR REPLACE VIEW condition_weeks AS
+SELECT
+    robot,
+    site,
+    CAST(date_trunc('week', start_time) AS DATE) AS week,
+    condition,
+    zone,
+    count(DISTINCT recording_id) AS recordings,
+    count(*) AS episodes,
+    sum(driven_h) AS driven_h,
+    CAST(sum(steps) AS BIGINT) AS steps,
+    CAST(sum(events) AS BIGINT) AS events,
+    sum(events) / sum(driven_h) AS events_per_h
+FROM episode_conditions
+GROUP BY ALL
+ORDER BY robot, condition, zone NULLS FIRST, week;

@@ -1,0 +1,274 @@
+"""Drift: the tests hold their level on correlated logs, and a worn wheel is named."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from typing import Any
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+import pytest
+from scipy import stats
+from support.fleets import SyntheticRobot, fleet, wander
+
+WEEKS = ["2026-03-02", "2026-03-09", "2026-03-16", "2026-03-23"]
+WORN = SyntheticRobot("b", changes={"odometry_scale": 0.94})
+
+
+def rows(connection: duckdb.DuckDBPyConnection, query: str) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = connection.sql(query).to_arrow_table().to_pylist()
+    return found
+
+
+def of_samples(signals: pa.Table, conditions: pa.Table | None = None) -> duckdb.DuckDBPyConnection:
+    """The views of drift.sql over given samples."""
+    connection = duckdb.connect()
+    connection.register("episode_signals", signals)
+    if conditions is None:
+        connection.execute(
+            "CREATE TABLE episode_conditions (robot TEXT, site TEXT, recording_id TEXT,"
+            " episode_id TEXT, start_time TIMESTAMP, condition TEXT, zone TEXT, driven_h DOUBLE,"
+            " steps BIGINT, events BIGINT)"
+        )
+    else:
+        connection.register("episode_conditions", conditions)
+    connection.execute(
+        "CREATE VIEW drift_signals AS SELECT * FROM (VALUES ('scale', 'wheels', 'ratio', 1.02, 5),"
+        " ('bias', 'gyro', 'difference', .1, 5))"
+        " AS known (signal, part, compared, matters, min_steps)"
+    )
+    connection.execute((files("restock.replay.store") / "drift.sql").read_text("utf-8"))
+    return connection
+
+
+def samples(
+    values: dict[tuple[str, str, int], list[np.ndarray]],
+    *,
+    part: str = "gyro",
+    signal: str = "bias",
+) -> pa.Table:
+    """`episode_signals` of (robot, site, week) -> for each recording the values of its episodes."""
+    lines = [
+        {
+            "robot": robot,
+            "site": site,
+            "recording_id": f"{robot}-{week}-{number}",
+            "episode_id": f"{robot}-{week}-{number}/{episode}",
+            "start_time": np.datetime64(WEEKS[week], "us").item(),
+            "part": part,
+            "signal": signal,
+            "value": float(value),
+            "steps": 50,
+        }
+        for (robot, site, week), recordings in values.items()
+        for number, episodes in enumerate(recordings)
+        for episode, value in enumerate(episodes)
+    ]
+    return pa.Table.from_pylist(lines)
+
+
+def correlated(
+    rng: np.random.Generator, recordings: int, episodes: int, steps: int = 60
+) -> list[np.ndarray]:
+    """Means of episodes whose steps wander, in recordings that differ from each other."""
+    return [
+        np.array([wander(rng, steps, 1.0, 0.95).mean() + base for _ in range(episodes)])
+        for base in rng.normal(0, 0.3, recordings)
+    ]
+
+
+@pytest.mark.parametrize("df", [1, 2, 3, 4, 7, 20, 51, 200])
+def test_students_t_is_scipys(df: int) -> None:
+    connection = of_samples(samples({("a", "x", 0): [np.ones(1)]}))
+    for t in (0.0, 0.4, -2.0, 5.0, 12.0):
+        p = connection.sql(f"SELECT student_p({t}::DOUBLE, {df})").fetchall()[0][0]
+        assert p == pytest.approx(max(2 * stats.t.sf(abs(t), df), 1e-15), rel=1e-6, abs=1e-14)
+    if df >= 3:
+        quantile = connection.sql(f"SELECT student_quantile({df})").fetchall()[0][0]
+        assert quantile == pytest.approx(stats.t.ppf(0.975, df), rel=2e-3)
+
+
+def test_the_test_and_its_sizes_are_scipys() -> None:
+    rng = np.random.default_rng(3)
+    early, late = rng.normal(0, 1, 24), rng.normal(0.9, 1, 31)
+    table = samples({("a", "x", 0): [early], ("a", "x", 1): [late]})
+    [row] = rows(of_samples(table), "FROM drift WHERE against = 'own reference'")
+    trimmed = stats.ttest_ind(late, early, trim=0.1)
+    low, high = trimmed.confidence_interval()
+    assert row["p"] == pytest.approx(trimmed.pvalue, rel=1e-6)
+    assert [row["change_low"], row["change_high"]] == pytest.approx([low, high], rel=1e-3)
+    wins = stats.mannwhitneyu(late, early).statistic / (len(late) * len(early))
+    assert row["cliffs_delta"] == pytest.approx(2 * wins - 1)
+    assert row["ks_distance"] == pytest.approx(stats.ks_2samp(late, early).statistic)
+    assert (row["n"], row["n_reference"], row["samples"]) == (31, 24, "episodes")
+
+
+def test_p_is_corrected_as_scipy_does() -> None:
+    rng = np.random.default_rng(4)
+    values = {
+        (f"r{robot}", f"r{robot}", week): [rng.normal(0.2 * robot * (week == 2), 1, 12)]
+        for robot in range(12)
+        for week in range(3)
+    }
+    found = rows(of_samples(samples(values)), "FROM drift WHERE against = 'own reference'")
+    p = [row["p"] for row in found]
+    assert len(p) == 12
+    assert [row["q"] for row in found] == pytest.approx(stats.false_discovery_control(p))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_false_alarms_keep_their_level_though_steps_and_recordings_are_correlated(
+    seed: int,
+) -> None:
+    rng, robots = np.random.default_rng(seed), 300
+    values = {
+        (f"r{robot}", f"r{robot}", week): correlated(rng, 3, 5)
+        for robot in range(robots)
+        for week in range(4)
+    }
+    connection = of_samples(samples(values))
+    found = rows(connection, "FROM drift WHERE against = 'own reference' AND period = '2026-03-23'")
+    assert {row["samples"] for row in found} == {"recordings"}
+    alarms = sum(row["p"] < 0.05 for row in found)
+    # 1 in 1,000 of binomial draws at the nominal level is outside
+    assert stats.binom.ppf(0.001, robots, 0.05) <= alarms <= stats.binom.ppf(0.999, robots, 0.05)
+    # Were episodes taken for independent, as p of a test that knows no recordings:
+    naive = [
+        stats.ttest_ind(
+            np.concatenate(values[f"r{robot}", f"r{robot}", 3]),
+            np.concatenate(
+                [*values[f"r{robot}", f"r{robot}", 0], *values[f"r{robot}", f"r{robot}", 1]]
+            ),
+        ).pvalue
+        for robot in range(robots)
+    ]
+    assert np.mean(np.array(naive) < 0.05) > 0.1
+    corrected = rows(connection, "SELECT count(*) AS n FROM drift WHERE q < .05")
+    assert corrected[0]["n"] <= 2
+
+
+def test_false_alarms_of_rates_keep_their_level() -> None:
+    rng, lines = np.random.default_rng(5), []
+    for robot in range(300):
+        for week in range(4):
+            for number in range(3):
+                # Some drives meet far more of it than others: not Poisson.
+                rate = rng.gamma(2, 1.0)
+                for episode in range(5):
+                    lines.append(
+                        {
+                            "robot": f"r{robot}",
+                            "site": f"r{robot}",
+                            "recording_id": f"{robot}-{week}-{number}",
+                            "episode_id": f"{robot}-{week}-{number}/{episode}",
+                            "start_time": np.datetime64(WEEKS[week], "us").item(),
+                            "condition": "wheel_slip",
+                            "zone": None,
+                            "driven_h": 1.0,
+                            "steps": 0,
+                            "events": int(rng.poisson(rate)),
+                        }
+                    )
+    schema = pa.Table.from_pylist(lines).schema.set(6, pa.field("zone", pa.string()))
+    connection = of_samples(
+        samples({("none", "none", 0): [np.ones(1)]}), pa.Table.from_pylist(lines, schema)
+    )
+    found = rows(connection, "FROM drift WHERE part = 'conditions' AND period = '2026-03-23'")
+    assert len(found) == 300
+    alarms = sum(row["p"] < 0.05 for row in found)
+    assert stats.binom.ppf(0.0001, 300, 0.05) <= alarms <= stats.binom.ppf(0.9999, 300, 0.05)
+
+
+@pytest.fixture(scope="module")
+def worn() -> duckdb.DuckDBPyConnection:
+    return fleet([SyntheticRobot("a"), WORN, SyntheticRobot("c")], recordings=3)
+
+
+def test_a_worn_wheel_is_named_and_nothing_else(worn: duckdb.DuckDBPyConnection) -> None:
+    [found] = rows(worn, "FROM drift_findings WHERE part <> 'driving'")
+    assert (found["robot"], found["part"], found["signal"]) == ("b", "wheels", "odometry_scale")
+    assert (str(found["since"]), found["weeks"], found["weeks_tested"]) == (WEEKS[2], 2, 2)
+    assert found["change_low"] < 0.94 < found["change_high"]
+    assert found["scope"] == "robot"
+    assert "0 of 2 other robots at this site changed alike" in found["finding"]
+
+
+def test_it_also_differs_from_the_other_robots(worn: duckdb.DuckDBPyConnection) -> None:
+    query = (
+        "SELECT period::VARCHAR AS period, verdict FROM drift WHERE against = 'other robots'"
+        " AND robot = 'b' AND signal = 'odometry_scale' ORDER BY period"
+    )
+    verdicts = {row["period"]: row["verdict"] for row in rows(worn, query)}
+    assert [verdicts[week] for week in WEEKS[2:]] == ["differs", "differs"]
+    assert "differs" not in [verdicts[week] for week in WEEKS[:2]]
+
+
+def test_where_all_robots_of_a_site_change_it_is_the_site() -> None:
+    slippery = {"odometry_scale": 0.92}
+    robots = [SyntheticRobot(name, changes=slippery) for name in "abc"]
+    found = rows(fleet(robots, recordings=3), "FROM drift_findings WHERE signal = 'odometry_scale'")
+    assert {(row["robot"], row["scope"]) for row in found} == {(name, "site") for name in "abc"}
+
+
+def test_robots_of_another_site_are_not_compared_with() -> None:
+    robots = [WORN, SyntheticRobot("a", site="other")]
+    found = rows(fleet(robots, recordings=3), "FROM drift_findings WHERE part = 'wheels'")
+    assert [(row["robot"], row["scope"]) for row in found] == [("b", "alone")]
+
+
+def test_a_noisier_lidar_and_a_slippery_floor_are_told_apart() -> None:
+    robots = [
+        SyntheticRobot("a", changes={"lidar_noise_m": 3.0}),
+        SyntheticRobot("b", changes={"slips_per_step": 8.0}),
+        SyntheticRobot("c"),
+    ]
+    found = rows(fleet(robots, recordings=3), "FROM drift_findings WHERE zone IS NULL")
+    parts = {
+        (row["robot"], row["part"], row["signal"]) for row in found if row["part"] != "driving"
+    }
+    assert parts == {("a", "lidar", "lidar_noise_m"), ("b", "conditions", "wheel_slip")}
+
+
+def test_too_few_episodes_is_a_verdict() -> None:
+    lone = fleet([SyntheticRobot("a")], recordings=1, episodes=3)
+    verdicts = rows(lone, "SELECT DISTINCT verdict, p FROM drift WHERE part = 'wheels'")
+    assert verdicts == [{"verdict": "too few", "p": None}]
+    one_week = fleet([SyntheticRobot("a")], weeks=1)
+    verdicts = rows(one_week, "SELECT DISTINCT verdict FROM drift WHERE against = 'own reference'")
+    assert verdicts == [{"verdict": "too few"}]
+
+
+def test_recordings_without_tags_are_one_robot_that_is_called_so() -> None:
+    mute = SyntheticRobot(None, site=None, changes={"odometry_scale": 0.9})
+    [found] = rows(fleet([mute], recordings=3), "FROM drift_findings WHERE part = 'wheels'")
+    assert (found["robot"], found["site"], found["scope"]) == ("untagged", "untagged", "alone")
+
+
+def test_signals_that_a_robot_lacks_are_not_made_up() -> None:
+    blind = SyntheticRobot("a", localiser=False, gyro=False)
+    found = rows(fleet([blind], recordings=3), "SELECT DISTINCT signal FROM drift")
+    signals = {row["signal"] for row in found}
+    assert "command_gain" in signals
+    lacking = {"odometry_scale", "wheel_yaw_scale", "gyro_bias_radps", "localiser_jitter_mps"}
+    assert not signals & (lacking | {"localised_speed_mps", "gyro_yaw_rate_radps"})
+
+
+def test_values_that_never_vary_have_the_p_of_their_order() -> None:
+    table = samples({("a", "x", 0): [np.zeros(6)], ("a", "x", 1): [np.ones(5)]})
+    [row] = rows(of_samples(table), "FROM drift WHERE against = 'own reference'")
+    assert row["p"] == pytest.approx(2 / 462)  # 11 over 5
+    same = samples({("a", "x", 0): [np.zeros(6)], ("a", "x", 1): [np.zeros(5)]})
+    [row] = rows(of_samples(same), "FROM drift WHERE against = 'own reference'")
+    assert (row["p"], row["verdict"]) == (1, "unchanged")
+
+
+def test_other_periods_than_weeks(worn: duckdb.DuckDBPyConnection) -> None:
+    monthly = rows(worn, "FROM drift_by('month') WHERE against = 'own reference'")
+    assert {row["verdict"] for row in monthly} == {"too few"}  # a month with nothing before it
+    first = rows(
+        worn,
+        "FROM drift_by(reference := 1) WHERE robot = 'b' AND signal = 'odometry_scale'"
+        " AND against = 'own reference'",
+    )
+    assert [row["verdict"] == "changed" for row in first] == [False, True, True]

@@ -1,0 +1,114 @@
+"""Synthetic fleets: robots that drive over weeks, as a connection with a store's views.
+
+Consecutive steps are correlated, as those of a robot are: speeds and errors wander (AR(1)).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+from scipy.signal import lfilter
+
+from restock.replay.store.query import install
+from support.stores import TASK, manifest, recording_transitions
+
+MONDAY_NS = 1_772_409_600 * 10**9  # 2026-03-02
+WEEK_NS = 7 * 86_400 * 10**9
+STEP_NS = 200_000_000
+
+
+@dataclass(frozen=True)
+class SyntheticRobot:
+    """A robot, and from which week (from 1) something about it changes."""
+
+    name: str | None
+    site: str | None = "hall"
+    odometry_scale: float = 1.0  # metres driven a metre that the wheels report
+    lidar_noise_m: float = 0.01
+    slips_per_step: float = 0.01
+    changes: Mapping[str, float] = field(default_factory=dict)  # what is multiplied
+    changes_in_week: int = 3
+    localiser: bool = True
+    gyro: bool = True
+
+
+def fleet(
+    robots: list[SyntheticRobot],
+    *,
+    weeks: int = 4,
+    recordings: int = 2,
+    episodes: int = 8,
+    seed: int = 0,
+) -> duckdb.DuckDBPyConnection:
+    """A connection with the views of a store of this fleet; `recordings` a robot and week."""
+    rows, manifests, number = [], [], 0
+    for robot in robots:
+        for week in range(1, weeks + 1):
+            for _ in range(recordings):
+                number += 1
+                drive = _drive(robot, number, week, episodes, seed)
+                rows.append(drive)
+                manifests.append(_tagged(manifest(drive), robot))
+    connection = duckdb.connect()
+    connection.register("stored_transitions", pa.concat_tables(rows))
+    connection.register("stored_recordings", pa.concat_tables(manifests))
+    install(connection, "FLOAT[]")
+    return connection
+
+
+def wander(
+    rng: np.random.Generator, rows: int, deviation: float, memory: float = 0.9
+) -> np.ndarray:
+    """An AR(1) process (rows,) of that standard deviation."""
+    drawn = rng.normal(0, deviation * np.sqrt(1 - memory**2), rows)
+    return np.asarray(lfilter([1.0], [1.0, -memory], drawn))
+
+
+def _drive(robot: SyntheticRobot, number: int, week: int, episodes: int, seed: int) -> pa.Table:
+    table = recording_transitions(number, episodes=episodes, seed=seed)
+    rows, rng = len(table), np.random.default_rng([seed, number, 7])
+    factor = robot.changes if week >= robot.changes_in_week else {}
+    wheel = 0.7 + wander(rng, rows, 0.08)
+    yaw_rate = np.where(np.arange(rows) // 8 % 3 == 2, 0.9, 0.02) * rng.choice([-1, 1])
+    true_speed = wheel * robot.odometry_scale * factor.get("odometry_scale", 1.0)
+    localised = true_speed + wander(rng, rows, 0.03, 0.5)
+    gyro = yaw_rate + rng.normal(0, 0.01, rows) + wander(rng, rows, 0.005)
+    slips = rng.random(rows) < robot.slips_per_step * factor.get("slips_per_step", 1.0)
+    noise = robot.lidar_noise_m * factor.get("lidar_noise_m", 1.0)
+    clearance = (
+        1.5 + wander(rng, rows, 0.2, 0.999)[:, None] + rng.normal(0, noise, (rows, TASK.sectors))
+    )
+    nearness = np.sqrt(np.clip(clearance / TASK.range_max_m, 0, 1))
+    observation = np.stack(table["observation"].to_pylist()).astype(np.float32)
+    observation[:, -2 * TASK.sectors : -TASK.sectors] = nearness
+    stamp = MONDAY_NS + (week - 1) * WEEK_NS + number * 600 * 10**9 + np.arange(rows) * STEP_NS
+    values = {
+        "observation": list(observation),
+        "stamp_ns": stamp,
+        "pose_stamp_ns": stamp - 10_000_000,
+        "wheel_speed_mps": wheel,
+        "wheel_yaw_rate_radps": yaw_rate,
+        "gyro_yaw_rate_radps": gyro if robot.gyro else yaw_rate,
+        "localised_speed_mps": localised if robot.localiser else wheel,
+        "localised_lateral_mps": wander(rng, rows, 0.03, 0.2) * robot.localiser,
+        "pose_yaw_rad": np.cumsum(yaw_rate) * 0.2,
+        "command_speed_mps": np.full(rows, 0.8),
+        "conditions": [["wheel_slip"] if slip else [] for slip in slips],
+        "clearance_m": clearance.min(1),
+    }
+    for name, column in values.items():
+        place = table.schema.get_field_index(name)
+        table = table.set_column(
+            place, table.schema[place], pa.array(column, table.schema[place].type)
+        )
+    return table
+
+
+def _tagged(row: pa.Table, robot: SyntheticRobot) -> pa.Table:
+    tags = [(key, value) for key, value in (("robot", robot.name), ("site", robot.site)) if value]
+    place = row.schema.get_field_index("tags")
+    return row.set_column(place, row.schema[place], pa.array([tags], row.schema[place].type))
