@@ -65,6 +65,10 @@ def describe_recording(
                 if extra.kind == "attachment"
             ],
             "metadata": [extra.name for extra in recording.extras if extra.kind == "metadata"],
+            "says": [
+                {"source": source, "entries": dict(entries)}
+                for source, _, entries in recording.metadata
+            ],
             "notes": notes,
             "damage": [item.what for item in recording.damage],
         }

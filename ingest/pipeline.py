@@ -91,7 +91,8 @@ def ingest(
     """
     with open_recording(path, typestore=typestore, salvage=salvage) as recording:
         before = _before(store, recording)
-        told = resolve_tags({}, tags or {}, (before or {}).get("tags") or {}, str(path))
+        tagged = (before or {}).get("tags") or {}
+        told = resolve_tags(profile.tags, Path(path), recording.metadata, tags or {}, tagged)
         if store is not None and before is not None and not force and _unchanged(before, profile):
             if told.tags == (before["tags"] or {}):
                 return IngestResult(str(path), "unchanged", before)

@@ -9,10 +9,16 @@ from pathlib import Path
 from typing import Literal, TypeVar
 
 from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
 
 from restock.errors import RecordingError, visible
 from restock.ingest.containers import mcap_records, sqlite_file
+from restock.ingest.containers.storage import (
+    INVALID_YAML,
+    NOT_KEPT,
+    Metadata,
+    custom_data,
+    keep_entries,
+)
 
 T = TypeVar("T")
 Kind = Literal["mcap", "sqlite3", "ros1"]
@@ -21,11 +27,6 @@ ROS1_MAGIC = b"#ROSBAG V"
 LFS_MAGIC = b"version https://git-lfs"
 METADATA = "metadata.yaml"
 LARGEST_METADATA = 2 << 20  # real ones have some kB, and the parser is slow
-# What the YAML library raises of an invalid document, or of one that it does not expect.
-_INVALID_YAML = (
-    *(YAMLError, KeyError, IndexError, TypeError, ValueError, AttributeError, AssertionError),
-    *(RecursionError, OverflowError, NotImplementedError),
-)
 ENDINGS = (".mcap", ".db3", ".bag", ".mcap.zstd", ".db3.zstd", ".mcap.zst", ".db3.zst")
 
 
@@ -121,6 +122,7 @@ class BagMetadata:
 
     files: tuple[str, ...] = ()  # names without folders: only files in the bag's own are read
     topics: tuple[ClaimedTopic, ...] = ()
+    custom_data: Metadata | None = None
 
 
 def bag_files(folder: Path, metadata: BagMetadata) -> tuple[list[Path], list[str]]:
@@ -155,13 +157,23 @@ def read_metadata(folder: Path) -> tuple[BagMetadata, str | None]:
     try:
         if file.stat().st_size > LARGEST_METADATA:
             return BagMetadata(), f"{METADATA} has {file.stat().st_size:,} bytes: not read"
-        document = YAML(typ="safe", pure=True).load(file.read_text(encoding="utf-8"))
+        text = file.read_text(encoding="utf-8")
+        document = YAML(typ="safe", pure=True).load(text)
         content = document["rosbag2_bagfile_information"]
-    except _INVALID_YAML as error:
+    except INVALID_YAML as error:
         why = (str(error).splitlines() or [type(error).__name__])[0]
         return BagMetadata(), f"{METADATA} cannot be used: {visible(why[:200])}"
     if not isinstance(content, dict):
         return BagMetadata(), f"{METADATA} cannot be used: not a mapping"
+    custom, problem = None, None
+    try:
+        said, more = custom_data(text)
+        entries, beyond = keep_entries(said)
+        custom = Metadata(f"custom_data in {METADATA}", "", entries)
+        if more + beyond:
+            problem = f"{METADATA}: {more + beyond:,} entries of custom_data: {NOT_KEPT}"
+    except ValueError as error:
+        problem = f"{METADATA}: {error}"
     listed = _items(content.get("relative_file_paths"), str)
     topics = _items(content.get("topics_with_message_count"), dict)
     return BagMetadata(
@@ -175,7 +187,8 @@ def read_metadata(folder: Path) -> tuple[BagMetadata, str | None]:
             for topic in topics
             if isinstance(topic.get("topic_metadata"), dict)
         ),
-    ), None
+        custom,
+    ), problem
 
 
 def _items(value: object, kind: type[T]) -> list[T]:

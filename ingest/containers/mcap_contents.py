@@ -11,6 +11,7 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
+from restock.errors import visible
 from restock.ingest.containers.mcap_chunk import HEAD_SIZE, Chunk, Definitions
 from restock.ingest.containers.mcap_records import (
     MAGIC,
@@ -21,12 +22,13 @@ from restock.ingest.containers.mcap_records import (
     parse,
     walk,
 )
-from restock.ingest.containers.storage import Extra
+from restock.ingest.containers.storage import Extra, Metadata, keep_entries
 
 # What the survey keeps is bounded, whatever a file is made of.
 MOST_CHUNKS = 1_000_000
 MOST_NAMED = 10_000  # attachments and metadata records; the others are counted
 MOST_DAMAGED = 100
+ROSBAG2 = "rosbag2"  # the metadata record of rosbag2's storage
 MOST_OTHERS = 1_000_000  # records beside those of messages
 _MANY = (Op.MESSAGE, Op.CHUNK, Op.MESSAGE_INDEX, Op.CHUNK_INDEX)
 
@@ -54,6 +56,9 @@ class Contents:
     damaged: list[str] = field(default_factory=list)  # records that could not be parsed
     extras: list[Extra] = field(default_factory=list)  # attachments and metadata records
     unnamed: int = 0  # more of them
+    metadata: list[Metadata] = field(default_factory=list)
+    left_out: int = 0  # entries of metadata
+    rosbag2: str = ""  # the metadata.yaml in its own record
 
     def indexed_counts(self) -> Counter[int]:
         """Messages per channel as far as they are known without looking into chunks."""
@@ -135,6 +140,7 @@ def take_record(contents: Contents, file: FileBytes, opcode: int, at: int, stop:
     elif opcode == Op.METADATA:
         named = parse(Op.METADATA, file, at, stop)
         _name(contents, Extra("metadata", named["name"], "", stop - at))
+        _keep(contents, file.path.name, named["name"], named["metadata"])
     elif opcode == Op.HEADER and not contents.profile:
         contents.profile = parse(Op.HEADER, file, at, stop)["profile"]
 
@@ -150,6 +156,19 @@ def _name(contents: Contents, extra: Extra) -> None:
         contents.extras.append(extra)
     else:
         contents.unnamed += 1
+
+
+def _keep(contents: Contents, file: str, name: str, said: dict[str, str]) -> None:
+    """Keep what a metadata record says. rosbag2 writes its metadata.yaml into one of its own, when
+    it opens the file and again when it closes it: the last counts."""
+    if name == ROSBAG2:
+        contents.rosbag2 = said.get("serialized_metadata", "")
+        return
+    entries, beyond = keep_entries(said, contents.metadata)
+    contents.left_out += beyond
+    if entries:
+        source = f"metadata record {visible(name)!r} of {file}"
+        contents.metadata.append(Metadata(source, name, entries))
 
 
 def _chunk(file: FileBytes, at: int, stop: int) -> Chunk:

@@ -12,11 +12,17 @@ from numpy.typing import NDArray
 from restock.errors import RecordingError
 from restock.ingest.containers import mcap_chunk
 from restock.ingest.containers.mcap_chunk import LATEST_NS, Chunk, Messages
-from restock.ingest.containers.mcap_contents import survey
+from restock.ingest.containers.mcap_contents import ROSBAG2, survey
 from restock.ingest.containers.mcap_group import Checks, ChunkReader, batch_of
 from restock.ingest.containers.mcap_records import MAGIC, PREFIX, FileBytes
 from restock.ingest.containers.mcap_salvage import resume
-from restock.ingest.containers.storage import Integrity
+from restock.ingest.containers.storage import (
+    NOT_KEPT,
+    Integrity,
+    Metadata,
+    custom_data,
+    keep_entries,
+)
 from restock.ingest.decoding.messages import Channel, MessageBatch
 
 GROUP_BYTES = 8 << 20  # of chunks decoded together: enough to amortise numpy's calls
@@ -42,6 +48,7 @@ class McapFile:
             self._checks.damaged(what, {})
         self._refuse_cut(salvage)
         self.extras = self._contents.extras
+        self.metadata = self._metadata()
         if self._contents.unnamed:
             self.notes.append(f"{self._contents.unnamed:,} more attachments and metadata records")
         self._chunks = ChunkReader(self._file, self._checks, self._contents.cut_chunk)
@@ -63,6 +70,21 @@ class McapFile:
             self._checks.damaged(lost, {})
         if self._contents.cut_chunk:
             self._contents.chunks.append(self._contents.cut_chunk)
+
+    def _metadata(self) -> list[Metadata]:
+        """What its metadata records say, rosbag2's own included."""
+        kept, left_out = self._contents.metadata, self._contents.left_out
+        custom = Metadata(f"custom_data in {self.path.name}", "", {})
+        try:
+            said, more = custom_data(self._contents.rosbag2)
+            entries, beyond = keep_entries(said, kept)
+            custom = custom._replace(entries=entries)
+            left_out += more + beyond
+        except ValueError as problem:
+            self.notes.append(f"its metadata record {ROSBAG2!r}: {problem}")
+        if left_out:
+            self.notes.append(f"{left_out:,} entries of its metadata: {NOT_KEPT}")
+        return [*kept, custom]
 
     # -- contents ---------------------------------------------------------------------
 

@@ -85,6 +85,7 @@ class _Opening:
         return Recording(
             *(self.path, self._format(), files, self.storages, self.distro),
             *(self.damage, self.notes, self.cleanup),
+            metadata=[metadata.custom_data] if metadata.custom_data else [],
         )
 
     def _bag(self) -> tuple[list[Path], BagMetadata]:

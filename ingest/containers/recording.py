@@ -16,7 +16,7 @@ from typing import Self
 
 from restock.errors import RecordingError
 from restock.ingest.containers.compression import decompressed
-from restock.ingest.containers.storage import Damage, Extra, Integrity, Storage
+from restock.ingest.containers.storage import Damage, Extra, Integrity, Metadata, Storage
 from restock.ingest.containers.topic_reading import (
     Account,
     LostMessages,
@@ -66,12 +66,15 @@ class Recording:
         damage: Sequence[Damage] = (),
         notes: Sequence[str] = (),
         cleanup: Sequence[Callable[[], None]] = (),
+        *,
+        metadata: Sequence[Metadata] = (),
     ) -> None:
         self.path, self.format, self.files, self.distro = path, format, tuple(files), distro
         self.accounts: dict[str, Account] = {}
         self._storages = tuple(storages)
         self.notes = [*notes, *(note for storage in self._storages for note in storage.notes)]
         self._bag_damage, self._cleanup = list(damage), tuple(cleanup)
+        self._bag_metadata = tuple(metadata)
         self._streams: dict[str, list[_Stream]] = {}
         # By storage and channel: what its messages are, or why they cannot be decoded.
         self._types: dict[tuple[int, int], MessageType | CannotDecode] = {}
@@ -163,6 +166,12 @@ class Recording:
     def extras(self) -> list[Extra]:
         """What its files hold besides messages: attachments and metadata records, by name."""
         return [extra for storage in self._storages for extra in storage.extras]
+
+    @property
+    def metadata(self) -> list[Metadata]:
+        """What it says of itself as a whole: the custom_data of a bag, metadata records."""
+        every = [*self._bag_metadata, *(m for storage in self._storages for m in storage.metadata)]
+        return [item for item in every if item.entries]
 
     @property
     def lost_messages(self) -> list[LostMessages]:

@@ -15,7 +15,7 @@ from rosbags.rosbag1 import Reader, ReaderError
 from rosbags.rosbag1.reader import Chunk, Header, IndexData, RecordType
 
 from restock.errors import RecordingError
-from restock.ingest.containers.storage import Damage, Extra, Integrity
+from restock.ingest.containers.storage import Damage, Extra, Integrity, Metadata
 from restock.ingest.decoding.messages import Channel, MessageBatch
 
 # A chunk's size is the file's claim: what decompresses to more than both is refused.
@@ -41,6 +41,7 @@ class Ros1File:
         self.damage: list[Damage] = []
         self.notes: list[str] = []
         self.extras: list[Extra] = []
+        self.metadata: list[Metadata] = []  # the format has no place for it
         self._reader = _Bag(path)
         try:
             self._reader.open()

@@ -22,7 +22,15 @@ import numpy as np
 
 from restock.errors import RecordingError
 from restock.ingest.containers.sqlite_salvage import SalvagedSqliteFile
-from restock.ingest.containers.storage import Damage, Extra, Integrity
+from restock.ingest.containers.storage import (
+    NOT_KEPT,
+    Damage,
+    Extra,
+    Integrity,
+    Metadata,
+    custom_data,
+    keep_entries,
+)
 from restock.ingest.decoding.messages import Channel, MessageBatch, PendingBatch
 
 MAGIC = b"SQLite format 3\x00"
@@ -30,6 +38,7 @@ ROWS_PER_FETCH = 1000
 BYTES_PER_BATCH = 8 << 20
 LARGE_ROW = 1 << 20  # bytes: larger ones are not fetched some at a time
 LARGEST_MESSAGE = 256 << 20
+LARGEST_METADATA = 2 << 20  # characters
 MOST_FOUND = 10  # by the check: one is enough to refuse the file
 STEPS_PER_BYTE = 64  # of sqlite's machine; reading rows of a few bytes takes one or two
 FEWEST_STEPS = 10_000_000
@@ -81,6 +90,7 @@ class SqliteFile:
         self.damage: list[Damage] = []
         self.notes: list[str] = []
         self.extras: list[Extra] = []
+        self.metadata: list[Metadata] = []
         self._copy: tempfile.TemporaryDirectory[str] | None = None
         self._refuse_short()
         self._connection = self._connect()
@@ -90,6 +100,7 @@ class SqliteFile:
             self.channels = self._read_channels()
             self._connection.execute("SELECT id, topic_id, timestamp, data FROM messages LIMIT 0")
             self.counts, self.span_ns = self._count()
+            self._read_metadata()
         except (sqlite3.Error, UnicodeError) as error:  # its messages, too, quote what they read
             self.close()
             raise RecordingError(
@@ -189,6 +200,25 @@ class SqliteFile:
             counts[number] = count
             stamps += [stamp for stamp in (first, last) if stamp is not None]
         return counts, (min(stamps), max(stamps)) if stamps else None
+
+    def _read_metadata(self) -> None:
+        """rosbag2 keeps its metadata.yaml here too; the last row is of when it was closed."""
+        try:
+            refuse_programs(self._connection, ("metadata",))
+            row = self._connection.execute(
+                "SELECT substr(metadata, 1, ?) FROM metadata ORDER BY id DESC LIMIT 1",
+                (LARGEST_METADATA,),
+            ).fetchone()
+            said, more = custom_data(str(row[0] or "") if row else "")
+        except sqlite3.OperationalError:  # older bags have no such table
+            return
+        except (sqlite3.DatabaseError, ValueError) as problem:
+            self.notes.append(f"its own metadata cannot be used: {problem}")
+            return
+        entries, beyond = keep_entries(said)
+        self.metadata.append(Metadata(f"custom_data in {self.path.name}", "", entries))
+        if more + beyond:
+            self.notes.append(f"{more + beyond:,} entries of its metadata: {NOT_KEPT}")
 
     def _damaged(self, what: str) -> None:
         self.integrity = "damaged"

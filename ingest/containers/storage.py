@@ -2,14 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+import re
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from typing import Literal, NamedTuple, Protocol
+
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
 
 from restock.errors import visible
 from restock.ingest.decoding.messages import Channel, MessageBatch
 
 Integrity = Literal["verified", "unverified", "damaged"]
+
+# Of a file's metadata so much is kept; the rest is counted.
+MOST_ENTRIES = 1_000
+LONGEST_TEXT = 4_096  # characters of a name or value
+LONGEST_CUSTOM_DATA = 64 << 10  # characters: the parser is slow
+NOT_KEPT = f"no text, longer than {LONGEST_TEXT:,} characters, or beyond the {MOST_ENTRIES:,}th"
+# What the YAML library raises of an invalid document, or of one that it does not expect.
+INVALID_YAML = (
+    *(YAMLError, KeyError, IndexError, TypeError, ValueError, AttributeError, AssertionError),
+    *(RecursionError, OverflowError, NotImplementedError),
+)
+# The key, and the lines further in: two spaces in metadata.yaml, none in what storages keep.
+_CUSTOM_DATA = re.compile(
+    r"^(?P<indent> {0,4})custom_data:(?P<value>.*)(?P<block>(?:\n(?:(?P=indent) .*|[ \t]*$))*)",
+    re.MULTILINE,
+)
 
 
 @dataclass
@@ -37,12 +57,58 @@ class Extra:
             object.__setattr__(self, name, visible(getattr(self, name)))
 
 
+class Metadata(NamedTuple):
+    """What a recorder, or who came after it, says of a whole recording: text by name."""
+
+    source: str  # where it says so, for errors
+    record: str  # name of the MCAP record; "" for the custom_data of a bag
+    entries: Mapping[str, str]
+
+
+def keep_entries(
+    said: Mapping[str, str], kept: Collection[Metadata] = ()
+) -> tuple[dict[str, str], int]:
+    """Those of a record's entries that are kept beside `kept`, and how many are not."""
+    room = MOST_ENTRIES - sum(len(item.entries) for item in kept)
+    short = {n: v for n, v in said.items() if len(n) <= LONGEST_TEXT and len(v) <= LONGEST_TEXT}
+    entries = dict(list(short.items())[: max(room, 0)])
+    return {visible(n): visible(v) for n, v in entries.items()}, len(said) - len(entries)
+
+
+def custom_data(text: str) -> tuple[dict[str, str], int]:
+    """rosbag2's `custom_data` in a bag's metadata, and how many of its entries are no text.
+
+    Only those lines are parsed, and their values stay as they are written: `007` is no number.
+
+    Raises:
+        ValueError: they are too long, or no YAML.
+    """
+    found = _CUSTOM_DATA.search(text)
+    if found is None:
+        return {}, 0
+    if found["value"].strip() in ("", "~", "null", "{}") and not found["block"].strip():
+        return {}, 0
+    lines = found[0]
+    if len(lines) > LONGEST_CUSTOM_DATA:
+        raise ValueError(f"custom_data has {len(lines):,} characters: not read")
+    try:
+        said = YAML(typ="base", pure=True).load(lines.strip())["custom_data"]
+    except INVALID_YAML as error:
+        why = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ValueError(f"custom_data cannot be used: {visible(why[:200])}") from error
+    if not isinstance(said, dict):
+        return {}, 1
+    entries = {n: v for n, v in said.items() if isinstance(n, str) and isinstance(v, str)}
+    return {n: v for n, v in entries.items() if v != "~"}, len(said) - len(entries)
+
+
 class Storage(Protocol):
     """One open file of messages.
 
     `counts` are the messages by the container's own count, per channel id; `span_ns` the first and
     last log time, or None when it holds no message. `damage` is final once everything wanted
-    has been read. `notes` are for the user to know and lose nothing. `extras` are listed, not read.
+    has been read. `notes` are for the user to know and lose nothing. `extras` are listed, not read;
+    `metadata` is what of them says something of the whole recording.
     """
 
     channels: dict[int, Channel]
@@ -51,6 +117,7 @@ class Storage(Protocol):
     damage: list[Damage]
     notes: list[str]
     extras: list[Extra]
+    metadata: list[Metadata]
 
     @property
     def integrity(self) -> Integrity:

@@ -2,7 +2,8 @@
 
 A profile is a TOML file: `name`, the shipped `conditions` it uses and `[[condition]]` of its own,
 `[task]`, `[clock]`, `[episodes]`, `[inputs.*]` (which topic fills what), `[frames]` (poses from
-transforms), `[signals.*]` (custom columns) and `[[zone]]` (named rectangles of the map).
+transforms), `[signals.*]` (custom columns), `[tags]` (whose drive it is) and `[[zone]]` (named
+rectangles of the map).
 `load_profile("warehouse_amr")` reads one that comes with Restock, `load_profile("my_robot.toml")`
 one of yours.
 """
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 
 from restock.errors import ConfigError
 from restock.ingest.profile.custom_signal import CustomSignal, name_problem
+from restock.ingest.profile.tag_rules import TagRules
 from restock.ingest.task.conditions import Condition, label, labels_version, shipped, with_files
 from restock.ingest.task.schema import steps_schema
 from restock.ingest.task.task import Task
@@ -152,6 +154,7 @@ class Profile(Checked, frozen=True):
     zones: list[Zone] = msgspec.field(default_factory=list, name="zone")
     frames: Frames | None = None
     signals: dict[str, CustomSignal] = msgspec.field(default_factory=dict)
+    tags: TagRules = TagRules()
 
     @property
     def conditions(self) -> list[Condition]:
@@ -165,11 +168,13 @@ class Profile(Checked, frozen=True):
 
     @property
     def hash(self) -> str:
-        """12 hex digits of everything in the profile but its conditions: rows depend on that.
+        """12 hex digits of everything in the profile that rows depend on.
 
-        Labels depend on `labels_version`: they can be changed without the recordings.
+        That leaves out conditions, which can be changed without the recordings (labels depend on
+        `labels_version`), and whose drive it is.
         """
-        rest = msgspec.structs.replace(self, shipped_conditions=[], own_conditions=[])
+        without = msgspec.structs.replace(self, shipped_conditions=[], own_conditions=[])
+        rest = {key: value for key, value in msgspec.to_builtins(without).items() if key != "tags"}
         return hashlib.blake2b(msgspec.json.encode(rest), digest_size=6).hexdigest()
 
     @property

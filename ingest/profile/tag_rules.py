@@ -6,10 +6,117 @@ each other; where both say the same, or one of them nothing, there is no questio
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import TypeAlias
+
+import msgspec
 
 from restock.errors import RecordingError
+from restock.ingest.task.tags import MOST_TAGS, NAMED, in_words, tag_problem
+from restock.toml import Checked
+
+Said: TypeAlias = "tuple[str, str, Mapping[str, str]]"  # source, record, entries: of a recording
+_TABLE = "`[tags]` of the profile"
+
+
+class TagRules(Checked, frozen=True):
+    """The `[tags]` of a profile: what of a path, and of a recording's metadata, is a tag.
+
+    `from_path` is a pattern of the path's last parts, or several, of which the first that matches
+    counts: `{robot}` is a tag, `{robot:[0-9]+}` one of the form of a regular expression, `*`
+    anything within a part, `**` any number of parts. `from_metadata` says which entry of the
+    recording's metadata is a tag of another name: `robot = "vehicle_id"`, or
+    `"record.vehicle_id"` where several records have one.
+    """
+
+    from_path: str | list[str] = msgspec.field(default_factory=list)
+    from_metadata: dict[str, str] = msgspec.field(default_factory=dict)
+
+    def check(self) -> None:
+        for pattern in self.patterns:
+            path_pattern(pattern)
+        for name in self.from_metadata:
+            if problem := tag_problem(name, ""):
+                raise ValueError(f"from_metadata: {problem}")
+
+    @property
+    def patterns(self) -> list[str]:
+        return [self.from_path] if isinstance(self.from_path, str) else self.from_path
+
+    def of_path(self, path: Path, given: Collection[str]) -> dict[str, dict[str, str]]:
+        """What the path says, by the pattern that says so; nothing without a pattern.
+
+        Raises:
+            RecordingError: no pattern matches, and `given` leaves open what they would say.
+        """
+        place = Path(os.path.abspath(path)).as_posix()  # noqa: PTH100  (".." out, links kept)
+        for pattern in self.patterns:
+            if found := path_pattern(pattern).fullmatch(place):
+                tags = {name: value for name, value in found.groupdict().items() if value}
+                for name, value in tags.items():
+                    if problem := tag_problem(name, value):
+                        raise RecordingError(problem, where=str(path), remedy="rename the folder")
+                return {f"its path ({pattern})": tags}
+        asked = {name for pattern in self.patterns for name in path_pattern(pattern).groupindex}
+        if asked <= set(given):
+            return {}
+        listed = " nor ".join(map(repr, self.patterns))
+        raise RecordingError(
+            f"its path does not match {listed}, the from_path in {_TABLE}",
+            where=place,
+            remedy='mend the pattern, add one for such paths (from_path = ["…", "…"]), or say'
+            f" {' '.join(f'--tag {name}=…' for name in sorted(asked))}",
+        )
+
+    def of_metadata(
+        self, said: Sequence[Said], given: Collection[str], where: str
+    ) -> tuple[dict[str, dict[str, str]], list[str]]:
+        """What a recording says of itself, by where it does, and what there is to say of the rest.
+
+        Raises:
+            RecordingError: it contradicts itself about a tag that is not `given`.
+        """
+        found: dict[str, list[tuple[str, str, str]]] = {}  # value, source, record
+        for source, record, entries in said:
+            for key, value in entries.items():
+                for name in self._names(record, key):
+                    if value.strip() and name not in given:
+                        found.setdefault(name, []).append((value, source, record))
+        named = [name for name in (*NAMED, *self.from_metadata) if name in found]
+        sources: dict[str, dict[str, str]] = {}
+        left_out: list[str] = []
+        room = MOST_TAGS
+        for name in dict.fromkeys([*named, *found]):
+            value, source, _ = found[name][0]
+            other = next((entry for entry in found[name] if entry[0] != value), None)
+            # Of a name that is only text to us, two records may mean two things.
+            same = name in named or not any(record for _, _, record in found[name])
+            if other and same:
+                raise _contradiction(name, (value, source), other[:2], where)
+            if other or not room or tag_problem(name, value):
+                left_out.append(name)
+            else:
+                sources.setdefault(source, {})[name] = value
+                room -= 1
+        if not left_out:
+            return sources, []
+        some = ", ".join(repr(name[:40]) for name in left_out[:5])
+        return sources, [
+            f"{len(left_out):,} names in its metadata are no tags ({some}"
+            f"{', …' if len(left_out) > 5 else ''}): too long, not printable, of several values, or"
+            f" beyond the {MOST_TAGS}th"
+        ]
+
+    def _names(self, record: str, key: str) -> list[str]:
+        """The tags that an entry of the metadata is."""
+        wanted = (key, f"{record}.{key}")
+        asked = [name for name, source in self.from_metadata.items() if source in wanted]
+        return asked or [key] * (key not in self.from_metadata)
 
 
 @dataclass
@@ -21,39 +128,120 @@ class Told:
 
 
 def resolve_tags(
-    sources: Mapping[str, Mapping[str, str]],
+    rules: TagRules,
+    path: Path,
+    said: Sequence[Said],
     given: Mapping[str, str],
     before: Mapping[str, str],
-    where: str,
 ) -> Told:
     """The tags of one recording.
 
     Args:
-        sources: what the recording and its path say, by the name of each source.
+        rules: of its profile.
+        path: where it lies.
+        said: its own metadata.
         given: what the command line says: it decides, and an empty value takes a tag off.
-        before: the recording's tags in the store: those that nothing speaks of any more stay.
-        where: the recording, for errors.
+        before: its tags in the store: those that nothing speaks of any more stay.
 
     Raises:
-        RecordingError: two sources disagree, and the command line does not decide.
+        RecordingError: two sources disagree, or no pattern matches the path, and `given` does not
+            decide.
     """
-    tags = dict(given)
-    by: dict[str, str] = {}
-    for source, said in sources.items():
-        for name, value in said.items():
-            if name in given:
-                continue
-            if tags.setdefault(name, value) != value:
-                raise RecordingError(
-                    f"its tag {name!r} is {tags[name]!r} by {by[name]}, and {value!r} by {source}",
-                    where=where,
-                    remedy=f"say which it is: --tag {name}={tags[name]} or --tag {name}={value}",
-                )
-            by.setdefault(name, source)
-    kept = {name: value for name, value in before.items() if name not in tags}
-    tags |= kept
-    told = Told({name: value for name, value in tags.items() if value})
+    own, notes = rules.of_metadata(said, given, str(path))
+    tags: dict[str, tuple[str, str]] = {}
+    for source, entries in (own | rules.of_path(path, given)).items():
+        for name, value in entries.items():
+            if tags.setdefault(name, (value, source))[0] != value and name not in given:
+                raise _contradiction(name, tags[name], (value, source), str(path))
+    told = {name: value for name, (value, _) in tags.items()} | dict(given)
+    kept = {name: value for name, value in before.items() if name not in told}
     if kept:
-        names = ", ".join(f"{name}={value}" for name, value in sorted(kept.items()))
-        told.notes.append(f"tags kept from the ingest before: {names} (--tag NAME= takes one off)")
-    return told
+        notes.append(
+            f"tags kept from the ingest before: {in_words(kept)} (--tag NAME= takes one off)"
+        )
+    return Told({name: value for name, value in (told | kept).items() if value}, notes)
+
+
+def _contradiction(
+    name: str, first: tuple[str, str], other: tuple[str, str], where: str
+) -> RecordingError:
+    return RecordingError(
+        f"its tag {name!r} is {first[0][:80]!r} by {first[1]}, and {other[0][:80]!r} by {other[1]}",
+        where=where,
+        remedy=f"say which it is: --tag {name}={first[0][:80]} or --tag {name}={other[0][:80]}",
+    )
+
+
+@cache
+def path_pattern(pattern: str) -> re.Pattern[str]:
+    """The regular expression of absolute paths that a `from_path` stands for.
+
+    Raises:
+        ValueError: the pattern cannot be read; says why.
+    """
+    parts = list(_parts(pattern.removeprefix("/")))
+    if not pattern.startswith("/") and "**" in parts and not re.match(r"[^{*?]", pattern):
+        raise ValueError(
+            f"from_path {pattern!r}: with ** it must begin with a folder's own name, or with /"
+        )
+    if "**" in parts[-1:] or not all(parts):
+        raise ValueError(f"from_path {pattern!r}: its last part is the recording's name, such as *")
+    begin = "/" if pattern.startswith("/") else "/(?:.*/)?"
+    *folders, last = parts
+    text = "".join("(?:[^/]+/)*" if p == "**" else _of_part(p, pattern) + "/" for p in folders)
+    text += _of_part(last, pattern)
+    names = re.findall(r"\(\?P<(\w+)>", text)
+    if not names:
+        raise ValueError(f"from_path {pattern!r} names no tag: such as {{robot}}/*")
+    if doubled := [name for name in names if names.count(name) > 1]:
+        raise ValueError(f"from_path {pattern!r}: {{{doubled[0]}}} is in it twice")
+    try:
+        return re.compile(begin + text)
+    except re.error as error:
+        raise ValueError(f"from_path {pattern!r}: {error}") from None
+
+
+def _parts(pattern: str) -> Iterator[str]:
+    """A pattern between its slashes; those in braces are of a regular expression."""
+    depth, part = 0, ""
+    for letter in pattern:
+        depth += (letter == "{") - (letter == "}")
+        if letter == "/" and depth == 0:
+            yield part
+            part = ""
+        else:
+            part += letter
+    if depth:
+        raise ValueError(f"from_path {pattern!r}: its braces do not match")
+    yield part
+
+
+def _of_part(part: str, pattern: str) -> str:
+    """The regular expression of one part of a path."""
+    text, rest = "", part
+    while rest:
+        if rest.startswith("{"):
+            end = _closing(rest)
+            name, colon, fits = rest[1:end].partition(":")
+            if not re.fullmatch(r"[A-Za-z_]\w*", name):
+                raise ValueError(f"from_path {pattern!r}: {{{name}}} is no name of a tag")
+            try:
+                re.compile(fits)
+            except re.error as error:
+                raise ValueError(f"from_path {pattern!r}: {fits!r}: {error}") from None
+            text += f"(?P<{name}>{fits if colon else '[^/]+?'})"
+            rest = rest[end + 1 :]
+        else:
+            text += {"*": "[^/]*", "?": "[^/]"}.get(rest[0], re.escape(rest[0]))
+            rest = rest[1:]
+    return "(?=[^/])" + text
+
+
+def _closing(text: str) -> int:
+    """Where the brace that a text begins with is closed."""
+    depth = 0
+    for place, letter in enumerate(text):
+        depth += (letter == "{") - (letter == "}")
+        if not depth:
+            return place
+    raise AssertionError(text)  # `_parts` has counted them

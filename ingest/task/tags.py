@@ -6,7 +6,6 @@ are in their column `tags`.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping
 
 from restock.errors import ConfigError
@@ -14,7 +13,6 @@ from restock.errors import ConfigError
 NAMED = ("robot", "site", "firmware", "map", "shift")  # columns of the views
 MOST_TAGS = 64  # of a recording
 LONGEST_NAME, LONGEST_VALUE = 64, 256  # characters
-_NAME = re.compile(rf"[A-Za-z_][A-Za-z0-9_.-]{{0,{LONGEST_NAME - 1}}}")
 
 
 def parse_tags(texts: Iterable[str], *, flag: str = "--tag", empty: bool = False) -> dict[str, str]:
@@ -32,7 +30,7 @@ def parse_tags(texts: Iterable[str], *, flag: str = "--tag", empty: bool = False
     tags: dict[str, str] = {}
     for text in texts:
         name, equals, value = text.partition("=")
-        value = value.strip()
+        name, value = name.strip(), value.strip()
         if not equals or not (value or empty):
             raise ConfigError(
                 f"{text!r} is not KEY=VALUE", where=flag, remedy=f"such as {flag} robot=amr-07"
@@ -54,10 +52,10 @@ def parse_tags(texts: Iterable[str], *, flag: str = "--tag", empty: bool = False
 
 def tag_problem(name: str, value: str) -> str | None:
     """Why this cannot be a tag, or None."""
-    if not _NAME.fullmatch(name):
+    if not 0 < len(name) <= LONGEST_NAME or "=" in name or not name.isprintable():
         return (
-            f"{name[: LONGEST_NAME + 1]!r} is no name of a tag: at most {LONGEST_NAME} letters,"
-            " digits, _, . and -, a letter or _ first"
+            f"{name[: LONGEST_NAME + 1]!r} is no name of a tag: 1 to {LONGEST_NAME} characters,"
+            " without = and control characters"
         )
     if len(value) > LONGEST_VALUE:
         return f"the value of {name} has {len(value):,} characters, more than {LONGEST_VALUE}"

@@ -77,8 +77,9 @@ MAY_IMPORT = {
         " train/evaluation train/run train/study train/twin/calibration"
     ),
     "cli/twin": (
-        "cli report ingest/profile replay/store train/evaluation train/twin/calibration"
-        " train/twin/env train/twin/floors train/twin/physics train/twin/recording"
+        "cli report ingest/profile ingest/task replay/store train/evaluation"
+        " train/twin/calibration train/twin/env train/twin/floors train/twin/physics"
+        " train/twin/recording"
     ),
 }
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from datetime import datetime
 from itertools import islice
 from pathlib import Path
 
@@ -24,20 +25,32 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 from restock.train.twin.recording.missions import BLOCK, FLEET, NATURAL, parse_shares, schedule
-from restock.train.twin.recording.recorder import HARDWARE, RecordingPlan, parse_rates, record
+from restock.train.twin.recording.recorder import (
+    HARDWARE,
+    RecordingPlan,
+    parse_rates,
+    parse_start,
+    record,
+)
 
 
 def test_both_formats_hold_the_same_drive(tmp_path: Path) -> None:
+    """Whose it is, too: ingest reads the tags that the recorder writes."""
     tables = []
+    tags, start_ns = {"robot": "amr-07", "line": "007"}, parse_start("2026-10-05T10:00+02:00")
     for name, file_format in (("a.mcap", "mcap"), ("a", "rosbag2")):
-        record(tmp_path / name, RecordingPlan(format=file_format, missions=1, seed=3))
+        plan = RecordingPlan(format=file_format, missions=1, seed=3, tags=tags, start_ns=start_ns)
+        record(tmp_path / name, plan)
         store = tmp_path / f"store_{file_format}"
         ingest(tmp_path / name, load_profile("warehouse_amr"), store=StoreWriter(store))
         columns = "observation, action, reward, next_observation, terminated, truncated, stamp_ns"
         query = (
             f"SELECT {columns}, condition, behaviour_policy FROM transitions ORDER BY step_index"
         )
-        tables.append(Store(store).sql(query).to_arrow_table())
+        with Store(store) as opened:
+            tables.append(opened.sql(query).to_arrow_table())
+            told = "SELECT DISTINCT robot, tags, date_trunc('hour', logged_time) FROM transitions"
+            assert opened.sql(told).fetchall() == [("amr-07", tags, datetime(2026, 10, 5, 8))]
     assert len(tables[0]) > 20
     assert tables[0].equals(tables[1])
 
@@ -157,6 +170,14 @@ def test_flags_from_python() -> None:
     assert parse_shares("nominal=.5, wheel_slip=.5") == {"nominal": 0.5, "wheel_slip": 0.5}
     assert parse_rates("odom=20,scan=5").odom == 20
     assert parse_rates("").imu == 50
+    assert parse_start("2026-10-05T08:00") == parse_start("2026-10-05T10:00+02:00")
+    assert parse_start("1970-01-02") == 86_400 * 10**9
+    with pytest.raises(ConfigError, match="'soon' is no time"):
+        parse_start("soon")
+    with pytest.raises(ConfigError, match="between 1970 and 2200"):
+        RecordingPlan(missions=1, start_ns=-1)
+    with pytest.raises(ConfigError, match="no name of a tag"):
+        RecordingPlan(missions=1, tags={"": "x"})
     with pytest.raises(ConfigError, match="give minutes or missions"):
         RecordingPlan()
 

@@ -8,7 +8,7 @@ bytes, wherever and whenever they are written.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +33,7 @@ from restock.errors import RecordingError
 from restock.train.twin.recording.messages import typestore
 
 Format = Literal["mcap", "rosbag2"]
+TAGS_RECORD = "tags"  # name of the metadata record of an MCAP file
 CHUNK_BYTES = 2 << 20  # some twenty seconds of one robot: still cheap to seek, and compresses well
 
 
@@ -67,8 +68,12 @@ class Sink(Protocol):
 
 
 @contextmanager
-def recording_sink(path: Path, file_format: Format, topics: Sequence[Topic]) -> Iterator[Sink]:
+def recording_sink(
+    path: Path, file_format: Format, topics: Sequence[Topic], tags: Mapping[str, str] | None = None
+) -> Iterator[Sink]:
     """A sink that becomes `path` when the block ends well, and leaves nothing when it does not.
+
+    `tags` say whose drive it is, in an MCAP file's metadata or a rosbag2 folder's custom_data.
 
     Raises:
         RecordingError: `path` exists, or its folder cannot be written to.
@@ -86,7 +91,9 @@ def recording_sink(path: Path, file_format: Format, topics: Sequence[Topic]) -> 
     try:
         # The bag's folder gives its database its name, so the temporary one has the final name.
         partial = scratch / path.name
-        sink: Sink = (McapSink if file_format == "mcap" else Rosbag2Sink)(partial, topics)
+        sink: Sink = (McapSink if file_format == "mcap" else Rosbag2Sink)(
+            partial, topics, tags or {}
+        )
         try:
             yield sink
             sink.close()
@@ -112,12 +119,14 @@ def refuse_existing(path: Path) -> None:
 class McapSink:
     """MCAP, profile ros2: zstd chunks with CRCs and message indexes, `ros2msg` schemas."""
 
-    def __init__(self, path: Path, topics: Sequence[Topic]) -> None:
+    def __init__(self, path: Path, topics: Sequence[Topic], tags: Mapping[str, str]) -> None:
         self._stream = path.open("wb")
         self._writer = McapWriter(
             self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD
         )
         self._writer.start(profile="ros2", library="restock")
+        if tags:  # first, where a file that is cut short has it too
+            self._writer.add_metadata(TAGS_RECORD, dict(sorted(tags.items())))
         schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._sequence = dict.fromkeys((topic.name for topic in topics), 0)
@@ -162,9 +171,11 @@ class Rosbag2Sink:
     This storage keeps one time a message, when it was received: `publish_ns` is not kept.
     """
 
-    def __init__(self, path: Path, topics: Sequence[Topic]) -> None:
+    def __init__(self, path: Path, topics: Sequence[Topic], tags: Mapping[str, str]) -> None:
         self._path = path
         self._writer = Rosbag2Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3)
+        for name, value in sorted(tags.items()):
+            self._writer.set_custom_data(name, value)
         self._writer.open()
         self._connections: dict[str, Connection] = {
             topic.name: self._writer.add_connection(

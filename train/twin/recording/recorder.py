@@ -11,6 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ import numpy as np
 
 from restock.errors import ConfigError
 from restock.ingest.task.label_scores import primary_of
+from restock.ingest.task.tags import tag_problem
 from restock.toml import typed
 from restock.train.twin.env.interface import Policy
 from restock.train.twin.floors.cells import cells_of
@@ -71,6 +73,7 @@ NOISELESS = Perturbation(
     accel_noise_mps2=0.0,
 )
 FIRST_NS = 1_772_438_400_000_000_000  # 2026-03-02, 08:00 UTC: a fixed morning, for the same bytes
+LATEST_START_NS = 7_258_118_400 * 10**9  # 2200: stamps are 64 bits, to 2262
 LIDAR_RANGE_M = (0.05, 25.0)
 MAP_CELL_M = 0.1
 
@@ -90,6 +93,7 @@ class RecordingPlan:
     hardware: Perturbation | Schedule = HARDWARE  # a schedule draws one for every mission
     layouts: str = DEFAULT  # floors, as `restock.train.twin.floors.floors.open_floors` reads them
     start_ns: int = FIRST_NS  # when the first mission starts
+    tags: Mapping[str, str] = field(default_factory=dict)  # whose drive it is: robot, site, …
 
     def __post_init__(self) -> None:
         """Raises ConfigError where the recording would have no end, or nothing in it."""
@@ -99,6 +103,14 @@ class RecordingPlan:
             value = getattr(self, name)
             if value is not None and not 0 < value < float("inf"):
                 raise ConfigError(f"{name} must be above 0, got {value}", where="recording")
+        for name, value in self.tags.items():
+            if problem := tag_problem(name, value):
+                raise ConfigError(problem, where="recording")
+        if not 0 <= self.start_ns < LATEST_START_NS:
+            raise ConfigError(
+                f"a recording begins between 1970 and 2200, not at {self.start_ns} ns",
+                where="recording",
+            )
         if self.seed < 0:
             raise ConfigError(f"seed must be 0 or more, got {self.seed}", where="recording")
         if self.epsilon is not None and not 0 <= self.epsilon <= 1:
@@ -123,6 +135,8 @@ class RecordingPlan:
             "rates_hz": msgspec.structs.asdict(self.rates),
             "hardware": self.hardware.name,
             "layouts": self.layouts,
+            "start": date_text(self.start_ns),
+            "tags": dict(self.tags),
             "topics": [topic.name for topic in TOPICS],
         }
 
@@ -150,6 +164,8 @@ class RecordingSummary:
             "format": self.plan.format,
             "seed": self.plan.seed,
             "size_bytes": sum(file.stat().st_size for file in files),
+            "start": date_text(self.plan.start_ns),
+            "tags": dict(self.plan.tags),
             "minutes": round(self.minutes, 3),
             "missions": dict(self.missions),
             "succeeded": {kind: self.succeeded[kind] for kind in self.missions},
@@ -202,7 +218,7 @@ def record(
         fleet.env.num_envs, seed=plan.seed, epsilon=plan.epsilon, external=external
     )
     start_ns = plan.start_ns
-    with recording_sink(path, plan.format, TOPICS) as sink:
+    with recording_sink(path, plan.format, TOPICS, plan.tags) as sink:
         floor: Warehouse | None = None
         for driven in fleet.drive(islice(missions, plan.missions), drivers):
             if driven.floor is not floor:  # the map comes once, and again on another floor
@@ -232,6 +248,28 @@ def record(
                 break
     summary.work_s = time.perf_counter() - begun
     return summary
+
+
+def parse_start(text: str) -> int:
+    """When a recording begins, in nanoseconds: an ISO date or time, UTC where it names no zone.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise ConfigError(
+            f"{text!r} is no time", where="--start", remedy="such as 2026-10-05T08:00"
+        ) from error
+    moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+    return (moment - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
+
+
+def date_text(moment_ns: int) -> str:
+    """A moment as ISO has it, UTC."""
+    moment = datetime.fromtimestamp(moment_ns // 10**9, UTC)
+    return moment.isoformat().replace("+00:00", "Z")
 
 
 def parse_rates(text: str) -> Rates:

@@ -10,7 +10,8 @@ import tyro
 
 from restock.errors import ExitCode, RecordingError, visible
 
-NAMED = 10  # attachments and metadata records that are listed
+NAMED = 10  # attachments, metadata records and their entries that are listed
+LONGEST = 60  # characters of an entry's value that are shown
 
 
 @dataclass
@@ -108,6 +109,12 @@ def _print(entry: dict[str, Any]) -> None:
             more = f" and {len(names) - NAMED:,} more" if len(names) > NAMED else ""
             listed = ", ".join(name or "(unnamed)" for name in names[:NAMED])
             sys.stdout.write(f"{what}, {len(names):,}: {listed}{more}\n")
+    for said in entry["says"]:
+        pairs = [
+            f"{name}={value[:LONGEST]}" for name, value in list(said["entries"].items())[:NAMED]
+        ]
+        more = len(said["entries"]) - NAMED
+        sys.stdout.write(f"{said['source']}: {', '.join(pairs)}{f', {more:,} more' * (more > 0)}\n")
     sys.stdout.flush()
     for line in entry["damage"]:
         sys.stderr.write(visible(f"{entry['path']}: damaged: {line}") + "\n")

@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
 
 from restock.errors import ConfigError, RestockError
 
@@ -28,6 +30,7 @@ class RecordCommand:
 
         restock record --out drive.mcap --minutes 5
         restock record --out icy --missions 20 --conditions nominal=.5,wheel_slip=.5
+        restock record --out amr07.mcap --tag robot=amr-07 --tag site=oslo --start 2026-10-05T08:00
         restock record --out mine.mcap --policy run:runs/a --epsilon .05
     """
 
@@ -39,6 +42,13 @@ class RecordCommand:
     """Stop after the mission in which this much driving is recorded (default 5)."""
     missions: int | None = None
     """Stop after so many missions instead."""
+    tag: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="KEY=VALUE")
+    ] = ()
+    """Whose drive it is, such as robot=amr-07: a metadata record of the MCAP file, custom_data of
+    the rosbag2 folder. May be given several times."""
+    start: Annotated[str | None, tyro.conf.arg(metavar="TIME")] = None
+    """When the first mission starts, as 2026-10-05T08:00 (UTC; default 2026-03-02T08:00)."""
     seed: int = 0
     """Of everything: missions, floor, traffic, noise, delays."""
     conditions: str | None = None
@@ -68,16 +78,19 @@ class RecordCommand:
     def run(self) -> None:
         """Record, and print what was recorded."""
         from restock.cli import output
+        from restock.ingest.task.tags import parse_tags
         from restock.train.twin.env.floor_report import refuse_unfit, sealed
         from restock.train.twin.floors.floors import open_floors
         from restock.train.twin.physics.perturbation import find_perturbation
         from restock.train.twin.recording.bag_writer import refuse_existing
         from restock.train.twin.recording.missions import NATURAL, parse_shares
         from restock.train.twin.recording.recorder import (
+            FIRST_NS,
             HARDWARE,
             NOISELESS,
             RecordingPlan,
             parse_rates,
+            parse_start,
             record,
         )
 
@@ -96,6 +109,8 @@ class RecordCommand:
             epsilon=self.epsilon,
             layouts=self.layouts,
             rates=parse_rates(self.rates or ""),
+            start_ns=FIRST_NS if self.start is None else parse_start(self.start),
+            tags=parse_tags(self.tag),
             hardware=(
                 hardware
                 if self.perturbation is None
@@ -189,5 +204,6 @@ def _print_plan(values: dict[str, Any]) -> None:
 
 def _in_words(value: Any) -> str:
     if isinstance(value, dict):
-        return ", ".join(f"{name} {item:g}" for name, item in value.items())
+        items = value.items()
+        return ", ".join(f"{n} {v if isinstance(v, str) else f'{v:g}'}" for n, v in items)
     return ", ".join(value) if isinstance(value, list) else str(value)

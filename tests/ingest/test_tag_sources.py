@@ -1,0 +1,260 @@
+"""What recordings and their paths say of themselves, and how a profile reads it."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from support.driven_robot import Drive, write_bag
+from support.profile_texts import WAREHOUSE
+
+from restock.cli import main
+from restock.errors import ConfigError, RecordingError
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.containers.storage import LONGEST_TEXT, MOST_ENTRIES, custom_data
+from restock.ingest.profile.profile import parse_profile
+from restock.ingest.profile.tag_rules import TagRules, path_pattern, resolve_tags
+from restock.ingest.task.tags import MOST_TAGS
+from restock.replay.store.store import Store
+
+
+def mcap(path: Path, *records: tuple[str, dict[Any, Any]]) -> Path:
+    """An MCAP file of one message, with these metadata records."""
+    with path.open("wb") as stream:
+        writer = McapWriter(stream)
+        writer.start()
+        for name, entries in records:
+            writer.add_metadata(name, entries)
+        channel = writer.register_channel("/a", "json", 0)
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.finish()
+    return path
+
+
+def bag(path: Path, plugin: StoragePlugin, data: dict[str, str]) -> Path:
+    types = get_typestore(Stores.ROS2_JAZZY)
+    with Writer(path, version=9, storage_plugin=plugin) as writer:
+        connection = writer.add_connection("/a", "std_msgs/msg/Bool", typestore=types)
+        message = types.types["std_msgs/msg/Bool"](True)
+        writer.write(connection, 1, types.serialize_cdr(message, "std_msgs/msg/Bool"))
+        for name, value in data.items():
+            writer.set_custom_data(name, value)
+    return path
+
+
+def said(path: Path) -> tuple[list[tuple[str, str, dict[str, str]]], list[str]]:
+    with open_recording(path) as recording:
+        return [(*item[:2], dict(item.entries)) for item in recording.metadata], recording.notes
+
+
+@pytest.mark.parametrize("plugin", list(StoragePlugin))
+def test_custom_data_of_a_bag_is_read_with_and_without_its_metadata_yaml(tmp_path, plugin):
+    """As it was written: `007`, a date and `~` inside are text."""
+    data = {"robot": "007", "day": "2026-10-05", "note": "a: b\n# c", "on": "yes"}
+    folder = bag(tmp_path / "bag", plugin, data)
+    shown = {**data, "note": "a: b\\n# c"}  # control characters as everywhere
+    (first, second), _ = said(folder)
+    assert first == ("custom_data in metadata.yaml", "", shown)
+    assert second == (f"custom_data in {next(folder.glob('bag.*')).name}", "", shown)
+    assert said(next(folder.glob("bag.*")))[0] == [second]
+
+
+def test_the_last_of_rosbag2_s_own_records_counts(tmp_path):
+    texts = [f"version: 9\ncustom_data:\n  robot: {name}\nros_distro: x" for name in ("a", "b")]
+    path = mcap(tmp_path / "a.mcap", *(("rosbag2", {"serialized_metadata": t}) for t in texts))
+    assert said(path) == ([("custom_data in a.mcap", "", {"robot": "b"})], [])
+
+
+def test_metadata_records_and_a_file_that_is_cut(tmp_path):
+    records = [("device", {"robot": "amr-07"}), ("left", {"serial": "1"}), ("empty", {})]
+    path = mcap(tmp_path / "a.mcap", *records)
+    found = [
+        ("metadata record 'device' of a.mcap", "device", {"robot": "amr-07"}),
+        ("metadata record 'left' of a.mcap", "left", {"serial": "1"}),
+    ]
+    assert said(path)[0] == found
+    path.write_bytes(path.read_bytes()[:-30])
+    with open_recording(path, salvage=True) as recording:
+        assert [(*item[:2], dict(item.entries)) for item in recording.metadata] == found
+
+
+def test_hostile_metadata_is_bounded_and_counted(tmp_path):
+    many = {f"key {number:05}": "x" for number in range(5_000)}
+    path = mcap(
+        tmp_path / "a.mcap",
+        ("large", {"value": "x" * 10_000_000, "robot": "amr\x1b[2J"}),
+        ("many", many),
+    )
+    raw = path.read_bytes().replace(b"key 00007", b"key \xff\xfe\xfd07")  # no UTF-8
+    path.write_bytes(raw)
+    (large, rest), notes = said(path)
+    assert large[2] == {"robot": r"amr\x1b[2J"}
+    assert len(rest[2]) == MOST_ENTRIES - 1
+    assert r"key \xff\xfe\xfd07" in rest[2]
+    left_out = 1 + 5_000 - (MOST_ENTRIES - 1)
+    assert notes[0].startswith(f"{left_out:,} entries of its metadata: no text, longer than")
+    told = resolve_tags(TagRules(), path, [large, rest], {}, {})
+    assert len(told.tags) == MOST_TAGS
+    assert f"{MOST_ENTRIES - MOST_TAGS:,} names in its metadata are no tags" in told.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("custom_data:\n  robot: [", "cannot be used: while parsing a flow node"),
+        ("custom_data:\n  robot: " + "x" * 70_000, "has 70,022 characters: not read"),
+        ("custom_data:\n  &a x: *b", "cannot be used: found undefined alias"),
+    ],
+)
+def test_custom_data_that_cannot_be_used(tmp_path, text, says):
+    with pytest.raises(ValueError, match=says):
+        custom_data(text)
+    folder = bag(tmp_path / "bag", StoragePlugin.SQLITE3, {})
+    with sqlite3.connect(folder / "bag.db3") as database:
+        database.execute("UPDATE metadata SET metadata = ?", (text,))
+    found, notes = said(folder)
+    assert found == []
+    assert any("its own metadata cannot be used: custom_data" in note for note in notes)
+
+
+def test_entries_of_custom_data_that_are_no_text_are_counted():
+    text = (
+        f"custom_data:\n  a: [1]\n  b: c\n\n  d: {{e: f}}\n  g: ~\n  h: {'x' * LONGEST_TEXT}\nz: 1"
+    )
+    entries, more = custom_data(text)
+    assert (list(entries), entries["b"], more) == (["b", "h"], "c", 2)
+    assert custom_data("custom_data: ~\n") == custom_data("version: 9") == ({}, 0)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "path", "tags"),
+    [
+        ("{site}/{robot}/*", "/data/oslo/amr-07/run.mcap", {"site": "oslo", "robot": "amr-07"}),
+        ("{site}/{robot}/*", "/amr-07/run.mcap", None),
+        ("/data/{site}/*", "/data/oslo/run", {"site": "oslo"}),
+        ("/data/{site}/*", "/mnt/data/oslo/run", None),
+        (
+            "{robot}_{day:[0-9]{8}}_*",
+            "/d/amr_07_20261005_a",
+            {"robot": "amr_07", "day": "20261005"},
+        ),
+        ("{robot}_*", "/d/amr_07_20261005_a", {"robot": "amr"}),
+        (
+            "fleet/{site}/**/{robot}.mcap",
+            "/a/fleet/oslo/x/y/7.mcap",
+            {"site": "oslo", "robot": "7"},
+        ),
+        ("fleet/{site}/**/{robot}.mcap", "/a/fleet/oslo/7.mcap", {"site": "oslo", "robot": "7"}),
+        ("{robot:[^/]+/[ab]}/*", "/d/amr/b/run", {"robot": "amr/b"}),
+        ("a?c.{robot}/*", "/abc.7/run", {"robot": "7"}),
+        ("a?c.{robot}/*", "/abcx7/run", None),
+    ],
+)
+def test_patterns_of_paths(pattern, path, tags):
+    found = path_pattern(pattern).fullmatch(path)
+    assert (found.groupdict() if found else None) == tags
+
+
+@pytest.mark.parametrize(
+    ("table", "says"),
+    [
+        ('from_path = "*/x"', "names no tag"),
+        ('from_path = "{robot}/**"', "with ** it must begin with a folder's own name"),
+        ('from_path = "fleet/{robot}/**"', "its last part is the recording's name"),
+        ('from_path = "{a b}/*"', "{a b} is no name of a tag"),
+        ('from_path = "{a/*"', "its braces do not match"),
+        ('from_path = "{a:[}/*"', "unterminated character set"),
+        ('from_path = ["{a}/*", "{a}/{a}"]', "{a} is in it twice"),
+        ('from_metadata = { "a=b" = "c" }', "'a=b' is no name of a tag"),
+        ('from_folder = "{a}/*"', "from_folder"),
+    ],
+)
+def test_rules_that_cannot_be_used(table, says):
+    with pytest.raises(ConfigError) as refused:
+        parse_profile(f"{WAREHOUSE}\n[tags]\n{table}\n", where="amr.toml")
+    assert "tags" in refused.value.what
+    assert says in refused.value.what
+
+
+PLACE = Path("/data/oslo/amr-07/run.mcap")
+RULES = TagRules(from_path="{site}/{robot}/*")
+
+
+def test_sources_that_agree_or_add_to_each_other():
+    own = [("a", "", {"robot": "amr-07", "line": "B"}), ("b", "", {"robot": "amr-07"})]
+    told = resolve_tags(RULES, PLACE, own, {"shift": "night"}, {})
+    assert told.tags == {"robot": "amr-07", "line": "B", "site": "oslo", "shift": "night"}
+    assert told.notes == []
+
+
+@pytest.mark.parametrize(
+    ("name", "own", "says"),
+    [
+        ("robot", [("a", "", "x")], "'x' by a, and 'amr-07' by its path ({site}/{robot}/*)"),
+        ("map", [("a", "", "x"), ("b", "", "y")], "'x' by a, and 'y' by b"),
+        ("map", [("a", "left", "x"), ("b", "right", "y")], "'x' by a, and 'y' by b"),
+        ("line", [("a", "", "x"), ("b", "", "y")], "'x' by a, and 'y' by b"),
+    ],
+)
+def test_sources_that_contradict_each_other(name, own, says):
+    said = [(source, record, {name: value}) for source, record, value in own]
+    with pytest.raises(RecordingError) as refused:
+        resolve_tags(RULES, PLACE, said, {}, {})
+    assert f"its tag {name!r} is {says}" in refused.value.what
+    assert f"say which it is: --tag {name}=x or --tag {name}=" in str(refused.value.remedy)
+    told = resolve_tags(RULES, PLACE, said, {name: "decided"}, {})
+    assert told.tags[name] == "decided"
+
+
+def test_records_that_mean_two_things_by_a_name():
+    """Left out and said, until the profile says which is meant."""
+    own = [("l", "left", {"serial": "1"}), ("r", "right", {"serial": "2"})]
+    told = resolve_tags(TagRules(), PLACE, own, {}, {})
+    assert told.tags == {}
+    assert "1 names in its metadata are no tags ('serial')" in told.notes[0]
+    rules = TagRules(from_metadata={"lidar": "left.serial", "site": "nowhere"})
+    assert resolve_tags(rules, PLACE, own, {}, {}).tags == {"lidar": "1", "serial": "2"}
+
+
+def test_a_path_that_no_pattern_matches_is_refused_unless_the_tags_are_given(tmp_path):
+    place = tmp_path / "run.mcap"
+    rules = TagRules(from_path=["never/{site}/{robot}/*", "nor/{robot}/*"])
+    with pytest.raises(RecordingError, match=r"match 'never/{site}/{robot}/\*' nor") as no:
+        resolve_tags(rules, place, [], {"robot": "amr-07"}, {})
+    assert "--tag robot=… --tag site=…" in str(no.value.remedy)
+    given = {"robot": "amr-07", "site": "oslo"}
+    assert resolve_tags(rules, place, [], given, {}).tags == given
+
+
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("fleet") / "oslo" / "amr-07"
+    folder.mkdir(parents=True)
+    return write_bag(Drive(), folder / "monday")
+
+
+def test_an_ingest_by_the_path_writes_all_or_nothing(driven, tmp_path, capsys, monkeypatch):
+    profile = tmp_path / "amr.toml"
+    profile.write_text(WAREHOUSE + '\n[tags]\nfrom_path = "{site:[a-z]+}/{robot}/*"\n')
+    options = ["--store", str(tmp_path / "store"), "--profile", str(profile)]
+    lost = tmp_path / "X" / "amr" / "monday"
+    shutil.copytree(driven, lost)
+    assert main(["ingest", str(lost), *options]) == 2
+    assert "does not match '{site:[a-z]+}/{robot}/*'" in capsys.readouterr().err
+    assert not (tmp_path / "store").exists()
+    monkeypatch.chdir(driven.parent)  # the path as it is given says nothing of the site
+    assert main(["ingest", "monday", *options]) == 0
+    with Store(tmp_path / "store") as store:
+        found = store.sql("SELECT DISTINCT robot, site FROM episodes").fetchall()
+    assert found == [("amr-07", "oslo")]
+
+
+def test_tag_rules_are_no_part_of_what_rows_depend_on():
+    tagged = parse_profile(WAREHOUSE + '\n[tags]\nfrom_path = "{robot}/*"\n', where="a")
+    assert tagged.hash == parse_profile(WAREHOUSE, where="a").hash
