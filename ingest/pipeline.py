@@ -162,7 +162,7 @@ class _Ingest:
         table, rows = recording_table(profile, steps, episodes, provenance)
         named = Counter(table["condition"].to_pylist())
         first = {name: named[name] for name in (*rows.labels, NOMINAL)}
-        scores = label_scores(table, rows.labels)
+        scores = label_scores(table, rows.labels, profile.task.control_period_s)
         facts = recorded_facts(self.recording, profile, columns, steps, episodes, rows)
         facts["tags"] = self.told.tags
         manifest = manifest_row(profile, provenance, table, scores, episodes.dropped, **facts)

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pyarrow as pa
 
@@ -24,8 +25,8 @@ from restock.ingest.profile.profile_text import (
     with_conditions,
 )
 from restock.ingest.store.episode_rows import episode_ends
-from restock.ingest.store.manifest import conditions_json, score_rows
-from restock.ingest.store.transitions import column_array, names_of
+from restock.ingest.store.manifest import conditions_json, count_rows, score_rows
+from restock.ingest.store.transitions import by_name, column_array, names_of
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.conditions import (
     NOMINAL,
@@ -33,11 +34,15 @@ from restock.ingest.task.conditions import (
     label,
     labels_version,
     primary,
+    probabilities,
     runnable,
+    too_near_to_call,
 )
 from restock.ingest.task.label_scores import LabelScore, label_scores
-from restock.ingest.task.schema import recording_schema
+from restock.ingest.task.schema import COVERAGE, recording_schema
+from restock.ingest.task.task import Task
 
+_LATER = {c.name: pa.field(c.name, c.type) for c in COVERAGE if c.nullable}
 TWIN = "twin"  # format of the recordings that training makes of its episodes
 
 
@@ -109,8 +114,11 @@ def _one(
     every_condition = conditions
     if row["format"] == TWIN:  # which fills none of the profile's own signals
         conditions = runnable(stored, conditions)
+    steps = pa.concat_tables([stored, ends.cast(stored.schema)])
+    begin = np.arange(len(rows))
     try:
-        every = label(pa.concat_tables([stored, ends.cast(stored.schema)]), conditions)
+        every = label(steps, conditions)
+        probable = probabilities(steps, conditions)
     except ConfigError as error:
         raise ConfigError(
             f"{error.where}: {error.what}",
@@ -125,22 +133,30 @@ def _one(
     ingest_id = uuid.uuid4().hex[:16]
     new = {
         "condition": named,
-        "conditions": names_of(labels, np.arange(len(rows))),
+        "conditions": names_of(labels, begin),
+        "probabilities": by_name(probable, begin),
+        "uncertain": names_of(too_near_to_call(probable, conditions), begin),
         "labels_version": version,
         "ingest_id": ingest_id,
     }
     metadata = rows.schema.metadata
     for name, values in new.items():
         index = rows.schema.get_field_index(name)
+        if index < 0:  # rows of an older store: it comes last
+            later = _LATER[name]
+            index = rows.num_columns
+            rows = rows.append_column(later, pa.nulls(len(rows), later.type))
         field = rows.schema.field(index)
         rows = rows.set_column(index, field, column_array(values, field.type, len(rows)))
     rows = rows.replace_schema_metadata(metadata)
-    scores = label_scores(rows, labels)
+    period_s = msgspec.json.decode(row["task_json"], type=Task, strict=False).control_period_s
+    scores = label_scores(rows, labels, period_s)
     manifest = row | {
         "ingest_id": ingest_id,
         "ingested_at": dt.datetime.now(dt.UTC),
         "labels_version": version,
         "label_scores": score_rows(scores),
+        "label_counts": count_rows(scores),
         "conditions_json": conditions_json(every_condition),
         "profile_toml": _with_conditions(row["profile_toml"], every_condition),
     }

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from restock.errors import RunError
 from restock.ingest.profile.profile import Profile
-from restock.ingest.store.episode_rows import EpisodeRows
+from restock.ingest.store.episode_rows import EpisodeRows, label_table
 from restock.ingest.store.manifest import definitions, manifest_row, software_version
 from restock.ingest.store.transitions import Provenance, TransitionValues, transition_table
 from restock.ingest.store.writer import StoreWriter
+from restock.ingest.task.conditions import probabilities
 from restock.ingest.task.label_scores import label_scores
 from restock.ingest.task.perturbation_columns import Perturbed
 from restock.ingest.task.schema import SIGNAL_COLUMNS, recording_schema
@@ -102,7 +103,9 @@ def _lay_out(episodes: Sequence[FreshEpisode], profile: Profile) -> EpisodeRows:
     }
     number = np.repeat(np.arange(len(episodes), dtype=np.int64), lengths)
     is_end = step == np.repeat(lengths, lengths) - 1
-    return EpisodeRows(tick, number, step, is_end, signals, labels, pa.table({}))
+    evaluated = [condition for condition in profile.conditions if condition.name in labels]
+    probable = probabilities(label_table(signals, number, step, pa.table({})), evaluated)
+    return EpisodeRows(tick, number, step, is_end, signals, labels, pa.table({}), probable)
 
 
 def _values(
@@ -161,7 +164,7 @@ def _manifest(
         profile,
         provenance,
         table,
-        label_scores(table, rows.labels),
+        label_scores(table, rows.labels, profile.task.control_period_s),
         {"physics blew up": dropped_steps} if dropped_steps else {},
         format=FORMAT,
         integrity="verified",

@@ -25,7 +25,14 @@ from numpy.typing import NDArray
 from restock.errors import ConfigError
 from restock.ingest.profile.custom_signal import CustomSignal, name_problem
 from restock.ingest.profile.tag_rules import TagRules
-from restock.ingest.task.conditions import Condition, label, labels_version, shipped, with_files
+from restock.ingest.task.conditions import (
+    Condition,
+    label,
+    labels_version,
+    probabilities,
+    shipped,
+    with_files,
+)
 from restock.ingest.task.schema import steps_schema
 from restock.ingest.task.task import Task
 from restock.toml import Checked, parse_toml, read_toml, typed
@@ -127,6 +134,24 @@ class Frames(Checked, frozen=True):
             raise ValueError(f"fixed and base are the same frame: {self.base!r}")
 
 
+class Noise(Checked, frozen=True):
+    """The `[noise]` of a profile: what the sensors' readings vary by, for probabilities.
+
+    Standard deviations. The SQL of conditions names them as `lidar_noise_m`, and so on.
+    """
+
+    lidar_m: Annotated[float, Meta(gt=0)] = 0.015  # of a range
+    localiser_m: Annotated[float, Meta(gt=0)] = 0.01  # of the way between two poses, each axis
+    wheels_mps: Annotated[float, Meta(gt=0)] = 0.003  # of the speed by the wheels
+    gyro_radps: Annotated[float, Meta(gt=0)] = 0.01  # its bias too
+
+    @property
+    def constants(self) -> dict[str, float]:
+        """Each by the name that SQL has for it."""
+        named = msgspec.structs.asdict(self)
+        return {"_noise_".join(name.rsplit("_", 1)): value for name, value in named.items()}
+
+
 class Zone(Checked, frozen=True):
     """A named rectangle of the map: `box_m = [x0, y0, x1, y1]`."""
 
@@ -155,12 +180,14 @@ class Profile(Checked, frozen=True):
     frames: Frames | None = None
     signals: dict[str, CustomSignal] = msgspec.field(default_factory=dict)
     tags: TagRules = TagRules()
+    noise: Noise = Noise()
 
     @property
     def conditions(self) -> list[Condition]:
         """The conditions that label this robot's steps."""
         known = shipped()
-        return [known[name] for name in self.shipped_conditions] + self.own_conditions
+        named = [known[name] for name in self.shipped_conditions] + self.own_conditions
+        return [condition.with_constants(self.noise.constants) for condition in named]
 
     @property
     def labels_version(self) -> str:
@@ -171,10 +198,11 @@ class Profile(Checked, frozen=True):
         """12 hex digits of everything in the profile that rows depend on.
 
         That leaves out conditions, which can be changed without the recordings (labels depend on
-        `labels_version`), and whose drive it is.
+        `labels_version`), their [noise], and whose drive it is.
         """
         without = msgspec.structs.replace(self, shipped_conditions=[], own_conditions=[])
-        rest = {key: value for key, value in msgspec.to_builtins(without).items() if key != "tags"}
+        values = msgspec.to_builtins(without)
+        rest = {key: value for key, value in values.items() if key not in ("tags", "noise")}
         return hashlib.blake2b(msgspec.json.encode(rest), digest_size=6).hexdigest()
 
     @property
@@ -324,8 +352,10 @@ def _check_conditions(profile: Profile, where: str) -> None:
     fields = [signal.field(name) for name, signal in profile.signals.items()]
     steps = steps_schema(fields).empty_table()
     for place, condition in enumerate(profile.own_conditions):
+        condition = condition.with_constants(profile.noise.constants)
         try:
             label(steps, [condition])
+            probabilities(steps, [condition])
         except ConfigError as error:
             raise ConfigError(
                 f"`condition[{place}].sql` ({condition.name!r}): {error.what}",

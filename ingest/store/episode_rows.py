@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pyarrow as pa
 
-from restock.arrays import Bools, Ints
+from restock.arrays import F32, Bools, Ints
 from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.episodes import Split, changed_route, with_route
 from restock.ingest.steps.steps import Steps
-from restock.ingest.task.conditions import label
+from restock.ingest.task.conditions import label, probabilities
 from restock.ingest.task.schema import SIGNAL_COLUMNS
 from restock.ingest.task.signals import Signals
 
@@ -32,6 +32,7 @@ class EpisodeRows:
     signals: Signals  # leading axis R, as the row's episode sees them
     labels: dict[str, Bools]  # condition -> (R,)
     custom: pa.Table  # (R,) the profile's own signals
+    probabilities: dict[str, F32]  # condition that has a rule for it -> (R,); NaN: not known
 
     @property
     def starts(self) -> Ints:
@@ -62,6 +63,10 @@ class EpisodeRows:
             none,
             labels,
             parts[0].custom.select([]),
+            {
+                name: np.concatenate([part.probabilities[name] for part in parts])
+                for name in parts[0].probabilities
+            },
         )
 
 
@@ -102,7 +107,8 @@ def episode_rows(
     custom = steps.custom.take(tick)
     table = label_table(signals, episode, step, custom)
     labels = label(table, profile.conditions)
-    return EpisodeRows(tick, episode, step, is_end, signals, labels, custom)
+    probable = probabilities(table, profile.conditions)
+    return EpisodeRows(tick, episode, step, is_end, signals, labels, custom, probable)
 
 
 def label_table(signals: Signals, episode: Ints, step: Ints, custom: pa.Table) -> pa.Table:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -71,6 +72,7 @@ def manifest_row(
         "topics": [],
         "stand_ins": [],
         "label_scores": score_rows(scores),
+        "label_counts": count_rows(scores),
         "clocks": [],
         "signals": [],
         "task_json": msgspec.json.encode(profile.task).decode(),
@@ -148,14 +150,19 @@ def clock_rows(recording: Recording, steps: Steps) -> list[dict[str, Any]]:
 
 
 def score_rows(scores: Sequence[LabelScore]) -> list[dict[str, Any]]:
-    """Scores as the manifest holds them."""
+    """Precision and recall a step, as the manifest holds them."""
     names = ("condition", "precision", "recall", "labelled", "support")
     return [{name: getattr(score, name) for name in names} for score in scores]
 
 
+def count_rows(scores: Sequence[LabelScore]) -> list[dict[str, Any]]:
+    """The counts of scores, which add up over recordings, as the manifest holds them."""
+    return [asdict(score) for score in scores]
+
+
 def conditions_json(conditions: Sequence[Condition]) -> str:
-    """Conditions as the manifest holds them: name, timing, priority and SQL."""
-    names = ("name", "timing", "priority", "sql")
+    """Conditions as the manifest holds them: all but their doc."""
+    names = ("name", "timing", "priority", "sql", "probability", "uncertain", "constants")
     return msgspec.json.encode(
         [{name: getattr(condition, name) for name in names} for condition in conditions]
     ).decode()

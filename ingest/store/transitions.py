@@ -10,14 +10,14 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from restock.arrays import Bools, Ints
+from restock.arrays import F32, Bools, Ints
 from restock.errors import RecordingError
 from restock.ingest.decoding.columns import offsets_of
 from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.episodes import Split
 from restock.ingest.steps.steps import Steps
 from restock.ingest.store.episode_rows import ENDS, EpisodeRows, episode_rows, groups, packed
-from restock.ingest.task.conditions import NOMINAL, primary
+from restock.ingest.task.conditions import NOMINAL, primary, too_near_to_call
 from restock.ingest.task.label_scores import true_names, truth_text
 from restock.ingest.task.schema import SIGNAL_COLUMNS, STEP_BITS, transition_schema
 from restock.ingest.task.task import observe, reward
@@ -147,6 +147,8 @@ def transition_table(
         "condition": [named[row] for row in begin],
         "conditions": names_of(rows.labels, begin),
         "true_condition": values.truth,
+        "probabilities": by_name(rows.probabilities, begin),
+        "uncertain": names_of(too_near_to_call(rows.probabilities, evaluated), begin),
         "perturbation": values.perturbation[0],
         "perturbation_values": values.perturbation[1],
         "zone": values.zone,
@@ -192,6 +194,19 @@ def column_array(values: Any, kind: pa.DataType, count: int) -> pa.Array:
     if isinstance(values, np.ndarray):
         return pa.array(values).cast(kind, safe=False) if len(values) else pa.array([], kind)
     return pa.array(values, kind)
+
+
+def by_name(values: Mapping[str, F32], rows: Ints) -> pa.Array:
+    """The values of these rows by their names, as a map array; without those that are NaN."""
+    table = np.stack([column[rows] for column in values.values()], axis=1) if values else None
+    if table is None:
+        table = np.zeros((len(rows), 0), np.float32)
+    known = np.isfinite(table)
+    which = pa.array(np.nonzero(known)[1].astype(np.int32))
+    names = pa.DictionaryArray.from_arrays(which, pa.array(list(values), pa.string()))
+    offsets = pa.array(offsets_of(known.sum(axis=1)).astype(np.int32))
+    items = pa.array(table[known].astype(np.float32))
+    return pa.MapArray.from_arrays(offsets, names.cast(pa.string()), items)
 
 
 def names_of(labels: Mapping[str, Bools], rows: Ints) -> pa.Array:

@@ -8,17 +8,21 @@ says what it may look at:
 - `pre`: known before acting at step t; looks at step t and earlier ones only;
 - `post`: about the outcome of step t; may look at t + 1 and later.
 
-The difference matters to replay: boosting a `post` stratum resamples the outcome of an action and
-biases what the critic learns, unless it is corrected for. What else a condition may not say is in
-`restock.ingest.task.condition_sql`. Where a simulator says the truth, labels are scored against it:
-`restock.ingest.task.label_scores`.
+A condition may have a **probability** beside its label: an expression of the same kind that gives
+0 to 1, from how far the signals are from the rule's limits against the noise of the sensors. A step
+whose probability lies within the condition's `uncertain` band is too near to call.
+
+The difference of timings matters to replay: boosting a `post` stratum resamples the outcome of an
+action and biases what the critic learns, unless it is corrected for. What else a condition may not
+say is in `restock.ingest.task.condition_sql`. Where a simulator says the truth, labels are scored
+against it: `restock.ingest.task.label_scores`.
 """
 
 from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
@@ -28,14 +32,15 @@ import duckdb
 import msgspec
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from restock.arrays import F32, Bools
 from restock.errors import ConfigError
 from restock.ingest.task.condition_sql import SANDBOX, refusal, select_of
 from restock.toml import Checked
 
 Timing = Literal["pre", "post"]
 NOMINAL = "nominal"
+PROBABILITY = "-- probability:"  # a line of a condition's file
 LARGEST_BYTES = 100_000  # of a condition's file
 
 
@@ -47,8 +52,28 @@ class Condition(Checked, frozen=True):
     sql: str
     priority: int = 50
     doc: str = ""
+    probability: str = ""  # SQL, 0 to 1; "": none
+    uncertain: tuple[float, float] = (0.2, 0.8)  # within it a step is too near to call
+    # Numbers that its SQL may name, beside the steps' columns.
+    constants: dict[str, float] = msgspec.field(default_factory=dict)
+
+    @property
+    def expressions(self) -> tuple[str, ...]:
+        """The SQL of the label, and of its probability where there is one."""
+        return (self.sql, self.probability) if self.probability else (self.sql,)
+
+    def with_constants(self, constants: Mapping[str, float]) -> Condition:
+        """The condition with those of the constants that its SQL names; its own win."""
+        words = {word for text in self.expressions for word in re.findall(r"\w+", text)}
+        used = {name: value for name, value in constants.items() if name in words}
+        return msgspec.structs.replace(self, constants=used | self.constants)
 
     def check(self) -> None:
+        if not 0 <= self.uncertain[0] <= self.uncertain[1] <= 1:
+            raise ValueError(f"uncertain must be [low, high] in [0, 1], got {self.uncertain}")
+        for name in self.constants:
+            if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+                raise ValueError(f"a constant's name must be lower case letters, got {name!r}")
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", self.name) or self.name == NOMINAL:
             raise ValueError(
                 f"name must be letters, digits and _, and not {NOMINAL!r}: {self.name!r}"
@@ -67,27 +92,52 @@ def shipped() -> dict[str, Condition]:
     return conditions
 
 
-def settings_of(text: str) -> dict[str, str | int]:
-    """What a .sql file says: `sql`, and of its comments `timing`, `priority` and `doc`."""
-    comments = [line[2:].strip() for line in text.splitlines() if line.startswith("--")]
-    keys = ("timing: ", "priority: ")
-    settings: dict[str, str | int] = {}
-    for line in comments:
-        if line.startswith(keys):
-            key, value = line.split(": ", 1)
-            settings[key] = int(value) if value.lstrip("-").isdigit() else value
-    doc = " ".join(line for line in comments if not line.startswith(keys))
-    sql = "\n".join(line for line in text.splitlines() if not line.startswith("--")).strip()
-    return {"sql": sql, "doc": doc, **settings}
+def settings_of(text: str) -> dict[str, Any]:
+    """What a .sql file says: `sql`, and of its comments `timing`, `priority`, `uncertain`, `doc`.
+
+    What follows the line `-- probability:` is the SQL of the probability.
+    """
+    rule, _, likelihood = (text + "\n").partition(f"\n{PROBABILITY}\n")
+    settings: dict[str, Any] = {}
+    doc: list[str] = []
+    for line in rule.splitlines():
+        if line.startswith("--"):
+            key, colon, value = line[2:].strip().partition(": ")
+            if not colon or key not in ("timing", "priority", "uncertain"):
+                doc.append(line[2:].strip())
+            elif key == "uncertain":
+                settings[key] = [_number(part) for part in value.split(" to ")]
+            else:
+                settings[key] = int(value) if value.lstrip("-").isdigit() else value
+    settings = {"sql": _without_comments(rule), "doc": " ".join(doc), **settings}
+    return settings | ({"probability": _without_comments(likelihood)} if likelihood else {})
+
+
+def _without_comments(text: str) -> str:
+    return "\n".join(line for line in text.splitlines() if not line.startswith("--")).strip()
+
+
+def _number(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text  # for the type check to refuse, with its key
 
 
 def labels_version(conditions: Sequence[Condition]) -> str:
     """Names a set of conditions by what they say: 12 hex digits."""
-    content = msgspec.json.encode(sorted((c.name, c.timing, c.sql, c.priority) for c in conditions))
+    said = [
+        (c.name, c.timing, c.sql, c.priority)
+        # Nothing more where there is nothing more: so that the version of a plain rule stays.
+        + ((c.probability, c.uncertain) if c.probability else ())
+        + ((sorted(c.constants.items()),) if c.constants else ())
+        for c in conditions
+    ]
+    content = msgspec.json.encode(sorted(said, key=str))
     return hashlib.blake2b(content, digest_size=6).hexdigest()
 
 
-def label(steps: pa.Table, conditions: Sequence[Condition]) -> dict[str, NDArray[np.bool_]]:
+def label(steps: pa.Table, conditions: Sequence[Condition]) -> dict[str, Bools]:
     """Every condition over a table of steps, in the table's row order.
 
     `steps` holds `episode_index`, `step_index` and the stored signals, one row a step, including
@@ -96,36 +146,94 @@ def label(steps: pa.Table, conditions: Sequence[Condition]) -> dict[str, NDArray
     Raises:
         ConfigError: a condition's SQL does not run, or gives no boolean; names the condition.
     """
-    if not conditions:
-        return {}
-    for condition in conditions:
-        if reason := refusal(condition.sql, condition.timing):
-            raise ConfigError(reason, where=f"condition {condition.name!r}")
-    with duckdb.connect(config=SANDBOX) as connection:
-        connection.register("steps", steps.append_column("row_", pa.array(range(len(steps)))))
-        connection.execute("SET lock_configuration = true").fetchall()
-        try:
-            rows = _query(connection, conditions)
-        except duckdb.Error:
-            for condition in conditions:  # again one by one, to say which
-                try:
-                    _query(connection, [condition])
-                except duckdb.Error as error:
-                    raise ConfigError(
-                        f"its SQL does not run over the steps: {_first_line(error)}",
-                        where=f"condition {condition.name!r}",
-                        remedy=f"the steps have the columns {', '.join(steps.column_names)}",
-                    ) from error
-            raise
     labels = {}
-    for condition in conditions:
-        column = rows[condition.name]
+    for name, column in _evaluate(steps, conditions, "sql").items():
         if not pa.types.is_boolean(column.type):
             raise ConfigError(
-                f"its SQL gives {column.type}, not a boolean", where=f"condition {condition.name!r}"
+                f"its SQL gives {column.type}, not a boolean", where=f"condition {name!r}"
             )
-        labels[condition.name] = np.asarray(column.fill_null(False).combine_chunks(), np.bool_)
+        labels[name] = np.asarray(column.fill_null(False).combine_chunks(), np.bool_)
     return labels
+
+
+def probabilities(steps: pa.Table, conditions: Sequence[Condition]) -> dict[str, F32]:
+    """The probability of every condition that has a rule for it, over steps as `label` takes them.
+
+    NaN where the rule gives null.
+
+    Raises:
+        ConfigError: the SQL does not run, or gives other than numbers in [0, 1].
+    """
+    rated = [condition for condition in conditions if condition.probability]
+    found = {}
+    for name, column in _evaluate(steps, rated, "probability").items():
+        where = f"the probability of condition {name!r}"
+        try:
+            values = column.cast(pa.float64()).combine_chunks().to_numpy(zero_copy_only=False)
+        except pa.ArrowInvalid as error:
+            raise ConfigError(f"its SQL gives {column.type}, not a number", where=where) from error
+        if len(wrong := values[(values < 0) | (values > 1)]):
+            raise ConfigError(f"it must be in [0, 1], and gives {wrong[0]:.4g}", where=where)
+        found[name] = values.astype(np.float32)
+    return found
+
+
+def too_near_to_call(
+    probable: Mapping[str, F32], conditions: Sequence[Condition]
+) -> dict[str, Bools]:
+    """Where the probability of each condition that has one lies within its `uncertain` band."""
+    bands = {condition.name: condition.uncertain for condition in conditions}
+    return {
+        name: (values >= bands[name][0]) & (values <= bands[name][1])
+        for name, values in probable.items()
+    }
+
+
+def _evaluate(
+    steps: pa.Table, conditions: Sequence[Condition], which: Literal["sql", "probability"]
+) -> dict[str, pa.ChunkedArray]:
+    """One expression of each condition over the steps."""
+    for condition in conditions:
+        if reason := refusal(getattr(condition, which), condition.timing):
+            raise ConfigError(reason, where=_where(condition, which))
+    columns: dict[str, pa.ChunkedArray] = {}
+    by_constants: dict[tuple[tuple[str, float], ...], list[Condition]] = {}
+    for condition in conditions:
+        by_constants.setdefault(tuple(sorted(condition.constants.items())), []).append(condition)
+    for constants, several in by_constants.items():
+        with duckdb.connect(config=SANDBOX) as connection:
+            _register(connection, steps, dict(constants))
+            try:
+                rows = _query(connection, several, which)
+            except duckdb.Error:
+                for condition in several:  # again one by one, to say which
+                    try:
+                        _query(connection, [condition], which)
+                    except duckdb.Error as error:
+                        raise ConfigError(
+                            f"its SQL does not run over the steps: {_first_line(error)}",
+                            where=_where(condition, which),
+                            remedy=f"the steps have the columns {', '.join(steps.column_names)}",
+                        ) from error
+                raise
+        columns |= {condition.name: rows[condition.name] for condition in several}
+    return {condition.name: columns[condition.name] for condition in conditions}
+
+
+def _where(condition: Condition, which: str) -> str:
+    said = f"condition {condition.name!r}"
+    return said if which == "sql" else f"the probability of {said}"
+
+
+def _register(
+    connection: duckdb.DuckDBPyConnection, steps: pa.Table, constants: Mapping[str, float]
+) -> None:
+    steps = steps.append_column("row_", pa.array(range(len(steps)), pa.int64()))
+    for name, value in constants.items():
+        if name not in steps.column_names:
+            steps = steps.append_column(name, pa.array(np.full(len(steps), value)))
+    connection.register("steps", steps)
+    connection.execute("SET lock_configuration = true").fetchall()
 
 
 def runnable(steps: pa.Table, conditions: Sequence[Condition]) -> list[Condition]:
@@ -134,16 +242,19 @@ def runnable(steps: pa.Table, conditions: Sequence[Condition]) -> list[Condition
     for condition in conditions:
         with suppress(ConfigError):
             label(steps.slice(0, 0), [condition])
+            probabilities(steps.slice(0, 0), [condition])
             run.append(condition)
     return run
 
 
-def _query(connection: duckdb.DuckDBPyConnection, conditions: Sequence[Condition]) -> pa.Table:
-    columns = ",\n".join(f'({c.sql}\n) AS "{c.name}"' for c in conditions)
+def _query(
+    connection: duckdb.DuckDBPyConnection, conditions: Sequence[Condition], which: str
+) -> pa.Table:
+    columns = ",\n".join(f'({getattr(c, which)}\n) AS "{c.name}"' for c in conditions)
     return connection.sql(select_of(columns)).to_arrow_table()
 
 
-def primary(labels: dict[str, NDArray[np.bool_]], conditions: Sequence[Condition]) -> list[str]:
+def primary(labels: dict[str, Bools], conditions: Sequence[Condition]) -> list[str]:
     """The one condition of each row: the one of lowest priority number, or `nominal`."""
     ordered = sorted(conditions, key=lambda condition: (condition.priority, condition.name))
     if not ordered:

@@ -1,19 +1,26 @@
-"""The true conditions of a step as text, and labels scored against them."""
+"""The true conditions of a step as text, and labels scored against them: by step and by event.
+
+An **event** is a maximal run of an episode's consecutive steps that hold a condition. A true event
+is found where a step within `TOLERANCE_S` of it has the label; an event of the label is right where
+a step within `TOLERANCE_S` of it is true. Steps whose truth is unknown count for neither.
+
+Scores are counts, so that those of several recordings add up: `pooled`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import astuple, dataclass
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
+from restock.arrays import Bools, Ints
 from restock.ingest.task.conditions import NOMINAL
 
 GOOD = 0.8  # precision and recall, for a label to be trusted
+TOLERANCE_S = 0.4  # between an event and what finds it
 # Where a reader needs one true condition: the first of these, then any other by its name.
 PRIMARY = ("recovery", "near_collision", "wheel_slip", "blocked_aisle")
 
@@ -40,14 +47,37 @@ def primary_of(text: str) -> str:
 
 @dataclass(frozen=True)
 class LabelScore:
-    """One label against the truth, over the transitions whose truth is known."""
+    """One label against the truth, over the transitions whose truth is known: counts."""
 
     condition: str
-    precision: float | None  # None: the label was never given
-    recall: float | None  # None: it was never true
+    known: int  # transitions whose truth is known
     labelled: int  # transitions that got the label
     support: int  # transitions where it is true
-    known: int  # transitions whose truth is known
+    both: int  # transitions where it is true and that got the label
+    event_labelled: int  # events of the label
+    event_right: int  # those of them that are near a true step
+    event_support: int  # true events
+    event_found: int  # those of them that are near a labelled step
+
+    @property
+    def precision(self) -> float | None:
+        """Of the transitions labelled, those that truly were; None: the label was never given."""
+        return _share(self.both, self.labelled)
+
+    @property
+    def recall(self) -> float | None:
+        """Of the transitions that truly were, those labelled; None: it was never true."""
+        return _share(self.both, self.support)
+
+    @property
+    def event_precision(self) -> float | None:
+        """Of the events of the label, those that are right; None: there is none."""
+        return _share(self.event_right, self.event_labelled)
+
+    @property
+    def event_recall(self) -> float | None:
+        """Of the true events, those that are found; None: there is none."""
+        return _share(self.event_found, self.event_support)
 
     @property
     def shortfall(self) -> str:
@@ -63,39 +93,97 @@ class LabelScore:
         return f"{', '.join(short)}; true in {rate:.1%} of steps"
 
 
-def score(labels: Mapping[str, NDArray[Any]], truth: Sequence[str | None]) -> list[LabelScore]:
+def _share(part: int, whole: int) -> float | None:
+    return part / whole if whole else None
+
+
+def score(
+    labels: Mapping[str, Bools],
+    truth: Sequence[str | None],
+    episode: Ints,
+    step: Ints,
+    period_s: float,
+) -> list[LabelScore]:
     """Labels (N,) by name against the true conditions of each transition (N).
 
-    A text may name several conditions, separated by commas. A label that no truth ever names
+    A text may name several conditions, separated by commas; None is unknown. Transitions are in
+    order of their episode (N,) and step (N,), `period_s` apart. A label that no truth ever names
     and that was never given is left out; nothing is scored where no truth is known.
     """
     known = np.array([text is not None for text in truth], np.bool_)
     if not known.any():
         return []
-    named = [frozenset[str]() if text is None else true_names(text) for text in truth]
+    whole = np.array(["" if text is None else text for text in truth])
+    texts, which = np.unique(whole, return_inverse=True)
+    named = [true_names(text) for text in texts.tolist()]
+    joined = np.zeros(len(known), np.bool_)  # to the step before
+    joined[1:] = (episode[1:] == episode[:-1]) & (step[1:] == step[:-1] + 1)
+    reach = int(TOLERANCE_S / period_s + 1e-6)  # steps
     scores = []
     for name, given in labels.items():
-        true = np.array([name in names for names in named], np.bool_)
-        labelled, support = int((given & known).sum()), int(true.sum())
-        both = int((given & true & known).sum())
-        if labelled or support:
-            scores.append(
-                LabelScore(
-                    name,
-                    both / labelled if labelled else None,
-                    both / support if support else None,
-                    labelled,
-                    support,
-                    int(known.sum()),
-                )
+        true = np.array([name in names for names in named], np.bool_)[which] & known
+        labelled = given & known
+        if not (labelled.any() or true.any()):
+            continue
+        given_events, true_events = events(labelled, joined), events(true, joined)
+        scores.append(
+            LabelScore(
+                name,
+                int(known.sum()),
+                int(labelled.sum()),
+                int(true.sum()),
+                int((labelled & true).sum()),
+                len(given_events),
+                int(touched(given_events, widened(true, joined, reach)).sum()),
+                len(true_events),
+                int(touched(true_events, widened(labelled, joined, reach)).sum()),
             )
+        )
     return scores
 
 
-def label_scores(rows: pa.Table, names: Iterable[str]) -> list[LabelScore]:
+def events(holds: Bools, joined: Bools) -> Ints:
+    """The maximal runs of consecutive steps that hold, (E, 2): first step and the one after last.
+
+    `joined` (N,) says which steps follow the one before in the same episode.
+    """
+    begins = holds & ~np.concatenate([[False], holds[:-1] & joined[1:]])
+    goes_on = np.concatenate([holds[1:] & joined[1:], [False]])
+    return np.stack([np.flatnonzero(begins), np.flatnonzero(holds & ~goes_on) + 1], axis=1)
+
+
+def widened(holds: Bools, joined: Bools, reach: int) -> Bools:
+    """Whether it holds within `reach` steps of each step, in the same stretch of steps, (N,)."""
+    wide = holds.copy()
+    for _ in range(reach):
+        ahead, behind = np.zeros_like(wide), np.zeros_like(wide)
+        ahead[1:] = wide[:-1] & joined[1:]
+        behind[:-1] = wide[1:] & joined[1:]
+        wide = wide | ahead | behind
+    return wide
+
+
+def touched(runs: Ints, holds: Bools) -> Bools:
+    """Which runs (E, 2) have a step that holds, (E,)."""
+    total = np.concatenate([[0], np.cumsum(holds)])
+    return np.asarray(total[runs[:, 1]] > total[runs[:, 0]], np.bool_)
+
+
+def label_scores(rows: pa.Table, names: Iterable[str], period_s: float) -> list[LabelScore]:
     """How well every condition of each transition agrees with the true ones, for these labels."""
     given = rows["conditions"].combine_chunks()
     held = np.asarray(pc.list_value_length(given).fill_null(0))
     row, named = np.repeat(np.arange(len(rows)), held), np.asarray(given.flatten(), object)
     labels = {name: np.isin(np.arange(len(rows)), row[named == name]) for name in names}
-    return score(labels, rows["true_condition"].to_pylist())
+    episode, step = rows["episode_index"].to_numpy(), rows["step_index"].to_numpy()
+    return score(labels, rows["true_condition"].to_pylist(), episode, step, period_s)
+
+
+def pooled(scores: Iterable[LabelScore]) -> list[LabelScore]:
+    """The scores of several recordings as those of one, by condition."""
+    sums: dict[str, list[int]] = {}
+    for one in scores:
+        name, *counts = astuple(one)
+        before = sums.get(name, [0] * len(counts))
+        sums[name] = [a + b for a, b in zip(before, counts, strict=True)]
+    return [LabelScore(name, *counts) for name, counts in sorted(sums.items())]

@@ -55,6 +55,18 @@ COVERAGE: tuple[Column, ...] = (
         "all that a simulator knows to be so, sorted, commas between; or nominal",
         nullable=True,
     ),
+    Column(
+        "probabilities",
+        pa.map_(pa.string(), pa.float32()),
+        "of each condition that has a rule for it; null: older than such rules",
+        nullable=True,
+    ),
+    Column(
+        "uncertain",
+        pa.list_(pa.string()),
+        "conditions too near to call by their probability; null: older than such rules",
+        nullable=True,
+    ),
     Column("perturbation", pa.string(), "name of the twin's parameters in force", nullable=True),
     Column(
         "perturbation_values",
@@ -174,6 +186,16 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
         "of the labels against the true condition; empty where that is not known",
     ),
     Column(
+        "label_counts",
+        _rows_of(
+            condition=pa.string(), known=pa.int64(), labelled=pa.int64(), support=pa.int64(),
+            both=pa.int64(), event_labelled=pa.int64(), event_right=pa.int64(),
+            event_support=pa.int64(), event_found=pa.int64(),
+        ),
+        "what those scores are made of, in steps and events; null: older than events",
+        nullable=True,
+    ),
+    Column(
         "clocks",
         _rows_of(
             topic=pa.string(), messages=pa.int64(), stamped=pa.bool_(), offset_ns=pa.int64(),
@@ -195,7 +217,7 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
         nullable=True,
     ),
     Column("task_json", pa.string(), "the task, as JSON"),
-    Column("conditions_json", pa.string(), "the conditions: name, timing, priority, sql, as JSON"),
+    Column("conditions_json", pa.string(), "the conditions: name, timing, sql, …, as JSON"),
     Column("profile_toml", pa.string(), "the profile, the SQL of its files in it", nullable=True),
 )  # fmt: skip
 

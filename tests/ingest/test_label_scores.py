@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 import pyarrow as pa
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from restock.ingest.task.label_scores import (
+    LabelScore,
     label_scores,
+    pooled,
     primary_of,
     score,
     true_names,
@@ -40,26 +46,125 @@ def test_a_reader_that_needs_one_condition_gets_the_most_pressing(text, one):
 def test_a_row_of_several_conditions_is_scored_for_each():
     rows = pa.table(
         {
+            "episode_index": [0, 0, 0, 0],
+            "step_index": [0, 1, 2, 3],
             "condition": ["recovery", "near_collision", "nominal", "near_collision"],
             "conditions": [["near_collision", "recovery"], ["near_collision"], [], None],
             "true_condition": ["near_collision,recovery", "nominal", "near_collision", None],
         }
     )
-    near, after = label_scores(rows, ["near_collision", "recovery"])
+    near, after = label_scores(rows, ["near_collision", "recovery"], 0.2)
     assert (near.precision, near.recall, near.labelled, near.support) == (0.5, 0.5, 2, 2)
     assert (after.precision, after.recall, after.labelled, after.support) == (1, 1, 1, 1)
+
+
+def in_one_episode(count: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.zeros(count, np.int64), np.arange(count)
 
 
 def test_scores_by_hand():
     given_ = {"slip": np.array([True, True, False, False, True, False])}
     truth = ["slip", "nominal", "slip, blocked", "nominal", None, "slip"]
-    (one,) = score(given_, truth)
+    (one,) = score(given_, truth, *in_one_episode(6), 0.2)
     assert (one.labelled, one.support, one.known) == (2, 3, 5)
     assert one.precision == pytest.approx(1 / 2)
     assert one.recall == pytest.approx(1 / 3)
     assert one.shortfall == (
         "precision 0.30 short of 0.8, recall 0.47 short of 0.8; true in 60.0% of steps"
     )
-    assert score(given_, [None] * 6) == []
-    never = score({"slip": np.zeros(2, np.bool_)}, ["nominal", "nominal"])
-    assert never == []
+    # One event of the label, near the first true one and the second, not the third.
+    assert (one.event_labelled, one.event_right) == (1, 1)
+    assert (one.event_support, one.event_found) == (3, 2)
+    assert score(given_, [None] * 6, *in_one_episode(6), 0.2) == []
+    never = {"slip": np.zeros(2, np.bool_)}
+    assert score(never, ["nominal", "nominal"], *in_one_episode(2), 0.2) == []
+
+
+@pytest.mark.parametrize(("apart", "found"), [(1, 1), (2, 1), (3, 0)])
+def test_an_event_is_found_within_the_tolerance(apart, found):
+    holds = np.arange(12) == 6 + apart
+    truth = ["slip" if step == 6 else "nominal" for step in range(12)]
+    (one,) = score({"slip": holds}, truth, *in_one_episode(12), 0.2)
+    assert (one.event_found, one.event_right) == (found, found)
+    # Half the control period: the same time is twice the steps.
+    (one,) = score({"slip": holds}, truth, *in_one_episode(12), 0.1)
+    assert one.event_found == 1
+
+
+def test_no_event_reaches_into_another_episode_or_over_a_gap():
+    holds, truth = np.array([False, True, False, False]), ["nominal", "nominal", "slip", "slip"]
+    for episode, step in (([0, 0, 1, 1], [0, 1, 0, 1]), ([0, 0, 0, 0], [0, 1, 7, 8])):
+        (one,) = score({"slip": holds}, truth, np.array(episode), np.array(step), 0.2)
+        assert (one.event_labelled, one.event_right) == (1, 0)
+        assert (one.event_support, one.event_found) == (1, 0)
+
+
+@st.composite
+def episodes(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Labels and truth (N,) with their episode and step."""
+    lengths = draw(st.lists(st.integers(1, 9), min_size=1, max_size=5))
+    count = sum(lengths)
+    holds, true = (np.array(draw(st.lists(st.booleans(), min_size=count, max_size=count)))
+                   for _ in range(2))  # fmt: skip
+    return (
+        holds,
+        true,
+        np.repeat(np.arange(len(lengths)), lengths),
+        np.concatenate([np.arange(length) for length in lengths]),
+    )
+
+
+def texts(true: np.ndarray) -> list[str]:
+    return ["slip" if one else "nominal" for one in true]
+
+
+@settings(max_examples=60, deadline=None)
+@given(episodes(), st.integers(0, 3))
+def test_events_are_found_as_one_would_by_looking_at_every_pair(drawn, reach):
+    holds, true, episode, step = drawn
+    found = score({"slip": holds}, texts(true), episode, step, 0.4 / reach if reach else 1.0)
+    if not found:
+        assert not holds.any()
+        assert not true.any()
+        return
+
+    def runs(values: np.ndarray) -> list[list[int]]:
+        by_hand: list[list[int]] = []
+        for row in np.flatnonzero(values).tolist():
+            if by_hand and by_hand[-1][-1] == row - 1 and episode[row] == episode[row - 1]:
+                by_hand[-1].append(row)
+            else:
+                by_hand.append([row])
+        return by_hand
+
+    def near(run: list[int], values: np.ndarray) -> bool:
+        return any(
+            values[other] and episode[other] == episode[row] and abs(other - row) <= reach
+            for row in run
+            for other in range(len(values))
+        )
+
+    (one,) = found
+    given_, truly = runs(holds), runs(true)
+    assert (one.event_labelled, one.event_support) == (len(given_), len(truly))
+    assert one.event_right == sum(near(run, true) for run in given_)
+    assert one.event_found == sum(near(run, holds) for run in truly)
+
+
+@settings(max_examples=40, deadline=None)
+@given(episodes(), st.randoms())
+def test_a_truth_that_is_its_own_label_scores_one_and_parts_add_up(drawn, chance):
+    holds, true, episode, step = drawn
+    for one in score({"slip": true}, texts(true), episode, step, 0.2):
+        assert one.precision == one.recall == one.event_precision == one.event_recall == 1
+    whole = score({"slip": holds}, texts(true), episode, step, 0.2)
+    cut = chance.randrange(int(episode[-1]) + 1)
+    parts = [
+        one
+        for part in (episode < cut, episode >= cut)
+        for one in score({"slip": holds[part]}, texts(true[part]), episode[part], step[part], 0.2)
+    ]
+    names = [field.name for field in fields(LabelScore) if field.name not in ("condition", "known")]
+    assert [[getattr(one, name) for name in names] for one in pooled(parts)] == [
+        [getattr(one, name) for name in names] for one in whole
+    ]

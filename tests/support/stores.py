@@ -57,6 +57,8 @@ def recording_transitions(
         "condition": primary(labels, CONDITIONS),
         "conditions": held,
         "true_condition": [None] * rows,
+        "probabilities": [None] * rows,
+        "uncertain": [None] * rows,
         "perturbation": np.where(np.arange(rows) % 3 > 0, "wet", None),
         "perturbation_values": [[("friction_scale", 0.5)] if r % 3 else None for r in range(rows)],
         "zone": rng.choice(["aisle_1", "aisle_2", "cross"], rows),
