@@ -53,7 +53,7 @@ class LabelScore:
     known: int  # transitions whose truth is known
     labelled: int  # transitions that got the label
     support: int  # transitions where it is true
-    both: int  # transitions where it is true and that got the label
+    agreed: int  # transitions where it is true and that got the label
     event_labelled: int  # events of the label
     event_right: int  # those of them that are near a true step
     event_support: int  # true events
@@ -62,12 +62,12 @@ class LabelScore:
     @property
     def precision(self) -> float | None:
         """Of the transitions labelled, those that truly were; None: the label was never given."""
-        return _share(self.both, self.labelled)
+        return _share(self.agreed, self.labelled)
 
     @property
     def recall(self) -> float | None:
         """Of the transitions that truly were, those labelled; None: it was never true."""
-        return _share(self.both, self.support)
+        return _share(self.agreed, self.support)
 
     @property
     def event_precision(self) -> float | None:

@@ -189,7 +189,7 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
         "label_counts",
         _rows_of(
             condition=pa.string(), known=pa.int64(), labelled=pa.int64(), support=pa.int64(),
-            both=pa.int64(), event_labelled=pa.int64(), event_right=pa.int64(),
+            agreed=pa.int64(), event_labelled=pa.int64(), event_right=pa.int64(),
             event_support=pa.int64(), event_found=pa.int64(),
         ),
         "what those scores are made of, in steps and events; null: older than events",

@@ -15,7 +15,7 @@ from restock.replay.store.column_docs import install_columns
 T = TypeVar("T")
 
 # In their order: a view may use those before it.
-VIEWS = ("rows.sql", "views.sql")
+VIEWS = ("rows.sql", "views.sql", "labels.sql")
 MACROS = ("macros.sql", "repeated_rows.sql", "episode_signals.sql", "drift.sql")
 
 # Statements that leave files as they are; CREATE makes tables and macros in memory.

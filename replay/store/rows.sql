@@ -19,7 +19,13 @@ SELECT
 FROM (
     FROM stored_recordings
     UNION ALL BY NAME
-    SELECT NULL::MAP(VARCHAR, VARCHAR) AS tags WHERE false
+    SELECT
+        NULL::MAP(VARCHAR, VARCHAR) AS tags,
+        NULL::STRUCT(
+            condition VARCHAR, known BIGINT, labelled BIGINT, support BIGINT, agreed BIGINT,
+            event_labelled BIGINT, event_right BIGINT, event_support BIGINT, event_found BIGINT
+        )[] AS label_counts
+    WHERE false
 )
 WHERE ingest_id IN (SELECT ingest_id FROM stored_transitions);
 
@@ -41,7 +47,11 @@ SELECT
 FROM (
     FROM stored_transitions
     UNION ALL BY NAME
-    SELECT NULL::VARCHAR AS perturbation, NULL::MAP(VARCHAR, DOUBLE) AS perturbation_values
+    SELECT
+        NULL::MAP(VARCHAR, FLOAT) AS probabilities,
+        NULL::VARCHAR[] AS uncertain,
+        NULL::VARCHAR AS perturbation,
+        NULL::MAP(VARCHAR, DOUBLE) AS perturbation_values
     WHERE false
 ) AS stored
 JOIN (

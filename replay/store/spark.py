@@ -57,6 +57,8 @@ _RULES = (
     (r"CREATE OR REPLACE VIEW", "CREATE OR REPLACE TEMPORARY VIEW"),
     (r"\bunnest\(", "explode("),
     (r"\blist_sort\(", "sort_array("),
+    (r"\blist_contains\(", "array_contains("),
+    (r"\bstring_split\(", "split("),
     (r"\blist_distinct\(", "array_distinct("),
     (r"\blist\(DISTINCT ", "collect_set("),
     (r"\blist\(", "collect_list("),
@@ -78,10 +80,19 @@ _RULES = (
 )
 _LATER = {
     TRANSITIONS: {
+        "probabilities": "CAST(NULL AS MAP<STRING, FLOAT>) AS probabilities",
+        "uncertain": "CAST(NULL AS ARRAY<STRING>) AS uncertain",
         "perturbation": "CAST(NULL AS STRING) AS perturbation",
         "perturbation_values": "CAST(NULL AS MAP<STRING, DOUBLE>) AS perturbation_values",
     },
-    RECORDINGS: {"tags": "CAST(NULL AS MAP<STRING, STRING>) AS tags"},
+    RECORDINGS: {
+        "tags": "CAST(NULL AS MAP<STRING, STRING>) AS tags",
+        "label_counts": (
+            "CAST(NULL AS ARRAY<STRUCT<condition: STRING, known: BIGINT, labelled: BIGINT,"
+            " support: BIGINT, agreed: BIGINT, event_labelled: BIGINT, event_right: BIGINT,"
+            " event_support: BIGINT, event_found: BIGINT>>) AS label_counts"
+        ),
+    },
 }
 
 if TYPE_CHECKING:

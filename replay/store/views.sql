@@ -301,18 +301,6 @@ SELECT recording_id, source_file, dropped.reason AS reason, dropped.count AS cou
 FROM (SELECT recording_id, source_file, unnest(drops) AS dropped FROM recordings)
 ORDER BY recording_id, source_file, reason, count;
 
--- How good the labels are, where the recording knew the true condition.
-CREATE OR REPLACE VIEW label_scores AS
-SELECT
-    recording_id,
-    score.condition AS condition,
-    score.precision AS precision,
-    score.recall AS recall,
-    score.labelled AS labelled,
-    score.support AS support
-FROM (SELECT recording_id, unnest(label_scores) AS score FROM recordings)
-ORDER BY recording_id, condition;
-
 -- Topics of each recording: expected against decoded messages.
 CREATE OR REPLACE VIEW topics AS
 SELECT

@@ -31,6 +31,7 @@ def recording_transitions(
 ) -> pa.Table:
     """Random transitions of one recording, with the columns and meanings of `ingest.schema`."""
     rng = np.random.default_rng([seed, recording])
+    chance = np.random.default_rng([seed, recording, 1])
     lengths = rng.integers(8, 60, episodes)
     rows, size = int(lengths.sum()), task.observation_size
     episode = np.repeat(np.arange(episodes), lengths)
@@ -57,8 +58,8 @@ def recording_transitions(
         "condition": primary(labels, CONDITIONS),
         "conditions": held,
         "true_condition": [None] * rows,
-        "probabilities": [None] * rows,
-        "uncertain": [None] * rows,
+        "probabilities": [[("recovery", p)] for p in chance.random(rows)],
+        "uncertain": [["recovery"] if row % 9 == 0 else [] for row in range(rows)],
         "perturbation": np.where(np.arange(rows) % 3 > 0, "wet", None),
         "perturbation_values": [[("friction_scale", 0.5)] if r % 3 else None for r in range(rows)],
         "zone": rng.choice(["aisle_1", "aisle_2", "cross"], rows),
@@ -115,6 +116,10 @@ def manifest(transitions: pa.Table, *, task: Task = TASK) -> pa.Table:
         "label_scores": [
             {"condition": "wheel_slip", "precision": 0.9, "recall": 0.8, "support": 40}
             | {"labelled": 36}
+        ],
+        "label_counts": [
+            {"condition": "wheel_slip", "known": 400, "labelled": 36, "support": 40, "agreed": 32}
+            | {"event_labelled": 5, "event_right": 4, "event_support": 6, "event_found": 3}
         ],
         "task_json": msgspec.json.encode(task).decode(),
         "conditions_json": msgspec.json.encode(conditions).decode(),
