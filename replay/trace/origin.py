@@ -28,7 +28,14 @@ from restock.replay.store.store import Store, is_store
 WINDOW_S = (-1.0, 0.1)
 _RELABELLED = ("condition", "conditions", "labels_version", "profile_hash", "ingest_id", "reward")
 # Of a manifest: long.
-_LEFT_OUT = ("task_json", "conditions_json", "profile_toml", "topics", "label_scores")
+_LEFT_OUT = (
+    "task_json",
+    "conditions_json",
+    "profile_toml",
+    "topics",
+    "label_scores",
+    "label_counts",
+)
 
 
 @dataclass(frozen=True)
