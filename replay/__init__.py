@@ -5,6 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from restock.public import lazy
+from restock.replay.store.computed import INSTALLERS
+
+INSTALLERS.append("restock.replay.panel.mixture_tables:install_mixtures")
 
 if TYPE_CHECKING:
     from restock.replay.export.dataset import export_dataset as export_dataset

@@ -25,6 +25,8 @@ from restock.replay.mixture.schedules import Fraction, Portion, Schedule, knots,
 from restock.toml import Checked, typed
 
 _SHIPPED = files("restock.replay.mixture") / "mixtures"
+# Shipped mixtures by the names of earlier versions.
+_RENAMED = {"missions": "coverage"}
 SCHEMA_FILE = "mixture.schema.json"
 _FIELD = re.compile(r"^    (\w+): .*?  # (.+)$", re.MULTILINE)
 
@@ -38,6 +40,7 @@ Share = Fraction | Literal["natural", "equal"] | Schedule
 Correction = Literal["none", "beta", "full", "clipped", "density_ratio"]
 Shortfall = Literal["refuse", "redistribute", "shrink"]
 Unit = Literal["step", "episode"]
+Prefer = Literal["rarest", "priority"]
 Within = Literal["uniform", "without_replacement", "per", "lap"]
 
 
@@ -131,9 +134,11 @@ class CorrectionRule(Checked, frozen=True):
     """Importance weights against the boost of strata, by what their condition may look at."""
 
     pre: Correction = "none"  # chosen on the state: the fixed point stays where it is
-    post: Correction = "full"  # chosen on the outcome: uncorrected, Q is biased
+    post: Correction = "density_ratio"  # chosen on the outcome: uncorrected, Q is biased
     beta: Fraction = 0.5  # exponent of the weights where the rule is "beta"
     clip: FromOne = 4.0  # largest weight of "clipped" (and smallest inverse) and "density_ratio"
+    # Of weights that take a stratum's share of the gradient below its share of the rows.
+    below_natural: Literal["refuse", "allow"] = "refuse"
 
 
 class Prioritised(Checked, frozen=True):
@@ -227,6 +232,7 @@ class Mixture(Checked, frozen=True):
     planned: PlannedUse = PlannedUse()
     strata: tuple[StratumRule, ...] = ()
     each_condition: EachCondition | None = None
+    prefer: Prefer = "rarest"  # which of its strata of episodes gets one; priority: the lowest
     max_replays_per_row: FromOne | None = None  # a run's learner holds it
     shortfall: Shortfall = "redistribute"
     adaptive: Adaptive | None = None
@@ -281,7 +287,9 @@ def load_mixture(name_or_path: str | Path) -> Mixture:
     else:
         raise ConfigError(
             f"no mixture {name!r}",
-            remedy=f"give a TOML file, or one of {', '.join(shipped_mixtures())}",
+            remedy=f"it is now called {_RENAMED[name]!r}"
+            if name in _RENAMED
+            else f"give a TOML file, or one of {', '.join(shipped_mixtures())}",
         )
     return parse_mixture(text, where=name)
 

@@ -179,3 +179,26 @@ def row_limits(
         if rows[index] < rule.min_rows or episodes[index] < rule.min_episodes:
             limit[index] = 0.0
     return limit
+
+
+def missing_rows(
+    mixture: Mixture,
+    rules: Sequence[StratumRule],
+    rows: Ints,
+    episodes: Ints,
+    wanted: F64,
+    draws: float,
+) -> Ints:
+    """How many rows more each stratum needs, to be drawn as often as it is wanted, (S,).
+
+    Rows of `min_episodes` are counted as of the episodes that there are.
+    """
+    needed = np.ones(len(rows))
+    if mixture.max_replays_per_row is not None:
+        needed = np.maximum(needed, wanted * draws / mixture.max_replays_per_row)
+    for index, rule in enumerate(rules):
+        an_episode = rows[index] / max(int(episodes[index]), 1)
+        needed[index] = max(needed[index], rule.min_rows, rule.min_episodes * an_episode)
+    # Rounded down by a hair: what fits exactly misses nothing.
+    missing = np.ceil(np.where(wanted > 0, needed - rows, 0.0) - 1e-6)
+    return np.asarray(np.maximum(missing, 0), np.int64)

@@ -22,7 +22,6 @@ from restock.errors import MixtureError, StoreError
 from restock.ingest.task.conditions import NOMINAL, Condition
 from restock.replay.mixture.mixture import Mixture, nanoseconds
 from restock.replay.mixture.schedules import mean_over
-from restock.replay.mixture.shares import SharePlan, plan_shares
 from restock.replay.panel.candidates import (
     META_COLUMNS,
     bools,
@@ -36,19 +35,20 @@ from restock.replay.panel.exclusions import (
     leave_out,
     leave_out_of_strata,
     repeats_of,
-    scramble,
     split_for_evaluation,
 )
+from restock.replay.panel.source_plan import SourcePlan, SourceRows, plan_source
 from restock.replay.panel.stores import PinnedStore
-from restock.replay.panel.strata import NO_STRATUM, ResolvedStratum, Stratum, assign, resolve_strata
-from restock.replay.panel.weights import (
-    RatioFit,
-    RatioRows,
-    effective_count,
-    effective_shares,
-    estimate_outcomes,
-    importance_weights,
+from restock.replay.panel.strata import (
+    NO_STRATUM,
+    ResolvedStratum,
+    Stratum,
+    as_dealt,
+    assign,
+    deal_episodes,
+    resolve_strata,
 )
+from restock.replay.panel.weights import RatioFit, effective_count
 
 LOGS = "logs"  # the name of the first store's part
 
@@ -92,7 +92,8 @@ def plan_panel(
 
     Raises:
         ConfigError: a predicate that does not run.
-        MixtureError: too few rows where the mixture refuses that; rows outside every stratum.
+        MixtureError: too few rows, or weights that take a stratum below its natural share, where
+            the mixture refuses that; rows outside every stratum.
         StoreError: no rows, rows of several tasks, or ids that are not unique.
     """
     wanted = [store.name for store in mixture.sources.stores]
@@ -138,6 +139,8 @@ def plan_panel(
     for other in others:
         if other.repeated_rows:
             out.reasons[f"of {other.name!r}, in a store before it too"] = other.repeated_rows
+    if mixture.prefer == "rarest":
+        stratum, state_code = _dealt(table, strata, member, stratum, state_code, ~out.gone)
     leave_out_of_strata(table, mixture, strata, stratum, out)
     stratum[out.gone] = NO_STRATUM
     given = _sources(mixture, table, stratum, state_code)
@@ -156,12 +159,32 @@ def plan_panel(
     )
 
 
+def _dealt(
+    table: pa.Table,
+    strata: Sequence[ResolvedStratum],
+    member: Bools,
+    stratum: NDArray[np.int16],
+    state_code: NDArray[np.int16],
+    counted: Bools,
+) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
+    """Strata (N,) and those of the state alone with each episode at its rarest, store by store."""
+    store, episode = table["store"].to_numpy(), codes(table, "episode_id")
+    stratum, state_code = stratum.copy(), state_code.copy()
+    for number in np.unique(store).tolist():
+        at = np.flatnonzero(store == number)
+        given = deal_episodes(stratum[at], member[at], episode[at], strata, counted[at])
+        stratum[at] = as_dealt(stratum[at], given, episode[at], strata)
+        state_code[at] = as_dealt(state_code[at], given, episode[at], strata)
+    return stratum, state_code
+
+
 def _sources(
     mixture: Mixture, table: pa.Table, stratum: NDArray[np.int16], state_code: NDArray[np.int16]
 ) -> list[SourceRows]:
     """What each store may give, with its share of a batch as a run begins."""
     store, episode = table["store"].to_numpy(), codes(table, "episode_id")
     ids, action = table["transition_id"].to_numpy(), table["action"].to_numpy()
+    recording, stamp_ns = codes(table, "recording_id"), table["stamp_ns"].to_numpy()
     sources = []
     for number, (name, part) in enumerate(mixture.sources.parts.items()):
         at = np.flatnonzero((stratum != NO_STRATUM) & (store == number))
@@ -175,9 +198,21 @@ def _sources(
                 ids[at],
                 action[at].astype(np.int64),
                 episode[at],
+                hours_of(recording[store == number], stamp_ns[store == number]),
             )
         )
     return sources
+
+
+def hours_of(recording: Ints, stamp_ns: Ints) -> float:
+    """Hours of logging that rows (n,) are of: from first to last, of every recording."""
+    if not len(recording):
+        return 0.0
+    first = np.full(int(recording.max()) + 1, np.iinfo(np.int64).max)
+    last = np.full(len(first), np.iinfo(np.int64).min)
+    np.minimum.at(first, recording, stamp_ns)
+    np.maximum.at(last, recording, stamp_ns)
+    return float((last - first)[last >= first].sum() / 3.6e12)
 
 
 def _joined(
@@ -254,112 +289,3 @@ def _joined(
 def outcome_column(stratum: str) -> str:
     """The column of a panel's metadata with P(stratum | state, action)."""
     return f"probability_of_{stratum}"
-
-
-@dataclass(frozen=True)
-class SourceRows:
-    """The rows of one source that may be drawn, (n,) each."""
-
-    name: str
-    part: float  # of a batch that this source is to fill
-    at: Ints  # their places in the table of candidates
-    code: NDArray[np.int16]  # stratum
-    state_code: NDArray[np.int16]  # the one their state alone would put them in
-    transition_id: Ints
-    action: Ints
-    episode: Ints
-
-
-@dataclass(frozen=True)
-class SourcePlan:
-    """A source worked out. Shares in `lines` are of the source's own part of a batch."""
-
-    shares: SharePlan
-    kept: Bools  # (n,) rows of strata that are drawn at all
-    weight: F32  # of the kept rows
-    outcome: F32 | None  # (kept, S) P(stratum | state, action), where one is estimated
-    fit: RatioFit | None
-    lines: list[Stratum]
-
-    @property
-    def drawn(self) -> float:
-        """How much of its part the source can fill."""
-        return self.shares.scale
-
-
-def plan_source(
-    connection: duckdb.DuckDBPyConnection,
-    mixture: Mixture,
-    strata: Sequence[ResolvedStratum],
-    source: SourceRows,
-) -> SourcePlan:
-    """Shares, weights and lines of one source.
-
-    Raises:
-        MixtureError: too few rows where the mixture refuses that.
-    """
-    size = len(strata)
-    rows = np.bincount(source.code, minlength=size).astype(np.int64)
-    per_episode = [
-        np.unique(source.episode[source.code == i], return_counts=True)[1] for i in range(size)
-    ]
-    episodes = np.array([len(counts) for counts in per_episode], np.int64)
-    draws = mixture.planned.updates * mixture.planned.batch_size * source.part
-    rules = [stratum.rule for stratum in strata]
-    shares = plan_shares(mixture, rules, rows, episodes, draws=draws)
-    # A share with a schedule may begin at 0; others that are 0 are never drawn.
-    drawn = (shares.got > 0) | [not isinstance(rule.share, int | float | str) for rule in rules]
-    kept = np.asarray(drawn[source.code], np.bool_)
-    code, state = source.code[kept], source.state_code[kept]
-    outcome, fit = _outcomes(connection, mixture, strata, source, kept)
-    weight = importance_weights(code, state, strata, shares.got, mixture.correction, outcome)
-    after = effective_shares(code, weight, shares.got)
-    lines = [
-        Stratum(
-            name=stratum.name,
-            source=source.name,
-            timing=stratum.timing,
-            correction=stratum.correction,
-            within=stratum.within,
-            rows=int(rows[i]),
-            episodes=int(episodes[i]),
-            natural_share=float(rows[i] / max(rows.sum(), 1)),
-            wanted_share=float(shares.wanted[i]),
-            share=float(shares.got[i]),
-            replays_per_row=float(draws * shares.scale * shares.got[i] / max(rows[i], 1)),
-            effective_episodes=effective_count(per_episode[i]),
-            effective_rows=effective_count(weight[code == i]),
-            largest_weight=float(weight[code == i].max(initial=0.0)),
-            effective_share=float(after[i]),
-            note=shares.notes[i],
-        )
-        for i, stratum in enumerate(strata)
-    ]
-    return SourcePlan(shares, kept, weight, outcome, fit, lines)
-
-
-def _outcomes(
-    connection: duckdb.DuckDBPyConnection,
-    mixture: Mixture,
-    strata: Sequence[ResolvedStratum],
-    source: SourceRows,
-    kept: Bools,
-) -> tuple[F32 | None, RatioFit | None]:
-    """P(k | s, a) of the strata that a density ratio corrects, (kept, S), or None for none."""
-    code = source.code[kept]
-    by_ratio = [s.correction == "density_ratio" and s.timing == "post" for s in strata]
-    estimated = np.flatnonzero(by_ratio & (np.bincount(code, minlength=len(strata)) > 0))
-    if not len(estimated):
-        return None, None
-    ids = source.transition_id[kept]
-    rows = RatioRows(
-        ids, source.action[kept], source.state_code[kept], code, scramble(ids, mixture.seed)
-    )
-    names = tuple(strata[index].name for index in estimated.tolist())
-    estimate, fit = estimate_outcomes(connection, rows, estimated, names, source.name)
-    outcome = np.zeros((len(code), len(strata)), np.float32)
-    outcome[:, estimated] = estimate
-    return outcome, fit
-
-
-__all__ = ["META_COLUMNS", "PanelPlan", "outcome_column", "plan_panel"]

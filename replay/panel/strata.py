@@ -1,4 +1,4 @@
-"""Strata: each row of the store to at most one, by priority."""
+"""Strata: each row of the store to at most one, by priority, or an episode to its rarest one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.arrays import Bools
+from restock.arrays import Bools, Ints
 from restock.errors import ConfigError
 from restock.ingest.task.conditions import NOMINAL, Condition
 from restock.replay.mixture.mixture import (
@@ -45,6 +45,8 @@ class Stratum(msgspec.Struct, frozen=True):
     largest_weight: float
     effective_share: float  # after weights
     note: str
+    missing_rows: int = 0  # more of them, and its rows would bear the wanted share
+    missing_hours: float | None = None  # of logging that has so many; None where it has none
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,16 @@ class ResolvedStratum:
     @property
     def name(self) -> str:
         return self.rule.name
+
+    @property
+    def left_over(self) -> bool:
+        """Whether it gets the episodes that no other stratum of episodes is for."""
+        return self.rule.unit == "episode" and self.name == NOMINAL and self.rule.where is None
+
+    @property
+    def dealt(self) -> bool:
+        """Whether `deal_episodes` gives it some: one with a `priority` of its own keeps to it."""
+        return self.rule.unit == "episode" and self.rule.priority is None and not self.left_over
 
 
 def resolve_strata(mixture: Mixture, conditions: Sequence[Condition]) -> list[ResolvedStratum]:
@@ -114,8 +126,8 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
     if rule.unit == "episode":
         # Chosen by what the whole episode met, not by what came of this step.
         state_predicate, timing = None, "pre"
-        left_over = rule.name == NOMINAL and rule.where is None
-        predicate = "true" if left_over else _of_episodes(predicate, rule.min_steps)
+        rest = rule.name == NOMINAL and rule.where is None
+        predicate = "true" if rest else _of_episodes(predicate, rule.min_steps)
     timing = rule.timing or timing
     default = mixture.correction.pre if timing == "pre" else mixture.correction.post
     return ResolvedStratum(
@@ -150,3 +162,63 @@ def assign(
     for index in reversed(order):  # the first in priority is written last
         code[member[:, index]] = index
     return code
+
+
+def deal_episodes(
+    code: NDArray[np.int16],
+    member: Bools,
+    episode: Ints,
+    strata: Sequence[ResolvedStratum],
+    counted: Bools,
+) -> NDArray[np.int16]:
+    """The rarest stratum of each episode (E,); -1 where it is not dealt to one.
+
+    The stratum with the fewest rows so far takes one of its episodes, and so on until none is left;
+    first those that could go nowhere else. So a condition that is met in few episodes has all of
+    them, and one that always comes with another (a recovery follows each near collision) has some.
+
+    Args:
+        code: (N,) by priority alone, as `assign` gives it: rows of other strata are not dealt.
+        member: (N, S) which strata a row may be in; the same for all rows of an episode.
+        episode: (N,) its code in 0..E - 1, in order of appearance.
+        counted: (N,) rows that may be drawn: the others add nothing to a stratum's rows.
+    """
+    given = np.full(int(episode.max(initial=-1)) + 1, NO_STRATUM, np.int16)
+    dealt = np.array([index for index, stratum in enumerate(strata) if stratum.dealt], np.int64)
+    rows = np.flatnonzero(np.isin(code, dealt))
+    if not len(rows):
+        return given
+    names, first, place = np.unique(episode[rows], return_index=True, return_inverse=True)
+    may = member[rows[first]][:, dealt]  # (n episodes, K)
+    size = np.bincount(place, weights=counted[rows]).astype(np.int64)
+    taken = np.zeros(len(names), np.bool_)
+    filled = [0] * len(dealt)
+    # Of strata with as many rows, the one that could get least goes first, then by priority.
+    could = (may * size[:, None]).sum(axis=0)
+    rank = {int(k): (int(could[k]), strata[dealt[k]].priority, int(k)) for k in range(len(dealt))}
+    choices = may.sum(axis=1)
+    waiting = {
+        k: iter(sorted(np.flatnonzero(may[:, k]).tolist(), key=choices.__getitem__)) for k in rank
+    }
+    while waiting:
+        k = min(waiting, key=lambda one: (filled[one], rank[one]))
+        mine = next((e for e in waiting[k] if not taken[e]), None)
+        if mine is None:
+            del waiting[k]
+        else:
+            taken[mine] = True
+            given[names[mine]] = dealt[k]
+            filled[k] += int(size[mine])
+    return given
+
+
+def as_dealt(
+    code: NDArray[np.int16],
+    given: NDArray[np.int16],
+    episode: Ints,
+    strata: Sequence[ResolvedStratum],
+) -> NDArray[np.int16]:
+    """Strata (N,) by priority with those of `deal_episodes` in place of the other dealt ones."""
+    dealt = [index for index, stratum in enumerate(strata) if stratum.dealt]
+    of_episode = given[episode]
+    return np.where(np.isin(code, dealt) & (of_episode != NO_STRATUM), of_episode, code)

@@ -124,7 +124,10 @@ def interruptible(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -
 
 
 def _message(error: duckdb.Error) -> str:
-    return str(error).strip()
+    """What DuckDB says, or what a function in Python said, without DuckDB's words around it."""
+    text = str(error).strip()
+    _, of_python, cause = text.partition("occurred while executing the UDF: ")
+    return cause.partition(": ")[2] if of_python else text
 
 
 def _hint(error: duckdb.Error) -> str | None:

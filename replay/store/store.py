@@ -29,6 +29,7 @@ from restock.ingest.store.version import Version
 from restock.ingest.store.writer import OWN_PATH, RECORDINGS, RETENTION_HOURS, TRANSITIONS
 from restock.ingest.task.conditions import Condition
 from restock.ingest.task.task import Task
+from restock.replay.store.computed import install_computed
 from restock.replay.store.query import definitions, install, query
 
 T = TypeVar("T")
@@ -113,6 +114,7 @@ class Store:
         self._tasks = self._read_tasks()
         self.observation_type = self._observation_type()
         install(self.connection, self.observation_type)
+        install_computed(self)
 
     def __enter__(self) -> Store:
         return self

@@ -315,8 +315,9 @@ def panels(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[s
     folder, made = tmp_path_factory.mktemp("panels"), {}
     with Store(store_path) as store:
         for by in ("episode", "recording", "time"):
-            text = f"evaluation_split = {{by = '{by}'}}\nplanned = {{updates = 50}}"
-            mixture = parse_mixture(f"{text}\n[each_condition]\nshare = 'equal'")
+            text = f"evaluation_split = {{by = '{by}'}}\nplanned = {{updates = 50}}\n"
+            text += "correction = {post = 'none'}\n[each_condition]\nshare = 'equal'"
+            mixture = parse_mixture(text)
             made[by] = build_panel(store, mixture, folder / by).path
     return made
 

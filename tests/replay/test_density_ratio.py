@@ -120,6 +120,7 @@ def test_risky_states_stay_boosted_where_full_correction_takes_the_boost_away() 
 TEXT = """
 [correction]
 post = "density_ratio"
+below_natural = "allow"  # labels at random: no state tells of them
 [each_condition]
 share = "equal"
 """

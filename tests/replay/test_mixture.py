@@ -107,7 +107,7 @@ def test_an_unknown_key_is_named_with_its_path(tmp_path: Path) -> None:
         load_mixture(tmp_path / "m.toml")
     with pytest.raises(ConfigError, match=r"`held_out`\n.*now called `evaluation_split`"):
         parse_mixture("[held_out]\nby = 'none'\n" + EVERY)
-    with pytest.raises(ConfigError, match="coverage, missions, uniform"):
+    with pytest.raises(ConfigError, match="coverage, steps, uniform"):
         load_mixture("coverag")
 
 
@@ -196,6 +196,7 @@ def test_replays_per_row_cap_a_small_stratum_and_the_surplus_goes_to_the_others(
 
 def test_a_stratum_below_its_minimum_gets_nothing(transitions: pa.Table) -> None:
     text = "[each_condition]\nshare = 'equal'\nmin_rows = 30\n[planned]\nupdates = 10\n"
+    text += "[correction]\npost = 'none'\n"
     plan = planned(transitions, text)
     assert shares(plan)["near_collision"] == 0
     assert sum(shares(plan).values()) == pytest.approx(1)
@@ -311,7 +312,8 @@ def test_the_state_of_a_slip_is_nominal_where_nothing_was_known_before(
     transitions: pa.Table,
 ) -> None:
     """Its row is weighted to the density of nominal rows, boosted or not: P(s'|s, a) stays."""
-    plan = planned(transitions, "[[strata]]\nname = 'nominal'\nshare = 0.2\n" + EVERY)
+    full = "[correction]\npost = 'full'\nbelow_natural = 'allow'\n"
+    plan = planned(transitions, full + "[[strata]]\nname = 'nominal'\nshare = 0.2\n" + EVERY)
     names = [line.name for line in plan.strata]
     slip, nominal = names.index("wheel_slip"), names.index("nominal")
     chosen = plan.panel_rows

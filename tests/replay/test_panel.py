@@ -253,7 +253,8 @@ def test_strata_are_those_of_the_labels_by_priority(transitions: pa.Table, tmp_p
 def test_the_sampler_draws_by_the_panels_quotas(transitions: pa.Table, tmp_path: Path) -> None:
     mixture = parse_mixture(
         "[planned]\nupdates = 100\n[each_condition]\nshare = 'equal'\n"
-        "[evaluation_split]\nby = 'none'"
+        "[evaluation_split]\nby = 'none'\n"
+        "[correction]\npost = 'full'\nbelow_natural = 'allow'"
     )
     panel = build_panel(transitions, mixture, tmp_path / "p")
     sampler = panel.sampler(50, seed=0)
@@ -395,6 +396,8 @@ return_to_go = true
 evaluation_split = {by = "episode", share = 0.2}
 [correction]
 pre = "full"
+post = "full"
+below_natural = "allow"
 [each_condition]
 share = "equal"
 """

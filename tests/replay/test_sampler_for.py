@@ -29,6 +29,7 @@ TASK = load_profile("warehouse_amr").task
 BATCH = 40
 EVERY = (
     "[planned]\nupdates = 1\n[evaluation_split]\nby = 'none'\n[each_condition]\nshare = 'equal'\n"
+    "[correction]\npost = 'full'\nbelow_natural = 'allow'\n"
 )
 MIXTURES = {
     "in turns": "within = 'without_replacement'\n" + EVERY,

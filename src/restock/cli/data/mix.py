@@ -24,15 +24,17 @@ class MixCommand:
     """Make a pinned replay panel: which transitions a run samples, in which shares.
 
     Applies a mixture to a store and packs the chosen transitions into one memory-mapped
-    file. The plan shows for each stratum its rows, the wanted and the actual share, how often
-    each of its rows will be replayed, and its share after importance weights. A
+    file. The plan shows for each stratum its share of the rows (natural), the wanted and the
+    drawn share, what is left of it after importance weights, how often each of its rows will be
+    replayed, and how many rows and hours of logging it misses. A correction that leaves less
+    of a stratum than the logs hold is refused. A
     panel never changes; its id is a hash of store version, mixture, task and rows.
     """
 
     store: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")] = None
     """The store to take transitions from."""
     mixture: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "coverage"
-    """A TOML file, or a shipped mixture: coverage, missions or uniform. See docs/mixture.md."""
+    """A TOML file, or a shipped mixture: coverage, steps or uniform. See docs/mixture.md."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
     """The panel's directory, which must not exist yet."""
     dry_run: bool = False
@@ -150,22 +152,27 @@ def _line(stratum: Stratum) -> dict[str, Any]:
 def _table(strata: list[dict[str, Any]], *, wide: bool) -> list[dict[str, Any]]:
     """As many columns as fit; shares in percent."""
     rows = []
+    missing = any(line["missing_rows"] for line in strata)
     for line in strata:
         row = {"stratum": line["stratum"], "rows": line["rows"]}
         if wide:
-            row |= {"episodes": line["episodes"], "% of\nrows": _percent(line["natural_share"])}
+            row["episodes"] = line["episodes"]
         row |= {
+            "%\nnatural": _percent(line["natural_share"]),
             "%\nwanted": _percent(line["wanted_share"]),
-            "%\nactual": _percent(line["share"]),
+            "%\ndrawn": _percent(line["share"]),
+            "% after\nweights": _percent(line["effective_share"]),
             "replays\na row": line["replays_per_row"],
-            "effective\nrows": round(line["effective_rows"]),
         }
+        if missing:
+            row["missing\nrows"] = line["missing_rows"]
         if wide:
             row |= {
+                "effective\nrows": round(line["effective_rows"]),
                 "largest\nweight": line["largest_weight"],
                 "weights": f"{line['correction']} ({line['timing']})",
             }
-        rows.append(row | {"% after\nweights": _percent(line["effective_share"])})
+        rows.append(row)
     return rows
 
 
@@ -173,10 +180,22 @@ def _percent(share: float) -> float:
     return round(100 * share, 2)
 
 
+def _missing(line: dict[str, Any]) -> str:
+    """What would fill a stratum, in rows and in hours of logging."""
+    if not line["missing_rows"]:
+        return ""
+    text = f"; {line['missing_rows']:,} more rows would fill it"
+    if line["missing_hours"] is None:
+        return f"{text}, and these logs hold none"
+    hours = line["missing_hours"]
+    took = f"{hours:,.1f} hours" if hours >= 1 else f"{60 * hours:,.0f} minutes"
+    return f"{text}: about {took} of logging at the rate of these logs"
+
+
 def _summary(document: dict[str, Any]) -> list[str]:
     lines = [
         f"{line['stratum']}: {line['note']} ({line['wanted_share']:.1%} wanted,"
-        f" {line['share']:.1%} actual)"
+        f" {line['share']:.1%} drawn){_missing(line)}"
         for line in document["strata"]
         if line["note"]
     ]

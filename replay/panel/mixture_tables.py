@@ -1,0 +1,145 @@
+"""`mixture(name)` and `mixture_rows(name)`: a plan as tables of a store's SQL.
+
+A plan is Python (its draws and splits are hashes of our own), so the macros call functions of the
+connection. These plan on a store of their own, at the same version: a query that runs cannot ask
+its own connection.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import duckdb
+import pyarrow as pa
+
+from restock.replay.store.store import Store
+
+if TYPE_CHECKING:
+    from restock.replay.panel.plan import PanelPlan
+
+# Columns of `mixture`, with their types; each is of `Stratum`, two under the names that a run uses.
+STRATA = {
+    "stratum": "VARCHAR",
+    "source": "VARCHAR",
+    "rows": "BIGINT",
+    "episodes": "BIGINT",
+    "natural_share": "DOUBLE",
+    "wanted_share": "DOUBLE",
+    "drawn_share": "DOUBLE",
+    "effective_share": "DOUBLE",
+    "replays_per_row": "DOUBLE",
+    "missing_rows": "BIGINT",
+    "missing_hours": "DOUBLE",
+    "correction": "VARCHAR",
+    "timing": "VARCHAR",
+    "note": "VARCHAR",
+}
+ROWS = {
+    "transition_id": "BIGINT",
+    "recording_id": "VARCHAR",
+    "episode_id": "VARCHAR",
+    "step_index": "INTEGER",
+    "source": "VARCHAR",
+    "stratum": "VARCHAR",
+    "weight": "FLOAT",
+}
+_ARROW = {
+    "VARCHAR": pa.string(),
+    "BIGINT": pa.int64(),
+    "INTEGER": pa.int32(),
+    "DOUBLE": pa.float64(),
+    "FLOAT": pa.float32(),
+}
+_RENAMED = {"stratum": "name", "drawn_share": "share"}  # to the fields of `Stratum`
+
+
+def install_mixtures(store: Store) -> None:
+    """Make both macros in a store's connection."""
+    limit = store.connection.sql("SELECT current_setting('memory_limit')").fetchall()[0][0]
+
+    @functools.lru_cache(maxsize=1)
+    def planned(name: str, _changed_ns: int) -> PanelPlan:
+        from restock.replay.mixture.mixture import load_mixture
+        from restock.replay.panel.build import open_source
+        from restock.replay.panel.plan import plan_panel
+
+        with Store(store_path, version=version, memory_limit=limit) as own:
+            mixture = load_mixture(name)
+            with open_source(own, mixture, folder=Path(name).parent) as source:
+                return plan_panel(source.connection, mixture, source.conditions, source.others)
+
+    store_path, version = store.path, store.version
+    for function, columns, table_of in (
+        ("planned_strata", STRATA, strata_table),
+        ("planned_rows", ROWS, rows_table),
+    ):
+        _install(store.connection, function, columns, table_of, planned)
+    text = (files("restock.replay.panel") / "mixture_tables.sql").read_text(encoding="utf-8")
+    store.connection.execute(text)
+
+
+def _install(
+    connection: duckdb.DuckDBPyConnection,
+    function: str,
+    columns: dict[str, str],
+    table_of: Callable[[PanelPlan], pa.Table],
+    planned: Callable[[str, int], PanelPlan],
+) -> None:
+    """A function of the connection: names of mixtures to lists of structs, one a row."""
+    schema = pa.schema([(name, _ARROW[kind]) for name, kind in columns.items()])
+
+    def lists(names: pa.Array) -> pa.Array:
+        tables = [
+            table_of(planned(name, _changed_ns(name))).select(columns).cast(schema)
+            for name in names.to_pylist()
+        ]
+        ends = [0]
+        for table in tables:
+            ends.append(ends[-1] + len(table))
+        rows = pa.concat_tables([schema.empty_table(), *tables]).combine_chunks()
+        structs = pa.StructArray.from_arrays(
+            [column.combine_chunks() for column in rows.columns], fields=list(schema)
+        )
+        return pa.ListArray.from_arrays(pa.array(ends, pa.int32()), structs)
+
+    fields = ", ".join(f'"{name}" {kind}' for name, kind in columns.items())
+    # Without "side effects" the optimiser would make one constant of all rows.
+    connection.create_function(
+        function,
+        lists,
+        ["VARCHAR"],
+        f"STRUCT({fields})[]",
+        type="arrow",
+        side_effects=True,
+    )
+
+
+def _changed_ns(name: str) -> int:
+    """When a mixture's file was last written: it is planned again when that changes."""
+    path = Path(name)
+    return path.stat().st_mtime_ns if path.is_file() else 0
+
+
+def strata_table(plan: PanelPlan) -> pa.Table:
+    """The strata of a plan, columns STRATA."""
+    return pa.table(
+        {name: [getattr(line, _RENAMED.get(name, name)) for line in plan.strata] for name in STRATA}
+    )
+
+
+def rows_table(plan: PanelPlan) -> pa.Table:
+    """The rows that a plan packs, in their order, columns ROWS."""
+    rows = plan.rows.take(pa.array(plan.panel_rows))
+    code = pa.array(plan.stratum[plan.panel_rows])
+    return pa.table(
+        {
+            **{name: rows[name] for name in ROWS if name in rows.column_names},
+            "source": pa.array([line.source for line in plan.strata]).take(code),
+            "stratum": pa.array([line.name for line in plan.strata]).take(code),
+            "weight": pa.array(plan.weight),
+        }
+    )

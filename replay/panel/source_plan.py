@@ -1,0 +1,171 @@
+"""One source of a panel worked out: shares, importance weights, and what is missing on a shelf."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import duckdb
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.arrays import F32, Bools, Ints
+from restock.errors import MixtureError
+from restock.replay.mixture.mixture import Mixture
+from restock.replay.mixture.shares import SharePlan, missing_rows, plan_shares
+from restock.replay.panel.exclusions import scramble
+from restock.replay.panel.strata import ResolvedStratum, Stratum
+from restock.replay.panel.weights import (
+    RatioFit,
+    RatioRows,
+    effective_count,
+    effective_shares,
+    estimate_outcomes,
+    importance_weights,
+)
+
+# A share of the gradient this much below the natural one is no rounding.
+TOLERANCE = 0.01
+
+
+@dataclass(frozen=True)
+class SourceRows:
+    """The rows of one source that may be drawn, (n,) each."""
+
+    name: str
+    part: float  # of a batch that this source is to fill
+    at: Ints  # their places in the table of candidates
+    code: NDArray[np.int16]  # stratum
+    state_code: NDArray[np.int16]  # the one their state alone would put them in
+    transition_id: Ints
+    action: Ints
+    episode: Ints
+    hours: float  # of logging that its store is of
+
+
+@dataclass(frozen=True)
+class SourcePlan:
+    """A source worked out. Shares in `lines` are of the source's own part of a batch."""
+
+    shares: SharePlan
+    kept: Bools  # (n,) rows of strata that are drawn at all
+    weight: F32  # of the kept rows
+    outcome: F32 | None  # (kept, S) P(stratum | state, action), where one is estimated
+    fit: RatioFit | None
+    lines: list[Stratum]
+
+    @property
+    def drawn(self) -> float:
+        """How much of its part the source can fill."""
+        return self.shares.scale
+
+
+def plan_source(
+    connection: duckdb.DuckDBPyConnection,
+    mixture: Mixture,
+    strata: Sequence[ResolvedStratum],
+    source: SourceRows,
+) -> SourcePlan:
+    """Shares, weights and lines of one source.
+
+    Raises:
+        MixtureError: too few rows, or weights that take a stratum below its natural share, where
+            the mixture refuses that.
+    """
+    size = len(strata)
+    rows = np.bincount(source.code, minlength=size).astype(np.int64)
+    per_episode = [
+        np.unique(source.episode[source.code == i], return_counts=True)[1] for i in range(size)
+    ]
+    episodes = np.array([len(counts) for counts in per_episode], np.int64)
+    draws = mixture.planned.updates * mixture.planned.batch_size * source.part
+    rules = [stratum.rule for stratum in strata]
+    shares = plan_shares(mixture, rules, rows, episodes, draws=draws)
+    # A share with a schedule may begin at 0; others that are 0 are never drawn.
+    drawn = (shares.got > 0) | [not isinstance(rule.share, int | float | str) for rule in rules]
+    kept = np.asarray(drawn[source.code], np.bool_)
+    code, state = source.code[kept], source.state_code[kept]
+    outcome, fit = _outcomes(connection, mixture, strata, source, kept)
+    weight = importance_weights(code, state, strata, shares.got, mixture.correction, outcome)
+    after = effective_shares(code, weight, shares.got)
+    missing = missing_rows(mixture, rules, rows, episodes, shares.wanted, draws)
+    lines = [
+        Stratum(
+            name=stratum.name,
+            source=source.name,
+            timing=stratum.timing,
+            correction=stratum.correction,
+            within=stratum.within,
+            rows=int(rows[i]),
+            episodes=int(episodes[i]),
+            natural_share=float(rows[i] / max(rows.sum(), 1)),
+            wanted_share=float(shares.wanted[i]),
+            share=float(shares.got[i]),
+            replays_per_row=float(draws * shares.scale * shares.got[i] / max(rows[i], 1)),
+            effective_episodes=effective_count(per_episode[i]),
+            effective_rows=effective_count(weight[code == i]),
+            largest_weight=float(weight[code == i].max(initial=0.0)),
+            effective_share=float(after[i]),
+            note=shares.notes[i],
+            missing_rows=int(missing[i]),
+            missing_hours=float(missing[i] * source.hours / rows[i]) if rows[i] else None,
+        )
+        for i, stratum in enumerate(strata)
+    ]
+    if mixture.correction.below_natural == "refuse":
+        _refuse_below_natural(lines)
+    return SourcePlan(shares, kept, weight, outcome, fit, lines)
+
+
+def below_natural(line: Stratum) -> bool:
+    """Whether weights took a stratum's share of the gradient below its share of the rows.
+
+    What its quota or the lack of its rows gives it below that already is not the weights' doing:
+    then only a correction of its own counts, and what it takes of the share that is drawn. `line`
+    has shares of its source's part.
+    """
+    least = (1.0 - TOLERANCE) * min(line.natural_share, line.share)
+    weighted = line.correction != "none" or line.share >= (1.0 - TOLERANCE) * line.natural_share
+    return weighted and line.effective_share < least
+
+
+def _refuse_below_natural(lines: Sequence[Stratum]) -> None:
+    below = [line for line in lines if below_natural(line)]
+    if not below:
+        return
+    of_them = "; ".join(
+        f"{line.name} ({line.correction}) is {line.natural_share:.2%} of the rows,"
+        f" {line.wanted_share:.2%} wanted, {line.share:.2%} drawn and {line.effective_share:.2%}"
+        " of the gradient after weights"
+        for line in below
+    )
+    raise MixtureError(
+        f"its correction leaves less of a stratum than the logs hold: {of_them}",
+        remedy='set unit = "episode" (whole episodes need no correction), or [correction] post ='
+        ' "density_ratio" (keeps the boost; a larger clip keeps more) or "none" (keeps all of it,'
+        ' and its bias); below_natural = "allow" mixes it as it is',
+    )
+
+
+def _outcomes(
+    connection: duckdb.DuckDBPyConnection,
+    mixture: Mixture,
+    strata: Sequence[ResolvedStratum],
+    source: SourceRows,
+    kept: Bools,
+) -> tuple[F32 | None, RatioFit | None]:
+    """P(k | s, a) of the strata that a density ratio corrects, (kept, S), or None for none."""
+    code = source.code[kept]
+    by_ratio = [s.correction == "density_ratio" and s.timing == "post" for s in strata]
+    estimated = np.flatnonzero(by_ratio & (np.bincount(code, minlength=len(strata)) > 0))
+    if not len(estimated):
+        return None, None
+    ids = source.transition_id[kept]
+    rows = RatioRows(
+        ids, source.action[kept], source.state_code[kept], code, scramble(ids, mixture.seed)
+    )
+    names = tuple(strata[index].name for index in estimated.tolist())
+    estimate, fit = estimate_outcomes(connection, rows, estimated, names, source.name)
+    outcome = np.zeros((len(code), len(strata)), np.float32)
+    outcome[:, estimated] = estimate
+    return outcome, fit

@@ -1,0 +1,129 @@
+"""`mixture(name)` and `mixture_rows(name)`: a plan in SQL, and `restock mix` packs just that."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+from support.panels import EVERY, NO_SPLIT
+from support.stores import recording_transitions, write_store
+
+from restock import cli
+from restock.replay.mixture.mixture import load_mixture
+from restock.replay.panel.build import open_source, write_panel
+from restock.replay.panel.mixture_tables import ROWS, STRATA
+from restock.replay.panel.plan import plan_panel
+from restock.replay.store.store import Store
+
+MIXTURES = {
+    "coverage": None,
+    "steps and caps": "n_step = 3\nmax_rows_per_episode = 5\nseed = 4\n" + EVERY,
+    "weighted": "[correction]\npost = 'full'\nbelow_natural = 'allow'\n"
+    "[each_condition]\nshare = 'equal'\n",
+    "split by recording": "[evaluation_split]\nby = 'recording'\nshare = 0.3\n" + EVERY,
+    "other store": "[[sources.stores]]\nname = 'twin'\npath = 'other'\nshare = 0.2\n"
+    "[sources]\nlogs = 0.4\n" + NO_SPLIT + EVERY,
+    "where, and a share of 0": "where = 'action <> 2'\nunlisted = 'drop'\n"
+    "[[strata]]\nname = 'wheel_slip'\nshare = 0.0\n" + EVERY,
+    "unlabelled": "unlabelled = 'nominal'\n" + EVERY,
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`store`, whose first recording has no labels in some rows, and `other`."""
+    path = tmp_path_factory.mktemp("stores")
+    first = recording_transitions(1)
+    bare = [None if row < 30 else held for row, held in enumerate(first["conditions"].to_pylist())]
+    place = first.schema.get_field_index("conditions")
+    field = first.schema.field(place).with_nullable(True)
+    unlabelled = first.set_column(place, field, pa.array(bare, field.type))
+    write_store(path / "store", [recording_transitions(2), recording_transitions(3)])
+    write_store(path / "half", [unlabelled, recording_transitions(2)])
+    write_store(path / "other", [recording_transitions(7)])
+    return path
+
+
+@pytest.mark.parametrize("name", MIXTURES)
+def test_mix_packs_exactly_what_the_tables_say(folder: Path, tmp_path: Path, name: str) -> None:
+    text, mixture = MIXTURES[name], name
+    if text is not None:
+        mixture = str(folder / "mixture.toml")
+        Path(mixture).write_text(text)
+    with Store(folder / ("half" if name == "unlabelled" else "store")) as store:
+        strata = store.sql(f"FROM mixture('{mixture}')").to_arrow_table()
+        rows = store.sql(f"FROM mixture_rows('{mixture}')").to_arrow_table()
+        loaded = load_mixture(mixture)
+        with open_source(store, loaded, folder=folder) as source:
+            plan = plan_panel(source.connection, loaded, source.conditions, source.others)
+            panel = write_panel(source, plan, tmp_path / "panel")
+    assert (strata.column_names, rows.column_names) == (list(STRATA), list(ROWS))
+    for column in ("transition_id", "recording_id", "episode_id", "step_index", "stratum"):
+        assert rows[column].to_pylist() == panel.meta[column].to_pylist(), column
+    assert rows["weight"].to_pylist() == panel.weights.tolist()
+    of_panel = {line.name: line for line in panel.strata}
+    for line in strata.to_pylist():
+        other = of_panel.pop(line["stratum"])
+        assert line["drawn_share"] == other.share
+        for column in STRATA.keys() - {"stratum", "drawn_share"}:
+            assert line[column] == getattr(other, column), column
+    assert not of_panel
+    counted = {line["stratum"]: line["rows"] for line in strata.to_pylist() if line["drawn_share"]}
+    assert counted == dict(
+        rows.group_by("stratum").aggregate([([], "count_all")]).to_pandas().to_numpy().tolist()
+    )
+
+
+def test_a_file_that_changed_is_planned_again(folder: Path, tmp_path: Path) -> None:
+    path = tmp_path / "m.toml"
+    path.write_text("seed = 1\n" + EVERY)
+    with Store(folder / "store") as store:
+        query = f"SELECT list(transition_id ORDER BY transition_id) FROM mixture_rows('{path}')"
+        first = store.sql(query).fetchall()
+        assert store.sql(query).fetchall() == first
+        path.write_text("seed = 2\n" + EVERY)  # another evaluation split
+        assert store.sql(query).fetchall() != first
+
+
+def test_the_verb_answers_of_a_version_and_joins(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = str(folder / "store")
+    query = (
+        "SELECT stratum, any_value(m.rows) AS rows, count(*) AS packed"
+        " FROM mixture('uniform') AS m JOIN mixture_rows('uniform') USING (stratum)"
+        " JOIN transitions USING (transition_id) GROUP BY ALL"
+    )
+    assert cli.main(["sql", store, query, "--json"]) == 0
+    newest = json.loads(capsys.readouterr().out)
+    assert newest
+    assert all(row["rows"] == row["packed"] for row in newest)
+    assert cli.main(["sql", store, query, "--json", "--version", "0"]) == 0
+    older = json.loads(capsys.readouterr().out)
+    assert sum(row["rows"] for row in older) < sum(row["rows"] for row in newest)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("coverag", "no mixture 'coverag'"),
+        ("missions", "now called 'coverage'"),
+        ("{folder}/wrong.toml", "unknown key `seeed`"),
+        ("{folder}/refused.toml", "of the gradient after weights"),
+    ],
+)
+def test_what_cannot_be_mixed_is_refused_as_by_mix(
+    folder: Path, name: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "wrong.toml").write_text("seeed = 1\n" + EVERY)
+    (folder / "refused.toml").write_text(
+        "[correction]\npost = 'full'\n[each_condition]\nshare = 'equal'\n"
+    )
+    name = name.format(folder=folder)
+    for macro in ("mixture", "mixture_rows"):
+        assert cli.main(["sql", str(folder / "store"), f"FROM {macro}('{name}')"]) == 2
+        said = capsys.readouterr().err
+        assert message in said
+        assert "UDF" not in said

@@ -1,0 +1,207 @@
+"""A mixture that stocks: nothing corrected below its natural share, and what is missing is told."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.panels import EVERY, NO_SPLIT, planned
+
+from restock import cli
+from restock.errors import MixtureError
+from restock.replay.mixture.mixture import StratumRule, load_mixture, parse_mixture
+from restock.replay.mixture.shares import missing_rows, plan_shares
+from restock.replay.panel.plan import hours_of
+from restock.replay.panel.source_plan import below_natural
+from restock.replay.panel.strata import (
+    NO_STRATUM,
+    ResolvedStratum,
+    Stratum,
+    assign,
+    deal_episodes,
+)
+
+EQUAL = "[planned]\nupdates = 50\n[each_condition]\nshare = 'equal'\n"
+
+
+def test_a_correction_that_takes_a_stratum_below_its_natural_share_is_refused(
+    transitions: pa.Table,
+) -> None:
+    full = "[correction]\npost = 'full'\n"
+    with pytest.raises(MixtureError) as refused:
+        planned(transitions, full + EQUAL)
+    allowed = planned(transitions, full + "below_natural = 'allow'\n" + EQUAL)
+    below = [line for line in allowed.strata if below_natural(line)]
+    assert below
+    assert {line.timing for line in below} == {"post"}  # chosen on the outcome
+    for line in below:
+        assert line.effective_share < line.natural_share < line.share
+        for share in (line.natural_share, line.wanted_share, line.share, line.effective_share):
+            assert f"{share:.2%}" in str(refused.value)
+    assert 'below_natural = "allow"' in str(refused.value)
+
+
+@pytest.mark.parametrize("post", ["none", "beta", "full", "clipped", "density_ratio"])
+def test_what_a_quota_takes_is_the_users_wish(transitions: pa.Table, post: str) -> None:
+    """No boost and no refusal by rounding; and a cap below the natural share is no correction."""
+    natural = planned(transitions, f"[correction]\npost = '{post}'\npre = 'full'\n" + EVERY)
+    for line in natural.strata:
+        assert line.effective_share == pytest.approx(line.natural_share, rel=1e-4)
+    capped = planned(
+        transitions,
+        f"[correction]\npost = '{post}'\n[[strata]]\nname = 'wheel_slip'\ncap = 0.005\n" + EVERY,
+    )
+    slip = next(line for line in capped.strata if line.name == "wheel_slip")
+    assert slip.share == pytest.approx(0.005)
+    assert slip.effective_share > 0.99 * slip.share
+
+
+def test_what_counts_as_taken_by_a_correction() -> None:
+    def line(natural: float, drawn: float, after: float, correction: str = "full") -> Stratum:
+        given = dict.fromkeys(msgspec.structs.asdict(empty), 0) | msgspec.structs.asdict(empty)
+        given |= {"natural_share": natural, "share": drawn, "effective_share": after}
+        return Stratum(**given | {"correction": correction})
+
+    empty = Stratum("a", "logs", "post", "full", "uniform", 9, 3, *([0.0] * 8), note="")
+    assert below_natural(line(0.04, 0.09, 0.033))
+    assert not below_natural(line(0.04, 0.09, 0.0399))  # within rounding
+    # Boosted, not corrected itself: what others' weights take of it counts as well.
+    assert below_natural(line(0.04, 0.05, 0.03, "none"))
+    # Drawn below what is natural by its quota, and left there.
+    assert not below_natural(line(0.84, 0.40, 0.38, "none"))
+    assert not below_natural(line(0.04, 0.02, 0.02))
+    assert below_natural(line(0.04, 0.02, 0.01))
+    assert not below_natural(line(0.0, 0.0, 0.0))
+
+
+def strata_of_episodes(count: int) -> list[ResolvedStratum]:
+    rules = [StratumRule(name=f"s{i}", unit="episode") for i in range(count)]
+    rules.append(StratumRule(name="nominal", unit="episode"))
+    return [ResolvedStratum(rule, "true", None, i, "pre", "none") for i, rule in enumerate(rules)]
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.data())
+def test_every_condition_that_can_have_an_episode_of_its_own_has_one(data: st.DataObject) -> None:
+    count = data.draw(st.integers(1, 5), label="strata")
+    sets = st.frozensets(st.integers(0, count - 1))
+    met = data.draw(st.lists(sets, min_size=1, max_size=30), label="met")
+    size = np.array([data.draw(st.integers(1, 9)) for _ in met])
+    episode = np.repeat(np.arange(len(met)), size)
+    member = np.array([[*(s in one for s in range(count)), True] for one in met])[episode]
+    strata = strata_of_episodes(count)
+    code = assign(member, strata)
+    got = deal_episodes(code, member, episode, strata, np.ones(len(episode), np.bool_))
+    assert len(got) == len(met)
+    for one, stratum in zip(met, got.tolist(), strict=True):
+        assert stratum in one if one else stratum == NO_STRATUM
+    rows = np.array([size[got == s].sum() for s in range(count)])
+    for s in range(count):
+        could = [i for i, one in enumerate(met) if s in one]
+        alone = [i for i in could if len(met[i]) == 1]
+        assert set(alone) <= set(np.flatnonzero(got == s).tolist())
+        # It is empty only where its episodes are fewer than the strata that want them.
+        if could and not rows[s]:
+            rivals = set().union(*(met[i] for i in could)) - {s}
+            assert rivals
+            assert len(could) <= sum(len([i for i in could if got[i] == r]) for r in rivals)
+    again = deal_episodes(code, member, episode, strata, np.ones(len(episode), np.bool_))
+    assert got.tolist() == again.tolist()
+
+
+def test_an_episode_counts_for_the_rarest_of_its_conditions() -> None:
+    # Two episodes met both; the second condition was met in eight more.
+    met = [{0, 1}, {0, 1}, *({1} for _ in range(8)), set()]
+    episode = np.repeat(np.arange(len(met)), 10)
+    member = np.array([[0 in one, 1 in one, True] for one in met])[episode]
+    for by_priority in ([1, 0], [0, 1]):  # whichever comes first by priority
+        strata = strata_of_episodes(2)
+        strata = [
+            replace(stratum, priority=priority)
+            for stratum, priority in zip(strata, [*by_priority, 9], strict=True)
+        ]
+        code = assign(member, strata)
+        given = deal_episodes(code, member, episode, strata, np.ones(len(episode), np.bool_))
+        assert given.tolist() == [0, 0, *([1] * 8), NO_STRATUM]
+
+
+def test_by_priority_and_a_priority_of_its_own(transitions: pa.Table) -> None:
+    each = "[each_condition]\nunit = 'episode'\n" + NO_SPLIT
+    rarest = {line.name: line.rows for line in planned(transitions, each).strata}
+    first = {
+        line.name: line.rows for line in planned(transitions, "prefer = 'priority'\n" + each).strata
+    }
+    assert min(rows for name, rows in rarest.items() if name != "nominal") > min(
+        rows for name, rows in first.items() if name != "nominal"
+    )
+    own = "[[strata]]\nname = 'wheel_slip'\nunit = 'episode'\npriority = 1\n" + each
+    kept = {line.name: line.rows for line in planned(transitions, own).strata}
+    labels = transitions.to_pandas()
+    slipped = labels[labels["conditions"].map(lambda held: "wheel_slip" in held)]["episode_id"]
+    assert kept["wheel_slip"] == int(labels["episode_id"].isin(slipped).sum())
+
+
+def test_the_default_mixture_gives_every_condition_its_rows_and_corrects_nothing(
+    transitions: pa.Table,
+) -> None:
+    mixture = load_mixture("coverage")
+    assert mixture.each_condition is not None
+    assert mixture.each_condition.unit == "episode"
+    plan = planned(transitions, "[each_condition]\nunit = 'episode'\n")
+    assert min(line.rows for line in plan.strata if line.name != "nominal") > 0
+    assert {line.correction for line in plan.strata} == {"none"}
+    assert [line.effective_share for line in plan.strata] == pytest.approx(
+        [line.share for line in plan.strata]
+    )
+
+
+def test_what_a_stratum_misses_is_what_would_fill_it() -> None:
+    text = "max_replays_per_row = 50\n[planned]\nupdates = 1000\nbatch_size = 100\n" + EVERY
+    mixture = parse_mixture(text)
+    rules = [StratumRule(name="nominal", share=0.5), StratumRule(name="rare", share=0.5)]
+    rows, episodes, draws = np.array([10_000, 93]), np.array([100, 10]), 50_000.0
+    plan = plan_shares(mixture, rules, rows, episodes, draws=draws)
+    missing = missing_rows(mixture, rules, rows, episodes, plan.wanted, draws)
+    assert missing.tolist() == [0, 407]  # 25,000 draws at 50 a row are 500 rows
+    filled = plan_shares(mixture, rules, rows + missing, episodes, draws=draws)
+    np.testing.assert_allclose(filled.got, filled.wanted)
+    # Without a limit a row is enough; below a minimum, what reaches it.
+    least = [rules[0], StratumRule(name="rare", share=0.5, min_episodes=20)]
+    free = parse_mixture(EVERY)
+    assert missing_rows(free, least, rows, episodes, plan.wanted, draws).tolist() == [0, 93]
+    none = np.array([10_000, 0])
+    assert missing_rows(free, rules, none, episodes, plan.wanted, draws).tolist() == [0, 1]
+
+
+def test_hours_of_logging_are_from_first_to_last_of_every_recording() -> None:
+    hour = 3_600 * 10**9
+    stamps = np.array([0, hour, 9 * hour, 9 * hour + hour // 2])
+    assert hours_of(np.array([0, 0, 2, 2]), stamps) == pytest.approx(1.5)
+
+
+def test_the_plan_shows_four_shares_side_by_side_and_what_is_missing(
+    store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "m.toml").write_text(
+        "max_replays_per_row = 40\n[each_condition]\nunit = 'episode'\nshare = 'equal'\n"
+    )
+    arguments = ["mix", str(store_path), "--mixture", str(tmp_path / "m.toml"), "--dry-run"]
+    assert cli.main([*arguments, "--json"]) == 0
+    lines = json.loads(capsys.readouterr().out)["strata"]
+    short = [line for line in lines if line["missing_rows"]]
+    assert short
+    for line in short:
+        assert line["missing_hours"] > 0
+        assert line["note"]
+    assert cli.main(arguments) == 0
+    text = capsys.readouterr().out
+    for name in ("natural", "wanted", "drawn", "after"):
+        assert name in text
+    assert f"{short[0]['missing_rows']:,} more rows would fill it" in text
