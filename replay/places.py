@@ -28,7 +28,6 @@ def open_place(
     *,
     beside: Mapping[str, str | Path] | None = None,
     memory_limit: str | None = None,
-    version: int | None = None,
     only_store: bool = False,
     version: Version | None = None,
 ) -> Iterator[duckdb.DuckDBPyConnection]:
@@ -39,7 +38,6 @@ def open_place(
         beside: more places, each under a schema of its own: `{"run": "runs/a"}` gives
             `run.audit`. Runs and panels only.
         memory_limit: of DuckDB, for a store.
-        version: of a store; default the newest.
         only_store: take nothing but a store.
         version: of a store; the newest.
 
@@ -52,8 +50,6 @@ def open_place(
             _add_all(store.connection, beside)
             yield store.connection
         return
-    if version is not None:
-        raise StoreError("only a store has versions", where=str(path), remedy="drop --version")
     path = place.folder
     if version is not None:
         raise StoreError("only a store has versions", where=str(path), remedy="leave --version out")

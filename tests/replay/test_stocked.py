@@ -9,10 +9,11 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.panels import EVERY, NO_SPLIT, planned
+from support.panels import EVERY, NO_SPLIT, panel_of, planned
 
 from restock import cli
 from restock.errors import MixtureError
@@ -27,7 +28,11 @@ from restock.replay.panel.strata import (
     assign,
     deal_episodes,
 )
+from restock.replay.places import open_place
+from restock.replay.store.audit import load_audits, load_thresholds, run_audits
 
+AUDITS = {audit.name: audit for audit in load_audits()}
+THRESHOLDS = load_thresholds()
 EQUAL = "[planned]\nupdates = 50\n[each_condition]\nshare = 'equal'\n"
 
 
@@ -205,3 +210,41 @@ def test_the_plan_shows_four_shares_side_by_side_and_what_is_missing(
     for name in ("natural", "wanted", "drawn", "after"):
         assert name in text
     assert f"{short[0]['missing_rows']:,} more rows would fill it" in text
+
+
+def test_an_audit_finds_a_panel_and_a_run_whose_weights_undo_a_quota(
+    store_path: Path, tmp_path: Path
+) -> None:
+    allow = "[correction]\npost = '{}'\nbelow_natural = 'allow'\n" + EQUAL
+    for post, status in (("full", "fail"), ("none", "pass")):
+        panel = panel_of(store_path, allow.format(post), tmp_path / post)
+        name = "effective_share"
+        with open_place(store_path, beside={"panel": panel.path}) as connection:
+            found = run_audits(
+                connection, [AUDITS[name]], {name: THRESHOLDS[name]}, beside=["panel"]
+            )
+        assert found[0].status == status
+        below = [line.name for line in panel.strata if below_natural(line)]
+        assert {row["stratum"] for row in found[0].sample} == set(below)
+
+    run, name = tmp_path / "run", "drawn_effective_share"
+    run.mkdir()
+    (run / "config.json").write_text("{}")
+    lines = [  # stratum, natural, drawn rows, effective share: twice, an interval each
+        ("nominal", 0.90, 60, 0.62),
+        ("wheel_slip", 0.04, 30, 0.01),
+        ("recovery", 0.06, 10, 0.37),
+    ]
+    rows = [
+        {"source": "logs", "stratum": stratum, "gradient_steps": step, "available_share": natural}
+        | {"drawn_rows": drawn, "effective_share": after}
+        for stratum, natural, drawn, after in lines
+        for step in (100, 200)
+    ]
+    pq.write_table(pa.Table.from_pylist(rows), run / "strata.parquet")
+    with open_place(store_path, beside={"run": run}) as connection:
+        found = run_audits(connection, [AUDITS[name]], {name: THRESHOLDS[name]}, beside=["run"])
+    (row,) = found[0].sample
+    assert (found[0].status, row["stratum"]) == ("fail", "wheel_slip")
+    assert row["drawn_share"] == pytest.approx(0.3)
+    assert row["effective_share"] == pytest.approx(0.01)
