@@ -34,7 +34,7 @@ MAY_IMPORT = {
     "replay/sampling": "mixture",
     "replay/ring": "mixture",
     "replay/panel": "mixture sampling store ingest/store ingest/task",
-    "replay/fleet": "store ingest/task",
+    "replay/fleet": "mixture panel store ingest/task",
     "replay/trace": "replay panel store ingest/profile ingest/steps ingest/task",
     "replay/export": "replay panel store ingest/profile ingest/task",
     "train": (
@@ -70,7 +70,7 @@ MAY_IMPORT = {
     "cli/data": (
         "cli ingest ingest/containers ingest/profile ingest/propose ingest/steps ingest/store"
         " ingest/task replay replay/export replay/fleet replay/mixture replay/panel replay/store"
-        " train/evaluation"
+        " train/evaluation train/twin/physics"
     ),
     "cli/learning": (
         "cli report ingest/store replay/store replay/trace train train/comparison"

@@ -24,6 +24,7 @@ VERBS = {
     "sql": "any question to a store (or a run), in SQL",
     "audit": "is the coverage good enough? exit 1 if not",
     "diff": "what is different between two stores, versions, panels or runs?",
+    "gaps": "what is missing, and which missions would fill it?",
     "mix": "a pinned replay panel with quotas per stratum",
     "export": "transitions as a data set for Minari, d3rlpy, LeRobot, Parquet or NumPy",
     "twin": "describe floors (layout), fit the twin to logs (fit), measure its gap to them (gap)",
@@ -38,7 +39,7 @@ VERBS = {
 }
 # folder -> the verbs whose modules it holds
 FOLDERS = {
-    "data": ("info", "profile", "ingest", "label", "sql", "audit", "diff", "mix", "export"),
+    "data": ("info", "profile", "ingest", "label", "sql", "audit", "diff", "gaps", "mix", "export"),
     "learning": ("train", "eval", "study", "compare", "trace", "diagnose", "report"),
     "twin": ("record", "twin"),
 }

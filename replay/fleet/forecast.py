@@ -1,0 +1,145 @@
+"""How many more missions (or hours) it takes until enough rows have come, at the rates seen so far.
+
+Two things are unknown: the rate, of which there is a sample of episodes (a Bayesian bootstrap,
+Rubin 1981), and which of the coming missions will be rich ones (draws of episodes from it). Both
+are in the interval. Where many missions are needed, the second is the normal one of renewal
+theory. A kind of mission that never yielded a row has no rate: only a bound.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from restock.arrays import F64, Ints
+
+REPLICATES = 200
+_SIMULATED = 2000  # expected missions up to which they are drawn one by one
+_SURE = 0.95
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Of one kind of mission for one gap; amounts are missions or hours."""
+
+    episodes: int  # that the rate is of
+    seen: int  # of them had any
+    rate: float  # rows (or episodes) for each
+    rate_low: float  # 95 % interval
+    rate_high: float
+    draws: F64  # (R,) amounts that were needed in replicates; empty where nothing was ever seen
+
+    @property
+    def known(self) -> bool:
+        return self.seen > 0
+
+    def quantile(self, share: float) -> float:
+        """The amount that is enough in this share of the replicates; infinite if none ever came."""
+        return float(np.quantile(self.draws, share)) if len(self.draws) else math.inf
+
+
+def forecast(
+    found: F64,
+    amount: F64,
+    missing: float,
+    *,
+    rng: np.random.Generator,
+    replicates: int = REPLICATES,
+) -> Forecast:
+    """From what E episodes yielded (E,), each of so many missions or hours (E,).
+
+    Episodes of no length (of one step, say) count as none.
+    """
+    used = amount > 0
+    found, amount = found[used], amount[used]
+    episodes, seen = len(found), int((found > 0).sum())
+    nan = float("nan")
+    if not seen:
+        return Forecast(episodes, 0, 0.0 if episodes else nan, nan, nan, np.zeros(0))
+    rate = float(found.sum() / amount.sum())
+    found, amount, weights = _weighted(found, amount, rng, replicates)
+    rates = (weights @ found) / np.maximum(weights @ amount, 1e-300)
+    low, high = np.quantile(rates, [0.025, 0.975])
+    draws = np.array(
+        [
+            _needed(found, amount, one, float(each), missing, rng)
+            for one, each in zip(weights, rates, strict=True)
+        ]
+    )
+    return Forecast(episodes, seen, rate, float(low), float(high), draws)
+
+
+def _needed(
+    found: F64, amount: F64, weights: F64, rate: float, missing: float, rng: np.random.Generator
+) -> float:
+    """The amount after which `missing` is reached, in one replicate."""
+    if missing <= 0:
+        return 0.0
+    mean = float(weights @ found)
+    episodes = missing / max(mean, 1e-300)
+    if episodes > _SIMULATED:
+        spread = math.sqrt(max(float(weights @ found**2) - mean**2, 0.0))
+        return max(missing + spread * math.sqrt(episodes) * float(rng.normal()), 0.0) / rate
+    total = spent = 0.0
+    while True:
+        drawn = _drawn(weights, math.ceil(episodes * 1.5) + 8, rng)
+        reached = total + np.cumsum(found[drawn])
+        if reached[-1] >= missing:
+            last = int(np.searchsorted(reached, missing))
+            return spent + float(amount[drawn[: last + 1]].sum())
+        total, spent = float(reached[-1]), spent + float(amount[drawn].sum())
+
+
+def missions_to_see_one(without: int) -> int:
+    """Missions that would show what `without` missions did not, with 95 %, at best.
+
+    At best: at the highest rate that such a silence leaves likely, 3 in `without` (rule of three).
+    """
+    most = min(3.0 / max(without, 1), 1.0)
+    return 1 if most >= 1 else math.ceil(math.log(1 - _SURE) / math.log(1 - most))
+
+
+def probability_to_close(
+    parts: list[tuple[F64, int]],
+    missing: float,
+    *,
+    rng: np.random.Generator,
+    replicates: int = REPLICATES,
+) -> float:
+    """That planned missions yield what is missing: `parts` are (yields (E,), missions) each."""
+    total = np.zeros(replicates)
+    for found, missions in parts:
+        if not len(found) or not missions or not found.any():
+            continue
+        found, _, weights = _weighted(found, np.ones(len(found)), rng, replicates)
+        mean = weights @ found
+        if missions > _SIMULATED:
+            spread = np.sqrt(np.maximum(weights @ found**2 - mean**2, 0.0))
+            total += missions * mean + spread * math.sqrt(missions) * rng.normal(size=replicates)
+            continue
+        total += [found[_drawn(one, missions, rng)].sum() for one in weights]
+    return float((total >= missing).mean())
+
+
+def _weighted(
+    found: F64, amount: F64, rng: np.random.Generator, replicates: int
+) -> tuple[F64, F64, F64]:
+    """The episodes, with their weights (R, E + 1) in each replicate.
+
+    One more, of half a weight, yields nothing: what every one of a few episodes did is not certain.
+    """
+    prior = np.append(np.ones(len(found)), 0.5)
+    return (
+        np.append(found, 0.0),
+        np.append(amount, amount.mean()),
+        np.asarray(rng.dirichlet(prior, replicates), np.float64),
+    )
+
+
+def _drawn(weights: F64, size: int, rng: np.random.Generator) -> Ints:
+    """So many episodes, each with its weight (E,)."""
+    steps = np.cumsum(weights)
+    drawn = np.searchsorted(steps, rng.random(size) * steps[-1], side="right")
+    return np.asarray(np.minimum(drawn, len(weights) - 1), np.int64)

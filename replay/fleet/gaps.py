@@ -1,0 +1,200 @@
+"""What a store lacks: what a mixture, the audits or a least number of rows ask for, and it has not.
+
+Every gap is so many rows (or episodes) of a cell of condition x zone x action x robot, with what
+each episode of the store has of it: the sample that a forecast is made from.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any, Literal
+
+import duckdb
+import msgspec
+import numpy as np
+
+from restock.arrays import F64
+from restock.ingest.task.conditions import NOMINAL, Condition
+from restock.replay.fleet.yields import CELL, Yields, by_episode, read_yields
+from restock.replay.mixture.mixture import CorrectionRule, EvaluationSplit, Mixture
+from restock.replay.panel.build import open_source
+from restock.replay.panel.plan import LOGS, PanelPlan, plan_panel
+from restock.replay.panel.strata import Stratum, rules_of
+from restock.replay.store.store import Store
+
+Counted = Literal["rows", "episodes"]
+# Audits that ask for more of something, with their thresholds.
+AUDITS = ("rare_condition", "few_effective_episodes", "missing_cells")
+Thresholds = Mapping[str, Mapping[str, float | str]]
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Something that there is too little of."""
+
+    asked_by: str  # "mixture coverage", "audit rare_condition", "--min-rows"
+    cell: dict[str, str | int]  # what it is of: condition (or stratum), zone, action, robot
+    counted: Counted
+    needed: float
+    there: float
+    found: F64  # (E,) of each episode of the store, in rows or episodes
+    thinnest: tuple[str, ...] = ()  # the zones that are furthest below their part of what is needed
+
+    @property
+    def missing(self) -> float:
+        return max(self.needed - self.there, 0.0)
+
+
+def find_gaps(
+    store: Store,
+    mixture: Mixture,
+    *,
+    name: str,
+    folder: Path | None = None,
+    kinds: Sequence[str] = (),
+    thresholds: Thresholds | None = None,
+    min_rows: int = 0,
+    by: Sequence[str] = CELL,
+) -> tuple[Yields, list[Gap]]:
+    """The store's episodes, and what is missing, the most first.
+
+    Args:
+        name: of the mixture, for the reports; `folder`: where its other stores are looked up.
+        kinds: of missions that can be driven.
+        thresholds: of audits, by audit; those of AUDITS are asked. None: the mixture alone.
+        min_rows: that each cell should have, of all combinations that `by` spans; 0: not asked.
+        by: the columns that make a cell.
+
+    Raises:
+        ConfigError, MixtureError, StoreError: as `plan_panel` does.
+    """
+    asked = _without_split(store, uncorrected(mixture))
+    with open_source(store, asked, folder=folder) as source:
+        plan = plan_panel(source.connection, asked, source.conditions, source.others)
+    yields = read_yields(store.connection, kinds)
+    gaps = _of_strata(plan, yields, f"mixture {name}")
+    if thresholds is not None:
+        gaps += _of_audits(store.connection, yields, thresholds)
+    if min_rows:
+        gaps += _of_cells(yields, store.conditions(), min_rows, by)
+    gaps.sort(key=lambda gap: (gap.counted, -gap.missing, str(gap.cell)))
+    return yields, [gap for gap in gaps if gap.missing > 0]
+
+
+def uncorrected(mixture: Mixture) -> Mixture:
+    """The mixture without weights, which take long to estimate and ask for no rows.
+
+    A shortfall is what is looked for: it is no reason to refuse.
+    """
+    strata = tuple(msgspec.structs.replace(rule, correction=None) for rule in mixture.strata)
+    each = mixture.each_condition
+    return msgspec.structs.replace(
+        mixture,
+        strata=strata,
+        each_condition=each and msgspec.structs.replace(each, correction=None),
+        correction=CorrectionRule(pre="none", post="none"),
+        shortfall="shrink",
+    )
+
+
+def _without_split(store: Store, mixture: Mixture) -> Mixture:
+    """The mixture, which keeps nothing from a store of one recording or one episode."""
+    by = "recording_id" if mixture.evaluation_split.by == "recording" else "episode_id"
+    several = store.sql(f"SELECT count(DISTINCT {by}) > 1 FROM transitions").fetchall()[0][0]
+    none = EvaluationSplit(by="none")
+    return mixture if several else msgspec.structs.replace(mixture, evaluation_split=none)
+
+
+def _of_strata(plan: PanelPlan, yields: Yields, asked_by: str) -> list[Gap]:
+    """Strata whose rows do not bear the share that the mixture wants for them."""
+    gaps = []
+    for code, line in enumerate(plan.strata):
+        missing = _missing_rows(plan, line)
+        if not missing or line.source != LOGS:
+            continue
+        found = by_episode(yields, plan.rows["episode_id"], plan.stratum == code)
+        needed = line.rows + missing
+        cell: dict[str, str | int] = {"stratum": line.name}
+        thin = _thinnest(plan, code, needed)
+        gaps.append(Gap(asked_by, cell, "rows", needed, line.rows, found, thin))
+    return gaps
+
+
+def _missing_rows(plan: PanelPlan, line: Stratum) -> int:
+    mixture, rule = plan.mixture, rules_of(plan.mixture, [line.name])[0]
+    draws = mixture.planned.updates * mixture.planned.batch_size * plan.logs_share_wanted
+    needed = 1.0
+    if mixture.max_replays_per_row is not None:
+        needed = max(needed, line.wanted_share * draws / mixture.max_replays_per_row)
+    needed = max(needed, rule.min_rows, rule.min_episodes * line.rows / max(line.episodes, 1))
+    return max(math.ceil(needed - line.rows - 1e-6), 0) if line.wanted_share > 0 else 0
+
+
+def _thinnest(plan: PanelPlan, code: int, needed: int) -> tuple[str, ...]:
+    """Zones, by how far their rows of a stratum are below their part of all driving."""
+    column = plan.rows["zone"].combine_chunks()
+    names, zone = column.dictionary.to_pylist(), column.indices.fill_null(len(column.dictionary))
+    size = len(names) + 1
+    everywhere = np.bincount(zone.to_numpy(), minlength=size)[: len(names)]
+    there = np.bincount(zone.to_numpy()[plan.stratum == code], minlength=size)[: len(names)]
+    short = needed * everywhere / max(everywhere.sum(), 1) - there
+    return tuple(names[place] for place in np.argsort(-short)[:3].tolist() if short[place] > 0)
+
+
+def _of_audits(
+    connection: duckdb.DuckDBPyConnection, yields: Yields, thresholds: Thresholds
+) -> list[Gap]:
+    """What the shipped audits of coverage ask for."""
+    gaps = []
+    limits = {name: {k: float(v) for k, v in thresholds.get(name, {}).items()} for name in AUDITS}
+    lines = connection.sql(
+        "SELECT condition, rows, episodes, effective_episodes FROM coverage_by_condition"
+    ).fetchall()
+    for condition, rows, episodes, effective in lines:
+        found = yields.rows_of({"condition": condition})
+        met = np.asarray(found > 0, np.float64)
+        asked = limits["rare_condition"]
+        cell: dict[str, str | int] = {"condition": condition}
+        by = "audit rare_condition"
+        gaps.append(Gap(by, cell, "rows", asked.get("min_rows", 0), rows, found))
+        gaps.append(Gap(by, cell, "episodes", asked.get("min_episodes", 0), episodes, met))
+        least = limits["few_effective_episodes"].get("min_effective_episodes", 0)
+        if rows and effective < least:
+            # As many more as would do if they were as uneven as those that there are.
+            needed = math.ceil(least * episodes / effective)
+            by = "audit few_effective_episodes"
+            gaps.append(Gap(by, cell, "episodes", needed, episodes, met))
+    least = limits["missing_cells"].get("min_rows", 0)
+    cells = connection.execute("FROM cells_below(?)", [least]).fetchall() if least else []
+    for condition, action, _, _, rows in cells:
+        cell = {"condition": condition, "action": action}
+        gaps.append(Gap("audit missing_cells", cell, "rows", least, rows, yields.rows_of(cell)))
+    return gaps
+
+
+def _of_cells(
+    yields: Yields, conditions: Sequence[Condition], min_rows: int, by: Sequence[str]
+) -> list[Gap]:
+    """Cells with fewer rows than that, empty ones included.
+
+    A cell of a robot counts that robot's rows, and is forecast by what any robot meets.
+    """
+    gaps = []
+    values: dict[str, list[str | int]] = {name: yields.values(name) for name in by}
+    if "condition" in values:
+        known = {NOMINAL, *(condition.name for condition in conditions), *values["condition"]}
+        values["condition"] = sorted(known, key=str)
+    if values.get("robot") == [""]:  # no recording says which robot
+        del values["robot"]
+    for chosen in product(*values.values()):
+        cell: dict[str, Any] = dict(zip(values, chosen, strict=True))
+        there = float(yields.rows_of(cell).sum())
+        if there < min_rows:
+            anyone = {name: value for name, value in cell.items() if name != "robot"}
+            found = yields.rows_of(anyone)
+            gaps.append(Gap("--min-rows", cell, "rows", min_rows, there, found))
+    return gaps

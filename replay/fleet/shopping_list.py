@@ -1,0 +1,309 @@
+"""The shopping list: which missions, and how many of each, fill the gaps of a store.
+
+Each gap is forecast for each kind of mission; the least number of missions that fills all of them
+is an integer linear programme. Planned is what is enough with a stated probability, gap by gap.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from restock.arrays import F64
+from restock.errors import ConfigError
+from restock.replay.fleet.forecast import (
+    Forecast,
+    forecast,
+    missions_to_see_one,
+    probability_to_close,
+)
+from restock.replay.fleet.gaps import Gap
+from restock.replay.fleet.yields import Unit, Yields
+
+HOUR_STEPS = 60  # of an hour that is planned
+_PART = 0.1  # of a gap that an order fills at least, to be named as for it
+
+
+@dataclass(frozen=True)
+class Supply:
+    """A kind of mission, or of an hour of logging, that could be ordered."""
+
+    kind: str | None  # None: whatever the fleet does
+    zone: str | None = None  # that it comes through
+    robot: str | None = None  # that drives it
+
+    @property
+    def name(self) -> str:
+        words = [self.kind or "logging"]
+        words += [f"in {self.zone}"] if self.zone else []
+        words += [f"by {self.robot}"] if self.robot else []
+        return " ".join(words)
+
+
+@dataclass(frozen=True)
+class FilledGap:
+    """A gap with what would fill it."""
+
+    gap: Gap
+    best: Supply | None  # None: nothing that was ever logged had any
+    forecast: Forecast | None  # of the best
+    see_one: tuple[Supply, int] | None  # where nothing had any: what would show one, at best
+    closes_with: float | None = None  # the probability that the plan closes it
+
+
+@dataclass(frozen=True)
+class Order:
+    """One line of the list."""
+
+    supply: Supply
+    amount: float  # missions, or hours
+    hours: float
+    fills: tuple[str, ...]  # the gaps that it is for
+
+
+@dataclass(frozen=True)
+class ShoppingList:
+    """What to log next."""
+
+    unit: Unit
+    confidence: float
+    gaps: list[FilledGap]
+    orders: list[Order]
+    total_low: float  # of all orders together: 95 % of replicates need more than this …
+    total_high: float  # … and less than this
+
+    @property
+    def total(self) -> float:
+        return sum(order.amount for order in self.orders)
+
+
+def shopping_list(
+    yields: Yields,
+    gaps: Sequence[Gap],
+    *,
+    unit: Unit | None = None,
+    confidence: float = 0.8,
+    seed: int = 0,
+) -> ShoppingList:
+    """What fills the gaps, at the rates of the store's episodes.
+
+    Args:
+        unit: missions of a kind, or hours of logging; None: missions where the recordings knew the
+            truth (a simulator drives what one orders), else hours.
+        confidence: with which the planned amount is to close each gap by itself.
+
+    Raises:
+        ConfigError: missions are asked for, and none could be told apart.
+    """
+    if unit is None:
+        unit = "missions" if yields.simulated else "hours"
+    if not 0 < confidence < 1:
+        raise ConfigError(f"must lie between 0 and 1, got {confidence:g}", where="--confidence")
+    rng = np.random.default_rng(seed)
+    kinds: list[str | None] = [None] if unit == "hours" else [*sorted(set(yields.kind))]
+    supplies = list(dict.fromkeys(s for gap in gaps for s in _supplies(gap, kinds)))
+    table: dict[tuple[int, Supply], Forecast] = {}
+    for number, supply in enumerate(supplies):
+        at = yields.members(supply.kind, supply.zone)
+        amount = yields.amount(unit, supply.zone)[at]
+        for index, gap in enumerate(gaps):
+            if _may_fill(supply, gap):
+                # The same draws for every gap: gaps that are alike come out alike.
+                draws = np.random.default_rng([seed, number])
+                table[index, supply] = forecast(gap.found[at], amount, gap.missing, rng=draws)
+    filled = [
+        _filled(gap, {s: table[index, s] for s in _supplies(gap, kinds)}, confidence)
+        for index, gap in enumerate(gaps)
+    ]
+    reachable = [index for index, one in enumerate(filled) if one.best is not None]
+    amounts = _least(gaps, reachable, table, confidence, unit)
+    total_low, total_high = (
+        sum(_least(gaps, reachable, table, share, unit).values()) for share in (0.025, 0.975)
+    )
+    orders = [
+        _order(supply, amount, gaps, table, yields, unit) for supply, amount in amounts.items()
+    ]
+    orders.sort(key=lambda order: -order.amount)
+    if unit == "missions":
+        filled = [_with_probability(one, amounts, yields, rng) for one in filled]
+    return ShoppingList(unit, confidence, filled, orders, total_low, total_high)
+
+
+def _may_fill(supply: Supply, gap: Gap) -> bool:
+    """Whether it is of the zone and the robot that the gap names."""
+    asked = ((gap.cell.get("zone"), supply.zone), (gap.cell.get("robot"), supply.robot))
+    return all(wanted is None or wanted in ("", given) for wanted, given in asked)
+
+
+def _supplies(gap: Gap, kinds: Sequence[str | None]) -> list[Supply]:
+    """What fills a gap best: a cell of a zone is filled by missions that come through it."""
+    zone, robot = gap.cell.get("zone"), gap.cell.get("robot")
+    return [
+        Supply(kind, None if zone is None else str(zone), str(robot) if robot else None)
+        for kind in kinds
+    ]
+
+
+def _filled(gap: Gap, mine: dict[Supply, Forecast], confidence: float) -> FilledGap:
+    known = {supply: one for supply, one in mine.items() if one.known}
+    if known:
+        best = min(known, key=lambda supply: known[supply].quantile(confidence))
+        return FilledGap(gap, best, known[best], None)
+    # The kind of mission that is called so, else the one that was driven least: it has shown least.
+    named = [
+        supply
+        for supply in mine
+        if supply.kind in (gap.cell.get("condition"), gap.cell.get("stratum"))
+    ]
+    likely = min(named or mine, key=lambda supply: (mine[supply].episodes, supply.name))
+    return FilledGap(gap, None, None, (likely, missions_to_see_one(mine[likely].episodes)))
+
+
+def _least(
+    gaps: Sequence[Gap],
+    reachable: Sequence[int],
+    table: dict[tuple[int, Supply], Forecast],
+    share: float,
+    unit: Unit,
+) -> dict[Supply, float]:
+    """The least amounts that fill every gap that can be, where each alone is enough with `share`.
+
+    A mission counts for a gap by what it takes of it alone: missing / the amount that is enough.
+    """
+    from scipy.optimize import LinearConstraint, milp
+
+    supplies = list(dict.fromkeys(supply for (index, supply) in table if index in reachable))
+    if not supplies:
+        return {}
+    rates = np.zeros((len(reachable), len(supplies)))
+    for row, index in enumerate(reachable):
+        for column, supply in enumerate(supplies):
+            enough = [one.quantile(share) for one in _forecasts(table, index, supply)]
+            if enough:
+                rates[row, column] = gaps[index].missing / max(*enough, 1e-9)
+    whole = unit == "missions"
+    missing = np.array([gaps[index].missing for index in reachable])
+    scale = np.maximum(missing, 1e-9)  # gaps of ten rows and of ten thousand in one programme
+    # Where either would do, a mission that may be anywhere is easier to have.
+    cost = [1.001 if supply.zone or supply.robot else 1.0 for supply in supplies]
+    found = milp(
+        np.array(cost),
+        constraints=LinearConstraint(rates / scale[:, None], missing / scale, np.inf),
+        integrality=np.full(len(supplies), int(whole)),
+        options={"time_limit": 10.0, "mip_rel_gap": 0.01},
+    )
+    if found.x is None:  # cannot be: each gap has a kind that fills it
+        return {}
+    amounts = np.round(found.x) if whole else np.ceil(found.x * HOUR_STEPS - 1e-6) / HOUR_STEPS
+    return {s: float(a) for s, a in zip(supplies, amounts.tolist(), strict=True) if a > 0}
+
+
+def _forecasts(
+    table: dict[tuple[int, Supply], Forecast], index: int, supply: Supply
+) -> list[Forecast]:
+    """What is known of a supply for a gap; the worst of it counts.
+
+    Of many zones the one that was luckiest looks best: where the gap is of any zone, missions
+    through one are worth no more than those through all.
+    """
+    ways = (supply, Supply(supply.kind, None, supply.robot), Supply(supply.kind))
+    return [one for way in dict.fromkeys(ways) if (one := table.get((index, way))) is not None]
+
+
+def _order(
+    supply: Supply,
+    amount: float,
+    gaps: Sequence[Gap],
+    table: dict[tuple[int, Supply], Forecast],
+    yields: Yields,
+    unit: Unit,
+) -> Order:
+    at = yields.members(supply.kind, supply.zone)
+    hours = amount if unit == "hours" else amount * float(yields.hours[at].mean())
+    fills = tuple(
+        describe_cell(gap)
+        for index, gap in enumerate(gaps)
+        if (one := table.get((index, supply))) is not None
+        and one.rate * amount >= _PART * gap.missing
+    )
+    return Order(supply, amount, hours, fills)
+
+
+def _with_probability(
+    one: FilledGap, amounts: dict[Supply, float], yields: Yields, rng: np.random.Generator
+) -> FilledGap:
+    parts: list[tuple[F64, int]] = []
+    for supply, amount in amounts.items():
+        if _may_fill(supply, one.gap):
+            at = yields.members(supply.kind, supply.zone)
+            parts.append((one.gap.found[at], round(amount)))
+    closes = probability_to_close(parts, one.gap.missing, rng=rng) if one.best else None
+    return FilledGap(one.gap, one.best, one.forecast, one.see_one, closes)
+
+
+def describe_cell(gap: Gap) -> str:
+    """`wheel_slip`, or `wheel_slip, action 3, aisle_2`."""
+    cell = dict(gap.cell)
+    words = [str(cell.pop(name)) for name in ("stratum", "condition") if name in cell]
+    words += [f"action {cell.pop('action')}"] if "action" in cell else []
+    return ", ".join([*words, *(str(value) for value in cell.values() if value != "")])
+
+
+def document(found: ShoppingList) -> dict[str, Any]:
+    """Plain values: what `restock gaps --json` prints of it."""
+    return {
+        "unit": found.unit,
+        "confidence": found.confidence,
+        "closed": not found.gaps,
+        "gaps": [_gap(one) for one in found.gaps],
+        "plan": {
+            "orders": [
+                {
+                    "kind": order.supply.kind,
+                    "zone": order.supply.zone,
+                    "robot": order.supply.robot,
+                    "missions": round(order.amount) if found.unit == "missions" else None,
+                    "hours": order.hours,
+                    "fills": list(order.fills),
+                }
+                for order in found.orders
+            ],
+            "total": found.total,
+            "total_low": found.total_low,
+            "total_high": found.total_high,
+            "hours": sum(order.hours for order in found.orders),
+        },
+    }
+
+
+def _gap(one: FilledGap) -> dict[str, Any]:
+    gap, seen = one.gap, one.forecast
+    line: dict[str, Any] = {
+        "asked_by": gap.asked_by,
+        "cell": describe_cell(gap),
+        **{
+            name: gap.cell.get(name) for name in ("stratum", "condition", "zone", "action", "robot")
+        },
+        "counted": gap.counted,
+        "needed": math.ceil(gap.needed),
+        "there": round(gap.there),
+        "missing": math.ceil(gap.missing),
+        "thinnest_zones": list(gap.thinnest),
+        "best": one.best.name if one.best else None,
+        "rate": seen.rate if seen else None,
+        "rate_low": seen.rate_low if seen else None,
+        "rate_high": seen.rate_high if seen else None,
+        "rate_of_episodes": seen.episodes if seen else None,
+        "amount": seen.quantile(0.5) if seen else None,
+        "amount_low": seen.quantile(0.025) if seen else None,
+        "amount_high": seen.quantile(0.975) if seen else None,
+        "closes_with": one.closes_with,
+    }
+    if one.see_one is not None:
+        supply, missions = one.see_one
+        line |= {"never_seen_in": supply.name, "at_least": missions}
+    return line

@@ -1,0 +1,112 @@
+"""What each episode of a store yielded, as a sample of what the next ones would.
+
+An episode is the unit: one mission, or for a fleet whose missions cannot be chosen, so many hours
+of logging. Its rows are alike, so nothing is said of a rate but over episodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.resources import files
+from typing import Literal
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from restock.arrays import F64, Bools, Ints
+
+MIN_STEPS = 3  # a label of a step or two may be a mistake
+CELL = ("condition", "zone", "action", "robot")
+Unit = Literal["missions", "hours"]
+
+
+@dataclass(frozen=True)
+class Yields:
+    """E episodes, and their rows by cell of condition x zone x action x robot."""
+
+    episode_id: list[str]  # (E,)
+    hours: F64  # (E,)
+    kind: list[str]  # (E,) what it met, of the kinds of missions there are
+    simulated: bool  # the recordings knew the truth: missions of a kind can be driven
+    cells: pa.Table  # number (of the episode), condition, zone, action, robot, rows
+
+    def __len__(self) -> int:
+        return len(self.episode_id)
+
+    def members(self, kind: str | None = None, zone: str | None = None) -> Ints:
+        """The episodes of a kind, and those that came through a zone."""
+        chosen = np.ones(len(self), np.bool_)
+        if kind is not None:
+            chosen &= np.array([one == kind for one in self.kind], np.bool_)
+        if zone is not None:
+            chosen &= self._hours_in(zone) > 0
+        return np.flatnonzero(chosen)
+
+    def amount(self, unit: Unit, zone: str | None = None) -> F64:
+        """(E,) what each episode was of: one mission, or so many hours (in the zone)."""
+        if unit == "missions":
+            return np.ones(len(self))
+        return self.hours if zone is None else self._hours_in(zone)
+
+    def rows_of(self, cell: dict[str, str | int]) -> F64:
+        """(E,) rows of each episode in a cell; what it does not name may be any."""
+        kept = np.ones(len(self.cells), np.bool_)
+        for name, value in cell.items():
+            kept &= self._is(name, value)
+        return self._sum(kept)
+
+    def values(self, name: str) -> list[str | int]:
+        """What there is of condition, zone, action or robot."""
+        found: list[str | int] = sorted(self.cells[name].unique().to_pylist())
+        return found
+
+    @cached_property
+    def total(self) -> F64:
+        """(E,) rows of each episode."""
+        return self._sum(np.ones(len(self.cells), np.bool_))
+
+    def _hours_in(self, zone: str) -> F64:
+        share = self.rows_of({"zone": zone}) / np.maximum(self.total, 1)
+        return np.asarray(self.hours * share, np.float64)
+
+    def _is(self, name: str, value: str | int) -> Bools:
+        return np.asarray(pc.equal(self.cells[name], value).to_numpy(), np.bool_)
+
+    def _sum(self, kept: Bools) -> F64:
+        number, rows = (self.cells[name].to_numpy()[kept] for name in ("number", "rows"))
+        return np.bincount(number, rows, len(self)).astype(np.float64)
+
+
+def read_yields(connection: duckdb.DuckDBPyConnection, kinds: Sequence[str]) -> Yields:
+    """The episodes of the connection's `transitions`; `kinds` of missions that could be driven."""
+    script = files("restock.replay.fleet").joinpath("episode_yields.sql")
+    for statement in duckdb.extract_statements(script.read_text(encoding="utf-8")):
+        given = {"kinds": list(kinds), "min_steps": MIN_STEPS}
+        named = {name: given[name] for name in statement.named_parameters}
+        connection.execute(statement, named or None)
+    table = connection.sql("FROM yield_episodes ORDER BY number").to_arrow_table()
+    return Yields(
+        table["episode_id"].to_pylist(),
+        np.asarray(table["hours"].to_numpy(), np.float64),
+        table["kind"].to_pylist(),
+        bool(pc.any(table["simulated"]).as_py()),
+        connection.sql("FROM yield_cells ORDER BY ALL").to_arrow_table(),
+    )
+
+
+def by_episode(yields: Yields, episode: pa.ChunkedArray, counted: Bools) -> F64:
+    """(E,) how many of some rows, by the text of their episode (N,), each episode has."""
+    place = {name: index for index, name in enumerate(yields.episode_id)}
+    column = episode.combine_chunks()
+    if not pa.types.is_dictionary(column.type):
+        column = column.dictionary_encode()
+    of_code = np.array([place.get(name, -1) for name in column.dictionary.to_pylist()], np.int64)
+    number = of_code[column.indices.to_numpy()][counted]
+    return np.bincount(number[number >= 0], minlength=len(yields)).astype(np.float64)
+
+
+__all__ = ["CELL", "Unit", "Yields", "by_episode", "read_yields"]

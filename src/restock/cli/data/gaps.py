@@ -1,0 +1,216 @@
+"""`restock gaps`: what is missing, and which missions would fill it?"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+SHOWN = 15  # lines of a table on a terminal; --json has all
+
+
+@dataclass
+class GapsCommand:
+    """What is missing from a store, and how many missions of which kind would fill it?
+
+        restock gaps store/
+        restock gaps store/ --mixture my.toml --missions-out next.toml
+        restock gaps store/ --min-rows 20 --by condition,zone
+
+    A gap is what a mixture, or an audit of coverage, asks for and the store has not: rows of a
+    stratum, rows or episodes of a condition, cells of condition x action; with --min-rows every
+    cell of condition x zone x action (x robot). Each comes with the rate seen so far, the missions
+    (or hours of logging) that it takes at that rate, and their 95 % interval. The plan is the least
+    number of missions that fills all of them. It can be written as a file that `restock record
+    --missions` drives, and that training's episodes follow (env.missions).
+    """
+
+    store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
+    """The store."""
+    mixture: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "coverage"
+    """What should be there: a mixture's shares of its planned draws. See docs/mixture.md."""
+    thresholds: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Thresholds of audits in place of the shipped ones, as `restock audit` takes them."""
+    no_audits: bool = False
+    """Ask for what the mixture needs alone."""
+    min_rows: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Ask for so many rows of every cell, too (default: none)."""
+    by: str = "condition,zone,action,robot"
+    """What makes a cell of --min-rows."""
+    unit: Literal["missions", "hours"] | None = None
+    """Count in missions of a kind, or in hours of logging (default: missions where a simulator made
+    the recordings, hours where a fleet did)."""
+    confidence: float = 0.8
+    """With which the planned missions are to close each gap."""
+    version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
+    """The store as it was: a version's number, or a time (2026-11-01T08:00Z); the newest."""
+    missions_out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Write the plan as a missions file, which must not exist yet."""
+    force: bool = False
+    """Replace an existing missions file."""
+    json: bool = False
+    """Print one JSON document."""
+
+    def run(self) -> None:
+        """Find the gaps, plan what fills them, and print both."""
+        from restock.cli import output
+        from restock.ingest.store.version import given_version
+        from restock.replay.fleet.gaps import find_gaps
+        from restock.replay.fleet.missions_file import of_list, refuse_existing, write_missions
+        from restock.replay.fleet.shopping_list import document, shopping_list
+        from restock.replay.mixture.mixture import load_mixture
+        from restock.replay.store.audit import load_thresholds
+        from restock.replay.store.store import Store
+        from restock.train.twin.physics.episode import KINDS
+
+        mixture = load_mixture(self.mixture)
+        thresholds = None if self.no_audits else load_thresholds(self.thresholds)
+        if self.missions_out is not None and not self.force:
+            refuse_existing(self.missions_out)
+        with Store(self.store, version=given_version(self.version)) as store:
+            yields, gaps = find_gaps(
+                store,
+                mixture,
+                name=self.mixture,
+                folder=Path(self.mixture).parent,
+                kinds=KINDS,
+                thresholds=thresholds,
+                min_rows=self.min_rows,
+                by=_columns(self.by),
+            )
+            place, version = str(store.path), store.version
+        found = shopping_list(yields, gaps, unit=self.unit, confidence=self.confidence)
+        answer = {
+            "store": place,
+            "store_version": version,
+            "mixture": self.mixture,
+            "episodes": len(yields),
+            **document(found),
+        }
+        if self.missions_out is not None:
+            plan = of_list(found, store=place, store_version=version, mixture=self.mixture)
+            write_missions(self.missions_out, plan)
+            answer["missions_file"] = str(self.missions_out)
+        if self.json:
+            output.print_json(answer)
+        else:
+            _print(answer)
+
+
+def _columns(text: str) -> list[str]:
+    from restock.errors import ConfigError
+    from restock.replay.fleet.yields import CELL
+
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    unknown = sorted(set(names) - set(CELL))
+    if unknown or len(set(names)) != len(names) or not names:
+        raise ConfigError(
+            f"{', '.join(unknown) or text!r} cannot make a cell",
+            where="--by",
+            remedy=f"name some of {', '.join(CELL)}, each once",
+        )
+    return names
+
+
+def _print(answer: dict[str, Any]) -> None:
+    from restock.cli import output
+
+    unit = answer["unit"]
+    name = f"{answer['store']} version {answer['store_version']}"
+    if answer["closed"]:
+        output.stdout().print(f"{name}: no gaps; it has all that {answer['mixture']} asks for")
+        return
+    known = [gap for gap in answer["gaps"] if gap["best"]]
+    unknown = [gap for gap in answer["gaps"] if not gap["best"]]
+    if known:
+        _table(
+            f"{name}: what is missing, at the rates of its {answer['episodes']:,} episodes",
+            [_line(gap, unit) for gap in known],
+        )
+    if unknown:
+        _table("never seen: no rate is known", _unknown(unknown, unit))
+    plan = answer["plan"]
+    if plan["orders"]:
+        with_ = {n: any(order[n] for order in plan["orders"]) for n in ("zone", "robot")}
+        _table("what to log next", [_order(order, unit, with_) for order in plan["orders"]])
+        output.stdout().print(
+            f"{_number(plan['total'])} {unit} in all (95 %: {_number(plan['total_low'])} to"
+            f" {_number(plan['total_high'])})"
+            + (f", {plan['hours']:,.2f} hours" if unit == "missions" else "")
+            + f": enough for each gap with {answer['confidence']:.0%}"
+        )
+    if "missions_file" in answer:
+        output.stdout().print(f"-> {answer['missions_file']}")
+
+
+def _table(title: str, rows: list[dict[str, Any]]) -> None:
+    from restock.cli import output
+
+    shown = rows[:SHOWN] if sys.stdout.isatty() else rows
+    output.print_table(shown, title=title)
+    if len(shown) < len(rows):
+        output.stdout().print(f"… {len(rows) - len(shown):,} more: --json has all")
+    output.stdout().print()
+
+
+def _line(gap: dict[str, Any], unit: str) -> dict[str, Any]:
+    each = "mission" if unit == "missions" else "hour"
+    line = {
+        "gap": gap["cell"],
+        "asked by": gap["asked_by"],
+        "of": gap["counted"],
+        "needed": gap["needed"],
+        "there": gap["there"],
+        "missing": gap["missing"],
+        "best": gap["best"],
+        f"per {each}": _interval(gap, "rate"),
+        unit: _interval(gap, "amount"),
+        "thinnest in": ", ".join(gap["thinnest_zones"][:2]),
+    }
+    if gap["closes_with"] is not None:
+        line["the plan closes it"] = f"{gap['closes_with']:.0%}"
+    return line
+
+
+def _interval(gap: dict[str, Any], name: str) -> str:
+    value, low, high = (_number(gap[key]) for key in (name, f"{name}_low", f"{name}_high"))
+    return f"{value} ({low} to {high})"
+
+
+def _number(value: float) -> str:
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
+
+
+def _unknown(gaps: list[dict[str, Any]], unit: str) -> list[dict[str, Any]]:
+    """One line for the actions of a condition that nobody ever took there."""
+    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for gap in gaps:
+        key = (gap["stratum"] or gap["condition"], gap["zone"], gap["robot"], gap["asked_by"])
+        groups.setdefault(key, []).append(gap)
+    lines = []
+    for (condition, zone, robot, asked_by), members in groups.items():
+        actions = [gap["action"] for gap in members if gap["action"] is not None]
+        least = min(members, key=lambda gap: gap["at_least"])
+        lines.append(
+            {
+                "gap": ", ".join(str(part) for part in (condition, zone, robot) if part),
+                "actions": ", ".join(map(str, actions)),
+                "asked by": asked_by,
+                "to see one, with 95 %": f"at least {least['at_least']:,} more episodes of"
+                f" {least['never_seen_in']}",
+            }
+        )
+    return lines
+
+
+def _order(order: dict[str, Any], unit: str, with_: dict[str, bool]) -> dict[str, Any]:
+    return {
+        "kind": order["kind"] or "logging",
+        **{name: order[name] or "" for name in ("zone", "robot") if with_[name]},
+        **({"missions": order["missions"]} if unit == "missions" else {}),
+        "hours": round(order["hours"], 2),
+        "fills": ", ".join(dict.fromkeys(order["fills"])),
+    }

@@ -1,0 +1,235 @@
+"""`restock gaps`: what is missing, what fills it, and how sure that is."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.stores import recording_transitions, write_store
+
+from restock.cli import main
+from restock.errors import ConfigError
+from restock.replay.fleet.forecast import forecast, missions_to_see_one, probability_to_close
+from restock.replay.fleet.gaps import Gap, find_gaps
+from restock.replay.fleet.missions_file import MissionOrder, MissionsFile, as_toml, read_missions
+from restock.replay.fleet.shopping_list import shopping_list
+from restock.replay.fleet.yields import Yields
+from restock.replay.mixture.mixture import parse_mixture
+from restock.replay.store.store import Store
+
+KINDS = ("nominal", "wheel_slip", "blocked_aisle")
+
+
+def simulated(rows: pa.Table) -> pa.Table:
+    """The rows with their labels for the truth."""
+    place = rows.schema.get_field_index("true_condition")
+    return rows.set_column(place, rows.schema.field(place), rows["condition"].combine_chunks())
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    rows = [simulated(recording_transitions(number)) for number in range(3)]
+    return write_store(tmp_path_factory.mktemp("gaps") / "store", rows)
+
+
+ASKING = """
+max_replays_per_row = 2
+planned = { updates = 100, batch_size = 10 }
+evaluation_split = { by = "none" }
+[[strata]]
+name = "nominal"
+share = 0.5
+[[strata]]
+name = "wheel_slip"
+share = 0.4
+[each_condition]
+share = "natural"
+"""
+
+
+def test_a_stratum_lacks_what_its_share_would_draw_too_often(store: Path) -> None:
+    with Store(store) as opened:
+        yields, gaps = find_gaps(opened, parse_mixture(ASKING), name="mine", kinds=KINDS)
+        slips = opened.sql("SELECT count(*) FROM transitions WHERE condition = 'wheel_slip'")
+        there = slips.fetchall()[0][0]
+    (gap,) = gaps
+    # Half of each batch is logs': .4 of 100 x 10 x .5 draws, at most two of a row.
+    assert (gap.cell, gap.needed, gap.there) == ({"stratum": "wheel_slip"}, 100, there)
+    assert gap.found.sum() == there
+    assert set(gap.thinnest) <= {"aisle_1", "aisle_2", "cross"}
+    found = shopping_list(yields, gaps)
+    assert found.unit == "missions"
+    (order,) = found.orders
+    (filled,) = found.gaps
+    assert order.supply == filled.best
+    assert filled.forecast is not None
+    assert filled.forecast.quantile(0.025) <= order.amount <= filled.forecast.quantile(0.975)
+    assert filled.closes_with is not None
+    assert 0.7 < filled.closes_with < 0.9  # what was asked for, .8
+
+
+def test_a_store_that_has_what_is_asked_for_has_no_gaps(store: Path) -> None:
+    mixture = parse_mixture(ASKING.replace("updates = 100", "updates = 1"))
+    with Store(store) as opened:
+        yields, gaps = find_gaps(opened, mixture, name="mine", kinds=KINDS)
+    assert not gaps
+    assert shopping_list(yields, gaps).orders == []
+
+
+def test_audits_and_cells_ask_too_and_what_was_never_seen_has_only_a_bound(store: Path) -> None:
+    mixture = parse_mixture(ASKING.replace("updates = 100", "updates = 1"))
+    limits = {
+        "rare_condition": {"min_rows": 60, "min_episodes": 5},
+        "missing_cells": {"min_rows": 1},
+    }
+    with Store(store) as opened:
+        yields, gaps = find_gaps(
+            opened,
+            mixture,
+            name="mine",
+            kinds=KINDS,
+            thresholds=limits,
+            min_rows=1,
+            by=("condition", "zone"),
+        )
+        rare = dict(
+            opened.sql(
+                "SELECT condition, rows FROM coverage_by_condition WHERE rows < 60"
+            ).fetchall()
+        )
+    asked = {gap.cell["condition"]: gap.there for gap in gaps if gap.asked_by.endswith("condition")}
+    assert asked == rare
+    found = shopping_list(yields, gaps)
+    for one in found.gaps:
+        assert (one.best is None) == (one.gap.found.sum() == 0)
+        if one.best is None:
+            assert one.see_one is not None
+            assert one.see_one[1] >= 1
+
+
+def test_hours_of_logging_where_no_recording_knew_the_truth(tmp_path: Path) -> None:
+    path = write_store(tmp_path / "store", [recording_transitions(1), recording_transitions(2)])
+    with Store(path) as opened:
+        yields, gaps = find_gaps(opened, parse_mixture(ASKING), name="mine", kinds=KINDS)
+    found = shopping_list(yields, gaps)
+    assert found.unit == "hours"
+    (order,) = found.orders
+    assert order.supply.kind is None
+    assert order.amount == order.hours
+    rate = gaps[0].there / yields.hours.sum()
+    assert found.gaps[0].forecast is not None
+    assert found.gaps[0].forecast.rate == pytest.approx(rate)
+
+
+def test_the_plan_is_the_least_that_fills_every_gap() -> None:
+    """One kind fills both gaps a little, one kind each fills them well."""
+    kinds = ["a"] * 30 + ["b"] * 30 + ["both"] * 30
+    yields = Yields([str(i) for i in range(90)], np.ones(90) / 60, kinds, True, pa.table({}))
+    found = {
+        name: np.array(
+            [amount if kind == name else few * (kind == "both") for kind in kinds], float
+        )
+        for name, amount, few in (("a", 10, 6), ("b", 10, 6))
+    }
+    gaps = [Gap("test", {"stratum": n}, "rows", 120, 0, found[n]) for n in ("a", "b")]
+    listed = shopping_list(yields, gaps)
+    assert [order.supply.kind for order in listed.orders] == ["both"]
+    assert 20 <= listed.total <= 24  # 120 / 6, and a little for chance
+    # With nothing but the single kinds it is the sum of both.
+    alone = [kind for kind in kinds if kind != "both"]
+    apart = Yields([str(i) for i in range(60)], np.ones(60) / 60, alone, True, pa.table({}))
+    gaps = [Gap("test", {"stratum": n}, "rows", 120, 0, found[n][:60]) for n in ("a", "b")]
+    orders = shopping_list(apart, gaps).orders
+    assert sorted(order.supply.kind or "" for order in orders) == ["a", "b"]
+
+
+@pytest.mark.parametrize("share", [0.2, 0.8])
+def test_a_forecast_holds_as_often_as_it_says(share: float) -> None:
+    """Over fleets drawn from one truth: the missions that were enough, against their quantile."""
+    rng, held = np.random.default_rng(3), 0
+    for _ in range(120):
+
+        def missions(count: int) -> np.ndarray:
+            return rng.negative_binomial(2, 0.2, count) * (rng.random(count) < 0.7)
+
+        past = missions(40).astype(float)
+        enough = forecast(past, np.ones(40), 150, rng=rng, replicates=80).quantile(share)
+        needed = int(np.searchsorted(np.cumsum(missions(400)), 150)) + 1
+        held += needed <= enough
+    assert abs(held / 120 - share) < 0.15
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    st.lists(st.integers(0, 30), min_size=2, max_size=40).filter(any),
+    st.integers(1, 5_000),
+    st.integers(0, 2**32 - 1),
+)
+def test_more_is_needed_for_more_and_never_less_than_the_best_mission_gives(
+    found: list[int], missing: int, seed: int
+) -> None:
+    yields = np.array(found, float)
+
+    def needed(amount: float) -> float:
+        rng = np.random.default_rng(seed)
+        return forecast(yields, np.ones(len(found)), amount, rng=rng, replicates=40).quantile(0.5)
+
+    assert needed(missing) >= missing / max(found) - 1e-9 or missing / yields.mean() > 2000
+    assert needed(missing) <= needed(100 * missing)
+
+
+def test_a_rare_find_leaves_much_open_and_silence_leaves_only_a_bound() -> None:
+    rng = np.random.default_rng(0)
+    once = forecast(np.array([3.0] + [0.0] * 49), np.ones(50), 30, rng=rng)
+    assert once.quantile(0.975) / once.quantile(0.5) > 3
+    assert not forecast(np.zeros(50), np.ones(50), 30, rng=rng).known
+    assert missions_to_see_one(100) == 99  # 1 - .97^99 = .951
+    assert missions_to_see_one(1) == 1
+    always = probability_to_close([(np.ones(50) * 2, 30)], 30, rng=rng)
+    assert always > 0.99
+    assert probability_to_close([(np.zeros(50), 30)], 30, rng=rng) == 0
+
+
+def test_the_list_is_a_file_that_reads_back(
+    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.toml").write_text(ASKING)
+    args = ["gaps", str(store), "--mixture", str(tmp_path / "mine.toml"), "--json"]
+    out = tmp_path / "next.toml"
+    assert main([*args, "--missions-out", str(out)]) == 0
+    plan = json.loads(capsys.readouterr().out)["plan"]
+    read = read_missions(out)
+    assert [order.missions for order in read.missions] == [o["missions"] for o in plan["orders"]]
+    assert read.store_version == 2
+    assert main([*args, "--missions-out", str(out)]) == 2
+    assert "--force" in capsys.readouterr().err
+    assert main(["gaps", str(store), "--no-audits", "--mixture", "uniform", "--missions-out",
+                 str(tmp_path / "none.toml")]) == 2  # fmt: skip
+    assert "there are no gaps" in capsys.readouterr().err
+    assert not (tmp_path / "none.toml").exists()
+
+
+def test_a_missions_file_says_what_is_wrong_with_it(tmp_path: Path) -> None:
+    whole = MissionsFile(missions=(MissionOrder(kind="wheel_slip", missions=3, zone='"x"'),))
+    (tmp_path / "good.toml").write_text(as_toml(whole))
+    assert read_missions(tmp_path / "good.toml") == whole
+    for text, message in (
+        ("[[missions]]\nkind = 'x'\n", "must say how much"),
+        ("[[missions]]\nkind = 'x'\nmissions = 0\n", "missions"),
+        ("[[missions]]\nmission = 3\n", "unknown key"),
+        ("missions = []\n", "names no missions"),
+        ("format = 'other/9'\n[[missions]]\nmissions = 1\n", "other/9"),
+    ):
+        (tmp_path / "bad.toml").write_text(text)
+        with pytest.raises(ConfigError, match=message):
+            read_missions(tmp_path / "bad.toml")
+
+
+def test_wrong_columns_of_a_cell_are_named(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["gaps", str(store), "--min-rows", "3", "--by", "condition,aisle"]) == 2
+    assert "'aisle' cannot make a cell" in capsys.readouterr().err
