@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import duckdb
 import pyarrow as pa
+from duckdb.func import PythonUDFType
 
 from restock.replay.store.store import Store
 
@@ -113,7 +114,7 @@ def _install(
         lists,
         ["VARCHAR"],
         f"STRUCT({fields})[]",
-        type="arrow",
+        type=PythonUDFType.ARROW,
         side_effects=True,
     )
 
