@@ -78,8 +78,8 @@ def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> bool
     """Views of a run or a panel in a schema; False where it is neither."""
     if (path / HEADER).is_file():
         panel = Panel.open(path)
-        read_parquet(connection, "rows", [path / META], schema=schema)
-        read_parquet(connection, "evaluation_split", [path / EVALUATION_SPLIT], schema=schema)
+        for view, file in (("rows", META), ("evaluation_split", EVALUATION_SPLIT)):
+            _add_table(connection, schema, view, path / file)
         strata = pa.Table.from_pylist([msgspec.structs.asdict(s) for s in panel.strata])
         _keep(connection, schema, "strata", strata)
         return True
@@ -99,6 +99,13 @@ def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> bool
     if "audit" in files:
         _add_replay_audit(connection, path, schema)
     return True
+
+
+def _add_table(connection: duckdb.DuckDBPyConnection, schema: str, view: str, file: Path) -> None:
+    """A view of a panel's table; one from before there were tags knows no robot and no site."""
+    has = pq.read_schema(file).names
+    absent = [name for name in ("robot", "site") if name not in has]
+    read_parquet(connection, view, [file], schema=schema, absent=absent)
 
 
 def _add_replay_audit(connection: duckdb.DuckDBPyConnection, run: Path, schema: str) -> None:

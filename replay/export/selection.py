@@ -23,6 +23,7 @@ from restock.replay.export.trajectory import (
     REQUIRED,
     missing_columns,
 )
+from restock.replay.panel.candidates import LATER
 from restock.replay.panel.panel import HEADER, Panel
 from restock.replay.places import open_place
 from restock.replay.store.query import fetch, interruptible
@@ -192,7 +193,7 @@ def _of_panel(panel: Panel, continuous: bool) -> Selection:
 def _panel_batches(panel: Panel) -> Iterator[pa.RecordBatch]:
     """A panel's rows in order, as a query would give them."""
     text = {"recording_id", "episode_id", "condition", "zone", "behaviour_policy"}
-    text |= {"behaviour_version", "perturbation"}
+    text |= {"behaviour_version", *LATER}
     meta = panel.meta.cast(
         pa.schema([f.with_type(pa.string()) if f.name in text else f for f in panel.meta.schema])
     )

@@ -119,7 +119,7 @@ class PlannedUse(Checked, frozen=True):
 class EvaluationSplit(Checked, frozen=True):
     """Episodes kept out of the panel, whole: `share` of the rows, chosen by `by`."""
 
-    by: Literal["episode", "recording", "time", "none"] = "episode"
+    by: Literal["episode", "recording", "robot", "site", "time", "none"] = "episode"
     share: Annotated[float, Meta(ge=0, lt=1)] = 0.1
 
 

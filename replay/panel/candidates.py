@@ -18,13 +18,13 @@ from restock.replay.panel.strata import ResolvedStratum
 META_COLUMNS = (
     *("transition_id", "recording_id", "episode_id", "step_index", "stamp_ns", "logged_ns"),
     *("condition", "zone", "behaviour_policy", "behaviour_version", "action_probability"),
-    *("action", "reward", "terminated", "truncated", "perturbation"),
+    *("action", "reward", "terminated", "truncated", "perturbation", "robot", "site"),
 )
-# Of which rows from before they were kept have none.
-_LATER = ("perturbation",)
+# Of which rows from before they were kept have none, and tables that are no store's view.
+LATER = ("perturbation", "robot", "site")
 _TEXT = (
     *("recording_id", "episode_id", "condition", "zone", "behaviour_policy", "behaviour_version"),
-    "perturbation",
+    *LATER,
 )
 _CODED = pa.dictionary(pa.int32(), pa.string())
 BATCH_ROWS = 65_536  # read at a time
@@ -36,7 +36,7 @@ def meta_columns(connection: duckdb.DuckDBPyConnection) -> str:
     """META_COLUMNS of the connection's `transitions`, for a SELECT."""
     has = connection.sql("FROM transitions LIMIT 0").columns
     return ", ".join(
-        f"NULL::VARCHAR AS {name}" if name in _LATER and name not in has else name
+        f"NULL::VARCHAR AS {name}" if name in LATER and name not in has else name
         for name in META_COLUMNS
     )
 

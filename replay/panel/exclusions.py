@@ -19,6 +19,8 @@ from restock.replay.panel.strata import NO_STRATUM, ResolvedStratum
 from restock.replay.store.query import repeated_rows
 
 DAY_NS = 86_400 * 10**9
+# What an evaluation split is by, where that is not an episode: column and name.
+_GROUPS = {"recording": ("recording_id", "recording")} | {n: (n, n) for n in ("robot", "site")}
 EPISODE_REPEATS = 3  # rows that an episode shares with the evaluation split, to be left out whole
 
 
@@ -198,17 +200,28 @@ def versions_behind(table: pa.Table) -> Ints:
 
 
 def split_for_evaluation(table: pa.Table, rule: EvaluationSplit, seed: int) -> Bools:
-    """The rows of the evaluation split, (N,): whole episodes or recordings, or the latest episodes.
+    """The rows of the evaluation split, (N,): whole episodes, recordings, robots or sites, or the
+    latest episodes.
 
     Raises:
-        MixtureError: the rule would take everything, or there is only one group to split.
+        MixtureError: the rule would take everything, there is only one group to split, or rows that
+            the mixture admits are of an unknown robot or site.
     """
     if rule.by == "none" or rule.share == 0:
         return np.zeros(len(table), np.bool_)
-    column = "recording_id" if rule.by == "recording" else "episode_id"
+    column, group = _GROUPS.get(rule.by, ("episode_id", "episode"))
     code = codes(table, column)
+    untold = (code < 0) & bools(table, "admitted")
+    if untold.any():
+        of = len(np.unique(codes(table, "recording_id")[untold]))
+        raise MixtureError(
+            f"{int(untold.sum()):,} rows of {of:,} recordings have no {column}: they could be of"
+            " one that is held out",
+            remedy=f"`restock ingest RECORDING --tag {column}=…` says which, or leave them out:"
+            f' where = "{column} IS NOT NULL"',
+        )
     names = table[column].combine_chunks().dictionary.to_pylist()
-    rows = np.bincount(code, minlength=len(names))
+    rows = np.bincount(code[code >= 0], minlength=len(names))
     if rule.by == "time":
         newest = np.zeros(len(names), np.int64)
         np.maximum.at(newest, code, table["logged_ns"].to_numpy())
@@ -218,8 +231,7 @@ def split_for_evaluation(table: pa.Table, rule: EvaluationSplit, seed: int) -> B
     order = order[rows[order] > 0]
     if len(order) < 2:
         raise MixtureError(
-            f"one {rule.by if rule.by == 'recording' else 'episode'} cannot be split"
-            " into a panel and an evaluation split",
+            f"one {group} cannot be split into a panel and an evaluation split",
             remedy='ingest more, or set [evaluation_split] by = "none" in a mixture of your own',
         )
     wanted = rule.share * len(table)

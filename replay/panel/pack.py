@@ -42,6 +42,8 @@ _SPLIT_COLUMNS = (
     "step_index",
     "logged_ns",
     "condition",
+    "robot",
+    "site",
 )
 
 

@@ -327,14 +327,16 @@ def read_parquet(
     files: Sequence[str | os.PathLike[str]],
     *,
     schema: str = "main",
+    absent: Sequence[str] = (),
 ) -> None:
-    """A view over Parquet files; columns that only some have are null in the others.
+    """A view over Parquet files; columns that only some have are null in the others, and so are
+    text columns that are `absent` from all.
 
     Raises:
         StoreError: one of them is missing or damaged.
     """
     try:
-        connection.execute(parquet_view(view, files, schema=schema))
+        connection.execute(parquet_view(view, files, schema=schema, absent=absent))
     except duckdb.Error as error:
         where = str(files[0]) if len(files) == 1 else os.path.commonpath([str(f) for f in files])
         raise StoreError(
@@ -345,12 +347,17 @@ def read_parquet(
 
 
 def parquet_view(
-    view: str, files: Sequence[str | os.PathLike[str]], *, schema: str | None = None
+    view: str,
+    files: Sequence[str | os.PathLike[str]],
+    *,
+    schema: str | None = None,
+    absent: Sequence[str] = (),
 ) -> str:
     """The statement that makes such a view."""
     quoted = ", ".join("'" + str(file).replace("'", "''") + "'" for file in files)
     name = f'"{schema}"."{view}"' if schema else f'"{view}"'
+    nulls = "".join(f", NULL::VARCHAR AS {column}" for column in absent)
     return (
         f"CREATE OR REPLACE VIEW {name} AS"
-        f" SELECT * FROM read_parquet([{quoted}], union_by_name = true)"
+        f" SELECT *{nulls} FROM read_parquet([{quoted}], union_by_name = true)"
     )

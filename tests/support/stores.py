@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from itertools import zip_longest
 from pathlib import Path
 
 import msgspec
@@ -86,7 +88,9 @@ def recording_transitions(
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
-def manifest(transitions: pa.Table, *, task: Task = TASK) -> pa.Table:
+def manifest(
+    transitions: pa.Table, *, task: Task = TASK, tags: Mapping[str, str] | None = None
+) -> pa.Table:
     """The `recordings` row of one recording's transitions."""
     first = transitions.slice(0, 1).to_pylist()[0]
     conditions = [
@@ -105,6 +109,7 @@ def manifest(transitions: pa.Table, *, task: Task = TASK) -> pa.Table:
         "task_hash": first["task_hash"],
         "labels_version": first["labels_version"],
         "restock_version": first["restock_version"],
+        "tags": dict(tags or {}),
         "steps": len(transitions) + 12,
         "episodes": len(transitions["episode_id"].unique()),
         "transitions": len(transitions),
@@ -131,10 +136,17 @@ def manifest(transitions: pa.Table, *, task: Task = TASK) -> pa.Table:
     return pa.Table.from_pylist([row], schema=schema)
 
 
-def write_store(path: Path, recordings: list[pa.Table], *, task: Task = TASK) -> Path:
-    """A store of these recordings, one commit each, the manifest row first."""
-    for transitions in recordings:
-        write_deltalake(str(path / "recordings"), manifest(transitions, task=task), mode="append")
+def write_store(
+    path: Path,
+    recordings: list[pa.Table],
+    *,
+    task: Task = TASK,
+    tags: Sequence[Mapping[str, str]] = (),
+) -> Path:
+    """A store of these recordings and their tags, one commit each, the manifest row first."""
+    for transitions, told in zip_longest(recordings, tags):
+        row = manifest(transitions, task=task, tags=told)
+        write_deltalake(str(path / "recordings"), row, mode="append")
         write_deltalake(str(path / "transitions"), transitions, mode="append")
     return path
 

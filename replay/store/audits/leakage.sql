@@ -1,7 +1,7 @@
 -- severity: error
 -- needs: panel
 -- advice: Make the panel again, after `duplicate_transitions` and `repeated_steps` pass; what is held out must share nothing with what is trained on.
--- doc: What is in the panel and held out at once: an episode; a recording, where whole ones are held out; an episode that ends after the first that is held out, where the latest are; or the same step under another id.
+-- doc: What is in the panel and held out at once: an episode; a recording, robot or site, where whole ones are held out; an episode that ends after the first that is held out, where the latest are; or the same step under another id.
 WITH copies AS (
     FROM same_steps()
 ), panel_steps AS (
@@ -24,6 +24,16 @@ UNION ALL
 SELECT 'a recording that is held out', episode_id, count(*)
 FROM panel.rows
 SEMI JOIN (FROM panel.evaluation_split WHERE split_by = 'recording') USING (recording_id)
+GROUP BY episode_id
+UNION ALL
+SELECT 'a robot that is held out', episode_id, count(*)
+FROM panel.rows
+SEMI JOIN (FROM panel.evaluation_split WHERE split_by = 'robot') USING (robot)
+GROUP BY episode_id
+UNION ALL
+SELECT 'a site that is held out', episode_id, count(*)
+FROM panel.rows
+SEMI JOIN (FROM panel.evaluation_split WHERE split_by = 'site') USING (site)
 GROUP BY episode_id
 UNION ALL
 SELECT 'later than what is held out', episode_id, count(*)

@@ -1,0 +1,108 @@
+"""Mixtures of a fleet: quotas by robot, and whole robots held out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.panels import EVERY, NO_SPLIT, panel_of, planned
+from support.stores import recording_transitions, write_store
+
+from restock.errors import MixtureError
+from restock.replay.mixture.mixture import parse_mixture
+from restock.replay.panel.panel import Panel
+from restock.replay.panel.plan import plan_panel
+from restock.replay.places import open_place
+from restock.replay.store.audit import run_audits, shipped_audits
+from restock.replay.store.store import Store
+
+TAGS = [{"robot": robot, "site": site} for robot, site in zip("abacd", "ooool", strict=True)]
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five recordings of four robots, of which one drives at another site."""
+    tables = [recording_transitions(number) for number in range(1, 6)]
+    return write_store(tmp_path_factory.mktemp("fleet") / "store", tables, tags=TAGS)
+
+
+def found(panel: Panel, query: str) -> list[tuple[object, ...]]:
+    with open_place(panel.path) as connection:
+        return connection.sql(query).fetchall()
+
+
+@pytest.mark.parametrize("by", ["robot", "site"])
+def test_whole_robots_and_sites_are_held_out(fleet, by):
+    held_by_seed = set()
+    with Store(fleet) as store:
+        for seed in range(8):
+            text = f"seed = {seed}\n[evaluation_split]\nby = '{by}'\n" + EVERY
+            plan = plan_panel(store.connection, parse_mixture(text), store.conditions())
+            names = np.array(plan.rows[by].to_pylist())
+            held, kept = set(names[plan.evaluation_split]), set(names[plan.panel_rows])
+            assert held
+            assert kept
+            assert not held & kept
+            assert held | kept == {tags[by] for tags in TAGS}
+            held_by_seed |= held
+    assert len(held_by_seed) > 1
+
+
+def test_a_panel_with_rows_of_a_robot_that_is_held_out_fails_its_audit(fleet, tmp_path):
+    text = "[evaluation_split]\nby = 'robot'\n" + EVERY
+    panel = panel_of(fleet, text, tmp_path / "panel")
+    chosen = [audit for audit in shipped_audits() if audit.name == "leakage"]
+    with open_place(fleet, beside={"panel": panel.path}) as connection:
+        (finding,) = run_audits(connection, chosen, {}, beside={"panel"})
+        assert finding.status == "pass"
+        connection.execute(
+            "CREATE OR REPLACE VIEW panel.evaluation_split AS"
+            " SELECT * REPLACE ('x' AS episode_id), 'robot' AS split_by FROM panel.rows LIMIT 1"
+        )
+        (finding,) = run_audits(connection, chosen, {}, beside={"panel"})
+    assert "a robot that is held out" in {row["leak"] for row in finding.sample}
+
+
+def test_strata_of_robots_have_their_quotas(fleet, tmp_path):
+    strata = "".join(
+        f"[[strata]]\nname = '{robot}'\nwhere = \"robot = '{robot}'\"\nshare = {share}\n"
+        for robot, share in (("a", 0.25), ("d", 0.75))
+    )
+    panel = panel_of(fleet, "unlisted = 'drop'\n" + NO_SPLIT + strata, tmp_path / "panel")
+    assert {line.name: line.share for line in panel.strata} == {"a": 0.25, "d": 0.75}
+    assert set(found(panel, "SELECT DISTINCT stratum::VARCHAR, robot FROM rows")) == {
+        ("a", "a"),
+        ("d", "d"),
+    }
+
+
+def test_rows_of_an_unknown_robot_cannot_be_held_out_by_robot(fleet, tmp_path):
+    tables = [recording_transitions(number) for number in (1, 2, 3)]
+    store = write_store(tmp_path / "store", tables, tags=[{}, {"robot": "a"}, {"robot": "b"}])
+    text = "[evaluation_split]\nby = 'robot'\n" + EVERY
+    says = f"{len(tables[0]):,} rows of 1 recordings have no robot: they could be of one that"
+    with pytest.raises(MixtureError, match=says) as refused:
+        panel_of(store, text, tmp_path / "panel")
+    assert 'where = "robot IS NOT NULL"' in str(refused.value.remedy)
+    panel = panel_of(store, 'where = "robot IS NOT NULL"\n' + text, tmp_path / "panel")
+    assert {name for (name,) in found(panel, "SELECT robot FROM rows")} < {"a", "b"}
+    with pytest.raises(MixtureError, match="have no robot"):  # a table that no store's view shows
+        planned(tables[0], text)
+
+
+def test_one_robot_cannot_be_split(tmp_path):
+    store = write_store(
+        tmp_path / "store", [recording_transitions(1)], tags=[{"robot": "a", "site": "o"}]
+    )
+    with pytest.raises(MixtureError, match="one robot cannot be split into a panel"):
+        panel_of(store, "[evaluation_split]\nby = 'robot'\n" + EVERY, tmp_path / "panel")
+
+
+def test_stores_of_two_fleets_are_one_fleet_in_a_mixture(fleet, tmp_path):
+    """Also where one of them is from before there were tags."""
+    other = write_store(tmp_path / "other", [recording_transitions(9)], tags=[{"robot": "z"}])
+    text = f"[sources]\nlogs = 0.5\n[[sources.stores]]\nname = 'z'\npath = '{other}'\nshare = 0.3\n"
+    panel = panel_of(fleet, text + NO_SPLIT + EVERY, tmp_path / "panel")
+    robots = {name for (name,) in found(panel, "SELECT DISTINCT robot FROM rows")}
+    assert robots == {"a", "b", "c", "d", "z"}
