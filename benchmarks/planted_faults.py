@@ -4,7 +4,9 @@
 
 Three faults of the buffer, all in the blocked aisles, which the twin's training episodes then lack:
 their logged rows are removed; stale (next observations and rewards of other rows of the stratum);
-or mislabelled (the label stands on nominal rows). Four of the target and the optimizer: frozen, too
+or mislabelled (the label stands on nominal rows). Two of the logs' actions: one (backing up) that
+they lack, or that is rare (a fiftieth is left) in the blocked aisles. Four of the target and the
+optimizer: frozen, too
 slow, no target at all (tau 1), learning rate a thousand times too high. Runs are kept in --out and
 taken up where they are, so that a table can be made again without training again.
 """
@@ -19,6 +21,7 @@ import numpy as np
 import pyarrow as pa
 from harness import finish, markdown, option_parser, run_restock, trained
 
+from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
 from restock.train.comparison.diagnose import diagnose
 from restock.train.run.run import Run
@@ -26,19 +29,24 @@ from restock.train.run.run import Run
 STRATUM = "blocked_aisle"
 # Of the training episodes: none in the stratum, the rest as a run has them by default.
 LACKING = "env.conditions={nominal=0.4, wheel_slip=0.2, near_collision=0.2, blocked_aisle=0}"
+ACTION, LEFT_SHARE = "back 0.4", 0.02  # of the logs' rows with it, where it is made rare
 BUFFER, TARGET = {"BUFFER", "BOTH"}, {"TARGET", "BOTH", "DIVERGENCE"}
-CAUSES = ["HEALTHY", "BUFFER", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED"]
+ACTIONS = {"ACTION_COVERAGE"}
+CAUSES = ["HEALTHY", "BUFFER", "ACTION_COVERAGE", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED"]
 # fault -> the causes that are right, and the settings that plant it
 FAULTS: dict[str, tuple[set[str], list[str]]] = {
     "healthy": ({"HEALTHY"}, []),
     "stratum removed": (BUFFER, [LACKING]),
     "stratum stale": (BUFFER, [LACKING]),
     "stratum mislabelled": (BUFFER, [LACKING]),
+    "action missing": (ACTIONS, []),
+    "action rare": (ACTIONS, []),
     "target frozen": (TARGET, ["target={rule='hard', every=1000000}"]),
     "target too slow": (TARGET, ["target={rule='polyak', tau=0.00003}"]),
     "target too fast": (TARGET, ["target={rule='polyak', tau=1.0}"]),
     "learning rate too high": (TARGET, ["optimizer.learning_rate=0.3"]),
 }
+LOGGED = ("stratum", "action")  # faults of the logs, by their first word
 SETTINGS = {
     "schedule.env_steps": 32_000,
     "schedule.offline_updates": 1_000,
@@ -56,14 +64,20 @@ SETTINGS = {
 def plant(clean: Path, faulty: Path, fault: str) -> None:
     """A store with the fault in its rows."""
     rng = np.random.default_rng(0)
+    action = load_profile("warehouse_amr").task.action_names.index(ACTION)
     source, writer = StoreWriter(clean), StoreWriter(faulty)
     for row in source.live().to_pylist():
         rows = source.rows(row["recording_id"], row["ingest_id"])
         labels = rows["conditions"].to_pylist()
         names = np.array(rows["condition"].to_pylist(), object)
         inside = np.array([STRATUM in some for some in labels]) | (names == STRATUM)
+        taken = np.array(rows["action"]) == action
         if fault == "stratum removed":
             rows = rows.filter(pa.array(~inside))
+        elif fault == "action missing":
+            rows = rows.filter(pa.array(~taken))
+        elif fault == "action rare":
+            rows = rows.filter(pa.array(~(taken & inside) | (rng.random(len(rows)) < LEFT_SHARE)))
         elif fault == "stratum stale":
             order = np.arange(len(rows))
             order[inside] = rng.permutation(order[inside])
@@ -93,7 +107,7 @@ def panel_for(fault: str, out: Path) -> Path:
         run_restock(["ingest", str(logs), "--store", str(clean)])
     if not panel.exists():
         store = clean
-        if fault.startswith("stratum"):
+        if fault.startswith(LOGGED):
             store = out / "stores" / fault.replace(" ", "_")
             if not store.exists():
                 plant(clean, store, fault)
@@ -104,7 +118,7 @@ def panel_for(fault: str, out: Path) -> Path:
 
 def run_for(fault: str, seed: int, out: Path) -> Run:
     """One run with the fault, trained where it is missing."""
-    panel = panel_for(fault if fault.startswith("stratum") else "healthy", out)
+    panel = panel_for(fault if fault.startswith(LOGGED) else "healthy", out)
     settings = [f"{key}={value}" for key, value in SETTINGS.items()] + FAULTS[fault][1]
     path = out / "runs" / f"{fault.replace(' ', '_')}-{seed}"
     return trained(path, [*settings, f"seed={seed}"], panel)
@@ -127,7 +141,8 @@ def main() -> int:
         table[fault] = dict(Counter(causes))
         total += len(causes)
         right += sum(cause in expected or cause == "UNDETERMINED" for cause in causes)
-        wrong = TARGET - BUFFER if expected == BUFFER else BUFFER - TARGET
+        of_rows = BUFFER | ACTIONS
+        wrong = TARGET - BUFFER if expected <= of_rows else of_rows - TARGET
         opposite += sum(cause in wrong for cause in causes)
     rows = [[fault, *(counts.get(c, "") for c in CAUSES)] for fault, counts in table.items()]
     verdict = f"{right} of {total} named right or UNDETERMINED; {opposite} named the opposite"

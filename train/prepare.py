@@ -24,6 +24,7 @@ from restock.train.feed.collector import conditions_in_twin
 from restock.train.feed.logs import Logs
 from restock.train.finite import STOPPED
 from restock.train.loop import Notify, TrainResult
+from restock.train.ring_capacity import resolve_ring_capacity
 from restock.train.run.checkpoint import check_earlier, go_back
 from restock.train.run.run import Run, check_free, now_ns, panel_document, software_versions
 from restock.train.run.run_profile import (
@@ -91,6 +92,11 @@ class Prepared:
             f" {schedule.env_steps:,} environment steps"
             + (f" or {schedule.seconds:g} s" if schedule.seconds is not None else "")
             + f"; seed {config.seed}, {config.device}"
+            + (
+                f"\na ring of {chosen['ring_rows']:,} rows: {chosen['reason']}"
+                if (chosen := self.document.get("ring_capacity"))
+                else ""
+            )
             + "".join(
                 f"\ncondition {name!r} is not evaluated in the twin, which has no"
                 f" {', '.join(signals)}: its stratum is of logs alone"
@@ -168,8 +174,11 @@ def prepare_new(
     else:
         profile = load_profile(config.profile)
     panel = open_panel(panel_path, config, profile) if panel_path is not None else None
-    config = resolve_config(config, panel)
-    return Prepared(out, config, profile, panel, _document(config, profile, panel))
+    config, ring = resolve_ring_capacity(resolve_config(config, panel), panel)
+    written = _document(config, profile, panel)
+    if ring is not None:
+        written["ring_capacity"] = ring
+    return Prepared(out, config, profile, panel, written)
 
 
 def prepare_resumed(

@@ -208,9 +208,9 @@ def open_session(
     seed = config.seed
     learner = Learner(config, task.observation_size, len(task.actions))
     names = ring_conditions(conditions)
-    reserved = int(config.replay.ring_capacity * config.replay.ring_reserved / len(names))
+    reserved = int(config.replay.ring_rows * config.replay.ring_reserved / len(names))
     ring = FreshRing(
-        config.replay.ring_capacity,
+        config.replay.ring_rows,
         env.num_envs,
         task.observation_size,
         discount=config.loss.discount,

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from importlib.resources import files
 from typing import Any
 
 import duckdb
+import pyarrow as pa
 
 from restock.errors import StoreError
 from restock.replay.store.query import interruptible, values
 
 CELLS_SHARE = 0.95
+EFFECTIVE_EPISODES = 50.0
 
 
 @dataclass(frozen=True)
@@ -20,8 +22,11 @@ class Capacity:
 
     rows: int  # of the store
     cells: int  # condition x zone x action cells that were ever seen
-    recommended: int  # rows: the least that keep `cells_share` of those cells
+    recommended: int  # rows: the least that keep those cells and episodes
     cells_share: float
+    effective_episodes: float  # that the rows must be worth
+    rows_for_cells: int  # the least that keep `cells_share` of the cells
+    rows_for_episodes: int | None  # … that are worth so many episodes; None: all rows are not
     half_share: float  # of the cells, what the newest half of the rows keeps
     curve: list[dict[str, Any]]  # capacity, cells, cells_share, conditions, episodes, …
 
@@ -30,37 +35,74 @@ class Capacity:
         """Whether the second half of the rows showed hardly anything new."""
         return self.half_share >= self.cells_share
 
+    @property
+    def reason(self) -> str:
+        """Why so many, in a sentence."""
+        cells = (
+            f"{self.rows_for_cells:,} of {self.rows:,} rows keep {self.cells_share:.0%} of the"
+            f" {self.cells} condition x zone x action cells ever seen"
+        )
+        if self.rows_for_episodes is None:
+            return (
+                f"{cells}, and all of them are worth less than"
+                f" {self.effective_episodes:g} effective episodes"
+            )
+        return (
+            f"{cells}, and {self.rows_for_episodes:,} are worth"
+            f" {self.effective_episodes:g} effective episodes"
+        )
+
 
 def recommend_capacity(
-    connection: duckdb.DuckDBPyConnection, cells_share: float = CELLS_SHARE
+    connection: duckdb.DuckDBPyConnection,
+    cells_share: float = CELLS_SHARE,
+    effective_episodes: float = EFFECTIVE_EPISODES,
 ) -> Capacity:
-    """The least number of newest rows that keep `cells_share` of the cells ever seen.
+    """The least number of newest rows that keep the diversity of a store's tasks.
 
-    A capacity by task diversity: below it, a first-in-first-out buffer forgets whole cells of
-    condition x zone x action, and no sampling brings them back.
+    They keep `cells_share` of the condition x zone x action cells ever seen, and are worth
+    `effective_episodes`. Below the first, a first-in-first-out buffer forgets whole cells, and no
+    sampling brings them back; below the second, what it holds is a few drives.
 
     Raises StoreError where there are no transitions.
     """
 
-    def ask() -> tuple[list[dict[str, Any]], list[tuple[Any, ...]]]:
+    def ask() -> tuple[list[dict[str, Any]], tuple[Any, ...]]:
         relation = connection.sql("FROM capacity_curve()")
         curve = [dict(zip(relation.columns, row, strict=True)) for row in values(relation)]
-        firsts = connection.sql(
-            "SELECT min(place) FROM (SELECT condition, zone, action,"
-            " row_number() OVER (ORDER BY logged_ns DESC, transition_id DESC) AS place"
-            " FROM transitions) GROUP BY condition, zone, action ORDER BY ALL"
-        ).fetchall()
-        return curve, firsts
+        needed = connection.execute(
+            "FROM capacity_needed($cells, $episodes)",
+            {"cells": cells_share, "episodes": effective_episodes},
+        )
+        return curve, needed.fetchall()[0]
 
-    curve, firsts = interruptible(connection, ask)
+    curve, (cells, for_cells, for_episodes) = interruptible(connection, ask)
     if not curve:
         raise StoreError("it holds no transitions", remedy="`restock ingest` recordings first")
-    needed = max(math.ceil(cells_share * len(firsts)), 1)
+    rows = curve[-1]["capacity"]
     return Capacity(
-        rows=curve[-1]["capacity"],
-        cells=len(firsts),
-        recommended=firsts[needed - 1][0],
+        rows=rows,
+        cells=cells,
+        recommended=max(for_cells, rows if for_episodes is None else for_episodes),
         cells_share=cells_share,
+        effective_episodes=effective_episodes,
+        rows_for_cells=for_cells,
+        rows_for_episodes=for_episodes,
         half_share=curve[-2]["cells_share"] if len(curve) > 1 else 1.0,
         curve=curve,
     )
+
+
+def capacity_of_rows(transitions: pa.Table) -> Capacity:
+    """The same of rows in memory.
+
+    They have the columns condition, zone, action, episode_id, logged_ns and transition_id.
+    """
+    macros = files("restock.replay.store").joinpath("capacity.sql").read_text(encoding="utf-8")
+    with duckdb.connect() as connection:
+        connection.register("transitions", transitions)
+        connection.execute(macros)
+        return recommend_capacity(connection)
+
+
+__all__ = ["Capacity", "capacity_of_rows", "recommend_capacity"]

@@ -7,6 +7,7 @@ several fields stays in a struct's own `check`.
 
 from __future__ import annotations
 
+import copy
 import functools
 import json
 import re
@@ -110,6 +111,52 @@ def toml_value(value: Any) -> str:
         return repr(float(value))  # JSON has no inf and nan
     # JSON would escape what is beyond 16 bits in two halves, and leave DEL as it is.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def with_value(text: str, key: str, value: Any, *, where: str) -> str:
+    """A TOML text with one key set, and every other line and comment as it was.
+
+    Args:
+        key: of a table, as `replay.ring_capacity`; it is added where it is not there.
+        where: names the text in errors.
+
+    Raises:
+        ConfigError: not TOML, or written in a way that a line of its own cannot change.
+    """
+    before, (table, _, name) = parse_toml(text, where=where), key.rpartition(".")
+    new = f"{name} = {toml_value(value)}"
+    lines, at, inside = text.splitlines(), None, ""
+    for number, line in enumerate(lines):
+        if header := re.fullmatch(r"\s*\[\s*([^\[\]]+?)\s*\]\s*(#.*)?", line):
+            inside = header[1]
+            at = number + 1 if inside == table else at
+        own = name if inside == table else key if not inside else None
+        if own and (found := re.match(rf"(\s*{re.escape(own)}\s*=\s*)[^#]*?(\s*#.*)?$", line)):
+            lines[number] = f"{found[1]}{toml_value(value)}{found[2] or ''}"
+            break
+    else:
+        if at is None:
+            lines += [*([""] if lines else []), f"[{table}]", new]
+        else:
+            lines.insert(at, new)
+    changed = "\n".join(lines) + "\n"
+    try:
+        after: Any = tomllib.loads(changed)
+    except tomllib.TOMLDecodeError:
+        after = None
+    expected: Any = copy.deepcopy(before)
+    place = expected
+    for part in table.split("."):
+        place = place.setdefault(part, {}) if isinstance(place, dict) else None
+    if isinstance(place, dict):
+        place[name] = value
+    if not isinstance(place, dict) or after != expected:
+        raise ConfigError(
+            f"{key} cannot be set without changing other lines",
+            where=where,
+            remedy=f"write it yourself: {new}, in a table [{table}]",
+        )
+    return changed
 
 
 def _key(name: str) -> str:

@@ -38,8 +38,8 @@ MAY_IMPORT = {
     "replay/trace": "replay panel store ingest/profile ingest/steps ingest/task",
     "replay/export": "replay panel store ingest/profile ingest/task",
     "train": (
-        "dqn evaluation feed run twin/env twin/floors twin/physics replay/panel replay/ring"
-        " replay/sampling ingest/profile ingest/store ingest/task"
+        "dqn evaluation feed run twin/env twin/floors twin/physics replay/mixture replay/panel"
+        " replay/ring replay/sampling ingest/profile ingest/store ingest/task"
     ),
     "train/dqn": "twin/env twin/physics",
     "train/run": "replay replay/panel ingest/profile ingest/task",
@@ -70,7 +70,7 @@ MAY_IMPORT = {
     "cli/data": (
         "cli ingest ingest/containers ingest/profile ingest/propose ingest/steps ingest/store"
         " ingest/task replay replay/export replay/fleet replay/mixture replay/panel replay/store"
-        " train/evaluation train/twin/physics"
+        " train/dqn train/evaluation train/twin/physics"
     ),
     "cli/learning": (
         "cli report ingest/store replay/store replay/trace train train/comparison"

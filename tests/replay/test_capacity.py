@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from pathlib import Path
 
 import pyarrow as pa
@@ -10,8 +11,28 @@ import pytest
 from support.stores import recording_transitions, write_store
 
 from restock import cli
+from restock.errors import ConfigError
+from restock.ingest.profile.profile import load_profile
+from restock.replay.mixture.mixture import parse_mixture
+from restock.replay.panel.build import build_panel
+from restock.replay.panel.panel import Panel
+from restock.replay.panel.panel_capacity import capacity_of_panel
 from restock.replay.store.capacity import recommend_capacity
 from restock.replay.store.store import Store
+from restock.train import ring_capacity
+from restock.train.dqn.config import load_config
+from restock.train.prepare import prepare_new
+
+MIXTURE = "[each_condition]\nshare = 'natural'\n[evaluation_split]\nby = 'none'\n"
+
+
+@pytest.fixture(scope="module")
+def panel(tmp_path_factory: pytest.TempPathFactory) -> Panel:
+    """Of rows of the twin's task."""
+    task = load_profile("warehouse_amr").task
+    rows = recording_transitions(1, episodes=10, task=task)
+    path = tmp_path_factory.mktemp("panels") / "panel"
+    return build_panel(rows, parse_mixture(MIXTURE), path, task=task)
 
 
 def newest_first(transitions: pa.Table) -> list[dict[str, object]]:
@@ -29,7 +50,7 @@ def test_the_curve_and_the_recommendation_are_those_of_a_naive_count(
 ) -> None:
     rows = newest_first(transitions)
     with Store(store_path) as store:
-        found = recommend_capacity(store.connection, 0.9)
+        found = recommend_capacity(store.connection, 0.9, effective_episodes=0)
     assert found.rows == len(rows)
     assert found.cells == cells(rows)
     for point in found.curve:
@@ -40,6 +61,28 @@ def test_the_curve_and_the_recommendation_are_those_of_a_naive_count(
         assert 1 <= point["effective_episodes"] <= point["episodes"]
     assert cells(rows[: found.recommended]) >= 0.9 * found.cells
     assert cells(rows[: found.recommended - 1]) < 0.9 * found.cells
+
+
+def effective(rows: list[dict[str, object]]) -> float:
+    counts = Counter(row["episode_id"] for row in rows)
+    return sum(counts.values()) ** 2 / sum(n * n for n in counts.values())
+
+
+def test_the_rows_must_be_worth_so_many_episodes_too(
+    store_path: Path, transitions: pa.Table
+) -> None:
+    rows = newest_first(transitions)
+    half = effective(rows) / 2
+    with Store(store_path) as store:
+        found = recommend_capacity(store.connection, 0.01, effective_episodes=half)
+        too_many = recommend_capacity(store.connection, 0.01, effective_episodes=1e6)
+    needed = found.rows_for_episodes
+    assert needed is not None
+    assert found.recommended == max(needed, found.rows_for_cells)
+    assert effective(rows[:needed]) >= half > effective(rows[: needed - 1])
+    assert too_many.rows_for_episodes is None
+    assert too_many.recommended == len(rows)
+    assert "all of them are worth less than 1e+06" in too_many.reason
 
 
 def test_whether_coverage_is_saturated_is_said(
@@ -67,4 +110,73 @@ def test_the_verb_recommends(store_path: Path, capsys: pytest.CaptureFixture[str
     assert document["curve"][-1]["capacity"] == document["rows"]
     assert document["curve"][-1]["cells_share"] == 1.0
     assert cli.main(["audit", str(store_path), "--capacity"]) == 0
-    assert f"{document['recommended']:,} of" in capsys.readouterr().out
+    assert f"{document['recommended']:,} rows: " in capsys.readouterr().out
+
+
+def test_the_number_is_written_into_a_config(
+    store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "train.toml"
+    path.write_text(
+        "seed = 3  # ours\n\n[replay]\nbatch_size = 64\nring_capacity = 5000 # guess\n", "utf-8"
+    )
+    apply = ["audit", str(store_path), "--capacity", "--apply"]
+    assert cli.main([*apply, str(path), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    rows = document["capacity"]["recommended"]
+    assert document["applied"] == {"config": str(path), "ring_capacity": rows, "before": 5000}
+    assert path.read_text("utf-8") == (
+        f"seed = 3  # ours\n\n[replay]\nbatch_size = 64\nring_capacity = {rows} # guess\n"
+    )
+    assert cli.main([*apply, str(tmp_path / "new.toml")]) == 0
+    assert load_config(tmp_path / "new.toml").replay.ring_capacity == rows
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("[strata]\nnominal = 0.5\n", "strata"),  # a mixture
+        ("replay = { batch_size = 64 }\n", "cannot be set without changing other lines"),
+        (f"[replay]\nbatch_size = {10**9}\n", "at least a batch"),
+        ("[replay\n", "TOML"),
+    ],
+)
+def test_a_file_that_cannot_take_it_stays_as_it_is(
+    store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, complaint: str
+) -> None:
+    path = tmp_path / "config.toml"
+    path.write_text(text, "utf-8")
+    assert cli.main(["audit", str(store_path), "--capacity", "--apply", str(path)]) == 2
+    assert complaint in capsys.readouterr().err
+    assert path.read_text("utf-8") == text
+    assert cli.main(["audit", str(store_path), "--apply", str(path)]) == 2
+    assert "--capacity" in capsys.readouterr().err
+
+
+def test_a_run_takes_the_number_and_says_why(panel: Panel, tmp_path: Path) -> None:
+    auto = ["replay.ring_capacity=auto", "replay.batch_size=8", "env.num_envs=2"]
+    prepared = prepare_new(tmp_path / "run", panel.path, None, auto)
+    chosen = prepared.document["ring_capacity"]
+    found = capacity_of_panel(panel)
+    assert chosen["ring_rows"] == prepared.config.replay.ring_rows == found.recommended
+    assert prepared.document["config"]["replay"]["ring_capacity"] == found.recommended
+    assert chosen["reason"] == found.reason
+    assert chosen["curve"][-1]["capacity"] == found.rows == len(panel)
+    assert f"a ring of {found.recommended:,} rows" in prepared.describe()
+    # A ring that could not hold a batch would be refused: it is as large as one.
+    wide = [*auto, f"replay.batch_size={len(panel) + 1}"]
+    least = prepare_new(tmp_path / "run", panel.path, None, wide)
+    assert least.config.replay.ring_rows == len(panel) + 1
+    with pytest.raises(ConfigError, match="by the rows of a panel, and there is none"):
+        prepare_new(tmp_path / "run", None, None, auto)
+
+
+def test_a_ring_that_is_chosen_stays_in_memory(
+    panel: Panel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    size = ring_capacity.row_bytes(panel.observation_size)
+    monkeypatch.setattr(ring_capacity, "MOST_BYTES", 40 * size)
+    auto = ["replay.ring_capacity=auto", "replay.batch_size=8", "env.num_envs=2"]
+    prepared = prepare_new(tmp_path / "run", panel.path, None, auto)
+    assert prepared.config.replay.ring_rows == 40
+    assert "GiB hold 40" in prepared.document["ring_capacity"]["reason"]

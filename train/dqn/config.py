@@ -70,15 +70,22 @@ class OptimizerConfig(Checked, frozen=True):
 class ReplayConfig(Checked, frozen=True):
     batch_size: Count = 128
     logs_share: Share | None = None  # of each online batch; None: what the panel's mixture says
-    ring_capacity: int = 100_000  # fresh rows kept
+    ring_capacity: int | Literal["auto"] = 100_000  # fresh rows kept; "auto": by their diversity
     ring_reserved: Share = 0.0  # share of them reserved for the conditions, in equal parts
 
     def check(self) -> None:
-        if self.ring_capacity < self.batch_size:
+        if self.ring_capacity != "auto" and self.ring_capacity < self.batch_size:
             raise ValueError(
                 f"ring_capacity must hold at least a batch of {self.batch_size},"
                 f" got {self.ring_capacity}"
             )
+
+    @property
+    def ring_rows(self) -> int:
+        """The capacity as a number. Raises ValueError where it is still to be chosen."""
+        if self.ring_capacity == "auto":
+            raise ValueError('ring_capacity = "auto" was not resolved')
+        return self.ring_capacity
 
 
 class ScheduleConfig(Checked, frozen=True):

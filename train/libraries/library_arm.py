@@ -84,6 +84,7 @@ def resolve(settings: tuple[str, ...], library: Library) -> TrainConfig:
             ("replay.ring_reserved", config.replay.ring_reserved > 0),
             ("schedule.seconds", config.schedule.seconds is not None),
             ("guard.margin", config.guard.margin is not None),
+            ('replay.ring_capacity "auto"', config.replay.ring_capacity == "auto"),
             ("jump_start.env_steps", config.jump_start.env_steps > 0),
         )
         if bad
@@ -109,7 +110,7 @@ def dqn_arguments(config: TrainConfig) -> dict[str, Any]:
         interval, tau = calls * count, 1 - (1 - target.tau) ** updates
     return {
         "learning_rate": config.optimizer.learning_rate,
-        "buffer_size": config.replay.ring_capacity,
+        "buffer_size": config.replay.ring_rows,
         "learning_starts": schedule.warmup_env_steps,
         "batch_size": config.replay.batch_size,
         "gamma": config.loss.discount,

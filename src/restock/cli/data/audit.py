@@ -35,6 +35,8 @@ class AuditCommand:
     """A TOML file with thresholds in place of the shipped ones."""
     capacity: bool = False
     """Instead of auditing, show how coverage grows with the rows kept, and how many are enough."""
+    apply: Annotated[Path | None, tyro.conf.arg(metavar="CONFIG")] = None
+    """With --capacity: write the number into this training config, as replay.ring_capacity."""
     strict: bool = False
     """Let warnings fail, too."""
     version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
@@ -57,6 +59,12 @@ class AuditCommand:
         given = {name: path for name, path in beside.items() if path is not None}
         if self.capacity:
             return self._capacity()
+        if self.apply is not None:
+            raise ConfigError(
+                "--apply writes the capacity that --capacity finds",
+                where="restock audit",
+                remedy="give both",
+            )
         if self.run_dir is not None and not (self.run_dir / RUN_CONFIG).is_file():
             raise RunError("is not a run directory", where=str(self.run_dir))
         audits, thresholds = load_audits(self.audits), load_thresholds(self.thresholds)
@@ -94,21 +102,49 @@ class AuditCommand:
         version = given_version(self.version)
         with open_place(self.store, only_store=True, version=version) as connection:
             capacity = recommend_capacity(connection)
+        applied = None
+        if self.apply is not None:
+            applied = _apply(self.apply, capacity.recommended)
         if self.json:
-            output.print_json({"store": str(self.store), "capacity": asdict(capacity)})
+            document = {"store": str(self.store), "capacity": asdict(capacity)}
+            output.print_json(document if applied is None else document | {"applied": applied})
             return int(ExitCode.OK)
         output.print_table(capacity.curve, title="what the newest rows cover")
         output.stdout().print(
-            f"{capacity.recommended:,} of {capacity.rows:,} rows keep"
-            f" {capacity.cells_share:.0%} of the {capacity.cells} condition x zone x action cells"
-            " ever seen: with less, a buffer forgets some that no sampling brings back"
+            f"{capacity.recommended:,} rows: {capacity.reason}. With less, a buffer forgets what no"
+            " sampling brings back"
         )
         if not capacity.saturated:
             output.stdout().print(
                 f"the newest half keeps {capacity.half_share:.0%}: the logs still show new cells,"
                 " and more recordings will show more"
             )
+        if applied is not None:
+            output.say(
+                f"{applied['config']}: replay.ring_capacity = {applied['ring_capacity']}"
+                + ("" if applied["before"] is None else f" (was {applied['before']})")
+            )
         return int(ExitCode.OK)
+
+
+def _apply(path: Path, rows: int) -> dict[str, Any]:
+    """Set `replay.ring_capacity` of a training config, which need not be there yet.
+
+    Raises:
+        ConfigError: it is no training config, or the number does not go with its other settings.
+    """
+    from restock.files import write_text
+    from restock.toml import parse_toml, with_value
+    from restock.train.dqn.config import load_config, parse_config
+
+    text, before = "", None
+    if path.exists():
+        before = load_config(path).replay.ring_capacity
+        text = path.read_text(encoding="utf-8")
+    changed = with_value(text, "replay.ring_capacity", rows, where=str(path))
+    parse_config(parse_toml(changed, where=str(path)), where=str(path))
+    write_text(path, changed)
+    return {"config": str(path), "ring_capacity": rows, "before": before}
 
 
 def _document(finding: Finding) -> dict[str, Any]:
