@@ -16,8 +16,8 @@ import numpy as np
 from restock.errors import ConfigError
 from restock.replay.mixture.packed_row import row_width
 from restock.replay.panel.panel import Panel
-from restock.replay.panel.panel_capacity import capacity_of_panel
 from restock.replay.ring.ring import META
+from restock.replay.store.capacity import capacity_of_rows
 from restock.train.dqn.config import TrainConfig
 
 MOST_BYTES = 2 << 30  # of a ring that "auto" chooses
@@ -39,7 +39,7 @@ def resolve_ring_capacity(
             'replay.ring_capacity = "auto" is chosen by the rows of a panel, and there is none',
             remedy="give --panel, or a number of rows",
         )
-    capacity = capacity_of_panel(panel)
+    capacity = capacity_of_rows(panel.meta)
     rows, reason = capacity.recommended, capacity.reason
     least = max(config.replay.batch_size, config.env.num_envs * config.loss.n_step)
     most = MOST_BYTES // row_bytes(panel.observation_size)

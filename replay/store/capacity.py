@@ -14,6 +14,7 @@ from restock.replay.store.query import interruptible, values
 
 CELLS_SHARE = 0.95
 EFFECTIVE_EPISODES = 50.0
+_COLUMNS = ("transition_id", "episode_id", "logged_ns", "condition", "zone", "action")
 
 
 @dataclass(frozen=True)
@@ -94,13 +95,10 @@ def recommend_capacity(
 
 
 def capacity_of_rows(transitions: pa.Table) -> Capacity:
-    """The same of rows in memory.
-
-    They have the columns condition, zone, action, episode_id, logged_ns and transition_id.
-    """
+    """The same of rows in memory: of a panel (`panel.meta`), which is what a run is fed."""
     macros = files("restock.replay.store").joinpath("capacity.sql").read_text(encoding="utf-8")
     with duckdb.connect() as connection:
-        connection.register("transitions", transitions)
+        connection.register("transitions", transitions.select(list(_COLUMNS)))
         connection.execute(macros)
         return recommend_capacity(connection)
 

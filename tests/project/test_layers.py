@@ -39,7 +39,7 @@ MAY_IMPORT = {
     "replay/export": "replay panel store ingest/profile ingest/task",
     "train": (
         "dqn evaluation feed run twin/env twin/floors twin/physics replay/mixture replay/panel"
-        " replay/ring replay/sampling ingest/profile ingest/store ingest/task"
+        " replay/ring replay/sampling replay/store ingest/profile ingest/store ingest/task"
     ),
     "train/dqn": "twin/env twin/physics",
     "train/run": "replay replay/panel ingest/profile ingest/task",

@@ -16,8 +16,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
 from restock.replay.panel.panel import Panel
-from restock.replay.panel.panel_capacity import capacity_of_panel
-from restock.replay.store.capacity import recommend_capacity
+from restock.replay.store.capacity import capacity_of_rows, recommend_capacity
 from restock.replay.store.store import Store
 from restock.train import ring_capacity
 from restock.train.dqn.config import load_config
@@ -157,7 +156,7 @@ def test_a_run_takes_the_number_and_says_why(panel: Panel, tmp_path: Path) -> No
     auto = ["replay.ring_capacity=auto", "replay.batch_size=8", "env.num_envs=2"]
     prepared = prepare_new(tmp_path / "run", panel.path, None, auto)
     chosen = prepared.document["ring_capacity"]
-    found = capacity_of_panel(panel)
+    found = capacity_of_rows(panel.meta)
     assert chosen["ring_rows"] == prepared.config.replay.ring_rows == found.recommended
     assert prepared.document["config"]["replay"]["ring_capacity"] == found.recommended
     assert chosen["reason"] == found.reason
