@@ -23,7 +23,6 @@ from restock.replay.fleet.yields import CELL, Yields, by_episode, read_yields
 from restock.replay.mixture.mixture import CorrectionRule, EvaluationSplit, Mixture
 from restock.replay.panel.build import open_source
 from restock.replay.panel.plan import LOGS, PanelPlan, plan_panel
-from restock.replay.panel.strata import Stratum, rules_of
 from restock.replay.store.store import Store
 
 Counted = Literal["rows", "episodes"]
@@ -96,7 +95,7 @@ def uncorrected(mixture: Mixture) -> Mixture:
         mixture,
         strata=strata,
         each_condition=each and msgspec.structs.replace(each, correction=None),
-        correction=CorrectionRule(pre="none", post="none"),
+        correction=CorrectionRule(pre="none", post="none", below_natural="allow"),
         shortfall="shrink",
     )
 
@@ -113,25 +112,14 @@ def _of_strata(plan: PanelPlan, yields: Yields, asked_by: str) -> list[Gap]:
     """Strata whose rows do not bear the share that the mixture wants for them."""
     gaps = []
     for code, line in enumerate(plan.strata):
-        missing = _missing_rows(plan, line)
-        if not missing or line.source != LOGS:
+        if not line.missing_rows or line.source != LOGS:
             continue
         found = by_episode(yields, plan.rows["episode_id"], plan.stratum == code)
-        needed = line.rows + missing
+        needed = line.rows + line.missing_rows
         cell: dict[str, str | int] = {"stratum": line.name}
         thin = _thinnest(plan, code, needed)
         gaps.append(Gap(asked_by, cell, "rows", needed, line.rows, found, thin))
     return gaps
-
-
-def _missing_rows(plan: PanelPlan, line: Stratum) -> int:
-    mixture, rule = plan.mixture, rules_of(plan.mixture, [line.name])[0]
-    draws = mixture.planned.updates * mixture.planned.batch_size * plan.logs_share_wanted
-    needed = 1.0
-    if mixture.max_replays_per_row is not None:
-        needed = max(needed, line.wanted_share * draws / mixture.max_replays_per_row)
-    needed = max(needed, rule.min_rows, rule.min_episodes * line.rows / max(line.episodes, 1))
-    return max(math.ceil(needed - line.rows - 1e-6), 0) if line.wanted_share > 0 else 0
 
 
 def _thinnest(plan: PanelPlan, code: int, needed: int) -> tuple[str, ...]:

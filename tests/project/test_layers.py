@@ -60,8 +60,8 @@ MAY_IMPORT = {
     "train/twin": "",
     "train/twin/floors": "",
     "train/twin/physics": "twin/floors ingest/task",
-    "train/twin/env": "twin/floors twin/physics ingest/profile ingest/task",
-    "train/twin/recording": "twin/env twin/floors twin/physics ingest/task",
+    "train/twin/env": "twin/floors twin/physics replay/fleet ingest/profile ingest/task",
+    "train/twin/recording": "twin/env twin/floors twin/physics replay/fleet ingest/task",
     "train/twin/calibration": (
         "twin/floors twin/physics replay/store ingest/profile ingest/steps ingest/store ingest/task"
     ),
@@ -77,7 +77,7 @@ MAY_IMPORT = {
         " train/evaluation train/run train/study train/twin/calibration"
     ),
     "cli/twin": (
-        "cli report ingest/profile ingest/task replay/store train/evaluation"
+        "cli report ingest/profile ingest/task replay/fleet replay/store train/evaluation"
         " train/twin/calibration train/twin/env train/twin/floors train/twin/physics"
         " train/twin/recording"
     ),

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import zlib
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from restock.errors import ConfigError
+from restock.replay.fleet.missions_file import MissionsFile, as_toml
+from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.physics.episode import KINDS, EpisodeSpec
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 
@@ -21,6 +26,7 @@ FLEET = {"planner 1": 0.70, "planner 2": 0.18, "operator 1": 0.12}
 BLOCK = 20  # missions dealt at a time, so that every condition comes up in a short recording too
 
 PAUSE_S = (4.0, 12.0)  # between missions, unrecorded
+MOST_DRIVEN = 3  # missions for each that was ordered, where some do not meet what they should
 
 
 @dataclass(frozen=True)
@@ -32,6 +38,7 @@ class Mission:
     version: str
     handover: bool  # whether the operator takes over when the driver is stuck
     pause_s: float  # before the next mission
+    order: int | None = None  # the one it is of, where missions were ordered
 
 
 def schedule(
@@ -59,6 +66,74 @@ def schedule(
             handover=driver == HANDOVER and name == "planner",
             pause_s=round(float(rng.uniform(*PAUSE_S)), 3),
         )
+
+
+class OrderedMissions:
+    """The missions of a file, in rounds: until as many as were ordered met their kind.
+
+    Who plans pallets in an aisle cannot know that the robot comes past them. Each round drives
+    what is still owed, mixed, and never more than MOST_DRIVEN times what was ordered.
+    """
+
+    def __init__(
+        self,
+        orders: MissionOrders,
+        file: MissionsFile,
+        seed: int,
+        driver: str,
+        hardware: Perturbation | Schedule,
+        *,
+        version: str = "1",
+    ) -> None:
+        self.orders, self._hardware = orders, hardware
+        # Another list is driven with other seeds: its missions are not the ones of the last.
+        self._rng = np.random.Generator(np.random.PCG64([seed, zlib.crc32(as_toml(file).encode())]))
+        self._drivers = _deal(FLEET, self._rng)
+        self._driver, self._version = driver, version
+        self.driven: Counter[int] = Counter()  # by order
+        self.met: Counter[int] = Counter()
+
+    def rounds(self) -> Iterator[Iterator[Mission]]:
+        """Drive each round to its end, and `note` its missions, before the next."""
+        while owed := self.owed():
+            numbers = np.repeat(list(owed), list(owed.values()))
+            yield iter([self._mission(int(number)) for number in self._rng.permutation(numbers)])
+
+    def owed(self) -> dict[int, int]:
+        """Missions that are still to be driven, by order."""
+        owed = {}
+        for number, order in enumerate(self.orders.orders):
+            wanted = order.missions or 0
+            left = min(wanted - self.met[number], MOST_DRIVEN * wanted - self.driven[number])
+            if left > 0:
+                owed[number] = left
+        return owed
+
+    def note(self, mission: Mission, *, met: bool) -> None:
+        """What became of a mission."""
+        if mission.order is not None:
+            self.driven[mission.order] += 1
+            self.met[mission.order] += met
+
+    def _mission(self, number: int) -> Mission:
+        rng, version = self._rng, self._version
+        name = self._driver
+        if name == HANDOVER:
+            name, version = next(self._drivers).split()
+        spec = self.orders.spec(number, int(rng.integers(1 << 31)))
+        return Mission(
+            msgspec.structs.replace(spec, perturbation=_in_force(self._hardware, spec.seed)),
+            name,
+            version,
+            handover=self._driver == HANDOVER and name == "planner",
+            pause_s=round(float(rng.uniform(*PAUSE_S)), 3),
+            order=number,
+        )
+
+
+def meets(kind: str, true_conditions: Sequence[str]) -> bool:
+    """Whether a mission of a kind met it at one of its steps; a nominal one has nothing to meet."""
+    return kind == "nominal" or any(kind in text.split(",") for text in true_conditions)
 
 
 def _in_force(hardware: Perturbation | Schedule, mission_seed: int) -> Perturbation:
@@ -123,4 +198,13 @@ def parse_numbers(text: str, flag: str, names: Sequence[str]) -> dict[str, float
     return numbers
 
 
-__all__ = ["FLEET", "NATURAL", "Mission", "parse_numbers", "parse_shares", "schedule"]
+__all__ = [
+    "FLEET",
+    "NATURAL",
+    "Mission",
+    "OrderedMissions",
+    "meets",
+    "parse_numbers",
+    "parse_shares",
+    "schedule",
+]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from itertools import islice, pairwise
@@ -22,21 +22,27 @@ import numpy as np
 from restock.errors import ConfigError
 from restock.ingest.task.label_scores import primary_of
 from restock.ingest.task.tags import tag_problem
+from restock.replay.fleet.missions_file import MissionOrder, MissionsFile
 from restock.toml import typed
 from restock.train.twin.env.interface import Policy
+from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.floors.cells import cells_of
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
+from restock.train.twin.floors.planner import Planner
 from restock.train.twin.physics.model import TRACK_M, WHEEL_RADIUS_M
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 from restock.train.twin.physics.simulation import LIDAR_BEAMS
 from restock.train.twin.recording.bag_writer import Format, recording_sink
 from restock.train.twin.recording.drive import Lidar, Odometer
 from restock.train.twin.recording.drivers import BehaviourPolicies, ExternalPolicy
-from restock.train.twin.recording.fleet import Fleet
+from restock.train.twin.recording.fleet import DrivenMission, Fleet
 from restock.train.twin.recording.missions import (
     HANDOVER,
     NATURAL,
     SCRIPTED,
+    Mission,
+    OrderedMissions,
+    meets,
     parse_numbers,
     schedule,
 )
@@ -84,7 +90,7 @@ class RecordingPlan:
 
     format: Format = "mcap"
     minutes: float | None = None
-    missions: int | None = None
+    missions: int | MissionsFile | None = None  # a file's are driven until they met their kinds
     seed: int = 0
     conditions: Mapping[str, float] = field(default_factory=lambda: dict(NATURAL))
     policy: str = HANDOVER  # or planner, operator, random, or what `record` is given
@@ -101,7 +107,7 @@ class RecordingPlan:
             raise ConfigError("give minutes or missions, one of them", where="recording")
         for name in ("minutes", "missions"):
             value = getattr(self, name)
-            if value is not None and not 0 < value < float("inf"):
+            if isinstance(value, int | float) and not 0 < value < float("inf"):
                 raise ConfigError(f"{name} must be above 0, got {value}", where="recording")
         for name, value in self.tags.items():
             if problem := tag_problem(name, value):
@@ -122,14 +128,48 @@ class RecordingPlan:
                 remedy="leave it out",
             )
 
+    @property
+    def kinds(self) -> Mapping[str, float]:
+        """Kinds of missions to come, by their shares or numbers."""
+        if not isinstance(self.missions, MissionsFile):
+            return self.conditions
+        amounts: Counter[str] = Counter()
+        for order in self.orders():
+            amounts[str(order.kind)] += order.missions or 0
+        return dict(amounts)
+
+    def orders(self) -> list[MissionOrder]:
+        """The file's missions that are for this robot, or for any.
+
+        Raises:
+            ConfigError: they are for other robots, or for some and no tag says which this is.
+        """
+        if not isinstance(self.missions, MissionsFile):
+            return []
+        mine = self.tags.get("robot")
+        robots = sorted({order.robot for order in self.missions.missions if order.robot})
+        chosen = [order for order in self.missions.missions if order.robot in (None, mine)]
+        if not chosen or (robots and mine is None):
+            raise ConfigError(
+                f"asks for missions of {', '.join(robots)}"
+                + (f", none of {mine}" if mine else ": which robot this is was not said"),
+                where="the missions file",
+                remedy=f"`--tag robot={robots[0]}` drives those of that robot",
+            )
+        return chosen
+
     def describe(self) -> dict[str, Any]:
         """As JSON has it."""
         return {
             "format": self.format,
             "minutes": self.minutes,
-            "missions": self.missions,
+            "missions": sum(order.missions or 0 for order in self.orders()) or self.missions,
+            "orders": [
+                {k: v for k, v in msgspec.structs.asdict(order).items() if v and k != "fills"}
+                for order in self.orders()
+            ],
             "seed": self.seed,
-            "conditions": dict(self.conditions),
+            "conditions": dict(self.kinds),
             "policy": self.policy,
             "epsilon": self.epsilon,
             "rates_hz": msgspec.structs.asdict(self.rates),
@@ -149,6 +189,7 @@ class RecordingSummary:
     plan: RecordingPlan
     missions: Counter[str] = field(default_factory=Counter)  # by kind
     succeeded: Counter[str] = field(default_factory=Counter)
+    met: Counter[str] = field(default_factory=Counter)  # those that truly met their kind
     steps: Counter[str] = field(default_factory=Counter)  # by true condition
     policies: Counter[str] = field(default_factory=Counter)  # steps
     handovers: int = 0
@@ -169,6 +210,8 @@ class RecordingSummary:
             "minutes": round(self.minutes, 3),
             "missions": dict(self.missions),
             "succeeded": {kind: self.succeeded[kind] for kind in self.missions},
+            "met": {kind: self.met[kind] for kind in self.missions},
+            "ordered": dict(self.plan.kinds) if self.plan.orders() else None,
             "steps": dict(self.steps),
             "policy_steps": dict(self.policies),
             "handovers": self.handovers,
@@ -207,20 +250,32 @@ def record(
     fleet = Fleet(
         plan.hardware,
         layouts=plan.layouts,
-        conditions=plan.conditions,
+        conditions=plan.kinds,
         scan_hz=plan.rates.scan,
     )
     robot = _robot(plan, fleet)
     summary = RecordingSummary(path, plan)
     driver, version = (plan.policy, "1") if policy is None else (policy.name, policy.version)
-    missions = schedule(plan.seed, plan.conditions, driver, plan.hardware, version=version)
+    missions: OrderedMissions | Iterator[Mission]
+    if isinstance(plan.missions, MissionsFile):
+        missions = OrderedMissions(
+            ordered(plan, fleet.env.floors, fleet.env.navigation.planners),
+            plan.missions,
+            plan.seed,
+            driver,
+            plan.hardware,
+            version=version,
+        )
+    else:
+        endless = schedule(plan.seed, plan.conditions, driver, plan.hardware, version=version)
+        missions = islice(endless, plan.missions)
     drivers = BehaviourPolicies(
         fleet.env.num_envs, seed=plan.seed, epsilon=plan.epsilon, external=external
     )
     start_ns = plan.start_ns
     with recording_sink(path, plan.format, TOPICS, plan.tags) as sink:
         floor: Warehouse | None = None
-        for driven in fleet.drive(islice(missions, plan.missions), drivers):
+        for driven in _drive(fleet, missions, drivers):
             if driven.floor is not floor:  # the map comes once, and again on another floor
                 floor = driven.floor
                 racks = ~cells_of(floor, MAP_CELL_M).T
@@ -236,6 +291,7 @@ def record(
             kind = driven.mission.spec.condition
             summary.missions[kind] += 1
             summary.succeeded[kind] += driven.success
+            summary.met[kind] += meets(kind, driven.drive.true_condition)
             summary.steps.update(map(primary_of, driven.drive.true_condition))
             who = [f"{name} {version}" for name, version, _ in driven.drive.policy]
             summary.policies.update(who)
@@ -248,6 +304,30 @@ def record(
                 break
     summary.work_s = time.perf_counter() - begun
     return summary
+
+
+def ordered(
+    plan: RecordingPlan, floors: Sequence[Warehouse], planners: Sequence[Planner]
+) -> MissionOrders:
+    """The missions of a plan's file, on these floors.
+
+    Raises:
+        ConfigError: one that the twin, or one of the floors, cannot hold.
+    """
+    return MissionOrders(plan.orders(), floors, planners, where="the missions file")
+
+
+def _drive(
+    fleet: Fleet, missions: OrderedMissions | Iterator[Mission], drivers: BehaviourPolicies
+) -> Iterator[DrivenMission]:
+    if not isinstance(missions, OrderedMissions):
+        yield from fleet.drive(missions, drivers)
+        return
+    for one_round in missions.rounds():
+        for driven in fleet.drive(one_round, drivers):
+            kind = driven.mission.spec.condition
+            missions.note(driven.mission, met=meets(kind, driven.drive.true_condition))
+            yield driven
 
 
 def parse_start(text: str) -> int:

@@ -12,6 +12,7 @@ import tyro
 from restock.errors import ConfigError, RestockError
 
 if TYPE_CHECKING:
+    from restock.replay.fleet.missions_file import MissionsFile
     from restock.train.twin.env.interface import Policy
 
 LEARNED = "dqn"  # the behaviour policy's name of what `restock train` made
@@ -32,6 +33,7 @@ class RecordCommand:
         restock record --out icy --missions 20 --conditions nominal=.5,wheel_slip=.5
         restock record --out amr07.mcap --tag robot=amr-07 --tag site=oslo --start 2026-10-05T08:00
         restock record --out mine.mcap --policy run:runs/a --epsilon .05
+        restock record --out next.mcap --missions next.toml
     """
 
     out: Path
@@ -40,8 +42,9 @@ class RecordCommand:
     """mcap (zstd) or rosbag2 (sqlite3). Default: mcap if --out ends in .mcap, else rosbag2."""
     minutes: float | None = None
     """Stop after the mission in which this much driving is recorded (default 5)."""
-    missions: int | None = None
-    """Stop after so many missions instead."""
+    missions: Annotated[str | None, tyro.conf.arg(metavar="N|FILE")] = None
+    """Stop after so many missions instead; or drive those of a missions file, as `restock gaps
+    --missions-out` writes it, until as many as it orders met their kind."""
     tag: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="KEY=VALUE")
     ] = ()
@@ -79,8 +82,10 @@ class RecordCommand:
         """Record, and print what was recorded."""
         from restock.cli import output
         from restock.ingest.task.tags import parse_tags
+        from restock.replay.fleet.missions_file import MissionsFile
         from restock.train.twin.env.floor_report import refuse_unfit, sealed
         from restock.train.twin.floors.floors import open_floors
+        from restock.train.twin.floors.planner import planners
         from restock.train.twin.physics.perturbation import find_perturbation
         from restock.train.twin.recording.bag_writer import refuse_existing
         from restock.train.twin.recording.missions import NATURAL, parse_shares
@@ -89,6 +94,7 @@ class RecordCommand:
             HARDWARE,
             NOISELESS,
             RecordingPlan,
+            ordered,
             parse_rates,
             parse_start,
             record,
@@ -102,7 +108,7 @@ class RecordCommand:
         plan = RecordingPlan(
             format=self.format or ("mcap" if self.out.suffix == ".mcap" else "rosbag2"),
             minutes=5.0 if self.minutes is None and self.missions is None else self.minutes,
-            missions=self.missions,
+            missions=_missions(self.missions),
             seed=self.seed,
             conditions=parse_shares(self.conditions) if self.conditions is not None else NATURAL,
             policy=self.policy,
@@ -119,7 +125,11 @@ class RecordCommand:
         )
         policy = load_policy(plan.policy)
         floors = open_floors(plan.layouts)
-        refuse_unfit(floors, [kind for kind, share in plan.conditions.items() if share])
+        refuse_unfit(floors, [kind for kind, share in plan.kinds.items() if share])
+        if isinstance(plan.missions, MissionsFile):
+            if self.conditions is not None:
+                raise RestockError("--conditions and a missions file exclude each other")
+            ordered(plan, floors, planners(floors))
         refuse_existing(self.out)
         if self.dry_run:
             wanted = {"path": str(self.out), "dry_run": True, **plan.describe()}
@@ -127,7 +137,9 @@ class RecordCommand:
             return
         for line in sealed(floors):
             output.say(line)
-        total = plan.minutes if plan.minutes is not None else float(plan.missions or 0)
+        ordered_missions = sum(order.missions or 0 for order in plan.orders())
+        counted = plan.missions if isinstance(plan.missions, int) else ordered_missions
+        total = plan.minutes if plan.minutes is not None else float(counted)
         with output.progress(f"recording {self.out.name}", total) as advance:
 
             def driven(missions: int, minutes: float) -> None:
@@ -138,6 +150,16 @@ class RecordCommand:
             output.print_json(done)
         else:
             _print_recording(done)
+
+
+def _missions(text: str | None) -> int | MissionsFile | None:
+    """How many, or which: a number, or a missions file."""
+    from restock.replay.fleet.missions_file import read_missions
+
+    if text is None:
+        return None
+    number = text.removeprefix("-")
+    return int(text) if number.isascii() and number.isdigit() else read_missions(text)
 
 
 def load_policy(name: str) -> Policy | None:
@@ -176,6 +198,7 @@ def _print_recording(done: dict[str, Any]) -> None:
         {
             "missions of": kind,
             "driven": count,
+            "met it": done["met"][kind] if kind != "nominal" else None,
             "at the goal without a bump": done["succeeded"][kind],
         }
         for kind, count in done["missions"].items()
@@ -188,6 +211,12 @@ def _print_recording(done: dict[str, Any]) -> None:
     for what, key in (("truly", "steps"), ("driven by", "policy_steps"), ("topic", "topics")):
         unit = "messages" if key == "topics" else "steps"
         output.print_table([{what: name, unit: count} for name, count in done[key].items()])
+    for kind, wanted in (done["ordered"] or {}).items():
+        if done["met"].get(kind, 0) < wanted:
+            output.say(
+                f"{kind}: {done['met'].get(kind, 0)} of the {wanted} missions that were ordered met"
+                f" it, of {done['missions'].get(kind, 0)} driven; no more were driven"
+            )
     output.say(f"{done['handovers']} handovers; took {done['work_s']:.1f} s")
 
 
@@ -197,7 +226,7 @@ def _print_plan(values: dict[str, Any]) -> None:
     rows = [
         {"": key, "would be": _in_words(value)}
         for key, value in values.items()
-        if value is not None
+        if value not in (None, [], {})
     ]
     output.print_table(rows, ["", "would be"])
 
@@ -206,4 +235,4 @@ def _in_words(value: Any) -> str:
     if isinstance(value, dict):
         items = value.items()
         return ", ".join(f"{n} {v if isinstance(v, str) else f'{v:g}'}" for n, v in items)
-    return ", ".join(value) if isinstance(value, list) else str(value)
+    return ", ".join(map(_in_words, value)) if isinstance(value, list) else str(value)

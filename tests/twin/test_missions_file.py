@@ -1,0 +1,184 @@
+"""A missions file in the twin: which missions it makes, and which it refuses by name."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from restock.cli import main
+from restock.errors import ConfigError
+from restock.replay.fleet.missions_file import MissionOrder, MissionsFile
+from restock.train.twin.env.mission_orders import MissionOrders
+from restock.train.twin.floors.layout import default_warehouse, strip_warehouse
+from restock.train.twin.floors.planner import planners
+from restock.train.twin.physics.episode import EpisodeSpec, draw_episode
+from restock.train.twin.physics.perturbation import Perturbation
+from restock.train.twin.recording.missions import MOST_DRIVEN, OrderedMissions, meets
+from restock.train.twin.recording.recorder import RecordingPlan
+
+FLOOR = default_warehouse()
+PLANNERS = planners([FLOOR])
+SLIP = MissionOrder(kind="wheel_slip", missions=4)
+THERE = MissionOrder(kind="nominal", missions=1, zone="aisle_3_east")
+
+
+def orders(*given: MissionOrder) -> MissionOrders:
+    return MissionOrders(given, [FLOOR], PLANNERS, where="next.toml")
+
+
+def ordered(*given: MissionOrder, seed: int = 0) -> OrderedMissions:
+    file = MissionsFile(missions=given)
+    return OrderedMissions(orders(*given), file, seed, "handover", Perturbation())
+
+
+def test_a_mission_of_a_zone_comes_through_it_and_is_an_episode_like_any_other() -> None:
+    made = orders(SLIP, THERE)
+    specs = [made.spec(1, seed) for seed in range(6)]
+    assert len(set(specs)) == 6
+    assert specs == [made.spec(1, seed) for seed in range(6)]
+    for spec in specs:
+        assert spec == EpisodeSpec("nominal", spec.seed)
+        plan = draw_episode(spec, FLOOR, PLANNERS[0]).plan_m
+        fine = plan[:-1, None] + np.linspace(0, 1, 50)[:, None] * np.diff(plan, axis=0)[:, None]
+        x, y = fine.reshape(-1, 2).T
+        assert "aisle_3_east" in FLOOR.zone_of(x, y)
+    assert made.shares.tolist() == [0.8, 0.2]
+
+
+@pytest.mark.parametrize(
+    ("order", "message"),
+    [
+        (MissionOrder(kind="rain", missions=1), "no missions of kind 'rain'"),
+        (MissionOrder(hours=3.0), "hours of logging"),
+        (MissionOrder(kind="nominal", missions=1, zone="roof"), "zone 'roof'"),
+        (MissionOrder(kind="nominal", missions=1, layout="hall"), "floor 'hall'"),
+    ],
+)
+def test_what_the_twin_cannot_hold_is_refused_by_name(order: MissionOrder, message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as error:
+        orders(SLIP, order)
+    assert "missions[1]" in str(error.value)
+
+
+def test_a_floor_without_room_for_a_kind_is_refused_by_name() -> None:
+    # Aisles so short that no way through them could be blocked.
+    tiny = strip_warehouse(
+        3.2, 3.0, ((0.0, 1.2), (1.8, 3.0)), ((0.0, 1.2), (2.0, 3.2)), name="tiny"
+    )
+    with pytest.raises(ConfigError, match="tiny has no room for episodes of blocked_aisle"):
+        MissionOrders(
+            [MissionOrder(kind="blocked_aisle", missions=1)], [tiny], planners([tiny]), where="x"
+        )
+
+
+def test_rounds_drive_on_until_enough_met_their_kind_and_never_without_end() -> None:
+    missions = ordered(SLIP, MissionOrder(kind="near_collision", missions=2))
+    driven = []
+    for one_round in missions.rounds():
+        for number, mission in enumerate(one_round):
+            driven.append(mission)
+            # Every second slip is met, a near collision never.
+            missions.note(mission, met=mission.order == 0 and number % 2 == 0)
+    kinds = [mission.spec.condition for mission in driven]
+    assert kinds.count("near_collision") == MOST_DRIVEN * 2
+    assert missions.met[0] == 4 or kinds.count("wheel_slip") == MOST_DRIVEN * 4
+    assert len({mission.spec.seed for mission in driven}) == len(driven)
+    assert not missions.owed()
+
+
+def test_another_list_or_seed_is_other_missions() -> None:
+    def seeds(missions: OrderedMissions) -> set[int]:
+        return {mission.spec.seed for mission in next(missions.rounds())}
+
+    first = seeds(ordered(SLIP))
+    assert first == seeds(ordered(SLIP))
+    assert not first & seeds(ordered(SLIP, seed=1))
+    assert not first & seeds(ordered(MissionOrder(kind="wheel_slip", missions=5)))
+
+
+def test_what_a_mission_met_is_in_its_truth() -> None:
+    assert meets("wheel_slip", ["nominal", "near_collision,wheel_slip"])
+    assert not meets("wheel_slip", ["nominal", "near_collision"])
+    assert meets("nominal", ["near_collision"])
+
+
+def test_missions_of_a_robot_are_those_of_its_tag() -> None:
+    file = MissionsFile(missions=(SLIP, MissionOrder(kind="nominal", missions=1, robot="amr_7")))
+    with pytest.raises(ConfigError, match="amr_7: which robot this is"):
+        RecordingPlan(missions=file).orders()
+    assert RecordingPlan(missions=file, tags={"robot": "amr_7"}).kinds == {
+        "wheel_slip": 4,
+        "nominal": 1,
+    }
+    assert RecordingPlan(missions=file, tags={"robot": "amr_8"}).orders() == [SLIP]
+
+
+def test_a_dry_run_says_what_would_be_driven_and_a_wrong_file_writes_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, file = tmp_path / "next.mcap", tmp_path / "next.toml"
+    file.write_text('[[missions]]\nkind = "wheel_slip"\nmissions = 3\n')
+    args = ["record", "--out", str(out), "--missions", str(file)]
+    assert main([*args, "--dry-run", "--json"]) == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert plan["orders"] == [{"kind": "wheel_slip", "missions": 3}]
+    assert plan["conditions"] == {"wheel_slip": 3}
+    file.write_text('[[missions]]\nkind = "wheel_slip"\nmissions = 3\nzone = "roof"\n')
+    assert main(args) == 2
+    assert "zone 'roof'" in capsys.readouterr().err
+    assert main(["record", "--out", str(out), "--missions", str(tmp_path / "none.toml")]) == 2
+    assert "restock gaps" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_missions_of_a_file_are_recorded_and_counted_by_what_they_met(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "next.toml"
+    file.write_text('[[missions]]\nkind = "nominal"\nmissions = 1\n')
+    out = tmp_path / "next.mcap"
+    assert main(["record", "--out", str(out), "--missions", str(file), "--json"]) == 0
+    done = json.loads(capsys.readouterr().out)
+    assert done["ordered"] == done["missions"] == done["met"] == {"nominal": 1}
+    assert out.stat().st_size == done["size_bytes"]
+
+
+@pytest.mark.slow
+def test_a_list_that_is_driven_and_ingested_closes_its_gaps(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What is missing, driven, and asked again: closed, or within what the intervals said."""
+
+    def run(*args: str) -> dict[str, object]:
+        assert main([*args, "--json"]) == 0
+        found: dict[str, object] = json.loads(capsys.readouterr().out)
+        return found
+
+    store, asked = str(tmp_path / "store"), tmp_path / "asked.toml"
+    asked.write_text(
+        'max_replays_per_row = 20\nplanned = {updates = 1000, batch_size = 64}\n'
+        '[[strata]]\nname = "nominal"\nunit = "episode"\nshare = 0.5\n'
+        '[[strata]]\nname = "wheel_slip"\nunit = "episode"\nshare = 0.5\n'
+        '[[strata]]\nname = "rest"\nwhere = "true"\nshare = 0.0\npriority = 5000\n'
+    )  # fmt: skip
+    first = ["--missions", "24", "--conditions", "nominal=.8,wheel_slip=.2"]
+    run("record", "--out", str(tmp_path / "first.mcap"), *first)
+    assert main(["ingest", str(tmp_path / "first.mcap"), "--store", store]) == 0
+    capsys.readouterr()
+    gaps = ["gaps", store, "--mixture", str(asked), "--no-audits"]
+    before = run(*gaps, "--missions-out", str(tmp_path / "next.toml"), "--confidence", "0.9")
+    missing = {gap["cell"]: gap for gap in before["gaps"]}  # type: ignore[attr-defined]
+    assert "wheel_slip" in missing
+    run("record", "--out", str(tmp_path / "next.mcap"), "--missions", str(tmp_path / "next.toml"),
+        "--start", "2026-03-03")  # fmt: skip
+    assert main(["ingest", str(tmp_path / "next.mcap"), "--store", store]) == 0
+    capsys.readouterr()
+    after = {gap["cell"]: gap for gap in run(*gaps)["gaps"]}  # type: ignore[attr-defined]
+    slip = missing["wheel_slip"]
+    driven = sum(o["missions"] for o in before["plan"]["orders"])  # type: ignore[index]
+    came = slip["missing"] - after.get("wheel_slip", {"missing": 0})["missing"]
+    assert "wheel_slip" not in after or came / driven >= slip["rate_low"] * 0.8
+    assert came > 0.5 * slip["missing"]
