@@ -11,6 +11,7 @@ INSTALLERS.append("restock.replay.panel.mixture_tables:install_mixtures")
 
 if TYPE_CHECKING:
     from restock.replay.export.dataset import export_dataset as export_dataset
+    from restock.replay.fleet.drift import measure_drift as measure_drift
     from restock.replay.mixture.mixture import Mixture as Mixture
     from restock.replay.mixture.mixture import load_mixture as load_mixture
     from restock.replay.panel.build import build_panel as build_panel
@@ -37,6 +38,7 @@ else:
         __name__,
         {
             "restock.replay.export.dataset": ["export_dataset"],
+            "restock.replay.fleet.drift": ["measure_drift"],
             "restock.replay.mixture.mixture": ["Mixture", "load_mixture"],
             "restock.replay.panel.build": ["build_panel"],
             "restock.replay.panel.iterable": ["PanelDataset"],

@@ -42,6 +42,7 @@ RENAMED = {
     "flattering_evaluation": "evaluation_bias",
     "flattering_panel": "panel_bias",
     "flattering_policy": "policy_bias",
+    "observation_drift": "signal_drift",
     "max_flattery": "max_bias",
 }
 BEGIN = "<!-- audits: written by `python -m restock.replay.store.audit docs/audit.md` -->"

@@ -28,6 +28,7 @@ UNITS = (
     ("_mps2", "m/s²"),
     ("_mps", "m/s"),
     ("_radps", "rad/s"),
+    ("_radpm", "rad/m"),
     ("_rad", "rad"),
     ("_days", "days"),
     ("_ns", "ns"),

@@ -408,8 +408,9 @@ ORDER BY robot, against DESC, part, signal, zone NULLS FIRST, period;
 
 CREATE OR REPLACE VIEW drift AS FROM drift_by();
 
--- One line for each robot and signal, or condition, that has changed against its own reference.
-CREATE OR REPLACE VIEW drift_findings AS
+-- One line for each robot and signal, or condition, that has changed against its own reference; `tests`
+-- is a table of what drift_by gives, `every` the length of its periods.
+CREATE OR REPLACE MACRO drift_findings_of(tests, every := 'week') AS TABLE
 SELECT
     robot,
     site,
@@ -418,47 +419,48 @@ SELECT
     zone,
     arg_max(scope, period) AS scope,
     min(period) AS since,
-    count(*) AS weeks,
-    any_value(weeks_tested) AS weeks_tested,
+    count(*) AS periods,
+    any_value(periods_tested) AS periods_tested,
     arg_max(compared, period) AS compared,
     arg_max(change, period) AS change,
     arg_max(change_low, period) AS change_low,
     arg_max(change_high, period) AS change_high,
     arg_max(size, period) AS size,
     max(q) AS q,
-    any_value(robot) || ': ' || any_value(part) || ': ' || any_value(signal)
+    any_value(robot) || ': ' || any_value(part) || ': '
+    || any_value(signal) || CASE WHEN any_value(part) = 'conditions' THEN ' events an hour' ELSE '' END
     || coalesce(' in ' || any_value(zone), '')
     || CASE arg_max(compared, period)
         WHEN 'ratio' THEN printf(
-            ' is %.3g [%.3g, %.3g] times', arg_max(change, period),
-            arg_max(change_low, period), arg_max(change_high, period)
-        )
-        WHEN 'difference' THEN printf(
-            ' is %+.3g [%+.3g, %+.3g] from', arg_max(change, period),
+            ' %.3g [%.3g, %.3g] times its reference', arg_max(change, period),
             arg_max(change_low, period), arg_max(change_high, period)
         )
         ELSE printf(
-            ' is %+.2g [%+.2g, %+.2g] standard deviations from', arg_max(change, period),
+            ' %+.3g [%+.3g, %+.3g]', arg_max(change, period),
             arg_max(change_low, period), arg_max(change_high, period)
-        )
+        ) || CASE arg_max(compared, period) WHEN 'spread' THEN ' standard deviations' ELSE '' END
+        || ' from its reference'
     END
-    || printf(' its reference, since %s (%d of %d weeks); ', min(period), count(*), any_value(weeks_tested))
+    || printf(
+        ' since %s (%d of %d %ss); ',
+        min(period), count(*), any_value(periods_tested), every
+    )
     || CASE arg_max(scope, period)
         WHEN 'alone' THEN 'no other robot at this site to compare with'
-        WHEN 'site' THEN 'the other robots at this site changed alike: look at the site'
+        WHEN 'site' THEN 'the other robots at this site changed alike'
         WHEN 'robot' THEN printf(
             '%d of %d other robots at this site changed alike',
             arg_max(others_changed, period), arg_max(others, period)
         )
-        ELSE 'not clear whether the other robots at this site changed alike'
+        ELSE 'unclear whether the other robots at this site changed alike'
     END AS finding
 FROM (
-    SELECT
-        *,
-        count(p) OVER (PARTITION BY robot, signal, zone) AS weeks_tested
-    FROM drift
+    SELECT *, count(p) OVER (PARTITION BY robot, part, signal, zone) AS periods_tested
+    FROM query_table(tests)
     WHERE against = 'own reference'
 )
 WHERE verdict = 'changed'
 GROUP BY robot, site, part, signal, zone
 ORDER BY part IN ('driving', 'conditions'), size DESC;
+
+CREATE OR REPLACE VIEW drift_findings AS FROM drift_findings_of('drift');

@@ -65,12 +65,14 @@ MAY_IMPORT = {
     "train/twin/calibration": (
         "twin/floors twin/physics replay/store ingest/profile ingest/steps ingest/store ingest/task"
     ),
-    "report": "replay/panel replay/store train/run train/twin/calibration train/twin/floors",
+    "report": (
+        "replay/fleet replay/panel replay/store train/run train/twin/calibration train/twin/floors"
+    ),
     "cli": "ingest/steps",
     "cli/data": (
         "cli ingest ingest/containers ingest/profile ingest/propose ingest/steps ingest/store"
         " ingest/task replay replay/export replay/fleet replay/mixture replay/panel replay/store"
-        " train/dqn train/evaluation train/twin/physics"
+        " train/dqn train/evaluation train/twin/physics report"
     ),
     "cli/learning": (
         "cli report ingest/store replay/store replay/trace train train/comparison"

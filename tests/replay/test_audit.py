@@ -185,10 +185,19 @@ def far_operator(table: pa.Table, recordings: pa.Table) -> Tables:
     return replaced(table, "action_residual", np.where(operator, 0.4, 0.0)), recordings
 
 
-def drifting_clearance(table: pa.Table, recordings: pa.Table) -> Tables:
-    clearance = table["clearance_m"].to_numpy().copy()
-    clearance[rows_where(table, "recording_id", f"{2:016x}")] += 5
-    return replaced(table, "clearance_m", clearance.astype(np.float32)), recordings
+def worn_wheel(table: pa.Table, recordings: pa.Table) -> Tables:
+    """The second recording is of a week later, and its wheels report more than was driven."""
+    later = rows_where(table, "recording_id", f"{2:016x}")
+    stamp = table["stamp_ns"].to_numpy() + later * 7 * 86_400 * 10**9
+    table = replaced(replaced(table, "stamp_ns", stamp), "pose_stamp_ns", stamp)
+    noise = np.random.default_rng(0).normal(0, 0.02, len(table))
+    for name, values in {
+        "wheel_speed_mps": np.full(len(table), 0.8),
+        "wheel_yaw_rate_radps": np.zeros(len(table)),
+        "localised_speed_mps": 0.8 * np.where(later, 0.9, 1.0) + noise,
+    }.items():
+        table = replaced(table, name, values.astype(np.float32))
+    return table, recordings
 
 
 def picky_operator(table: pa.Table, recordings: pa.Table) -> Tables:
@@ -237,7 +246,7 @@ PLANTS: list[tuple[str, Plant, int, dict[str, object]]] = [
     ("odometry_as_command", measured, 1, {"instead": "odometry"}),
     ("far_actions", far_operator, 1, {"behaviour_policy": "operator", "far_share": 1.0}),
     ("repeated_steps", bag_and_a_part_of_it, 1, {"same_as_file": "logs/part.mcap", "rows": 60}),
-    ("observation_drift", drifting_clearance, 2, {"signal": "clearance_m"}),
+    ("signal_drift", worn_wheel, 2, {"signal": "odometry_scale", "scope": "alone"}),
     ("policy_bias", picky_operator, 1, {"behaviour_policy": "operator"}),
     ("policy_bias", mostly_easy_operator, 1, {"behaviour_policy": "operator"}),
 ]

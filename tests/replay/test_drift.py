@@ -188,7 +188,7 @@ def worn() -> duckdb.DuckDBPyConnection:
 def test_a_worn_wheel_is_named_and_nothing_else(worn: duckdb.DuckDBPyConnection) -> None:
     [found] = rows(worn, "FROM drift_findings WHERE part <> 'driving'")
     assert (found["robot"], found["part"], found["signal"]) == ("b", "wheels", "odometry_scale")
-    assert (str(found["since"]), found["weeks"], found["weeks_tested"]) == (WEEKS[2], 2, 2)
+    assert (str(found["since"]), found["periods"], found["periods_tested"]) == (WEEKS[2], 2, 2)
     assert found["change_low"] < 0.94 < found["change_high"]
     assert found["scope"] == "robot"
     assert "0 of 2 other robots at this site changed alike" in found["finding"]

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import duckdb
 import numpy as np
 import pyarrow as pa
+from deltalake import write_deltalake
 from scipy.signal import lfilter
 
 from restock.replay.store.query import install
@@ -36,28 +38,44 @@ class SyntheticRobot:
     gyro: bool = True
 
 
-def fleet(
+def fleet(robots: list[SyntheticRobot], **size: int) -> duckdb.DuckDBPyConnection:
+    """A connection with the views of a store of this fleet, of a size as `drives` has it."""
+    made = drives(robots, **size)
+    connection = duckdb.connect()
+    connection.register("stored_transitions", pa.concat_tables(rows for rows, _ in made))
+    connection.register("stored_recordings", pa.concat_tables(row for _, row in made))
+    install(connection, "FLOAT[]")
+    return connection
+
+
+def fleet_store(path: Path, robots: list[SyntheticRobot], **size: int) -> Path:
+    """The same as a store on disk."""
+    made = drives(robots, **size)
+    for name, tables in (
+        ("recordings", [row for _, row in made]),
+        ("transitions", [rows for rows, _ in made]),
+    ):
+        write_deltalake(str(path / name), pa.concat_tables(tables), mode="append")
+    return path
+
+
+def drives(
     robots: list[SyntheticRobot],
     *,
     weeks: int = 4,
     recordings: int = 2,
     episodes: int = 8,
     seed: int = 0,
-) -> duckdb.DuckDBPyConnection:
-    """A connection with the views of a store of this fleet; `recordings` a robot and week."""
-    rows, manifests, number = [], [], 0
+) -> list[tuple[pa.Table, pa.Table]]:
+    """Transitions and manifest of every recording; so many `recordings` a robot and week."""
+    made, number = [], 0
     for robot in robots:
         for week in range(1, weeks + 1):
             for _ in range(recordings):
                 number += 1
                 drive = _drive(robot, number, week, episodes, seed)
-                rows.append(drive)
-                manifests.append(_tagged(manifest(drive), robot))
-    connection = duckdb.connect()
-    connection.register("stored_transitions", pa.concat_tables(rows))
-    connection.register("stored_recordings", pa.concat_tables(manifests))
-    install(connection, "FLOAT[]")
-    return connection
+                made.append((drive, _tagged(manifest(drive), robot)))
+    return made
 
 
 def wander(

@@ -23,6 +23,7 @@ VERBS = {
     "label": "label a store again after its conditions changed, without the recordings",
     "sql": "any question to a store (or a run), in SQL",
     "audit": "is the coverage good enough? exit 1 if not",
+    "drift": "which robot's wheels, lidar or floor have changed?",
     "diff": "what is different between two stores, versions, panels or runs?",
     "gaps": "what is missing, and which missions would fill it?",
     "mix": "a pinned replay panel with quotas per stratum",
@@ -39,7 +40,10 @@ VERBS = {
 }
 # folder -> the verbs whose modules it holds
 FOLDERS = {
-    "data": ("info", "profile", "ingest", "label", "sql", "audit", "diff", "gaps", "mix", "export"),
+    "data": (
+        *("info", "profile", "ingest", "label", "sql", "audit"),
+        *("drift", "diff", "gaps", "mix", "export"),
+    ),
     "learning": ("train", "eval", "study", "compare", "trace", "diagnose", "report"),
     "twin": ("record", "twin"),
 }

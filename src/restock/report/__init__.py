@@ -14,7 +14,9 @@ from typing import Any
 import jinja2
 
 from restock.files import write_text
+from restock.replay.fleet.drift import Drift
 from restock.report.card import as_markdown, replay_card
+from restock.report.drift import drift_page
 from restock.report.facts import gather
 from restock.report.page import page
 from restock.report.twin_gap import gap_page
@@ -41,6 +43,11 @@ def write_gap_page(folder: Path, out: Path | None = None) -> Path:
     )
 
 
+def write_drift_page(drift: Drift, out: Path) -> Path:
+    """Write the page of what `measure_drift` found; returns its path."""
+    return _write_page(drift_page(drift), out)
+
+
 def _write_page(content: dict[str, Any], out: Path) -> Path:
     template = (files("restock.report") / "page.html.jinja").read_text(encoding="utf-8")
     environment = jinja2.Environment(
@@ -64,4 +71,4 @@ def write_card(run: Path) -> tuple[dict[str, Any], str]:
     return card, markdown
 
 
-__all__ = ["build_report", "write_card", "write_gap_page"]
+__all__ = ["build_report", "write_card", "write_drift_page", "write_gap_page"]

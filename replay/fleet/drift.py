@@ -1,0 +1,123 @@
+"""Drift of a store: its tests, what they found, and the weeks behind them.
+
+The statistics are SQL (replay/store/drift.sql); here they run once, for a table or a page.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from restock.errors import ConfigError
+from restock.replay.store.store import Store, passed_in
+
+PERIODS = ("day", "week", "month", "year", "decade")
+OWN, OTHERS = "own reference", "other robots"
+Rows = list[dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Drift:
+    """What `measure_drift` found. Columns of the rows are documented in docs/sql.md."""
+
+    store: str
+    version: int
+    every: str  # day, week, …
+    reference: int  # of these periods
+    findings: Rows  # as of the view drift_findings: what changed, the largest first
+    tests: Rows  # as of the view drift: every comparison
+    periods: Rows  # robot, site, period, part, signal, recordings, episodes, p25, median, p75
+    conditions: Rows  # robot, period, condition, driven_h, events, events_per_h
+    notes: list[str]  # what could not be compared, and why
+
+    def document(self) -> dict[str, Any]:
+        """As `restock drift --json` prints it."""
+        return {
+            "store": self.store,
+            "version": self.version,
+            "every": self.every,
+            "reference": self.reference,
+            "findings": self.findings,
+            "notes": self.notes,
+            "tests": self.tests,
+        }
+
+
+def measure_drift(
+    store: Store, *, every: str = "week", reference: int = 2, least_episodes: int = 5
+) -> Drift:
+    """Compare each robot's periods with its own first ones and with the other robots.
+
+    Args:
+        every: the length of a period: day, week, month, year or decade.
+        reference: how many of a robot's first periods the later ones are compared with.
+        least_episodes: with fewer on a side the verdict is "too few".
+
+    Raises:
+        ConfigError: no such period, or a number below its least.
+    """
+    if every not in PERIODS:
+        raise ConfigError(
+            f"no period {every!r}", where="drift", remedy=f"give one of {', '.join(PERIODS)}"
+        )
+    for name, value, least in (("reference", reference, 1), ("least_episodes", least_episodes, 2)):
+        if value < least:
+            raise ConfigError(f"{name} must be at least {least}, got {value}", where="drift")
+
+    def rows(query: str) -> Rows:
+        found: Rows = store.sql(query).to_arrow_table().to_pylist()
+        return found
+
+    period = f"CAST(date_trunc('{every}', start_time) AS DATE) AS period"
+    tests = store.sql(f"FROM drift_by('{every}', {reference}, {least_episodes})").to_arrow_table()
+    with passed_in(store.connection, drift_tests=tests):
+        findings = rows(f"FROM drift_findings_of('drift_tests', '{every}')")
+    periods = rows(
+        f"SELECT robot, site, {period}, part, signal, count(DISTINCT recording_id) AS recordings,"
+        " count(*) AS episodes, quantile_cont(value, 0.25) AS p25, median(value) AS median,"
+        " quantile_cont(value, 0.75) AS p75 FROM episode_signals GROUP BY ALL ORDER BY ALL"
+    )
+    conditions = rows(
+        f"SELECT robot, {period}, condition, sum(driven_h) AS driven_h,"
+        " CAST(sum(events) AS BIGINT) AS events, sum(events) / sum(driven_h) AS events_per_h"
+        " FROM episode_conditions WHERE zone IS NULL GROUP BY ALL ORDER BY ALL"
+    )
+    every_test: Rows = tests.to_pylist()
+    return Drift(
+        str(store.path),
+        store.version,
+        every,
+        reference,
+        findings,
+        every_test,
+        periods,
+        conditions,
+        _notes(every_test, periods, every),
+    )
+
+
+def _notes(tests: Rows, periods: Rows, every: str) -> list[str]:
+    """What a reader must know of what was not, or hardly, compared."""
+    notes = []
+    robots = sorted({row["robot"] for row in periods})
+    if "untagged" in robots:
+        notes.append(
+            "Recordings without the tag `robot` are taken for one robot, untagged:"
+            " `restock ingest --tag robot=NAME` tells robots apart."
+        )
+    for robot in robots:
+        seen = {row["period"] for row in periods if row["robot"] == robot}
+        if len(seen) == 1:
+            notes.append(f"{robot} drove in one {every} only: it has no reference of its own.")
+    own = [row for row in tests if row["against"] == OWN]
+    if few := sum(row["verdict"] == "too few" for row in own):
+        notes.append(
+            f"{few:,} of {len(own):,} comparisons with a robot's own reference have too few"
+            " episodes or events."
+        )
+    if single := sum(row["samples"] == "episodes" and row["p"] is not None for row in own):
+        notes.append(
+            f"{single:,} compare episode by episode, for want of recordings (two a {every}): what"
+            " differs from drive to drive may be taken for drift there."
+        )
+    return notes

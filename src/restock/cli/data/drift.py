@@ -1,0 +1,95 @@
+"""`restock drift`: which robot's wheels, lidar or floor have changed?"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from restock.errors import ExitCode
+
+if TYPE_CHECKING:
+    from restock.replay.fleet.drift import Drift
+
+
+@dataclass
+class DriftCommand:
+    """Which robot's wheels, lidar or floor have changed?
+
+    Compares each robot's weeks with its own first ones and with the other robots of its site, for
+    each signal (odometry scale, lidar noise, gyroscope bias, …) and for how often each condition
+    begins: a two-sample test over recordings or episodes, its size of effect, and p corrected over
+    all of them. What all robots of a site share is called the site's. Robots and sites are the
+    tags of recordings (`restock ingest --tag robot=amr-1`). See docs/drift.md.
+
+        restock drift store/
+        restock drift store/ --out drift.html
+        restock sql store/ "FROM drift WHERE robot = 'amr-2'"       # every comparison
+    """
+
+    store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
+    """The store."""
+    every: str = "week"
+    """The length of a period: day, week, month, year or decade."""
+    reference: int = 2
+    """How many of a robot's first periods its later ones are compared with."""
+    least_episodes: int = 5
+    """With fewer episodes on a side there is no verdict."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Write a page (HTML) that opens without a network. Replaces what is there."""
+    exit_code: bool = False
+    """Exit 1 where a robot, a site or a condition has changed; how it was driven does not count."""
+    json: bool = False
+    """Print one JSON document: {"findings", "notes", "tests", …}."""
+
+    def run(self) -> int:
+        """Measure, print, and write the page."""
+        from restock.cli import output
+        from restock.replay.fleet.drift import measure_drift
+        from restock.replay.store.store import Store
+
+        with Store(self.store) as store:
+            drift = measure_drift(
+                store,
+                every=self.every,
+                reference=self.reference,
+                least_episodes=self.least_episodes,
+            )
+        if self.out is not None:
+            from restock.report import write_drift_page
+
+            output.say(f"wrote {write_drift_page(drift, self.out)}")
+        if self.json:
+            output.print_json(drift.document())
+        else:
+            _show(drift)
+        changed = any(row["part"] != "driving" for row in drift.findings)
+        return int(ExitCode.FAILED if self.exit_code and changed else ExitCode.OK)
+
+
+def _show(drift: Drift) -> None:
+    from restock.cli import output
+
+    out = output.stdout()
+    verdicts: dict[tuple[str, str], Counter[str]] = {}
+    for row in drift.tests:
+        verdicts.setdefault((row["robot"], row["against"]), Counter())[row["verdict"]] += 1
+    names = sorted({name for counts in verdicts.values() for name in counts})
+    output.print_table(
+        [
+            {"robot": robot, "against": against, **{name: counts[name] for name in names}}
+            for (robot, against), counts in sorted(verdicts.items())
+        ],
+        ["robot", "against", *names],
+        title=f"comparisons by {drift.every}",
+    )
+    for note in drift.notes:
+        out.print(f"- {note}", markup=False, soft_wrap=True)
+    out.print()
+    for row in drift.findings:
+        out.print(row["finding"], markup=False, soft_wrap=True)
+    if not drift.findings:
+        out.print("nothing has changed by what matters, as far as these logs can tell")

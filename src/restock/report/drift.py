@@ -1,0 +1,336 @@
+"""The page of drift: what has changed about which robot, and since when."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any
+
+import altair as alt
+
+from restock import __version__
+from restock.replay.fleet.drift import OWN, Drift
+from restock.replay.store.column_docs import UNITS
+from restock.replay.store.column_docs import unit as unit_of
+from restock.report import charts
+from restock.report.blocks import Figure, Rows, Section, Table, words
+
+MOST_ROBOTS = 12  # in a chart: those with findings first
+MOST_PERIODS = 26  # the newest
+MOST_FINDINGS = 8  # with a chart of their own
+_BEYOND = 3.0  # sizes past it look alike
+_BESIDE = ("driving", "conditions")  # what tells of the use, not of the hardware
+_SCOPE = {
+    "robot": "this robot",
+    "site": "the whole site",
+    "alone": "no other robot to tell",
+    "unclear": "unclear",
+}
+
+
+def drift_page(drift: Drift) -> dict[str, Any]:
+    """Everything the page's template asks for."""
+    robots = {row["robot"] for row in drift.periods}
+    periods = {row["period"] for row in drift.periods}
+    own = [row for row in drift.tests if row["against"] == OWN]
+    sections = [
+        _findings_section(drift),
+        _overview_section(drift, own),
+        _conditions_section(drift, own),
+        _differences_section(drift),
+        _comparisons_section(own),
+    ]
+    return {
+        "kicker": "drift of a fleet",
+        "title": f"Drift of {drift.store}",
+        "headline": headline(drift),
+        "lead": f"{_count(len(robots), 'robot')} over {_count(len(periods), drift.every)}:"
+        f" each {drift.every} of a robot against its first"
+        f" {_count(drift.reference, drift.every)}, and against the other robots of its site.",
+        "cards": [
+            {"value": f"{number:,}", "label": label}
+            for number, label in (
+                (len(robots), "robots"),
+                (len(periods), f"{drift.every}s with driving"),
+                (sum(row["p"] is not None for row in own), "tests against a robot's own reference"),
+                (len(drift.findings), "robots' signals that changed"),
+                (
+                    sum(row["verdict"] == "too few" for row in own),
+                    "comparisons with too little data",
+                ),
+            )
+        ],
+        "sections": [section for section in sections if section is not None],
+        "footer": f"restock {__version__} · written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC from"
+        f" {drift.store}, version {drift.version}",
+    }
+
+
+def headline(drift: Drift) -> str:
+    """One sentence: what has changed."""
+    parts: dict[str, list[str]] = {}
+    for row in drift.findings:
+        if row["part"] not in _BESIDE:
+            named = parts.setdefault(row["part"], [])
+            who = f"site {row['site']}" if row["scope"] == "site" else row["robot"]
+            named += [] if who in named else [who]
+    if parts:
+        return "Changed: " + "; ".join(f"{part} of {_list(who)}" for part, who in parts.items())
+    if all(row["p"] is None for row in drift.tests):
+        return "Too little to compare: no robot has a reference and enough later episodes"
+    if drift.findings:
+        return "No robot's hardware has changed by what matters; how or where it drives has"
+    return "Nothing has changed by what matters, as far as these logs can tell"
+
+
+def _findings_section(drift: Drift) -> Section:
+    rows = [
+        {
+            "robot": row["robot"],
+            "part": row["part"],
+            "signal": _signal(row),
+            "change": _change(row),
+            "since": str(row["since"]),
+            f"{drift.every}s": f"{row['periods']} of {row['periods_tested']}",
+            "scope": _SCOPE[row["scope"]],
+            "corrected p": f"{row['q']:.1g}",
+        }
+        for row in drift.findings
+    ]
+    shown = [row for row in drift.findings if row["part"] != "conditions"][:MOST_FINDINGS]
+    return Section(
+        "findings",
+        "What has changed",
+        intro="A change is reported where it is at least what matters for its signal and its p,"
+        " corrected over all signals, robots and periods, is below .05. The interval holds with"
+        " 95 % confidence for the one signal. Scope: whether the other robots of the site changed"
+        " alike in the same period, as a new floor makes them.",
+        callout="" if rows else headline(drift) + ".",
+        figures=[_trend(drift, row) for row in shown],
+        two=True,
+        tables=[Table(rows), Table([{"notes": note} for note in drift.notes])],
+    )
+
+
+def _trend(drift: Drift, finding: dict[str, Any]) -> Figure:
+    """One signal of the robots of a site over the periods."""
+    rows = [
+        {**row, "period": str(row["period"])}
+        for row in drift.periods
+        if row["signal"] == finding["signal"] and row["site"] == finding["site"]
+    ]
+    robots = _chosen({row["robot"] for row in rows}, {finding["robot"]})
+    rows = _newest([row for row in rows if row["robot"] in robots])
+    colours = {finding["robot"]: "#b91c1c"}
+    base = charts.plot(rows).encode(
+        x=alt.X("period:O", title=None, axis=alt.Axis(labelAngle=-35, grid=False)),
+        color=alt.Color("robot:N", scale=charts.scale(robots, colours), sort=robots),
+        xOffset=alt.XOffset("robot:N", sort=robots),
+    )
+    bars = base.mark_rule(strokeWidth=3, opacity=0.4).encode(
+        y=alt.Y("p25:Q", title=finding["signal"], scale=alt.Scale(zero=False)), y2="p75:Q"
+    )
+    dots = base.mark_circle(size=55, opacity=1).encode(y=alt.Y("median:Q"))
+    return Figure(
+        charts.svg(alt.layer(bars, dots).properties(width=400, height=190)),
+        f"{finding['robot']}: {_signal(finding)}",
+        "Median and middle half of the episodes.",
+    )
+
+
+def _overview_section(drift: Drift, own: Rows) -> Section | None:
+    """Size of every hardware signal's change, by robot and period."""
+    found = {row["robot"] for row in drift.findings}
+    robots = _chosen({row["robot"] for row in own}, found)
+    rows = _newest(
+        [
+            {
+                "robot": row["robot"],
+                "signal": f"{row['part']}: {_signal(row)}",
+                "period": str(row["period"]),
+                "size": max(-_BEYOND, min(_BEYOND, _signed_size(row))),
+                "mark": "●" if row["verdict"] == "changed" else "",
+            }
+            for row in own
+            if row["part"] not in _BESIDE and row["p"] is not None and row["robot"] in robots
+        ]
+    )
+    if not rows:
+        return None
+    signals = sorted({row["signal"] for row in rows})
+    base = charts.plot(rows).encode(
+        x=alt.X("period:O", title=None, axis=alt.Axis(labelAngle=-35)),
+        y=alt.Y("signal:N", sort=signals, title=None, axis=alt.Axis(ticks=False, labelLimit=260)),
+    )
+    cells = base.mark_rect().encode(
+        color=alt.Color(
+            "size:Q",
+            scale=alt.Scale(scheme="blueorange", domain=[-_BEYOND, _BEYOND]),
+            legend=alt.Legend(title="change in units of what matters", orient="top"),
+        )
+    )
+    marks = base.mark_text(color="#0f172a").encode(text="mark:N")
+    periods = len({row["period"] for row in rows})
+    chart = alt.layer(cells, marks).properties(
+        width=max(30 * periods, 150), height=20 * len(signals)
+    )
+    left_out = len({row["robot"] for row in own}) - len(robots)
+    return Section(
+        "overview",
+        "Every signal of the hardware",
+        intro="Against the robot's own reference. One unit is the least change that matters; a dot"
+        " marks what is reported as changed.",
+        figures=[
+            Figure(
+                charts.svg(chart.facet(column=alt.Column("robot:N", sort=robots))),
+                caption=f"{left_out} more robots are not shown." if left_out else "",
+            )
+        ],
+    )
+
+
+def _conditions_section(drift: Drift, own: Rows) -> Section | None:
+    found = {row["robot"] for row in drift.findings if row["part"] == "conditions"}
+    robots = _chosen({row["robot"] for row in drift.conditions}, found)
+    rows = _newest(
+        [
+            {**row, "period": str(row["period"]), "condition": words(row["condition"])}
+            for row in drift.conditions
+            if row["robot"] in robots
+        ]
+    )
+    if not rows:
+        return None
+    chart = (
+        charts.plot(rows)
+        .mark_line(point={"size": 40, "filled": True})
+        .encode(
+            x=alt.X("period:O", title=None, axis=alt.Axis(labelAngle=-35, grid=False)),
+            y=alt.Y("events_per_h:Q", title="events an hour", scale=alt.Scale(zero=True)),
+            color=alt.Color("robot:N", scale=charts.scale(robots, {}), sort=robots),
+        )
+        .properties(width=210, height=150)
+        .facet(facet=alt.Facet("condition:N"), columns=4)
+        .resolve_scale(y="independent")
+    )
+    compared = sum(row["part"] == "conditions" and row["p"] is not None for row in own)
+    return Section(
+        "conditions",
+        "How often each condition begins",
+        intro=f"Events an hour driven. {compared:,} comparisons by robot, zone and {drift.every}"
+        " had five events or more and were tested (a quasi-Poisson score test, whose dispersion is"
+        " from how a robot's drives differ).",
+        figures=[Figure(charts.svg(chart))],
+    )
+
+
+def _differences_section(drift: Drift) -> Section | None:
+    """What sets a robot apart from the others of its site, changed or not."""
+    newest: dict[tuple[str, str], dict[str, Any]] = {}
+    for row in drift.tests:
+        if row["against"] != OWN and row["part"] not in _BESIDE and row["verdict"] == "differs":
+            newest[row["robot"], row["signal"]] = row
+    if not newest:
+        return None
+    rows = [
+        {
+            "robot": row["robot"],
+            "site": row["site"],
+            "signal": _signal(row),
+            drift.every: str(row["period"]),
+            "the others": _figure(row["reference_value"]),
+            "this robot": _figure(row["value"]),
+            "difference": _change(row),
+        }
+        for row in sorted(newest.values(), key=lambda row: -row["size"])
+    ]
+    return Section(
+        "differences",
+        "Robots that differ from the others",
+        intro="Against the mean of the other robots of the site, newest difference of each signal."
+        " Robots may differ from the day they were built: that alone is no drift. In a small fleet"
+        " one robot that changed also sets all others apart from their mean.",
+        tables=[Table(rows[:40], numbers={"the others", "this robot"})],
+    )
+
+
+def _comparisons_section(own: Rows) -> Section | None:
+    """The newest comparison of each hardware signal, with its sizes of effect."""
+    newest: dict[tuple[str, str], dict[str, Any]] = {}
+    for row in own:
+        if row["part"] not in _BESIDE:
+            newest[row["robot"], row["signal"]] = row
+    if not newest:
+        return None
+    rows = [
+        {
+            "robot": row["robot"],
+            "signal": _signal(row),
+            "reference": _figure(row["reference_value"]),
+            "now": _figure(row["value"]),
+            "change": _change(row),
+            "verdict": row["verdict"],
+            "Cliff's delta": _figure(row["cliffs_delta"]),
+            "KS": _figure(row["ks_distance"]),
+            "corrected p": "" if row["q"] is None else f"{row['q']:.1g}",
+            "samples": f"{row['n']} / {row['n_reference']} {row['samples']}",
+        }
+        for row in newest.values()
+    ]
+    numbers = {"reference", "now", "Cliff's delta", "KS", "corrected p"}
+    return Section(
+        "comparisons",
+        "The newest comparison of each signal",
+        intro="Undecided: neither shown to have changed nor to be within what matters; more drives"
+        " would decide. Cliff's delta and the Kolmogorov-Smirnov distance compare episodes: 0 is no"
+        " difference, 1 no overlap.",
+        tables=[Table(rows[:120], numbers=numbers)],
+    )
+
+
+def _signal(row: dict[str, Any]) -> str:
+    name, unit = row["signal"], unit_of(row["signal"])
+    ending = next((ending for ending, _ in UNITS if unit and name.endswith(ending)), "")
+    name = words(name.removesuffix(ending)) + (f" ({unit})" if unit else "")
+    if row["part"] == "conditions":
+        name += " events"
+    zone = row.get("zone")
+    return f"{name} in {zone}" if zone else name
+
+
+def _change(row: dict[str, Any]) -> str:
+    """`× 0.942 [0.935, 0.950]`, or a difference with its sign."""
+    if row["change"] is None:
+        return ""
+    ratio = row["compared"] == "ratio"
+    values = [row["change"], row["change_low"], row["change_high"]]
+    value, low, high = (f"{v:.3f}" if ratio else f"{v:+.3g}" for v in values)
+    unit = " sd" if row["compared"] == "spread" else ""
+    return f"{'× ' if ratio else ''}{value}{unit} [{low}, {high}]"
+
+
+def _signed_size(row: dict[str, Any]) -> float:
+    neutral = 1.0 if row["compared"] == "ratio" else 0.0
+    return float(row["size"]) * (1 if row["change"] >= neutral else -1)
+
+
+def _figure(value: float | None) -> str:
+    return "" if value is None else f"{value:.3g}"
+
+
+def _chosen(robots: set[str], first: set[str]) -> list[str]:
+    """At most MOST_ROBOTS, these first; in the order of their names."""
+    return sorted((sorted(robots & first) + sorted(robots - first))[:MOST_ROBOTS])
+
+
+def _newest(rows: Rows) -> Rows:
+    """The rows of the newest periods."""
+    kept = sorted({row["period"] for row in rows})[-MOST_PERIODS:]
+    return [row for row in rows if row["period"] in kept]
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
+def _list(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
