@@ -21,6 +21,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -86,16 +87,31 @@ def record_all(folder: Path, *, quick: bool) -> dict[str, object]:
         plan=0.2,
         diagnostics=0.2,
     )
+    # Somewhat more trouble than the recorder's own shares: enough of each for the shipped mixture.
+    missions = {"nominal": 0.74, "wheel_slip": 0.08, "blocked_aisle": 0.08, "near_collision": 0.1}
     plans = {
-        "amr_monday.mcap": RecordingPlan(format="mcap", minutes=24.0, seed=20260302, rates=monday),
+        "amr_monday.mcap": RecordingPlan(
+            format="mcap",
+            minutes=36.0,
+            seed=20260302,
+            conditions=missions,
+            rates=monday,
+            tags={"robot": "amr-07", "site": "oslo"},
+        ),
         "amr_tuesday": RecordingPlan(
-            format="rosbag2", minutes=2.4, seed=20260397, rates=tuesday, start_ns=FIRST_NS + DAY_NS
+            format="rosbag2",
+            minutes=2.4,
+            seed=20260397,
+            conditions=missions,
+            rates=tuesday,
+            start_ns=FIRST_NS + DAY_NS,
+            tags={"robot": "amr-12", "site": "oslo"},
         ),
     }
     made: dict[str, object] = {}
     for name, plan in plans.items():
         if quick:
-            plan = RecordingPlan(plan.format, None, 2, plan.seed, rates=plan.rates, start_ns=plan.start_ns)
+            plan = replace(plan, minutes=None, missions=2)
         done = record(folder / name, plan).describe()
         made[name] = {
             key: done[key]

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from support.bag_samples import write_bag as write_sample_bag
 from support.driven_robot import Drive, write_bag
-from support.paths import ROOT, SHARED
+from support.paths import ROOT, SHARED, sample_transitions
 
 from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
@@ -17,6 +17,7 @@ from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.propose.propose import propose_profile
 
 SAMPLES = ROOT / "sample_logs"
+ROWS = sample_transitions("amr_tuesday")
 ROBOTS = {  # of others -> transitions of the proposal
     "turtlebot3-sim-humble": 138,
     "turtlebot3-sim-sparse-cmd": 9,
@@ -52,13 +53,13 @@ def proposed(
 def test_of_the_sample_bag_and_with_all_its_signals(tmp_path, capsys):
     recording = SAMPLES / "amr_tuesday"
     file = proposed(recording, tmp_path, capsys)
-    assert check(file, recording, capsys)["transitions"] == 740
+    assert check(file, recording, capsys)["transitions"] == ROWS
     text = file.read_text()
     count = len(re.findall(r"^# \[signals\.", text, re.M))
     assert count >= 8
     file.write_text(with_all_signals(text))
     outcome = check(file, recording, capsys)
-    assert outcome["transitions"] == 740
+    assert outcome["transitions"] == ROWS
     assert len(outcome["signals"]) == count
     for signal in outcome["signals"]:
         assert signal["steps"] > 0, signal["name"]
