@@ -8,10 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import pyarrow as pa
 import pytest
 
 from restock.cli import main
-from restock.train.comparison.confirm import swapped
+from restock.errors import RunError
+from restock.train.comparison.action_coverage import action_symptoms
+from restock.train.comparison.confirm import confirm, swapped
 from restock.train.comparison.diagnose import diagnose
 from restock.train.dqn.config import TrainConfig, apply_overrides, parse_config
 from restock.train.run.run import Run
@@ -35,6 +38,8 @@ def make_run(
     explained: float | None = 0.8,
     strata: bool = True,  # named as the conditions are; else there is one of all rows
     until: int | None = None,  # the window in which the symptoms end
+    actions: Mapping[str, tuple[float, float]] | None = None,  # of `turn`: wanted, of the logs
+    logged: int = 400,  # different rows of each condition in the logs
 ) -> Run:
     """A run whose evaluations show these figures, as training writes them."""
     run = Run.create(path, {"config": msgspec.to_builtins(TrainConfig()), "panel": None})
@@ -64,6 +69,7 @@ def make_run(
                     }
                 ],
             )
+            run.append("actions", action_rows(clocks, name, (actions or {}).get(name), logged))
             if share:
                 run.append(
                     "conditions",
@@ -112,6 +118,35 @@ def make_run(
     return run
 
 
+def action_rows(
+    clocks: Mapping[str, int], condition: str, turn: tuple[float, float] | None, logged: int
+) -> list[dict[str, Any]]:
+    """Of two actions in a condition: `turn` is taken in some of the fresh rows, and of the logs."""
+    wanted, share = turn or (0.4, 0.4)
+    rows = []
+    for source, drawn, greedy in (("logs", 5 * logged, 60), ("fresh", 2000, 100)):
+        for action, (has, wants) in enumerate(((1 - share, 1 - wanted), (share, wanted))):
+            rows.append(
+                {
+                    **clocks,
+                    "phase": "online",
+                    "source": source,
+                    "stratum": "all",
+                    "condition": condition,
+                    "action": action,
+                    "name": ("stop", "turn")[action],
+                    "drawn_rows": round(drawn * (has if source == "logs" else wants)),
+                    "drawn_share": None,
+                    "unique_rows": round(logged * has),
+                    "audited_rows": greedy,
+                    # What it would do in logged rows says less: half of them, whatever the case.
+                    "greedy_rows": round(greedy * (wants if source == "fresh" else 0.5)),
+                    "greedy_share": None,
+                }
+            )
+    return rows
+
+
 @pytest.mark.parametrize(
     ("symptoms", "cause"),
     [
@@ -138,6 +173,14 @@ def make_run(
         ({"windows": 2, "lag": 0.9}, "UNDETERMINED"),  # too few to agree
         ({"until": 3, "lag": 0.9}, "UNDETERMINED"),  # gone in the last one
         ({"until": 1, "lag": 0.9}, "HEALTHY"),  # a young critic's lag
+        ({"actions": {"recovery": (0.3, 0.0)}}, "ACTION_COVERAGE"),
+        ({"actions": {"recovery": (0.3, 0.01)}}, "ACTION_COVERAGE"),
+        ({"actions": {"recovery": (0.3, 0.05)}}, "HEALTHY"),  # rare, and there
+        ({"actions": {"recovery": (0.1, 0.0)}}, "HEALTHY"),  # not there, and hardly wanted
+        # Nobody knows of so few rows what they lack.
+        ({"actions": {"recovery": (0.3, 0.0)}, "logged": 40}, "HEALTHY"),
+        ({"actions": {"recovery": (0.3, 0.0)}, "gap": {"blocked_aisle": 6.0}}, "BUFFER"),
+        ({"actions": {"recovery": (0.3, 0.0)}, "lag": 0.9}, "TARGET"),
     ],
 )
 def test_symptoms_are_named(tmp_path: Path, symptoms: dict[str, Any], cause: str) -> None:
@@ -151,6 +194,34 @@ def test_the_evidence_names_the_condition(tmp_path: Path) -> None:
     )
     assert "blocked_aisle" in found.experiment
     assert not any("wheel_slip" in line for line in found.evidence)
+
+
+def test_the_evidence_names_the_action(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "r", actions={"recovery": (0.3, 0.01)})
+    found = diagnose([run])
+    (line,) = [line for line in found.evidence if "turn" in line]
+    assert line.startswith("recovery: the policy takes 'turn' in 30% of the rows looked at")
+    assert "in 1.0%: 4 of 400 different rows, fresh rows in 30%" in line
+    assert "'turn' in recovery" in found.experiment
+    with pytest.raises(RunError, match="no setting gives the logs the rows that they lack"):
+        confirm(run, found, tmp_path / "c")
+
+
+def test_without_fresh_rows_the_logged_ones_say_what_is_wanted(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "r", actions={"recovery": (0.3, 0.01)})
+    actions = run.table("actions")
+    offline = actions.filter(pa.array([name == "logs" for name in actions["source"].to_pylist()]))
+    run._written["actions"] = offline
+    (symptom,) = [
+        found
+        for found in action_symptoms(run, 0)
+        if found.condition == "recovery" and found.action == "turn"
+    ]
+    assert symptom.wanted_share == 0.5
+    assert symptom.fresh_share is None
+    assert symptom.logged_rows == 4
+    run._written["actions"] = actions.slice(0, 0)  # a run from before that table was kept
+    assert action_symptoms(run, 0) == []
 
 
 def test_most_seeds_must_agree(tmp_path: Path) -> None:

@@ -26,11 +26,17 @@ def confirm(run: Run, diagnosis: Diagnosis, out: Path) -> dict[str, Any]:
     gone, False where it stayed, None where the new run does not say.
 
     Raises:
-        RunError: there is nothing to confirm.
+        RunError: there is nothing to confirm, or it takes other logs.
     """
     if diagnosis.cause in _NOTHING:
         raise RunError(
             f"is {diagnosis.cause}: there is nothing to confirm",
+            where=str(run.path),
+            remedy=diagnosis.experiment,
+        )
+    if diagnosis.cause == "ACTION_COVERAGE":
+        raise RunError(
+            "is ACTION_COVERAGE: no setting gives the logs the rows that they lack",
             where=str(run.path),
             remedy=diagnosis.experiment,
         )

@@ -14,6 +14,8 @@ A network that generalises, or memorises few rows, hides what is wrong with its 
 all of these. So three figures look at the rows, not at the critic
 (`restock.train.feed.log_fidelity`): how much of replay a condition is, beside how often it is met;
 how many of its logged rows look like it; and whether their next observations follow from them.
+And a condition may be well supplied, and an action of it not (`action_coverage`): the logs do not
+say what it leads to, and the policy wants it.
 
 Each figure is its median over the last evaluations. The limits are from faults planted in the twin
 (benchmarks/planted_faults.py; the table is in docs/diagnose.md).
@@ -23,7 +25,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from statistics import median
 from typing import Any, Literal
@@ -31,12 +33,16 @@ from typing import Any, Literal
 import numpy as np
 
 from restock.errors import RunError
+from restock.train.comparison.action_coverage import ActionSymptom, action_symptoms
 from restock.train.run.run import Run
 
-Cause = Literal["HEALTHY", "BUFFER", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED"]
+Cause = Literal[
+    *("HEALTHY", "BUFFER", "ACTION_COVERAGE", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED")
+]
 WINDOWS = 3  # the last, that figures are the median of
 _LEAST_ROWS = 20  # held out, for a condition to be diagnosed
 _LEAST_ALIKE = 50  # … for its look to be known
+_LEAST_LOGGED = 100  # different logged rows of a condition, for an action to be lacking there
 
 
 @dataclass(frozen=True)
@@ -55,6 +61,8 @@ class DiagnosisLimits:
     unexplained: float = 1.0  # of the variance of its next observations: their mean explains more
     unexplained_relative: float = 1.6  # and over that of the condition with the least
     quota_met: float = 0.5  # a smaller part of a quota is worth saying beside a gap
+    wanted: float = 0.15  # of a condition's fresh rows, those where the policy takes an action …
+    logged: float = 0.02  # … and of its logged rows drawn, those with it: the logs lack it
 
 
 @dataclass(frozen=True)
@@ -88,6 +96,7 @@ class Window:
     explained: float | None  # of the targets' variance, the median condition's
     q_abs_max: float
     q_bound: float  # the largest value that rewards seen could add up to
+    actions: list[ActionSymptom] = field(default_factory=list)  # over several windows only
 
     def relative(self, symptom: Symptom) -> float | None:
         """G_k over the median G: how much worse held out this condition is than the others."""
@@ -144,6 +153,16 @@ class Window:
             )
         return reasons
 
+    def lacking(self, limits: DiagnosisLimits) -> list[ActionSymptom]:
+        """Actions that the policy wants in a condition, and whose logged rows hardly have them."""
+        return [
+            symptom
+            for symptom in self.actions
+            if symptom.condition_rows >= _LEAST_LOGGED
+            and symptom.wanted_low >= limits.wanted
+            and symptom.logs_share <= limits.logged
+        ]
+
     def target(self, limits: DiagnosisLimits) -> bool:
         """Whether the target is in doubt."""
         clocks = not limits.no_lag <= self.lag < limits.lag or self.clock >= limits.clock
@@ -168,7 +187,9 @@ class Window:
             return "BOTH" if buffer else "TARGET"
         if buffer:
             return "BUFFER"
-        return "UNDETERMINED" if bad else "HEALTHY"
+        if bad:
+            return "UNDETERMINED"
+        return "ACTION_COVERAGE" if self.lacking(limits) else "HEALTHY"
 
 
 @dataclass(frozen=True)
@@ -190,7 +211,7 @@ def diagnose(runs: Sequence[Run], limits: DiagnosisLimits = DiagnosisLimits()) -
         RunError: a run has no evaluation after its updates.
     """
     windows = [windows_of(run) for run in runs]
-    figures = [median_window(of_run[-WINDOWS:]) for of_run in windows]
+    figures = [_figures(*pair) for pair in zip(runs, windows, strict=True)]
     causes = [_cause_of_run(*pair, limits) for pair in zip(windows, figures, strict=True)]
     ((cause, votes), *_) = Counter(causes).most_common()
     if votes <= len(causes) / 2:
@@ -204,6 +225,13 @@ def diagnose(runs: Sequence[Run], limits: DiagnosisLimits = DiagnosisLimits()) -
         _evidence(shown[0], limits),
         _experiment(cause, shown, limits),
     )
+
+
+def _figures(run: Run, windows: Sequence[Window]) -> Window:
+    """What the last windows of a run show together."""
+    before = windows[-WINDOWS - 1].gradient_steps if len(windows) > WINDOWS else 0
+    actions = action_symptoms(run, before)
+    return replace(median_window(windows[-WINDOWS:]), actions=actions)
 
 
 def _cause_of_run(windows: Sequence[Window], figures: Window, limits: DiagnosisLimits) -> Cause:
@@ -319,16 +347,25 @@ def _evidence(window: Window, limits: DiagnosisLimits) -> list[str]:
     ]
     for condition, reasons in window.bad(limits).items():
         lines += [f"{condition}: {reason}" for reason in reasons]
-    return lines
+    return lines + [f"{lack.condition}: {lack.reason}" for lack in window.lacking(limits)]
 
 
 def _experiment(cause: Cause, windows: Sequence[Window], limits: DiagnosisLimits) -> str:
     named = dict.fromkeys(name for window in windows for name in window.bad(limits))
     which = ", ".join(named) or "the condition with the largest gap"
+    lacking = {
+        f"{lack.action!r} in {lack.condition}": None
+        for window in windows
+        for lack in window.lacking(limits)
+    }
     return {
         "HEALTHY": "none needed: no figure is past its limit",
         "BUFFER": f"train again with more or corrected rows of {which} and the same target rule:"
         " these symptoms must be gone, and nothing else change",
+        "ACTION_COVERAGE": "train again with logged rows of "
+        + ", ".join(lacking)
+        + " (record some, or take the twin's: `restock train --flush-fresh`): this symptom must be"
+        " gone, and the offline policy no worse there",
         "TARGET": "train again with another target rule (target.tau 0.005) on the same panel:"
         " L and S must fall, or the median G",
         "BOTH": f"first change the target rule alone, then the rows of {which} alone: one clock"

@@ -18,8 +18,9 @@ class DiagnoseCommand:
 
     Compares replay with the periodic evaluations' own steps, which no replay has, condition by
     condition: the critic's TD error, its frequency, its rows; and the online network with the
-    target network. The verdict is HEALTHY, BUFFER, TARGET, BOTH, DIVERGENCE or UNDETERMINED, with
-    the evidence and the experiment that would confirm it. Figures are of the last three
+    target network; and what the policy wants with what the logs have of each action. The verdict is
+    HEALTHY, BUFFER, ACTION_COVERAGE, TARGET, BOTH, DIVERGENCE or UNDETERMINED, with the evidence
+    and the experiment that would confirm it. Figures are of the last three
     evaluations; most of the runs must agree.
 
     Example: `restock diagnose runs/a runs/a-seed1 runs/a-seed2`
