@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from restock.ingest.containers.discover import recordings_in as recordings_in
     from restock.ingest.containers.open_recording import open_recording as open_recording
     from restock.ingest.containers.recording import Recording as Recording
+    from restock.ingest.correct import RecordingCorrections as RecordingCorrections
+    from restock.ingest.correct import correct_store as correct_store
+    from restock.ingest.correct import remove_corrections as remove_corrections
     from restock.ingest.describe import describe_recording as describe_recording
     from restock.ingest.pipeline import ingest as ingest
     from restock.ingest.profile.profile import Profile as Profile
@@ -28,6 +31,11 @@ else:
             "restock.ingest.containers.discover": ["recordings_in"],
             "restock.ingest.containers.open_recording": ["open_recording"],
             "restock.ingest.containers.recording": ["Recording"],
+            "restock.ingest.correct": [
+                "RecordingCorrections",
+                "correct_store",
+                "remove_corrections",
+            ],
             "restock.ingest.describe": ["describe_recording"],
             "restock.ingest.pipeline": ["ingest"],
             "restock.ingest.profile.profile": ["Profile", "load_profile"],

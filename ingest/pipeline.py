@@ -24,6 +24,13 @@ from restock.ingest.profile.tag_rules import Told, resolve_tags
 from restock.ingest.steps.episodes import Split, split
 from restock.ingest.steps.needs import read_topics
 from restock.ingest.steps.steps import Steps, steps_of
+from restock.ingest.store.corrections import (
+    correction_rows,
+    corrections_in,
+    held,
+    lay_over,
+    rules_of,
+)
 from restock.ingest.store.manifest import (
     definitions,
     manifest_row,
@@ -100,7 +107,7 @@ def ingest(
             manifest = before | {"tags": told.tags}
             return IngestResult(str(path), "tagged", manifest, notes=told.notes, version=version)
         try:
-            return _Ingest(str(path), recording, profile, told, repeated).run(store)
+            return _Ingest(str(path), recording, profile, told, repeated, before).run(store)
         except RecordingError as error:
             if error.where:
                 raise
@@ -117,7 +124,8 @@ def _before(store: StoreWriter | None, recording: Recording) -> dict[str, Any] |
 
 def _unchanged(before: Mapping[str, Any], profile: Profile) -> bool:
     """Whether the rows of this manifest were made by the same definitions."""
-    return all(before[name] == value for name, value in definitions(profile).items())
+    by_rules = {**before, "labels_version": rules_of(before["labels_version"])}
+    return all(by_rules[name] == value for name, value in definitions(profile).items())
 
 
 def _tag(store: StoreWriter, before: Mapping[str, Any], tags: Mapping[str, str]) -> int:
@@ -138,10 +146,17 @@ class _Ingest:
     """The stages over one open recording."""
 
     def __init__(
-        self, path: str, recording: Recording, profile: Profile, told: Told, repeated: OnRepeat
+        self,
+        path: str,
+        recording: Recording,
+        profile: Profile,
+        told: Told,
+        repeated: OnRepeat,
+        before: Mapping[str, Any] | None,
     ) -> None:
         self.path, self.recording, self.profile, self.told = path, recording, profile, told
-        self.repeated = repeated
+        self.repeated, self.before = repeated, before or {}
+        self.corrections = corrections_in(self.before)
         self.ingest_id = uuid.uuid4().hex[:16]
 
     def run(self, store: StoreWriter | None) -> IngestResult:
@@ -160,14 +175,22 @@ class _Ingest:
             self.recording.recording_id, self.ingest_id, self.path, software_version()
         )
         table, rows = recording_table(profile, steps, episodes, provenance)
+        table, self.corrections = lay_over(
+            table, self.corrections, profile.conditions, steps.clock.offset_ns
+        )
         named = Counter(table["condition"].to_pylist())
         first = {name: named[name] for name in (*rows.labels, NOMINAL)}
         scores = label_scores(table, rows.labels, profile.task.control_period_s)
         facts = recorded_facts(self.recording, profile, columns, steps, episodes, rows)
-        facts["tags"] = self.told.tags
+        facts |= {
+            "tags": self.told.tags,
+            "labels_version": table["labels_version"][0].as_py(),
+            "corrections": correction_rows(self.corrections),
+        }
         manifest = manifest_row(profile, provenance, table, scores, episodes.dropped, **facts)
         at, repeats = self._write(store, manifest, table) if store else (None, None)
-        counts = {name: int(holds[rows.starts].sum()) for name, holds in rows.labels.items()}
+        holding = held(table["conditions"], list(rows.labels))
+        counts = {name: int(holds.sum()) for name, holds in holding.items()}
         counts[NOMINAL] = first[NOMINAL]
         return IngestResult(
             self.path,
@@ -195,7 +218,10 @@ class _Ingest:
                 where=self.path,
                 remedy="leave it out; --repeated keep ingests it all the same",
             )
-        at = store.write(pa.Table.from_pylist([manifest], recording_schema()), table)
+        made = (pa.Table.from_pylist([manifest], recording_schema()), table)
+        # What another process corrects meanwhile is not written over.
+        read = {manifest["recording_id"]: self.before["ingest_id"]} if self.corrections else {}
+        at = store.write_all([made], instead_of=read)
         # Looked for after the commit: another process may have written the same drive meanwhile.
         return at, store.repeated(table, period_s)
 
@@ -245,6 +271,12 @@ class _Ingest:
             notes.append(
                 f"{far} of {len(residual)} commands are more than .25 from the nearest action "
                 f"(median {np.median(residual):.2f}, largest {residual.max():.2f}, scaled)"
+            )
+        if self.corrections:
+            idle = sum(not correction.rows for correction in self.corrections)
+            notes.append(
+                f"{len(self.corrections)} corrections of its labels are kept"
+                + (f"; {idle} of them speak of conditions or steps that are gone" if idle else "")
             )
         if repeats is not None:
             notes.append(f"{repeats}; the audit `repeated_steps` fails until one is taken out")

@@ -1,7 +1,8 @@
 """Relabel: run conditions again over the signals that are stored, without the recordings.
 
 Rows, observations and rewards stay as they were ingested; `condition`, `conditions` and
-`labels_version` become new, and so do the manifest's scores. All recordings change in one commit.
+`labels_version` become new, and so do the manifest's scores. Corrections that people made are laid
+over the new labels. All recordings change in one commit.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from restock.ingest.profile.profile_text import (
     read_profile_toml,
     with_conditions,
 )
+from restock.ingest.store.corrections import correction_rows, corrections_in, lay_over, rules_of
 from restock.ingest.store.episode_rows import episode_ends
 from restock.ingest.store.manifest import conditions_json, count_rows, score_rows
 from restock.ingest.store.transitions import by_name, column_array, names_of
@@ -79,14 +81,15 @@ def relabel_store(
     stale: list[dict[str, Any]] = []
     for row in store.live().to_pylist():
         version = labels_version(conditions_of(row["profile"]))
-        if row["labels_version"] == version:
-            outcomes.append(Relabelled(row["recording_id"], row["source_file"], version, version))
+        if rules_of(row["labels_version"]) == version:
+            same = (row["labels_version"], row["labels_version"])
+            outcomes.append(Relabelled(row["recording_id"], row["source_file"], *same))
         else:
             stale.append(row)
 
     def relabelled() -> Iterator[tuple[pa.Table, pa.Table]]:
         for row in stale:
-            manifest, rows, outcome = _one(store, row, conditions_of(row["profile"]))
+            manifest, rows, outcome = relabel_rows(store, row, conditions_of(row["profile"]))
             outcomes.append(outcome)
             yield manifest, rows
 
@@ -98,10 +101,15 @@ def relabel_store(
     return outcomes, store.write_all(relabelled(), instead_of=replaced)
 
 
-def _one(
+def relabel_rows(
     store: StoreWriter, row: dict[str, Any], conditions: Sequence[Condition]
 ) -> tuple[pa.Table, pa.Table, Relabelled]:
-    """One recording's manifest and rows with new labels."""
+    """One recording's manifest (of which `row` is the old one) and rows with new labels.
+
+    Raises:
+        StoreError: its rows were written before their episodes' ends were kept.
+        ConfigError: a condition's SQL does not run over the signals that are stored.
+    """
     rows = store.rows(row["recording_id"], row["ingest_id"])
     ends = episode_ends(rows)
     if ends is None:
@@ -129,14 +137,13 @@ def _one(
     labels = {name: holds[: len(rows)] for name, holds in every.items()}
     named = primary(labels, conditions) or [NOMINAL] * len(rows)
     before = rows["condition"].to_pylist()
-    version = labels_version(every_condition)
     ingest_id = uuid.uuid4().hex[:16]
     new = {
         "condition": named,
         "conditions": names_of(labels, begin),
         "probabilities": by_name(probable, begin),
         "uncertain": names_of(too_near_to_call(probable, conditions), begin),
-        "labels_version": version,
+        "labels_version": labels_version(every_condition),
         "ingest_id": ingest_id,
     }
     metadata = rows.schema.metadata
@@ -149,14 +156,18 @@ def _one(
         field = rows.schema.field(index)
         rows = rows.set_column(index, field, column_array(values, field.type, len(rows)))
     rows = rows.replace_schema_metadata(metadata)
+    corrections = corrections_in(row)
+    rows, corrections = lay_over(rows, corrections, every_condition, row["clock_offset_ns"])
+    named = rows["condition"].to_pylist()
     period_s = msgspec.json.decode(row["task_json"], type=Task, strict=False).control_period_s
     scores = label_scores(rows, labels, period_s)
     manifest = row | {
         "ingest_id": ingest_id,
         "ingested_at": dt.datetime.now(dt.UTC),
-        "labels_version": version,
+        "labels_version": rows["labels_version"][0].as_py(),
         "label_scores": score_rows(scores),
         "label_counts": count_rows(scores),
+        "corrections": correction_rows(corrections),
         "conditions_json": conditions_json(every_condition),
         "profile_toml": _with_conditions(row["profile_toml"], every_condition),
     }
@@ -164,7 +175,7 @@ def _one(
         row["recording_id"],
         row["source_file"],
         row["labels_version"],
-        version,
+        manifest["labels_version"],
         sum(a != b for a, b in zip(before, named, strict=True)),
         dict(sorted(Counter(named).items())),
         dict(sorted(Counter(before).items())),

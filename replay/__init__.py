@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from restock.replay.panel.iterable import PanelDataset as PanelDataset
     from restock.replay.panel.logged_sampler import sampler_for as sampler_for
     from restock.replay.panel.panel import Panel as Panel
+    from restock.replay.review.doubtful import doubtful_events as doubtful_events
+    from restock.replay.review.verdicts import read_verdicts as read_verdicts
     from restock.replay.sampling.chunked import ChunkedSampler as ChunkedSampler
     from restock.replay.sampling.device import DeviceSampler as DeviceSampler
     from restock.replay.sampling.priorities import Lap as Lap
@@ -44,6 +46,8 @@ else:
             "restock.replay.panel.iterable": ["PanelDataset"],
             "restock.replay.panel.logged_sampler": ["sampler_for"],
             "restock.replay.panel.panel": ["Panel"],
+            "restock.replay.review.doubtful": ["doubtful_events"],
+            "restock.replay.review.verdicts": ["read_verdicts"],
             "restock.replay.sampling.chunked": ["ChunkedSampler"],
             "restock.replay.sampling.device": ["DeviceSampler"],
             "restock.replay.sampling.priorities": ["Lap", "Per"],

@@ -75,6 +75,7 @@ def manifest_row(
         "label_counts": count_rows(scores),
         "clocks": [],
         "signals": [],
+        "corrections": [],
         "task_json": msgspec.json.encode(profile.task).decode(),
         "conditions_json": conditions_json(profile.conditions),
         "profile_toml": profile_toml(profile),

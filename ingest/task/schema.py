@@ -218,6 +218,16 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
     ),
     Column("task_json", pa.string(), "the task, as JSON"),
     Column("conditions_json", pa.string(), "the conditions: name, timing, sql, …, as JSON"),
+    Column(
+        "corrections",
+        _rows_of(
+            condition=pa.string(), value=pa.bool_(), episode_index=pa.int64(),
+            first_ns=pa.int64(), last_ns=pa.int64(), given_at=pa.timestamp("us", "UTC"),
+            rows=pa.int64(),
+        ),
+        "what people said of its labels, see the view; null: older than corrections",
+        nullable=True,
+    ),
     Column("profile_toml", pa.string(), "the profile, the SQL of its files in it", nullable=True),
 )  # fmt: skip
 

@@ -31,7 +31,7 @@ from restock.replay.panel.plan import PanelPlan, plan_panel
 from restock.replay.panel.scratch import SourceSteps
 from restock.replay.panel.seal import FileRecord, seal
 from restock.replay.panel.stores import AllStores, PinnedStore, all_stores
-from restock.replay.store.store import Store, StoredProfile, profiles_of
+from restock.replay.store.store import Store, StoredProfile, corrected_versions, profiles_of
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,7 @@ class TransitionSource:
     others: tuple[PinnedStore, ...] = ()  # whose rows are in the view too
     # task hash -> the profiles that read its rows, newest ingest first
     profiles: Callable[[str], list[StoredProfile]] = lambda task_hash: []
+    corrected: tuple[str, ...] = ()  # versions of labels that people corrected
 
 
 @contextmanager
@@ -76,6 +77,7 @@ def open_source(
                 named,
                 stores.others,
                 lambda task_hash: profiles_of(stores.connection, task_hash),
+                corrected_versions(stores.connection),
             )
         return
     with duckdb.connect() as connection:
@@ -261,6 +263,15 @@ def panel_id(source: TransitionSource, plan: PanelPlan, digest: str) -> str:
     return hashlib.blake2b(msgspec.json.encode(named), digest_size=8).hexdigest()
 
 
+def _labels_version(source: TransitionSource) -> str:
+    """Of the rules, and where people corrected what they say, of all that they said."""
+    rules = labels_version(source.conditions)
+    if not source.corrected:
+        return rules
+    content = msgspec.json.encode(source.corrected)
+    return f"{rules}+{hashlib.blake2b(content, digest_size=4).hexdigest()}"
+
+
 def _header(
     source: TransitionSource,
     plan: PanelPlan,
@@ -279,7 +290,7 @@ def _header(
         task_json=task_json,
         profile=read_by.name,
         profile_toml=read_by.toml,
-        labels_version=labels_version(source.conditions),
+        labels_version=_labels_version(source),
         observation_size=observation_size,
         rows=len(plan.panel_rows),
         discount=plan.mixture.discount,

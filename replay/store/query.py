@@ -16,7 +16,14 @@ T = TypeVar("T")
 
 # In their order: a view may use those before it.
 VIEWS = ("rows.sql", "views.sql", "labels.sql")
-MACROS = ("macros.sql", "capacity.sql", "repeated_rows.sql", "episode_signals.sql", "drift.sql")
+MACROS = (
+    "macros.sql",
+    "capacity.sql",
+    "repeated_rows.sql",
+    "episode_signals.sql",
+    "drift.sql",
+    "corrections.sql",
+)
 
 # Statements that leave files as they are; CREATE makes tables and macros in memory.
 _ALLOWED = {"SELECT", "EXPLAIN", "CREATE", "DROP", "SET", "VARIABLE_SET", "PRAGMA", "CALL"}

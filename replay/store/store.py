@@ -275,6 +275,15 @@ def profiles_of(connection: duckdb.DuckDBPyConnection, task_hash: str) -> list[S
     return [StoredProfile(*row) for row in rows]
 
 
+def corrected_versions(connection: duckdb.DuckDBPyConnection) -> tuple[str, ...]:
+    """The versions of labels that people corrected, of a connection with a view `recordings`."""
+    rows = connection.sql(
+        "SELECT DISTINCT labels_version FROM recordings WHERE contains(labels_version, '+')"
+        " ORDER BY ALL"
+    ).fetchall()
+    return tuple(version for (version,) in rows)
+
+
 def is_store(path: str | Path | Location) -> bool:
     """Whether there is a store at `path`. Raises StoreError where the place cannot be reached."""
     place = Location.of(path)

@@ -63,6 +63,10 @@ class StoreError(RestockError):
     """A store that is missing, is not one, or changed under a writer."""
 
 
+class LabelError(RestockError):
+    """Verdicts on labels that cannot be taken: rows that are not there, or contradictions."""
+
+
 class QueryError(RestockError):
     """SQL that DuckDB refused."""
 

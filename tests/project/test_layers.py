@@ -35,6 +35,7 @@ MAY_IMPORT = {
     "replay/ring": "mixture",
     "replay/panel": "mixture sampling store ingest/store ingest/task",
     "replay/fleet": "mixture panel store ingest/task",
+    "replay/review": "store ingest ingest/store",
     "replay/trace": "replay panel store ingest/profile ingest/steps ingest/task",
     "replay/export": "replay panel store ingest/profile ingest/task",
     "train": (
@@ -71,8 +72,8 @@ MAY_IMPORT = {
     "cli": "ingest/steps",
     "cli/data": (
         "cli ingest ingest/containers ingest/profile ingest/propose ingest/steps ingest/store"
-        " ingest/task replay replay/export replay/fleet replay/mixture replay/panel replay/store"
-        " train/dqn train/evaluation train/twin/physics report"
+        " ingest/task replay replay/export replay/fleet replay/mixture replay/panel replay/review"
+        " replay/store report train/dqn train/evaluation train/twin/physics"
     ),
     "cli/learning": (
         "cli report ingest/store replay/store replay/trace train train/comparison"

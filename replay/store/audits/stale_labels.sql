@@ -6,7 +6,8 @@ SELECT recordings.recording_id, recordings.source_file, recordings.labels_versio
 FROM recordings, newest
 WHERE recordings.profile = newest.profile
     AND (
-        recordings.labels_version <> newest.labels_version
+        -- Of the rules alone: corrections stand behind a plus, and are each recording's own.
+        split_part(recordings.labels_version, '+', 1) <> split_part(newest.labels_version, '+', 1)
         OR recordings.profile_hash <> newest.profile_hash
     )
 ORDER BY recordings.source_file

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from restock.errors import ExitCode
+from restock.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
     from restock.ingest.relabel import Relabelled
+    from restock.ingest.store.writer import StoreWriter
     from restock.ingest.task.conditions import Condition
 
 
@@ -24,8 +25,13 @@ class LabelCommand:
     actions and rewards stay as they are. Recordings whose labels are up to date are left
     unchanged; the others change in one commit. Each row keeps the version of its labels.
 
-    The conditions of a recording are those of the profile that read it, by name; `--profile` gives
-    others, for the recordings of that profile's name (or, with --all, for every recording).
+    The conditions of a recording are those of the profile that read it, by name or as the store
+    keeps it; `--profile` gives others, for the recordings of that profile's name (or, with --all,
+    for every recording).
+
+    With --review it labels nothing: it lists the events whose label is most doubtful, each with its
+    moment, the command that opens it, and a column for a verdict. --corrections takes verdicts
+    into the store: they stay when recordings are labelled or ingested again. See docs/review.md.
     """
 
     store: Annotated[Path, tyro.conf.Positional]
@@ -34,6 +40,13 @@ class LabelCommand:
     """A profile that comes with Restock, or a TOML file, whose conditions to use."""
     all: bool = False
     """Use that profile's conditions for recordings that another profile read, too."""
+    review: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """List the N most doubtful events."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """With --review: write them to this CSV file, to fill in the column `verdict`."""
+    corrections: Annotated[str | None, tyro.conf.arg(metavar="FILE|none")] = None
+    """Take the verdicts of a CSV file (see docs/review.md) into the store; `none` takes all
+    corrections out."""
     dry_run: bool = False
     """Do everything but write, and print what would change."""
     json: bool = False
@@ -42,10 +55,18 @@ class LabelCommand:
     def run(self) -> int:
         """Label, and say what changed."""
         from restock.cli import output
+        from restock.cli.data import label_review
         from restock.ingest.relabel import open_for_relabel, relabel_store
 
         store = open_for_relabel(self.store)
-        outcomes, version = relabel_store(store, self._conditions_of(), dry_run=self.dry_run)
+        self._check_options()
+        if self.review is not None:
+            return label_review.review(self.store, self.review, self.out, json=self.json)
+        if self.corrections is not None:
+            return label_review.correct(
+                store, self.store, self.corrections, dry_run=self.dry_run, json=self.json
+            )
+        outcomes, version = relabel_store(store, self._conditions_of(store), dry_run=self.dry_run)
         rows = [as_json(outcome) for outcome in outcomes]
         if self.json:
             output.print_json({"version": version, "dry_run": self.dry_run, "recordings": rows})
@@ -78,10 +99,24 @@ class LabelCommand:
             output.stdout().print(f"store version {version}")
         return ExitCode.OK
 
-    def _conditions_of(self) -> Any:
-        from restock.errors import ConfigError
-        from restock.ingest.profile.profile import load_profile
+    def _check_options(self) -> None:
+        """Raises ConfigError where options do not go together."""
+        of_rules = {"--profile": self.profile is not None, "--all": self.all}
+        for verb, given, others in (
+            ("--review", self.review is not None, {"--corrections": self.corrections is not None}),
+            ("--corrections", self.corrections is not None, {"--out": self.out is not None}),
+        ):
+            clash = [name for name, there in (others | of_rules).items() if there]
+            if given and clash:
+                raise ConfigError(f"{verb} does not go with {clash[0]}")
+        if self.out is not None and self.review is None:
+            raise ConfigError("--out goes with --review N")
 
+    def _conditions_of(self, store: StoreWriter) -> Callable[[str], Sequence[Condition]]:
+        from restock.ingest.profile.profile import load_profile
+        from restock.ingest.profile.profile_text import read_profile_toml
+
+        carried = {row["profile"]: row["profile_toml"] for row in store.live().to_pylist()}
         given = load_profile(self.profile) if self.profile is not None else None
 
         def conditions_of(name: str) -> Sequence[Condition]:
@@ -90,6 +125,8 @@ class LabelCommand:
             try:
                 return load_profile(name).conditions
             except ConfigError as error:
+                if text := carried[name]:
+                    return read_profile_toml(text, where=f"profile {name!r}").conditions
                 raise ConfigError(
                     f"recordings of the profile {name!r} are in the store, and it is not at hand",
                     where=str(self.store),

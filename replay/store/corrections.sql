@@ -1,0 +1,29 @@
+-- What people said of labels, one row a correction: a view over `recordings`. Recordings of an older
+-- store have none. Not translated for Spark.
+CREATE OR REPLACE VIEW corrections AS
+SELECT
+    recording_id,
+    source_file,
+    said.condition AS condition,
+    said.value AS value,
+    said.episode_index AS episode_index,
+    said.first_ns AS first_ns,
+    said.last_ns AS last_ns,
+    make_timestamp(said.first_ns // 1000) AS first_time,
+    make_timestamp(said.last_ns // 1000) AS last_time,
+    said.rows AS rows,
+    said.given_at AS given_at
+FROM (
+    SELECT recording_id, source_file, unnest(corrections) AS said
+    FROM (
+        FROM recordings
+        UNION ALL BY NAME
+        SELECT
+            NULL::STRUCT(
+                condition VARCHAR, "value" BOOLEAN, episode_index BIGINT, first_ns BIGINT,
+                last_ns BIGINT, given_at TIMESTAMPTZ, "rows" BIGINT
+            )[] AS corrections
+        WHERE false
+    )
+)
+ORDER BY source_file, first_ns, condition;

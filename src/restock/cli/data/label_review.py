@@ -1,0 +1,129 @@
+"""`restock label --review` and `--corrections`: doubtful labels for a person, and verdicts back."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from restock.errors import ExitCode, LabelError
+
+if TYPE_CHECKING:
+    from restock.ingest.correct import Corrected
+    from restock.ingest.store.writer import StoreWriter
+
+NONE = "none"  # in place of a file: takes all corrections out
+
+
+def review(path: Path, most: int, out: Path | None, *, json: bool) -> int:
+    """List the most doubtful events, and write them to a file for verdicts."""
+    from restock.cli import output
+    from restock.files import write_text
+    from restock.replay.review.doubtful import doubtful_events, review_csv, review_rows
+    from restock.replay.store.store import Store
+
+    if most < 1:
+        raise LabelError(f"--review must be 1 or more, got {most}")
+    with Store(path) as store:
+        rows = review_rows(doubtful_events(store, most), str(path))
+    if out is not None:
+        try:
+            write_text(out, review_csv(rows), exclusive=True)
+        except FileExistsError:
+            raise LabelError(
+                "already exists, and may hold verdicts",
+                where=str(out),
+                remedy="choose another --out",
+            ) from None
+        except OSError as error:
+            raise LabelError(f"cannot be written: {error.strerror}", where=str(out)) from error
+    if json:
+        output.print_json(rows)
+        return ExitCode.OK
+    if not rows:
+        output.stdout().print("no event of a label is in doubt, or none is left to review")
+        return ExitCode.OK
+    output.print_table([_line(row) for row in rows], title="the most doubtful events first")
+    output.say(f"to look at the first: {rows[0]['open']}")
+    output.say(
+        f"write yes, no or FIRST..LAST (its true steps) into the last column of {out}, then:"
+        f" restock label {path} --corrections {out}"
+        if out is not None
+        else "--out FILE writes them to a CSV file with a column for verdicts"
+    )
+    return ExitCode.OK
+
+
+def _line(row: dict[str, Any]) -> dict[str, Any]:
+    """As much of a line as fits a terminal; the file has all of it."""
+    return {
+        "condition": row["condition"],
+        "labelled": row["labelled"],
+        "p": row["probability"],
+        "why": row["why"],
+        "recording": Path(row["source_file"]).name,
+        "from s": row["start_s"],
+        "to s": row["end_s"],
+        "log time": row["start_time"],
+        "episode": row["episode_id"].rpartition("/")[2],
+        "steps": f"{row['first_step']}..{row['last_step']}",
+        "restock trace STORE": row["event"] and row["open"].split()[3],
+    }
+
+
+def correct(store: StoreWriter, path: Path, file: str, *, dry_run: bool, json: bool) -> int:
+    """Take a file's verdicts into the store, or all corrections out of it."""
+    from restock.cli import output
+    from restock.ingest.correct import correct_store, remove_corrections
+    from restock.replay.review.verdicts import read_verdicts
+    from restock.replay.store.store import Store
+
+    taken = left_open = 0
+    if file == NONE:
+        outcomes, version = remove_corrections(store, dry_run=dry_run)
+    else:
+        with Store(path) as opened:
+            verdicts = read_verdicts(Path(file), opened)
+        taken, left_open = verdicts.taken, verdicts.left_open
+        outcomes, version = correct_store(store, verdicts.given, dry_run=dry_run)
+    document = {
+        "version": version,
+        "dry_run": dry_run,
+        "verdicts": taken,
+        "without_verdict": left_open,
+        "recordings": [asdict(outcome) for outcome in outcomes],
+    }
+    if json:
+        output.print_json(document)
+        return ExitCode.OK
+    if not outcomes:
+        output.stdout().print(
+            "there are no corrections to take out"
+            if file == NONE
+            else f"no line of {file} has a verdict",
+            markup=False,
+        )
+        return ExitCode.OK
+    output.print_table(
+        [_correction(outcome, name) for outcome in outcomes for name in outcome.changed]
+    )
+    lines = [] if file == NONE else [f"{taken} verdicts, {left_open} lines without one"]
+    if dry_run:
+        lines.append("dry run: nothing was written")
+    else:
+        lines.append("unchanged" if version is None else f"store version {version}")
+    for line in lines:
+        output.stdout().print(line, markup=False)
+    return ExitCode.OK
+
+
+def _correction(outcome: Corrected, name: str) -> dict[str, Any]:
+    changed = outcome.changed[name]
+    return {
+        "recording": outcome.source_file,
+        "labels": f"{outcome.before} -> {outcome.after}",
+        "condition": name,
+        "rows added": changed.added,
+        "removed": changed.removed,
+        "confirmed": changed.confirmed,
+    }

@@ -1,0 +1,273 @@
+"""Corrections of labels: laid over the rules' labels, kept through relabelling and re-ingest."""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+import shutil
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.driven_robot import Drive, write_bag
+from support.panels import panel_of
+from support.profile_texts import WAREHOUSE
+from support.stores import CONDITIONS, one, recording_transitions
+
+from restock.cli import main
+from restock.errors import StoreError
+from restock.ingest.correct import (
+    RecordingCorrections,
+    correct_store,
+    remove_corrections,
+)
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.relabel import relabel_store
+from restock.ingest.store.corrections import (
+    Correction,
+    Moments,
+    corrected_version,
+    lay_over,
+    merged,
+)
+from restock.ingest.store.writer import StoreWriter
+from restock.ingest.task.conditions import Condition, labels_version
+from restock.replay.store.store import Store
+
+NOW = dt.datetime(2026, 3, 1, tzinfo=dt.UTC)
+SOON = '\n[[condition]]\nname = "soon"\ntiming = "post"\npriority = 1\nsql = "{}"\n'
+HALF_WAY, FURTHER = "lead(pose_x_m) OVER episode > 2.55", "pose_x_m > 2.8"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of one episode, in a store by a profile with a condition of its own, `soon`."""
+    folder = tmp_path_factory.mktemp("corrections")
+    profile(folder, HALF_WAY)
+    write_bag(Drive(goals=[(0.0, 11.0, 1.0)]), folder / "a")
+    assert ingest(folder) == 0
+    return folder
+
+
+@pytest.fixture
+def store(made: Path, tmp_path: Path) -> Path:
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "store"
+
+
+def profile(folder: Path, sql: str, text: str = WAREHOUSE) -> None:
+    (folder / "amr.toml").write_text(text + SOON.format(sql))
+
+
+def ingest(folder: Path, force: bool = False) -> int:
+    known = ["--store", str(folder / "store"), "--profile", str(folder / "amr.toml")]
+    return main(["ingest", str(folder / "a"), *known, *(["--force"] if force else [])])
+
+
+def labels(store: Path, columns: str = "conditions") -> list[tuple]:
+    with Store(store) as opened:
+        query = f"SELECT {columns} FROM transitions ORDER BY transition_id"
+        return opened.sql(query).fetchall()
+
+
+def said(store: Path, first: int, last: int, value: bool, condition: str = "soon") -> None:
+    """Correct these steps of the only episode."""
+    with Store(store) as opened:
+        recording, ingest_id, first_ns, last_ns = opened.sql(
+            "SELECT any_value(recording_id), any_value(ingest_id), min(logged_ns), max(logged_ns)"
+            f" FROM transitions WHERE step_index BETWEEN {first} AND {last}"
+        ).fetchall()[0]
+    given = RecordingCorrections(
+        ingest_id, [Correction(condition, value, 0, first_ns, last_ns, NOW)]
+    )
+    correct_store(StoreWriter(store), {recording: given})
+
+
+def soon(store: Path) -> list[int]:
+    """The steps that have the label."""
+    found = labels(store, "step_index, list_contains(conditions, 'soon')")
+    return [step for step, holds in found if holds]
+
+
+def test_corrections_survive_new_rules_a_new_ingest_and_a_changed_profile(
+    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = soon(store)
+    said(store, 2, 4, True)
+    said(store, before[0], before[1], False)
+    wanted = [2, 3, 4, *before[2:]]
+    assert soon(store) == wanted
+    (version,) = {version for (version,) in labels(store, "labels_version")}
+    rules = labels_version(load_profile(tmp_path / "amr.toml").conditions)
+    assert version.startswith(f"{rules}+")
+
+    capsys.readouterr()
+    assert ingest(tmp_path) == 0  # unchanged: its definitions are what they were
+    assert "unchanged" in capsys.readouterr().out
+    assert ingest(tmp_path, force=True) == 0
+    assert "2 corrections of its labels are kept" in capsys.readouterr().out
+    assert soon(store) == wanted
+
+    profile(tmp_path, FURTHER)  # other rules
+    conditions = load_profile(tmp_path / "amr.toml").conditions
+    relabel_store(StoreWriter(store), lambda name: conditions)
+    assert soon(store)[:3] == [2, 3, 4]
+    assert not set(soon(store)) & set(before[:2])
+    assert len(soon(store)) > 3
+
+    (tmp_path / "amr.toml").write_text(WAREHOUSE)  # no such condition: kept, and said
+    assert ingest(tmp_path, force=True) == 0
+    assert "2 of them speak of conditions or steps that are gone" in capsys.readouterr().out
+    profile(tmp_path, HALF_WAY)
+    assert ingest(tmp_path, force=True) == 0
+    assert soon(store) == wanted
+
+
+def test_taken_out_the_labels_of_the_rules_are_there_again(store: Path) -> None:
+    columns = "* EXCLUDE (ingest_id)"
+    before = labels(store, columns)
+    said(store, 2, 4, True)
+    said(store, 3, 3, False)
+    assert labels(store, columns) != before
+    (outcome,), _ = remove_corrections(StoreWriter(store))
+    assert "+" not in outcome.after
+    assert labels(store, columns) == before
+    assert remove_corrections(StoreWriter(store)) == ([], None)
+
+
+def test_a_recording_that_was_ingested_meanwhile_is_not_corrected(store: Path) -> None:
+    with Store(store) as opened:
+        recording = opened.sql("SELECT min(recording_id) FROM recordings").fetchall()[0][0]
+    given = {recording: RecordingCorrections("another", [])}
+    with pytest.raises(StoreError, match="ingested again, or taken out"):
+        correct_store(StoreWriter(store), given)
+
+
+def test_a_corrected_recording_is_not_stale_and_its_panel_says_so(
+    store: Path, tmp_path: Path
+) -> None:
+    mixture = "[each_condition]\nshare = 'natural'\n[evaluation_split]\nby = 'none'\n"
+    plain = panel_of(store, mixture, tmp_path / "plain").header.labels_version
+    said(store, 2, 4, True)
+    with Store(store) as opened:
+        stale = (files("restock.replay.store") / "audits" / "stale_labels.sql").read_text("utf-8")
+        assert opened.sql(stale).fetchall() == []
+    corrected = panel_of(store, mixture, tmp_path / "corrected").header.labels_version
+    assert corrected.startswith(f"{plain}+")
+
+
+def test_condition_conditions_probabilities_and_uncertain_follow(tmp_path: Path) -> None:
+    writer = StoreWriter(tmp_path / "store")
+    writer.write(*one(1))
+    before = writer.rows(*writer_key(writer))
+    uncertain = before["uncertain"].to_pylist()
+    row = uncertain.index(["recovery"])
+    stamp = before["stamp_ns"][row].as_py()
+    episode = before["episode_index"][row].as_py()
+    for value in (True, False):
+        recording, ingest_id = writer_key(writer)
+        given = [Correction("recovery", value, episode, stamp, stamp, NOW)]
+        correct_store(writer, {recording: RecordingCorrections(ingest_id, given)})
+        after = writer.rows(*writer_key(writer))
+        held = after["conditions"][row].as_py()
+        assert ("recovery" in held) == value
+        if value:  # of the lowest priority number
+            assert after["condition"][row].as_py() == "recovery"
+        assert dict(after["probabilities"][row].as_py())["recovery"] == float(value)
+        assert after["uncertain"][row].as_py() == []
+        others = [i for i in range(len(after)) if i != row]
+        for name in ("condition", "probabilities", "uncertain"):
+            assert after[name].take(others).to_pylist() == before[name].take(others).to_pylist()
+        same = [set(held) for held in after["conditions"].take(others).to_pylist()]
+        assert same == [set(held) for held in before["conditions"].take(others).to_pylist()]
+
+
+def writer_key(writer: StoreWriter) -> tuple[str, str]:
+    row = writer.live().to_pylist()[0]
+    return row["recording_id"], row["ingest_id"]
+
+
+def test_rows_of_an_older_store_have_no_probability_and_get_none() -> None:
+    rows = recording_transitions(1)
+    for name in ("probabilities", "uncertain"):
+        place = rows.schema.get_field_index(name)
+        rows = rows.set_column(
+            place, rows.schema.field(place), pa.nulls(len(rows), rows[name].type)
+        )
+    stamp = rows["stamp_ns"][0].as_py()
+    after, _ = lay_over(rows, [Correction("recovery", True, 0, stamp, stamp, NOW)], CONDITIONS, 0)
+    assert "recovery" in after["conditions"][0].as_py()
+    assert after["probabilities"].null_count == after["uncertain"].null_count == len(rows)
+
+
+STRETCHES = st.lists(st.tuples(st.integers(0, 19), st.integers(0, 6), st.booleans()), max_size=5)
+
+
+@settings(max_examples=80, deadline=None)
+@given(STRETCHES, STRETCHES)
+def test_what_is_said_last_counts_and_nothing_is_said_twice(
+    first: list[tuple[int, int, bool]], second: list[tuple[int, int, bool]]
+) -> None:
+    moments = Moments(np.zeros(20, np.int64), np.arange(20) * 100)
+    painted = np.full(20, -1)
+
+    def corrections(stretches: list[tuple[int, int, bool]]) -> list[Correction]:
+        made: list[Correction] = []
+        for begin, more, value in stretches:  # of one file, no two contradict each other
+            taken = np.zeros(20, bool)
+            for other in made:
+                taken |= moments.covered(other)
+            end = min(begin + more, 19)
+            if not taken[begin : end + 1].any():
+                made.append(Correction("x", value, 0, begin * 100, end * 100, NOW))
+        return made
+
+    before, given = corrections(first), corrections(second)
+    for said in (*before, *given):
+        painted[moments.covered(said)] = said.value
+    every = merged(before, given, moments)
+    covered = np.zeros(20, np.int64)
+    result = np.full(20, -1)
+    for said in every:
+        covered += moments.covered(said)
+        result[moments.covered(said)] = said.value
+    assert covered.max() <= 1
+    np.testing.assert_array_equal(result, painted)
+    again = merged(every, given, moments)
+    assert corrected_version("r", again) == corrected_version("r", every)
+
+
+def test_times_that_a_clock_repeats_are_told_apart_by_the_episode() -> None:
+    moments = Moments(np.array([0, 0, 1, 1]), np.array([10, 20, 10, 20]))
+    correction = Correction("x", True, 1, 10, 20, NOW)
+    assert moments.covered(correction).tolist() == [False, False, True, True]
+    # Split otherwise since, by another profile: the time says which rows.
+    moved = Correction("x", True, 7, 10, 10, NOW)
+    assert moments.covered(moved).tolist() == [True, False, True, False]
+
+
+def test_the_view_lists_them_and_a_store_without_has_none(store: Path) -> None:
+    with Store(store) as opened:
+        assert opened.sql("FROM corrections").fetchall() == []
+    said(store, 2, 4, True)
+    with Store(store) as opened:
+        query = "SELECT condition, value, rows, last_ns > first_ns, given_at FROM corrections"
+        assert opened.sql(query).fetchall() == [("soon", True, 3, True, NOW)]
+
+
+def test_label_uses_the_profile_that_the_store_keeps_where_its_file_is_gone(
+    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (tmp_path / "amr.toml").read_text().replace('name = "warehouse_amr"', 'name = "own"', 1)
+    (tmp_path / "amr.toml").write_text(text)
+    assert ingest(tmp_path, force=True) == 0
+    (tmp_path / "amr.toml").unlink()
+    relabel_store(StoreWriter(store), lambda name: [Condition("always", "pre", "true")])
+    capsys.readouterr()
+    assert main(["label", str(store), "--json"]) == 0
+    recordings = json.loads(capsys.readouterr().out)["recordings"]
+    assert [row["changed"] for row in recordings] == [0]

@@ -1,0 +1,240 @@
+"""Label review: doubtful events are listed with their moment, and verdicts are taken back."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+from support.paths import ROOT
+from support.stores import one
+
+from restock.cli import main
+from restock.errors import LabelError
+from restock.ingest.correct import correct_store
+from restock.ingest.store.writer import StoreWriter
+from restock.ingest.task.label_scores import true_names
+from restock.replay.review.doubtful import DoubtfulEvent, doubtful_events, review_csv, review_rows
+from restock.replay.review.verdicts import read_verdicts
+from restock.replay.store.store import Store
+
+HEADER = "episode_id,condition,first_step,last_step,value\n"
+MONDAY = ROOT / "sample_logs" / "amr_monday.mcap"
+
+
+@pytest.fixture(scope="module")
+def monday(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    store = tmp_path_factory.mktemp("review") / "store"
+    assert main(["ingest", str(MONDAY), "--store", str(store)]) == 0
+    return store
+
+
+@pytest.fixture(scope="module")
+def reviewed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[DoubtfulEvent]]:
+    """Two synthetic recordings, and all that is doubtful in them. `recovery` has a probability, the
+    other conditions have none."""
+    path = tmp_path_factory.mktemp("small") / "store"
+    for recording in (1, 2):
+        StoreWriter(path).write(*one(recording))
+    with Store(path) as store:
+        return path, doubtful_events(store, 1000)
+
+
+def truly(store: Store) -> dict[str, dict[int, frozenset[str]]]:
+    """episode -> step -> its true conditions."""
+    found: dict[str, dict[int, frozenset[str]]] = {}
+    query = "SELECT episode_id, step_index, true_condition FROM transitions"
+    for episode, step, text in store.sql(query).fetchall():
+        found.setdefault(episode, {})[step] = true_names(text)
+    return found
+
+
+def true_verdict(event: DoubtfulEvent, truth: dict[str, dict[int, frozenset[str]]]) -> bool:
+    """Whether a true step is within .4 s of a labelled event, or in an unlabelled one."""
+    reach = 2 if event.labelled else 0
+    steps = range(event.first_step - reach, event.last_step + reach + 1)
+    return any(event.condition in truth[event.episode_id].get(s, ()) for s in steps)
+
+
+def test_doubtful_events_are_wrong_more_often_and_their_verdicts_mend_the_labels(
+    monday: Path, tmp_path: Path
+) -> None:
+    with Store(monday) as store:
+        truth, events = truly(store), doubtful_events(store, 100_000)
+    wrong = [true_verdict(event, truth) != event.labelled for event in events]
+    assert sum(wrong[:10]) / 10 >= 1.5 * sum(wrong) / len(wrong)
+
+    def wrong_steps() -> dict[str, int]:
+        with Store(monday) as store:
+            query = "SELECT condition, sum(labelled - agreed + support - agreed) FROM label_scores"
+            return dict(store.sql(f"{query} GROUP BY condition").fetchall())
+
+    before, file = wrong_steps(), tmp_path / "verdicts.csv"
+    with file.open("w", newline="") as out:
+        lines = csv.writer(out)
+        lines.writerow(["episode_id", "condition", "first_step", "last_step", "value"])
+        for event in events[:10]:
+            steps = (event.first_step, event.last_step)
+            lines.writerow([event.episode_id, event.condition, *steps, true_verdict(event, truth)])
+    with Store(monday) as store:
+        verdicts = read_verdicts(file, store)
+    correct_store(StoreWriter(monday), verdicts.given)
+    after = wrong_steps()
+    assert all(after[name] <= before[name] for name in before)
+    assert sum(after.values()) < sum(before.values())
+    with Store(monday) as store:  # what somebody spoke of is not asked again
+        assert not {e.event for e in events[:10]} & {e.event for e in doubtful_events(store, 999)}
+
+
+def test_the_list_is_a_file_whose_commands_open_the_moment(
+    monday: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "review.csv"
+    assert main(["label", str(monday), "--review", "3", "--out", str(file)]) == 0
+    shown = capsys.readouterr().out
+    with file.open(newline="") as text:
+        rows = list(csv.DictReader(text))
+    assert len(rows) == 3
+    for row in rows:
+        assert row["verdict"] == ""
+        assert row["condition"] in shown
+    command = shlex.split(rows[0]["open"])
+    assert command[0] == "restock"
+    assert command[-2:] == ["--recording", str(MONDAY)]
+    assert main([*command[1:], "--json"]) == 0
+    traced = json.loads(capsys.readouterr().out)
+    assert traced["transition"]["episode_id"] == rows[0]["episode_id"]
+    assert traced["transition"]["step_index"] == int(rows[0]["first_step"])
+    assert traced["messages"]
+    # Verdicts may be in it: it is not written over.
+    assert main(["label", str(monday), "--review", "3", "--out", str(file)]) == 2
+    assert "may hold verdicts" in capsys.readouterr().err
+
+
+def fill(
+    store: Path, events: list[DoubtfulEvent], file: Path, verdicts: dict[int, str], **changed: str
+) -> Path:
+    """A review file with verdicts on some lines, and other values in the first of them."""
+    rows = review_rows(events, str(store))
+    for place, verdict in verdicts.items():
+        rows[place]["verdict"] = verdict
+    rows[min(verdicts)].update(changed)
+    file.write_text(review_csv(rows))
+    return file
+
+
+def test_verdicts_of_a_review_change_the_labels_and_a_dry_run_does_not(
+    reviewed: tuple[Path, list[DoubtfulEvent]],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    small, events = tmp_path / "store", reviewed[1]
+    shutil.copytree(reviewed[0], small)
+    assert events == sorted(events, key=lambda event: event.margin)
+    for event in events:
+        assert (event.probability is not None) == (event.condition == "recovery")
+    no = next(i for i, e in enumerate(events) if e.labelled and e.condition == "wheel_slip")
+    longer = (i for i, e in enumerate(events) if e.last_step > e.first_step)
+    long = next(i for i in longer if events[i].condition == "recovery")
+    first = events[long].first_step
+    file = fill(small, events, tmp_path / "review.csv", {no: "No", long: f"{first}..{first}"})
+    for dry in (["--dry-run"], []):
+        assert main(["label", str(small), "--corrections", str(file), "--json", *dry]) == 0
+        said = json.loads(capsys.readouterr().out)
+        assert (said["verdicts"], said["without_verdict"]) == (2, len(events) - 2)
+        assert (said["version"] is None) == bool(dry)
+        with Store(small) as store:
+            assert len(store.sql("FROM corrections").fetchall()) == (0 if dry else 3)
+    with Store(small) as store:
+        for place, begins in ((no, [False]), (long, [True, False])):
+            event = events[place]
+            held = store.sql(
+                f"SELECT list_contains(conditions, '{event.condition}') FROM transitions"
+                f" WHERE episode_id = '{event.episode_id}'"
+                f" AND step_index BETWEEN {event.first_step} AND {event.last_step}"
+                " ORDER BY step_index"
+            ).fetchall()
+            length = event.last_step - event.first_step + 1
+            assert [one for (one,) in held] == (begins + [False] * length)[:length]
+    assert main(["label", str(small), "--corrections", str(file)]) == 0  # the same again
+    assert "unchanged" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("verdict", "changed", "problem"),
+    [
+        ("perhaps", {}, "line 2: the verdict is 'perhaps', not yes, no or FIRST..LAST"),
+        ("5..2", {}, "line 2: the verdict 5..2 ends before it begins"),
+        ("0..99999999", {}, "line 2: steps 0 to 99999999 are not all there"),
+        ("yes", {"condition": "wheelslip"}, "line 2: no condition 'wheelslip' labelled that"),
+        ("yes", {"episode_id": "gone/3"}, "line 2: no episode or recording 'gone/3'"),
+        ("yes", {"start_s": "3600"}, "it was ingested again since"),
+        ("yes", {"first_step": "x"}, "line 2: first_step and last_step must be step numbers"),
+        ("yes", {"last_step": "9" * 5000}, "line 2: first_step and last_step must be"),
+    ],
+)
+def test_a_line_that_does_not_fit_is_named(
+    reviewed: tuple[Path, list[DoubtfulEvent]],
+    tmp_path: Path,
+    verdict: str,
+    changed: dict[str, str],
+    problem: str,
+) -> None:
+    small, events = reviewed
+    file = fill(small, events, tmp_path / "review.csv", {0: verdict, 3: "yes"}, **changed)
+    with Store(small) as store, pytest.raises(LabelError, match=re.escape(problem)) as error:
+        read_verdicts(file, store)
+    assert error.value.remedy is not None
+    assert "--review N` lists events" in error.value.remedy
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("", "it has no column condition"),
+        ("condition,episode_id,first_step,last_step\n", "no column verdict or value"),
+        ("a\n\xff", "cannot be read"),
+        (
+            HEADER + "{episode},wheel_slip,0,3,yes\n{episode},recovery,0,3,yes\n"
+            "{episode},wheel_slip,3,5,no\n",
+            "line 4: contradicts line 2 about wheel_slip at step 3",
+        ),
+        (
+            HEADER.replace("\n", ",verdict\n") + "{episode},wheel_slip,0,3,yes,no\n",
+            "line 2: verdict and value contradict each other",
+        ),
+        (
+            HEADER.replace("episode_id", "recording") + "{recording},wheel_slip,0,3,yes\n",
+            "has 12 episodes: name the episode_id",
+        ),
+        (HEADER + '"{episode},wheel_slip', "is not CSV"),
+    ],
+)
+def test_a_file_that_cannot_be_taken_is_refused(
+    reviewed: tuple[Path, list[DoubtfulEvent]], tmp_path: Path, text: str, problem: str
+) -> None:
+    recording, file = f"{1:016x}", tmp_path / "file.csv"
+    text = text.format(recording=recording, episode=f"{recording}/0")
+    file.write_bytes(text.encode("latin-1"))
+    with Store(reviewed[0]) as store, pytest.raises(LabelError, match=problem):
+        read_verdicts(file, store)
+
+
+def test_wrong_usage_writes_nothing(
+    reviewed: tuple[Path, list[DoubtfulEvent]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = sorted(reviewed[0].rglob("*"))
+    for words, problem in (
+        (["--review", "3", "--corrections", "x.csv"], "--review does not go with --corrections"),
+        (["--out", "x.csv"], "--out goes with --review"),
+        (["--corrections", "x.csv", "--profile", "turtlebot3"], "does not go with --profile"),
+        (["--review", "0"], "must be 1 or more"),
+        (["--corrections", "gone.csv"], "cannot be read"),
+    ):
+        assert main(["label", str(reviewed[0]), *words]) == 2
+        assert problem in " ".join(capsys.readouterr().err.split())
+    assert sorted(reviewed[0].rglob("*")) == before
