@@ -1,0 +1,160 @@
+"""Every block of the documentation runs as it is printed, in the folder of a reader.
+
+`support.pages` says what a page may say about its blocks, `support.reader` how they are run.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tomllib
+from collections.abc import Callable, Iterator
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+from support.pages import PAGES, RUN, Block, blocks, indented
+from support.paths import ROOT
+from support.reader import Reader, reader
+
+from restock.ingest.profile.profile import parse_profile
+from restock.replay.mixture.mixture import parse_mixture
+from restock.train.study.study import load_study
+from restock.train.twin.floors.floor_file import read_floor
+
+LANGUAGES = (*RUN, "toml", "json", "text", "py")  # py: signatures in docs/api.md
+ALL = {page: blocks(page) for page in PAGES}
+PAGES_RUN = [page for page in PAGES if any(block.is_run for block in ALL[page])]
+PAGES_SLOW = [page for page in PAGES if any("slow" in block.marks for block in ALL[page])]
+TOML = [b for told in ALL.values() for b in told if b.language == "toml" and "file" not in b.marks]
+
+
+def name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+@pytest.fixture(scope="session")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Reader]:
+    with reader(tmp_path_factory.mktemp("reader")) as it:
+        yield it
+
+
+@pytest.fixture(scope="session")
+def prepared(server: Reader, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a reader has: recordings, a store and a panel of them, two runs."""
+    folder = tmp_path_factory.mktemp("prepared")
+    (folder / "sample_logs").symlink_to(ROOT / "sample_logs")
+    (folder / "docs").symlink_to(ROOT / "docs")
+    shutil.copytree(ROOT / "sample_logs/amr_tuesday", folder / "drives")
+    (folder / "logs").mkdir()
+    (folder / "logs/run.mcap").symlink_to(ROOT / "sample_logs/amr_monday.mcap")
+    (folder / "run.mcap").symlink_to(ROOT / "sample_logs/amr_monday.mcap")
+    commands = """
+        restock ingest logs/ --store store/
+        restock mix store/ --out panel/
+        restock train --panel panel/ --out runs/a
+        restock train --panel panel/ --out runs/b --seed 1
+    """
+    made = Block("prepared", 1, "sh", commands, {"exit codes": "3"})
+    assert not server.run([made], folder)
+    return folder
+
+
+def run_page(page: Path, server: Reader, prepared: Path, folder: Path, *, slow: bool) -> None:
+    shutil.copytree(prepared, folder, symlinks=True)
+    told = blocks(page)
+    for block in told:
+        if target := block.marks.get("file"):
+            (folder / target).parent.mkdir(parents=True, exist_ok=True)
+            (folder / target).write_text(block.text, encoding="utf-8")
+    wanted = [block for block in told if block.is_run and (slow or "slow" not in block.marks)]
+    wrong = server.run(wanted, folder)
+    assert not wrong, wrong
+
+
+@pytest.mark.parametrize("page", PAGES_RUN, ids=name)
+def test_a_page_runs_as_printed(page: Path, server: Reader, prepared: Path, tmp_path: Path) -> None:
+    run_page(page, server, prepared, tmp_path / "reader", slow=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES_SLOW, ids=name)
+def test_a_page_runs_with_its_slow_blocks(
+    page: Path, server: Reader, prepared: Path, tmp_path: Path
+) -> None:
+    run_page(page, server, prepared, tmp_path / "reader", slow=True)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_blocks_are_fenced_and_name_their_language(page: Path) -> None:
+    assert indented(page) == []
+    assert [b.place for b in blocks(page) if b.language not in LANGUAGES] == []
+
+
+def test_blocks_that_are_not_run_are_few_and_say_why() -> None:
+    """Each needs what no test has. A new one is counted here, so that it is seen in review."""
+    told = [block for page in PAGES for block in blocks(page) if block.language in RUN]
+    left_out = {block.place: block.marks["not run"] for block in told if "not run" in block.marks}
+    print("\n".join(f"{place}: {reason}" for place, reason in left_out.items()))  # noqa: T201
+    assert all(len(reason.split()) >= 2 for reason in left_out.values()), left_out
+    assert len(left_out) <= 24
+    assert len(told) > 5 * len(left_out)
+
+
+def check_mixture(block: Block, folder: Path) -> None:
+    """A part of a mixture is checked with the shortest list of strata, where it has none."""
+    listed = {"strata", "each_condition"} & set(tomllib.loads(block.text))
+    parse_mixture(block.text + ("" if listed else "\n[each_condition]\n"), where=block.place)
+
+
+def check_study(block: Block, folder: Path) -> None:
+    """A part of a study is checked with what it leaves out taken from the page's whole one."""
+    (whole,) = [other for other in blocks(ROOT / block.page) if other.marks.get("file")]
+    own = tomllib.loads(block.text)
+    left_out = {
+        key: value
+        for key, value in tomllib.loads(whole.text).items()
+        if key not in own and isinstance(value, str | list) and key not in ("baseline", "arms")
+    }
+    file = folder / "study.toml"
+    file.write_text("".join(f"{key} = {value!r}\n" for key, value in left_out.items()) + block.text)
+    load_study(file)
+
+
+def check_floor(block: Block, folder: Path) -> None:
+    (folder / "floor.toml").write_text(block.text, encoding="utf-8")
+    read_floor(folder / "floor.toml")
+
+
+WHEELS = "".join(
+    f"""
+[signals.{side}_wheel_radps]
+topic = "/joint_states"
+type = "sensor_msgs/msg/JointState"
+path = "velocity[wheel_{side}_joint]"
+unit = "rad/s"
+max_age_s = 0.2
+"""
+    for side in ("left", "right")
+)  # the custom signals that a reader of docs/profile.md has when its condition is added
+
+
+def check_profile(block: Block, folder: Path) -> None:
+    """A part of a profile is checked as an addition to the shipped one."""
+    shipped = files("restock.ingest.profile") / "profiles/warehouse_amr.toml"
+    whole = "\n".join([shipped.read_text("utf-8"), WHEELS, block.text])
+    parse_profile(whole, where=block.place, folder=folder)
+
+
+# Blocks of TOML that are no file of a page's commands: how a page's are checked.
+CHECKS: dict[str, Callable[[Block, Path], None]] = {
+    "docs/mixture.md": check_mixture,
+    "docs/study.md": check_study,
+    "docs/layouts.md": check_floor,
+    "docs/profile.md": check_profile,
+    "docs/ingest.md": check_profile,
+}
+
+
+@pytest.mark.parametrize("block", TOML, ids=lambda block: block.place)
+def test_a_block_of_toml_is_accepted(block: Block, tmp_path: Path) -> None:
+    CHECKS[block.page](block, tmp_path)
