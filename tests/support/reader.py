@@ -220,7 +220,7 @@ def cut_short() -> None:
         RecordingPlan.__post_init__,
     )
     fit_all, measure = fit.fit, gap.measure_gap
-    study, made = study_run.run_study, WarehouseVectorEnv.__init__
+    study = study_run.run_study
 
     def short_config(config: Any, panel: Any) -> Any:
         parts = {
@@ -247,16 +247,16 @@ def cut_short() -> None:
         config = msgspec.structs.replace(config or gap.GapConfig(), max_segments=4)
         return measure(store, calibrated, config, **options)
 
-    def short_episodes(self: WarehouseVectorEnv, *args: Any, **options: Any) -> None:
-        made(self, *args, **options)
-        if self.num_envs > 1:  # a recording drives one, to the end of its missions
-            self.task = msgspec.structs.replace(self.task, time_limit_steps=12)
+    def short_episodes(*args: Any, **options: Any) -> WarehouseVectorEnv:
+        env = WarehouseVectorEnv(*args, **options)
+        env.task = msgspec.structs.replace(env.task, time_limit_steps=12)
+        return env
 
     def one_process(*args: Any, **options: Any) -> Any:
         return study(*args, **{**options, "workers": 1})
 
     prepare.resolve_config = short_config
-    WarehouseVectorEnv.__init__ = short_episodes
+    prepare.WarehouseVectorEnv = eval_run.WarehouseVectorEnv = short_episodes
     study_run.run_study = one_process
     model = ope.OpeConfig().model
     object.__setattr__(model, "iterations", 2)
