@@ -210,7 +210,7 @@ def cut_short() -> None:
     from restock.train.evaluation import eval_run, ope
     from restock.train.study import study_run
     from restock.train.twin.calibration import fit, gap
-    from restock.train.twin.env.vector_env import WarehouseVectorEnv
+    from restock.train.twin.env import vector_env
     from restock.train.twin.recording.recorder import RecordingPlan
 
     cut_libraries_short()
@@ -220,7 +220,7 @@ def cut_short() -> None:
         RecordingPlan.__post_init__,
     )
     fit_all, measure = fit.fit, gap.measure_gap
-    study = study_run.run_study
+    study, make = study_run.run_study, vector_env.WarehouseVectorEnv
 
     def short_config(config: Any, panel: Any) -> Any:
         parts = {
@@ -232,10 +232,10 @@ def cut_short() -> None:
     def one_episode(*args: Any, **options: Any) -> Any:
         return plan(*args, **{**options, "episodes": 1})
 
-    def two_missions(self: RecordingPlan) -> None:
+    def few_missions(self: RecordingPlan) -> None:
         ended(self)
+        object.__setattr__(self, "missions", 5 if (self.minutes or 0) > 5 else 2)
         object.__setattr__(self, "minutes", None)
-        object.__setattr__(self, "missions", 2)
 
     def short_fit(store: Any, config: Any = None, **options: Any) -> Any:
         config = msgspec.structs.replace(
@@ -247,8 +247,8 @@ def cut_short() -> None:
         config = msgspec.structs.replace(config or gap.GapConfig(), max_segments=4)
         return measure(store, calibrated, config, **options)
 
-    def short_episodes(*args: Any, **options: Any) -> WarehouseVectorEnv:
-        env = WarehouseVectorEnv(*args, **options)
+    def short_episodes(*args: Any, **options: Any) -> Any:
+        env = make(*args, **options)
         env.task = msgspec.structs.replace(env.task, time_limit_steps=12)
         return env
 
@@ -256,13 +256,13 @@ def cut_short() -> None:
         return study(*args, **{**options, "workers": 1})
 
     prepare.resolve_config = short_config
-    prepare.WarehouseVectorEnv = eval_run.WarehouseVectorEnv = short_episodes
+    vector_env.WarehouseVectorEnv = short_episodes  # what is recorded drives whole missions
     study_run.run_study = one_process
     model = ope.OpeConfig().model
     object.__setattr__(model, "iterations", 2)
     object.__setattr__(model, "cloning_updates", 20)
     eval_run.plan_evaluation = one_episode
-    RecordingPlan.__post_init__ = two_missions
+    RecordingPlan.__post_init__ = few_missions
     fit.fit = short_fit
     gap.measure_gap = short_gap
 
