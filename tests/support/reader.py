@@ -211,7 +211,7 @@ def cut_short() -> None:
     from restock.train.study import study_run
     from restock.train.twin.calibration import fit, gap
     from restock.train.twin.env import vector_env
-    from restock.train.twin.recording.recorder import RecordingPlan
+    from restock.train.twin.recording.recorder import MissionsFile, RecordingPlan
 
     cut_libraries_short()
     resolve, plan, ended = (
@@ -234,7 +234,13 @@ def cut_short() -> None:
 
     def few_missions(self: RecordingPlan) -> None:
         ended(self)
-        object.__setattr__(self, "missions", 5 if (self.minutes or 0) > 5 else 2)
+        missions: Any = 5 if (self.minutes or 0) > 5 else 2
+        if isinstance(self.missions, MissionsFile):
+            orders = [
+                msgspec.structs.replace(order, missions=1) for order in self.missions.missions
+            ]
+            missions = msgspec.structs.replace(self.missions, missions=orders)
+        object.__setattr__(self, "missions", missions)
         object.__setattr__(self, "minutes", None)
 
     def short_fit(store: Any, config: Any = None, **options: Any) -> Any:
