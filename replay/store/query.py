@@ -15,7 +15,7 @@ from restock.replay.store.column_docs import install_columns
 T = TypeVar("T")
 
 # In their order: a view may use those before it.
-VIEWS = ("rows.sql", "views.sql", "labels.sql")
+VIEWS = ("rows.sql", "views.sql", "labels.sql", "events.sql", "fleet.sql")
 MACROS = (
     "macros.sql",
     "capacity.sql",

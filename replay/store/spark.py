@@ -63,6 +63,8 @@ _RULES = (
     (r"\blist\(DISTINCT ", "collect_set("),
     (r"\blist\(", "collect_list("),
     (r"\barg_min\(", "min_by("),
+    (r"\barg_max\(", "max_by("),
+    (r"(?<!range\()\blen\(", "size("),
     (r"\bjson_extract_string\(", "get_json_object("),
     (r"\bquantile_cont\(", "percentile("),
     (r"\bquantile_disc\((\w+), ([\d.]+)\)", r"percentile_disc(\2) WITHIN GROUP (ORDER BY \1)"),

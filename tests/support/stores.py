@@ -110,6 +110,8 @@ def manifest(
         "labels_version": first["labels_version"],
         "restock_version": first["restock_version"],
         "tags": dict(tags or {}),
+        "start_stamp_ns": int(transitions["stamp_ns"].to_numpy().min(initial=START_NS)),
+        "end_stamp_ns": int(transitions["stamp_ns"].to_numpy().max(initial=START_NS)) + 200_000_000,
         "steps": len(transitions) + 12,
         "episodes": len(transitions["episode_id"].unique()),
         "transitions": len(transitions),

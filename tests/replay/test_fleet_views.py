@@ -1,0 +1,110 @@
+"""A fleet's weeks and robots: counts that add up, and cells that were never seen."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pyarrow as pa
+import pytest
+from support.stores import recording_transitions, write_store
+
+from restock.replay.store.store import Store
+
+WEEK_NS = 7 * 86_400 * 10**9
+TAGS = [{"robot": "a"}, {"robot": "a"}, {"robot": "b"}, {}]
+# The synthetic recordings begin on a Tuesday; the second of robot a is three weeks later.
+LATER = [0, 3, 0, 1]
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    tables = []
+    for number, weeks in enumerate(LATER, 1):
+        table = recording_transitions(number)
+        place = table.schema.get_field_index("stamp_ns")
+        stamps = pa.array(table["stamp_ns"].to_numpy() + weeks * WEEK_NS)
+        table = table.set_column(place, table.schema.field(place), stamps)
+        tables.append(table)
+    path = tmp_path_factory.mktemp("fleet") / "store"
+    return Store(write_store(path, tables, tags=TAGS))
+
+
+def asked(store: Store, query: str) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = store.sql(query).to_arrow_table().to_pylist()
+    return rows
+
+
+def test_every_condition_stands_in_every_week_that_a_robot_drove(fleet):
+    rows = asked(fleet, "FROM coverage_by_week")
+    conditions = {row["condition"] for row in asked(fleet, "FROM conditions")}
+    cells = {(row["robot"], str(row["week"]), row["condition"]) for row in rows}
+    driven = {("a", "2023-11-13"), ("a", "2023-12-04"), ("b", "2023-11-13"), (None, "2023-11-20")}
+    assert cells == {(*one, condition) for one in driven for condition in conditions}
+    assert len(rows) == len(cells)
+
+
+def test_counts_of_weeks_are_those_of_rows_and_events(fleet):
+    week = "CAST(date_trunc('week', {}) AS DATE) AS week"
+    rows = fleet.sql(
+        f"SELECT robot, {week.format('logged_time')}, condition, count(*),"
+        " count(DISTINCT episode_id) FROM transitions GROUP BY ALL"
+    ).fetchall()
+    events = fleet.sql(
+        f"SELECT robot, {week.format('logged_onset_time')}, condition, count(*),"
+        " count(*) FILTER (NOT recovered) FROM events GROUP BY ALL"
+    ).fetchall()
+    seen = {row[:3]: row[3:] for row in rows}
+    happened = {row[:3]: row[3:] for row in events}
+    for row in asked(fleet, "FROM coverage_by_week"):
+        cell = row["robot"], row["week"], row["condition"]
+        driven = sum(count for other, (count, _) in seen.items() if other[:2] == cell[:2])
+        count, episodes = seen.get(cell, (0, 0))
+        began, not_recovered = happened.get(cell, (0, 0))
+        hours = driven * 0.2 / 3600
+        wanted = {
+            "rows": count,
+            "share": count / driven,
+            "episodes": episodes,
+            "hours": hours,
+            "events": began,
+            "not_recovered": not_recovered,
+            "events_per_hour": began / hours,
+        }
+        assert {name: row[name] for name in wanted} == pytest.approx(wanted)
+    assert sum(count for count, _ in happened.values()) > 50
+
+
+def test_weeks_add_up_to_robots(fleet):
+    weeks = "sum(rows), sum(episodes), sum(goal_episodes), sum(successes), sum(events), sum(hours)"
+    totals = fleet.sql(
+        f"SELECT robot, condition, {weeks}, count(*), min(week) FROM coverage_by_week"
+        " GROUP BY ALL ORDER BY ALL"
+    ).fetchall()
+    robots = fleet.sql(
+        "SELECT robot, condition, rows, episodes, goal_episodes, successes, events, hours, weeks,"
+        " first_week FROM coverage_by_robot ORDER BY ALL"
+    ).fetchall()
+    assert [row[:2] for row in robots] == [row[:2] for row in totals]
+    for robot, total in zip(robots, totals, strict=True):
+        assert robot[2:-1] == pytest.approx(total[2:-1])
+        assert robot[-1] == total[-1]
+    assert {robot: weeks for robot, *_, weeks, _ in robots} == {"a": 2, "b": 1, None: 1}
+    totals = "SELECT sum(share) AS share, any_value(hours) AS hours FROM coverage_by_robot"
+    shares = asked(fleet, f"{totals} GROUP BY robot")
+    assert [row["share"] for row in shares] == pytest.approx([1.0, 1.0, 1.0])
+    assert sum(row["hours"] for row in shares) == pytest.approx(
+        asked(fleet, "SELECT count(*) * 0.2 / 3600 AS hours FROM transitions")[0]["hours"]
+    )
+
+
+def test_successes_are_of_episodes_in_which_the_condition_was_seen(fleet):
+    for row in asked(fleet, "FROM coverage_by_robot WHERE robot = 'a'"):
+        (found,) = asked(
+            fleet,
+            "SELECT count(*) AS episodes, count(*) FILTER (success) AS successes FROM episodes"
+            " SEMI JOIN (FROM transitions WHERE robot = 'a'"
+            f" AND condition = '{row['condition']}') USING (episode_id)",
+        )
+        assert found["episodes"] == row["episodes"] == row["goal_episodes"]
+        assert found["successes"] == row["successes"]
+        assert row["success_share"] == pytest.approx(found["successes"] / found["episodes"])
