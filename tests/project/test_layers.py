@@ -52,7 +52,7 @@ MAY_IMPORT = {
         "dqn feed run twin/env twin/floors twin/physics replay/panel replay/ring replay/store"
         " ingest/store ingest/task"
     ),
-    "train/comparison": "train dqn evaluation run",
+    "train/comparison": "train dqn evaluation run replay/fleet replay/panel",
     "train/libraries": (
         "train dqn evaluation feed run twin/floors twin/physics replay/mixture replay/panel"
         " replay/ring replay/store ingest/profile ingest/task"
@@ -73,7 +73,7 @@ MAY_IMPORT = {
     "cli/data": (
         "cli ingest ingest/containers ingest/profile ingest/propose ingest/steps ingest/store"
         " ingest/task replay replay/export replay/fleet replay/mixture replay/panel replay/review"
-        " replay/store report train/dqn train/evaluation train/twin/physics"
+        " replay/store report train/comparison train/dqn train/evaluation train/twin/physics"
     ),
     "cli/learning": (
         "cli report ingest/store replay/store replay/trace train train/comparison"

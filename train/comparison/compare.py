@@ -135,7 +135,7 @@ def _outcomes(
     arms = [[agent_episodes(run) for run in arm.runs] for arm in (first, second)]
     source = "restock eval" if all(e is not None for arm in arms for e in arm) else "training"
     if source == "training":
-        arms = [[_last_evaluation(run) for run in arm.runs] for arm in (first, second)]
+        arms = [[last_evaluation(run) for run in arm.runs] for arm in (first, second)]
     scores = [_scores([e for e in arm if e is not None]) for arm in arms]
     rows = []
     for cell in scores[0]:
@@ -219,8 +219,8 @@ def _scores(tables: Iterable[pa.Table]) -> dict[Cell, dict[int, F64]]:
     return shared
 
 
-def _last_evaluation(run: Run) -> pa.Table:
-    """The last periodic evaluation in training."""
+def last_evaluation(run: Run) -> pa.Table:
+    """The last periodic evaluation in training. Raises RunError where there was none."""
     table = run.table("evaluations")
     if not len(table):
         raise RunError(
@@ -230,4 +230,4 @@ def _last_evaluation(run: Run) -> pa.Table:
     return table.filter(pa.compute.equal(table["gradient_steps"], last))
 
 
-__all__ = ["Comparison", "compare"]
+__all__ = ["LEAST_EPISODES", "Comparison", "compare", "last_evaluation"]

@@ -1,0 +1,78 @@
+"""`restock diff` of runs: settings, feed and evaluation side by side, whatever the gate says."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pyarrow.compute as pc
+import pytest
+from support.finished_runs import document, make_run
+
+from restock.cli import main
+from restock.errors import RunError
+from restock.files import write_table
+from restock.train.comparison.run_difference import diff_runs
+from restock.train.run.run import Run
+
+
+def test_what_moved_is_shown_where_compare_refuses(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = make_run(tmp_path / "a", document(0), success=0.2)
+    second = make_run(
+        tmp_path / "b", document(1, config__network__dueling=True), success=0.7, slip_share=0.1
+    )
+    assert main(["compare", str(first), "--against", str(second), "--json"]) == 1
+    capsys.readouterr()
+    assert main(["diff", str(first), str(second), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    settings = {row["setting"]: (row["first"], row["second"]) for row in found["settings"]}
+    assert settings["config.network.dueling"] == (False, True)
+    fed = {(row["source"], row["stratum"]): row for row in found["fed"]}
+    slip = fed["logs", "wheel_slip"]
+    assert (slip["share_a"], slip["share_b"]) == pytest.approx((0.15, 0.05))
+    assert sum(row["share_a"] for row in found["fed"]) == pytest.approx(1)
+    rows = {row["condition"]: row for row in found["evaluation"]}
+    assert rows["wheel_slip"]["episodes"] == 40
+    assert rows["wheel_slip"]["difference"] == pytest.approx(0.5, abs=0.2)
+    assert rows["wheel_slip"]["difference_low"] > 0
+    assert found["evaluated_by"] == "training"
+    assert found["comparable"]["algorithm"] == "incomparable"
+    assert found["different"]
+    assert main(["diff", str(first), str(second)]) == 0
+    assert "incomparable as methods" in capsys.readouterr().out
+
+
+def test_runs_that_share_no_episode_or_have_no_evaluation_say_so(tmp_path: Path) -> None:
+    first = make_run(tmp_path / "a", document(0))
+    second = make_run(tmp_path / "b", document(1), first_episode_seed=5)
+    found = diff_runs(first, second)
+    assert found["evaluation"] == []
+    assert "share no episode" in found["evaluation_note"]
+    young = Run.create(tmp_path / "young", document(2)).path
+    found = diff_runs(first, young)
+    assert "has no evaluation" in found["evaluation_note"]
+    assert found["comparable"]["algorithm"].startswith("not compared")
+    assert all(row["drawn_b"] == 0 for row in found["fed"])
+
+
+def test_a_task_without_a_goal_is_compared_by_its_returns(tmp_path: Path) -> None:
+    paths = [make_run(tmp_path / name, document(seed)) for seed, name in enumerate("ab")]
+    for path in paths:
+        run = Run.open(path)
+        table = run.table("evaluations")
+        place = table.schema.get_field_index("success")
+        unknown = pc.if_else(pc.is_null(table["success"]), table["success"], None)
+        table = table.set_column(place, table.schema.field(place), unknown)
+        write_table(table, path / "evaluations.parquet")
+    for row in diff_runs(*paths)["evaluation"]:
+        assert row["difference"] is None
+        assert row["return_difference"] == pytest.approx(row["return_b"] - row["return_a"])
+
+
+def test_runs_of_two_tasks_are_refused(tmp_path: Path) -> None:
+    first = make_run(tmp_path / "a", document(0))
+    second = make_run(tmp_path / "b", document(1, task_hash="other"))
+    with pytest.raises(RunError, match="task other"):
+        diff_runs(first, second)
