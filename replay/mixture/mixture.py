@@ -40,6 +40,7 @@ Share = Fraction | Literal["natural", "equal"] | Schedule
 Correction = Literal["none", "beta", "full", "clipped", "density_ratio"]
 Shortfall = Literal["refuse", "redistribute", "shrink"]
 Unit = Literal["step", "episode"]
+Uncertain = Literal["drop", "keep", "nominal"]
 Prefer = Literal["rarest", "priority"]
 Within = Literal["uniform", "without_replacement", "per", "lap"]
 
@@ -226,6 +227,7 @@ class Mixture(Checked, frozen=True):
     max_rows_per_episode: AtLeastOne | None = None  # of one stratum
     max_rows_per_recording: AtLeastOne | None = None
     unlabelled: Literal["refuse", "drop", "nominal"] = "refuse"  # rows without a condition
+    uncertain: Uncertain = "nominal"  # conditions too near to call: not held; keep: as labelled
     unlisted: Literal["refuse", "drop"] = "refuse"  # rows that belong to no stratum
     # In which shares.
     sources: SourceShares = SourceShares()

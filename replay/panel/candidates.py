@@ -26,6 +26,7 @@ _TEXT = (
     *("recording_id", "episode_id", "condition", "zone", "behaviour_policy", "behaviour_version"),
     *LATER,
 )
+_CERTAIN = "list_filter(conditions, lambda held: NOT list_contains(coalesce(uncertain, []), held))"
 _CODED = pa.dictionary(pa.int32(), pa.string())
 BATCH_ROWS = 65_536  # read at a time
 # Of a view of several stores, which one a row is from (`replay.panel.stores`).
@@ -50,9 +51,10 @@ def read_candidates(
 ) -> pa.Table:
     """Every row of the connection's `transitions`, by recording, episode and step.
 
-    META_COLUMNS, `task_hash`, `labelled`, and one boolean for each predicate of the mixture:
-    `admitted`, `unsafe`, `stratum_0`, `state_0` (of the row's state alone) …; text columns come
-    as dictionaries; `store` (int) says which store a row is from.
+    META_COLUMNS, `task_hash`, `labelled`, `uncertain` (a condition is too near to call), and one
+    boolean for each predicate of the mixture: `admitted`, `unsafe`, `stratum_0`, `state_0` (of
+    the row's state alone) …; text columns come as dictionaries; `store` (int) says which store a
+    row is from. Predicates see `conditions` as the mixture's `uncertain` has them.
 
     Raises:
         ConfigError: a predicate that does not run; names it.
@@ -69,10 +71,15 @@ def read_candidates(
         f"coalesce(({sql}\n)::BOOLEAN, false) AS {name}" for name, (_, sql) in predicates.items()
     )
     store = STORE_COLUMN if several_stores else "0"
+    rows, has_uncertain = "transitions", "false"
+    if "uncertain" in connection.sql("FROM transitions LIMIT 0").columns:
+        has_uncertain = "coalesce(len(uncertain) > 0, false)"
+        if mixture.uncertain == "nominal":
+            rows = f"(SELECT * REPLACE ({_CERTAIN} AS conditions) FROM transitions)"
     query = (
         f"SELECT {meta_columns(connection)}, task_hash, ({store})::INTEGER AS store,"
         " coalesce(condition, '') <> '' AND conditions IS NOT NULL AS labelled,"
-        f" {tests} FROM transitions {ORDER}"
+        f" {has_uncertain} AS uncertain, {tests} FROM {rows} {ORDER}"
     )
     try:
         # Text becomes codes batch by batch: whole columns of it would be most of the memory.

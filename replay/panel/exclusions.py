@@ -77,6 +77,8 @@ def leave_out(table: pa.Table, mixture: Mixture, evaluation_split: Bools, as_of_
         )
     if mixture.unlabelled == "drop":
         out.add("without a coverage label", bare)
+    if mixture.uncertain == "drop":
+        out.add("with a condition too near to call", bools(table, "uncertain"))
     return out
 
 

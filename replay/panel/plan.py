@@ -72,6 +72,7 @@ class PanelPlan:
     newest_ns: int  # when the newest row was logged
     as_of_ns: int | None  # what max_age_days counted to, where there is one
     others: tuple[PinnedStore, ...] = ()  # besides the first store
+    uncertain_rows: int = 0  # with a condition too near to call, whatever the mixture does of it
     ratios: tuple[RatioFit, ...] = ()  # where a correction is by density ratio
 
     @property
@@ -282,6 +283,7 @@ def _joined(
         newest_ns=int(table["logged_ns"].to_numpy().max()),
         as_of_ns=None if mixture.max_age_days is None else as_of_ns,
         others=tuple(others),
+        uncertain_rows=int(bools(table, "uncertain").sum()),
         ratios=tuple(plan.fit for plan in worked_out if plan.fit is not None),
     )
 

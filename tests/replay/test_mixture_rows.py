@@ -56,7 +56,9 @@ def test_a_stratum_of_episodes_has_all_rows_of_those_that_met_it(
 ) -> None:
     plan = planned(
         transitions,
-        NO_SPLIT + f"[each_condition]\nunit = 'episode'\nmin_steps = {min_steps}\n",
+        "prefer = 'priority'\nuncertain = 'keep'\n"
+        + NO_SPLIT
+        + f"[each_condition]\nunit = 'episode'\nmin_steps = {min_steps}\n",
     )
     assert len(plan.panel_rows) == len(transitions)  # nominal is what is left
     rows = taken(plan)
@@ -287,3 +289,39 @@ def test_the_schema_accepts_and_refuses_as_the_reader_does(text: str, ok: bool) 
     else:
         with pytest.raises(jsonschema.ValidationError):
             jsonschema.validate(tomllib.loads(text), schema)
+
+
+def test_rows_too_near_to_call_are_kept_dropped_or_nominal(transitions: pa.Table) -> None:
+    labels = transitions["conditions"].to_pylist()
+    # Every third slip, and some rows that are labelled as nothing, may be a slip or not.
+    slips = [i for i, held in enumerate(labels) if held == ["wheel_slip"]]
+    doubtful = {*slips[::3], *[i for i, held in enumerate(labels) if not held][:40]}
+    assert len(slips[::3]) > 3
+    place = transitions.schema.get_field_index("uncertain")
+    field = pa.field("uncertain", pa.list_(pa.string()))
+    values = [["wheel_slip"] if row in doubtful else [] for row in range(len(labels))]
+    table = transitions.set_column(place, field, pa.array(values, field.type))
+    table = table.set_column(  # and the label decides nothing where there is no such rule
+        place, field, pa.array([None if i % 7 == 0 and not v else v for i, v in enumerate(values)])
+    )
+
+    def planned_as(key: str) -> tuple[PanelPlan, dict[str, int]]:
+        plan = planned(table, key + NO_SPLIT + EVERY)
+        assert plan.uncertain_rows == len(doubtful)
+        return plan, {line.name: line.rows for line in plan.strata}
+
+    _, before = planned_as("uncertain = 'keep'\n")
+    plan, rows = planned_as("")
+    assert plan.left_out == {}
+    assert rows["wheel_slip"] == before["wheel_slip"] - len(slips[::3])
+    assert rows["nominal"] == before["nominal"] + len(slips[::3])
+    # What the panel says of a row is what the store says.
+    by_id = dict(zip(transitions["transition_id"].to_pylist(), labels, strict=True))
+    condition = taken(plan).select(["transition_id", "condition"]).to_pylist()
+    assert sum(row["condition"] == "wheel_slip" for row in condition) >= len(slips)
+    assert all(row["condition"] in [*by_id[row["transition_id"]], "nominal"] for row in condition)
+    plan, rows = planned_as("uncertain = 'drop'\n")
+    assert plan.left_out == {"with a condition too near to call": len(doubtful)}
+    assert rows["wheel_slip"] == before["wheel_slip"] - len(slips[::3])
+    older = table.drop_columns(["uncertain"])
+    assert planned(older, "uncertain = 'drop'\n" + NO_SPLIT + EVERY).left_out == {}

@@ -34,6 +34,7 @@ from restock.replay.store.store import Store
 
 
 def uniform(**changes: object) -> Mixture:
+    changes.setdefault("uncertain", "keep")
     split = f"[evaluation_split]\nby = '{changes.pop('by', 'none')}'\n"
     text = f"[each_condition]\nshare = 'natural'\n{split}"
     top = "".join(f"{name} = {json.dumps(value)}\n" for name, value in changes.items())
@@ -392,6 +393,7 @@ def test_an_edited_header_is_refused(transitions: pa.Table, tmp_path: Path) -> N
 
 GOLDEN = """
 n_step = 3
+uncertain = "keep"
 return_to_go = true
 evaluation_split = {by = "episode", share = 0.2}
 [correction]

@@ -16,6 +16,11 @@ if TYPE_CHECKING:
     from restock.replay.panel.plan import PanelPlan
     from restock.replay.panel.strata import Stratum
 
+_UNCERTAIN = {
+    "drop": "they are left out",
+    "keep": "their labels count as they are",
+    "nominal": "it does not count as held",
+}
 _WIDE = 110  # columns of a terminal from which on the table says more
 
 
@@ -122,6 +127,8 @@ def describe(plan: PanelPlan) -> dict[str, Any]:
         "strata": [_line(stratum) for stratum in plan.strata],
         "rows": len(plan.panel_rows),
         "left_out": plan.left_out,
+        "uncertain_rows": plan.uncertain_rows,
+        "uncertain": plan.mixture.uncertain,
         "logs_share": plan.logs_share,
         "logs_share_wanted": plan.logs_share_wanted,
         "effective_rows": plan.effective_rows,
@@ -186,7 +193,7 @@ def _missing(line: dict[str, Any]) -> str:
         return ""
     text = f"; {line['missing_rows']:,} more rows would fill it"
     if line["missing_hours"] is None:
-        return f"{text}, and these logs hold none"
+        return f"{text}, and none of these logs went to it"
     hours = line["missing_hours"]
     took = f"{hours:,.1f} hours" if hours >= 1 else f"{60 * hours:,.0f} minutes"
     return f"{text}: about {took} of logging at the rate of these logs"
@@ -231,6 +238,11 @@ def _summary(document: dict[str, Any]) -> list[str]:
         lines.append(
             f"profiles of this task: {', '.join(read_by)}; the panel carries {read_by[0]}, of the"
             " newest ingest"
+        )
+    if document["uncertain_rows"]:
+        lines.append(
+            f"{document['uncertain_rows']:,} rows have a condition too near to call:"
+            f" {_UNCERTAIN[document['uncertain']]}"
         )
     rules = dict.fromkeys(line["within"] for line in document["strata"])
     of_rule = {
