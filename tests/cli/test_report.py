@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from html import escape
 from html.parser import HTMLParser
 from itertools import pairwise
 from pathlib import Path
@@ -19,6 +20,8 @@ from support.stores import TASK
 from restock import cli
 from restock.errors import RunError
 from restock.replay.mixture.mixture import parse_mixture
+from restock.replay.panel.panel import Panel
+from restock.replay.store.capacity import capacity_of_rows
 from restock.report import build_report
 from restock.report.facts import evaluation_bias, gather
 from restock.stats import ConfidenceInterval
@@ -69,6 +72,27 @@ def run(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
             for n in steps
             for source in ("logs", "fresh")
             for name, rows in (("nominal", 90), (HOSTILE, 10))
+        ],
+    )
+    # Of three actions the logs never have the last, which the policy takes in 18 of 60 rows.
+    made.append(
+        "actions",
+        [
+            filled(
+                "actions",
+                gradient_steps=1000,
+                source=source,
+                stratum=name,
+                condition=name,
+                action=action,
+                name=("stop", "drive 1", HOSTILE)[action],
+                drawn_rows=rows[action],
+                audited_rows=60,
+                greedy_rows=(2, 40, 18)[action],
+            )
+            for source, rows in (("logs", (500, 500, 0)), ("fresh", (300, 2, 698)))
+            for name in ("nominal", HOSTILE)
+            for action in range(3)
         ],
     )
     estimates = {"fqe": {"refused": None}, "wdr": {"value": None, "refused": HOSTILE}}
@@ -215,12 +239,46 @@ def test_every_section_has_its_figures(html: str) -> None:
     for section, figures in (
         ("success", 1),
         ("fed", 3),
+        ("actions", 1),
+        ("capacity", 1),
         ("learning", 2),
         ("critic", 2),
         ("map", 2),
     ):
         part = html.split(f'<section id="{section}">')[1].split("</section>")[0]
         assert part.count("<svg") == figures, section
+
+
+def rows_of(html: str, section: str) -> list[list[str]]:
+    """The cells of the rows of a section's tables."""
+    part = html.split(f'<section id="{section}">')[1].split("</section>")[0]
+    lines = re.findall(r"<tr>(.*?)</tr>", part, re.DOTALL)
+    return [re.findall(r"<td[^>]*>(.*?)</td>", line, re.DOTALL) for line in lines]
+
+
+def test_an_action_that_is_wanted_and_not_in_the_logs_is_on_the_page(html: str) -> None:
+    table = [row for row in rows_of(html, "actions") if row]
+    assert {(row[0], row[2], row[3], row[4]) for row in table if "alert" in row[1]} == {
+        ("nominal", "30%", "0.0%", "70%"),
+        (escape(HOSTILE.replace("_", " ")), "30%", "0.0%", "70%"),
+    }
+    assert not any(row[1] == "drive 1" for row in table)  # wanted, and in half of the logs
+    part = html.split('<section id="actions">')[1].split("</section>")[0]
+    assert "&lt;1%" in part  # 2 of 1,000 fresh rows: seldom …
+    assert ">0<" in part  # … is not never
+
+
+def test_the_curve_of_capacity_is_on_the_page(html: str, run: Path) -> None:
+    found = capacity_of_rows(Panel.open(Path(Run.open(run).document["panel"]["path"])).meta)
+    part = html.split('<section id="capacity">')[1].split("</section>")[0]
+    assert "The ring holds 4,096 rows" in part
+    assert found.reason in part
+    last = found.curve[-1]
+    assert rows_of(html, "capacity")[-1][:3] == [
+        f"{last['capacity']:,}",
+        str(last["cells"]),
+        "100%",
+    ]
 
 
 def test_estimates_from_logs_are_on_the_page_with_what_was_refused(html: str) -> None:

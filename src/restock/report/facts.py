@@ -24,7 +24,7 @@ CELL_M = 0.25
 NO_GOAL = "The task has no goal: success is not defined, and no evaluation shows it."
 MOST_DOTS = 1500
 _TABLES = (  # of a run, that run.sql asks
-    *("strata", "conditions", "ages", "policies", "evaluations", "probe", "progress"),
+    *("strata", "conditions", "actions", "ages", "policies", "evaluations", "probe", "progress"),
 )
 
 
@@ -36,6 +36,7 @@ class Facts:
     config: dict[str, Any]
     sampled: Rows  # per source and stratum: available, intended, drawn
     conditions: Rows  # in the batches, whatever the strata are
+    actions: Rows  # in the batches, and wanted, by source, stratum and condition
     ages: Rows
     policies: Rows
     learning: Rows

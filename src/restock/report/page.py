@@ -5,7 +5,9 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
+from restock.report.actions import actions_section
 from restock.report.blocks import span, words
+from restock.report.capacity import capacity_section
 from restock.report.facts import Facts, mean_success
 from restock.report.sections import critic, floor_section, learning, provenance, sampled, success
 from restock.report.twin_gap import run_section
@@ -16,6 +18,8 @@ def page(facts: Facts) -> dict[str, Any]:
     sections = [
         success(facts),
         sampled(facts),
+        actions_section(facts),
+        capacity_section(facts),
         learning(facts),
         critic(facts),
         floor_section(facts),

@@ -40,6 +40,26 @@ FROM drawn
 GROUP BY source, condition
 ORDER BY source DESC, drawn_share DESC;
 
+-- name: actions
+-- What batches held of each action, and what the policy wanted in the last quarter of the updates.
+WITH counted AS (
+    SELECT source, stratum, condition, action, any_value(name) AS name,
+           sum(drawn_rows) AS drawn_rows,
+           sum(greedy_rows) FILTER (
+               gradient_steps > 0.75 * (SELECT max(gradient_steps) FROM actions)
+           ) AS wanted_rows
+    FROM actions
+    WHERE condition <> 'unlabelled'
+    GROUP BY source, stratum, condition, action
+)
+SELECT source, stratum, condition, action, name, drawn_rows,
+       drawn_rows / sum(drawn_rows) OVER cell AS drawn_share,
+       wanted_rows / nullif(sum(wanted_rows) OVER cell, 0) AS wanted_share,
+       sum(wanted_rows) OVER cell AS audited_rows
+FROM counted
+WINDOW cell AS (PARTITION BY source, stratum, condition)
+ORDER BY source DESC, stratum, condition, action;
+
 -- name: ages
 -- Age histogram per source: days for logs, environment steps for fresh rows.
 SELECT source, unit, bucket, sum(count) AS rows,

@@ -1,0 +1,132 @@
+"""The section on actions: what batches held of each, and which the policy wants instead."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import altair as alt
+
+from restock.report import charts
+from restock.report.blocks import Figure, Rows, Section, Table, count, percent, words
+from restock.report.facts import Facts
+
+KINDS = ("logs", "fresh", "wanted")
+_LEAST_AUDITED = 20  # rows in which the policy was asked, for a line of the table
+_LINES = 12
+
+
+def actions_section(facts: Facts) -> Section | None:
+    """None for a run that kept no such counts."""
+    if not facts.actions:
+        return None
+    cells = _cells(facts.actions)
+    return Section(
+        "actions",
+        "Which actions did it see, and which does it want?",
+        intro="Of each condition's sampled rows, those with an action: in batches from logs, in"
+        " fresh rows, and those of the fresh rows where the policy would take it (of audited"
+        " batches, in the last quarter of the updates). Of an action that is wanted and not in the"
+        " logs, the logs do not tell what it leads to; `restock diagnose` says when that is a"
+        " cause of failure.",
+        figures=[Figure(_heatmap(cells), "Share of a condition's rows by action")],
+        tables=_table(facts.actions),
+    )
+
+
+def _row_name(row: dict[str, Any]) -> str:
+    """A condition, or the stratum of logs that it is a part of."""
+    stratum, condition = words(row["stratum"]), words(row["condition"])
+    return condition if stratum == condition else f"{stratum}: {condition}"
+
+
+def _cells(rows: Rows) -> Rows:
+    """One a source, condition and action, with the share of its rows; `wanted` is a source here."""
+    cells: Rows = []
+    for row in rows:
+        name = _row_name(row)
+        shares = {row["source"]: row["drawn_share"]}
+        if row["source"] == "fresh":
+            shares["wanted"] = row["wanted_share"]
+        cells += [
+            {
+                **{"row": name, "action": row["name"], "order": row["action"]},
+                **{"kind": kind, "share": share, "text": _short(share)},
+            }
+            for kind, share in shares.items()
+            if share is not None
+        ]
+    return cells
+
+
+def _short(share: float) -> str:
+    """A share in a tile: never is not the same as seldom."""
+    if not share:
+        return "0"
+    return f"{share:.0%}" if share >= 0.01 else "<1%"
+
+
+def _heatmap(cells: Rows) -> str:
+    kinds = [kind for kind in KINDS if any(cell["kind"] == kind for cell in cells)]
+    actions = [c["action"] for c in sorted(cells, key=lambda cell: int(cell["order"]))]
+    base = charts.plot(cells).encode(
+        x=alt.X(
+            "action:N",
+            sort=list(dict.fromkeys(actions)),
+            title=None,
+            axis=alt.Axis(labelAngle=-35, grid=False, ticks=False),
+        ),
+        y=alt.Y("row:N", title=None, axis=alt.Axis(grid=False, ticks=False)),
+    )
+    tiles = base.mark_rect(stroke="#ffffff").encode(
+        color=alt.Color(
+            "share:Q",
+            scale=alt.Scale(type="sqrt", domain=[0, 1], range=["#f1f5f9", "#0f766e"]),
+            legend=None,
+        )
+    )
+    numbers = base.mark_text(fontSize=10).encode(
+        text="text:N",
+        color=alt.condition("datum.share > 0.35", alt.value("#ffffff"), alt.value("#334155")),
+    )
+    layered = alt.layer(tiles, numbers).properties(width=620, height=alt.Step(24))
+    facets = layered.facet(row=alt.Row("kind:N", sort=kinds, header=alt.Header(labelAngle=0)))
+    return charts.svg(facets.resolve_scale(y="independent"))
+
+
+def _table(rows: Rows) -> list[Table]:
+    """What the policy wants most beyond what the logs have, by condition."""
+    logged: dict[tuple[str, int], int] = {}
+    of_condition: dict[str, int] = {}
+    for row in rows:
+        if row["source"] == "logs":
+            key = row["condition"], row["action"]
+            logged[key] = logged.get(key, 0) + row["drawn_rows"]
+            of_condition[row["condition"]] = (
+                of_condition.get(row["condition"], 0) + row["drawn_rows"]
+            )
+    gaps = []
+    for row in rows:
+        drawn = of_condition.get(row["condition"], 0)
+        if row["source"] != "fresh" or not drawn or (row["audited_rows"] or 0) < _LEAST_AUDITED:
+            continue
+        share = logged.get((row["condition"], row["action"]), 0) / drawn
+        if row["wanted_share"] > 2 * share:
+            gaps.append((row["wanted_share"] - share, share, row))
+    gaps.sort(key=lambda gap: -gap[0])
+    lines = [
+        {
+            "condition": words(row["condition"]),
+            "action": row["name"],
+            "wanted": percent(row["wanted_share"]),
+            "in the logs": percent(share),
+            "in fresh rows": percent(row["drawn_share"]),
+            "rows looked at": count(row["audited_rows"]),
+        }
+        for _, share, row in gaps[:_LINES]
+    ]
+    numbers = {"wanted", "in the logs", "in fresh rows", "rows looked at"}
+    title = "Wanted more than twice as often as the logs have it"
+    return [Table(lines, numbers, title=title)] if lines else []
+
+
+__all__ = ["actions_section"]
