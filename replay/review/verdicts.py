@@ -110,7 +110,8 @@ class _Reading:
         self._refuse()
         episodes = self._episodes(verdicts)
         known = dict(self.store.connection.sql(_CONDITIONS).fetchall())
-        now, given = dt.datetime.now(dt.UTC), {}
+        now = dt.datetime.now(dt.UTC)
+        given: dict[str, RecordingCorrections] = {}
         said: dict[tuple[str, str], Ints] = {}  # episode, condition -> line that spoke of each row
         for verdict in verdicts:
             episode = self._episode_of(verdict, episodes)
@@ -229,8 +230,8 @@ class _Reading:
         wanted = sorted({verdict.place for verdict in verdicts})
         table = self.store.connection.sql(_ROWS, params={"wanted": wanted}).to_arrow_table()
         found: dict[str, list[_Episode]] = {}
-        ids = np.asarray(table["episode_id"].to_pylist(), object)
-        begins = np.flatnonzero(np.append(True, ids[1:] != ids[:-1])) if len(ids) else []
+        ids = table["episode_id"].to_pylist()
+        begins = [row for row in range(len(ids)) if row == 0 or ids[row] != ids[row - 1]]
         for begin, end in zip(begins, [*begins[1:], len(ids)], strict=True):
             part = table.slice(begin, end - begin)
             first = part.slice(0, 1).to_pylist()[0]

@@ -106,11 +106,8 @@ def test_corrections_survive_new_rules_a_new_ingest_and_a_changed_profile(
     assert version.startswith(f"{rules}+")
 
     capsys.readouterr()
-    assert ingest(tmp_path) == 0  # unchanged: its definitions are what they were
+    assert ingest(tmp_path) == 0  # its definitions are what they were
     assert "unchanged" in capsys.readouterr().out
-    assert ingest(tmp_path, force=True) == 0
-    assert "2 corrections of its labels are kept" in capsys.readouterr().out
-    assert soon(store) == wanted
 
     profile(tmp_path, FURTHER)  # other rules
     conditions = load_profile(tmp_path / "amr.toml").conditions
@@ -120,10 +117,11 @@ def test_corrections_survive_new_rules_a_new_ingest_and_a_changed_profile(
     assert len(soon(store)) > 3
 
     (tmp_path / "amr.toml").write_text(WAREHOUSE)  # no such condition: kept, and said
-    assert ingest(tmp_path, force=True) == 0
+    assert ingest(tmp_path) == 0
     assert "2 of them speak of conditions or steps that are gone" in capsys.readouterr().out
     profile(tmp_path, HALF_WAY)
-    assert ingest(tmp_path, force=True) == 0
+    assert ingest(tmp_path) == 0
+    assert "2 corrections of its labels are kept" in capsys.readouterr().out
     assert soon(store) == wanted
 
 
@@ -147,13 +145,15 @@ def test_a_recording_that_was_ingested_meanwhile_is_not_corrected(store: Path) -
         correct_store(StoreWriter(store), given)
 
 
-def test_a_corrected_recording_is_not_stale_and_its_panel_says_so(
+def test_views_and_panels_show_corrections_and_stale_labels_does_not(
     store: Path, tmp_path: Path
 ) -> None:
     mixture = "[each_condition]\nshare = 'natural'\n[evaluation_split]\nby = 'none'\n"
     plain = panel_of(store, mixture, tmp_path / "plain").header.labels_version
     said(store, 2, 4, True)
     with Store(store) as opened:
+        query = "SELECT condition, value, rows, last_ns > first_ns, given_at FROM corrections"
+        assert opened.sql(query).fetchall() == [("soon", True, 3, True, NOW)]
         stale = (files("restock.replay.store") / "audits" / "stale_labels.sql").read_text("utf-8")
         assert opened.sql(stale).fetchall() == []
     corrected = panel_of(store, mixture, tmp_path / "corrected").header.labels_version
@@ -248,15 +248,6 @@ def test_times_that_a_clock_repeats_are_told_apart_by_the_episode() -> None:
     # Split otherwise since, by another profile: the time says which rows.
     moved = Correction("x", True, 7, 10, 10, NOW)
     assert moments.covered(moved).tolist() == [True, False, True, False]
-
-
-def test_the_view_lists_them_and_a_store_without_has_none(store: Path) -> None:
-    with Store(store) as opened:
-        assert opened.sql("FROM corrections").fetchall() == []
-    said(store, 2, 4, True)
-    with Store(store) as opened:
-        query = "SELECT condition, value, rows, last_ns > first_ns, given_at FROM corrections"
-        assert opened.sql(query).fetchall() == [("soon", True, 3, True, NOW)]
 
 
 def test_label_uses_the_profile_that_the_store_keeps_where_its_file_is_gone(

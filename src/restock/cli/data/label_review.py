@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,8 +45,10 @@ def review(path: Path, most: int, out: Path | None, *, json: bool) -> int:
         output.stdout().print("no event of a label is in doubt, or none is left to review")
         return ExitCode.OK
     output.print_table([_line(row) for row in rows], title="the most doubtful events first")
-    output.say(f"to look at the first: {rows[0]['open']}")
-    output.say(
+    # A command is one line, however narrow the terminal.
+    say = partial(output.stderr().print, soft_wrap=True, highlight=False, markup=False)
+    say(f"to look at the first: {rows[0]['open']}")
+    say(
         f"write yes, no or FIRST..LAST (its true steps) into the last column of {out}, then:"
         f" restock label {path} --corrections {out}"
         if out is not None
