@@ -79,9 +79,14 @@ WITH valued AS (
 ), means AS (
     SELECT
         * EXCLUDE (squares),
-        -- Of the mean: from how the robot's samples vary within its periods, all of them together.
-        sum(squares) FILTER (period IS NOT NULL) OVER own
-            / nullif(sum(kept - 1) FILTER (period IS NOT NULL) OVER own, 0) / kept AS variance,
+        -- Of the mean: from how the robot's samples vary within its periods, all of them together. They
+        -- are not believed to vary by less than a tenth of what matters.
+        greatest(
+            sum(squares) FILTER (period IS NOT NULL) OVER own
+                / nullif(sum(kept - 1) FILTER (period IS NOT NULL) OVER own, 0),
+            CASE compared WHEN 'ratio' THEN pow(ln(matters) / 10, 2)
+                WHEN 'difference' THEN pow(matters / 10, 2) ELSE 0 END
+        ) / kept AS variance,
         sum(kept - 1) FILTER (period IS NOT NULL) OVER own AS df
     FROM spreads
     WINDOW own AS (PARTITION BY robot, signal, samples)
@@ -236,7 +241,6 @@ WITH valued AS (
     SELECT
         *,
         mean - mean_reference AS difference,
-        -- Values that never vary have no error: the chance of their order is all there is.
         CASE WHEN variance > 0 THEN (mean - mean_reference) / sqrt(variance) END AS t,
         CASE compared WHEN 'ratio' THEN exp(mean) ELSE mean END AS value,
         CASE compared WHEN 'ratio' THEN exp(mean_reference) ELSE mean_reference END AS reference_value
@@ -282,9 +286,8 @@ WITH valued AS (
     SELECT
         * REPLACE (CASE WHEN enough THEN difference / unit END AS difference, variance / unit / unit AS variance),
         CASE WHEN NOT enough THEN NULL
-            WHEN variance > 0 THEN student_p(t, df)
             WHEN difference = 0 THEN 1
-            ELSE 2 * exp(lgamma(n + 1) + lgamma(n_reference + 1) - lgamma(n + n_reference + 1))
+            WHEN variance > 0 THEN student_p(t, df)
         END AS p,
         student_quantile(df) * sqrt(variance) / unit AS half,
         against || CASE WHEN part IN ('driving', 'conditions') THEN part ELSE 'robot' END AS family
@@ -307,7 +310,7 @@ WITH valued AS (
         * REPLACE (CASE WHEN p IS NOT NULL THEN q END AS q),
         abs(difference) / step AS size,
         CASE
-            WHEN p IS NULL THEN 'too few'
+            WHEN NOT enough THEN 'too few'
             WHEN q < 0.05 AND abs(difference) >= step THEN 'changed'
             WHEN abs(difference) + half < step THEN 'unchanged'
             ELSE 'undecided'

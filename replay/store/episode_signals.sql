@@ -18,7 +18,7 @@ FROM (VALUES
     ('localiser_jitter_mps', 'localiser', 'ratio', 1.4, 10),
     ('localiser_age_s', 'localiser', 'difference', 0.05, 1),
     ('lidar_noise_m', 'lidar', 'ratio', 1.3, 10),
-    ('blind_sectors', 'lidar', 'difference', 0.5, 10),
+    ('silent_sectors', 'lidar', 'difference', 0.5, 10),
     ('vibration_mps2', 'floor', 'ratio', 1.4, 10),
     ('wheel_speed_mps', 'driving', 'spread', 0.8, 1),
     ('wheel_yaw_rate_radps', 'driving', 'spread', 0.8, 1),
@@ -104,8 +104,8 @@ WITH tasks AS (
                 THEN abs(m[1] - 2 * m[2] + m[3]) END
         )) END AS unevenness_m
     FROM kinds
-), blind AS (
-    SELECT episode_id, count(*) FILTER (spread_m < 0.005) AS blind_sectors
+), silent AS ( -- dead, covered, or open space: they look the same
+    SELECT episode_id, count(*) FILTER (spread_m < 0.005) AS silent_sectors
     FROM (
         SELECT episode_id, sector, max(m) - min(m) AS spread_m
         FROM (
@@ -181,7 +181,7 @@ WITH tasks AS (
                 value: median(unevenness_m) / 0.6745 / sqrt(6),
                 steps: count(unevenness_m)
             },
-            {signal: 'blind_sectors', value: any_value(blind_sectors)::DOUBLE, steps: count(*)},
+            {signal: 'silent_sectors', value: any_value(silent_sectors)::DOUBLE, steps: count(*)},
             {signal: 'wheel_speed_mps', value: avg(wheel_speed_mps), steps: count(wheel_speed_mps)},
             {
                 signal: 'wheel_yaw_rate_radps',
@@ -211,7 +211,7 @@ WITH tasks AS (
             {signal: 'reward', value: avg(reward), steps: count(reward)}
         ], recursive := true)
     FROM flagged
-    LEFT JOIN blind USING (episode_id)
+    LEFT JOIN silent USING (episode_id)
     GROUP BY recording_id, episode_id
 )
 SELECT

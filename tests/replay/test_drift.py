@@ -217,17 +217,21 @@ def test_robots_of_another_site_are_not_compared_with() -> None:
     assert [(row["robot"], row["scope"]) for row in found] == [("b", "alone")]
 
 
-def test_a_noisier_lidar_and_a_slippery_floor_are_told_apart() -> None:
+def test_lidar_and_floor_are_told_apart() -> None:
     robots = [
         SyntheticRobot("a", changes={"lidar_noise_m": 3.0}),
         SyntheticRobot("b", changes={"slips_per_step": 8.0}),
-        SyntheticRobot("c"),
+        SyntheticRobot("c", changes={"silent_sectors": 1}),
     ]
     found = rows(fleet(robots, recordings=3), "FROM drift_findings WHERE zone IS NULL")
     parts = {
         (row["robot"], row["part"], row["signal"]) for row in found if row["part"] != "driving"
     }
-    assert parts == {("a", "lidar", "lidar_noise_m"), ("b", "conditions", "wheel_slip")}
+    assert parts == {
+        ("a", "lidar", "lidar_noise_m"),
+        ("b", "conditions", "wheel_slip"),
+        ("c", "lidar", "silent_sectors"),
+    }
 
 
 def test_too_few_episodes_is_a_verdict() -> None:
@@ -254,10 +258,12 @@ def test_signals_that_a_robot_lacks_are_not_made_up() -> None:
     assert not signals & (lacking | {"localised_speed_mps", "gyro_yaw_rate_radps"})
 
 
-def test_values_that_never_vary_have_the_p_of_their_order() -> None:
+def test_values_that_never_vary_are_believed_to_a_tenth_of_what_matters() -> None:
     table = samples({("a", "x", 0): [np.zeros(6)], ("a", "x", 1): [np.ones(5)]})
     [row] = rows(of_samples(table), "FROM drift WHERE against = 'own reference'")
-    assert row["p"] == pytest.approx(2 / 462)  # 11 over 5
+    t = 1 / np.sqrt(0.01**2 * (1 / 6 + 1 / 5))
+    assert row["verdict"] == "changed"
+    assert row["p"] == pytest.approx(max(2 * stats.t.sf(t, 9), 1e-15), rel=1e-3)
     same = samples({("a", "x", 0): [np.zeros(6)], ("a", "x", 1): [np.zeros(5)]})
     [row] = rows(of_samples(same), "FROM drift WHERE against = 'own reference'")
     assert (row["p"], row["verdict"]) == (1, "unchanged")

@@ -32,7 +32,7 @@ class SyntheticRobot:
     odometry_scale: float = 1.0  # metres driven a metre that the wheels report
     lidar_noise_m: float = 0.01
     slips_per_step: float = 0.01
-    changes: Mapping[str, float] = field(default_factory=dict)  # what is multiplied
+    changes: Mapping[str, float] = field(default_factory=dict)  # factors; silent_sectors: how many
     changes_in_week: int = 3
     localiser: bool = True
     gyro: bool = True
@@ -100,6 +100,7 @@ def _drive(robot: SyntheticRobot, number: int, week: int, episodes: int, seed: i
     clearance = (
         1.5 + wander(rng, rows, 0.2, 0.999)[:, None] + rng.normal(0, noise, (rows, TASK.sectors))
     )
+    clearance[:, : int(factor.get("silent_sectors", 0))] = TASK.range_max_m
     nearness = np.sqrt(np.clip(clearance / TASK.range_max_m, 0, 1))
     observation = np.stack(table["observation"].to_pylist()).astype(np.float32)
     observation[:, -2 * TASK.sectors : -TASK.sectors] = nearness
