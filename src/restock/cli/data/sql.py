@@ -26,10 +26,10 @@ class SqlCommand:
     """Any question to a store, a run directory or a panel, in DuckDB's SQL.
 
     A store has the views transitions, recordings, episodes, coverage, coverage_by_condition,
-    missing_cells, reward_mix, ages, label_overlap, versions, conditions, actions, drops, topics
-    label_scores, drift and signal_weeks; `restock sql STORE "FROM columns"` lists every column with its meaning. A run
-    has its tables (progress, strata, ages, audit, …) and the view replay_audit; a panel has `rows`,
-    `strata` and `evaluation_split`.
+    missing_cells, reward_mix, ages, label_overlap, versions, conditions, actions, drops, topics,
+    label_scores, drift and signal_weeks; `restock sql STORE "FROM columns"` lists every column
+    with its meaning. A run has its tables (progress, strata, ages, audit, …) and the view
+    replay_audit; a panel has `rows`, `strata` and `evaluation_split`.
     A terminal shows the first 40 rows and cuts long lists; a file or a pipe gets all.
     Queries are read-only, and Ctrl-C stops one. Without a query there is a prompt.
     """
