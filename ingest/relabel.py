@@ -29,6 +29,7 @@ from restock.ingest.store.corrections import correction_rows, corrections_in, la
 from restock.ingest.store.episode_rows import episode_ends
 from restock.ingest.store.manifest import conditions_json, count_rows, score_rows
 from restock.ingest.store.transitions import by_name, column_array, names_of
+from restock.ingest.store.version import Version
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.conditions import (
     NOMINAL,
@@ -67,8 +68,11 @@ def relabel_store(
     conditions_of: Callable[[str], Sequence[Condition]],
     *,
     dry_run: bool = False,
+    version: Version | None = None,
 ) -> tuple[list[Relabelled], int | None]:
     """Label every recording again whose conditions have changed.
+
+    A `version` of the store is labelled in a dry run alone: what was is not written over.
 
     `conditions_of` gives the conditions for the profile (by name) that read a recording. Returns
     what became of each, and the version of `transitions` (None where nothing was written).
@@ -77,11 +81,17 @@ def relabel_store(
         StoreError: rows were written before their episodes' ends were kept, or changed meanwhile.
         ConfigError: a condition's SQL does not run over the signals that are stored.
     """
+    if version is not None and not dry_run:
+        raise StoreError(
+            "a version that was cannot be labelled again",
+            where=str(store.path),
+            remedy="give --dry-run to see what would change, or leave --version out",
+        )
     outcomes: list[Relabelled] = []
     stale: list[dict[str, Any]] = []
-    for row in store.live().to_pylist():
-        version = labels_version(conditions_of(row["profile"]))
-        if rules_of(row["labels_version"]) == version:
+    for row in store.live(version=version).to_pylist():
+        rules = labels_version(conditions_of(row["profile"]))
+        if rules_of(row["labels_version"]) == rules:
             same = (row["labels_version"], row["labels_version"])
             outcomes.append(Relabelled(row["recording_id"], row["source_file"], *same))
         else:

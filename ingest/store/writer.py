@@ -41,6 +41,7 @@ from restock.ingest.store.repeated import (
     read_sketch,
     sketch,
 )
+from restock.ingest.store.version import Version
 from restock.ingest.task.schema import recording_schema
 
 TRANSITIONS, RECORDINGS = "transitions", "recordings"
@@ -66,14 +67,17 @@ class StoreWriter:
         """Check that the place can be reached. Raises StoreError where it cannot."""
         self.path.has_table(TRANSITIONS)
 
-    def live(self, recording_id: str | None = None) -> pa.Table:
-        """The manifest rows whose transitions are in the store (of one recording, or of all)."""
+    def live(self, recording_id: str | None = None, version: Version | None = None) -> pa.Table:
+        """The manifest rows whose transitions are in the store (of one recording, or of all).
+
+        Of a version, or as it is now.
+        """
         empty = recording_schema().empty_table()
         if not self.path.has_table(TRANSITIONS):
             return empty
         parts = [
             self.path.read(f"{RECORDINGS}/{file.path}")
-            for file in _files(self.path.open_table(TRANSITIONS))
+            for file in _files(self.path.open_table(TRANSITIONS, version))
             if recording_id in (None, file.recording_id)
         ]
         return pa.concat_tables([empty, *parts], promote_options="default")

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from restock.errors import StoreError
+from restock.ingest.store.version import Version
 from restock.replay.export.selection import Selection, open_selection
 from restock.replay.export.trajectory import Counts, Trajectory, count_episodes, trajectories
 
@@ -37,6 +38,7 @@ def export_dataset(
     *,
     query: str | None = None,
     panel: str | Path | None = None,
+    version: Version | None = None,
     continuous: bool = False,
     advance: Callable[[int], None] = lambda steps: None,
 ) -> dict[str, Any]:
@@ -46,7 +48,7 @@ def export_dataset(
         source: a store or a panel.
         to: one of FORMATS.
         out: a file or directory that must not exist yet.
-        query, panel, continuous: see `open_selection`.
+        query, panel, version, continuous: see `open_selection`.
         advance: called with the number of steps written, as it goes on.
 
     Returns what was written: the counts of `Counts`, `notes`, and the provenance that the data
@@ -71,7 +73,9 @@ def export_dataset(
         raise StoreError("already there", where=str(out), remedy="choose another name")
     counts = Counts()
     write = getattr(importlib.import_module(f"restock.replay.export.{module}"), f"write_{to}")
-    with open_selection(source, query=query, panel=panel, continuous=continuous) as selection:
+    with open_selection(
+        source, query=query, panel=panel, version=version, continuous=continuous
+    ) as selection:
         episodes = _advancing(_trajectories(selection, counts), advance)
         if (first := next(episodes, None)) is None:
             raise StoreError("no whole transition is left of the rows", where=selection.where)

@@ -16,9 +16,10 @@ import numpy as np
 
 from restock.errors import PanelError, RunError, StoreError
 from restock.files import read_json
+from restock.ingest.store.version import Version
 from restock.replay.panel.panel import HEADER, Panel
 from restock.replay.places import RUN_CONFIG
-from restock.replay.store.store import is_store
+from restock.replay.store.store import Store, is_store
 from restock.replay.trace.origin import Origin, StoreVersion, find_origin, rows_of, sql_file
 
 
@@ -41,6 +42,7 @@ class TracePlaces:
     panel: Path | None = None
     recording: Path | None = None
     profile: str | None = None
+    version: Version | None = None  # of the store that a trace begins at
 
 
 def trace_row(place: str | Path, row: str, where: TracePlaces | None = None) -> Trace:
@@ -59,13 +61,23 @@ def trace_row(place: str | Path, row: str, where: TracePlaces | None = None) -> 
     """
     path, where = Path(place), where or TracePlaces()
     trace = Trace()
+    if where.version is not None and not is_store(str(place)):
+        raise StoreError(
+            "only a store has versions: rows of runs and panels are of the version that was mixed",
+            where=str(place),
+            remedy="leave --version out",
+        )
     if (path / RUN_CONFIG).is_file():
         _of_run(trace, path, row, where)
     elif (path / HEADER).is_file():
         _of_panel(trace, Panel.open(path), _number(row, path, "row number of the panel"), where)
     elif is_store(str(place)):
         number = _number(row, path, "transition id")
-        trace.origin = _origin([StoreVersion(str(place))], number, where)
+        version = None
+        if where.version is not None:
+            with Store(place, version=where.version) as store:
+                version = store.version
+        trace.origin = _origin([StoreVersion(str(place), version)], number, where)
     else:
         raise StoreError(
             "neither a run, a panel nor a store" if path.exists() else "nothing is there",

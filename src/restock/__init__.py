@@ -40,11 +40,15 @@ gymnasium.register(
 )
 
 
-def open(store: str) -> Store:
-    """Open a store of transitions for reading: `restock.open("store").sql("FROM coverage")`."""
+def open(store: str, *, version: int | str | None = None) -> Store:
+    """Open a store of transitions for reading: `restock.open("store").sql("FROM coverage")`.
+
+    `version` opens it as it was: a version's number, or an ISO 8601 time.
+    """
+    from restock.ingest.store.version import given_version
     from restock.replay.store.store import Store
 
-    return Store(store)
+    return Store(store, version=given_version(version) if isinstance(version, str) else version)
 
 
 if not TYPE_CHECKING:

@@ -36,8 +36,8 @@ MAY_IMPORT = {
     "replay/panel": "mixture sampling store ingest/store ingest/task",
     "replay/fleet": "mixture panel store ingest/task",
     "replay/review": "store ingest ingest/store",
-    "replay/trace": "replay panel store ingest/profile ingest/steps ingest/task",
-    "replay/export": "replay panel store ingest/profile ingest/task",
+    "replay/trace": "replay panel store ingest/store ingest/profile ingest/steps ingest/task",
+    "replay/export": "replay panel store ingest/store ingest/profile ingest/task",
     "train": (
         "dqn evaluation feed run twin/env twin/floors twin/physics replay/mixture replay/panel"
         " replay/ring replay/sampling replay/store ingest/profile ingest/store ingest/task"
@@ -80,9 +80,9 @@ MAY_IMPORT = {
         " train/evaluation train/run train/study train/twin/calibration"
     ),
     "cli/twin": (
-        "cli report ingest/profile ingest/task replay/fleet replay/store train/evaluation"
-        " train/twin/calibration train/twin/env train/twin/floors train/twin/physics"
-        " train/twin/recording"
+        "cli report ingest/profile ingest/store ingest/task replay/fleet replay/store"
+        " train/evaluation train/twin/calibration train/twin/env train/twin/floors"
+        " train/twin/physics train/twin/recording"
     ),
 }
 

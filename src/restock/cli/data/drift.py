@@ -38,6 +38,8 @@ class DriftCommand:
     """How many of a robot's first periods its later ones are compared with."""
     least_episodes: int = 5
     """With fewer episodes on a side there is no verdict."""
+    version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
+    """The store as it was: a version's number, or a time (2026-11-01T08:00Z); the newest."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write a page (HTML) that opens without a network. Replaces what is there."""
     exit_code: bool = False
@@ -48,10 +50,11 @@ class DriftCommand:
     def run(self) -> int:
         """Measure, print, and write the page."""
         from restock.cli import output
+        from restock.ingest.store.version import given_version
         from restock.replay.fleet.drift import measure_drift
         from restock.replay.store.store import Store
 
-        with Store(self.store) as store:
+        with Store(self.store, version=given_version(self.version)) as store:
             drift = measure_drift(
                 store,
                 every=self.every,

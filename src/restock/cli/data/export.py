@@ -30,6 +30,8 @@ class ExportCommand:
     """A query for whole transitions of a store (default: all)."""
     panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
     """A panel whose tables the query may use, as panel.rows and panel.strata."""
+    version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
+    """Of a store as it was: a version's number, or a time (2026-11-01T08:00Z); the newest."""
     action: Literal["discrete", "continuous"] = "discrete"
     """The index of the task's action, or the logged command (m/s, rad/s)."""
     json: bool = False
@@ -38,8 +40,12 @@ class ExportCommand:
     def run(self) -> None:
         """Write the data set and say what is in it."""
         from restock.cli import output
+        from restock.errors import StoreError
+        from restock.ingest.store.version import given_version
 
         if self.to == "onnx":
+            if self.version is not None:
+                raise StoreError("only a store has versions", remedy="leave --version out")
             from restock.train.evaluation.onnx_policy import export_onnx
 
             made = export_onnx(self.source, self.out)
@@ -60,6 +66,7 @@ class ExportCommand:
                 self.out,
                 query=self.query,
                 panel=self.panel,
+                version=given_version(self.version),
                 continuous=self.action == "continuous",
                 advance=lambda steps: advance(steps),
             )

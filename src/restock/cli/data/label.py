@@ -47,6 +47,8 @@ class LabelCommand:
     corrections: Annotated[str | None, tyro.conf.arg(metavar="FILE|none")] = None
     """Take the verdicts of a CSV file (see docs/review.md) into the store; `none` takes all
     corrections out."""
+    version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
+    """With --dry-run: of the store as it was, a version's number or a time; the newest."""
     dry_run: bool = False
     """Do everything but write, and print what would change."""
     json: bool = False
@@ -57,6 +59,7 @@ class LabelCommand:
         from restock.cli import output
         from restock.cli.data import label_review
         from restock.ingest.relabel import open_for_relabel, relabel_store
+        from restock.ingest.store.version import given_version
 
         store = open_for_relabel(self.store)
         self._check_options()
@@ -66,7 +69,12 @@ class LabelCommand:
             return label_review.correct(
                 store, self.store, self.corrections, dry_run=self.dry_run, json=self.json
             )
-        outcomes, version = relabel_store(store, self._conditions_of(store), dry_run=self.dry_run)
+        outcomes, version = relabel_store(
+            store,
+            self._conditions_of(store),
+            dry_run=self.dry_run,
+            version=given_version(self.version),
+        )
         rows = [as_json(outcome) for outcome in outcomes]
         if self.json:
             output.print_json({"version": version, "dry_run": self.dry_run, "recordings": rows})
@@ -101,7 +109,11 @@ class LabelCommand:
 
     def _check_options(self) -> None:
         """Raises ConfigError where options do not go together."""
-        of_rules = {"--profile": self.profile is not None, "--all": self.all}
+        of_rules = {
+            "--profile": self.profile is not None,
+            "--all": self.all,
+            "--version": self.version is not None,
+        }
         for verb, given, others in (
             ("--review", self.review is not None, {"--corrections": self.corrections is not None}),
             ("--corrections", self.corrections is not None, {"--out": self.out is not None}),
@@ -115,8 +127,10 @@ class LabelCommand:
     def _conditions_of(self, store: StoreWriter) -> Callable[[str], Sequence[Condition]]:
         from restock.ingest.profile.profile import load_profile
         from restock.ingest.profile.profile_text import read_profile_toml
+        from restock.ingest.store.version import given_version
 
-        carried = {row["profile"]: row["profile_toml"] for row in store.live().to_pylist()}
+        live = store.live(version=given_version(self.version))
+        carried = {row["profile"]: row["profile_toml"] for row in live.to_pylist()}
         given = load_profile(self.profile) if self.profile is not None else None
 
         def conditions_of(name: str) -> Sequence[Condition]:

@@ -37,6 +37,8 @@ class TraceCommand:
     """The profile that read the recording, if it is not a shipped one."""
     store: Annotated[str | None, tyro.conf.arg(metavar="STORE")] = None
     """Where the store is now, if it was moved."""
+    version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
+    """Of a STORE as it was: a version's number, or a time (2026-11-01T08:00Z); the newest."""
     panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
     """Where the panel is now, if it was moved."""
     rows: int = 20
@@ -47,6 +49,7 @@ class TraceCommand:
     def run(self) -> None:
         """Trace, and print what was found."""
         from restock.cli import output
+        from restock.ingest.store.version import given_version
         from restock.replay.trace.trace import TracePlaces, audited_rows, trace_row
 
         if self.row is None:
@@ -58,7 +61,8 @@ class TraceCommand:
             if listed:
                 output.say(f"`restock trace {self.place} {listed[0]['row']}` follows one")
             return
-        where = TracePlaces(self.store, self.panel, self.recording, self.profile)
+        version = given_version(self.version)
+        where = TracePlaces(self.store, self.panel, self.recording, self.profile, version)
         trace = trace_row(self.place, self.row, where)
         if self.json:
             output.print_json(document(trace))

@@ -53,6 +53,8 @@ class FitCommand:
     """Of the search, the draw of segments and the bootstrap."""
     threads: int = 1
     """For the physics; the result does not depend on it."""
+    version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
+    """The store as it was: a version's number, or a time (2026-11-01T08:00Z); the newest."""
     task: str | None = None
     """Hash of the task whose rows are fitted, where the store has several."""
     dry_run: bool = False
@@ -64,13 +66,14 @@ class FitCommand:
         """Fit, print, write."""
         from restock.cli import output
         from restock.errors import ConfigError, ExitCode
+        from restock.ingest.store.version import given_version
         from restock.replay.store.store import Store
         from restock.train.twin.calibration.fitted_twin import write_fit
         from restock.train.twin.calibration.logged_steps import recordings_of
 
         if self.out is not None and self.out.exists():
             raise ConfigError("already exists", where=str(self.out), remedy="name another --out")
-        with Store(self.store) as store:
+        with Store(self.store, version=given_version(self.version)) as store:
             groups: list[tuple[str, ...]] = [self.recording]
             if self.per_recording:
                 groups = [(name,) for name in recordings_of(store, self.recording, self.task)]

@@ -63,6 +63,8 @@ class GapCommand:
     """Physics timestep (default: the perturbation's, .01)."""
     threads: int = 1
     """For the physics; the result does not depend on it."""
+    version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
+    """The store as it was: a version's number, or a time (2026-11-01T08:00Z); the newest."""
     task: str | None = None
     """Hash of the task whose rows are compared, where the store has several."""
     check: bool = False
@@ -75,6 +77,7 @@ class GapCommand:
         """Measure, print, write."""
         from restock.cli import output
         from restock.errors import ConfigError, ExitCode
+        from restock.ingest.store.version import given_version
         from restock.replay.store.store import Store
         from restock.report import write_gap_page
         from restock.toml import typed
@@ -103,7 +106,7 @@ class GapCommand:
         config = typed(values, GapConfig, where="restock twin gap")
         if self.out is not None:
             check_place(self.out)
-        with Store(self.store) as store:
+        with Store(self.store, version=given_version(self.version)) as store:
             notes: tuple[str, ...] = ()
             if self.fit:
                 from restock.train.twin.calibration.fit import FitConfig, fit

@@ -1,0 +1,95 @@
+"""Time travel: every verb that reads a store answers as it was at a version or a time."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+from support.stores import one
+
+import restock
+from restock.cli import main
+from restock.errors import StoreError
+from restock.ingest.store.writer import StoreWriter
+
+VERBS = ("sql", "audit", "gaps", "drift", "mix", "export", "trace", "label")
+
+
+@pytest.fixture(scope="module")
+def versions(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
+    """A store of two recordings, and the version that had one."""
+    path = tmp_path_factory.mktemp("versions") / "store"
+    writer = StoreWriter(path)
+    first = writer.write(*one(1))
+    writer.write(*one(2))
+    return path, first
+
+
+@pytest.mark.parametrize("verb", [*VERBS, "twin fit", "twin gap"])
+def test_the_flag_is_the_same_everywhere(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*verb.split(), "--help"]) == 0
+    assert "--version N|TIME" in capsys.readouterr().out
+
+
+def test_each_reads_what_was(
+    versions: tuple[Path, int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, first = versions
+    store, then = str(path), str(first)
+    rows = one(1)[1]
+
+    def asked(*args: str) -> object:
+        assert main([*args, "--version", then, "--json"]) in (0, 1)
+        return json.loads(capsys.readouterr().out)
+
+    assert asked("sql", store, "SELECT count(*) AS n FROM transitions") == [{"n": len(rows)}]
+    plan = asked("mix", store, "--mixture", "uniform", "--dry-run")
+    assert isinstance(plan, dict)
+    assert plan["store_version"] == first
+    gaps = asked("gaps", store, "--mixture", "uniform")
+    assert isinstance(gaps, dict)
+    assert (gaps["store_version"], gaps["episodes"]) == (first, 12)
+    out = tmp_path / "rows.parquet"
+    asked("export", store, "--to", "parquet", "--out", str(out))
+    assert pq.read_metadata(out).num_rows <= len(rows)
+    identity = rows["transition_id"][0].as_py()
+    found = asked("trace", store, str(identity))
+    assert isinstance(found, dict)
+    assert found["store"]["version"] == first
+    labelled = asked("label", store, "--dry-run")
+    assert isinstance(labelled, dict)
+    assert len(labelled["recordings"]) == 1
+    with restock.open(store, version=first) as opened:
+        assert opened.version == first
+    with restock.open(store, version="2999-01-01T00:00Z") as opened:
+        assert opened.version == first + 1
+
+
+def test_what_has_no_versions_says_so(
+    versions: tuple[Path, int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, first = versions
+    assert main(["label", str(path), "--version", str(first)]) == 2
+    assert "--dry-run" in capsys.readouterr().err
+    assert main(["mix", str(path), "--out", str(tmp_path / "panel")]) == 0
+    for args in (
+        ["sql", str(tmp_path / "panel"), "FROM rows"],
+        ["trace", str(tmp_path / "panel"), "3"],
+        ["export", str(tmp_path / "panel"), "--to", "npz", "--out", str(tmp_path / "x.npz")],
+    ):
+        assert main([*args, "--version", "1"]) == 2
+        assert "only a store has versions" in capsys.readouterr().err
+    with pytest.raises(StoreError, match="neither the number"):
+        restock.open(str(path), version="yesterday")
+
+
+def test_a_version_whose_files_are_gone_says_for_how_long_they_are_kept(tmp_path: Path) -> None:
+    writer = StoreWriter(tmp_path / "store")
+    first = writer.write(*one(1))
+    writer.write(*one(1, ingest="b"))
+    (tmp_path / "store/transitions").joinpath(f"{1:016x}", f"{1:016x}-a.parquet").unlink()
+    with pytest.raises(StoreError, match="cannot be read any more") as error:
+        restock.open(str(tmp_path / "store"), version=first)
+    assert "7 days" in str(error.value)
