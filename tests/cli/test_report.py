@@ -22,7 +22,7 @@ from restock.errors import RunError
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.panel import Panel
 from restock.replay.store.capacity import capacity_of_rows
-from restock.report import build_report
+from restock.report import build_report, shares
 from restock.report.facts import evaluation_bias, gather
 from restock.stats import ConfidenceInterval
 from restock.train.run.run import Run
@@ -428,3 +428,16 @@ def test_the_verb_prints_where_the_page_is(
 def test_what_is_no_run_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["report", str(tmp_path / "nothing")]) == 2
     assert "is not a run directory" in capsys.readouterr().err
+
+
+def test_four_shares_stand_side_by_side_and_a_loss_by_weights_is_said(run: Path) -> None:
+    facts = gather(run)
+    kinds = {row["kind"] for row in shares.bars(facts)}
+    assert kinds == {"natural", "wanted", "drawn", "after weights"}
+    (said,) = shares.remarks(facts)
+    assert "nominal (86.67% of the rows, 90.00% of the draws, 50.00% of the gradient)" in said
+    facts.sampled = [row | {"effective_share": row["drawn_share"]} for row in facts.sampled]
+    assert shares.remarks(facts) == []
+    figure = shares.figure(facts)
+    assert figure is not None
+    assert "after weights" in figure.svg

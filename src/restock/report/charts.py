@@ -28,7 +28,6 @@ CONDITION_COLOURS = {
 SPARE_COLOURS = ("#009e73", "#56b4e9", "#8b5cf6", "#84643a", "#111827")
 POLICY_COLOURS = {"agent": "#0f766e", "planner": "#b45309", "random": "#9ca3af"}
 SOURCE_COLOURS = {"logs": "#334155", "fresh": "#14b8a6"}
-SHARE_COLOURS = {"in the logs": "#cbd5e1", "intended": "#94a3b8", "drawn": "#0f766e"}
 
 _CONFIG = {
     "background": "transparent",
@@ -95,32 +94,6 @@ def success(rows: Sequence[Row]) -> str:
     dots = base.mark_circle(size=70, opacity=1).encode(x=alt.X("success:Q", scale=x_scale))
     layered = alt.layer(bars, dots).properties(width=235, height=46 * max(len(cells), 1))
     return svg(layered.facet(column=alt.Column("perturbation:N", sort=perturbations)))
-
-
-def shares(rows: Sequence[Row]) -> str:
-    """Per stratum, what the logs hold, what was intended and what was drawn.
-
-    Rows of stratum, kind ("in the logs", "intended", "drawn"), share. Square-root axis, so that
-    the rare strata can be seen at all.
-    """
-    strata = list(dict.fromkeys(row["stratum"] for row in rows))
-    kinds = ordered(rows, "kind", SHARE_COLOURS)
-    chart = (
-        plot(rows)
-        .mark_bar(cornerRadiusEnd=2)
-        .encode(
-            y=alt.Y("stratum:N", sort=strata, title=None, axis=alt.Axis(grid=False, ticks=False)),
-            yOffset=alt.YOffset("kind:N", sort=kinds),
-            x=alt.X(
-                "share:Q",
-                title="share of rows (square-root axis)",
-                scale=alt.Scale(type="sqrt"),
-                axis=alt.Axis(format="%", values=[0, 0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 1]),
-            ),
-            color=alt.Color("kind:N", scale=scale(kinds, SHARE_COLOURS), sort=kinds),
-        )
-    )
-    return svg(chart.properties(width=520, height=44 * max(len(strata), 1)))
 
 
 def lines(

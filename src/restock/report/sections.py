@@ -6,7 +6,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from restock.report import charts, floor_map
+from restock.report import charts, floor_map, shares
 from restock.report.blocks import (
     Figure,
     Rows,
@@ -14,8 +14,6 @@ from restock.report.blocks import (
     Table,
     count,
     estimate,
-    number,
-    percent,
     pretty,
     span,
     words,
@@ -98,11 +96,8 @@ def _regressions(facts: Facts) -> list[str]:
 
 def sampled(facts: Facts) -> Section:
     """The section that matters most: what the critic was fed."""
-    figures = []
-    bars = _share_bars(facts)
-    if bars:
-        title = "Logs: available, intended and drawn"
-        figures.append(Figure(charts.shares(bars), title))
+    of_shares = shares.figure(facts)
+    figures = [] if of_shares is None else [of_shares]
     if facts.ages:
         figures.append(
             Figure(
@@ -116,58 +111,17 @@ def sampled(facts: Facts) -> Section:
         policies = [{**row, "who": row["behaviour_policy"]} for row in facts.policies]
         stacked = charts.stacked(policies, group="source", part="who", value="share")
         figures.append(Figure(stacked, "Whose experience it was"))
-    rows = [
-        {
-            "source": row["source"],
-            "stratum": words(row["stratum"]),
-            "timing": row["timing"] or "",
-            "available": count(row["available_rows"]),
-            "intended": percent(row["quota_share"]),
-            "drawn": percent(row["drawn_share"]),
-            "after weights": percent(row["effective_share"]),
-            "rows drawn": count(row["drawn_rows"]),
-            "replays per row": f"{row['drawn_rows'] / row['available_rows']:.1f}"
-            if row["available_rows"]
-            else "",
-            "mean reward": number(row["reward_mean"]),
-            "terminal": percent(row["terminal_share"]),
-        }
-        for row in facts.sampled
-    ]
     return Section(
         "fed",
         "What was the critic fed?",
-        intro="The replay mix is the training distribution. Intended is what the mixture asks for,"
-        " drawn what the batches held, after weights what the gradient saw.",
+        intro="The replay mix is the training distribution. Natural is what the logs"
+        " hold, wanted what the mixture asks for, drawn what the batches held, and after weights"
+        " what the gradient saw.",
         callout=evaluation_bias(facts),
         figures=figures,
         two=True,
-        tables=[
-            _table(
-                rows,
-                {"source", "stratum", "timing"},
-                caption="Shares are of the source. Replays per row: rows drawn over rows available"
-                " at the end, so for a ring that turned over it is an upper bound.",
-            )
-        ],
+        tables=[shares.table(facts)],
     )
-
-
-def _share_bars(facts: Facts) -> Rows:
-    """Of each logged stratum its share in the logs, as intended and as drawn."""
-    natural = {stratum.name: stratum.natural_share for stratum in facts.strata}
-    intended = {stratum.name: stratum.share for stratum in facts.strata}
-    return [
-        {"stratum": words(row["stratum"]), "kind": kind, "share": value}
-        for row in facts.sampled
-        if row["source"] == "logs"
-        for kind, value in (
-            ("in the logs", natural.get(row["stratum"], row["available_share"])),
-            ("intended", intended.get(row["stratum"], row["quota_share"])),
-            ("drawn", row["drawn_share"]),
-        )
-        if value is not None
-    ]
 
 
 def _age_rows(facts: Facts) -> Rows:
