@@ -72,6 +72,7 @@ def write_lerobot(
                 "restock/first_step": trajectory.first_step,
                 "restock/terminated": trajectory.terminated,
                 "restock/cut": trajectory.cut,
+                **{f"restock/{name}": said for name, said in trajectory.whose.items()},
                 **{
                     f"stats/{name}/{kind}": value.tolist()
                     for name, kinds in stats.items()

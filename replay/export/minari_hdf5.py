@@ -56,7 +56,12 @@ def write_minari(
     storage.update_episodes(
         EpisodeBuffer(
             id=number,
-            options={"episode_id": t.episode_id, "first_step": t.first_step, "cut": t.cut},
+            options={
+                "episode_id": t.episode_id,
+                "first_step": t.first_step,
+                "cut": t.cut,
+                **t.whose,
+            },
             observations=t.observations,
             actions=t.actions,
             rewards=t.rewards,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,9 +112,14 @@ def _of_query(
         if name in ("observation", "next_observation") and not str(kind).endswith("]"):
             raise QueryError(f"its {name} is a {kind}, not a list of numbers", where=where)
     by_command = ", ".join(f"min({name}), max({name})" for name in COMMAND) if continuous else "0"
-    hashes = "list(DISTINCT task_hash)" if "task_hash" in columns else "NULL"
+    hashes, recordings = (
+        f"list(DISTINCT {name})" if name in columns else "NULL"
+        for name in ("task_hash", "recording_id")
+    )
     _, rows, _ = fetch(
-        connection, f"SELECT count(*), {hashes}, {by_command} FROM ({text})", where=where
+        connection,
+        f"SELECT count(*), {hashes}, {recordings}, {by_command} FROM ({text})",
+        where=where,
     )
     facts = rows[0]
     if not facts[0]:
@@ -137,7 +142,7 @@ def _of_query(
         f"SELECT {', '.join(wanted)} FROM ({text}) ORDER BY {', '.join(order)}",
         where=where,
     )
-    seen = ((facts[2], facts[4]), (facts[3], facts[5])) if continuous else None
+    seen = ((facts[3], facts[5]), (facts[4], facts[6])) if continuous else None
     return Selection(
         where=where,
         batches=_batches(connection, relation, where),
@@ -149,9 +154,20 @@ def _of_query(
             "store_version": store.version,
             "query": text,
             "panel": Panel.open(panel).id if panel is not None else None,
+            "tags": _tags(store, facts[2] or []),
             **_of_task(task, continuous),
         },
     )
+
+
+def _tags(store: Store, recordings: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Whose drives these recordings are, by their ids; those that nobody tagged are left out."""
+    rows = store.connection.execute(
+        "SELECT recording_id, tags FROM recordings WHERE recording_id IN (SELECT unnest(?))"
+        " AND cardinality(tags) > 0 ORDER BY recording_id",
+        [list(recordings)],
+    ).fetchall()
+    return dict(rows)
 
 
 def _batches(

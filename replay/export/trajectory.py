@@ -28,7 +28,7 @@ REQUIRED = (
 COMMAND = ("command_speed_mps", "command_yaw_rate_radps")
 CARRIED = (  # of a row, where the query has it
     *("transition_id", "stamp_ns", "condition", "zone", "behaviour_policy", "behaviour_version"),
-    *("action_probability", "action_residual"),
+    *("action_probability", "action_residual", "robot", "site"),
 )
 # A row of an n-step panel: whether `next_observation` is the one a single step later.
 NEXT_IS_NEXT = "next_is_next"
@@ -55,6 +55,12 @@ class Trajectory:
     @property
     def truncated(self) -> bool:
         return not self.terminated
+
+    @property
+    def whose(self) -> dict[str, str]:
+        """Its robot and site, as far as the rows have them and say: an episode has one of each."""
+        said = {name: self.carried[name][0] for name in ("robot", "site") if name in self.carried}
+        return {name: "" if value is None else str(value) for name, value in said.items()}
 
 
 @dataclass

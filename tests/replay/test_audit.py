@@ -227,6 +227,16 @@ def mostly_easy_operator(table: pa.Table, recordings: pa.Table) -> Tables:
     ), recordings
 
 
+def two_robots(table: pa.Table, recordings: pa.Table) -> Tables:
+    return table, replaced(recordings, "tags", [{"robot": "a", "site": "o"}, {"robot": "b"}])
+
+
+def only_one_robot_slips(table: pa.Table, recordings: pa.Table) -> Tables:
+    slip = rows_where(table, "condition", "wheel_slip")
+    of_b = rows_where(table, "recording_id", f"{2:016x}")
+    return two_robots(table.filter(pa.array(~slip | ~of_b)), recordings)
+
+
 PLANTS: list[tuple[str, Plant, int, dict[str, object]]] = [
     ("rare_condition", no_slip, 1, {"condition": "wheel_slip", "rows": 0}),
     ("few_effective_episodes", slip_of_one_episode, 1, {"condition": "wheel_slip", "episodes": 1}),
@@ -247,6 +257,8 @@ PLANTS: list[tuple[str, Plant, int, dict[str, object]]] = [
     ("far_actions", far_operator, 1, {"behaviour_policy": "operator", "far_share": 1.0}),
     ("repeated_steps", bag_and_a_part_of_it, 1, {"same_as_file": "logs/part.mcap", "rows": 60}),
     ("signal_drift", worn_wheel, 2, {"signal": "odometry_scale", "scope": "alone"}),
+    ("untagged_recordings", two_robots, 1, {"recording_id": f"{2:016x}", "untold": "site"}),
+    ("single_robot", only_one_robot_slips, 1, {"condition": "wheel_slip", "robot": "a"}),
     ("policy_bias", picky_operator, 1, {"behaviour_policy": "operator"}),
     ("policy_bias", mostly_easy_operator, 1, {"behaviour_policy": "operator"}),
 ]

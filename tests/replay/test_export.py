@@ -60,6 +60,30 @@ def n_step_panel(store: Path, out: Path, n_step: int, where: str = "") -> Panel:
     return panel_of(store, mixture, out)
 
 
+def test_whose_drive_it_was_goes_along(tmp_path: Path) -> None:
+    """Per row and episode where the format has a place for it, all tags in the provenance."""
+    tables = [recording_transitions(number, episodes=3) for number in (1, 2)]
+    tags = {"robot": "amr-07", "line": "B"}
+    store = write_store(tmp_path / "store", tables, tags=[tags, {}])
+    done = export_dataset(store, "parquet", tmp_path / "a.parquet")
+    assert done["provenance"]["tags"] == {f"{1:016x}": tags}
+    rows = pq.read_table(tmp_path / "a.parquet").to_pylist()
+    robots = {row["episode_id"].split("/")[0]: (row["robot"], row["site"]) for row in rows}
+    assert robots == {f"{1:016x}": ("amr-07", None), f"{2:016x}": (None, None)}
+    export_dataset(store, "lerobot", tmp_path / "lerobot")
+    (file,) = (tmp_path / "lerobot" / "meta" / "episodes").rglob("*.parquet")
+    episodes = pq.read_table(file)
+    assert episodes["restock/robot"].to_pylist() == ["amr-07"] * 3 + [""] * 3
+    panel = n_step_panel(store, tmp_path / "panel", 1)
+    export_dataset(panel.path, "npz", tmp_path / "a.npz")
+    arrays = np.load(tmp_path / "a.npz")
+    assert (arrays["robot"] == "amr-07").sum() == len(tables[0])
+    # A query that gives no such column exports without it.
+    plain = "SELECT * EXCLUDE (robot, site, recording_id) FROM transitions"
+    assert export_dataset(store, "npz", tmp_path / "b.npz", query=plain)["provenance"]["tags"] == {}
+    assert "robot" not in np.load(tmp_path / "b.npz")
+
+
 def test_whole_episodes_come_back_in_order_with_their_final_observation(
     store_path: Path, transitions: pa.Table
 ) -> None:

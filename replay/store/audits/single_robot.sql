@@ -1,0 +1,16 @@
+-- severity: warning
+-- advice: Look at the robot (its wheels, its lidar, its floor) before learning from it: a policy for the others may never meet this, or a fault looks like it. `FROM coverage_by_robot` has the rates.
+-- doc: Conditions that one robot saw (almost) alone, though others drove too: the robot's own fault, or what only its site has.
+WITH seen AS (
+    SELECT robot, condition, count(*) AS rows, count(DISTINCT episode_id) AS episodes
+    FROM transitions
+    WHERE robot IS NOT NULL
+    GROUP BY robot, condition
+), driven AS (
+    SELECT robot, sum(rows) / sum(sum(rows)) OVER () AS share_of_rows FROM seen GROUP BY robot
+)
+SELECT condition, robot, rows, episodes, share, share_of_rows
+FROM (SELECT *, rows / sum(rows) OVER (PARTITION BY condition) AS share FROM seen)
+JOIN driven USING (robot)
+WHERE episodes >= $min_episodes AND share >= $max_share AND share_of_rows < $max_share AND condition <> 'nominal'
+ORDER BY condition

@@ -1,0 +1,27 @@
+-- severity: info
+-- advice: `restock ingest RECORDING --tag robot=…` says it without reading the recording again, or let the profile take it from the path: [tags] in docs/ingest.md.
+-- doc: Recordings that do not say their robot, site, firmware, map or shift while others do: they are missing from what is counted by it.
+WITH told AS (
+    SELECT
+        count(robot) > 0 AS robot,
+        count(site) > 0 AS site,
+        count(firmware) > 0 AS firmware,
+        count(map) > 0 AS map,
+        count(shift) > 0 AS shift
+    FROM recordings
+)
+SELECT
+    source_file,
+    recording_id,
+    concat_ws(
+        ', ',
+        CASE WHEN recordings.robot IS NULL AND told.robot THEN 'robot' END,
+        CASE WHEN recordings.site IS NULL AND told.site THEN 'site' END,
+        CASE WHEN recordings.firmware IS NULL AND told.firmware THEN 'firmware' END,
+        CASE WHEN recordings.map IS NULL AND told.map THEN 'map' END,
+        CASE WHEN recordings.shift IS NULL AND told.shift THEN 'shift' END
+    ) AS untold
+FROM recordings
+CROSS JOIN told
+WHERE untold <> '' AND format <> 'twin'
+ORDER BY source_file, recording_id
