@@ -43,7 +43,8 @@ LEFT JOIN met USING (episode_id);
 CREATE OR REPLACE TEMP TABLE yield_cells AS
 SELECT
     number,
-    coalesce(condition, '') AS condition,
+    -- All that hold, of which a cell names one.
+    coalesce(nullif(array_to_string(conditions, ','), ''), condition, '') AS condition,
     coalesce(zone, '') AS zone,
     action,
     coalesce(robot, '') AS robot,

@@ -140,16 +140,17 @@ def _of_audits(
     gaps = []
     limits = {name: {k: float(v) for k, v in thresholds.get(name, {}).items()} for name in AUDITS}
     lines = connection.sql(
-        "SELECT condition, rows, episodes, effective_episodes FROM coverage_by_condition"
+        "SELECT condition, rows_held, episodes_held, episodes, effective_episodes"
+        " FROM coverage_by_condition"
     ).fetchall()
-    for condition, rows, episodes, effective in lines:
+    for condition, rows, held_in, episodes, effective in lines:
         found = yields.rows_of({"condition": condition})
         met = np.asarray(found > 0, np.float64)
         asked = limits["rare_condition"]
         cell: dict[str, str | int] = {"condition": condition}
         by = "audit rare_condition"
         gaps.append(Gap(by, cell, "rows", asked.get("min_rows", 0), rows, found))
-        gaps.append(Gap(by, cell, "episodes", asked.get("min_episodes", 0), episodes, met))
+        gaps.append(Gap(by, cell, "episodes", asked.get("min_episodes", 0), held_in, met))
         least = limits["few_effective_episodes"].get("min_effective_episodes", 0)
         if rows and effective < least:
             # As many more as would do if they were as uneven as those that there are.

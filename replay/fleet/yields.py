@@ -32,7 +32,8 @@ class Yields:
     hours: F64  # (E,)
     kind: list[str]  # (E,) what it met, of the kinds of missions there are
     simulated: bool  # the recordings knew the truth: missions of a kind can be driven
-    cells: pa.Table  # number (of the episode), condition, zone, action, robot, rows
+    # Number (of the episode), condition (all that hold, by commas), zone, action, robot, rows.
+    cells: pa.Table
 
     def __len__(self) -> int:
         return len(self.episode_id)
@@ -61,8 +62,10 @@ class Yields:
 
     def values(self, name: str) -> list[str | int]:
         """What there is of condition, zone, action or robot."""
-        found: list[str | int] = sorted(self.cells[name].unique().to_pylist())
-        return found
+        values: list[str | int] = self.cells[name].unique().to_pylist()
+        if name == "condition":
+            values = [one for held in values for one in str(held).split(",")]
+        return sorted(set(values))
 
     @cached_property
     def total(self) -> F64:
@@ -74,6 +77,9 @@ class Yields:
         return np.asarray(self.hours * share, np.float64)
 
     def _is(self, name: str, value: str | int) -> Bools:
+        if name == "condition":
+            held = [one for one in self.cells[name].unique().to_pylist() if value in one.split(",")]
+            return np.asarray(pc.is_in(self.cells[name], pa.array(held, pa.string())), np.bool_)
         return np.asarray(pc.equal(self.cells[name], value).to_numpy(), np.bool_)
 
     def _sum(self, kept: Bools) -> F64:

@@ -5,7 +5,7 @@ CREATE OR REPLACE MACRO cells_below(minimum) AS TABLE
 SELECT condition, action, speed_mps, yaw_rate_radps, coalesce(rows, 0) AS rows
 FROM (SELECT DISTINCT condition FROM (SELECT condition FROM conditions UNION SELECT condition FROM transitions))
 CROSS JOIN (SELECT DISTINCT action, speed_mps, yaw_rate_radps FROM actions)
-LEFT JOIN (SELECT condition, action, count(*) AS rows FROM transitions GROUP BY ALL)
+LEFT JOIN (SELECT condition, action, count(*) AS rows FROM held_conditions GROUP BY ALL)
     USING (condition, action)
 WHERE coalesce(rows, 0) < minimum
 ORDER BY condition, action;

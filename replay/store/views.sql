@@ -128,6 +128,15 @@ FROM (
 JOIN (SELECT recording_id, robot, site, firmware, map, shift, tags FROM recordings)
     USING (recording_id);
 
+-- A row is named by the first of its conditions; this has one line for each that holds.
+CREATE OR REPLACE VIEW held_conditions AS
+SELECT transition_id, recording_id, episode_id, unnest(conditions) AS condition, action, zone, robot
+FROM transitions
+UNION ALL
+SELECT transition_id, recording_id, episode_id, condition, action, zone, robot
+FROM transitions
+WHERE condition = 'nominal';
+
 -- Each cell of what was seen. Cells never seen are in missing_cells: GROUP BY cannot show them.
 CREATE OR REPLACE VIEW coverage AS
 SELECT
@@ -171,6 +180,10 @@ WITH seen AS (
     FROM (SELECT condition, episode_id, count(*) AS n FROM transitions GROUP BY condition, episode_id)
     JOIN episodes USING (episode_id)
     GROUP BY condition
+), held AS (
+    SELECT condition, count(*) AS rows_held, count(DISTINCT episode_id) AS episodes_held
+    FROM held_conditions
+    GROUP BY condition
 )
 SELECT
     condition,
@@ -178,6 +191,8 @@ SELECT
     coalesce(rows, 0) AS rows,
     coalesce(rows, 0) / nullif(sum(rows) OVER (), 0) AS share,
     coalesce(episodes, 0) AS episodes,
+    coalesce(rows_held, 0) AS rows_held,
+    coalesce(episodes_held, 0) AS episodes_held,
     coalesce(effective_episodes, 0) AS effective_episodes,
     success_share,
     return_mean,
@@ -190,6 +205,7 @@ SELECT
 FROM conditions
 FULL JOIN seen USING (condition)
 FULL JOIN by_episode USING (condition)
+FULL JOIN held USING (condition)
 ORDER BY rows DESC, condition;
 
 -- One line a perturbation of the twin; null is hardware, or a simulator that did not say.
@@ -229,12 +245,12 @@ FROM (
 GROUP BY perturbation, field
 ORDER BY perturbation, field;
 
--- Condition x action cells without a single row; cells_below(n) for those with fewer than n.
+-- Condition x action cells without a single row in which that condition holds; cells_below(n) for those with fewer than n.
 CREATE OR REPLACE VIEW missing_cells AS
 SELECT condition, action, speed_mps, yaw_rate_radps
 FROM (SELECT DISTINCT condition FROM (SELECT condition FROM conditions UNION SELECT condition FROM transitions))
 CROSS JOIN (SELECT DISTINCT action, speed_mps, yaw_rate_radps FROM actions)
-ANTI JOIN (SELECT DISTINCT condition, action FROM transitions) USING (condition, action)
+ANTI JOIN (SELECT DISTINCT condition, action FROM held_conditions) USING (condition, action)
 ORDER BY condition, action;
 
 CREATE OR REPLACE VIEW reward_mix AS
@@ -269,7 +285,7 @@ ORDER BY rows DESC, condition;
 
 -- Which conditions hold at the same time: a row can have several, and one of them wins.
 CREATE OR REPLACE VIEW label_overlap AS
-WITH held AS (SELECT transition_id, unnest(conditions) AS condition FROM transitions),
+WITH held AS (SELECT transition_id, condition FROM held_conditions WHERE condition <> 'nominal'),
 counts AS (SELECT condition, count(*) AS n FROM held GROUP BY condition)
 SELECT
     a.condition AS condition,

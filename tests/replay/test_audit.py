@@ -76,7 +76,8 @@ def rows_where(table: pa.Table, name: str, value: object) -> np.ndarray:
 
 
 def no_slip(table: pa.Table, recordings: pa.Table) -> Tables:
-    return table.filter(pa.array(~rows_where(table, "condition", "wheel_slip"))), recordings
+    never = ["wheel_slip" not in held for held in table["conditions"].to_pylist()]
+    return table.filter(pa.array(never)), recordings
 
 
 def slip_of_one_episode(table: pa.Table, recordings: pa.Table) -> Tables:
@@ -238,7 +239,7 @@ def only_one_robot_slips(table: pa.Table, recordings: pa.Table) -> Tables:
 
 
 PLANTS: list[tuple[str, Plant, int, dict[str, object]]] = [
-    ("rare_condition", no_slip, 1, {"condition": "wheel_slip", "rows": 0}),
+    ("rare_condition", no_slip, 1, {"condition": "wheel_slip", "rows_held": 0}),
     ("few_effective_episodes", slip_of_one_episode, 1, {"condition": "wheel_slip", "episodes": 1}),
     ("missing_cells", never_back, 1, {"condition": "recovery", "action": 4, "rows": 0}),
     ("thin_perturbation", never_slipped_in_the_twin, 1, {"condition": "wheel_slip", "rows": 0}),

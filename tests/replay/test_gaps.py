@@ -99,7 +99,7 @@ def test_audits_and_cells_ask_too_and_what_was_never_seen_has_only_a_bound(store
         )
         rare = dict(
             opened.sql(
-                "SELECT condition, rows FROM coverage_by_condition WHERE rows < 60"
+                "SELECT condition, rows_held FROM coverage_by_condition WHERE rows_held < 60"
             ).fetchall()
         )
     asked = {gap.cell["condition"]: gap.there for gap in gaps if gap.asked_by.endswith("condition")}

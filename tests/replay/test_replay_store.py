@@ -135,22 +135,33 @@ def test_coverage_counts_every_row_once(store: Store, transitions: pa.Table) -> 
 
 def test_a_condition_never_seen_has_a_line_and_empty_cells(tmp_path: Path) -> None:
     table = recording_transitions(1)
-    keep = [name != "wheel_slip" for name in table["condition"].to_pylist()]
-    table = table.filter(pa.array(keep))
     keep = [
-        not (name == "recovery" and action == 2)
-        for name, action in zip(
-            table["condition"].to_pylist(), table["action"].to_pylist(), strict=True
+        "wheel_slip" not in held and not ("recovery" in held and action == 2)
+        for held, action in zip(
+            table["conditions"].to_pylist(), table["action"].to_pylist(), strict=True
         )
     ]
     with Store(write_store(tmp_path / "s", [table.filter(pa.array(keep))])) as store:
         (slip,) = rows(store, "FROM coverage_by_condition WHERE condition = 'wheel_slip'")
         assert (slip["rows"], slip["episodes"], slip["behaviour_policies"]) == (0, 0, [])
+        assert (slip["rows_held"], slip["episodes_held"]) == (0, 0)
         missing = {(row["condition"], row["action"]) for row in rows(store, "FROM missing_cells")}
         assert {("wheel_slip", action) for action in range(5)} | {("recovery", 2)} <= missing
         assert rows(store, "FROM cells_below(1)") == [
             row | {"rows": 0} for row in rows(store, "FROM missing_cells")
         ]
+
+
+def test_a_row_counts_for_every_condition_that_holds_in_it(
+    store: Store, transitions: pa.Table
+) -> None:
+    held = [conditions or ["nominal"] for conditions in transitions["conditions"].to_pylist()]
+    lines = rows(store, "FROM coverage_by_condition")
+    assert {line["condition"]: line["rows_held"] for line in lines} == {
+        line["condition"]: sum(line["condition"] in names for names in held) for line in lines
+    }
+    assert any(line["rows_held"] > line["rows"] for line in lines)
+    assert sum(line["rows"] for line in lines) == len(held)
 
 
 def test_overlap_counts_pairs_both_ways(store: Store, transitions: pa.Table) -> None:
