@@ -7,7 +7,6 @@ and `restock.ingest.task.task.observe`; all that is different is who hands over 
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,13 +19,12 @@ from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, j
 from restock.ingest.profile.profile import Input, Profile
 from restock.ingest.steps.align import NS, ClockSegment, Samples
 from restock.ingest.steps.aligned_inputs import AlignedInputs, InputColumns
-from restock.ingest.steps.clocks import median
+from restock.ingest.steps.live_clock import LiveClock
 from restock.ingest.steps.needs import field_paths
 from restock.ingest.steps.steps import Filling
 from restock.ingest.task.task import nearest_action, observe
 
 PROVENANCE = ("behaviour_policy", "true_condition", "perturbation")  # no robot acts by these
-_DELAYS = 200  # of each topic, of which the median counts
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,8 @@ class LiveObserver:
     def reset(self) -> None:
         """Discard all messages: the clock was set, or the robot was moved."""
         self._buffers: dict[str, list[_Message]] = {topic: [] for topic in self._inputs}
-        self._delays: dict[str, deque[int]] = {}
+        self._clock = LiveClock(round(self.profile.clock.jump_s * NS))
+        self._newest_ns = 0  # log time of the last message
         self._command: _Message | None = None  # the first since the last tick, or the last before
         self._ticked = True
         self._before_ns: int | None = None
@@ -87,16 +86,16 @@ class LiveObserver:
 
     @property
     def offset_ns(self) -> int:
-        """Log time less the alignment clock, as ingest finds it: of the topic
-        that comes with the least delay, the median."""
-        medians = [median(np.array(delays, np.int64)) for delays in self._delays.values()]
-        return min(medians, default=0)
+        """Log time less the alignment clock at the last message, as ingest finds it: of the topic
+        that comes with the least delay, the median, or where the clocks drift what it is now."""
+        return self._clock.offset_ns(self._newest_ns)
 
     def receive(self, topic: str, message: Any, log_time_ns: int) -> None:
         """Take a message of one of `topics`, received at `log_time_ns`."""
         sources = self._inputs[topic]
         paths = dict.fromkeys(path for source in sources for path in field_paths(source))
         latched = all(source.max_age_s is None for source in sources)
+        self._newest_ns = log_time_ns
         stamp_ns = self._stamp(topic, message, log_time_ns, latched)
         if stamp_ns is None:
             self.left_out[topic] = self.left_out.get(topic, 0) + 1
@@ -110,7 +109,10 @@ class LiveObserver:
 
     def observe(self, now_ns: int) -> Observed:
         """The observation of a tick at `now_ns`, by the clock of the messages' log times."""
-        stamp_ns = now_ns - (self.offset_ns if self.profile.clock.alignment != "log_time" else 0)
+        offset_ns = (
+            0 if self.profile.clock.alignment == "log_time" else self._clock.offset_ns(now_ns)
+        )
+        stamp_ns = now_ns - offset_ns
         ticks = [stamp_ns] if self._before_ns is None else [self._before_ns, stamp_ns]
         topics: dict[str, TopicColumns] = {}
         samples: dict[str, Samples] = {}
@@ -126,7 +128,7 @@ class LiveObserver:
         if silent:
             return self._unknown(stamp_ns, f"nothing received yet on {', '.join(sorted(silent))}")
         inputs = InputColumns(self.profile, topics)
-        segment = ClockSegment(samples, self.offset_ns)
+        segment = ClockSegment(samples, offset_ns)
         at = [np.array(ticks, np.int64)]
         filling = Filling(AlignedInputs(self.profile, inputs, [segment], at))
         signals = filling.fill()
@@ -172,17 +174,14 @@ class LiveObserver:
         """When a message was measured, on the alignment clock; None where it is off it."""
         if self.profile.clock.alignment == "log_time":
             return log_time_ns
+        received_ns = log_time_ns - self._clock.offset_ns(log_time_ns)
         header = getattr(message, "header", None)
         if header is None:
-            return log_time_ns - self.offset_ns
+            return received_ns
         stamp_ns = int(header.stamp.sec) * NS + int(header.stamp.nanosec)
-        delay = log_time_ns - stamp_ns
-        jump_ns = round(self.profile.clock.jump_s * NS)
-        if self._delays and abs(delay - self.offset_ns) > jump_ns:
-            return log_time_ns - self.offset_ns if latched else None
-        if not latched:
-            self._delays.setdefault(topic, deque(maxlen=_DELAYS)).append(delay)
-        return stamp_ns
+        if latched:  # it may have been published long ago: it does not tell the time
+            return stamp_ns if self._clock.agrees(log_time_ns, stamp_ns) else received_ns
+        return stamp_ns if self._clock.receive(topic, log_time_ns, stamp_ns) else None
 
     def _optional(self, topic: str) -> bool:
         return all(source.optional for source in self._inputs[topic])
