@@ -6,9 +6,9 @@ Three faults of the buffer, all in the blocked aisles, which the twin's training
 their logged rows are removed; stale (next observations and rewards of other rows of the stratum);
 or mislabelled (the label stands on nominal rows). Two of the logs' actions: one (backing up) that
 they lack, or that is rare (a fiftieth is left) in the blocked aisles. Four of the target and the
-optimizer: frozen, too
-slow, no target at all (tau 1), learning rate a thousand times too high. Runs are kept in --out and
-taken up where they are, so that a table can be made again without training again.
+optimizer: frozen, too slow, no target at all (tau 1), learning rate a thousand times too high. Runs
+are kept in --out and taken up where they are, so that a table can be made again without training
+again.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ class DiagnosisLimits:
     unexplained: float = 1.0  # of the variance of its next observations: their mean explains more
     unexplained_relative: float = 1.6  # and over that of the condition with the least
     quota_met: float = 0.5  # a smaller part of a quota is worth saying beside a gap
-    wanted: float = 0.15  # of a condition's fresh rows, those where the policy takes an action …
+    wanted: float = 0.18  # of a condition's fresh rows, those where the policy takes an action …
     logged: float = 0.02  # … and of its logged rows drawn, those with it: the logs lack it
 
 
