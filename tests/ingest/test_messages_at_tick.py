@@ -27,7 +27,7 @@ from restock.ingest.task.task import nearest_action
 
 SAMPLE = ROOT / "sample_logs" / "amr_tuesday"
 TURTLEBOT = SHARED / "turtlebot3-sim-humble"
-ROWS = 30  # each reads the recording again
+ROWS = 10  # each reads the recording again
 # The wheel's joint says more often than the command what time it is, and after the last of them.
 SIGNALS = """
 [signals.left_wheel_radps]

@@ -74,13 +74,13 @@ def test_a_pipe_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
 def test_a_tail_of_zeros_is_damage(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "run.mcap")
     with path.open("ab") as file:
-        file.truncate(path.stat().st_size + (1 << 30))  # a hole
+        file.truncate(path.stat().st_size + (1 << 28))  # a hole
     with open_recording(path) as recording:  # after the end of the recording
         assert recording.messages == 140
     content = path.open("rb").read(8000)
     path.write_bytes(content)
     with path.open("ab") as file:
-        file.truncate(1 << 30)
+        file.truncate(1 << 28)
     with pytest.raises(RecordingError, match="cut short or damaged"):
         open_recording(path)
     with open_recording(path, salvage=True) as recording:
@@ -99,7 +99,7 @@ def test_zeros_in_a_chunk_and_in_a_compressed_file_are_damage(tmp_path: Path) ->
     assert cut == "zeros or noise, 67,108,864 bytes before its end"
     path = tmp_path / "run.mcap.zstd"
     head = b"\x89MCAP0\r\n" + b"\x01" + (8).to_bytes(8, "little") + bytes(8)
-    path.write_bytes(zstandard.ZstdCompressor().compress(head + bytes(200 << 20)))
+    path.write_bytes(zstandard.ZstdCompressor().compress(head + bytes(64 << 20)))
     with pytest.raises(RecordingError, match="opcode 0"):
         open_recording(path)
 

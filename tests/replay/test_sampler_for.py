@@ -91,8 +91,13 @@ def by_dataset(workers: int) -> Way:
         )
         for epoch in range(10**9):
             dataset.set_epoch(epoch)
-            for batch in loader:
-                yield Drawn(batch["row"].numpy(), batch["stratum"].numpy())
+            batches = iter(loader)
+            try:
+                for batch in batches:
+                    yield Drawn(batch["row"].numpy(), batch["stratum"].numpy())
+            finally:  # collected as garbage, its workers are waited for, five seconds each
+                if workers:
+                    batches._shutdown_workers()
 
     return draw
 
