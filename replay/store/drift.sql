@@ -456,6 +456,10 @@ SELECT
             arg_max(others_changed, period), arg_max(others, period)
         )
         ELSE 'unclear whether the other robots at this site changed alike'
+    END
+    || CASE arg_max(samples, period)
+        WHEN 'episodes' THEN '; compared episode by episode, as recordings are few: these may differ as much'
+        ELSE ''
     END AS finding
 FROM (
     SELECT *, count(p) OVER (PARTITION BY robot, part, signal, zone) AS periods_tested

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from restock.errors import ExitCode
+from restock.errors import ExitCode, visible
 
 if TYPE_CHECKING:
     from restock.replay.fleet.drift import Drift
@@ -90,9 +90,9 @@ def _show(drift: Drift) -> None:
         title=f"comparisons by {drift.every}",
     )
     for note in drift.notes:
-        out.print(f"- {note}", markup=False, soft_wrap=True)
+        out.print(visible(f"- {note}"), markup=False, soft_wrap=True)
     out.print()
     for row in drift.findings:
-        out.print(row["finding"], markup=False, soft_wrap=True)
+        out.print(visible(row["finding"]), markup=False, soft_wrap=True)
     if not drift.findings:
         out.print("nothing has changed by what matters, as far as these logs can tell")
