@@ -11,6 +11,7 @@ import msgspec
 
 from restock.errors import PanelError, RunError
 from restock.ingest.profile.profile import Profile, load_profile
+from restock.replay.fleet.missions_file import MissionOrder, read_missions
 from restock.replay.panel.logged_sampler import controller_for
 from restock.replay.panel.panel import Panel
 from restock.replay.sampling.share_controller import PlannedDraws
@@ -36,11 +37,14 @@ from restock.train.run.run_profile import (
 from restock.train.session import Session, open_session
 from restock.train.twin.env.floor_report import refuse_unfit, sealed
 from restock.train.twin.env.interface import AFTER_LOGS, Twin
+from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.floors.floors import layouts_of_split, open_floors
+from restock.train.twin.floors.planner import planners
 from restock.train.twin.physics.episode import KINDS
 from restock.train.twin.physics.perturbation import PERTURBATIONS, find_perturbation
 
 _EVALUATION_ENVS = 16
+MISSIONS = "env.missions"
 
 
 @dataclass
@@ -167,6 +171,9 @@ def prepare_new(
         # What is wrong with one is reported before anything is written. Evaluation drives all kinds
         # that are named, whatever their share.
         refuse_unfit(open_floors(layouts), config.env.conditions)
+    if orders := mission_orders(config):
+        floors = open_floors(config.env.layouts)
+        MissionOrders(orders, floors, planners(floors), where=MISSIONS)
     fed = Panel.open(panel_path) if panel_path is not None else None
     if fed is not None and (not chosen or carries_profile(fed, config.profile)):
         profile = profile_of_panel(fed)
@@ -261,8 +268,21 @@ def make_twin(
         nthread=nthread,
         task=profile.task,
         layouts=layouts or config.env.layouts,
+        # Evaluation has its own floors and fixed episodes.
+        missions=() if layouts is not None else mission_orders(config),
+        missions_share=config.env.missions_share,
     )
     return twin
+
+
+def mission_orders(config: TrainConfig) -> tuple[MissionOrder, ...]:
+    """The missions that a share of the episodes follows; none where the config names none.
+
+    Raises:
+        ConfigError: their file cannot be read, or says something else.
+    """
+    missions = config.env.missions
+    return read_missions(missions).missions if isinstance(missions, str) else missions or ()
 
 
 def _evaluation_layouts(config: TrainConfig) -> str:
@@ -279,6 +299,8 @@ def resolve_config(config: TrainConfig, panel: Panel | None) -> TrainConfig:
     if env.perturbation not in PERTURBATIONS:  # what is in a file may change: the run keeps it
         perturbation = find_perturbation(env.perturbation, where="env.perturbation")
         env = msgspec.structs.replace(env, perturbation=msgspec.to_builtins(perturbation))
+    if isinstance(env.missions, str):
+        env = msgspec.structs.replace(env, missions=mission_orders(config))
     return msgspec.structs.replace(config, epsilon=epsilon, env=env)
 
 

@@ -39,10 +39,11 @@ MAY_IMPORT = {
     "replay/trace": "replay panel store ingest/store ingest/profile ingest/steps ingest/task",
     "replay/export": "replay panel store ingest/store ingest/profile ingest/task",
     "train": (
-        "dqn evaluation feed run twin/env twin/floors twin/physics replay/mixture replay/panel"
-        " replay/ring replay/sampling replay/store ingest/profile ingest/store ingest/task"
+        "dqn evaluation feed run twin/env twin/floors twin/physics replay/fleet replay/mixture"
+        " replay/panel replay/ring replay/sampling replay/store ingest/profile ingest/store"
+        " ingest/task"
     ),
-    "train/dqn": "twin/env twin/physics",
+    "train/dqn": "twin/env twin/physics replay/fleet",
     "train/run": "replay replay/panel ingest/profile ingest/task",
     "train/feed": (
         "dqn run twin/env twin/floors replay/mixture replay/panel replay/ring replay/sampling"

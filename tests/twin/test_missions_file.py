@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,12 @@ import pytest
 from restock.cli import main
 from restock.errors import ConfigError
 from restock.replay.fleet.missions_file import MissionOrder, MissionsFile
+from restock.train.comparison.arms import kind_of
+from restock.train.dqn.config import parse_config
+from restock.train.prepare import make_twin, prepare_new
+from restock.train.twin.env.episode_queue import EpisodeQueue
 from restock.train.twin.env.mission_orders import MissionOrders
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.layout import default_warehouse, strip_warehouse
 from restock.train.twin.floors.planner import planners
 from restock.train.twin.physics.episode import EpisodeSpec, draw_episode
@@ -182,3 +188,56 @@ def test_a_list_that_is_driven_and_ingested_closes_its_gaps(
     came = slip["missing"] - after.get("wheel_slip", {"missing": 0})["missing"]
     assert "wheel_slip" not in after or came / driven >= slip["rate_low"] * 0.8
     assert came > 0.5 * slip["missing"]
+
+
+def drawn(missions: tuple[MissionOrder, ...], share: float, count: int = 400) -> list[EpisodeSpec]:
+    """The episodes that one of two environments begins."""
+    queue = EpisodeQueue(2, [FLOOR], {"nominal": 1.0}, None, seed=5)
+    if missions:
+        queue.follow(orders(*missions), share)
+    return [queue.next(1)[0] for _ in range(count)]
+
+
+def test_a_share_of_trainings_episodes_follows_the_file_and_the_others_are_as_they_were() -> None:
+    missions = (SLIP, MissionOrder(kind="blocked_aisle", missions=12))
+    plain, mixed = drawn((), 0.5), drawn(missions, 0.5)
+    kinds = Counter(spec.condition for spec in mixed)
+    assert kinds["blocked_aisle"] == pytest.approx(150, abs=30)
+    assert kinds["wheel_slip"] == pytest.approx(50, abs=22)
+    assert mixed == drawn(missions, 0.5)
+    assert set(mixed) - set(plain) == {s for s in mixed if s.condition != "nominal"}
+    assert all(spec.condition != "nominal" for spec in drawn(missions, 1.0))
+
+
+def test_a_run_keeps_its_missions_and_comparisons_see_them(tmp_path: Path) -> None:
+    file = tmp_path / "next.toml"
+    file.write_text('[[missions]]\nkind = "wheel_slip"\nmissions = 3\nzone = "cross_east"\n')
+    settings = [f"env.missions={str(file)!r}", "env.missions_share=0.25"]
+    prepared = prepare_new(tmp_path / "run", None, None, settings)
+    file.unlink()  # what is in a file may change: the run keeps what it was
+    kept = prepared.document["config"]["env"]
+    assert kept["missions"][0]["zone"] == "cross_east"
+    assert parse_config(prepared.document["config"], where="kept") == prepared.config
+    assert kind_of("config.env.missions") == "environment"
+    twin = make_twin(prepared.config, prepared.profile, 2)
+    assert isinstance(twin, WarehouseVectorEnv)
+    kinds = {twin.queue.next(0)[0].condition for _ in range(40)}
+    assert "wheel_slip" in kinds
+
+
+def test_training_refuses_what_its_floors_cannot_hold_before_anything_is_written(
+    tmp_path: Path,
+) -> None:
+    for text, message in (
+        ('kind = "wheel_slip"\nmissions = 1\nlayout = "hall"', "floor 'hall'"),
+        ("hours = 3.0", "hours of logging"),
+    ):
+        (tmp_path / "next.toml").write_text(f"[[missions]]\n{text}\n")
+        with pytest.raises(ConfigError, match=message) as error:
+            prepare_new(
+                tmp_path / "run", None, None, [f"env.missions={str(tmp_path / 'next.toml')!r}"]
+            )
+        assert "env.missions" in str(error.value)
+    with pytest.raises(ConfigError, match="restock gaps"):
+        prepare_new(tmp_path / "run", None, None, ["env.missions='none.toml'"])
+    assert not (tmp_path / "run").exists()

@@ -59,6 +59,8 @@ _KINDS: dict[str, Kind] = {
     "config.env.conditions": "environment",
     "config.env.perturbation": "environment",
     "config.env.layouts": "environment",
+    "config.env.missions": "environment",
+    "config.env.missions_share": "environment",
     "library.replay": "feed",
     "library.target": "target",
     "config": "feed",  # replay, schedule, env, epsilon: which rows there are and how often

@@ -16,6 +16,7 @@ import msgspec
 from msgspec import Meta
 
 from restock.errors import ConfigError
+from restock.replay.fleet.missions_file import MissionOrder
 from restock.toml import Checked, read_toml, toml_value, typed
 from restock.train.dqn.target import Polyak, TargetRule
 from restock.train.twin.env.interface import DEFAULT_CONDITIONS, LinearEpsilon
@@ -114,6 +115,9 @@ class EnvConfig(Checked, frozen=True):
     conditions: dict[str, NonNegative] = msgspec.field(
         default_factory=lambda: dict(DEFAULT_CONDITIONS)
     )
+    # A missions file, or its [[missions]]: that part of the episodes is of those; docs/train.md.
+    missions: str | tuple[MissionOrder, ...] | None = None
+    missions_share: Share = 0.5
     overlap: bool = True  # simulate on one thread while learning on another; same result
     layouts: str = "default"  # floors: generated:train, FILE.toml, map.yaml; docs/layouts.md
     # A ready-made one's name, a TOML file, or its table; of a schedule, one drawn an episode.

@@ -27,6 +27,7 @@ from restock.train.libraries.fresh_meta import InfoLabels
 from restock.train.libraries.library_arm import Evaluations, as_network
 from restock.train.libraries.mixed_feed import PartialTables, episode_row
 from restock.train.libraries.sb3_buffer import MixtureReplayBuffer, dqn_critic
+from restock.train.prepare import mission_orders
 from restock.train.run.run import Run
 from restock.train.twin.physics.perturbation import find_perturbation
 
@@ -42,6 +43,8 @@ def _environment(config: TrainConfig) -> Any:
             "conditions": dict(config.env.conditions),
             "perturbation": find_perturbation(config.env.perturbation, where="env.perturbation"),
             "layouts": config.env.layouts,
+            "missions": mission_orders(config),
+            "missions_share": config.env.missions_share,
         },
     )
 

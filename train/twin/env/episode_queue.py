@@ -8,10 +8,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
+import msgspec
 import numpy as np
 
 from restock.errors import ConfigError
 from restock.state import Stateful
+from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.physics.episode import KINDS, EpisodeSpec
 from restock.train.twin.physics.perturbation import Schedule
@@ -20,7 +22,8 @@ from restock.train.twin.physics.perturbation import Schedule
 class EpisodeQueue(Stateful):
     """An environment's n-th drawn episode is the same whatever the others do.
 
-    `conditions` are shares per kind of episode; a schedule draws each a perturbation.
+    `conditions` are shares per kind of episode; a schedule draws each a perturbation. Where
+    missions were ordered, a share of the drawn episodes is of those.
 
     Raises:
         ConfigError: an unknown condition, or shares that are not numbers of at least 0.
@@ -42,6 +45,8 @@ class EpisodeQueue(Stateful):
         self.drawn = np.zeros(num_envs, np.int64)  # episodes so far, per environment
         self.fixed: list[EpisodeSpec] = []
         self.next_fixed = 0
+        self._orders: MissionOrders | None = None
+        self._orders_share = 0.0
         self.set_conditions(conditions)
 
     def set_conditions(self, conditions: Mapping[str, float]) -> None:
@@ -58,6 +63,10 @@ class EpisodeQueue(Stateful):
         self.conditions = {k: float(conditions[k]) for k in KINDS if k in conditions}
         self._cumulative = np.cumsum(shares) / total
 
+    def follow(self, orders: MissionOrders, share: float) -> None:
+        """From now on this share of the drawn episodes is of these orders, each at its part."""
+        self._orders, self._orders_share = orders, share
+
     def restored(self) -> None:
         """What the shares add up to follows from them."""
         self.set_conditions(self.conditions)
@@ -71,13 +80,19 @@ class EpisodeQueue(Stateful):
         if self.next_fixed < len(self.fixed):
             self.next_fixed += 1
             return self.fixed[self.next_fixed - 1], self.next_fixed - 1
-        draw = np.random.SeedSequence([self.seed, env, int(self.drawn[env])]).generate_state(3)
+        draw = np.random.SeedSequence([self.seed, env, int(self.drawn[env])]).generate_state(5)
         self.drawn[env] += 1
-        kind = np.searchsorted(self._cumulative, draw[0] / 2**32, side="right")
         seed = int(draw[1]) << 20 ^ int(draw[2])
-        rng = np.random.default_rng([seed, 1])
-        perturbation = self.schedule.draw(rng) if self.schedule else None
-        return EpisodeSpec(KINDS[int(kind)], seed, perturbation), -1
+        if self._orders is not None and draw[3] / 2**32 < self._orders_share:
+            drawn = np.searchsorted(np.cumsum(self._orders.shares), draw[4] / 2**32, side="right")
+            spec = self._orders.spec(min(int(drawn), len(self._orders.orders) - 1), seed)
+        else:
+            kind = np.searchsorted(self._cumulative, draw[0] / 2**32, side="right")
+            spec = EpisodeSpec(KINDS[int(kind)], seed)
+        if self.schedule is not None:
+            rng = np.random.default_rng([spec.seed, 1])
+            spec = msgspec.structs.replace(spec, perturbation=self.schedule.draw(rng))
+        return spec, -1
 
     def floor_of(self, spec: EpisodeSpec) -> int:
         """Which floor an episode is on: by name, or by its seed.

@@ -45,12 +45,14 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task, observe, reached_goal, reward
 from restock.ingest.task.task import terminated as is_terminated
+from restock.replay.fleet.missions_file import MissionOrder
 from restock.state import Stateful
 from restock.train.twin.env.action_space import ActionKind, action_space
 from restock.train.twin.env.camera import Renderer, View
 from restock.train.twin.env.episode_queue import EpisodeQueue
 from restock.train.twin.env.floor_report import refuse_unfit
 from restock.train.twin.env.interface import DEFAULT_CONDITIONS, Info, Step
+from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.env.navigation import Navigation
 from restock.train.twin.floors.floors import floors_of
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
@@ -92,6 +94,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         task: Task | None = None,
         warehouse: Warehouse | None = None,
         layouts: str | Sequence[Warehouse] = DEFAULT,
+        missions: Sequence[MissionOrder] = (),
+        missions_share: float = 0.5,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         action: ActionKind = "discrete",
         physics: Physics = "mujoco",
@@ -106,6 +110,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         `layouts` are floors, or what `restock.train.twin.floors.floors.open_floors` reads, such as
         `generated:train`: an episode whose spec names none of them is on one that its seed draws.
         `warehouse` is the one floor, in their place.
+
+        Of the drawn episodes `missions_share` are of the ordered `missions`, where there are some.
 
         `render()` draws a top-down map, or with a `camera` ("chase", "overhead") renders over EGL.
 
@@ -152,6 +158,10 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         self.sensing = Sensing(self.simulation, self.task)
         self.truth = Truth(self.task, num_envs)
         self.navigation = Navigation(self.floors, num_envs, self.task)
+        if missions:
+            planners = self.navigation.planners
+            orders = MissionOrders(missions, self.floors, planners, where="env.missions")
+            self.queue.follow(orders, missions_share)
         self.specs: list[EpisodeSpec] = [EpisodeSpec("nominal", 0)] * num_envs
         self.diverged = 0  # episodes that ended in a NaN or beyond MuJoCo's limits
         self.signals: Signals = {}
