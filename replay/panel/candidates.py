@@ -53,7 +53,8 @@ def read_candidates(
 
     META_COLUMNS, `task_hash`, `labelled`, `uncertain` (a condition is too near to call), and one
     boolean for each predicate of the mixture: `admitted`, `unsafe`, `stratum_0`, `state_0` (of
-    the row's state alone) …; text columns come as dictionaries; `store` (int) says which store a
+    the row's state alone) …, of a stratum of episodes the rows of the episode in which it holds
+    (int); text columns come as dictionaries; `store` (int) says which store a
     row is from. Predicates see `conditions` as the mixture's `uncertain` has them.
 
     Raises:
@@ -67,8 +68,17 @@ def read_candidates(
         predicates[f"stratum_{index}"] = (f"stratum {stratum.name!r}", stratum.predicate)
         state = stratum.state_predicate or stratum.predicate
         predicates[f"state_{index}"] = (f"stratum {stratum.name!r}", state)
+    counted = {
+        f"{kind}_{index}"
+        for index, stratum in enumerate(strata)
+        for kind in ("stratum", "state")
+        if stratum.steps_of_episode
+    }
     tests = ", ".join(
-        f"coalesce(({sql}\n)::BOOLEAN, false) AS {name}" for name, (_, sql) in predicates.items()
+        f"coalesce(({sql}\n)::INTEGER, 0) AS {name}"
+        if name in counted
+        else f"coalesce(({sql}\n)::BOOLEAN, false) AS {name}"
+        for name, (_, sql) in predicates.items()
     )
     store = STORE_COLUMN if several_stores else "0"
     rows, has_uncertain = "transitions", "false"

@@ -46,6 +46,7 @@ from restock.replay.panel.strata import (
     as_dealt,
     assign,
     deal_episodes,
+    least_steps,
     resolve_strata,
 )
 from restock.replay.panel.weights import RatioFit, effective_count
@@ -118,7 +119,7 @@ def plan_panel(
             remedy="`restock audit` names them; ingest those recordings again",
         )
     member, state = (
-        np.stack([bools(table, f"{kind}_{i}") for i in range(len(strata))], axis=1)
+        np.stack([_member(table, f"{kind}_{i}", s) for i, s in enumerate(strata)], axis=1)
         for kind in ("stratum", "state")
     )
     if mixture.unlabelled == "nominal":
@@ -158,6 +159,14 @@ def plan_panel(
         others,
         as_of_ns,
     )
+
+
+def _member(table: pa.Table, column: str, stratum: ResolvedStratum) -> Bools:
+    """Which rows (N,) a stratum's predicate is for."""
+    if not stratum.steps_of_episode:
+        return bools(table, column)
+    steps = table[column].to_numpy()
+    return np.asarray(steps >= least_steps(stratum.rule, steps), np.bool_)
 
 
 def _dealt(

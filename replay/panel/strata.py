@@ -54,7 +54,7 @@ class ResolvedStratum:
     """A stratum as resolved against a store's conditions."""
 
     rule: StratumRule
-    predicate: str  # SQL over `transitions`
+    predicate: str  # SQL over `transitions`: whether a row is in it, or of `steps_of_episode`
     # The same of the state alone; None where that is the predicate, or the outcome decides.
     state_predicate: str | None
     priority: int
@@ -72,9 +72,14 @@ class ResolvedStratum:
         return self.rule.unit == "episode" and self.name == NOMINAL and self.rule.where is None
 
     @property
+    def steps_of_episode(self) -> bool:
+        """Whether its predicate counts the rows of a row's episode, which has `min_steps`."""
+        return self.rule.unit == "episode" and not self.left_over
+
+    @property
     def dealt(self) -> bool:
         """Whether `deal_episodes` gives it some: one with a `priority` of its own keeps to it."""
-        return self.rule.unit == "episode" and self.rule.priority is None and not self.left_over
+        return self.steps_of_episode and self.rule.priority is None
 
 
 def resolve_strata(mixture: Mixture, conditions: Sequence[Condition]) -> list[ResolvedStratum]:
@@ -127,7 +132,7 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
         # Chosen by what the whole episode met, not by what came of this step.
         state_predicate, timing = None, "pre"
         rest = rule.name == NOMINAL and rule.where is None
-        predicate = "true" if rest else _of_episodes(predicate, rule.min_steps)
+        predicate = "true" if rest else _steps_of_episode(predicate)
     timing = rule.timing or timing
     default = mixture.correction.pre if timing == "pre" else mixture.correction.post
     return ResolvedStratum(
@@ -141,10 +146,19 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
     )
 
 
-def _of_episodes(predicate: str, min_steps: int) -> str:
-    """Whether a row's episode has so many rows for which the predicate holds."""
+def _steps_of_episode(predicate: str) -> str:
+    """In how many rows of a row's episode the predicate holds."""
     holds = f"count(*) FILTER (WHERE ({predicate}\n)::BOOLEAN)"
-    return f"{holds} OVER (PARTITION BY episode_id) >= {min_steps}"
+    return f"{holds} OVER (PARTITION BY episode_id)"
+
+
+def least_steps(rule: StratumRule, steps: Ints) -> int:
+    """In how many rows of an episode a condition must hold, of the rows (N,) it holds in.
+
+    `min_steps`, or the most that an episode has where none has so many: a condition that is there
+    has rows of its own.
+    """
+    return max(min(rule.min_steps, int(steps.max(initial=0))), 1)
 
 
 def assign(

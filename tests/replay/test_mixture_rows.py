@@ -50,7 +50,7 @@ def test_every_row_is_in_one_stratum_or_left_out_for_one_reason(transitions: pa.
     assert sum(line.rows for line in plan.strata) == len(plan.panel_rows)
 
 
-@pytest.mark.parametrize("min_steps", [1, 4])
+@pytest.mark.parametrize("min_steps", [1, 2])
 def test_a_stratum_of_episodes_has_all_rows_of_those_that_met_it(
     transitions: pa.Table, min_steps: int
 ) -> None:
@@ -325,3 +325,19 @@ def test_rows_too_near_to_call_are_kept_dropped_or_nominal(transitions: pa.Table
     assert rows["wheel_slip"] == before["wheel_slip"] - len(slips[::3])
     older = table.drop_columns(["uncertain"])
     assert planned(older, "uncertain = 'drop'\n" + NO_SPLIT + EVERY).left_out == {}
+
+
+def test_a_condition_that_never_holds_for_long_has_its_episodes_all_the_same(
+    transitions: pa.Table,
+) -> None:
+    """No episode has so many steps: those with the most count."""
+    labels = transitions.select(["episode_id", "conditions"]).to_pylist()
+    steps: dict[str, int] = {}
+    for row in labels:
+        steps[row["episode_id"]] = steps.get(row["episode_id"], 0) + (
+            "near_collision" in row["conditions"]
+        )
+    most = {episode for episode, count in steps.items() if count == max(steps.values())}
+    text = "unlisted = 'drop'\n[[strata]]\nname = 'near_collision'\nunit = 'episode'\nmin_steps = "
+    plan = planned(transitions, text + f"{max(steps.values()) + 5}\n" + NO_SPLIT)
+    assert set(taken(plan)["episode_id"].to_pylist()) == most
