@@ -25,13 +25,13 @@ from numpy.typing import NDArray
 from restock.errors import ConfigError
 from restock.ingest.profile.custom_signal import CustomSignal, name_problem
 from restock.ingest.profile.tag_rules import TagRules
+from restock.ingest.task.condition_files import with_files
 from restock.ingest.task.conditions import (
     Condition,
     label,
     labels_version,
     probabilities,
     shipped,
-    with_files,
 )
 from restock.ingest.task.schema import steps_schema
 from restock.ingest.task.task import Task

@@ -163,7 +163,7 @@ def count_rows(scores: Sequence[LabelScore]) -> list[dict[str, Any]]:
 
 def conditions_json(conditions: Sequence[Condition]) -> str:
     """Conditions as the manifest holds them: all but their doc."""
-    names = ("name", "timing", "priority", "sql", "probability", "uncertain", "constants")
+    names = ("name", "timing", "priority", "sql", "let", "probability", "uncertain", "constants")
     return msgspec.json.encode(
         [{name: getattr(condition, name) for name in names} for condition in conditions]
     ).decode()

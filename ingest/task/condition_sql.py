@@ -48,9 +48,9 @@ _BACKWARD = {
 }
 
 
-def select_of(columns: str) -> str:
-    """The query that computes such columns over the table `steps`."""
-    return f"SELECT {columns} FROM steps {WINDOW} ORDER BY row_"
+def select_of(columns: str, source: str = "steps") -> str:
+    """The query that computes such columns over the table `steps`, or over what is made of it."""
+    return f"SELECT {columns} FROM {source} {WINDOW} ORDER BY row_"
 
 
 @lru_cache(maxsize=1024)

@@ -8,6 +8,9 @@ says what it may look at:
 - `pre`: known before acting at step t; looks at step t and earlier ones only;
 - `post`: about the outcome of step t; may look at t + 1 and later.
 
+What an expression computes may be named first: each `let` is a column for those after it, so that a
+window can look over another's results.
+
 A condition may have a **probability** beside its label: an expression of the same kind that gives
 0 to 1, from how far the signals are from the rule's limits against the noise of the sensors. A step
 whose probability lies within the condition's `uncertain` band is too near to call.
@@ -25,8 +28,7 @@ import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from importlib.resources import files
-from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import duckdb
 import msgspec
@@ -35,13 +37,12 @@ import pyarrow as pa
 
 from restock.arrays import F32, Bools
 from restock.errors import ConfigError
-from restock.ingest.task.condition_sql import SANDBOX, refusal, select_of
+from restock.ingest.task.condition_files import settings_of
+from restock.ingest.task.condition_sql import SANDBOX, WINDOW, refusal, select_of
 from restock.toml import Checked
 
 Timing = Literal["pre", "post"]
 NOMINAL = "nominal"
-PROBABILITY = "-- probability:"  # a line of a condition's file
-LARGEST_BYTES = 100_000  # of a condition's file
 
 
 class Condition(Checked, frozen=True):
@@ -52,28 +53,24 @@ class Condition(Checked, frozen=True):
     sql: str
     priority: int = 50
     doc: str = ""
+    let: dict[str, str] = msgspec.field(default_factory=dict)  # name -> SQL, of those before it
     probability: str = ""  # SQL, 0 to 1; "": none
     uncertain: tuple[float, float] = (0.2, 0.8)  # within it a step is too near to call
-    # Numbers that its SQL may name, beside the steps' columns.
-    constants: dict[str, float] = msgspec.field(default_factory=dict)
-
-    @property
-    def expressions(self) -> tuple[str, ...]:
-        """The SQL of the label, and of its probability where there is one."""
-        return (self.sql, self.probability) if self.probability else (self.sql,)
+    constants: dict[str, float] = msgspec.field(default_factory=dict)  # that its SQL may name
 
     def with_constants(self, constants: Mapping[str, float]) -> Condition:
         """The condition with those of the constants that its SQL names; its own win."""
-        words = {word for text in self.expressions for word in re.findall(r"\w+", text)}
+        expressions = (self.sql, self.probability, *self.let.values())
+        words = {word for text in expressions for word in re.findall(r"\w+", text)}
         used = {name: value for name, value in constants.items() if name in words}
         return msgspec.structs.replace(self, constants=used | self.constants)
 
     def check(self) -> None:
         if not 0 <= self.uncertain[0] <= self.uncertain[1] <= 1:
             raise ValueError(f"uncertain must be [low, high] in [0, 1], got {self.uncertain}")
-        for name in self.constants:
-            if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
-                raise ValueError(f"a constant's name must be lower case letters, got {name!r}")
+        for name in (*self.constants, *self.let):
+            if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
+                raise ValueError(f"let and constants: a name is letters, digits and _: {name!r}")
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", self.name) or self.name == NOMINAL:
             raise ValueError(
                 f"name must be letters, digits and _, and not {NOMINAL!r}: {self.name!r}"
@@ -92,45 +89,13 @@ def shipped() -> dict[str, Condition]:
     return conditions
 
 
-def settings_of(text: str) -> dict[str, Any]:
-    """What a .sql file says: `sql`, and of its comments `timing`, `priority`, `uncertain`, `doc`.
-
-    What follows the line `-- probability:` is the SQL of the probability.
-    """
-    rule, _, likelihood = (text + "\n").partition(f"\n{PROBABILITY}\n")
-    settings: dict[str, Any] = {}
-    doc: list[str] = []
-    for line in rule.splitlines():
-        if line.startswith("--"):
-            key, colon, value = line[2:].strip().partition(": ")
-            if not colon or key not in ("timing", "priority", "uncertain"):
-                doc.append(line[2:].strip())
-            elif key == "uncertain":
-                settings[key] = [_number(part) for part in value.split(" to ")]
-            else:
-                settings[key] = int(value) if value.lstrip("-").isdigit() else value
-    settings = {"sql": _without_comments(rule), "doc": " ".join(doc), **settings}
-    return settings | ({"probability": _without_comments(likelihood)} if likelihood else {})
-
-
-def _without_comments(text: str) -> str:
-    return "\n".join(line for line in text.splitlines() if not line.startswith("--")).strip()
-
-
-def _number(text: str) -> float | str:
-    try:
-        return float(text)
-    except ValueError:
-        return text  # for the type check to refuse, with its key
-
-
 def labels_version(conditions: Sequence[Condition]) -> str:
     """Names a set of conditions by what they say: 12 hex digits."""
     said = [
         (c.name, c.timing, c.sql, c.priority)
         # Nothing more where there is nothing more: so that the version of a plain rule stays.
         + ((c.probability, c.uncertain) if c.probability else ())
-        + ((sorted(c.constants.items()),) if c.constants else ())
+        + ((list(c.let.items()), sorted(c.constants.items())) if c.let or c.constants else ())
         for c in conditions
     ]
     content = msgspec.json.encode(sorted(said, key=str))
@@ -193,16 +158,16 @@ def _evaluate(
     steps: pa.Table, conditions: Sequence[Condition], which: Literal["sql", "probability"]
 ) -> dict[str, pa.ChunkedArray]:
     """One expression of each condition over the steps."""
+    together: dict[str, list[Condition]] = {}  # those with the same table to select from
     for condition in conditions:
-        if reason := refusal(getattr(condition, which), condition.timing):
-            raise ConfigError(reason, where=_where(condition, which))
+        _refuse(condition, which, steps.column_names)
+        together.setdefault(_source(condition), []).append(condition)
     columns: dict[str, pa.ChunkedArray] = {}
-    by_constants: dict[tuple[tuple[str, float], ...], list[Condition]] = {}
-    for condition in conditions:
-        by_constants.setdefault(tuple(sorted(condition.constants.items())), []).append(condition)
-    for constants, several in by_constants.items():
-        with duckdb.connect(config=SANDBOX) as connection:
-            _register(connection, steps, dict(constants))
+    with duckdb.connect(config=SANDBOX) as connection:
+        numbered = steps.append_column("row_", pa.array(range(len(steps)), pa.int64()))
+        connection.register("steps", numbered)
+        connection.execute("SET lock_configuration = true").fetchall()
+        for several in together.values():
             try:
                 rows = _query(connection, several, which)
             except duckdb.Error:
@@ -216,8 +181,22 @@ def _evaluate(
                             remedy=f"the steps have the columns {', '.join(steps.column_names)}",
                         ) from error
                 raise
-        columns |= {condition.name: rows[condition.name] for condition in several}
+            columns |= {condition.name: rows[condition.name] for condition in several}
     return {condition.name: columns[condition.name] for condition in conditions}
+
+
+def _refuse(condition: Condition, which: str, columns: Sequence[str]) -> None:
+    """Raises ConfigError where its SQL says what no condition may."""
+    taken = {"row_", *(name.lower() for name in columns)}
+    for name in (*condition.constants, *condition.let):
+        if name.lower() in taken:
+            raise ConfigError(f"{name!r} is taken: give it another name",
+                              where=f"condition {condition.name!r}")  # fmt: skip
+        taken.add(name.lower())
+    for name, sql in (*condition.let.items(), ("", getattr(condition, which))):
+        if reason := refusal(sql, condition.timing):
+            where = f"`let` {name!r} of condition {condition.name!r}" if name else None
+            raise ConfigError(reason, where=where or _where(condition, which))
 
 
 def _where(condition: Condition, which: str) -> str:
@@ -225,15 +204,15 @@ def _where(condition: Condition, which: str) -> str:
     return said if which == "sql" else f"the probability of {said}"
 
 
-def _register(
-    connection: duckdb.DuckDBPyConnection, steps: pa.Table, constants: Mapping[str, float]
-) -> None:
-    steps = steps.append_column("row_", pa.array(range(len(steps)), pa.int64()))
-    for name, value in constants.items():
-        if name not in steps.column_names:
-            steps = steps.append_column(name, pa.array(np.full(len(steps), value)))
-    connection.register("steps", steps)
-    connection.execute("SET lock_configuration = true").fetchall()
+def _source(condition: Condition) -> str:
+    """What its expressions select from: the steps, its constants, and its `let`s one by one."""
+    source = "steps"
+    if condition.constants:
+        named = (f'{float(value)!r}::DOUBLE AS "{n}"' for n, value in condition.constants.items())
+        source = f"(SELECT *, {', '.join(named)} FROM steps) AS steps"
+    for name, sql in condition.let.items():
+        source = f'(SELECT *, ({sql}\n) AS "{name}" FROM {source} {WINDOW}) AS steps'
+    return source
 
 
 def runnable(steps: pa.Table, conditions: Sequence[Condition]) -> list[Condition]:
@@ -250,8 +229,9 @@ def runnable(steps: pa.Table, conditions: Sequence[Condition]) -> list[Condition
 def _query(
     connection: duckdb.DuckDBPyConnection, conditions: Sequence[Condition], which: str
 ) -> pa.Table:
+    """Of conditions that select from the same."""
     columns = ",\n".join(f'({getattr(c, which)}\n) AS "{c.name}"' for c in conditions)
-    return connection.sql(select_of(columns)).to_arrow_table()
+    return connection.sql(select_of(columns, _source(conditions[0]))).to_arrow_table()
 
 
 def primary(labels: dict[str, Bools], conditions: Sequence[Condition]) -> list[str]:
@@ -267,50 +247,3 @@ def primary(labels: dict[str, Bools], conditions: Sequence[Condition]) -> list[s
 
 def _first_line(error: Exception) -> str:
     return str(error).splitlines()[0]
-
-
-def with_files(document: dict[str, Any], folder: Path | None, where: str) -> dict[str, Any]:
-    """A profile's TOML with the text of each `[[condition]] file = "…"` in place of its name.
-
-    A file may say `-- timing: pre` and `-- priority: 45` in comments, as the shipped ones do;
-    what the TOML says goes first. Its name must stay in the profile's folder: profiles are
-    passed between strangers.
-
-    Raises:
-        ConfigError: no such file, or one that lies elsewhere; names the key.
-    """
-    conditions = document.get("condition")
-    if not isinstance(conditions, list):
-        return document
-    read = [
-        _read(entry, f"condition[{place}]", folder, where)
-        if isinstance(entry, dict) and "file" in entry
-        else entry
-        for place, entry in enumerate(conditions)
-    ]
-    return document | {"condition": read}
-
-
-def _read(entry: dict[str, Any], key: str, folder: Path | None, where: str) -> dict[str, Any]:
-    name = entry["file"]
-
-    def refused(what: str, remedy: str | None = None) -> ConfigError:
-        return ConfigError(f"`{key}.file` {what}", where=where, remedy=remedy)
-
-    if "sql" in entry:
-        raise refused("stands beside `sql`: give one of them")
-    if not isinstance(name, str) or not name.endswith(".sql"):
-        raise refused(f"must name a .sql file, got {name!r}")
-    if folder is None:
-        raise refused("needs a profile that is a file: it is looked for beside it")
-    path = (folder / name).resolve()
-    if Path(name).is_absolute() or not path.is_relative_to(folder.resolve()):
-        raise refused(f"leads out of the profile's folder: {name}", "put it beside the profile")
-    try:
-        if path.stat().st_size > LARGEST_BYTES:
-            raise refused(f"is larger than {LARGEST_BYTES:,} bytes: {name}")
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise refused(f"cannot be read: {name}: {error}") from error
-    stem = {"name": path.stem} if path.stem.isidentifier() else {}
-    return stem | settings_of(text) | {k: value for k, value in entry.items() if k != "file"}
