@@ -28,6 +28,7 @@ from restock.ingest.profile.tag_rules import TagRules
 from restock.ingest.task.condition_files import with_files
 from restock.ingest.task.conditions import (
     Condition,
+    Noise,
     label,
     labels_version,
     probabilities,
@@ -134,24 +135,6 @@ class Frames(Checked, frozen=True):
             raise ValueError(f"fixed and base are the same frame: {self.base!r}")
 
 
-class Noise(Checked, frozen=True):
-    """The `[noise]` of a profile: what the sensors' readings vary by, for probabilities.
-
-    Standard deviations. The SQL of conditions names them as `lidar_noise_m`, and so on.
-    """
-
-    lidar_m: Annotated[float, Meta(gt=0)] = 0.015  # of a range
-    localiser_m: Annotated[float, Meta(gt=0)] = 0.01  # of the way between two poses, each axis
-    wheels_mps: Annotated[float, Meta(gt=0)] = 0.003  # of the speed by the wheels
-    gyro_radps: Annotated[float, Meta(gt=0)] = 0.01  # its bias too
-
-    @property
-    def constants(self) -> dict[str, float]:
-        """Each by the name that SQL has for it."""
-        named = msgspec.structs.asdict(self)
-        return {"_noise_".join(name.rsplit("_", 1)): value for name, value in named.items()}
-
-
 class Zone(Checked, frozen=True):
     """A named rectangle of the map: `box_m = [x0, y0, x1, y1]`."""
 
@@ -185,9 +168,9 @@ class Profile(Checked, frozen=True):
     @property
     def conditions(self) -> list[Condition]:
         """The conditions that label this robot's steps."""
-        known = shipped()
-        named = [known[name] for name in self.shipped_conditions] + self.own_conditions
-        return [condition.with_constants(self.noise.constants) for condition in named]
+        known = shipped(self.noise)
+        own = [one.with_constants(self.noise.constants) for one in self.own_conditions]
+        return [known[name] for name in self.shipped_conditions] + own
 
     @property
     def labels_version(self) -> str:

@@ -43,8 +43,7 @@ def read_profile_toml(text: str, *, where: str) -> Profile:
 
 def with_conditions(profile: Profile, conditions: Sequence[Condition]) -> Profile:
     """The same profile with other conditions; those that come with Restock go by their names."""
-    noise = profile.noise.constants
-    known = {name: one.with_constants(noise) for name, one in shipped().items()}
+    known = shipped(profile.noise)
     named = [c.name for c in conditions if known.get(c.name) == c]
     own = [c for c in conditions if c.name not in named]
     return msgspec.structs.replace(profile, shipped_conditions=named, own_conditions=own)

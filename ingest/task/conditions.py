@@ -28,12 +28,13 @@ import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from importlib.resources import files
-from typing import Literal
+from typing import Annotated, Literal
 
 import duckdb
 import msgspec
 import numpy as np
 import pyarrow as pa
+from msgspec import Meta
 
 from restock.arrays import F32, Bools
 from restock.errors import ConfigError
@@ -77,15 +78,38 @@ class Condition(Checked, frozen=True):
             )
 
 
-def shipped() -> dict[str, Condition]:
-    """The conditions that come with Restock, by name: `ingest/task/conditions/*.sql`."""
+class Noise(Checked, frozen=True):
+    """The `[noise]` of a profile: what the sensors' readings vary by, for probabilities.
+
+    Standard deviations. The SQL of conditions names them as `lidar_noise_m`, and so on.
+    """
+
+    lidar_m: Annotated[float, Meta(gt=0)] = 0.015  # of a range
+    localiser_m: Annotated[float, Meta(gt=0)] = 0.01  # of the way between two poses, each axis
+    wheels_mps: Annotated[float, Meta(gt=0)] = 0.003  # of the speed by the wheels
+    gyro_radps: Annotated[float, Meta(gt=0)] = 0.01  # its bias too
+
+    @property
+    def constants(self) -> dict[str, float]:
+        """Each by the name that SQL has for it."""
+        named = msgspec.structs.asdict(self)
+        return {"_noise_".join(name.rsplit("_", 1)): value for name, value in named.items()}
+
+
+def shipped(noise: Noise | None = None) -> dict[str, Condition]:
+    """The conditions that come with Restock, by name: `ingest/task/conditions/*.sql`.
+
+    `noise` is of the sensors of the robot whose steps they label; None: as the profile's defaults.
+    """
+    constants = (noise or Noise()).constants
     folder = files("restock.ingest.task") / "conditions"
     conditions = {}
     for entry in sorted(folder.iterdir(), key=lambda item: item.name):
         if entry.name.endswith(".sql"):
             name = entry.name.removesuffix(".sql")
             text = entry.read_text(encoding="utf-8")
-            conditions[name] = msgspec.convert({"name": name, **settings_of(text)}, Condition)
+            made = msgspec.convert({"name": name, **settings_of(text)}, Condition)
+            conditions[name] = made.with_constants(constants)
     return conditions
 
 
