@@ -77,23 +77,16 @@ def test_a_bump_makes_the_step_before_it_a_near_collision():
 def test_an_obstacle_in_the_way_is_a_blocked_aisle_only_when_it_stays():
     passing = steps(20, clearance_ahead_m=changed(0.5, 2.0, 20, slice(8, 9)))
     assert given_to(passing, "blocked_aisle") == []
-    x = np.minimum(np.arange(60) * 0.18, 3.4)  # up to a pallet, and stop before it
-    speed = np.where(x < 3.4, 0.9, 0.0)
-    pallet = steps(
-        60,
-        pose_x_m=x,
-        wheel_speed_mps=speed,
-        clearance_ahead_m=3.9 - x,
-        clearance_m=np.full(60, 0.4),
-    )
+    x = np.minimum(np.arange(60) * 0.18, 3.68)  # up to a pallet, and stop before it
+    drive = {"pose_x_m": x, "wheel_speed_mps": np.where(x < 3.68, 0.9, 0.0)}
+    ahead = 3.9 - x
+    pallet = steps(60, **drive, clearance_ahead_m=ahead, clearance_m=np.minimum(ahead, 0.5))
     found = given_to(pallet, "blocked_aisle")
     assert {20, 30, 50, 59} <= set(found)
-    assert found[0] >= 14  # 1.2 m before it
+    assert found[0] >= 14  # 1.4 m before it
     # Somebody walks up to the robot as fast as it drives, and is away after a second.
     ahead = np.concatenate([np.linspace(4, 0.3, 10), np.full(5, 0.3), np.full(45, 4.0)])
-    person = steps(
-        60, pose_x_m=x, wheel_speed_mps=speed, clearance_ahead_m=ahead, clearance_m=np.full(60, 0.4)
-    )
+    person = steps(60, **drive, clearance_ahead_m=ahead, clearance_m=np.minimum(ahead, 0.5))
     assert given_to(person, "blocked_aisle") == []
 
 
