@@ -40,6 +40,11 @@ class LabelCommand:
     """A profile that comes with Restock, or a TOML file, whose conditions to use."""
     all: bool = False
     """Use that profile's conditions for recordings that another profile read, too."""
+    score: bool = False
+    """Label nothing: print how good the labels are where a simulator knew what was true, by step
+    and by event, and how reliable their probabilities are."""
+    by: Annotated[str | None, tyro.conf.arg(metavar="COLUMN")] = None
+    """With --score: one score for each value of a column of `recordings` (source_file, map, …)."""
     review: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """List the N most doubtful events."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -57,12 +62,14 @@ class LabelCommand:
     def run(self) -> int:
         """Label, and say what changed."""
         from restock.cli import output
-        from restock.cli.data import label_review
+        from restock.cli.data import label_quality, label_review
         from restock.ingest.relabel import open_for_relabel, relabel_store
         from restock.ingest.store.version import given_version
 
         store = open_for_relabel(self.store)
         self._check_options()
+        if self.score:
+            return label_quality.print_scores(self.store, self.by, json=self.json)
         if self.review is not None:
             return label_review.review(self.store, self.review, self.out, json=self.json)
         if self.corrections is not None:
@@ -115,12 +122,16 @@ class LabelCommand:
             "--version": self.version is not None,
         }
         for verb, given, others in (
+            ("--score", self.score, {"--review": self.review is not None}),
+            ("--score", self.score, {"--corrections": self.corrections is not None}),
             ("--review", self.review is not None, {"--corrections": self.corrections is not None}),
             ("--corrections", self.corrections is not None, {"--out": self.out is not None}),
         ):
             clash = [name for name, there in (others | of_rules).items() if there]
             if given and clash:
                 raise ConfigError(f"{verb} does not go with {clash[0]}")
+        if self.by is not None and not self.score:
+            raise ConfigError("--by goes with --score")
         if self.out is not None and self.review is None:
             raise ConfigError("--out goes with --review N")
 

@@ -1,0 +1,95 @@
+"""`restock label --score`: labels against the truth, by step and event, and their reliability."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from support.stores import manifest, recording_transitions, write_store
+
+from restock.cli import main
+from restock.errors import QueryError
+from restock.ingest.store.writer import StoreWriter
+from restock.replay.store.label_quality import label_quality
+from restock.replay.store.store import Store
+
+
+def with_truth(table: pa.Table, missed: float) -> pa.Table:
+    """The labels are the truth, but for a share of the true steps that were not labelled."""
+    rng = np.random.default_rng(3)
+    named = table["conditions"].to_pylist()
+    truth = [",".join(sorted(names)) or "nominal" for names in named]
+    held = [[name for name in names if rng.random() > missed] for names in named]
+    for name, values in (("true_condition", truth), ("conditions", held)):
+        field = table.schema.field(name)
+        at = table.column_names.index(name)
+        table = table.set_column(at, field, pa.array(values, field.type))
+    return table
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    tables = [with_truth(recording_transitions(number), 0.1 * number) for number in (1, 5)]
+    return write_store(tmp_path_factory.mktemp("quality") / "store", tables)
+
+
+def test_the_scores_of_a_store_say_how_sure_they_are(store: Path) -> None:
+    with Store(store) as opened:
+        found = {one.score.condition: one for one in label_quality(opened)}
+        for one in found.values():
+            assert one.precision.value == 1 == one.event_precision.value
+            assert one.recall.low <= one.recall.value == one.score.recall <= one.recall.high <= 1
+            assert one.event_recall.low < one.event_recall.value < one.event_recall.high
+        by_log = label_quality(opened, "source_file")
+        assert {one.group for one in by_log} == {"logs/1.mcap", "logs/5.mcap"}
+        blocked = [one for one in by_log if one.score.condition == "blocked_aisle"]
+        assert sum(one.score.support for one in blocked) == found["blocked_aisle"].score.support
+        better, worse = (one.recall.value for one in sorted(blocked, key=lambda one: one.group))
+        assert better > worse + 0.2
+        with pytest.raises(QueryError, match="no column 'colour'"):
+            label_quality(opened, "colour")
+
+
+def test_the_command_prints_scores_and_reliability(
+    store: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["label", str(store), "--score"]) == 0
+    said = capsys.readouterr().out
+    assert "event recall" in said
+    assert "wheel_slip" in said
+    assert main(["label", str(store), "--score", "--by", "source_file", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert {row["group"] for row in document["scores"]} == {"logs/1.mcap", "logs/5.mcap"}
+    assert {row["condition"] for row in document["reliability"]} == {"recovery"}
+    assert main(["label", str(store), "--by", "source_file"]) == 2
+    assert main(["label", str(store), "--score", "--corrections", "none"]) == 2
+
+
+def test_a_store_without_truth_has_nothing_to_score(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_store(tmp_path / "store", [recording_transitions(1)])
+    assert main(["label", str(path), "--score"]) == 0
+    assert "nothing to score" in capsys.readouterr().out
+
+
+def test_scores_of_recordings_older_than_events_are_read(tmp_path: Path) -> None:
+    """The manifest has ratios only: the views give steps, and null for events."""
+    writer = StoreWriter(tmp_path / "store")
+    rows = recording_transitions(1)
+    old = manifest(rows)
+    at = old.column_names.index("label_counts")
+    old = old.set_column(at, old.schema.field(at), pa.nulls(1, old.schema.types[at]))
+    writer.write(old, rows)
+    writer.write(manifest(recording_transitions(2)), recording_transitions(2))
+    with Store(tmp_path / "store") as opened:
+        first, second = opened.sql(
+            "SELECT agreed, event_recall FROM label_scores ORDER BY recording_id"
+        ).fetchall()
+        pooled = opened.sql("SELECT labelled, event_support FROM pooled_label_scores").fetchall()
+    assert first == (32, None)
+    assert second == (32, 0.5)
+    assert pooled == [(72, 6)]
