@@ -155,7 +155,7 @@ def misses(floors: str, one: LabelQuality) -> list[str]:
 
 def bounds(stores: Mapping[tuple[str, str], Path], part: str) -> dict[str, dict[str, LabelScore]]:
     """Floors -> condition -> what a network reaches there that was trained on development logs."""
-    logs = {key: [one for one in signals_of(path)] for key, path in stores.items()}
+    logs = {key: signals_of(path) for key, path in stores.items()}
     found: dict[str, dict[str, LabelScore]] = {}
     for condition in load_profile("warehouse_amr").conditions:
         span = BACK[condition.timing], AHEAD[condition.timing]

@@ -66,10 +66,10 @@ class LabelCommand:
         from restock.ingest.relabel import open_for_relabel, relabel_store
         from restock.ingest.store.version import given_version
 
-        store = open_for_relabel(self.store)
         self._check_options()
         if self.score:
             return label_quality.print_scores(self.store, self.by, json=self.json)
+        store = open_for_relabel(self.store)
         if self.review is not None:
             return label_review.review(self.store, self.review, self.out, json=self.json)
         if self.corrections is not None:
