@@ -78,8 +78,8 @@ def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> bool
     """Views of a run or a panel in a schema; False where it is neither."""
     if (path / HEADER).is_file():
         panel = Panel.open(path)
-        for view, file in (("rows", META), ("evaluation_split", EVALUATION_SPLIT)):
-            _add_table(connection, schema, view, path / file)
+        for view, name in (("rows", META), ("evaluation_split", EVALUATION_SPLIT)):
+            _add_table(connection, schema, view, path / name)
         strata = pa.Table.from_pylist([msgspec.structs.asdict(s) for s in panel.strata])
         _keep(connection, schema, "strata", strata)
         return True

@@ -37,7 +37,7 @@ from restock.train.comparison.action_coverage import ActionSymptom, action_sympt
 from restock.train.run.run import Run
 
 Cause = Literal[
-    *("HEALTHY", "BUFFER", "ACTION_COVERAGE", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED")
+    "HEALTHY", "BUFFER", "ACTION_COVERAGE", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED"
 ]
 WINDOWS = 3  # the last, that figures are the median of
 _LEAST_ROWS = 20  # held out, for a condition to be diagnosed
