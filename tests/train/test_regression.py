@@ -123,6 +123,33 @@ def test_pairing_tells_what_unpaired_shares_would_not(tmp_path: Path) -> None:
     assert verdicts(tolerant)["wheel_slip"] == "no difference shown"
 
 
+def test_few_episodes_say_nothing_of_better_or_worse(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One episode that fell is no regression: values, without interval and verdict, and exit 0."""
+    good = evaluated(tmp_path / "a", dict.fromkeys(CONDITIONS, 1.0), episodes=9)
+    bad = evaluated(tmp_path / "b", dict.fromkeys(CONDITIONS, 0.0), episodes=9)
+    rows = regression(of_run(good), of_run(bad))
+    few = {row["condition"]: row for row in rows if row["perturbation"] == "none"}
+    assert {few[name]["verdict"] for name in ("nominal", "wheel_slip")} == {"inconclusive"}
+    assert (few["nominal"]["difference"], few["nominal"]["difference_low"]) == (-1.0, None)
+    assert few["nominal"]["reason"] == "9 episodes, at least 10 are needed"
+    # 27 episodes together, but one kind has 4: its spread would count for nothing.
+    assert few["blocked_aisle (full)"]["episodes"] + few["blocked_aisle (partial)"]["episodes"] == 9
+    assert few["all"]["verdict"] == "inconclusive"
+    assert "at least 5" in str(few["all"]["reason"])
+    assert not regressed(rows)
+
+    from restock.train.evaluation import eval_run
+
+    monkeypatch.setattr(eval_run, "plan_evaluation", lambda *_, **__: None)  # nothing drives
+    assert main(["eval", str(bad), "--no-drive", "--baseline", str(good), "--check"]) == 0
+    said = capsys.readouterr()
+    assert "inconclusive" in said.out
+    assert "WORSE" not in said.err
+    assert "9 episodes, at least 10 are needed" in said.err
+
+
 @pytest.mark.parametrize(
     "changes",
     [

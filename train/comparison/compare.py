@@ -31,13 +31,12 @@ from restock.train.comparison.comparability import (
     check_feeds,
     worst,
 )
-from restock.train.evaluation.regression import agent_episodes
+from restock.train.evaluation.regression import LEAST_EPISODES, agent_episodes
 from restock.train.run.run import Run
 
 Cell = tuple[str, str]  # perturbation, condition (with the kind of block)
 _SAME_TOTAL = 1.02  # ratio of environment steps, and of updates
-LEAST_RUNS = 3  # seeds of each arm, and …
-LEAST_EPISODES = 10  # … of a cell, that both arms drove: fewer give no interval
+LEAST_RUNS = 3  # seeds of each arm: with fewer there is no interval
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,9 @@ from restock.train.run.run_tables import EVAL_EPISODES
 
 FOLDER = Path("baselines")  # where names are looked up, in the working directory
 EVERY = "all"
-Verdict = Literal["better", "worse", "no difference shown", "refused"]
+Verdict = Literal["better", "worse", "no difference shown", "inconclusive", "refused"]
+LEAST_EPISODES = 10  # of a row; fewer give no interval and no verdict
+LEAST_OF_A_KIND = 5  # … and of each condition in the row of all, whose spreads are added up
 _KEY = b"restock-baseline"
 _Key = tuple[int, str]  # seed, and the values of the perturbation in force
 _Episodes = dict[_Key, tuple[float, float]]  # success and return
@@ -104,7 +106,8 @@ def regression(
     """One row a perturbation and condition of the baseline, and one of each perturbation's all.
 
     `worse` is a success lower by more than `margin`, with the paired 95 % interval below 0;
-    `better` is an interval above 0. A cell whose episodes are not the same is `refused`.
+    `better` is an interval above 0. From fewer than `LEAST_EPISODES` neither is told: the row is
+    `inconclusive`. A cell whose episodes are not the same is `refused`.
 
     Raises:
         RunError: the two are of different tasks.
@@ -168,8 +171,11 @@ def _row(
     difference = mean_over_strata([pair[:, 1, 0] - pair[:, 0, 0] for pair in pairs], rng=rng)
     success = [float(np.mean([pair[:, arm, 0].mean() for pair in pairs])) for arm in (0, 1)]
     together = np.concatenate(pairs)[:, :, 1]
+    few = _too_few([len(pair) for pair in pairs])
     verdict: Verdict = "no difference shown"
-    if difference.high < 0 and difference.value < -margin:
+    if few:
+        verdict = "inconclusive"
+    elif difference.high < 0 and difference.value < -margin:
         verdict = "worse"
     elif difference.low > 0:
         verdict = "better"
@@ -180,15 +186,25 @@ def _row(
         "baseline": success[0],
         "candidate": success[1],
         "difference": difference.value,
-        "difference_low": difference.low,
-        "difference_high": difference.high,
+        "difference_low": None if few else difference.low,
+        "difference_high": None if few else difference.high,
         "return_iqm": [iqm(together[:, 0]), iqm(together[:, 1])],
         "improvement": float(
             np.mean([paired_improvement(pair[:, 1, 1], pair[:, 0, 1]) for pair in pairs])
         ),
         "verdict": verdict,
-        "reason": None,
+        "reason": few,
     }
+
+
+def _too_few(episodes: Sequence[int]) -> str | None:
+    """Why so many episodes of each condition are too few for an interval, or None."""
+    total, least = sum(episodes), min(episodes)
+    if total < LEAST_EPISODES:
+        return f"{total} episode{'s' * (total > 1)}, at least {LEAST_EPISODES} are needed"
+    if len(episodes) > 1 and least < LEAST_OF_A_KIND:
+        return f"{least} of a condition, at least {LEAST_OF_A_KIND} are needed"
+    return None
 
 
 def _refused(cell: tuple[str, str], before: _Episodes, after: _Episodes) -> dict[str, Any]:

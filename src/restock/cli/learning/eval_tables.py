@@ -83,16 +83,16 @@ def show_regression(rows: list[dict[str, Any]], baseline: str, margin: float) ->
 
 def _regression_row(row: dict[str, Any]) -> dict[str, Any]:
     known = row["baseline"] is not None
+    difference = f"{row['difference']:+.2f}" if known else ""
+    if row["difference_low"] is not None:
+        difference += f" [{row['difference_low']:+.2f}, {row['difference_high']:+.2f}]"
     return {
         "perturbation": row["perturbation"],
         "condition": row["condition"],
         "episodes": row["episodes"],
         "baseline": f"{row['baseline']:.2f}" if known else "",
         "candidate": f"{row['candidate']:.2f}" if known else "",
-        "difference": f"{row['difference']:+.2f} [{row['difference_low']:+.2f},"
-        f" {row['difference_high']:+.2f}]"
-        if known
-        else "",
+        "difference": difference,
         "P(improvement)": f"{row['improvement']:.2f}" if known else "",
         "": row["verdict"],
     }
