@@ -84,17 +84,29 @@ WITH steps AS (
         episode_id,
         ended,
         success,
+        robot,
+        site,
+        firmware,
+        map,
+        shift,
+        tags,
         episode_end_ns,
         recording_end_ns,
         CAST(period_s * 1e9 AS BIGINT) AS period_ns
-    FROM (SELECT recording_id, episode_id, task_hash, ended, success, end_ns AS episode_end_ns FROM episodes)
-    JOIN (SELECT recording_id, end_stamp_ns AS recording_end_ns FROM recordings) USING (recording_id)
+    FROM (SELECT recording_id, episode_id, ended, success, end_ns AS episode_end_ns FROM episodes)
     JOIN (
-        SELECT DISTINCT
-            task_hash,
+        SELECT
+            recording_id,
+            robot,
+            site,
+            firmware,
+            map,
+            shift,
+            tags,
+            end_stamp_ns AS recording_end_ns,
             CAST(json_extract_string(task_json, '$.control_period_s') AS DOUBLE) AS period_s
         FROM recordings
-    ) USING (task_hash)
+    ) USING (recording_id)
 ), judged AS (
     SELECT
         *,
@@ -139,6 +151,4 @@ SELECT
     outcome,
     CASE WHEN outcome <> 'open' THEN outcome = 'recovered' END AS recovered,
     (recovered_ns - onset_ns) / 1e9 AS recovered_after_s
-FROM judged
-JOIN (SELECT recording_id, robot, site, firmware, map, shift, tags FROM recordings)
-    USING (recording_id);
+FROM judged;

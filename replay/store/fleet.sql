@@ -11,11 +11,11 @@ WITH of_episode AS (
         period_h
     FROM episodes
     JOIN (
-        SELECT DISTINCT
-            task_hash,
+        SELECT
+            recording_id,
             CAST(json_extract_string(task_json, '$.control_period_s') AS DOUBLE) / 3600 AS period_h
         FROM recordings
-    ) USING (task_hash)
+    ) USING (recording_id)
 ), seen AS (
     SELECT
         robot,
