@@ -11,7 +11,7 @@ import functools
 from collections.abc import Callable
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import duckdb
 import pyarrow as pa
@@ -55,6 +55,7 @@ _ARROW = {
     "DOUBLE": pa.float64(),
     "FLOAT": pa.float32(),
 }
+T = TypeVar("T")
 _RENAMED = {"stratum": "name", "drawn_share": "share"}  # to the fields of `Stratum`
 
 
@@ -78,19 +79,22 @@ def install_mixtures(store: Store) -> None:
         ("planned_strata", STRATA, strata_table),
         ("planned_rows", ROWS, rows_table),
     ):
-        _install(store.connection, function, columns, table_of, planned)
+        install_function(store.connection, function, columns, table_of, planned)
     text = (files("restock.replay.panel") / "mixture_tables.sql").read_text(encoding="utf-8")
     store.connection.execute(text)
 
 
-def _install(
+def install_function(
     connection: duckdb.DuckDBPyConnection,
     function: str,
     columns: dict[str, str],
-    table_of: Callable[[PanelPlan], pa.Table],
-    planned: Callable[[str, int], PanelPlan],
+    table_of: Callable[[T], pa.Table],
+    planned: Callable[[str, int], T],
 ) -> None:
-    """A function of the connection: names of mixtures to lists of structs, one a row."""
+    """A function of the connection: names of mixtures to lists of structs, one a row.
+
+    `planned` gets a name and when its file was last written, in ns (0 of a shipped mixture).
+    """
     schema = pa.schema([(name, _ARROW[kind]) for name, kind in columns.items()])
 
     def lists(names: pa.Array) -> pa.Array:

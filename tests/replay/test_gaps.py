@@ -233,3 +233,16 @@ def test_a_missions_file_says_what_is_wrong_with_it(tmp_path: Path) -> None:
 def test_wrong_columns_of_a_cell_are_named(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["gaps", str(store), "--min-rows", "3", "--by", "condition,aisle"]) == 2
     assert "'aisle' cannot make a cell" in capsys.readouterr().err
+
+
+def test_gaps_are_a_table_of_sql(store: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text(ASKING)
+    with Store(store) as opened:
+        query = f"FROM gaps('{tmp_path / 'mine.toml'}') WHERE asked_by LIKE 'mixture%'"
+        rows = opened.sql(query).to_arrow_table().to_pylist()
+        none = opened.sql("FROM gaps('uniform') WHERE asked_by LIKE 'mixture%'").fetchall()
+    (row,) = rows
+    assert (row["stratum"], row["needed"], row["unit"]) == ("wheel_slip", 100, "missions")
+    assert row["missing"] == 100 - row["there"]
+    assert row["amount_low"] <= row["amount"] <= row["amount_high"]
+    assert none == []
