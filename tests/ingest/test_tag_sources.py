@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import sqlite3
 from pathlib import Path
@@ -82,6 +83,19 @@ def test_metadata_records_and_a_file_that_is_cut(tmp_path):
     path.write_bytes(path.read_bytes()[:-30])
     with open_recording(path, salvage=True) as recording:
         assert [(*item[:2], dict(item.entries)) for item in recording.metadata] == found
+
+
+def test_info_shows_what_a_recording_says(tmp_path, capsys):
+    entries = {f"k{number:02}": "x" * 100 for number in range(12)}
+    path = mcap(tmp_path / "a.mcap", ("device", entries))
+    assert main(["info", str(path)]) == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "k00" in line]
+    assert line.startswith(f"metadata record 'device' of a.mcap: k00={'x' * 60}, k01=")
+    assert line.endswith(f"k09={'x' * 60}, and 2 more")
+    assert main(["info", str(path), "--json"]) == 0
+    (recording,) = json.loads(capsys.readouterr().out)["recordings"]
+    says = [{"source": "metadata record 'device' of a.mcap", "entries": entries}]
+    assert recording["says"] == says
 
 
 def test_hostile_metadata_is_bounded_and_counted(tmp_path):

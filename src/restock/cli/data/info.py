@@ -110,11 +110,11 @@ def _print(entry: dict[str, Any]) -> None:
             listed = ", ".join(name or "(unnamed)" for name in names[:NAMED])
             sys.stdout.write(f"{what}, {len(names):,}: {listed}{more}\n")
     for said in entry["says"]:
-        pairs = [
-            f"{name}={value[:LONGEST]}" for name, value in list(said["entries"].items())[:NAMED]
-        ]
-        more = len(said["entries"]) - NAMED
-        sys.stdout.write(f"{said['source']}: {', '.join(pairs)}{f', {more:,} more' * (more > 0)}\n")
+        entries = list(said["entries"].items())
+        pairs = [f"{name}={value[:LONGEST]}" for name, value in entries[:NAMED]]
+        if len(entries) > NAMED:
+            pairs.append(f"and {len(entries) - NAMED:,} more")
+        sys.stdout.write(visible(f"{said['source']}: {', '.join(pairs)}") + "\n")
     sys.stdout.flush()
     for line in entry["damage"]:
         sys.stderr.write(visible(f"{entry['path']}: damaged: {line}") + "\n")
