@@ -7,8 +7,8 @@ Records logs of seeds that no rule was set on, on the default floor and on `gene
 them, and prints precision and recall of each condition with 95 % intervals, the share that is too
 near to call, the reliability of the probabilities, and `bound`: what a network of two layers
 reaches that saw the development logs, all stored signals of 5 steps before to 4 after (`pre`
-conditions: 12 before) and the truth. It holds where it is, in FOLDER: what was recorded and
-ingested there is not again, and labels follow the rules as they are now.
+conditions: 12 before) and the truth. What is in FOLDER is not recorded again; labels follow the
+rules as they are now.
 """
 
 from __future__ import annotations
@@ -53,9 +53,8 @@ def main() -> int:
     options = parser.parse_args()
     if options.quick:
         options.minutes = 6.0
-    parts = [options.part]
-    if not (options.quick or options.no_bound):
-        parts = sorted({"development", options.part})
+    trained = not (options.quick or options.no_bound)
+    parts = sorted({"development", options.part}) if trained else [options.part]
     stores = {
         (part, floors): stored(options.cache, floors, list(seeds)[: 2 if options.quick else None],
                                options.minutes)
@@ -63,7 +62,7 @@ def main() -> int:
         for floors, seeds in SEEDS[part].items()
     }  # fmt: skip
     measured = {key: path for key, path in stores.items() if key[0] == options.part}
-    bound = {} if len(parts) == 1 and options.part == "held-out" else bounds(stores, options.part)
+    bound = bounds(stores, options.part) if trained else {}
     lines: list[str] = []
     figures: dict[str, Any] = {}
     missed: list[str] = []

@@ -151,6 +151,13 @@ def poor_labels(table: pa.Table, recordings: pa.Table) -> Tables:
     return table, replaced(recordings, "label_scores", scores)
 
 
+def uncertain_slip(table: pa.Table, recordings: pa.Table) -> Tables:
+    slips = rows_where(table, "condition", "wheel_slip")
+    return replaced(
+        table, "uncertain", [["wheel_slip"] if row else [] for row in slips]
+    ), recordings
+
+
 def failures(table: pa.Table, recordings: pa.Table) -> Tables:
     # Episodes with a slip end in failure: cut instead of terminated.
     failed = set(
@@ -251,6 +258,7 @@ PLANTS: list[tuple[str, Plant, int, dict[str, object]]] = [
     ("several_tasks", two_tasks, 2, {"task_hash": TASK.hash}),
     ("stale_labels", old_labels, 1, {"recording_id": f"{2:016x}"}),
     ("label_quality", poor_labels, 1, {"condition": "wheel_slip", "precision": 0.5}),
+    ("uncertain_labels", uncertain_slip, 1, {"condition": "wheel_slip"}),
     ("stratum_of_failures", failures, 1, {"condition": "wheel_slip", "success_share": 0.0}),
     ("unsafe_data", bumping_operator, 1, {"behaviour_policy": "operator"}),
     ("dropped_ticks", many_drops, 1, {"dropped": 2000}),

@@ -61,7 +61,7 @@ def recording_transitions(
         "conditions": held,
         "true_condition": [None] * rows,
         "probabilities": [[("recovery", p)] for p in chance.random(rows)],
-        "uncertain": [["recovery"] if row % 9 == 0 else [] for row in range(rows)],
+        "uncertain": [["recovery"] if row % 97 == 0 else [] for row in range(rows)],
         "perturbation": np.where(np.arange(rows) % 3 > 0, "wet", None),
         "perturbation_values": [[("friction_scale", 0.5)] if r % 3 else None for r in range(rows)],
         "zone": rng.choice(["aisle_1", "aisle_2", "cross"], rows),

@@ -5,7 +5,9 @@ SELECT
     condition,
     sum(precision * labelled) / sum(labelled) AS precision,
     sum(recall * support) / sum(support) AS recall,
-    sum(support) AS support
+    sum(support) AS support,
+    sum(event_right) / nullif(sum(event_labelled), 0) AS event_precision,
+    sum(event_found) / nullif(sum(event_support), 0) AS event_recall
 FROM label_scores
 GROUP BY condition
 HAVING sum(support) >= $min_support

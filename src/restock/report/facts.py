@@ -53,6 +53,8 @@ class Facts:
     rare: Rows = field(default_factory=list)
     recordings: Rows = field(default_factory=list)
     logged: Rows = field(default_factory=list)  # share of logged rows per condition
+    labels: Rows = field(default_factory=list)  # scores of the store's labels, pooled
+    reliability: Rows = field(default_factory=list)  # of their probabilities
     off_policy: Rows = field(default_factory=list)  # off-policy estimates, over all conditions
     missing: list[str] = field(default_factory=list)  # what could not be read, and why
 
@@ -133,6 +135,8 @@ def _add_panel(facts: Facts) -> None:
             facts.rare = _store_rows(store, "rare", most=MOST_DOTS)
             facts.recordings = _store_rows(store, "recordings")
             facts.logged = _store_rows(store, "logged")
+            facts.labels = _store_rows(store, "labels")
+            facts.reliability = _store_rows(store, "reliability")
     except RestockError as error:
         facts.missing.append(f"Not shown, since it could not be read: {error}")
 

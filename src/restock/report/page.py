@@ -9,6 +9,7 @@ from restock.report.actions import actions_section
 from restock.report.blocks import span, words
 from restock.report.capacity import capacity_section
 from restock.report.facts import Facts, mean_success
+from restock.report.labels import labels_section
 from restock.report.sections import critic, floor_section, learning, provenance, sampled, success
 from restock.report.twin_gap import run_section
 
@@ -19,6 +20,7 @@ def page(facts: Facts) -> dict[str, Any]:
         success(facts),
         sampled(facts),
         actions_section(facts),
+        labels_section(facts),
         capacity_section(facts),
         learning(facts),
         critic(facts),

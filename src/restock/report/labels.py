@@ -1,0 +1,63 @@
+"""The section on labels: how good they are on the run's logs, where a simulator knew the truth."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from restock.report.blocks import Section, Table, count, percent, words
+from restock.report.facts import Facts
+from restock.stats import wilson
+
+
+def labels_section(facts: Facts) -> Section | None:
+    """None where no recording of the store knows what was true."""
+    if not facts.labels:
+        return None
+    rows = [_score(row) for row in facts.labels]
+    reliability = _reliability(facts.reliability)
+    tables = [Table(rows, set(rows[0]) - {"condition"})]
+    if reliability:
+        title = "Of steps whose probability is about p, a share p should be true"
+        tables.append(Table(reliability, set(reliability[0]) - {"condition"}, title=title))
+    return Section(
+        "labels",
+        "How good are the labels?",
+        intro="Against what the simulator knew, over all recordings of the store. An event is a run"
+        " of steps of an episode; it is found within .4 s. Ranges are 95 % (Wilson). Uncertain is"
+        " the share of all steps that are too near to call by the condition's probability.",
+        tables=tables,
+    )
+
+
+def _score(row: dict[str, Any]) -> dict[str, str]:
+    return {
+        "condition": words(row["condition"]),
+        "true steps": count(row["support"]),
+        "precision": _share(row["precision"]),
+        "recall": _share(row["recall"]),
+        "true events": count(row["event_support"]) if row["event_support"] is not None else "",
+        "event precision": _with_range(row["event_precision"], row["event_labelled"]),
+        "event recall": _with_range(row["event_recall"], row["event_support"]),
+        "uncertain": percent(row["uncertain_share"] or 0.0),
+    }
+
+
+def _share(value: float | None) -> str:
+    return "" if value is None else f"{value:.2f}"
+
+
+def _with_range(value: float | None, events: int | None) -> str:
+    if value is None or not events:
+        return ""
+    low, high = wilson(round(value * events), events)
+    return f"{value:.2f} ({low:.2f} to {high:.2f})"
+
+
+def _reliability(bins: list[dict[str, Any]]) -> list[dict[str, str]]:
+    """One row a condition, a column a tenth of probability: the share that is true, of how many."""
+    rows: dict[str, dict[str, str]] = {}
+    for one in bins:
+        blank = {f"{tenth / 10:g}+": "" for tenth in range(10)}
+        row = rows.setdefault(one["condition"], {"condition": words(one["condition"]), **blank})
+        row[f"{one['from_probability']:g}+"] = f"{one['true_share']:.2f} of {one['known']:,}"
+    return list(rows.values())
