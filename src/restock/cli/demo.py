@@ -125,8 +125,9 @@ def stages(logs: Path, out: Path, seconds: float, episodes: int, device: str) ->
         ),
         Stage(
             "A replay panel that keeps the rare conditions in stock",
-            "Quotas per stratum, caps on replays per row, and shortfalls reported; the result"
-            " is a pinned panel with an id.",
+            "Each shelf has the whole episodes that met its condition. Natural, wanted, drawn and"
+            " after weights stand side by side, and what is missing is told in rows and hours of"
+            " logging; the result is a pinned panel with an id.",
             ["mix", str(store), "--mixture", "coverage", "--out", str(panel)],
         ),
         Stage(

@@ -195,7 +195,7 @@ def _missing(line: dict[str, Any]) -> str:
     if line["missing_hours"] is None:
         return f"{text}, and none of these logs went to it"
     hours = line["missing_hours"]
-    took = f"{hours:,.1f} hours" if hours >= 1 else f"{60 * hours:,.0f} minutes"
+    took = f"{hours:,.1f} h" if hours >= 1 else f"{60 * hours:,.1f} min"
     return f"{text}: about {took} of logging at the rate of these logs"
 
 
