@@ -4,18 +4,21 @@ A loss or gradient that is NaN or infinite makes every value NaN within an updat
 is learnt, evaluated or kept after it means anything. The loss of each update is looked at, which
 costs nothing: it is summed anyway. A gradient that is not finite under a loss that is shows in the
 parameters: they are looked at before an interval is closed, a policy is evaluated and a checkpoint
-is written, so that none of them is ever of NaN.
+is written, so that none of them is ever of NaN. Another library's loop is its own: there the rows
+and TD errors that its buffer sees are looked at, and the parameters before they are evaluated.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 
-from restock.arrays import Bools
+from restock.arrays import F32, Bools
 from restock.errors import RunError
 from restock.files import write_text
 from restock.train.dqn.loss import Loss
@@ -73,29 +76,86 @@ def check_parameters(session: Session) -> None:
     _stop(session, what, everything, "gave it", _SLOWER)
 
 
+def check_fed(
+    packed: F32,
+    td: F32 | None,
+    rows: Callable[[], list[dict[str, Any]]],
+    *,
+    run: Path | None,
+    steps: Mapping[str, int],
+) -> None:
+    """A batch (B, W) of another library's loop, with its TD errors (B,) where they are known.
+
+    Args:
+        rows: the ids of its rows, as `FeedRecord.last_batch` has them.
+        run: the run's directory, if there is one.
+        steps: `env_steps` and `gradient_steps` so far.
+
+    Raises:
+        NotFinite: one of them is not finite; names the rows.
+    """
+    bad_rows = ~np.isfinite(packed).all(axis=1)
+    bad_td = np.zeros(len(packed), np.bool_) if td is None else ~np.isfinite(td)
+    if bad_rows.any():
+        why = "hold values that are not finite"
+        _refuse("a batch is not finite", bad_rows, why, _LEAVE_OUT, rows(), run, steps)
+    if bad_td.any():
+        what = "the loss is not finite"
+        why = "have such TD errors"
+        if bad_td.all():
+            why += ", after an update that left no parameter whole"
+        _refuse(what, bad_td, why, _SLOWER, rows(), run, steps)
+
+
+def check_kept(parameters: bool, run: Path, steps: Mapping[str, int]) -> None:
+    """Before what another library learnt is evaluated: whether all its parameters are finite.
+
+    Raises:
+        NotFinite: one is not.
+    """
+    if not parameters:
+        what = "the gradient was not finite, and with it the network's parameters"
+        _refuse(what, np.zeros(0, np.bool_), "", _SLOWER, [], run, steps)
+
+
 def _stop(
     session: Session, what: str, bad: Bools, why: str, remedy: str, *, before: bool = False
 ) -> NoReturn:
     """Leave the run's tables whole, write down the rows, and raise."""
-    rows = session.feed.last_batch()
     session.write_held()
-    document = {
-        **session.steps,
-        "what": what,
-        "rows": [{**row, "named": bool(is_bad)} for row, is_bad in zip(rows, bad, strict=True)],
-        "rows_before": session.feed.last_batch(before=True) if before else [],
-    }
-    write_text(session.run.path / STOPPED, json.dumps(document, indent=1) + "\n")
+    rows_before = session.feed.last_batch(before=True) if before else []
+    rows, path = session.feed.last_batch(), session.run.path
+    _refuse(what, bad, why, remedy, rows, path, session.steps, rows_before)
+
+
+def _refuse(
+    what: str,
+    bad: Bools,
+    why: str,
+    remedy: str,
+    rows: Sequence[dict[str, Any]],
+    run: Path | None,
+    steps: Mapping[str, int],
+    rows_before: Sequence[dict[str, Any]] = (),
+) -> NoReturn:
+    """Write the rows into the run, if there is one, and raise."""
     named = [row for row, is_bad in zip(rows, bad, strict=True) if is_bad]
-    shown = ", ".join(map(_name, named[:_NAMED]))
-    more = f" and {len(named) - _NAMED} more" if len(named) > _NAMED else ""
-    raise NotFinite(
-        f"{what} at update {session.learner.gradient_steps}; {len(named)} of the {len(rows)} rows"
-        f" of the batch {why}: {shown}{more}; all are in {STOPPED}"
-        + (", with those of the batch before" if before else ""),
-        where=str(session.run.path),
-        remedy=remedy,
-    )
+    message = f"{what} at update {steps['gradient_steps']}"
+    if named:
+        more = f" and {len(named) - _NAMED} more" if len(named) > _NAMED else ""
+        message += f"; {len(named)} of the {len(rows)} rows of the batch {why}:"
+        message += f" {', '.join(map(_name, named[:_NAMED]))}{more}"
+    if run is not None:
+        document = {
+            **steps,
+            "what": what,
+            "rows": [{**row, "named": bool(is_bad)} for row, is_bad in zip(rows, bad, strict=True)],
+            "rows_before": list(rows_before),
+        }
+        write_text(run / STOPPED, json.dumps(document, indent=1) + "\n")
+        message += f"; all are in {STOPPED}" if rows else ""
+        message += ", with those of the batch before" if rows_before else ""
+    raise NotFinite(message, where=None if run is None else str(run), remedy=remedy)
 
 
 def _name(row: dict[str, Any]) -> str:
@@ -104,4 +164,11 @@ def _name(row: dict[str, Any]) -> str:
     return f"step {row['episode_step']} of the twin's episode {row['episode']}"
 
 
-__all__ = ["STOPPED", "NotFinite", "check_loss", "check_parameters"]
+__all__ = [
+    "STOPPED",
+    "NotFinite",
+    "check_fed",
+    "check_kept",
+    "check_loss",
+    "check_parameters",
+]

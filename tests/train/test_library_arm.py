@@ -14,7 +14,14 @@ from restock.cli import main
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.train.evaluation.policies import load_agent
-from restock.train.libraries.library_arm import LibraryArm, dqn_arguments, resolve, train_library
+from restock.train.finite import NotFinite
+from restock.train.libraries.library_arm import (
+    DONE,
+    LibraryArm,
+    dqn_arguments,
+    resolve,
+    train_library,
+)
 from restock.train.run.run import Run
 from restock.train.study.study import load_study
 
@@ -52,6 +59,17 @@ def test_dqn_leaves_a_run_that_says_what_it_was_fed(tmp_path: Path) -> None:
     evaluated = run.table("evaluations")
     assert len(evaluated) == 4  # one episode of each kind
     assert json.loads((tmp_path / "dqn" / "library.json").read_text())["env_steps"] == 160
+
+
+@pytest.mark.parametrize("library", ["sb3-dqn", "sb3-ppo"])
+def test_an_arm_whose_network_is_not_finite_ends_with_an_error(
+    library: str, tmp_path: Path
+) -> None:
+    own = {"sb3-ppo": {"n_steps": 40, "batch_size": 20, "n_epochs": 2}}.get(library, {})
+    with pytest.raises(NotFinite, match="not finite"):
+        trained(tmp_path / "run", library, learning_rate=float("inf"), **own)
+    assert not (tmp_path / "run" / DONE).exists()
+    assert not Run.open(tmp_path / "run").best.exists()
 
 
 def test_what_is_kept_acts_as_the_library_does(tmp_path: Path, monkeypatch) -> None:

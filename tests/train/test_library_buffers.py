@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import hashlib
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from support.library_buffers import TrainedBuffer, trained_sb3, trained_tianshou
 
 from restock import cli
 from restock.replay.store.store import Store
+from restock.train.finite import STOPPED, NotFinite
 
 
 @pytest.fixture(scope="module", params=[trained_sb3, trained_tianshou], ids=["sb3", "tianshou"])
@@ -35,6 +39,31 @@ def test_dqn_trains_first_on_logs_then_on_both(trained: TrainedBuffer) -> None:
     assert logs == trained.offline_updates * size + online * size // 2
     assert logs + fresh == size * feed.batches
     assert sum(row["updates"] for row in tables["progress"]) == feed.batches
+
+
+def test_a_network_that_is_not_finite_stops_the_loop_and_names_the_rows(
+    tmp_path: Path,
+) -> None:
+    """Where the buffer is told of TD errors; what was recorded before stays whole."""
+    trained = trained_sb3(tmp_path)
+    updates = trained.feed.batches
+    with torch.no_grad():
+        next(iter(trained.algorithm.q_net.parameters()))[0, 0] = float("nan")
+    with pytest.raises(NotFinite, match=rf"loss is not finite at update {updates}; 64 of the 64"):
+        trained.algorithm.train(1, batch_size=64)
+    document = json.loads((trained.run / STOPPED).read_text())
+    assert {row["source"] for row in document["rows"]} == {"logs", "fresh"}
+    assert all(row["named"] for row in document["rows"])
+    assert sum(row["updates"] for row in trained.tables["progress"]) == updates
+
+
+def test_a_row_that_is_not_finite_stops_the_loop_and_is_named(trained: TrainedBuffer) -> None:
+    feed = trained.feed
+    drawing = feed.draw_logs(4)
+    packed = np.zeros((len(drawing.rows), 3), np.float32)
+    packed[1, 2] = np.inf
+    with pytest.raises(NotFinite, match=rf"1 of the .* panel row {drawing.rows[1]} "):
+        feed.drawn(packed, drawing, np.empty(0, np.int64))
 
 
 def test_the_quotas_are_met_exactly(trained: TrainedBuffer) -> None:

@@ -151,15 +151,7 @@ class FeedRecord(Stateful):
 
     def last_batch(self, *, before: bool = False) -> list[dict[str, Any]]:
         """The ids of the rows of the batch last kept, or of the one before it, in its order."""
-        batch = self._before if before else self._last
-        panel_row, episode, episode_step = (values.tolist() for values in batch)
-        known = [] if self.logs is None else self.logs.transition_id[batch[0]].tolist()
-        logged = zip(panel_row, known, strict=True)
-        fresh = zip(episode, episode_step, strict=True)
-        return [
-            *({"source": "logs", "panel_row": row, "transition_id": key} for row, key in logged),
-            *({"source": "fresh", "episode": key, "episode_step": step} for key, step in fresh),
-        ]
+        return row_ids(self.logs, *(self._before if before else self._last))
 
     def flush(self, env_steps: int, gradient_steps: int, phase: str) -> dict[str, float | None]:
         """Close an interval and write what is known of it; returns its means, for `progress`."""
@@ -348,4 +340,17 @@ class FeedRecord(Stateful):
             self._audits.append(whole(slice(logged, len(packed)), rows))
 
 
-__all__ = ["UNLABELLED", "FeedRecord"]
+def row_ids(
+    logs: Logs | None, panel_row: Ints, episode: Ints, episode_step: Ints
+) -> list[dict[str, Any]]:
+    """The ids of a batch's rows: logged ones (L,), then fresh ones by episode and step (F,)."""
+    known = [] if logs is None else logs.transition_id[panel_row].tolist()
+    logged = zip(panel_row.tolist(), known, strict=True)
+    fresh = zip(episode.tolist(), episode_step.tolist(), strict=True)
+    return [
+        *({"source": "logs", "panel_row": row, "transition_id": key} for row, key in logged),
+        *({"source": "fresh", "episode": key, "episode_step": step} for key, step in fresh),
+    ]
+
+
+__all__ = ["UNLABELLED", "FeedRecord", "row_ids"]

@@ -34,7 +34,7 @@ from restock.train.evaluation.evaluate import (
     score,
 )
 from restock.train.evaluation.policies import GreedyPolicy, save_agent
-from restock.train.libraries.mixed_feed import create_run
+from restock.train.libraries.library_run import create_run
 from restock.train.prepare import make_twin, resolve_config
 from restock.train.run.run import Run
 from restock.train.twin.floors.floors import layouts_of_split

@@ -9,8 +9,7 @@ does: `strata`, `ages`, `policies`, `sampled_episodes`, `episodes`, `audit` and 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
-from importlib.metadata import version
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -24,20 +23,18 @@ from restock.ingest.profile.profile import Profile, load_profile
 from restock.replay.panel.logged_sampler import BatchDraw, LoggedSampler
 from restock.replay.panel.panel import Panel
 from restock.train.dqn.loss import Loss
-from restock.train.feed.batch_record import FeedRecord
+from restock.train.feed.batch_record import FeedRecord, row_ids
 from restock.train.feed.batches import ReplayBatch
 from restock.train.feed.collector import conditions_in_twin
-from restock.train.feed.fresh_log import values_entries
 from restock.train.feed.held_rows import EpisodeLabels
 from restock.train.feed.logs import Logs
+from restock.train.finite import NotFinite, check_fed
 from restock.train.libraries.fresh_meta import FreshMeta, InfoLabels
-from restock.train.run.run import Run, now_ns, panel_document, software_versions
-from restock.train.run.run_profile import profile_document, profile_of_panel
-from restock.train.run.run_tables import TABLES
+from restock.train.libraries.library_run import PartialTables, create_run, episode_row
+from restock.train.run.run import Run, now_ns
+from restock.train.run.run_profile import profile_of_panel
 
 PROFILE = "warehouse_amr"
-# Of an episode that ended, by the info of its last step.
-_INFO = ("episode_seed", "perturbation", "block", "success", "bumps")
 _NO_ROWS: Ints = np.empty(0, np.int64)
 NO_LOGS = BatchDraw(_NO_ROWS, _NO_ROWS, None, np.empty(0))
 
@@ -221,7 +218,17 @@ class MixedFeed:
 
         `weight` as applied, `td` (Q - target) and `q` (B,); unknown ones are null in the tables.
         Priorities and adaptive shares follow `td` where it is known.
+
+        Raises:
+            NotFinite: a row or a TD error is NaN or infinite; names the rows.
         """
+        path = None if self.run is None else self.run.path
+        steps = {"env_steps": self.env_steps, "gradient_steps": self.batches}
+        try:
+            check_fed(packed, td, lambda: self._row_ids(drawing, slots), run=path, steps=steps)
+        except NotFinite:
+            self.flush()  # the tables up to here are whole
+            raise
         if self._sampler is not None and self._sampler.needs_td and len(drawing.rows):
             self._td_missing = td is None
             if td is not None:
@@ -252,6 +259,10 @@ class MixedFeed:
         self._open += 1
         if self._open >= self.log_every:
             self._close_interval()
+
+    def _row_ids(self, drawing: BatchDraw, slots: Ints) -> list[dict[str, Any]]:
+        meta = self.fresh.meta
+        return row_ids(self.logs, drawing.rows, meta["episode"][slots], meta["episode_step"][slots])
 
     def flush(self) -> None:
         """Write the rows of the open interval, and those whose episodes go on without conditions.
@@ -309,82 +320,3 @@ def _check(panel: Panel, profile: Profile, observation_size: int) -> None:
             where=str(panel.path),
             remedy=f"ingest the logs with `--profile {profile.name}` and mix again",
         )
-
-
-def create_run(
-    path: Path,
-    library: Mapping[str, Any],
-    profile: Profile,
-    panel: Panel | None,
-    config: Any,
-    *,
-    seeds: Mapping[str, int],
-    **more: Any,
-) -> Run:
-    """Make the run of a library by its distribution's `name`: its `config.json` says all of this.
-
-    Raises RunError when something is at `path` already.
-    """
-    name = library["name"]
-    mixed = None
-    if panel is not None:
-        strata = {stratum.name: stratum.share for stratum in panel.strata}
-        mixed = {**panel_document(panel), "strata": strata}
-    return Run.create(
-        path,
-        {
-            "created_ns": now_ns(),
-            "library": {"version": version(name), **library},
-            "config": config,
-            "panel": mixed,
-            **more,
-            **profile_document(profile),
-            "not_evaluated": conditions_in_twin(profile.conditions, profile.signals)[1],
-            "seeds": seeds,
-            "versions": software_versions() | {name: version(name)},
-        },
-    )
-
-
-class PartialTables:
-    """A run's tables, null where a value is missing or NaN: what a library keeps to itself."""
-
-    def __init__(self, run: Run) -> None:
-        self.run = run
-
-    def append(self, table: str, rows: Sequence[Mapping[str, Any]]) -> None:
-        blank = dict.fromkeys(TABLES[table].names)
-        self.run.append(table, [blank | {k: known(v) for k, v in row.items()} for row in rows])
-
-    def append_columns(self, table: str, columns: Mapping[str, Any]) -> None:
-        self.run.append_columns(table, {k: column(v) for k, v in columns.items()})
-
-
-def column(values: Any) -> Any:
-    """A column, or one value for all rows, without NaNs."""
-    if isinstance(values, np.ndarray) and values.dtype.kind == "f" and np.isnan(values).any():
-        values = values.tolist()
-    return [known(value) for value in values] if isinstance(values, list) else known(values)
-
-
-def known(value: Any) -> Any:
-    """A value, or None for NaN."""
-    return None if isinstance(value, float) and value != value else value
-
-
-def episode_row(env: int, key: int, info: Mapping[str, Any]) -> dict[str, Any]:
-    """A row of `episodes`, as far as the last step's info tells."""
-    columns = set(TABLES["episodes"].names)
-    row = {"env": env, "episode": key, "conditions": []}
-    row |= {name: _plain(info[name]) for name in _INFO if name in info}
-    if "episode_condition" in info:
-        row["true_condition"] = _plain(info["episode_condition"])
-    if "perturbation_values" in info:
-        row["perturbation_values"] = values_entries(str(_plain(info["perturbation_values"])))
-    if "episode_steps" in info:
-        row["steps"] = _plain(info["episode_steps"])
-    return {name: value for name, value in row.items() if name in columns}
-
-
-def _plain(value: Any) -> Any:
-    return value.item() if hasattr(value, "item") else value

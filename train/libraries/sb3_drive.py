@@ -23,9 +23,10 @@ from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.train.dqn.config import TrainConfig
 from restock.train.feed.collector import conditions_in_twin
+from restock.train.finite import check_kept
 from restock.train.libraries.fresh_meta import InfoLabels
 from restock.train.libraries.library_arm import Evaluations, as_network
-from restock.train.libraries.mixed_feed import PartialTables, episode_row
+from restock.train.libraries.library_run import PartialTables, episode_row
 from restock.train.libraries.sb3_buffer import MixtureReplayBuffer, dqn_critic
 from restock.train.prepare import mission_orders
 from restock.train.run.run import Run
@@ -108,7 +109,11 @@ def ppo(
     fed = _OnPolicyFeed(config, run, model)
     parts = [model.policy.mlp_extractor.policy_net, model.policy.action_net]
     drive = _Drive(config, evaluations, parts, lambda: fed.updates)
-    model.learn(config.schedule.env_steps, callback=[fed, drive])
+    try:
+        model.learn(config.schedule.env_steps, callback=[fed, drive])
+    except ValueError:  # what its distributions say of logits that are NaN
+        drive.check()
+        raise
     fed.close()
     return drive.end()
 
@@ -139,7 +144,17 @@ class _Drive(BaseCallback):
             self._evaluate()
         return self.num_timesteps, self.updates()
 
+    def _on_rollout_start(self) -> None:
+        self.check()
+
+    def check(self) -> None:
+        """Raises NotFinite where an update has left a parameter that is not finite."""
+        finite = all(p.isfinite().all() for layer in self.linears for p in layer.parameters())
+        steps = {"env_steps": self.num_timesteps, "gradient_steps": self.updates()}
+        check_kept(finite, self.evaluations.run.path, steps)
+
     def _evaluate(self) -> None:
+        self.check()
         network = as_network(self.config, self.evaluations.task, self.linears)
         self.evaluations.drive(network, self.num_timesteps, self.updates())
 
