@@ -1,0 +1,153 @@
+"""Probabilities of conditions, named parts of their rules, and the noise that a profile states."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from support.profile_texts import WAREHOUSE
+from support.stores import manifest, recording_transitions
+
+from restock.errors import ConfigError
+from restock.ingest.profile.profile import parse_profile
+from restock.ingest.profile.profile_text import profile_toml, read_profile_toml
+from restock.ingest.relabel import relabel_store
+from restock.ingest.store.episode_rows import ENDS, packed
+from restock.ingest.store.writer import StoreWriter
+from restock.ingest.task.condition_files import settings_of
+from restock.ingest.task.conditions import (
+    Condition,
+    Noise,
+    label,
+    labels_version,
+    probabilities,
+    shipped,
+    too_near_to_call,
+)
+from restock.ingest.task.schema import COVERAGE, steps_schema
+from restock.replay.store.store import Store
+
+FILE = """-- Fast, for a while.
+-- timing: pre
+-- priority: 35
+-- uncertain: 0.1 to 0.6
+-- let over_mps:
+wheel_speed_mps - 0.5 -- of half a metre a second
+-- let smooth_mps:
+avg(over_mps) OVER (episode ROWS BETWEEN 1 PRECEDING AND CURRENT ROW)
+-- label:
+smooth_mps > 0
+-- probability:
+CASE WHEN step_index > 0 THEN 1 / (1 + exp(-smooth_mps / lidar_noise_m)) END
+"""
+
+
+def steps(speeds: list[float]) -> pa.Table:
+    count = len(speeds)
+    given = {
+        "wheel_speed_mps": speeds,
+        "step_index": np.arange(count),
+        "stamp_ns": np.arange(count) * 200_000_000,
+    }
+    columns = [
+        pa.array(given.get(field.name, np.zeros(count))).cast(field.type, safe=False)
+        for field in steps_schema()
+    ]
+    return pa.table(columns, schema=steps_schema())
+
+
+def condition(text: str = FILE, noise_m: float = 0.1) -> Condition:
+    made = Condition(name="fast", **settings_of(text))
+    return made.with_constants(Noise(lidar_m=noise_m).constants)
+
+
+def test_the_parts_of_a_file_are_named_and_looked_over_by_windows():
+    fast = condition()
+    assert (fast.doc, fast.timing, fast.priority) == ("Fast, for a while.", "pre", 35)
+    assert list(fast.let) == ["over_mps", "smooth_mps"]
+    assert fast.constants == {"lidar_noise_m": 0.1}  # what it names, and no more
+    table = steps([0.5, 0.7, 0.1, 0.9, 0.9])
+    assert label(table, [fast])["fast"].tolist() == [False, True, False, False, True]
+    given = probabilities(table, [fast])["fast"]
+    assert np.isnan(given[0])
+    np.testing.assert_allclose(given[1:], 1 / (1 + np.exp([-1, 1, 0, -4])), rtol=1e-5)
+    near = too_near_to_call({"fast": given}, [fast])["fast"]
+    assert near.tolist() == [False, False, True, True, False]
+
+
+def test_more_noise_makes_a_probability_less_sure():
+    table = steps([0.5, 0.7, 0.9])
+    sure, unsure = (probabilities(table, [condition(noise_m=n)])["fast"][2] for n in (0.05, 0.5))
+    assert sure > 0.95 > unsure > 0.5
+
+
+def test_the_version_of_labels_follows_what_can_change_them():
+    plain = Condition("fast", "pre", "wheel_speed_mps > 1")
+    assert labels_version([plain]) == labels_version([plain.with_constants(Noise().constants)])
+    versions = {
+        labels_version([condition(text, noise)])
+        for text in (FILE, FILE.replace("0.1 to", "0.3 to"), FILE.replace("0.5 --", "0.6 --"))
+        for noise in (0.1, 0.2)
+    }
+    assert len(versions) == 6
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            FILE.replace("wheel_speed_mps - 0.5", "lead(wheel_speed_mps) OVER episode"),
+            "'over_mps",
+        ),
+        (FILE.replace("let smooth_mps", "let pose_x_m"), "'pose_x_m' is taken"),
+        (FILE.replace("1 / (1 + exp(-smooth_mps / lidar_noise_m))", "1.5"), "in \\[0, 1\\]"),
+        (FILE.replace("1 / (1 + exp(-smooth_mps / lidar_noise_m))", "'much'"), "not a number"),
+        (FILE.replace("1 / (1 +", "1 / (unheard_of +"), "probability of condition 'fast'"),
+        (FILE.replace("1 / (1 +", "1 / ((SELECT 1) +"), "holds a query"),
+    ],
+)
+def test_a_probability_keeps_the_rules_of_a_label(text, said):
+    with pytest.raises(ConfigError, match=said):
+        probabilities(steps([0.5, 0.7, 0.9]), [condition(text)])
+
+
+def test_a_band_that_is_none_is_refused():
+    for band in ((0.8, 0.2), (-0.1, 0.5), (0.5, 1.5)):
+        with pytest.raises(ValueError, match="uncertain must be"):
+            Condition("fast", "pre", "true", uncertain=band)
+
+
+def test_a_profile_states_the_noise_and_stays_the_same_profile_for_rows():
+    usual = parse_profile(WAREHOUSE, where="a")
+    noisy = parse_profile(WAREHOUSE + "\n[noise]\nlidar_m = 0.05\n", where="b")
+    assert usual.hash == noisy.hash
+    assert usual.labels_version != noisy.labels_version
+    near = next(one for one in noisy.conditions if one.name == "near_collision")
+    assert near.constants == {"lidar_noise_m": 0.05}
+    carried = read_profile_toml(profile_toml(noisy), where="its text")
+    assert carried.labels_version == noisy.labels_version
+    assert shipped(noisy.noise)["near_collision"] == near
+    with pytest.raises(ConfigError, match="lidar_m"):
+        parse_profile(WAREHOUSE + "\n[noise]\nlidar_m = 0\n", where="c")
+
+
+def test_rows_from_before_there_were_probabilities_get_them_when_labelled_again(tmp_path: Path):
+    rows = recording_transitions(1)
+    later = [column.name for column in COVERAGE if column.name in ("probabilities", "uncertain")]
+    names = [field.name for field in steps_schema()]
+    ends = rows.select([name for name in names if name in rows.column_names]).slice(0, 1)
+    old = rows.drop_columns(later).replace_schema_metadata({ENDS: packed(ends)})
+    writer = StoreWriter(tmp_path / "s")
+    writer.write(manifest(rows).drop_columns(["label_counts"]), old)
+    query = "SELECT count(probabilities), count(uncertain), count(*) FROM transitions"
+    with Store(tmp_path / "s") as store:
+        assert store.sql(query).fetchall() == [(0, 0, len(rows))]
+    # One more that never holds: the labels are of another version.
+    conditions = [*shipped().values(), Condition("never", "pre", "false")]
+    relabel_store(StoreWriter(tmp_path / "s"), lambda name: conditions)
+    with Store(tmp_path / "s") as store:
+        assert store.sql(query).fetchall() == [(len(rows), len(rows), len(rows))]
+        ((told,),) = store.sql("SELECT map_keys(probabilities) FROM transitions LIMIT 1").fetchall()
+        assert set(told) <= set(shipped())
