@@ -13,6 +13,11 @@ INSTALLERS.append("restock.replay.fleet.gap_tables:install_gaps")
 if TYPE_CHECKING:
     from restock.replay.export.dataset import export_dataset as export_dataset
     from restock.replay.fleet.drift import measure_drift as measure_drift
+    from restock.replay.fleet.gaps import find_gaps as find_gaps
+    from restock.replay.fleet.missions_file import read_missions as read_missions
+    from restock.replay.fleet.panel_difference import diff_panels as diff_panels
+    from restock.replay.fleet.shopping_list import shopping_list as shopping_list
+    from restock.replay.fleet.store_difference import diff_stores as diff_stores
     from restock.replay.mixture.mixture import Mixture as Mixture
     from restock.replay.mixture.mixture import load_mixture as load_mixture
     from restock.replay.panel.build import build_panel as build_panel
@@ -42,6 +47,11 @@ else:
         {
             "restock.replay.export.dataset": ["export_dataset"],
             "restock.replay.fleet.drift": ["measure_drift"],
+            "restock.replay.fleet.gaps": ["find_gaps"],
+            "restock.replay.fleet.missions_file": ["read_missions"],
+            "restock.replay.fleet.panel_difference": ["diff_panels"],
+            "restock.replay.fleet.shopping_list": ["shopping_list"],
+            "restock.replay.fleet.store_difference": ["diff_stores"],
             "restock.replay.mixture.mixture": ["Mixture", "load_mixture"],
             "restock.replay.panel.build": ["build_panel"],
             "restock.replay.panel.iterable": ["PanelDataset"],

@@ -9,6 +9,7 @@ from restock.public import lazy
 if TYPE_CHECKING:
     from restock.train.comparison.compare import compare as compare
     from restock.train.comparison.diagnose import diagnose as diagnose
+    from restock.train.comparison.run_difference import diff_runs as diff_runs
     from restock.train.dqn.config import TrainConfig as TrainConfig
     from restock.train.evaluation.eval_run import evaluate as evaluate
     from restock.train.evaluation.ope import OpeConfig as OpeConfig
@@ -33,6 +34,7 @@ else:
         __name__,
         {
             "restock.train.comparison.compare": ["compare"],
+            "restock.train.comparison.run_difference": ["diff_runs"],
             "restock.train.comparison.diagnose": ["diagnose"],
             "restock.train.dqn.config": ["TrainConfig"],
             "restock.train.evaluation.eval_run": ["evaluate"],
