@@ -69,7 +69,8 @@ class Truth(Stateful):
         left = np.maximum(self.aftermath_s - self._period_s, 0.0)
         left[(clearance_m > CLEAR_M) & ~near] = 0.0
         self.aftermath_s = np.where(near, AFTERMATH_S, left)
-        return _TEXTS[which]
+        texts: NDArray[np.str_] = _TEXTS[which]
+        return texts
 
 
 def _blocked(pose: F64, plans_m: F64, pallets: F64) -> Bools:
