@@ -290,7 +290,7 @@ WITH valued AS (
             WHEN variance > 0 THEN student_p(t, df)
         END AS p,
         student_quantile(df) * sqrt(variance) / unit AS half,
-        against || CASE WHEN part IN ('driving', 'conditions') THEN part ELSE 'robot' END AS family
+        against || CASE WHEN part IN ('driving', 'conditions', 'custom') THEN part ELSE 'robot' END AS family
     FROM measured
 ), corrected AS (
     SELECT

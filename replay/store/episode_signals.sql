@@ -2,6 +2,12 @@
 -- each condition began (episode_conditions). drift.sql compares them over weeks. docs/drift.md says what
 -- each signal tells. Not in Spark's list of views.
 
+-- The names of the profiles' own signals (as JSON: recordings of an older store have no such column).
+CREATE OR REPLACE VIEW custom_signals AS
+SELECT DISTINCT unnest(CAST(json_extract_string(to_json(kept), '$.signals[*].name') AS VARCHAR[])) AS signal
+FROM recordings AS kept
+ORDER BY signal;
+
 -- What is compared: the part of the robot that a signal tells of, and the least change that matters.
 -- A `ratio` is compared as now / before, a `difference` as now - before, a `spread` as a difference in
 -- units of the reference's standard deviation between episodes.
@@ -31,7 +37,9 @@ FROM (VALUES
     ('clearance_m', 'driving', 'spread', 0.8, 1),
     ('clearance_ahead_m', 'driving', 'spread', 0.8, 1),
     ('reward', 'driving', 'spread', 0.8, 1)
-) AS known (signal, part, compared, matters, min_steps);
+) AS known (signal, part, compared, matters, min_steps)
+UNION ALL
+SELECT signal, 'custom', 'spread', 0.8, 1 FROM custom_signals;
 
 -- One value an episode of each signal, and the steps that it is from: none where those are too few
 -- or the robot has no such sensor. What tells of the robot leaves slipping steps out. Recordings without
@@ -213,6 +221,42 @@ WITH tasks AS (
     FROM flagged
     LEFT JOIN silent USING (episode_id)
     GROUP BY recording_id, episode_id
+    UNION ALL BY NAME
+    SELECT
+        any_value(robot) AS robot,
+        any_value(site) AS site,
+        recording_id,
+        episode_id,
+        min(logged_time) AS start_time,
+        signal,
+        avg(value) AS value,
+        count(value) AS steps
+    FROM (
+        SELECT
+            robot,
+            site,
+            recording_id,
+            episode_id,
+            logged_time,
+            signal,
+            -- A flag is 0 or 1; texts are no numbers.
+            coalesce(
+                TRY_CAST(told AS DOUBLE), CASE told WHEN 'true' THEN 1 WHEN 'false' THEN 0 END
+            ) AS value
+        FROM (
+            SELECT
+                robot,
+                site,
+                recording_id,
+                episode_id,
+                logged_time,
+                signal,
+                json_extract_string(to_json(rows), '$."' || signal || '"') AS told
+            FROM (SELECT * EXCLUDE (observation, next_observation) FROM transitions) AS rows
+            CROSS JOIN custom_signals
+        )
+    )
+    GROUP BY recording_id, episode_id, signal
 )
 SELECT
     coalesce(robot, 'untagged') AS robot,

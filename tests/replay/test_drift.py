@@ -258,6 +258,25 @@ def test_signals_that_a_robot_lacks_are_not_made_up() -> None:
     assert not signals & (lacking | {"localised_speed_mps", "gyro_yaw_rate_radps"})
 
 
+def test_the_signals_of_a_profile_are_compared_too() -> None:
+    connection = fleet([SyntheticRobot("a"), SyntheticRobot("b")], recordings=3)
+    # A battery of robot b that is weaker from week three on.
+    connection.execute(
+        "CREATE TABLE volts AS SELECT *, (24 + sin(transition_id) - 2 * (robot = 'b' AND"
+        f" logged_time >= '{WEEKS[2]}')::INT)::FLOAT AS battery_v, true AS lit FROM transitions"
+    )
+    connection.execute(
+        "CREATE TABLE told AS SELECT * REPLACE (list_transform(['battery_v', 'lit'], lambda name:"
+        " {name: name}) AS signals) FROM recordings"
+    )
+    connection.execute("CREATE OR REPLACE VIEW transitions AS FROM volts")
+    connection.execute("CREATE OR REPLACE VIEW recordings AS FROM told")
+    found = rows(connection, "FROM drift_findings WHERE part = 'custom'")
+    assert [(row["robot"], row["signal"]) for row in found] == [("b", "battery_v")]
+    lit = rows(connection, "SELECT DISTINCT value FROM episode_signals WHERE signal = 'lit'")
+    assert lit == [{"value": 1.0}]
+
+
 def test_values_that_never_vary_are_believed_to_a_tenth_of_what_matters() -> None:
     table = samples({("a", "x", 0): [np.zeros(6)], ("a", "x", 1): [np.ones(5)]})
     [row] = rows(of_samples(table), "FROM drift WHERE against = 'own reference'")
