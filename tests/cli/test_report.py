@@ -58,7 +58,12 @@ def run(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     panel = panel_of(store_path, mixture, root / "panel", task=TASK)
     config = {"target": {"rule": "hard", "every": 500}, "replay": {"ring_capacity": 4096}}
-    document = {"config": config, "panel": {"path": str(root / "panel"), "id": panel.id}}
+    began_ns = panel.header.newest_ns + 3 * 86_400 * 10**9
+    document = {
+        "config": config,
+        "panel": {"path": str(root / "panel"), "id": panel.id},
+        "created_ns": began_ns,
+    }
     made = Run.create(root / "run", document)
     steps = (500, 1000)
     made.append(
@@ -221,6 +226,17 @@ def test_the_page_fetches_nothing(html: str) -> None:
 def test_a_hostile_name_is_text_and_no_markup(html: str) -> None:
     assert "alert(1)" in html  # it is shown …
     assert HOSTILE not in html  # … as text
+
+
+def test_what_stands_in_backticks_is_set_as_code(html: str) -> None:
+    sentences = re.findall(r'<(?:p|figcaption|div class="callout")[^>]*>(.*?)</', html, re.DOTALL)
+    assert [text for text in sentences if "`" in text] == []
+    assert "<code>restock " in html
+
+
+def test_ages_say_how_old_the_newest_row_was(html: str) -> None:
+    part = html.split('<section id="fed">')[1].split("</section>")[0]
+    assert "when the panel&#39;s newest row was 3.0 days old" in part
 
 
 def test_the_headline_is_what_the_episodes_say(html: str) -> None:

@@ -7,11 +7,13 @@ replay card, its one-page answer to what the critic was fed.
 from __future__ import annotations
 
 import json
+import re
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import jinja2
+from markupsafe import Markup, escape
 
 from restock.files import write_text
 from restock.replay.fleet.drift import Drift
@@ -53,9 +55,15 @@ def _write_page(content: dict[str, Any], out: Path) -> Path:
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    environment.filters["code"] = _code
     out.parent.mkdir(parents=True, exist_ok=True)
     write_text(out, environment.from_string(template).render(content))
     return out
+
+
+def _code(text: str) -> Markup:
+    """A sentence as HTML: escaped, and what stands in backticks set as code."""
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 
 def write_card(run: Path) -> tuple[dict[str, Any], str]:

@@ -6,6 +6,7 @@ from typing import Any
 
 from markupsafe import Markup
 
+from restock.replay.panel.exclusions import DAY_NS
 from restock.report import charts, floor_map, shares
 from restock.report.blocks import (
     Figure,
@@ -103,8 +104,8 @@ def sampled(facts: Facts) -> Section:
             Figure(
                 charts.ages(_age_rows(facts)),
                 "How old the sampled rows were",
-                "Logs age by the calendar (days before training began); fresh rows by environment"
-                " steps since they were collected. The two are never pooled.",
+                f"Logs age by the calendar (days before training began{_newest(facts)}); fresh"
+                " rows by environment steps since they were collected. The two are never pooled.",
             )
         )
     if facts.policies:
@@ -122,6 +123,15 @@ def sampled(facts: Facts) -> Section:
         two=True,
         tables=[shares.table(facts)],
     )
+
+
+def _newest(facts: Facts) -> str:
+    """How old the newest row of the panel was then: what is older only for that is not stale."""
+    began_ns = facts.config.get("created_ns")
+    if facts.panel is None or began_ns is None:
+        return ""
+    days = (began_ns - facts.panel.header.newest_ns) / DAY_NS
+    return f", when the panel's newest row was {days:,.1f} days old: take that off for its age then"
 
 
 def _age_rows(facts: Facts) -> Rows:
