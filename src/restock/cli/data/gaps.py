@@ -212,5 +212,5 @@ def _order(order: dict[str, Any], unit: str, with_: dict[str, bool]) -> dict[str
         **{name: order[name] or "" for name in ("zone", "robot") if with_[name]},
         **({"missions": order["missions"]} if unit == "missions" else {}),
         "hours": round(order["hours"], 2),
-        "fills": ", ".join(dict.fromkeys(order["fills"])),
+        "fills": "; ".join(dict.fromkeys(order["fills"])),
     }
