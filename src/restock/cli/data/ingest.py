@@ -124,12 +124,22 @@ class IngestCommand:
 
 
 # Of a manifest, as printed: definitions, and what is said in other words.
-_LEFT_OUT = ("task_json", "conditions_json", "profile_toml", "source_file", "label_scores")
+_LEFT_OUT = (
+    "task_json",
+    "conditions_json",
+    "profile_toml",
+    "source_file",
+    "label_scores",
+    "label_counts",
+)
 
 
 def as_json(outcome: IngestResult) -> dict[str, Any]:
     """An outcome as `--json` prints it."""
     from restock.ingest.task.label_scores import GOOD
+
+    # Of events, too; a recording that was ingested before there were such counts has none.
+    counts = {row["condition"]: row for row in outcome.manifest.get("label_counts") or []}
 
     row = {key: value for key, value in outcome.manifest.items() if key not in _LEFT_OUT}
     return {
@@ -140,7 +150,11 @@ def as_json(outcome: IngestResult) -> dict[str, Any]:
         "conditions": outcome.conditions,
         "named": outcome.named,
         "label_scores": [
-            {**score, "good": None not in (p, r) and min(p, r) >= GOOD}
+            {
+                **counts.get(score["condition"], {}),
+                **score,
+                "good": None not in (p, r) and min(p, r) >= GOOD,
+            }
             for score in outcome.manifest["label_scores"]
             for p, r in [(score["precision"], score["recall"])]
         ],
