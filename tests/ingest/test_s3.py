@@ -67,6 +67,11 @@ def test_every_verb_of_a_store_takes_the_address(place, tmp_path, run):
     assert said["store_version"] == 1
     header = json.loads((tmp_path / "panel" / "panel.json").read_text())
     assert place in json.dumps(header, ensure_ascii=False)
+    code, said, err = run("diff", f"{place}@0", place)
+    assert (code, err) == (0, "")
+    assert (said["a"]["rows"], said["b"]["rows"]) == (0, count)
+    code, said, err = run("gaps", place)
+    assert (code, err, said["store_version"]) == (0, "", 1)
 
 
 def test_of_two_writers_of_one_version_the_second_is_refused(place, monkeypatch):
