@@ -93,13 +93,13 @@ def _read(store: Store, ingest_id: str, names: Sequence[str], period_s: float) -
     truth = [frozenset(text.split(",")) for text in rows["true_condition"].to_pylist()]
     held = [frozenset(names or ()) for names in rows["conditions"].to_pylist()]
     unsure = [frozenset(names or ()) for names in rows["uncertain"].to_pylist()]
-    episodes = {}
+    episodes: dict[str, F64] = {}
     for score in scores:
         has, true, doubt = (_has(score.condition, sets) for sets in (held, truth, unsure))
         counted = (has, true, has & true, doubt)
         episodes[score.condition] = np.stack(
             [
-                np.bincount(episode, column, episode.max() + 1).astype(np.int64)
+                np.bincount(episode, column, episode.max() + 1).astype(np.float64)
                 for column in counted
             ],
             axis=1,
