@@ -13,6 +13,7 @@ as printed.
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import signal
@@ -99,6 +100,8 @@ def serve(folder: Path) -> None:
     """Import everything, then run what is asked for, each in a fork."""
     import_all()
     cut_short()
+    gc.collect()
+    gc.freeze()  # a fork's collections leave the pages that it shares alone
     listener = socket.socket(socket.AF_UNIX)
     listener.bind(str(folder / "socket"))
     listener.listen()
