@@ -232,7 +232,8 @@ class _Reading:
         found: dict[str, list[_Episode]] = {}
         ids = table["episode_id"].to_pylist()
         begins = [row for row in range(len(ids)) if row == 0 or ids[row] != ids[row - 1]]
-        for begin, end in zip(begins, [*begins[1:], len(ids)], strict=True):
+        ends = [*begins[1:], len(ids)] if ids else []  # none where no verdict is filled in
+        for begin, end in zip(begins, ends, strict=True):
             part = table.slice(begin, end - begin)
             first = part.slice(0, 1).to_pylist()[0]
             episode = _Episode(
