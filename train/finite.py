@@ -94,8 +94,10 @@ def check_fed(
     Raises:
         NotFinite: one of them is not finite; names the rows.
     """
-    bad_rows = ~np.isfinite(packed).all(axis=1)
-    bad_td = np.zeros(len(packed), np.bool_) if td is None else ~np.isfinite(td)
+    bad_rows: Bools = np.logical_not(np.isfinite(packed).all(axis=1))
+    bad_td: Bools = np.zeros(len(packed), np.bool_)
+    if td is not None:
+        bad_td = np.logical_not(np.isfinite(td))
     if bad_rows.any():
         why = "hold values that are not finite"
         _refuse("a batch is not finite", bad_rows, why, _LEAVE_OUT, rows(), run, steps)
