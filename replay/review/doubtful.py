@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from restock.errors import StoreError
+from restock.replay.store.query import install_named
 from restock.replay.store.store import Store
 
 LIKELY = 0.2  # from this probability on, steps without a label may be a missed event
@@ -53,6 +54,7 @@ def doubtful_events(store: Store, most: int) -> list[DoubtfulEvent]:
     """
     text = (files("restock.replay.review") / "doubtful.sql").read_text(encoding="utf-8")
     given = {"likely": LIKELY, "edge": EDGE_STEPS, "most": most}
+    install_named(store.connection, text)
     relation = store.connection.sql(text, params=given)
     events = [DoubtfulEvent(*row) for row in relation.fetchall()]
     if not events and not store.connection.sql("FROM recordings LIMIT 1").fetchall():

@@ -29,7 +29,7 @@ import duckdb
 
 from restock.errors import ConfigError, StoreError
 from restock.files import first_line
-from restock.replay.store.query import interruptible, values
+from restock.replay.store.query import install_named, interruptible, values
 from restock.toml import read_toml
 
 Severity = Literal["error", "warning", "info"]
@@ -202,6 +202,7 @@ def _run(
         )
 
     def run() -> tuple[list[str], list[tuple[Any, ...]]]:
+        install_named(connection, audit.sql)
         relation = connection.sql(audit.sql, params=dict(thresholds) or None)
         return relation.columns, values(relation)
 

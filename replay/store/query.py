@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from importlib.resources import files
 from typing import Any, TypeVar
 
@@ -20,19 +22,61 @@ MACROS = (
     "macros.sql",
     "capacity.sql",
     "repeated_rows.sql",
+    "corrections.sql",
     "episode_signals.sql",
     "drift.sql",
-    "corrections.sql",
 )
+# To bind these takes more than half of the time to open a store: only for queries that name them.
+ON_DEMAND = (("events.sql", "fleet.sql"), ("episode_signals.sql", "drift.sql"))
+_LISTS = {
+    "columns",
+    "information_schema",
+    "duckdb_views",
+    "duckdb_columns",
+    "duckdb_tables",
+    "show",
+}
 
 # Statements that leave files as they are; CREATE makes tables and macros in memory.
 _ALLOWED = {"SELECT", "EXPLAIN", "CREATE", "DROP", "SET", "VARIABLE_SET", "PRAGMA", "CALL"}
 
 
 def install(connection: duckdb.DuckDBPyConnection, observation_type: str) -> None:
-    """Create the views and macros over `stored_transitions` and `stored_recordings`."""
+    """Create all views and macros over `stored_transitions` and `stored_recordings`."""
     connection.execute(definitions(observation_type))
     install_columns(connection)
+
+
+def install_first(connection: duckdb.DuckDBPyConnection, observation_type: str) -> None:
+    """Create those that are not ON_DEMAND; `install_named` makes the others."""
+    later = {name for group in ON_DEMAND for name in group}
+    first = [name for name in (*VIEWS, *MACROS) if name not in later]
+    connection.execute(definitions(observation_type, first))
+
+
+def install_named(connection: duckdb.DuckDBPyConnection, text: str) -> None:
+    """Create the views ON_DEMAND that a query (or another text) names, on a store's connection."""
+    words = set(re.findall(r"\w+", text.lower()))
+    every = bool(words & _LISTS)
+    named = [group for group in ON_DEMAND if every or words & _names(group)]
+    if not named:
+        return
+    query = "SELECT view_name FROM duckdb_views() WHERE schema_name = 'main'"
+    there = {name for (name,) in connection.execute(query).fetchall()}
+    if "recordings" not in there:  # a run's or a panel's
+        return
+    for group in named:
+        if not _names(group) & there:
+            connection.execute(definitions(names=group))
+    if every and "columns" not in there:
+        install_columns(connection)
+
+
+@cache
+def _names(group: Sequence[str]) -> frozenset[str]:
+    """The views and macros of some SQL files."""
+    text = definitions(names=group)
+    return frozenset(re.findall(r"^CREATE OR REPLACE (?:VIEW|MACRO) (\w+)", text, re.MULTILINE))
 
 
 def definitions(observation_type: str = "FLOAT[]", names: Sequence[str] = (*VIEWS, *MACROS)) -> str:
@@ -68,6 +112,7 @@ def query(
                 where=where,
                 remedy="print with --csv or --json and redirect, or use .to_arrow_table()",
             )
+    install_named(connection, text)
     try:
         for statement in statements[:-1]:
             connection.execute(statement).fetchall()

@@ -30,7 +30,7 @@ from restock.ingest.store.writer import OWN_PATH, RECORDINGS, RETENTION_HOURS, T
 from restock.ingest.task.conditions import Condition
 from restock.ingest.task.task import Task
 from restock.replay.store.computed import install_computed
-from restock.replay.store.query import definitions, install, query
+from restock.replay.store.query import install_first, query
 
 T = TypeVar("T")
 
@@ -113,7 +113,7 @@ class Store:
             ) from error
         self._tasks = self._read_tasks()
         self.observation_type = self._observation_type()
-        install(self.connection, self.observation_type)
+        install_first(self.connection, self.observation_type)
         install_computed(self)
 
     def __enter__(self) -> Store:
@@ -210,12 +210,14 @@ class Store:
     def attach(self, connection: duckdb.DuckDBPyConnection, schema: str) -> None:
         """Views and macros of this store in a schema of another connection, beside other stores'.
 
+        Those on demand are not there.
+
         Raises StoreError where a file is missing or damaged.
         """
         connection.execute(f'CREATE SCHEMA "{schema}"; USE "{schema}"')
         try:
             self._present_all(connection, schema)
-            connection.execute(definitions(self.observation_type))
+            install_first(connection, self.observation_type)
         finally:
             connection.execute("USE main")
 
