@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -27,6 +28,7 @@ from restock.ingest.steps.episodes import split
 from restock.ingest.steps.steps import steps_of
 from restock.ingest.store import episode_rows
 from restock.ingest.store.transitions import Provenance, recording_table
+from restock.ingest.task.schema import recording_schema
 
 WHOLE = 1 << 40
 PROFILE = load_profile("warehouse_amr")
@@ -134,12 +136,16 @@ def test_any_batches_of_a_sqlite_bag_give_the_same_columns(size: int, tmp_path: 
 class Kept:
     """A store that only keeps what is written."""
 
-    def write(self, manifest: Any, rows: Any) -> int:
-        self.manifest, self.rows = manifest, rows
+    def write_all(self, recordings: Any, *, instead_of: Any) -> int:
+        [(self.manifest, self.rows)] = recordings
         return 1
 
     def repeated(self, rows: Any, period_s: float) -> None:
         """Nothing is in it that could be repeated."""
+
+    def live(self, recording_id: str) -> pa.Table:
+        """Nothing was in it before."""
+        return recording_schema().empty_table()
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])

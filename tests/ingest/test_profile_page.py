@@ -79,4 +79,4 @@ def test_every_key_of_a_signal_and_every_reduction_is_on_the_page():
         assert f"`{name}`" in PAGE or f"`{name} = " in PAGE, name
     for name in ("fixed", "base", "max_age_s"):
         assert name in Frames.__struct_fields__
-        assert re.search(rf"^    {name} = ", PAGE, re.M), name
+        assert re.search(rf"^{name} = ", PAGE, re.M), name

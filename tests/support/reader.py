@@ -113,6 +113,8 @@ def serve(folder: Path) -> None:
             "#!/bin/sh\necho 'mark this block as not run' >&2; exit 70\n"
         )
         (folder / installer).chmod(0o755)
+    (folder / "python").write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
+    (folder / "python").chmod(0o755)
     client.rename(folder / "restock")
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
     listener.settimeout(1)
