@@ -71,11 +71,13 @@ def run_page(page: Path, server: Reader, prepared: Path, folder: Path, *, slow: 
     assert not wrong, wrong
 
 
+@pytest.mark.docs
 @pytest.mark.parametrize("page", PAGES_RUN, ids=name)
 def test_a_page_runs_as_printed(page: Path, server: Reader, prepared: Path, tmp_path: Path) -> None:
     run_page(page, server, prepared, tmp_path / "reader", slow=False)
 
 
+@pytest.mark.docs
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES_SLOW, ids=name)
 def test_a_page_runs_with_its_slow_blocks(
