@@ -28,6 +28,7 @@ from restock.replay.panel.build import build_panel
 from restock.replay.panel.panel import Panel
 from restock.replay.places import open_place
 from restock.replay.store.audit import load_audits, load_thresholds, run_audits
+from restock.replay.store.query import query
 from restock.replay.store.store import Store
 from restock.replay.trace.trace import TracePlaces, audited_rows, trace_row
 
@@ -290,7 +291,8 @@ def test_a_store_that_an_older_version_wrote_audits_mixes_and_traces(tmp_path: P
     def works(expected: int) -> None:
         with open_place(store) as connection:
             findings = run_audits(connection, load_audits(), load_thresholds())
-            for (view,) in connection.sql('SELECT DISTINCT "view" FROM columns').fetchall():
+            views = query(connection, 'SELECT DISTINCT "view" FROM columns', where=str(store))
+            for (view,) in views.fetchall():
                 connection.sql(f'FROM "{view}"').fetchall()
         assert {f.audit.name for f in findings if f.status == "fail"} == {"rare_condition"}
         panel = tmp_path / f"panel{expected}"
