@@ -24,14 +24,13 @@ from restock.ingest.store.corrections import (
     Moments,
     correction_rows,
     corrections_in,
-    held,
     lay_over,
     merged,
-    replaced,
 )
 from restock.ingest.store.manifest import count_rows, score_rows
+from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
-from restock.ingest.task.conditions import Condition
+from restock.ingest.task.conditions import Condition, held
 from restock.ingest.task.label_scores import label_scores
 from restock.ingest.task.schema import recording_schema
 from restock.ingest.task.task import Task

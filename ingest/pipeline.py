@@ -27,7 +27,6 @@ from restock.ingest.steps.steps import Steps, steps_of
 from restock.ingest.store.corrections import (
     correction_rows,
     corrections_in,
-    held,
     lay_over,
     rules_of,
 )
@@ -38,9 +37,9 @@ from restock.ingest.store.manifest import (
     software_version,
 )
 from restock.ingest.store.repeated import RepeatedDrive
-from restock.ingest.store.transitions import Provenance, recording_table
+from restock.ingest.store.transitions import Provenance, recording_table, replaced
 from restock.ingest.store.writer import StoreWriter
-from restock.ingest.task.conditions import NOMINAL
+from restock.ingest.task.conditions import NOMINAL, held
 from restock.ingest.task.label_scores import LabelScore, label_scores
 from restock.ingest.task.schema import recording_schema
 
@@ -133,9 +132,7 @@ def _tag(store: StoreWriter, before: Mapping[str, Any], tags: Mapping[str, str])
     ingest_id = uuid.uuid4().hex[:16]
     manifest = {**before, "ingest_id": ingest_id, "tags": tags}
     rows = store.rows(before["recording_id"], before["ingest_id"])
-    place = rows.schema.get_field_index("ingest_id")
-    column = pa.array([ingest_id] * len(rows), rows.schema.field(place).type)
-    rows = rows.set_column(place, rows.schema.field(place), column)
+    rows = replaced(rows, {"ingest_id": ingest_id})
     return store.write_all(
         [(pa.Table.from_pylist([manifest], recording_schema()), rows)],
         instead_of={before["recording_id"]: before["ingest_id"]},

@@ -28,24 +28,22 @@ from restock.ingest.profile.profile_text import (
 from restock.ingest.store.corrections import correction_rows, corrections_in, lay_over, rules_of
 from restock.ingest.store.episode_rows import episode_ends
 from restock.ingest.store.manifest import conditions_json, count_rows, score_rows
-from restock.ingest.store.transitions import by_name, column_array, names_of
+from restock.ingest.store.transitions import by_name, names_of, replaced
 from restock.ingest.store.version import Version
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.conditions import (
     NOMINAL,
     Condition,
-    label,
+    label_with_probabilities,
     labels_version,
     primary,
-    probabilities,
     runnable,
     too_near_to_call,
 )
 from restock.ingest.task.label_scores import LabelScore, label_scores
-from restock.ingest.task.schema import COVERAGE, recording_schema
+from restock.ingest.task.schema import recording_schema
 from restock.ingest.task.task import Task
 
-_LATER = {c.name: pa.field(c.name, c.type) for c in COVERAGE if c.nullable}
 TWIN = "twin"  # format of the recordings that training makes of its episodes
 
 
@@ -107,8 +105,8 @@ def relabel_store(
         for _ in relabelled():
             pass
         return outcomes, None
-    replaced = {row["recording_id"]: row["ingest_id"] for row in stale}
-    return outcomes, store.write_all(relabelled(), instead_of=replaced)
+    read = {row["recording_id"]: row["ingest_id"] for row in stale}
+    return outcomes, store.write_all(relabelled(), instead_of=read)
 
 
 def relabel_rows(
@@ -135,8 +133,7 @@ def relabel_rows(
     steps = pa.concat_tables([stored, ends.cast(stored.schema)])
     begin = np.arange(len(rows))
     try:
-        every = label(steps, conditions)
-        probable = probabilities(steps, conditions)
+        every, probable = label_with_probabilities(steps, conditions)
     except ConfigError as error:
         raise ConfigError(
             f"{error.where}: {error.what}",
@@ -156,16 +153,7 @@ def relabel_rows(
         "labels_version": labels_version(every_condition),
         "ingest_id": ingest_id,
     }
-    metadata = rows.schema.metadata
-    for name, values in new.items():
-        index = rows.schema.get_field_index(name)
-        if index < 0:  # rows of an older store: it comes last
-            later = _LATER[name]
-            index = rows.num_columns
-            rows = rows.append_column(later, pa.nulls(len(rows), later.type))
-        field = rows.schema.field(index)
-        rows = rows.set_column(index, field, column_array(values, field.type, len(rows)))
-    rows = rows.replace_schema_metadata(metadata)
+    rows = replaced(rows, new)
     corrections = corrections_in(row)
     rows, corrections = lay_over(rows, corrections, every_condition, row["clock_offset_ns"])
     named = rows["condition"].to_pylist()

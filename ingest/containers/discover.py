@@ -17,7 +17,6 @@ from restock.ingest.containers.storage import (
     NOT_KEPT,
     Metadata,
     custom_data,
-    keep_entries,
 )
 
 T = TypeVar("T")
@@ -167,11 +166,9 @@ def read_metadata(folder: Path) -> tuple[BagMetadata, str | None]:
         return BagMetadata(), f"{METADATA} cannot be used: not a mapping"
     custom, problem = None, None
     try:
-        said, more = custom_data(text)
-        entries, beyond = keep_entries(said)
-        custom = Metadata(f"custom_data in {METADATA}", "", entries)
-        if more + beyond:
-            problem = f"{METADATA}: {more + beyond:,} entries of custom_data: {NOT_KEPT}"
+        custom, left_out = custom_data(text, METADATA)
+        if left_out:
+            problem = f"{METADATA}: {left_out:,} entries of custom_data: {NOT_KEPT}"
     except ValueError as error:
         problem = f"{METADATA}: {error}"
     listed = _items(content.get("relative_file_paths"), str)

@@ -21,7 +21,6 @@ from restock.ingest.containers.storage import (
     Integrity,
     Metadata,
     custom_data,
-    keep_entries,
 )
 from restock.ingest.decoding.messages import Channel, MessageBatch
 
@@ -74,17 +73,14 @@ class McapFile:
     def _metadata(self) -> list[Metadata]:
         """What its metadata records say, rosbag2's own included."""
         kept, left_out = self._contents.metadata, self._contents.left_out
-        custom = Metadata(f"custom_data in {self.path.name}", "", {})
         try:
-            said, more = custom_data(self._contents.rosbag2)
-            entries, beyond = keep_entries(said, kept)
-            custom = custom._replace(entries=entries)
-            left_out += more + beyond
+            custom, more = custom_data(self._contents.rosbag2, self.path.name, kept)
+            kept, left_out = [*kept, custom], left_out + more
         except ValueError as problem:
             self.notes.append(f"its metadata record {ROSBAG2!r}: {problem}")
         if left_out:
             self.notes.append(f"{left_out:,} entries of its metadata: {NOT_KEPT}")
-        return [*kept, custom]
+        return kept
 
     # -- contents ---------------------------------------------------------------------
 

@@ -29,7 +29,6 @@ from restock.ingest.containers.storage import (
     Integrity,
     Metadata,
     custom_data,
-    keep_entries,
 )
 from restock.ingest.decoding.messages import Channel, MessageBatch, PendingBatch
 
@@ -209,16 +208,15 @@ class SqliteFile:
                 "SELECT substr(metadata, 1, ?) FROM metadata ORDER BY id DESC LIMIT 1",
                 (LARGEST_METADATA,),
             ).fetchone()
-            said, more = custom_data(str(row[0] or "") if row else "")
+            custom, left_out = custom_data(str(row[0] or "") if row else "", self.path.name)
         except sqlite3.OperationalError:  # older bags have no such table
             return
         except (sqlite3.DatabaseError, ValueError) as problem:
             self.notes.append(f"its own metadata cannot be used: {problem}")
             return
-        entries, beyond = keep_entries(said)
-        self.metadata.append(Metadata(f"custom_data in {self.path.name}", "", entries))
-        if more + beyond:
-            self.notes.append(f"{more + beyond:,} entries of its metadata: {NOT_KEPT}")
+        self.metadata.append(custom)
+        if left_out:
+            self.notes.append(f"{left_out:,} entries of its metadata: {NOT_KEPT}")
 
     def _damaged(self, what: str) -> None:
         self.integrity = "damaged"

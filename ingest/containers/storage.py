@@ -75,13 +75,22 @@ def keep_entries(
     return {visible(n): visible(v) for n, v in entries.items()}, len(said) - len(entries)
 
 
-def custom_data(text: str) -> tuple[dict[str, str], int]:
-    """rosbag2's `custom_data` in a bag's metadata, and how many of its entries are no text.
-
-    Only those lines are parsed, and their values stay as they are written: `007` is no number.
+def custom_data(text: str, source: str, kept: Collection[Metadata] = ()) -> tuple[Metadata, int]:
+    """rosbag2's `custom_data` in the text of a bag's metadata, which is `source`, and how many of
+    its entries are not kept beside `kept`.
 
     Raises:
-        ValueError: they are too long, or no YAML.
+        ValueError: it is too long, or no YAML.
+    """
+    said, no_text = _custom_data(text)
+    entries, beyond = keep_entries(said, kept)
+    return Metadata(f"custom_data in {source}", "", entries), no_text + beyond
+
+
+def _custom_data(text: str) -> tuple[dict[str, str], int]:
+    """Its entries, and how many of them are no text.
+
+    Only those lines are parsed, and their values stay as they are written: `007` is no number.
     """
     found = _CUSTOM_DATA.search(text)
     if found is None:

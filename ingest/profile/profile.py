@@ -29,9 +29,8 @@ from restock.ingest.task.condition_files import with_files
 from restock.ingest.task.conditions import (
     Condition,
     Noise,
-    label,
+    label_with_probabilities,
     labels_version,
-    probabilities,
     shipped,
 )
 from restock.ingest.task.schema import steps_schema
@@ -337,8 +336,7 @@ def _check_conditions(profile: Profile, where: str) -> None:
     for place, condition in enumerate(profile.own_conditions):
         condition = condition.with_constants(profile.noise.constants)
         try:
-            label(steps, [condition])
-            probabilities(steps, [condition])
+            label_with_probabilities(steps, [condition])
         except ConfigError as error:
             raise ConfigError(
                 f"`condition[{place}].sql` ({condition.name!r}): {error.what}",

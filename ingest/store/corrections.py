@@ -17,11 +17,10 @@ from typing import Any
 import msgspec
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from restock.arrays import Bools, Ints
-from restock.ingest.store.transitions import column_array, names_of
-from restock.ingest.task.conditions import NOMINAL, Condition, primary
+from restock.ingest.store.transitions import names_of, replaced
+from restock.ingest.task.conditions import NOMINAL, Condition, held, primary
 
 COLUMN = "corrections"  # of `recordings`
 
@@ -162,18 +161,6 @@ def _with_labels(
     return replaced(rows, new)
 
 
-def held(column: pa.ChunkedArray, names: Sequence[str]) -> dict[str, Bools]:
-    """Which rows (N,) of a column of lists name each of these; a null names none."""
-    lists = column.combine_chunks()
-    lengths = np.asarray(pc.list_value_length(lists).fill_null(0))
-    row, named = np.repeat(np.arange(len(lists)), lengths), np.asarray(lists.flatten(), object)
-    found = {}
-    for name in names:
-        found[name] = np.zeros(len(lists), np.bool_)
-        found[name][row[named == name]] = True
-    return found
-
-
 def _certain(probabilities: pa.MapArray, said: Mapping[str, Ints]) -> pa.MapArray:
     """The probabilities with 1 and 0 where somebody said so, of conditions that have one."""
     ends = np.asarray(probabilities.offsets)
@@ -188,13 +175,3 @@ def _certain(probabilities: pa.MapArray, said: Mapping[str, Ints]) -> pa.MapArra
         items[entry[value >= 0]] = value[value >= 0]
     made = pa.MapArray.from_arrays(pa.array(ends - first), keys, pa.array(items))
     return made.cast(probabilities.type)
-
-
-def replaced(rows: pa.Table, columns: Mapping[str, Any]) -> pa.Table:
-    """The table with other values in some columns; its metadata stays."""
-    metadata = rows.schema.metadata
-    for name, values in columns.items():
-        index = rows.schema.get_field_index(name)
-        field = rows.schema.field(index)
-        rows = rows.set_column(index, field, column_array(values, field.type, len(rows)))
-    return rows.replace_schema_metadata(metadata)

@@ -13,7 +13,7 @@ from restock.arrays import F32, Bools, Ints
 from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.episodes import Split, changed_route, with_route
 from restock.ingest.steps.steps import Steps
-from restock.ingest.task.conditions import label, probabilities
+from restock.ingest.task.conditions import label_with_probabilities
 from restock.ingest.task.schema import SIGNAL_COLUMNS
 from restock.ingest.task.signals import Signals
 
@@ -106,8 +106,7 @@ def episode_rows(
             signals[name][old] = column
     custom = steps.custom.take(tick)
     table = label_table(signals, episode, step, custom)
-    labels = label(table, profile.conditions)
-    probable = probabilities(table, profile.conditions)
+    labels, probable = label_with_probabilities(table, profile.conditions)
     return EpisodeRows(tick, episode, step, is_end, signals, labels, custom, probable)
 
 

@@ -19,8 +19,11 @@ from restock.ingest.steps.steps import Steps
 from restock.ingest.store.episode_rows import ENDS, EpisodeRows, episode_rows, groups, packed
 from restock.ingest.task.conditions import NOMINAL, primary, too_near_to_call
 from restock.ingest.task.label_scores import true_names, truth_text
-from restock.ingest.task.schema import SIGNAL_COLUMNS, STEP_BITS, transition_schema
+from restock.ingest.task.schema import COVERAGE, SIGNAL_COLUMNS, STEP_BITS, transition_schema
 from restock.ingest.task.task import observe, reward
+
+# Columns that rows of an older store may lack.
+_LATER = {column.name: pa.field(column.name, column.type) for column in COVERAGE if column.nullable}
 
 
 @dataclass(frozen=True)
@@ -194,6 +197,23 @@ def column_array(values: Any, kind: pa.DataType, count: int) -> pa.Array:
     if isinstance(values, np.ndarray):
         return pa.array(values).cast(kind, safe=False) if len(values) else pa.array([], kind)
     return pa.array(values, kind)
+
+
+def replaced(rows: pa.Table, columns: Mapping[str, Any]) -> pa.Table:
+    """The table with other values in some columns; its metadata stays.
+
+    A column that rows of an older store do not have comes last.
+    """
+    metadata = rows.schema.metadata
+    for name, values in columns.items():
+        index = rows.schema.get_field_index(name)
+        if index < 0:
+            field = _LATER[name]
+            rows = rows.append_column(field, column_array(values, field.type, len(rows)))
+        else:
+            field = rows.schema.field(index)
+            rows = rows.set_column(index, field, column_array(values, field.type, len(rows)))
+    return rows.replace_schema_metadata(metadata)
 
 
 def by_name(values: Mapping[str, F32], rows: Ints) -> pa.Array:

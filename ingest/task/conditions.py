@@ -34,6 +34,7 @@ import duckdb
 import msgspec
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from msgspec import Meta
 
 from restock.arrays import F32, Bools
@@ -43,6 +44,8 @@ from restock.ingest.task.condition_sql import SANDBOX, WINDOW, refusal, select_o
 from restock.toml import Checked
 
 Timing = Literal["pre", "post"]
+Expression = Literal["sql", "probability"]  # of a condition
+Columns = dict[tuple[str, Expression], pa.ChunkedArray]  # by the condition's name
 NOMINAL = "nominal"
 
 
@@ -135,14 +138,7 @@ def label(steps: pa.Table, conditions: Sequence[Condition]) -> dict[str, Bools]:
     Raises:
         ConfigError: a condition's SQL does not run, or gives no boolean; names the condition.
     """
-    labels = {}
-    for name, column in _evaluate(steps, conditions, "sql").items():
-        if not pa.types.is_boolean(column.type):
-            raise ConfigError(
-                f"its SQL gives {column.type}, not a boolean", where=f"condition {name!r}"
-            )
-        labels[name] = np.asarray(column.fill_null(False).combine_chunks(), np.bool_)
-    return labels
+    return _labels(_evaluate(steps, conditions, ("sql",)), conditions)
 
 
 def probabilities(steps: pa.Table, conditions: Sequence[Condition]) -> dict[str, F32]:
@@ -153,17 +149,46 @@ def probabilities(steps: pa.Table, conditions: Sequence[Condition]) -> dict[str,
     Raises:
         ConfigError: the SQL does not run, or gives other than numbers in [0, 1].
     """
-    rated = [condition for condition in conditions if condition.probability]
+    return _probabilities(_evaluate(steps, conditions, ("probability",)), conditions)
+
+
+def label_with_probabilities(
+    steps: pa.Table, conditions: Sequence[Condition]
+) -> tuple[dict[str, Bools], dict[str, F32]]:
+    """What `label` and `probabilities` give, their common parts worked out once.
+
+    Raises:
+        ConfigError: as they do.
+    """
+    columns = _evaluate(steps, conditions, ("sql", "probability"))
+    return _labels(columns, conditions), _probabilities(columns, conditions)
+
+
+def _labels(columns: Columns, conditions: Sequence[Condition]) -> dict[str, Bools]:
+    labels = {}
+    for condition in conditions:
+        column = columns[condition.name, "sql"]
+        if not pa.types.is_boolean(column.type):
+            raise ConfigError(
+                f"its SQL gives {column.type}, not a boolean", where=_where(condition, "sql")
+            )
+        labels[condition.name] = np.asarray(column.fill_null(False).combine_chunks(), np.bool_)
+    return labels
+
+
+def _probabilities(columns: Columns, conditions: Sequence[Condition]) -> dict[str, F32]:
     found = {}
-    for name, column in _evaluate(steps, rated, "probability").items():
-        where = f"the probability of condition {name!r}"
+    for condition in conditions:
+        if not condition.probability:
+            continue
+        column, where = columns[condition.name, "probability"], _where(condition, "probability")
         try:
             values = column.cast(pa.float64()).combine_chunks().to_numpy(zero_copy_only=False)
         except pa.ArrowInvalid as error:
             raise ConfigError(f"its SQL gives {column.type}, not a number", where=where) from error
         if len(wrong := values[(values < 0) | (values > 1)]):
             raise ConfigError(f"it must be in [0, 1], and gives {wrong[0]:.4g}", where=where)
-        found[name] = values.astype(np.float32)
+        found[condition.name] = values.astype(np.float32)
     return found
 
 
@@ -179,37 +204,39 @@ def too_near_to_call(
 
 
 def _evaluate(
-    steps: pa.Table, conditions: Sequence[Condition], which: Literal["sql", "probability"]
-) -> dict[str, pa.ChunkedArray]:
-    """One expression of each condition over the steps."""
-    together: dict[str, list[Condition]] = {}  # those with the same table to select from
-    for condition in conditions:
-        _refuse(condition, which, steps.column_names)
-        together.setdefault(_source(condition), []).append(condition)
-    columns: dict[str, pa.ChunkedArray] = {}
+    steps: pa.Table, conditions: Sequence[Condition], which: Sequence[Expression]
+) -> Columns:
+    """These expressions of each condition, of those it has, over the steps."""
+    asked = [(c, part) for c in conditions for part in which if part == "sql" or c.probability]
+    together: dict[str, list[tuple[Condition, Expression]]] = {}  # that select from the same table
+    for condition, part in asked:
+        _refuse(condition, part, steps.column_names)
+        together.setdefault(_source(condition), []).append((condition, part))
+    columns: Columns = {}
+    if not asked:
+        return columns
     with duckdb.connect(config=SANDBOX) as connection:
         numbered = steps.append_column("row_", pa.array(range(len(steps)), pa.int64()))
         connection.register("steps", numbered)
         connection.execute("SET lock_configuration = true").fetchall()
         for several in together.values():
             try:
-                rows = _query(connection, several, which)
+                columns |= _query(connection, several)
             except duckdb.Error:
-                for condition in several:  # again one by one, to say which
+                for condition, part in several:  # again one by one, to say which
                     try:
-                        _query(connection, [condition], which)
+                        _query(connection, [(condition, part)])
                     except duckdb.Error as error:
                         raise ConfigError(
                             f"its SQL does not run over the steps: {_first_line(error)}",
-                            where=_where(condition, which),
+                            where=_where(condition, part),
                             remedy=f"the steps have the columns {', '.join(steps.column_names)}",
                         ) from error
                 raise
-            columns |= {condition.name: rows[condition.name] for condition in several}
-    return {condition.name: columns[condition.name] for condition in conditions}
+    return columns
 
 
-def _refuse(condition: Condition, which: str, columns: Sequence[str]) -> None:
+def _refuse(condition: Condition, which: Expression, columns: Sequence[str]) -> None:
     """Raises ConfigError where its SQL says what no condition may."""
     taken = {"row_", *(name.lower() for name in columns)}
     for name in (*condition.constants, *condition.let):
@@ -223,7 +250,7 @@ def _refuse(condition: Condition, which: str, columns: Sequence[str]) -> None:
             raise ConfigError(reason, where=where or _where(condition, which))
 
 
-def _where(condition: Condition, which: str) -> str:
+def _where(condition: Condition, which: Expression) -> str:
     said = f"condition {condition.name!r}"
     return said if which == "sql" else f"the probability of {said}"
 
@@ -244,18 +271,21 @@ def runnable(steps: pa.Table, conditions: Sequence[Condition]) -> list[Condition
     run = []
     for condition in conditions:
         with suppress(ConfigError):
-            label(steps.slice(0, 0), [condition])
-            probabilities(steps.slice(0, 0), [condition])
+            label_with_probabilities(steps.slice(0, 0), [condition])
             run.append(condition)
     return run
 
 
 def _query(
-    connection: duckdb.DuckDBPyConnection, conditions: Sequence[Condition], which: str
-) -> pa.Table:
-    """Of conditions that select from the same."""
-    columns = ",\n".join(f'({getattr(c, which)}\n) AS "{c.name}"' for c in conditions)
-    return connection.sql(select_of(columns, _source(conditions[0]))).to_arrow_table()
+    connection: duckdb.DuckDBPyConnection, asked: Sequence[tuple[Condition, Expression]]
+) -> Columns:
+    """Expressions of conditions that select from the same."""
+    columns = ",\n".join(
+        f"({getattr(condition, part)}\n) AS column_{place}"
+        for place, (condition, part) in enumerate(asked)
+    )
+    rows = connection.sql(select_of(columns, _source(asked[0][0]))).to_arrow_table()
+    return {(c.name, part): rows.column(place) for place, (c, part) in enumerate(asked)}
 
 
 def primary(labels: dict[str, Bools], conditions: Sequence[Condition]) -> list[str]:
@@ -267,6 +297,18 @@ def primary(labels: dict[str, Bools], conditions: Sequence[Condition]) -> list[s
     names = [condition.name for condition in ordered] + [NOMINAL]
     first = np.where(table.any(axis=1), table.argmax(axis=1), len(ordered))
     return [names[index] for index in first]
+
+
+def held(column: pa.ChunkedArray, names: Sequence[str]) -> dict[str, Bools]:
+    """Which rows (N,) of a column of lists name each of these; a null names none."""
+    lists = column.combine_chunks()
+    lengths = np.asarray(pc.list_value_length(lists).fill_null(0))
+    row, named = np.repeat(np.arange(len(lists)), lengths), np.asarray(lists.flatten(), object)
+    holds = {}
+    for name in names:
+        holds[name] = np.zeros(len(lists), np.bool_)
+        holds[name][row[named == name]] = True
+    return holds
 
 
 def _first_line(error: Exception) -> str:

@@ -14,10 +14,9 @@ from dataclasses import astuple, dataclass
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from restock.arrays import Bools, Ints
-from restock.ingest.task.conditions import NOMINAL
+from restock.ingest.task.conditions import NOMINAL, held
 
 GOOD = 0.8  # precision and recall, for a label to be trusted
 TOLERANCE_S = 0.4  # between an event and what finds it
@@ -171,10 +170,7 @@ def touched(runs: Ints, holds: Bools) -> Bools:
 
 def label_scores(rows: pa.Table, names: Iterable[str], period_s: float) -> list[LabelScore]:
     """How well every condition of each transition agrees with the true ones, for these labels."""
-    given = rows["conditions"].combine_chunks()
-    held = np.asarray(pc.list_value_length(given).fill_null(0))
-    row, named = np.repeat(np.arange(len(rows)), held), np.asarray(given.flatten(), object)
-    labels = {name: np.isin(np.arange(len(rows)), row[named == name]) for name in names}
+    labels = held(rows["conditions"], list(names))
     episode, step = rows["episode_index"].to_numpy(), rows["step_index"].to_numpy()
     return score(labels, rows["true_condition"].to_pylist(), episode, step, period_s)
 

@@ -18,7 +18,12 @@ from support.profile_texts import WAREHOUSE
 from restock.cli import main
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.containers.storage import LONGEST_TEXT, MOST_ENTRIES, custom_data
+from restock.ingest.containers.storage import (
+    LONGEST_TEXT,
+    MOST_ENTRIES,
+    Metadata,
+    custom_data,
+)
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.profile.tag_rules import TagRules, path_pattern, resolve_tags
 from restock.ingest.task.tags import MOST_TAGS
@@ -128,7 +133,7 @@ def test_hostile_metadata_is_bounded_and_counted(tmp_path):
 )
 def test_custom_data_that_cannot_be_used(tmp_path, text, says):
     with pytest.raises(ValueError, match=says):
-        custom_data(text)
+        custom_data(text, "a bag")
     folder = bag(tmp_path / "bag", StoragePlugin.SQLITE3, {})
     with sqlite3.connect(folder / "bag.db3") as database:
         database.execute("UPDATE metadata SET metadata = ?", (text,))
@@ -141,9 +146,11 @@ def test_entries_of_custom_data_that_are_no_text_are_counted():
     text = (
         f"custom_data:\n  a: [1]\n  b: c\n\n  d: {{e: f}}\n  g: ~\n  h: {'x' * LONGEST_TEXT}\nz: 1"
     )
-    entries, more = custom_data(text)
+    (source, _, entries), more = custom_data(text, "metadata.yaml")
+    assert source == "custom_data in metadata.yaml"
     assert (list(entries), entries["b"], more) == (["b", "h"], "c", 2)
-    assert custom_data("custom_data: ~\n") == custom_data("version: 9") == ({}, 0)
+    none = (Metadata("custom_data in x", "", {}), 0)
+    assert custom_data("custom_data: ~\n", "x") == custom_data("version: 9", "x") == none
 
 
 @pytest.mark.parametrize(
