@@ -274,14 +274,12 @@ def test_they_are_columns_of_the_table_with_units(store, capsys):
     field = pq.read_schema(file).field("left_radps")
     assert field.metadata[b"unit"] == b"rad/s"
     rows = ask(store, "SELECT unnest(signals, recursive := true) FROM recordings", capsys)
-    assert [(row["name"], row["unit"], row["type"]) for row in rows] == [
-        ("left_radps", "rad/s", "number"),
-        ("beams_m", "m", "list"),
-        ("battery_v", "V", "number"),
+    said = [(row["name"], row["unit"], row["type"], row["messages"]) for row in rows]
+    assert said == [
+        ("left_radps", "rad/s", "number", 195),
+        ("beams_m", "m", "list", 939),
+        ("battery_v", "V", "number", 44),
     ]
-    left, beams, battery = (row["messages"] for row in rows)  # at 1, 5 and 0.2 Hz
-    assert 0 < battery < left < beams
-    assert beams > ROWS
 
 
 def test_conditions_use_them_and_label_runs_changed_ones_again(store, tmp_path, capsys):

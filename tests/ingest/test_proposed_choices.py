@@ -169,4 +169,4 @@ def test_a_small_robots_rows_are_not_all_recovery(tmp_path, capsys):
     bag = str(SHARED / "turtlebot3-sim-humble")
     assert main(["profile", "new", bag, "--out", str(file)]) == 0
     assert main(["profile", "check", str(file), bag, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["outcome"]["conditions"]["recovery"] <= 2  # was 124
+    assert json.loads(capsys.readouterr().out)["outcome"]["conditions"]["recovery"] == 1  # was 124

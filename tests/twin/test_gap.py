@@ -54,7 +54,7 @@ TRUE = Perturbation(
     name="true", payload_kg=30.0, wheel_radius_scale=0.96, latency_s=0.15, gain=0.97
 )
 TURTLEBOT = SHARED / "turtlebot3-sim-humble"
-CONFIG = GapConfig(max_segments=24, limits=TrustLimits(segments=10, episodes=3))
+CONFIG = GapConfig(max_segments=60, limits=TrustLimits(segments=10, episodes=3))
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Missions on a dry and on a slippery floor, by a robot that TRUE describes."""
     folder = tmp_path_factory.mktemp("gap")
     shares = {"nominal": 0.5, "wheel_slip": 0.5}
-    plan = RecordingPlan(missions=10, seed=5, conditions=shares, policy="planner", hardware=TRUE)
+    plan = RecordingPlan(missions=14, seed=5, conditions=shares, policy="planner", hardware=TRUE)
     record(folder / "log.mcap", plan)
     ingest(folder / "log.mcap", load_profile("warehouse_amr"), store=StoreWriter(folder / "store"))
     return folder / "store"
@@ -101,7 +101,7 @@ def test_a_slippery_floor_is_named_and_a_dry_one_is_not(gap: TwinGap) -> None:
     said = {found.condition: found for found in gap.verdicts}
     assert said["wheel_slip"].verdict == UNTRUSTED
     assert "metres" in said["wheel_slip"].reasons[0] or " m " in said["wheel_slip"].reasons[0]
-    assert said["nominal"].verdict != UNTRUSTED  # of ten missions: trusted, or undecided
+    assert said["nominal"].verdict == TRUSTED
     assert gap.untrusted == ["wheel_slip"]
     assert any("patches" in line for line in gap.not_done)
 
