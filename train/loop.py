@@ -128,6 +128,9 @@ def train(
             session.interval.successes += bool(episode.success)
             session.interval.returns += episode.undiscounted_return
         session.run.append("episodes", session.collector.label())
+        # … and where an interval of practice ends, the twin's next missions get its shares.
+        session.practice.note(ended)
+        session.run.append("practice", session.practice.advance(session.steps))
 
         # 6. Every so often: the fixed episodes, greedily; and a checkpoint.
         if progress.env_steps - max(progress.evaluated_at, 0) >= config.evaluation.every_env_steps:
@@ -140,6 +143,7 @@ def train(
             _save(session)
 
     session.run.append("episodes", session.collector.label(all_of_them=True))
+    session.run.append("practice", session.practice.advance(session.steps, last=True))
     if session.interval.updates or progress.env_steps > session.interval.env_steps_before:
         _close_interval(session, "warmup" if progress.online_from is None else "online", notify)
     if progress.evaluated_at != progress.env_steps:

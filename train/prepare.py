@@ -22,7 +22,8 @@ from restock.train.dqn.learner import open_device
 from restock.train.dqn.manual_backprop import update_path
 from restock.train.dqn.target import describe
 from restock.train.feed.collector import conditions_in_twin
-from restock.train.feed.logs import Logs
+from restock.train.feed.logs import Coded, Logs
+from restock.train.feed.practice import Practice, logged_shares
 from restock.train.finite import STOPPED
 from restock.train.loop import Notify, TrainResult
 from restock.train.ring_capacity import resolve_ring_capacity
@@ -37,11 +38,12 @@ from restock.train.run.run_profile import (
 from restock.train.session import Session, open_session
 from restock.train.twin.env.floor_report import refuse_unfit, sealed
 from restock.train.twin.env.interface import AFTER_LOGS, Twin
+from restock.train.twin.env.mission_arms import MissionArms
 from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.floors.floors import layouts_of_split, open_floors
 from restock.train.twin.floors.planner import planners
 from restock.train.twin.physics.episode import KINDS
-from restock.train.twin.physics.perturbation import PERTURBATIONS, find_perturbation
+from restock.train.twin.physics.perturbation import PERTURBATIONS, Schedule, find_perturbation
 
 _EVALUATION_ENVS = 16
 MISSIONS = "env.missions"
@@ -171,9 +173,6 @@ def prepare_new(
         # What is wrong with one is reported before anything is written. Evaluation drives all kinds
         # that are named, whatever their share.
         refuse_unfit(open_floors(layouts), config.env.conditions)
-    if orders := mission_orders(config):
-        floors = open_floors(config.env.layouts)
-        MissionOrders(orders, floors, planners(floors), where=MISSIONS)
     fed = Panel.open(panel_path) if panel_path is not None else None
     if fed is not None and (not chosen or carries_profile(fed, config.profile)):
         profile = profile_of_panel(fed)
@@ -181,6 +180,7 @@ def prepare_new(
     else:
         profile = load_profile(config.profile)
     panel = open_panel(panel_path, config, profile) if panel_path is not None else None
+    check_missions(config, profile, panel)
     config, ring = resolve_ring_capacity(resolve_config(config, panel), panel)
     written = _document(config, profile, panel)
     if ring is not None:
@@ -283,6 +283,36 @@ def mission_orders(config: TrainConfig) -> tuple[MissionOrder, ...]:
     """
     missions = config.env.missions
     return read_missions(missions).missions if isinstance(missions, str) else missions or ()
+
+
+def check_missions(config: TrainConfig, profile: Profile, panel: Panel | None) -> None:
+    """What the twin is to drive: refused now, before anything is written.
+
+    Raises:
+        ConfigError: an order, arm, share or floor of practice that the floors cannot hold.
+    """
+    ordered, practice = mission_orders(config), config.practice
+    if not ordered and practice == type(practice)():
+        return
+    floors = open_floors(config.env.layouts)
+    routes = planners(floors)
+    orders = MissionOrders(ordered, floors, routes, where=MISSIONS) if ordered else None
+    perturbation = find_perturbation(config.env.perturbation, where="env.perturbation")
+    arms = MissionArms(
+        floors,
+        routes,
+        config.env.conditions,
+        by=practice.by,
+        schedule=perturbation if isinstance(perturbation, Schedule) else None,
+        orders=orders,
+        orders_share=config.env.missions_share,
+    ).arms
+    logged = None
+    if panel is not None:
+        meta = panel.meta
+        met, episode = Coded.of(meta["condition"]), Coded.of(meta["episode_id"])
+        logged = logged_shares(met, episode, list(config.env.conditions))
+    Practice(practice, arms, goal=profile.task.goal != "none", logged=logged)
 
 
 def _evaluation_layouts(config: TrainConfig) -> str:

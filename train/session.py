@@ -30,6 +30,7 @@ from restock.train.feed.batches import Batches
 from restock.train.feed.collector import Collector, ring_conditions
 from restock.train.feed.log_fidelity import LogFidelity
 from restock.train.feed.logs import Logs, LogTerms
+from restock.train.feed.practice import Practice
 from restock.train.feed.probe import Probe
 from restock.train.jump_start import POLICIES, JumpStart
 from restock.train.run import checkpoint
@@ -81,6 +82,7 @@ class Session(Stateful):
         "ring",
         "env",
         "collector",
+        "practice",
         "feed",
         "probe",
         "jump_start",
@@ -109,6 +111,7 @@ class Session(Stateful):
     logs: Logs | None
     log_terms: LogTerms
     jump_start: JumpStart | None
+    practice: Practice
     progress: Progress = field(default_factory=Progress)
     interval: Interval = field(default_factory=Interval)
     best: Score | None = None
@@ -263,6 +266,9 @@ def open_session(
             (env.num_envs, task.observation_size, len(task.actions)),
             seed,
             resume=resume,
+        ),
+        practice=Practice.of(
+            config.practice, env, config.env.conditions, logs, goal=task.goal != "none"
         ),
     )
     session.collector.check_conditions()

@@ -218,7 +218,7 @@ def test_a_run_keeps_its_missions_and_comparisons_see_them(tmp_path: Path) -> No
     kept = prepared.document["config"]["env"]
     assert kept["missions"][0]["zone"] == "cross_east"
     assert parse_config(prepared.document["config"], where="kept") == prepared.config
-    assert kind_of("config.env.missions") == "environment"
+    assert kind_of("config.env.missions") == "practice"
     twin = make_twin(prepared.config, prepared.profile, 2)
     assert isinstance(twin, WarehouseVectorEnv)
     kinds = {twin.queue.next(0)[0].condition for _ in range(40)}

@@ -21,11 +21,12 @@ from restock.errors import RunError
 from restock.train.comparison.comparability import Feed
 from restock.train.run.run import Run
 
-Treatment = Literal["algorithm", "target", "mixture", "method"]
+Treatment = Literal["algorithm", "target", "mixture", "practice", "method"]
 Kind = Literal[
     "algorithm",
     "target",
     "feed",
+    "practice",
     "environment",
     "store",
     "evaluation",
@@ -39,6 +40,7 @@ ALLOWED: Mapping[Treatment, frozenset[Kind]] = {
     "algorithm": frozenset({"algorithm"}),
     "target": frozenset({"target"}),
     "mixture": frozenset({"feed", "environment"}),
+    "practice": frozenset({"practice"}),
     # Off-policy and policy-gradient methods have no replay in common: what is held is the twin,
     # its conditions, the environment steps and the evaluation.
     "method": frozenset({"algorithm", "target", "feed"}),
@@ -56,11 +58,12 @@ _KINDS: dict[str, Kind] = {
     "config.network": "algorithm",
     "config.loss": "algorithm",
     "config.optimizer": "algorithm",
-    "config.env.conditions": "environment",
+    "config.practice": "practice",
+    "config.env.conditions": "practice",
     "config.env.perturbation": "environment",
     "config.env.layouts": "environment",
-    "config.env.missions": "environment",
-    "config.env.missions_share": "environment",
+    "config.env.missions": "practice",
+    "config.env.missions_share": "practice",
     "library.replay": "feed",
     "library.target": "target",
     "config": "feed",  # replay, schedule, env, epsilon: which rows there are and how often

@@ -114,6 +114,8 @@ def _paths(arm: Arm) -> set[Path]:
 def _deciding(treatment: Treatment, totals: list[Check], checks: list[Check]) -> list[Check]:
     if treatment == "method":  # an update of one method is not one of another
         return [check for check in totals if check.name == "env steps"]
+    if treatment == "practice":  # fresh rows are of what was practised; the logs' must be the same
+        return totals + [check for check in checks if " logs/" in check.name]
     return totals + ([] if treatment == "mixture" else checks)
 
 

@@ -70,7 +70,12 @@ def swapped(run: Run, cause: Cause) -> list[str]:
     # The feed: all conditions that were evaluated, equally often, and fresh rows alone.
     share = 1 / len(config["env"]["conditions"])
     names = list(config["env"]["conditions"])
-    return ["replay.logs_share=0.0", *(f"env.conditions.{name}={share:.6g}" for name in names)]
+    natural = "practice={rule='natural'}"
+    return [
+        "replay.logs_share=0.0",
+        natural,
+        *(f"env.conditions.{name}={share:.6g}" for name in names),
+    ]
 
 
 __all__ = ["confirm", "swapped"]

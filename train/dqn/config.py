@@ -130,6 +130,29 @@ class EnvConfig(Checked, frozen=True):
             find_perturbation(self.perturbation, where="env.perturbation")
 
 
+class PracticeConfig(Checked, frozen=True):
+    """Which missions the twin gives next: see `restock.train.feed.practice`."""
+
+    rule: Literal["natural", "even", "shares", "logs", "missions", "success"] = "natural"
+    # What tells missions of one kind apart: "block", "layout", fields of a schedule's ranges.
+    by: tuple[str, ...] = ("block",)
+    shares: dict[str, NonNegative] = msgspec.field(default_factory=dict)  # of kinds or arms
+    floor: Share | None = None  # least share of an arm; None: FLOOR where shares move, else 0
+    floors: dict[str, Share] = msgspec.field(default_factory=dict)  # of single kinds or arms
+    every_env_steps: Count = 1_000  # one interval of practice
+    warmup_episodes: NonNegativeInt = 5  # of an arm, before its rate is believed
+    half_life_episodes: Positive = 20.0  # of an arm: an older episode counts half
+    max_change: Annotated[float, Meta(gt=0, le=1)] = 0.1  # of a share, in an interval
+
+    def check(self) -> None:
+        if self.rule == "shares" and sum(self.shares.values()) <= 0:
+            raise ValueError(f"shares must have a share above 0, got {self.shares}")
+        if self.rule != "shares" and self.shares:
+            raise ValueError(f'shares are of the rule "shares", and the rule is "{self.rule}"')
+        if sum(self.floors.values()) > 1:
+            raise ValueError(f"floors must sum to at most 1, got {self.floors}")
+
+
 class EvaluationConfig(Checked, frozen=True):
     every_env_steps: Count = 20_000
     episodes: Count = 10  # per condition
@@ -173,6 +196,7 @@ class TrainConfig(Checked, frozen=True):
     epsilon: LinearEpsilon = LinearEpsilon()
     jump_start: JumpStartConfig = JumpStartConfig()
     env: EnvConfig = msgspec.field(default_factory=EnvConfig)
+    practice: PracticeConfig = msgspec.field(default_factory=PracticeConfig)
     evaluation: EvaluationConfig = EvaluationConfig()
     guard: GuardConfig = GuardConfig()
     record: RecordConfig = RecordConfig()
@@ -252,6 +276,7 @@ def _apply(document: dict[str, Any], override: str) -> None:
 
 __all__ = [
     "JumpStartConfig",
+    "PracticeConfig",
     "TrainConfig",
     "apply_overrides",
     "as_overrides",

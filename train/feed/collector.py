@@ -52,6 +52,7 @@ class EndedEpisode:
     perturbation_values: str = "{}"  # JSON: those that are not nominal
     layout: str = DEFAULT
     zones: list[str] | None = None  # (steps + 1,) on its layout; None: what the profile says
+    arm: int = -1  # of the twin's `mission_arms`; -1: none was chosen
 
 
 class Collector(Stateful):
@@ -229,6 +230,7 @@ class Collector(Stateful):
                     perturbation_values=str(values[place]),
                     layout=str(info["layout"][place]) if "layout" in info else DEFAULT,
                     zones=self._zones(info, int(place), count),
+                    arm=int(info["mission_arm"][place]) if "mission_arm" in info else -1,
                     true_condition=str(info["episode_condition"][place]),
                     block=str(info["block"][place]),
                     undiscounted_return=float(self._return[place]),

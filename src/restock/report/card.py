@@ -14,6 +14,7 @@ import msgspec
 
 from restock.report.blocks import Rows, count, estimate, number
 from restock.report.facts import Facts, evaluation_bias
+from restock.report.practice import by_arm
 
 FORMAT = "restock-replay-card/1"
 _UNKNOWN = "unknown: run `restock eval` on a run whose panel and store are at hand"
@@ -57,6 +58,14 @@ def replay_card(facts: Facts) -> dict[str, Any]:
             *("source", "stratum", "timing", "available_rows", "quota_share"),
             *("drawn_rows", "drawn_share", "effective_share", "terminal_share"),
         ),
+        "practice": {
+            "rule": settings.get("practice", {}).get("rule", "natural"),
+            "arms": _columns(
+                by_arm(facts),
+                *("arm", "natural_share", "first_share", "last_share", "given_share"),
+                *("episodes", "success"),
+            ),
+        },
         "behaviour_policies": _columns(
             facts.policies, "source", "behaviour_policy", "rows", "share"
         ),
@@ -125,6 +134,16 @@ _TABLES = (
 )
 
 
+_PRACTICE = {
+    "arm": "missions",
+    "natural_share": "natural",
+    "first_share": "wanted at first",
+    "last_share": "wanted at last",
+    "given_share": "given",
+    "episodes": "ended",
+}
+
+
 def as_markdown(card: dict[str, Any]) -> str:
     """The card as a page of Markdown."""
     capacity, sampling = card["capacity"], card["sampling"]
@@ -135,6 +154,7 @@ def as_markdown(card: dict[str, Any]) -> str:
         "Sampling rule": f"batches of {_or_none(sampling['batch_size'])},"
         f" {_percent(sampling['logs_share'])} of all rows from logs, the offline phase among them:"
         f" {sampling['logs'] or 'rule unknown'}; fresh: {sampling['fresh'] or 'none'}",
+        "Practice": f"missions by the rule {card['practice']['rule']}",
         "Returns": f"{_or_none(sampling['n_step']['logs'])}-step in the logs,"
         f" {_or_none(sampling['n_step']['fresh'])}-step fresh",
         "Target rule": _words(card["target"]),
@@ -149,6 +169,8 @@ def as_markdown(card: dict[str, Any]) -> str:
     for title, key, columns in _TABLES:
         if card[key] or key != "off_policy":
             lines += ["", f"## {title}", "", *_table(card[key], columns)]
+    lines += ["", "## Missions that the twin gave", ""]
+    lines += _table(card["practice"]["arms"], _PRACTICE)
     if card["missing"]:
         lines += ["", "## Unknown", "", *(f"- {_cell(line)}" for line in card["missing"])]
     return "\n".join(lines) + "\n"
@@ -220,7 +242,7 @@ def _table(rows: Rows, columns: dict[str, str]) -> list[str]:
 
 def _shown(row: dict[str, Any], name: str) -> str:
     """A row's column as its cell shows it."""
-    if name in ("available_rows", "drawn_rows", "rows"):
+    if name in ("available_rows", "drawn_rows", "rows", "episodes"):
         return count(row[name])
     if name.endswith("share"):
         return _percent(row[name])

@@ -56,6 +56,7 @@ class Facts:
     labels: Rows = field(default_factory=list)  # scores of the store's labels, pooled
     reliability: Rows = field(default_factory=list)  # of their probabilities
     off_policy: Rows = field(default_factory=list)  # off-policy estimates, over all conditions
+    practice: Rows = field(default_factory=list)  # an interval x arm of missions
     missing: list[str] = field(default_factory=list)  # what could not be read, and why
 
     @property
@@ -114,6 +115,7 @@ def gather(path: Path) -> Facts:
     facts.off_policy = [
         row for row in run.table("off_policy").to_pylist() if row["condition"] == "all"
     ]
+    facts.practice = run.table("practice").to_pylist()
     if not facts.cells:
         facts.missing.append("`restock eval` has not been run: success is of training only.")
     _add_panel(facts)

@@ -10,6 +10,7 @@ from restock.report.blocks import span, words
 from restock.report.capacity import capacity_section
 from restock.report.facts import Facts, mean_success
 from restock.report.labels import labels_section
+from restock.report.practice import practice_section
 from restock.report.sections import critic, floor_section, learning, provenance, sampled, success
 from restock.report.twin_gap import run_section
 
@@ -19,6 +20,7 @@ def page(facts: Facts) -> dict[str, Any]:
     sections = [
         success(facts),
         sampled(facts),
+        practice_section(facts),
         actions_section(facts),
         labels_section(facts),
         capacity_section(facts),

@@ -11,10 +11,13 @@ from typing import Any, ClassVar
 import msgspec
 import numpy as np
 
+from restock.arrays import F64
 from restock.errors import ConfigError
 from restock.state import Stateful
+from restock.train.twin.env.mission_arms import MissionArms, floor_place
 from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.floors.layout import Warehouse
+from restock.train.twin.floors.planner import Planner
 from restock.train.twin.physics.episode import KINDS, EpisodeSpec
 from restock.train.twin.physics.perturbation import Schedule
 
@@ -41,12 +44,15 @@ class EpisodeQueue(Stateful):
         seed: int,
     ) -> None:
         self.seed, self.schedule = seed, schedule
+        self._layouts = list(floors)
         self._floors = {floor.name: index for index, floor in enumerate(floors)}
         self.drawn = np.zeros(num_envs, np.int64)  # episodes so far, per environment
         self.fixed: list[EpisodeSpec] = []
         self.next_fixed = 0
         self._orders: MissionOrders | None = None
         self._orders_share = 0.0
+        self._arms: MissionArms | None = None
+        self._arm_shares = np.zeros(0)  # cumulative
         self.set_conditions(conditions)
 
     def set_conditions(self, conditions: Mapping[str, float]) -> None:
@@ -67,6 +73,31 @@ class EpisodeQueue(Stateful):
         """From now on this share of the drawn episodes is of these orders, each at its part."""
         self._orders, self._orders_share = orders, share
 
+    def practise(self, arms: MissionArms, shares: Sequence[float]) -> None:
+        """From now on the drawn episodes are of these arms, in these shares.
+
+        Raises:
+            ConfigError: they are not one share an arm, numbers of at least 0 and not all 0.
+        """
+        parts = np.asarray(shares, np.float64)
+        if parts.shape != (len(arms.arms),) or not (parts >= 0).all() or not parts.sum() > 0:
+            raise ConfigError(
+                f"{list(shares)} are not shares of {len(arms.arms)} arms", where="the twin"
+            )
+        self._arms, self._arm_shares = arms, np.cumsum(parts) / parts.sum()
+
+    def arms(self, by: Sequence[str], planners: Sequence[Planner]) -> MissionArms:
+        """The arms that its drawn episodes can be of. Raises ConfigError as `MissionArms`."""
+        return MissionArms(
+            self._layouts,
+            planners,
+            self.conditions,
+            by=by,
+            schedule=self.schedule,
+            orders=self._orders,
+            orders_share=self._orders_share,
+        )
+
     def restored(self) -> None:
         """What the shares add up to follows from them."""
         self.set_conditions(self.conditions)
@@ -75,40 +106,36 @@ class EpisodeQueue(Stateful):
         """These are next, in order, for any environment."""
         self.fixed, self.next_fixed = list(specs), 0
 
-    def next(self, env: int) -> tuple[EpisodeSpec, int]:
-        """The episode that an environment begins now, and its place among the fixed, or -1."""
+    def next(self, env: int) -> tuple[EpisodeSpec, int, int]:
+        """The episode that an environment begins now, its place among the fixed, and its arm.
+
+        The place is -1 of a drawn one, the arm -1 where none was asked for.
+        """
         if self.next_fixed < len(self.fixed):
             self.next_fixed += 1
-            return self.fixed[self.next_fixed - 1], self.next_fixed - 1
+            return self.fixed[self.next_fixed - 1], self.next_fixed - 1, -1
         draw = np.random.SeedSequence([self.seed, env, int(self.drawn[env])]).generate_state(5)
         self.drawn[env] += 1
         seed = int(draw[1]) << 20 ^ int(draw[2])
-        if self._orders is not None and draw[3] / 2**32 < self._orders_share:
-            drawn = np.searchsorted(np.cumsum(self._orders.shares), draw[4] / 2**32, side="right")
-            spec = self._orders.spec(min(int(drawn), len(self._orders.orders) - 1), seed)
+        schedule, arm = self.schedule, -1
+        if self._arms is not None:
+            arm = _drawn(self._arm_shares, draw[0])
+            spec, schedule = self._arms.spec(arm, seed), self._arms.schedule(arm)
+        elif self._orders is not None and draw[3] / 2**32 < self._orders_share:
+            spec = self._orders.spec(_drawn(np.cumsum(self._orders.shares), draw[4]), seed)
         else:
-            kind = np.searchsorted(self._cumulative, draw[0] / 2**32, side="right")
-            spec = EpisodeSpec(KINDS[int(kind)], seed)
-        if self.schedule is not None:
+            spec = EpisodeSpec(KINDS[_drawn(self._cumulative, draw[0])], seed)
+        if schedule is not None:
             rng = np.random.default_rng([spec.seed, 1])
-            spec = msgspec.structs.replace(spec, perturbation=self.schedule.draw(rng))
-        return spec, -1
+            spec = msgspec.structs.replace(spec, perturbation=schedule.draw(rng))
+        return spec, -1, arm
 
     def floor_of(self, spec: EpisodeSpec) -> int:
-        """Which floor an episode is on: by name, or by its seed.
+        """Which floor an episode is on. Raises ConfigError where there is none of its name."""
+        return floor_place(spec, self._floors)
 
-        Raises:
-            ConfigError: the environment has no floor of that name.
-        """
-        if spec.layout is None:
-            if len(self._floors) == 1:
-                return 0
-            return int(np.random.default_rng([spec.seed, 2]).integers(len(self._floors)))
-        if spec.layout not in self._floors:
-            raise ConfigError(
-                f"an episode needs layout {spec.layout!r}, which is not among the environment's"
-                f" {len(self._floors)}",
-                where=f"episode {spec.condition}/{spec.seed}",
-                remedy="make the environment with that layout",
-            )
-        return self._floors[spec.layout]
+
+def _drawn(cumulative: F64, draw: np.integer[Any]) -> int:
+    """The place among cumulative shares that 32 random bits fall into."""
+    place = int(np.searchsorted(cumulative, draw / 2**32, side="right"))
+    return min(place, len(cumulative) - 1)  # their sum may fall short of 1 by rounding

@@ -6,8 +6,8 @@ a trained network, an ONNX file, a script, one of your own.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, runtime_checkable
 
 import numpy as np
 from msgspec import Meta
@@ -18,6 +18,7 @@ from restock.ingest.task.signals import Signals
 from restock.toml import Checked
 
 if TYPE_CHECKING:  # an episode needs MuJoCo; a run's config does not
+    from restock.train.twin.env.mission_arms import MissionArm
     from restock.train.twin.physics.episode import EpisodeSpec
 
 # Shares among the episodes that are drawn, where nothing else is asked for.
@@ -50,6 +51,24 @@ class Twin(Protocol):
     def step(self, actions: NDArray[Any], /) -> Step: ...
     def state_dict(self) -> dict[str, Any]: ...
     def load_state_dict(self, state: dict[str, Any], /) -> None: ...
+
+
+@runtime_checkable
+class ArmedTwin(Protocol):
+    """A twin whose missions can be chosen by arm, as `[practice]` does.
+
+    `info["mission_arm"]` (N,) of a step says the arm of each episode, -1 where none was chosen.
+    """
+
+    def mission_arms(self, by: Sequence[str], /) -> Sequence[MissionArm]: ...
+    def set_mission_shares(self, shares: Sequence[float], /) -> None: ...
+
+
+@runtime_checkable
+class KindsTwin(Protocol):
+    """A twin that takes shares per kind of episode alone."""
+
+    def set_conditions(self, conditions: Mapping[str, float], /) -> None: ...
 
 
 class Policy(Protocol):

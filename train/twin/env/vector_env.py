@@ -17,8 +17,9 @@ termination.
   `command_*` columns are the commands of [t, t + 1); `progress_m` along the plan in force at t;
 - `true_condition`: what was physically so over [t, t + 1); `episode_condition`, `block` (none,
   partial, full), `episode_seed`, `perturbation` and `layout` (their names), `floor` (the layout
-  itself), `episode_number` (place in `set_episodes`, or -1); `perturbation_values`, as JSON those
-  that are not nominal;
+  itself), `episode_number` (place in `set_episodes`, or -1), `mission_arm` (place among
+  `mission_arms`, -1 where none was asked for); `perturbation_values`, as JSON those that are not
+  nominal;
 - `success` (at the goal without any bump, at the episode's end), `bumps` (steps with a bump so
   far), `episode_steps`, `true_pose` (N, 3);
 - `invalid`: the physics diverged: the episode is truncated and the step must not enter replay;
@@ -52,6 +53,7 @@ from restock.train.twin.env.camera import Renderer, View
 from restock.train.twin.env.episode_queue import EpisodeQueue
 from restock.train.twin.env.floor_report import refuse_unfit
 from restock.train.twin.env.interface import DEFAULT_CONDITIONS, Info, Step
+from restock.train.twin.env.mission_arms import MissionArm, MissionArms
 from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.env.navigation import Navigation
 from restock.train.twin.floors.floors import floors_of
@@ -72,7 +74,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
     STATE = (
         *("specs", "observation", "signals", "previous_action", "steps", "bumps", "episode_number"),
         *("episode_seed", "episode_condition", "block", "perturbation_name", "episodes_begun"),
-        *("diverged", "queue", "simulation", "sensing", "truth", "navigation"),
+        *("mission_arm", "diverged", "queue", "simulation", "sensing", "truth", "navigation"),
     )
     STATE_TYPES: ClassVar[Mapping[str, Any]] = {"specs": list[EpisodeSpec]}
 
@@ -162,6 +164,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
             planners = self.navigation.planners
             orders = MissionOrders(missions, self.floors, planners, where="env.missions")
             self.queue.follow(orders, missions_share)
+        self._arms: MissionArms | None = None
         self.specs: list[EpisodeSpec] = [EpisodeSpec("nominal", 0)] * num_envs
         self.diverged = 0  # episodes that ended in a NaN or beyond MuJoCo's limits
         self.signals: Signals = {}
@@ -171,6 +174,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         self.bumps = np.zeros(num_envs, np.int64)
         self.episodes_begun = np.zeros(num_envs, np.int64)  # rises with every episode
         self.episode_number = np.full(num_envs, -1)
+        self.mission_arm = np.full(num_envs, -1)
         self.episode_seed = np.zeros(num_envs, np.int64)
         self.episode_condition = np.full(num_envs, "nominal", "U16")
         self.block = np.full(num_envs, "none", "U8")
@@ -199,6 +203,27 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         """Shares per kind of episode, for episodes that begin from now on."""
         self.queue.set_conditions(conditions)
 
+    def mission_arms(self, by: Sequence[str]) -> list[MissionArm]:
+        """The arms that drawn episodes can be chosen by, each with its natural share.
+
+        `by` splits them: "block" (of a blocked aisle), "layout", a field of the schedule's ranges.
+
+        Raises:
+            ConfigError: `by` names something else.
+        """
+        self._arms = self.queue.arms(by, self.navigation.planners)
+        return self._arms.arms
+
+    def set_mission_shares(self, shares: Sequence[float]) -> None:
+        """Shares of the last `mission_arms`, for episodes that begin from now on.
+
+        Raises:
+            ConfigError: they are not one share an arm.
+        """
+        if self._arms is None:
+            raise ConfigError("has no arms yet: ask for `mission_arms` first", where="the twin")
+        self.queue.practise(self._arms, shares)
+
     def set_episodes(self, specs: Iterable[EpisodeSpec]) -> None:
         """Run these episodes, in order, from the next reset on; then episodes drawn as usual.
 
@@ -209,7 +234,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
     def _begin(self, ids: Ints) -> None:
         """Start the next episode of each environment in `ids`."""
         for env in ids.tolist():
-            spec, self.episode_number[env] = self.queue.next(env)
+            spec, self.episode_number[env], self.mission_arm[env] = self.queue.next(env)
             self._lay_out(env, spec)
         self.steps[ids] = self.bumps[ids] = self.previous_action[ids] = 0
         first = self.sensing.sense(ids, self.steps[ids])
@@ -322,6 +347,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
             "layout": self._layout_names[self.layout],
             "floor": self._floor_objects[self.layout],
             "episode_number": self.episode_number.copy(),
+            "mission_arm": self.mission_arm.copy(),
             "episode_steps": self.steps.copy(),
             "bumps": self.bumps.copy(),
             "true_pose": self.simulation.pose(),

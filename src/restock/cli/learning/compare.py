@@ -20,7 +20,9 @@ class CompareCommand:
     and `target` (the target rule) the arms must have been fed the same rows in the same mix, which
     an equivalence test over episodes decides, and been evaluated in the same way. Under `mixture`
     the feed is what is compared, and the store, the algorithm, the target rule, the evaluation and
-    the numbers of steps and updates must be the same. Under `method` everything about how an arm
+    the numbers of steps and updates must be the same. Under `practice` the missions that the twin
+    gave may differ (`practice.*`, `env.conditions`, `env.missions`), and the logs must have been
+    drawn alike. Under `method` everything about how an arm
     learns may differ (replay, target rule, updates), but not the twin, the environment steps and
     the evaluation.
 
@@ -33,7 +35,7 @@ class CompareCommand:
     """Two runs; or, with --against, all runs (seeds) of the first method."""
     against: tuple[Path, ...] = ()
     """The runs of the second method."""
-    treatment: Literal["algorithm", "target", "mixture", "method"] = "algorithm"
+    treatment: Literal["algorithm", "target", "mixture", "practice", "method"] = "algorithm"
     """What is compared, and so may differ."""
     all_checks: bool = False
     """Show every check, not only the deciding ones."""
@@ -80,8 +82,11 @@ def _show(comparison: Comparison, all_checks: bool) -> None:
     checks = comparison.totals + comparison.checks
     shown = checks if all_checks else [c for c in checks if c.verdict != "comparable"]
     if shown:
-        feed = comparison.treatment in ("mixture", "method")
-        treated = " (the treatment: shown, not compared)" if feed else ""
+        treated = {
+            "mixture": " (the treatment: shown, not compared)",
+            "method": " (the treatment: shown, not compared)",
+            "practice": " (of fresh rows it is the treatment: shown, not compared)",
+        }.get(comparison.treatment, "")
         print_table([_check(check) for check in shown], title=f"what was fed{treated}")
     say(_sentence(comparison))
     if comparison.rows:
@@ -136,6 +141,7 @@ def _sentence(comparison: Comparison) -> str:
     if comparison.verdict == "comparable":
         what = {
             "mixture": "settings, steps",
+            "practice": "settings, steps and the logs' part of the feed",
             "method": "environment, environment steps and evaluation",
         }.get(comparison.treatment, "settings, steps and feed")
         return (

@@ -1,0 +1,88 @@
+"""The section on practice: which missions the twin gave, over the run, and how they went."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import altair as alt
+
+from restock.report import charts
+from restock.report.blocks import Figure, Rows, Section, Table, count, percent, words
+from restock.report.facts import Facts
+
+
+def practice_section(facts: Facts) -> Section | None:
+    """None where the run has no record of it."""
+    rows = by_arm(facts)
+    if not rows:
+        return None
+    shown = [
+        {
+            "missions": words(row["arm"]),
+            "natural": percent(row["natural_share"]),
+            "wanted at first": percent(row["first_share"]),
+            "wanted at last": percent(row["last_share"]),
+            "given": percent(row["given_share"]),
+            "ended": count(row["episodes"]),
+            "success, exploring": "" if row["success"] is None else f"{row['success']:.2f}",
+        }
+        for row in rows
+    ]
+    rule = rows[0]["rule"]
+    return Section(
+        "practice",
+        "What did it practise?",
+        intro=f"Missions that the twin gave, by the rule “{rule}”. Shares are of missions that"
+        " ended, while the agent explored; its success there is below that of evaluations.",
+        figures=[] if rule in FIXED else [Figure(_svg(facts.practice), "Wanted shares")],
+        tables=[Table(shown, set(shown[0]) - {"missions"})],
+    )
+
+
+FIXED = ("natural", "even", "shares", "logs", "missions")
+
+
+def by_arm(facts: Facts) -> Rows:
+    """One row an arm: its shares at first and last, and all of its missions that ended."""
+    arms: dict[str, dict[str, Any]] = {}
+    for row in facts.practice:
+        arm = arms.setdefault(
+            row["arm"],
+            {
+                **{name: row[name] for name in ("rule", "arm", "condition", "natural_share")},
+                "first_share": row["wanted_share"],
+                "episodes": 0,
+                "successes": 0.0,
+            },
+        )
+        arm["last_share"] = row["wanted_share"]
+        arm["episodes"] += row["episodes"]
+        arm["successes"] += row["episodes"] * (row["success"] or 0.0)
+    total = sum(arm["episodes"] for arm in arms.values())
+    for arm in arms.values():
+        ended, successes = arm["episodes"], arm.pop("successes")
+        arm["given_share"] = ended / total if total else None
+        arm["success"] = successes / ended if ended else None
+    return list(arms.values())
+
+
+def _svg(rows: Rows) -> str:
+    lines = [
+        {"env_steps": row["env_steps"], "arm": words(row["arm"]), "share": row["wanted_share"]}
+        for row in rows
+    ]
+    colours = {words(name): colour for name, colour in charts.CONDITION_COLOURS.items()}
+    arms = charts.ordered(lines, "arm", colours)
+    chart = (
+        charts.plot(lines)
+        .mark_line(interpolate="step-before")
+        .encode(
+            x=alt.X("env_steps:Q", title="environment steps", axis=alt.Axis(format="~s")),
+            y=alt.Y("share:Q", title="share of missions", axis=alt.Axis(format="%")),
+            color=alt.Color("arm:N", scale=charts.scale(arms, colours), sort=arms),
+        )
+    )
+    return charts.svg(chart.properties(width=520, height=220))
+
+
+__all__ = ["by_arm", "practice_section"]

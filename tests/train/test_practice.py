@@ -1,0 +1,307 @@
+"""Practice by arm: the rule's shares, what moves them, their record, and what is refused."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.finished_runs import document, make_run
+from support.toy_run import assert_same_run, config, logs, session
+from support.toy_twin import ToyTwin
+
+from restock.cli import main
+from restock.errors import ConfigError, RunError
+from restock.replay.fleet.missions_file import MissionOrder
+from restock.train.dqn.config import PracticeConfig, load_config
+from restock.train.feed.collector import EndedEpisode
+from restock.train.feed.practice import Practice, logged_shares, moved, unordered, with_floors
+from restock.train.loop import train
+from restock.train.prepare import prepare_new
+from restock.train.twin.env.mission_arms import MissionArm
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.physics.perturbation import Schedule
+
+ARMS = [
+    MissionArm("nominal", "nominal", 0.6),
+    MissionArm("wheel_slip", "wheel_slip", 0.2),
+    MissionArm("blocked_aisle (partial)", "blocked_aisle", 0.15, block="partial"),
+    MissionArm("blocked_aisle (full)", "blocked_aisle", 0.05, block="full"),
+]
+
+
+def ended(kind: str, success: bool, count: int = 1, block: str = "none") -> list[EndedEpisode]:
+    one = EndedEpisode(*(0, 0, 0, 0, 0, "nominal", kind, block, 0.0, success, 0, 1), signals={})
+    return [one] * count
+
+
+def practice(arms: Sequence[MissionArm] = ARMS, **given: Any) -> Practice:
+    return Practice(PracticeConfig(**given), arms)
+
+
+def at(env_steps: int) -> dict[str, int]:
+    return {"env_steps": env_steps, "gradient_steps": 0}
+
+
+# -- shares ---------------------------------------------------------------------------------------
+
+parts = st.lists(st.floats(0, 1), min_size=1, max_size=12)
+
+
+@st.composite
+def floors_of(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Two sets of weights and floors that sum to at most 1."""
+    count = draw(st.integers(1, 12))
+    some = st.lists(st.floats(0, 1), min_size=count, max_size=count)
+    floors = np.array(draw(some))
+    floors *= draw(st.floats(0, 1)) / max(floors.sum(), 1.0)
+    weights = [np.array(draw(some)) for _ in range(2)]
+    return (*(w + (0 if w.sum() > 1e-6 else 1) for w in weights), floors)  # type: ignore[return-value]
+
+
+@given(floors_of())
+def test_shares_sum_to_one_keep_their_floors_and_the_proportions_of_the_rest(given: Any) -> None:
+    weights, _, floors = given
+    shares = with_floors(weights, floors)
+    assert math.isclose(shares.sum(), 1.0)
+    assert (shares >= floors - 1e-9).all()
+    free = np.flatnonzero(shares > floors + 1e-9)
+    if weights[free].sum() > 0:
+        np.testing.assert_allclose(
+            shares[free] / shares[free].sum(), weights[free] / weights[free].sum(), atol=1e-9
+        )
+
+
+@given(floors_of(), st.floats(0.001, 1))
+def test_a_share_moves_at_most_so_far_and_sum_and_floors_hold(given: Any, most: float) -> None:
+    first, second, floors = given
+    before, wanted = with_floors(first, floors), with_floors(second, floors)
+    after = moved(before, wanted, most)
+    assert np.abs(after - before).max() <= most + 1e-12
+    assert math.isclose(after.sum(), 1.0)
+    assert (after >= floors - 1e-9).all()
+    assert np.abs(wanted - after).max() <= np.abs(wanted - before).max() + 1e-12
+
+
+def test_fixed_rules_give_what_they_say() -> None:
+    assert practice(rule="natural").shares.tolist() == [0.6, 0.2, 0.15, 0.05]
+    assert practice(rule="even").shares.tolist() == [0.25] * 4
+    given = practice(rule="shares", shares={"nominal": 1, "blocked_aisle": 1})  # a kind's arms as
+    np.testing.assert_allclose(given.shares, [0.5, 0, 0.375, 0.125])  # they are natural
+    one = practice(rule="shares", shares={"blocked_aisle (full)": 2}, floor=0.1)
+    np.testing.assert_allclose(one.shares, [0.1, 0.1, 0.1, 0.7])
+    held = practice(rule="even", floors={"nominal": 0.7})
+    np.testing.assert_allclose(held.shares, [0.7, 0.1, 0.1, 0.1])
+
+
+def test_as_the_logs_are_counts_episodes_that_met_a_kind() -> None:
+    rows = logs()
+    shares = logged_shares(rows.condition, rows.episode, ["nominal", "wheel_slip"])
+    assert shares == {"nominal": 0.0, "wheel_slip": 1.0}  # its one episode slipped
+    found = Practice(PracticeConfig(rule="logs"), ARMS, logged={"nominal": 3, "wheel_slip": 1})
+    np.testing.assert_allclose(found.shares, [0.75, 0.25, 0, 0])
+
+
+def test_success_practises_what_fails_once_it_is_believed() -> None:
+    found = practice(rule="success", warmup_episodes=4, max_change=1.0, floor=0.1)
+    np.testing.assert_allclose(found.shares, 0.25)  # nothing is known: all count as failing
+    found.note(ended("nominal", True, 50) + ended("wheel_slip", False, 50))
+    found.note(ended("blocked_aisle", True, 3, "partial"))  # too few to be believed
+    rows = found.advance(at(1000))
+    np.testing.assert_allclose(found.shares.sum(), 1.0)
+    nominal, slip, partial, full = found.shares
+    assert nominal == pytest.approx(0.1)
+    assert partial == full == pytest.approx(slip, abs=0.01)
+    assert [row["success_rate"] is None for row in rows] == [False, False, True, True]
+    assert [row["episodes"] for row in rows] == [50, 50, 3, 0]
+    assert sum(row["given_share"] for row in rows) == pytest.approx(1.0)
+    assert rows[0]["wanted_share"] == 0.25  # what was in force, not what comes
+
+
+def test_old_episodes_fade_by_their_half_life() -> None:
+    found = practice(rule="success", half_life_episodes=10)
+    found.note(ended("nominal", False, 200))
+    found.note(ended("nominal", True, 10))
+    assert found.failure_rate[0] == pytest.approx(0.5, abs=0.04)
+
+
+def test_shares_move_at_interval_ends_and_by_no_more_than_the_limit() -> None:
+    told: list[list[float]] = []
+    settings = PracticeConfig(rule="success", every_env_steps=100, max_change=0.02)
+    found = Practice(settings, ARMS, told.append)
+    found.note(ended("nominal", True, 30))
+    assert found.advance(at(99)) == []
+    found.advance(at(100))
+    found.advance(at(250))
+    assert len(told) == 3  # at first, and twice after
+    steps = np.abs(np.diff(told, axis=0)).max(axis=1)
+    np.testing.assert_allclose(steps, 0.02)
+
+
+def test_ordered_missions_are_arms_or_count_as_their_kinds() -> None:
+    order = MissionArm("missions[0] wheel_slip aisle_1", "wheel_slip", 0.5, order=0)
+    whole = [MissionArm(arm.name, arm.kind, arm.share / 2, arm.block) for arm in ARMS]
+    only = practice([*whole, order], rule="missions", floor=0.1)
+    np.testing.assert_allclose(only.shares, [0.1, 0.1, 0.1, 0.1, 0.6])
+    natural = {arm.name: arm.share for arm in unordered([*whole, order])}
+    assert natural["wheel_slip"] == pytest.approx(0.6)
+    assert sum(natural.values()) == pytest.approx(1.0)
+
+
+# -- refused by name ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"rule": "shares", "shares": {"fog": 1.0}}, "'fog' is no kind of missions"),
+        ({"rule": "shares", "shares": {"nominal": 0.0}}, "a share above 0"),
+        ({"rule": "even", "shares": {"nominal": 1.0}}, 'shares are of the rule "shares"'),
+        ({"rule": "success", "floor": 0.3}, r"floors of 4 arms sum to 1\.2, above 1"),
+        ({"floors": {"nominal": 0.7, "wheel_slip": 0.4}}, "floors must sum to at most 1"),
+        ({"rule": "logs"}, "this run has no logs"),
+        ({"rule": "missions"}, "there are none"),
+    ],
+)
+def test_what_no_arm_can_follow_is_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises((ConfigError, ValueError), match=message):
+        practice(**settings)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("practice={rule='shares', shares={fog=1}}", "'fog' is no kind"),
+        ("practice={rule='shares', shares={near_collision=1}}", "'near_collision' is no kind"),
+        ("practice.by=['friction_scale']", "cannot be told apart by 'friction_scale'"),
+        ("practice.rule='missions'", "env.missions a missions file"),
+        ("practice={rule='success', floor=0.5}", "above 1"),
+    ],
+)
+def test_nothing_is_written_for_a_practice_that_cannot_be(
+    tmp_path: Path, override: str, message: str
+) -> None:
+    shares = "env.conditions={nominal=1, wheel_slip=1, blocked_aisle=1, near_collision=0}"
+    with pytest.raises(ConfigError, match=message):
+        prepare_new(tmp_path / "run", None, load_config(None, [shares, override]))
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_twin_that_takes_no_shares_is_refused_but_for_the_natural_rule(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="ToyTwin cannot be given shares"):
+        session(tmp_path / "even", config(practice={"rule": "even"}))
+
+
+def test_success_of_a_task_without_a_goal_is_refused() -> None:
+    with pytest.raises(ConfigError, match="the task has no goal"):
+        Practice(PracticeConfig(rule="success"), ARMS, goal=False)
+
+
+# -- in a run -------------------------------------------------------------------------------------
+
+
+class KindsToy(ToyTwin):
+    """The corridor, with shares that can be set."""
+
+    def set_conditions(self, conditions: dict[str, float]) -> None:
+        self._names = list(conditions)
+        self._shares = np.array(list(conditions.values()))
+
+
+PRACTICE = {"rule": "success", "every_env_steps": 100, "warmup_episodes": 2, "max_change": 0.3}
+
+
+@pytest.fixture
+def with_shares(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("support.toy_run.ToyTwin", KindsToy)
+
+
+@pytest.mark.usefixtures("with_shares")
+def test_a_resumed_run_practises_as_an_undisturbed_one(tmp_path: Path) -> None:
+    whole = session(tmp_path / "whole", config(practice=PRACTICE))
+    train(whole)
+    cut = session(tmp_path / "cut", config(practice=PRACTICE))
+    with pytest.raises(Exception, match="interrupted"):
+        train(cut, stop=lambda: cut.progress.env_steps >= 750)
+    cut.close()
+    resumed = session(tmp_path / "cut", config(practice=PRACTICE), resume=True)
+    train(resumed)
+    assert_same_run(whole, resumed)
+    rows = whole.run.table("practice").to_pylist()
+    assert {row["arm"] for row in rows} == {"nominal", "wheel_slip"}
+    assert len({row["wanted_share"] for row in rows}) > 2  # they did move
+    assert sum(row["episodes"] for row in rows) == whole.run.table("episodes").num_rows
+    whole.close()
+    resumed.close()
+
+
+@pytest.mark.usefixtures("with_shares")
+def test_a_run_of_other_arms_is_not_resumed(tmp_path: Path) -> None:
+    first = session(tmp_path / "run", config(practice=PRACTICE))
+    first.save()
+    first.close()
+    one = {"conditions": {"nominal": 1.0, "wheel_slip": 0.0}}
+    with pytest.raises(RunError, match="practised nominal, wheel_slip; now there are nominal"):
+        session(tmp_path / "run", config(practice=PRACTICE, env=one), resume=True)
+
+
+# -- the warehouse --------------------------------------------------------------------------------
+
+
+def test_the_warehouse_draws_missions_of_the_arms_that_are_asked_for() -> None:
+    twin = WarehouseVectorEnv(2, seed=3)
+    names = [arm.name for arm in twin.mission_arms(["block"])]
+    assert names[2:4] == ["blocked_aisle (partial)", "blocked_aisle (full)"]
+    twin.set_mission_shares([0, 0, 1, 0, 0])
+    _, info = twin.reset(seed=3)
+    assert info["block"].tolist() == ["partial"] * 2
+    assert info["mission_arm"].tolist() == [2, 2]
+    twin.set_mission_shares([0, 1, 0, 0, 0])
+    first = [twin.queue.next(0)[0] for _ in range(5)]
+    assert {spec.condition for spec in first} == {"wheel_slip"}
+    twin.queue.drawn[:] = 1
+    assert [twin.queue.next(0)[0] for _ in range(5)] == first  # the same, whenever it is asked
+
+
+def test_arms_by_half_of_a_range_draw_from_that_half() -> None:
+    schedule = Schedule({"friction_scale": (0.4, 1.0)})
+    twin = WarehouseVectorEnv(1, seed=1, perturbation=schedule, conditions={"nominal": 1})
+    arms = twin.mission_arms(["friction_scale"])
+    assert [arm.name for arm in arms] == [f"nominal, friction_scale {x}" for x in ("low", "high")]
+    twin.set_mission_shares([1, 0])
+    drawn = [twin.queue.next(0)[0].perturbation for _ in range(8)]
+    assert all(p is not None and 0.4 <= p.friction_scale <= 0.7 for p in drawn)
+
+
+def test_an_order_is_an_arm_and_says_so() -> None:
+    orders = [MissionOrder(kind="near_collision", missions=2)]
+    twin = WarehouseVectorEnv(1, missions=orders, missions_share=0.25, conditions={"nominal": 1})
+    arms = twin.mission_arms([])
+    assert [(arm.name, arm.share) for arm in arms] == [
+        ("nominal", 0.75),
+        ("missions[0] near_collision", 0.25),
+    ]
+    twin.set_mission_shares([0, 1])
+    _, info = twin.reset(seed=1)
+    assert (info["episode_condition"][0], info["mission_arm"][0]) == ("near_collision", 1)
+
+
+# -- the gate -------------------------------------------------------------------------------------
+
+
+def test_runs_practised_differently_are_compared_as_practice_alone(tmp_path: Path, capsys) -> None:
+    first = str(make_run(tmp_path / "a", document(0)))
+    even = str(make_run(tmp_path / "b", document(1, config__practice__rule="even"), success=0.7))
+    for treatment, code in (("algorithm", 1), ("mixture", 1), ("practice", 0)):
+        assert main(["compare", first, even, "--treatment", treatment]) == code, treatment
+    assert "REFUSED: the runs differ in config.practice.rule" in capsys.readouterr().err
+    other = str(
+        make_run(tmp_path / "c", document(2, config__practice__rule="even"), slip_share=0.5)
+    )
+    assert main(["compare", first, other, "--treatment", "practice"]) == 1
+    assert "fed differently in share of logs/" in capsys.readouterr().err

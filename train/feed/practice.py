@@ -1,0 +1,374 @@
+"""Practice: which missions the twin gives next, by arm, and a record of what it gave.
+
+An arm is a kind of missions (`restock.train.twin.env.mission_arms`). The rules:
+
+- natural: as `env.conditions`, `env.missions` and the floors say; the twin is left as it is;
+- even: every arm alike; shares: as given; logs: the kinds as often as the logs' episodes met them;
+  missions: the ordered missions alone, each at its part;
+- success: an arm's weight is its rate of failures, while the agent explores. The failures and
+  successes of an arm fade by a half-life; an arm with too few episodes counts as if all failed.
+
+Weights become shares that sum to 1, none below its floor, and a share moves at most so far in an
+interval. Nothing is drawn here: the twin draws its missions from its own seed.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, ClassVar
+
+import numpy as np
+
+from restock.arrays import F64, Ints
+from restock.errors import ConfigError, RunError
+from restock.state import Stateful
+from restock.train.dqn.config import PracticeConfig
+from restock.train.feed.collector import EndedEpisode
+from restock.train.feed.logs import Coded, Logs
+from restock.train.twin.env.interface import ArmedTwin, KindsTwin, Twin
+from restock.train.twin.env.mission_arms import MissionArm
+
+MOVING = ("success",)  # rules whose shares follow what happens
+FLOOR = 0.05  # of an arm under those, unless the config says otherwise
+WHERE = "practice"
+
+
+class Practice(Stateful):
+    """Counts ended missions by arm; at the end of an interval it sets the twin's shares.
+
+    Raises:
+        ConfigError: the rule's shares or floors do not fit the arms, or it lacks what it needs.
+    """
+
+    SAME: ClassVar[tuple[str, ...]] = ("names",)
+    STATE: ClassVar[tuple[str, ...]] = (
+        *("shares", "_episodes", "_failures", "_seen"),
+        *("_interval_episodes", "_interval_successes", "_closed_at"),
+    )
+
+    def __init__(
+        self,
+        config: PracticeConfig,
+        arms: Sequence[MissionArm],
+        set_shares: Callable[[Sequence[float]], None] | None = None,
+        *,
+        goal: bool = True,
+        logged: Mapping[str, float] | None = None,
+    ) -> None:
+        """`logged` are the kinds' shares of the logs' episodes; `goal`: success is defined."""
+        self.config, self._set = config, set_shares
+        # Where nothing is chosen, ordered missions count as what they are.
+        self.arms = unordered(arms) if config.rule == "natural" else list(arms)
+        count = len(self.arms)
+        self.names = [arm.name for arm in self.arms]
+        self.natural: F64 = np.array([arm.share for arm in self.arms])
+        self.floors = self._resolved_floors()
+        if config.rule in MOVING and not goal:
+            raise ConfigError(
+                f'the rule "{config.rule}" needs success, and the task has no goal',
+                where=f"{WHERE}.rule",
+                remedy='use "even" or "shares"',
+            )
+        self._episodes, self._failures = np.zeros(count), np.zeros(count)  # fading
+        self._seen: Ints = np.zeros(count, np.int64)  # ended so far
+        self._interval_episodes: Ints = np.zeros(count, np.int64)
+        self._interval_successes: Ints = np.zeros(count, np.int64)
+        self._closed_at = 0  # environment steps
+        self._fixed = self._fixed_weights(logged)
+        self.shares: F64 = (
+            self.natural if config.rule == "natural" else with_floors(self.weights, self.floors)
+        )
+        self._tell()
+
+    @classmethod
+    def of(
+        cls,
+        config: PracticeConfig,
+        env: Twin,
+        conditions: Mapping[str, float],
+        logs: Logs | None,
+        *,
+        goal: bool,
+    ) -> Practice:
+        """For a twin, of `conditions` (`env.conditions`).
+
+        Raises:
+            ConfigError: the twin cannot be given shares, or as the class.
+        """
+        kinds = [
+            MissionArm(kind, kind, share / sum(conditions.values()))
+            for kind, share in conditions.items()
+            if share
+        ]
+        logged = None
+        if logs is not None:
+            logged = logged_shares(logs.condition, logs.episode, [arm.kind for arm in kinds])
+        if isinstance(env, ArmedTwin):
+            arms = list(env.mission_arms(config.by))
+            return cls(config, arms, env.set_mission_shares, goal=goal, logged=logged)
+        if isinstance(env, KindsTwin):
+            tell = partial(_set_kinds, env, [arm.kind for arm in kinds])
+            return cls(config, kinds, tell, goal=goal, logged=logged)
+        if config.rule != "natural":
+            raise ConfigError(
+                f'the rule "{config.rule}" chooses missions, and {type(env).__name__} cannot be'
+                " given shares",
+                where=f"{WHERE}.rule",
+                remedy='give it `set_conditions(shares)`, or use "natural"',
+            )
+        return cls(config, kinds, goal=goal, logged=logged)
+
+    # -- what happens ---------------------------------------------------------------------------
+
+    def note(self, episodes: Sequence[EndedEpisode]) -> None:
+        """Count ended missions."""
+        fades = 0.5 ** (1 / self.config.half_life_episodes)
+        for episode in episodes:
+            place = self._place(episode)
+            if place is None:
+                continue
+            success = bool(episode.success)
+            self._seen[place] += 1
+            self._episodes[place] = fades * self._episodes[place] + 1
+            self._failures[place] = fades * self._failures[place] + (not success)
+            self._interval_episodes[place] += 1
+            self._interval_successes[place] += success
+
+    def advance(self, steps: Mapping[str, int], *, last: bool = False) -> list[dict[str, Any]]:
+        """At the end of an interval, its rows for the run's `practice`; the next one's shares.
+
+        Call while no step of the twin is out. `last`: the run ends here, in whatever interval.
+        """
+        env_steps = steps["env_steps"]
+        due = env_steps - self._closed_at >= self.config.every_env_steps
+        if not due and not (last and self._interval_episodes.any()):
+            return []
+        rows = [{**steps, **row} for row in self._rows()]
+        self._closed_at = env_steps
+        self._interval_episodes[:] = self._interval_successes[:] = 0
+        if self.config.rule in MOVING and not last:
+            self.shares = moved(
+                self.shares, with_floors(self.weights, self.floors), self.config.max_change
+            )
+            self._tell()
+        return rows
+
+    @property
+    def weights(self) -> F64:
+        """(K,) what the rule goes by, before floors: above 0 somewhere."""
+        if self._fixed is not None:
+            return self._fixed
+        return np.where(self.believed, self.failure_rate, 1.0)
+
+    @property
+    def believed(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
+        """(K,) whether an arm has ended often enough."""
+        return self._seen >= self.config.warmup_episodes
+
+    @property
+    def failure_rate(self) -> F64:
+        """(K,) of an arm's fading episodes, with half a failure more in one more (Jeffreys)."""
+        rate: F64 = (self._failures + 0.5) / (self._episodes + 1)
+        return rate
+
+    def restored(self) -> None:
+        """The twin draws by the shares of then; another rule than then goes by its own."""
+        if self.config.rule == "natural":
+            self.shares = self.natural
+        elif self._fixed is not None:
+            self.shares = with_floors(self._fixed, self.floors)
+        self._tell()
+
+    def mismatch(self, name: str, value: Any) -> Exception:
+        """The run practised other arms."""
+        return RunError(
+            f"practised {', '.join(map(str, value or ()))}; now there are {', '.join(self.names)}",
+            where=WHERE,
+            remedy="resume it with its own env and practice.by, or start another run",
+        )
+
+    def _tell(self) -> None:
+        if self._set is not None and self.config.rule != "natural":
+            self._set(self.shares.tolist())
+
+    def _rows(self) -> list[dict[str, Any]]:
+        total = int(self._interval_episodes.sum())
+        weights, rate = self.weights, self.failure_rate
+        return [
+            {
+                "rule": self.config.rule,
+                "arm": arm.name,
+                "condition": arm.kind,
+                "natural_share": arm.share,
+                "wanted_share": float(self.shares[place]),
+                "given_share": self._interval_episodes[place] / total if total else None,
+                "episodes": int(self._interval_episodes[place]),
+                "success": self._interval_successes[place] / self._interval_episodes[place]
+                if self._interval_episodes[place]
+                else None,
+                "success_rate": 1 - float(rate[place]) if self.believed[place] else None,
+                "weight": float(weights[place]),
+                "total_episodes": int(self._seen[place]),
+            }
+            for place, arm in enumerate(self.arms)
+        ]
+
+    def _place(self, episode: EndedEpisode) -> int | None:
+        """Which arm an episode was of; None where of none."""
+        if episode.arm >= 0:
+            return episode.arm
+        values = json.loads(episode.perturbation_values)
+        for place, arm in enumerate(self.arms):
+            if arm.holds(episode.true_condition, episode.block, episode.layout, values):
+                return place
+        return None
+
+    # -- the rule -------------------------------------------------------------------------------
+
+    def _fixed_weights(self, logged: Mapping[str, float] | None) -> F64 | None:
+        """Of a rule whose weights do not change; None of one whose do."""
+        config = self.config
+        if config.rule == "natural":
+            return self.natural
+        if config.rule == "even":
+            return np.ones(len(self.arms))
+        if config.rule == "shares":
+            return self._by_name(config.shares, "shares")
+        if config.rule == "missions":
+            weights = np.where([arm.order >= 0 for arm in self.arms], self.natural, 0.0)
+            if not weights.any():
+                raise ConfigError(
+                    'the rule "missions" practises ordered missions, and there are none',
+                    where=f"{WHERE}.rule",
+                    remedy="give env.missions a missions file (`restock gaps --missions-out`)",
+                )
+            return weights
+        if config.rule == "logs":
+            if not logged:
+                raise ConfigError(
+                    'the rule "logs" practises as the logs are, and this run has no logs of the'
+                    " kinds that the twin has",
+                    where=f"{WHERE}.rule",
+                    remedy="give --panel, or use another rule",
+                )
+            return self._by_name(logged, "the logs' shares")
+        return None
+
+    def _by_name(self, given: Mapping[str, float], key: str) -> F64:
+        """(K,) values of arms or of whole kinds, split among a kind's arms as they are natural."""
+        found = np.zeros(len(self.arms))
+        for name, value in given.items():
+            if name in self.names:
+                found[self.names.index(name)] += value
+                continue
+            of_kind = np.array([arm.kind == name and arm.order < 0 for arm in self.arms])
+            if not of_kind.any():
+                raise ConfigError(
+                    f"{name!r} is no kind of missions that this run can practise",
+                    where=f"{WHERE}.{key}",
+                    remedy=f"there are {', '.join(self._known())}",
+                )
+            parts = np.where(of_kind, self.natural, 0.0)
+            found += value * parts / parts.sum()
+        return found
+
+    def _known(self) -> list[str]:
+        """The names that shares and floors may give: kinds, then arms."""
+        return list(dict.fromkeys([*(a.kind for a in self.arms if a.order < 0), *self.names]))
+
+    def _resolved_floors(self) -> F64:
+        config = self.config
+        least = config.floor
+        if least is None:
+            least = FLOOR if config.rule in MOVING else 0.0
+            # Many arms (floors, orders) leave less for each: half is always free to move.
+            least = min(least, 0.5 / max(len(self.arms), 1))
+        given = self._by_name(config.floors, "floors")
+        floors: F64 = np.maximum(np.full(len(self.arms), least), given)
+        if floors.sum() > 1 + 1e-9:
+            raise ConfigError(
+                f"the floors of {len(self.arms)} arms sum to {floors.sum():.3g}, above 1",
+                where=f"{WHERE}.floor",
+                remedy=f"give at most {1 / len(self.arms):.3g} where all have the same",
+            )
+        return floors
+
+
+def with_floors(weights: F64, floors: F64) -> F64:
+    """Shares (K,) in proportion to weights, none below its floor; they sum to 1.
+
+    Those that would be below it get it, the others share the rest. Without any weight beside them
+    the rest is shared evenly. `floors` sum to at most 1, `weights` to more than 0.
+    """
+    shares: F64 = floors
+    held = np.zeros(len(weights), np.bool_)
+    while not held.all():
+        rest = max(1.0 - floors[held].sum(), 0.0)
+        weight = np.where(held, 0.0, weights)
+        if not weight.sum() > 0:
+            weight = (~held).astype(np.float64)
+        part = rest * weight / weight.sum()
+        below = ~held & (part < floors)
+        if not below.any():
+            shares = np.where(held, floors, part)
+            break
+        held |= below
+    whole: F64 = shares / shares.sum()
+    return whole
+
+
+def moved(shares: F64, wanted: F64, most: float) -> F64:
+    """From shares toward those wanted, no share by more than `most`; they still sum to 1.
+
+    All go the same part of their way, so what holds for both (a floor, a sum) holds for the result.
+    """
+    farthest = float(np.abs(wanted - shares).max())
+    part = 1.0 if farthest <= most else most / farthest
+    return np.add(shares, part * (wanted - shares))
+
+
+def _set_kinds(env: KindsTwin, kinds: Sequence[str], shares: Sequence[float]) -> None:
+    env.set_conditions(dict(zip(kinds, shares, strict=True)))
+
+
+def unordered(arms: Sequence[MissionArm]) -> list[MissionArm]:
+    """The arms without those of orders, whose shares go to their kinds' own."""
+    own = [arm for arm in arms if arm.order < 0]
+    for order in (arm for arm in arms if arm.order >= 0):
+        total = sum(arm.share for arm in own if arm.kind == order.kind)
+        if not total:
+            own.append(MissionArm(order.kind, order.kind, order.share))
+            continue
+        own = [
+            replace(arm, share=arm.share * (1 + order.share / total))
+            if arm.kind == order.kind
+            else arm
+            for arm in own
+        ]
+    return own
+
+
+def logged_shares(condition: Coded, episode: Coded, kinds: Sequence[str]) -> dict[str, float]:
+    """Of the logs' episodes, the share that met each kind's condition; the rest is nominal.
+
+    An episode that met several counts for each. Empty where the logs have none of the kinds.
+    """
+    codes = {name: code for code, name in enumerate(condition.names)}
+    everyone = np.unique(episode.codes)
+    met: dict[str, int] = {}
+    rare = np.zeros(0, np.int64)
+    for kind in kinds:
+        if kind == "nominal" or kind not in codes:
+            continue
+        of_kind = np.unique(episode.codes[condition.codes == codes[kind]])
+        met[kind], rare = len(of_kind), np.union1d(rare, of_kind)
+    if "nominal" in kinds:
+        met = {"nominal": len(everyone) - len(rare), **met}
+    total = sum(met.values())
+    return {kind: count / total for kind, count in met.items()} if total else {}
+
+
+__all__ = ["Practice", "logged_shares", "moved", "with_floors"]
