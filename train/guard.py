@@ -61,9 +61,7 @@ def _roll_back(learner: Learner, run: Run) -> None:
     The ring, the twin and every generator go on: experience of the worse policy is experience.
     """
     weights: dict[str, Any] = checkpoint.load(run.best)["network"]
-    for network in (learner.network, learner.target_network, learner.policy_network):
-        network.load_state_dict(weights)
-    learner.optimizer.state.clear()
+    learner.take_over(weights)
 
 
 __all__ = ["Fall", "enforce", "falls"]

@@ -74,7 +74,8 @@ def train(
     schedule, epsilon_at = config.schedule, config.epsilon.at
     offline_updates = schedule.offline_updates if session.logs is not None else 0
 
-    # 1. Offline: the logs alone.
+    # 1. Offline, the logs alone: what their teacher finds plausible, then values.
+    _clone_teacher(session, stop)
     while learner.gradient_steps < offline_updates and _time_left(session):
         _interrupt(session, stop)
         _update(session, session.batches.draw_offline(), "offline", notify)
@@ -123,6 +124,8 @@ def train(
             acting_step=acting_step,
         )
         progress.env_steps += session.env.num_envs
+        if learner.behaviour is not None:
+            learner.behaviour.move_to(progress.env_steps)
         for episode in ended:
             session.interval.episodes += 1
             session.interval.successes += bool(episode.success)
@@ -161,6 +164,16 @@ def train(
     )
 
 
+def _clone_teacher(session: Session, stop: Callable[[], bool]) -> None:
+    """The behaviour network on the logs' rows of the teacher's policies."""
+    behaviour, imitation = session.learner.behaviour, session.imitation
+    if behaviour is None or imitation is None or session.learner.gradient_steps:
+        return
+    while behaviour.updates < imitation.offline_updates and _time_left(session):
+        _interrupt(session, stop)
+        behaviour.learn(imitation.draw_offline())
+
+
 def _updates_due(session: Session) -> int:
     progress = session.progress
     if progress.online_from is None:
@@ -180,6 +193,9 @@ def _update(session: Session, batch: ReplayBatch, phase: str, notify: Notify) ->
         conservative=_conservative_weight(session, phase),
         return_to_go=return_to_go,
         expert=expert,
+        labelled=session.imitation.draw_online()
+        if session.imitation is not None and phase == "online"
+        else None,
     )
     step = learner.gradient_steps
     session.feed.batch(step, session.progress.env_steps, batch, loss, learner.target.last_sync)
@@ -263,7 +279,7 @@ def _evaluate_off_policy(session: Session) -> None:
         return
     config, learner = session.config, session.learner
     rows = evaluate_off_policy(
-        clone(learner.policy_network).to("cpu"),
+        clone(learner.policy).to("cpu"),
         load_ope_dataset(session.logs.panel, session.task, seed=config.seed),
         discount=config.loss.discount,
         measures=measures_of(session.task),
@@ -278,7 +294,7 @@ def _evaluate(session: Session, notify: Notify) -> None:
     config, progress, learner = session.config, session.progress, session.learner
     names = list(config.env.conditions)  # also those with a share of 0: never trained on, yet met
     specs = fixed_episodes(names, config.evaluation.episodes, config.evaluation.seed)
-    results = session.evaluation_buffer.drive(GreedyPolicy(learner.policy_network), specs)
+    results = session.evaluation_buffer.drive(GreedyPolicy(learner.policy), specs)
     measured = session.evaluation_buffer.measure(learner)
     session.run.append("evaluation_buffer", [{**session.steps, **row} for row in measured])
     progress.evaluated_at = progress.env_steps

@@ -9,6 +9,7 @@ from typing import Any
 
 import msgspec
 
+from restock.arrays import F32, Ints
 from restock.errors import PanelError, RunError
 from restock.ingest.profile.profile import Profile, load_profile
 from restock.replay.fleet.missions_file import MissionOrder, read_missions
@@ -17,13 +18,15 @@ from restock.replay.panel.panel import Panel
 from restock.replay.sampling.share_controller import PlannedDraws
 from restock.toml import read_toml
 from restock.train import loop
-from restock.train.dqn.config import TrainConfig, apply_overrides, load_config, parse_config
+from restock.train.dqn.config import GIVEN, TrainConfig, apply_overrides, load_config, parse_config
 from restock.train.dqn.learner import open_device
 from restock.train.dqn.manual_backprop import update_path
 from restock.train.dqn.target import describe
 from restock.train.feed.collector import conditions_in_twin
+from restock.train.feed.imitation import refuse_nothing_to_learn
 from restock.train.feed.logs import Coded, Logs
 from restock.train.feed.practice import Practice, logged_shares
+from restock.train.feed.teacher import Teacher, open_teacher
 from restock.train.finite import STOPPED
 from restock.train.loop import Notify, TrainResult
 from restock.train.ring_capacity import resolve_ring_capacity
@@ -60,9 +63,16 @@ class Prepared:
     document: dict[str, Any]  # config.json
     resumed: Run | None = None
     from_env_steps: int | None = None  # of an earlier checkpoint than the latest
+    teacher: Any = None  # that Python code passed in
 
     def open(self) -> Session:
         """Make the run directory (or take up the old one), the twin and the learner."""
+        env = make_twin(self.config, self.profile, self.config.env.num_envs)
+        teacher = open_teacher(
+            self.config.teacher, self.profile.task, seed=self.config.seed, given=self.teacher
+        )
+        if teacher is not None and self.resumed is None:  # refused before anything is written
+            teacher.ask(env, env.reset(seed=self.config.seed)[0])
         run = self.resumed or Run.create(self.path, self.document)
         if self.resumed is not None:
             run.remove_leftovers()
@@ -74,7 +84,7 @@ class Prepared:
             self.config,
             task=self.profile.task,
             conditions=conditions_in_twin(self.profile.conditions, self.profile.signals)[0],
-            env=make_twin(self.config, self.profile, self.config.env.num_envs),
+            env=env,
             evaluation_env=make_twin(
                 self.config,
                 self.profile,
@@ -83,6 +93,7 @@ class Prepared:
                 layouts=_evaluation_layouts(self.config),
             ),
             logs=_logs(self.panel, self.config, self.document) if self.panel is not None else None,
+            teacher=teacher,
             resume=self.resumed is not None,
         )
 
@@ -118,6 +129,7 @@ def train(
     panel: Path | str | None = None,
     out: Path | str,
     settings: Sequence[str] = (),
+    teacher: Teacher | Callable[[Any, F32], Ints] | None = None,
     stop: Callable[[], bool] = lambda: False,
     notify: Notify = lambda event, values: None,
 ) -> TrainResult:
@@ -127,6 +139,8 @@ def train(
         config: a config, the path of its TOML file, or None for the defaults.
         panel: the folder of a panel; None: online only.
         settings: `key.path=value`, over the config.
+        teacher: who is asked in the twin, in place of what `teacher.source` names: an object with
+            `act(env, observation)`, or a function like it, that gives actions (N,).
         stop: asked between steps; True ends the run with a checkpoint.
         notify: called for every row of `progress` and every evaluation.
 
@@ -137,9 +151,14 @@ def train(
         TrainingInterrupted: `stop` returned True.
     """
     panel_path = None if panel is None else Path(panel)
+    named = [f"teacher.source={GIVEN}"] if teacher is not None else []
     prepared = prepare_new(
-        Path(out), panel_path, Path(config) if isinstance(config, str) else config, settings
+        Path(out),
+        panel_path,
+        Path(config) if isinstance(config, str) else config,
+        [*settings, *named],
     )
+    prepared.teacher = teacher
     session = prepared.open()
     try:
         return loop.train(session, stop=stop, notify=notify)
@@ -181,6 +200,7 @@ def prepare_new(
         profile = load_profile(config.profile)
     panel = open_panel(panel_path, config, profile) if panel_path is not None else None
     check_missions(config, profile, panel)
+    refuse_nothing_to_learn(config.teacher, None if panel is None else _policies(panel))
     config, ring = resolve_ring_capacity(resolve_config(config, panel), panel)
     written = _document(config, profile, panel)
     if ring is not None:
@@ -220,6 +240,15 @@ def prepare_resumed(
                 where=str(path),
                 remedy="put the old panel back, or start a new run",
             )
+    began = stored.get("teacher", {}).get("source", "none")
+    if config.teacher.filters != (began != "none"):
+        raise RunError(
+            f"was begun with teacher.source = {began!r}, not"
+            f" {config.teacher.source!r}: its checkpoint has"
+            f" {'no' if config.teacher.filters else 'a'} behaviour network",
+            where=str(path),
+            remedy="leave teacher.source as it is, or start a new run",
+        )
     if from_env_steps is not None:
         check_earlier(run.latest, from_env_steps)
     return Prepared(path, config, profile, panel, run.document, run, from_env_steps)
@@ -353,6 +382,11 @@ def _logs(panel: Panel, config: TrainConfig, document: dict[str, Any]) -> Logs:
         config.loss.huber_delta,
         as_of_ns=int(document["created_ns"]),
     )
+
+
+def _policies(panel: Panel) -> list[str]:
+    """The behaviour policies of a panel's rows."""
+    return sorted({name for name in panel.meta_column("behaviour_policy").tolist() if name})
 
 
 def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dict[str, Any]:

@@ -28,10 +28,12 @@ from restock.train.evaluation.policies import save_agent
 from restock.train.feed.batch_record import FeedRecord
 from restock.train.feed.batches import Batches
 from restock.train.feed.collector import Collector, ring_conditions
+from restock.train.feed.imitation import Imitation
 from restock.train.feed.log_fidelity import LogFidelity
 from restock.train.feed.logs import Logs, LogTerms
 from restock.train.feed.practice import Practice
 from restock.train.feed.probe import Probe
+from restock.train.feed.teacher import AskedTeacher
 from restock.train.jump_start import POLICIES, JumpStart
 from restock.train.run import checkpoint
 from restock.train.run.checkpoint import keep, newest_whole
@@ -86,6 +88,7 @@ class Session(Stateful):
         "feed",
         "probe",
         "jump_start",
+        "imitation",
         "exploration",
     )
     STATE_TYPES: ClassVar[Mapping[str, Any]] = {
@@ -112,6 +115,7 @@ class Session(Stateful):
     log_terms: LogTerms
     jump_start: JumpStart | None
     practice: Practice
+    imitation: Imitation | None  # what the behaviour network learns from
     progress: Progress = field(default_factory=Progress)
     interval: Interval = field(default_factory=Interval)
     best: Score | None = None
@@ -186,7 +190,7 @@ class Session(Stateful):
             "env_steps": self.progress.env_steps,
             "gradient_steps": self.learner.gradient_steps,
         }
-        save_agent(self.run, self.learner.policy_network, self.task, results, clocks)
+        save_agent(self.run, self.learner.policy, self.task, results, clocks)
 
     def close(self) -> None:
         """Release the thread and the event files."""
@@ -204,6 +208,7 @@ def open_session(
     env: Twin,
     evaluation_env: Twin,
     logs: Logs | None,
+    teacher: AskedTeacher | None = None,
     resume: bool = False,
 ) -> Session:
     """Put the parts of a run together, new or as its latest checkpoint left them."""
@@ -231,7 +236,7 @@ def open_session(
         device=learner.device,
     )
     executor = ThreadPoolExecutor(1, "twin") if config.env.overlap else None
-    collector = Collector(env, ring, conditions, task, executor)
+    collector = Collector(env, ring, conditions, task, executor, teacher)
     fidelity = LogFidelity.of(logs, task.observation_size) if logs is not None else None
     session = Session(
         run=run,
@@ -270,6 +275,16 @@ def open_session(
         practice=Practice.of(
             config.practice, env, config.env.conditions, logs, goal=task.goal != "none"
         ),
+        imitation=Imitation(
+            config.teacher,
+            logs,
+            ring,
+            batch_size=config.replay.batch_size,
+            seed=seed,
+            device=learner.device,
+        )
+        if config.teacher.filters
+        else None,
     )
     session.collector.check_conditions()
     if resume:

@@ -33,6 +33,7 @@ META: dict[str, type[np.generic]] = {
     "policy_version": np.int64,  # the caller's number for the policy that acted
     "behaviour_policy": np.int16,  # code into `behaviour_policies`
     "action_probability": np.float32,  # of the action under that policy; NaN if unknown
+    "teacher_action": np.int16,  # what a teacher would have done; -1: not asked, or no opinion
     "episode": np.int64,  # the episode's key
     "episode_step": np.int32,  # of the row's first step in its episode, from 0
     "horizon": np.int16,  # steps the row's return spans, 1..n_step
@@ -216,6 +217,7 @@ class FreshRing(Stateful):
         policy_version: int = 0,
         behaviour_policy: NDArray[Any] | int = 0,
         action_probability: NDArray[Any] | float = float("nan"),
+        teacher_action: NDArray[Any] | int = -1,
     ) -> Ints:
         """Take one step of every environment.
 
@@ -231,6 +233,7 @@ class FreshRing(Stateful):
             "policy_version": policy_version,
             "behaviour_policy": behaviour_policy,
             "action_probability": action_probability,
+            "teacher_action": teacher_action,
             "episode": self.episode_key,
             "episode_step": self._episode_step,
         }

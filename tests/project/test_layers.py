@@ -43,7 +43,7 @@ MAY_IMPORT = {
         " replay/panel replay/ring replay/sampling replay/store ingest/profile ingest/store"
         " ingest/task"
     ),
-    "train/dqn": "twin/env twin/physics replay/fleet",
+    "train/dqn": "twin/env twin/physics replay/fleet replay/mixture",
     "train/run": "replay replay/panel ingest/profile ingest/task",
     "train/feed": (
         "dqn run twin/env twin/floors replay/mixture replay/panel replay/ring replay/sampling"

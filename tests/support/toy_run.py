@@ -13,6 +13,7 @@ import torch
 from restock.replay.mixture.packed_row import row_width
 from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.feed.logs import Coded, Logs
+from restock.train.feed.teacher import open_teacher
 from restock.train.loop import train
 from restock.train.run.run import Run
 from restock.train.run.run_tables import TABLES
@@ -94,6 +95,9 @@ def session(path: Path, settings: TrainConfig, *, resume: bool = False, **parts:
         env=ToyTwin(settings.env.num_envs, settings.env.conditions),
         evaluation_env=ToyTwin(3),
         logs=parts.get("logs", logs()),
+        teacher=open_teacher(
+            settings.teacher, TASK, seed=settings.seed, given=parts.get("teacher")
+        ),
         resume=resume,
     )
 
@@ -118,7 +122,7 @@ def assert_same_run(first: Session, second: Session) -> None:
     for a, b in (
         (first.learner.network, second.learner.network),
         (first.learner.target_network, second.learner.target_network),
-        (first.learner.policy_network, second.learner.policy_network),
+        (first.learner.policy, second.learner.policy),
     ):
         for name, value in a.state_dict().items():
             assert torch.equal(value, b.state_dict()[name]), name

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from restock.train.dqn.config import parse_config
+from restock.train.dqn.flat_adam import FlatParameters
 from restock.train.dqn.learner import Learner
 from restock.train.dqn.loss import (
     conservative_gradient,
@@ -19,7 +20,7 @@ from restock.train.dqn.loss import (
     margin_gradient,
     margin_penalty,
 )
-from restock.train.dqn.manual_backprop import FlatParameters, ManualBackprop, update_path
+from restock.train.dqn.manual_backprop import ManualBackprop, update_path
 from restock.train.dqn.network import QNetwork, clone
 
 OBSERVATION, ACTIONS, BATCH = 7, 4, 12
@@ -188,7 +189,7 @@ def test_a_learner_that_is_restored_learns_on_as_it_would_have() -> None:
     state = first.state_dict()
     # Moments are kept a parameter: in shape and order as an optimizer of each would.
     shapes = [parameter.shape for parameter in first.network.parameters()]
-    assert [entry["exp_avg"].shape for entry in state["moments"].values()] == shapes
+    assert [entry["exp_avg"].shape for entry in state["optimizer"]["moments"].values()] == shapes
     second = learner("manual", seed=5)  # type: ignore[arg-type]
     second.load_state_dict(state)
     for each in (first, second):

@@ -7,6 +7,7 @@ later. Every field has its meaning in a comment; `docs/train.md` explains the ch
 from __future__ import annotations
 
 import copy
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,12 +18,14 @@ from msgspec import Meta
 
 from restock.errors import ConfigError
 from restock.replay.fleet.missions_file import MissionOrder
+from restock.replay.mixture.schedules import Portion
 from restock.toml import Checked, read_toml, toml_value, typed
 from restock.train.dqn.target import Polyak, TargetRule
 from restock.train.twin.env.interface import DEFAULT_CONDITIONS, LinearEpsilon
 from restock.train.twin.physics.perturbation import find_perturbation
 
 RENAMED = {"guide": "jump_start"}  # keys of earlier versions
+GIVEN = "given"  # the source of a teacher that Python code passed in
 
 Count = Annotated[int, Meta(ge=1)]
 Share = Annotated[float, Meta(ge=0, le=1)]
@@ -107,6 +110,40 @@ class JumpStartConfig(Checked, frozen=True):
         """The most steps of an episode that begins after `env_steps`."""
         left = max(1.0 - env_steps / self.env_steps, 0.0) if self.env_steps else 0.0
         return round(self.horizon_steps * left)
+
+
+class TeacherConfig(Checked, frozen=True):
+    """Who says what it would do where the agent is, and how far Q may go from that."""
+
+    # operator: the twin's; logs: rows of `policies` alone; none; or your own, as module:name
+    source: str = "none"
+    ratio: Portion = 0.3  # plausible: G(a|s) >= ratio * max G; a number, or a schedule
+    target: Literal["filtered", "all"] = "filtered"  # actions that the target's maximum looks at
+    policies: tuple[str, ...] = ("operator",)  # behaviour policies whose logged rows are cloned
+    logs_share: Share = 0.25  # of the behaviour network's online batch, where there are such rows
+    offline_updates: NonNegativeInt = 2_000  # of it on those rows, before any of the critic's
+    learning_rate: Positive = 1e-3
+    hidden: tuple[Count, ...] = (256, 256)  # widths of the behaviour network
+
+    @property
+    def filters(self) -> bool:
+        """Whether there is a behaviour network."""
+        return self.source != "none"
+
+    @property
+    def asks(self) -> bool:
+        """Whether somebody is asked in the twin."""
+        return self.source not in ("none", "logs")
+
+    def check(self) -> None:
+        named = ("none", "logs", "operator", GIVEN)
+        if self.source not in named and not re.fullmatch(r"[\w.]+:\w+", self.source):
+            raise ValueError(
+                "source must be none, operator, logs, or your own teacher as module:name,"
+                f" got {self.source!r}"
+            )
+        if not self.hidden:
+            raise ValueError("hidden must name the width of at least one layer, got []")
 
 
 class EnvConfig(Checked, frozen=True):
@@ -195,6 +232,7 @@ class TrainConfig(Checked, frozen=True):
     schedule: ScheduleConfig = ScheduleConfig()
     epsilon: LinearEpsilon = LinearEpsilon()
     jump_start: JumpStartConfig = JumpStartConfig()
+    teacher: TeacherConfig = TeacherConfig()
     env: EnvConfig = msgspec.field(default_factory=EnvConfig)
     practice: PracticeConfig = msgspec.field(default_factory=PracticeConfig)
     evaluation: EvaluationConfig = EvaluationConfig()
@@ -204,6 +242,11 @@ class TrainConfig(Checked, frozen=True):
     def check(self) -> None:
         if self.loss.munchausen and self.network.quantiles:
             raise ValueError("loss.munchausen and network.quantiles do not go together: choose one")
+        if self.loss.munchausen and self.teacher.filters and self.teacher.target == "filtered":
+            raise ValueError(
+                'loss.munchausen averages over all actions, teacher.target = "filtered" leaves'
+                ' some out: choose one, or teacher.target = "all"'
+            )
         unknown = set(self.guard.conditions) - set(self.env.conditions)
         if unknown:
             raise ValueError(
@@ -236,8 +279,8 @@ def as_overrides(document: Mapping[str, Any], prefix: str = "") -> list[str]:
     """Nested settings as `key.path=value`, which `apply_overrides` takes."""
     overrides = []
     for key, value in document.items():
-        # A target rule is one value: half of one and half of another is no rule.
-        if isinstance(value, Mapping) and prefix + key != "target":
+        # A target rule is one value, as is a schedule: half of one and half of another is none.
+        if isinstance(value, Mapping) and prefix + key not in ("target", "teacher.ratio"):
             overrides += as_overrides(value, f"{prefix}{key}.")
         elif value is not None:
             overrides.append(f"{prefix}{key}={toml_value(value)}")
@@ -277,6 +320,7 @@ def _apply(document: dict[str, Any], override: str) -> None:
 __all__ = [
     "JumpStartConfig",
     "PracticeConfig",
+    "TeacherConfig",
     "TrainConfig",
     "apply_overrides",
     "as_overrides",

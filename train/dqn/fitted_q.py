@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from restock.arrays import F32
-from restock.train.dqn.network import Network, QNetwork, clone
+from restock.train.dqn.behaviour import PolicyNetwork
+from restock.train.dqn.network import QNetwork, clone
 
 _PART = 8192  # rows
 
@@ -49,7 +50,7 @@ class FittedQConfig:
     cloning_updates: int = 1500  # of the behaviour, where its probabilities are not logged
 
 
-def soft_greedy(network: Network, observation: F32, epsilon: float) -> F32:
+def soft_greedy(network: PolicyNetwork, observation: F32, epsilon: float) -> F32:
     """The probabilities (N, A) of the greedy policy that acts at random with probability `epsilon`.
 
     A deterministic policy has none for any action but one, so an episode in which the logs did

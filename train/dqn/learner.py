@@ -13,7 +13,9 @@ from torch import Tensor
 
 from restock.errors import ConfigError
 from restock.state import Stateful
+from restock.train.dqn.behaviour import Behaviour, FilteredNetwork, Labelled, PolicyNetwork
 from restock.train.dqn.config import LossConfig, TrainConfig
+from restock.train.dqn.flat_adam import FlatAdam, FlatParameters
 from restock.train.dqn.loss import (
     Loss,
     conservative_gradient,
@@ -28,16 +30,9 @@ from restock.train.dqn.loss import (
     quantile_target,
     td_target,
 )
-from restock.train.dqn.manual_backprop import (
-    FlatParameters,
-    ManualBackprop,
-    UpdatePath,
-    update_path,
-)
+from restock.train.dqn.manual_backprop import ManualBackprop, UpdatePath, update_path
 from restock.train.dqn.network import Network, clone, make_network
 from restock.train.dqn.target import TargetUpdate
-
-_MOMENTS = ("exp_avg", "exp_avg_sq")  # of Adam, as PyTorch names them
 
 
 @dataclass(frozen=True)
@@ -62,9 +57,10 @@ class Learner(Stateful):
         "network",
         "target_network",
         "policy_network",
-        "moments",
+        "optimizer",
         "gradient_steps",
         "target",
+        "behaviour",
     )
 
     def __init__(
@@ -78,7 +74,6 @@ class Learner(Stateful):
         """`path` None takes the fastest that the config allows; both agree but for rounding."""
         self.device = open_device(config.device)
         self.loss: LossConfig = config.loss
-        self.max_grad_norm = config.optimizer.max_grad_norm
         self.network: Network = make_network(
             config.network,
             observation_size,
@@ -87,20 +82,36 @@ class Learner(Stateful):
         ).to(self.device)
         self.target_network = clone(self.network)
         self.policy_network = clone(self.network)
-        self._flat = FlatParameters(self.network, learns=True)
+        self.optimizer = FlatAdam(
+            self.network, config.optimizer.learning_rate, config.optimizer.max_grad_norm
+        )
         self._policy = FlatParameters(self.policy_network, learns=False).values
         slow = FlatParameters(self.target_network, learns=False).values
-        self.target = TargetUpdate(config.target, [self._flat.values], [slow])
+        self.target = TargetUpdate(config.target, [self.optimizer.values], [slow])
         self.averaging = config.evaluation.averaging
-        self.optimizer = torch.optim.Adam(
-            [self._flat.values], lr=config.optimizer.learning_rate, fused=True
-        )
         self.path = path or update_path(config.network, config.device)
         self._backprop = ManualBackprop(self.network) if self.path == "manual" else None
         self._target_backprop = (
             ManualBackprop(self.target_network) if self.path == "manual" else None
         )
         self.gradient_steps = 0
+        self.behaviour: Behaviour | None = None
+        self._acting: PolicyNetwork = self.network
+        self.policy: PolicyNetwork = self.policy_network  # what is evaluated and kept
+        if config.teacher.filters:
+            self.behaviour = Behaviour(
+                config.teacher,
+                observation_size,
+                actions,
+                seed=config.seed,
+                averaging=self.averaging,
+                device=self.device,
+                by_hand=self.path == "manual" or (path is None and self.device.type == "cpu"),
+            )
+            ratio = self.behaviour.ratio
+            self._acting = FilteredNetwork(self.network, self.behaviour.network, ratio)
+            self.policy = FilteredNetwork(self.policy_network, self.behaviour.average, ratio)
+        self._filters_target = config.teacher.target == "filtered"
 
     def update(
         self,
@@ -111,6 +122,7 @@ class Learner(Stateful):
         conservative: float = 0.0,
         return_to_go: Tensor | None = None,
         expert: Tensor | None = None,
+        labelled: Labelled | None = None,
     ) -> Loss:
         """One gradient step on `rows`; the target's clock is ticked by `self.target` afterwards.
 
@@ -121,16 +133,17 @@ class Learner(Stateful):
             conservative: the weight of that term.
             return_to_go: (logged,) what the logs got from each of them on, for Cal-QL.
             expert: (logged,) bool, whether the margin term applies, or None: to none.
+            labelled: what the behaviour network learns from, where there is one.
         """
         terms = _Terms(weight, logged, conservative if logged else 0.0, return_to_go, expert)
         if self._backprop is not None and self._target_backprop is not None:
             loss = self._by_hand(self._backprop, self._target_backprop, rows, terms)
         else:
             loss = self._by_autograd(rows, terms)
-        if self.max_grad_norm is not None:
-            torch.nn.utils.clip_grad_norm_([self._flat.values], self.max_grad_norm)
         self.optimizer.step()
         self.gradient_steps += 1
+        if self.behaviour is not None and labelled is not None:
+            self.behaviour.learn(labelled)
         self._average()
         return loss
 
@@ -167,7 +180,7 @@ class Learner(Stateful):
         value = loss.value
         if penalties:
             value = value + torch.stack(penalties).sum() / len(losses)
-        self._flat.gradient.zero_()
+        self.optimizer.gradient.zero_()
         value.backward()  # type: ignore[no-untyped-call]
         return loss
 
@@ -187,11 +200,13 @@ class Learner(Stateful):
         elif settings.double:  # s and s' through the online network together
             q, next_q = online.forward(observation, next_observation)
             (slow_q,) = slow.forward(next_observation)
-            target = td_target(reward, discount, slow_q, next_q)
+            plausible = self._plausible(next_observation)
+            target = td_target(reward, discount, slow_q, next_q, plausible)
         else:
             (q,) = online.forward(observation)
             (slow_q,) = slow.forward(next_observation)
-            target = td_target(reward, discount, slow_q)
+            plausible = self._plausible(next_observation)
+            target = td_target(reward, discount, slow_q, plausible=plausible)
         loss = dqn_loss(q, action, target, weight=terms.weight, huber_delta=settings.huber_delta)
         gradient = dqn_gradient(
             loss.td, action, q.shape[1], weight=terms.weight, huber_delta=settings.huber_delta
@@ -223,17 +238,26 @@ class Learner(Stateful):
             slow_q, slow_next_q = slow(observation), slow(next_observation)
             return self._munchausen(reward, discount, action, slow_q, slow_next_q)
         next_q = self.network(next_observation) if self.loss.double else None
+        plausible = self._plausible(next_observation)
         if self.network.quantiles:
             return quantile_target(
                 reward,
                 discount,
                 [member.distribution(next_observation) for member in slow.members],
                 next_q,
+                plausible,
             )
         targets = [
-            td_target(reward, discount, member(next_observation), next_q) for member in slow.members
+            td_target(reward, discount, member(next_observation), next_q, plausible)
+            for member in slow.members
         ]
         return targets[0] if len(targets) == 1 else torch.stack(targets).amin(dim=0)
+
+    def _plausible(self, next_observation: Tensor) -> Tensor | None:
+        """The actions (B, A) that the target's maximum may look at; None: all."""
+        if self.behaviour is None or not self._filters_target:
+            return None
+        return self.behaviour.plausible(next_observation)
 
     def _munchausen(self, *parts: Tensor) -> Tensor:
         """`munchausen_target` of reward, discount, action and the target network at s and s'."""
@@ -247,7 +271,7 @@ class Learner(Stateful):
     @property
     def is_finite(self) -> bool:
         """Whether every parameter is: a gradient that is not finite leaves its mark on them."""
-        return bool(torch.isfinite(self._flat.values).all())
+        return bool(torch.isfinite(self.optimizer.values).all())
 
     @torch.no_grad()
     def _average(self) -> None:
@@ -258,7 +282,7 @@ class Learner(Stateful):
         Juditsky 1992). Until there are as many, it is the mean of all of them.
         """
         rate = max(self.averaging, 1.0 / self.gradient_steps)
-        self._policy.lerp_(self._flat.values, rate)
+        self._policy.lerp_(self.optimizer.values, rate)
 
     @torch.no_grad()
     def td_error(self, rows: Tensor, *, online: bool = False) -> tuple[Tensor, Tensor, Tensor]:
@@ -282,30 +306,21 @@ class Learner(Stateful):
         return dqn_loss(q, action, value).td, q, self.target_network(observation)
 
     def greedy(self, observation: NDArray[np.float32]) -> NDArray[np.int64]:
-        """The best action (N,) of each observation (N, D)."""
-        return greedy_actions(self.network, observation)
+        """The best action (N,) of each observation (N, D), among the plausible ones."""
+        return greedy_actions(self._acting, observation)
 
-    @property
-    def moments(self) -> dict[str, dict[str, Tensor]]:
-        """Adam's moments a parameter, in the network's order, as if each were its own."""
-        if not (state := self.optimizer.state[self._flat.values]):
-            return {}
-        moments = zip(*(self._flat.views(state[name]) for name in _MOMENTS), strict=True)
-        return {
-            str(index): {"step": state["step"], **dict(zip(_MOMENTS, pair, strict=True))}
-            for index, pair in enumerate(moments)
-        }
-
-    @moments.setter
-    def moments(self, entries: Mapping[str, Mapping[str, Tensor]]) -> None:
-        self.optimizer.state.clear()
-        if not entries:
-            return
-        state = self.optimizer.state[self._flat.values]
-        ordered = [entries[str(index)] for index in range(len(entries))]
-        state["step"] = ordered[0]["step"].to(self.device, copy=True)
-        for name in _MOMENTS:
-            state[name] = self._flat.flat_of([entry[name] for entry in ordered])
+    def take_over(self, weights: Mapping[str, Tensor]) -> None:
+        """Put a kept policy's weights (of `policy`) into all networks; moments are forgotten."""
+        ratio = None if self.behaviour is None else self.behaviour.in_force
+        self.policy.load_state_dict(weights)
+        kept = self.policy_network.state_dict()
+        for network in (self.network, self.target_network):
+            network.load_state_dict(kept)
+        self.optimizer.forget()
+        if self.behaviour is not None and ratio is not None:
+            self.behaviour.in_force = ratio  # the run's, not that of when the policy was kept
+            self.behaviour.network.load_state_dict(self.behaviour.average.state_dict())
+            self.behaviour.optimizer.forget()
 
 
 def unpack(rows: Tensor, observation_size: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -321,7 +336,7 @@ def unpack(rows: Tensor, observation_size: int) -> tuple[Tensor, Tensor, Tensor,
 
 
 @torch.inference_mode()
-def greedy_actions(network: Network, observation: NDArray[np.float32]) -> NDArray[np.int64]:
+def greedy_actions(network: PolicyNetwork, observation: NDArray[np.float32]) -> NDArray[np.int64]:
     """The best action (N,) of each observation (N, D), on the network's device."""
     device = next(network.parameters()).device
     values = network(torch.from_numpy(np.ascontiguousarray(observation)).to(device))

@@ -28,7 +28,11 @@ class Loss:
 
 
 def td_target(
-    reward: Tensor, discount: Tensor, next_target_q: Tensor, next_online_q: Tensor | None = None
+    reward: Tensor,
+    discount: Tensor,
+    next_target_q: Tensor,
+    next_online_q: Tensor | None = None,
+    plausible: Tensor | None = None,
 ) -> Tensor:
     """What Q(s, a) should be, (B,).
 
@@ -38,13 +42,19 @@ def td_target(
         next_target_q: (B, A), the target network at s'.
         next_online_q: (B, A), the online network at s': it selects the action that the target
             network evaluates (Double DQN). None lets the target network do both (DQN).
+        plausible: (B, A) bool, at least one of each row: the actions at s' that may be selected
+            (discrete BCQ, arXiv:1910.01708). None: all of them.
     """
-    if next_online_q is None:
-        next_value = next_target_q.amax(dim=1)
-    else:
-        best = next_online_q.argmax(dim=1, keepdim=True)
-        next_value = next_target_q.gather(1, best).squeeze(1)
-    return reward + discount * next_value
+    chooses = next_target_q if next_online_q is None else next_online_q
+    best = _best(chooses, plausible).unsqueeze(1)
+    return reward + discount * next_target_q.gather(1, best).squeeze(1)
+
+
+def _best(q: Tensor, plausible: Tensor | None) -> Tensor:
+    """The action (B,) of the highest of the values `q` (B, A) that are `plausible` (B, A)."""
+    if plausible is not None:
+        q = q.masked_fill(~plausible, -torch.inf)
+    return q.argmax(dim=1)
 
 
 def mean_loss(losses: Sequence[Loss]) -> Loss:
@@ -87,14 +97,15 @@ def quantile_target(
     discount: Tensor,
     next_quantiles: Sequence[Tensor],
     next_online_q: Tensor | None = None,
+    plausible: Tensor | None = None,
 ) -> Tensor:
     """The quantiles that Q(s, a) should have, (B, N): those of the next state's best action.
 
     `next_quantiles` are (B, A, N) of each member of an ensemble: the one with the least mean for
-    that action is taken. `next_online_q` selects the action as in `td_target`.
+    that action is taken. `next_online_q` and `plausible` select the action as in `td_target`.
     """
     means = torch.stack([quantiles.mean(dim=2) for quantiles in next_quantiles]).amin(dim=0)
-    best = (means if next_online_q is None else next_online_q).argmax(dim=1)
+    best = _best(means if next_online_q is None else next_online_q, plausible)
     count = next_quantiles[0].shape[2]
     index = best[:, None, None].expand(-1, 1, count)
     each = torch.stack([q.gather(1, index).squeeze(1) for q in next_quantiles])  # (K, B, N)

@@ -21,7 +21,8 @@ from restock.arrays import F32, Ints
 from restock.errors import ConfigError, RunError
 from restock.files import write_bytes
 from restock.ingest.task.task import Task
-from restock.train.dqn.network import Network, QNetwork
+from restock.train.dqn.behaviour import FilteredNetwork, PolicyNetwork
+from restock.train.dqn.network import QNetwork
 from restock.train.evaluation.policies import load_agent
 from restock.train.run.run import Run
 from restock.train.run.run_profile import profile_of_run
@@ -32,7 +33,8 @@ _OPSET = 18
 
 def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
     """Write a run's kept policy to `out`: input `observation` (N, D), outputs `values` (N, A) and
-    `action` (N,).
+    `action` (N,). With a teacher's filter both networks are in it, and the values of actions that
+    are not plausible are -inf.
 
     Raises:
         RunError: no such run, no policy kept, or there is something at `out` already.
@@ -62,15 +64,18 @@ def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
     return {"path": str(out), "bytes": out.stat().st_size, **metadata}
 
 
-def to_onnx(network: Network) -> Any:
-    """The network as an ONNX model, node for layer."""
+def to_onnx(network: PolicyNetwork) -> Any:
+    """The network as an ONNX model, node for layer; where it is filtered, both in one graph."""
     onnx = _library("onnx")
     graph = _Graph(onnx)
-    values = [graph.values(member, f"m{index}") for index, member in enumerate(network.members)]
-    if len(values) == 1:
-        graph.node("Identity", values, "values")
-    else:
-        graph.node("Mean", values, "values")
+    filtered = isinstance(network, FilteredNetwork)
+    members = network.values.members if isinstance(network, FilteredNetwork) else network.members
+    each = [graph.values(member, f"m{index}") for index, member in enumerate(members)]
+    values = graph.node(
+        "Mean" if len(each) > 1 else "Identity", each, "all_values" if filtered else "values"
+    )
+    if isinstance(network, FilteredNetwork):
+        graph.filter(network, values, "values")
     graph.node("ArgMax", ["values"], "action", axis=1, keepdims=0)
     tensor, kinds = onnx.helper.make_tensor_value_info, onnx.TensorProto
     return onnx.helper.make_model(
@@ -141,6 +146,17 @@ class _Graph:
         middle = self.mean(spread, 1, f"{name}.middle")
         centred = self.node("Sub", [spread, middle], f"{name}.centred")
         return self.node("Add", [value, centred], f"{name}.values")
+
+    def filter(self, network: FilteredNetwork, values: str, output: str) -> str:
+        """The values (N, A) where an action is plausible, -inf elsewhere."""
+        logits = self.values(network.behaviour, "behaviour")
+        axes = self.constant("behaviour.axes", np.array([1], np.int64))
+        largest = self.node("ReduceMax", [logits, axes], "behaviour.largest", keepdims=1)
+        below = self.constant("behaviour.log_ratio", _array(network.ratio.log()))
+        least = self.node("Add", [largest, below], "behaviour.least")
+        plausible = self.node("GreaterOrEqual", [logits, least], "plausible")
+        none = self.constant("behaviour.none", np.array(-np.inf, np.float32))
+        return self.node("Where", [plausible, values, none], output)
 
     def mean(self, inputs: str, axis: int, name: str, *, keep: bool = True) -> str:
         axes = self.constant(f"{name}.axes", np.array([axis], np.int64))

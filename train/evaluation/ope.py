@@ -20,6 +20,7 @@ from restock.arrays import F64
 from restock.files import write_table
 from restock.ingest.task.task import Task
 from restock.toml import Checked
+from restock.train.dqn.behaviour import PolicyNetwork
 from restock.train.dqn.config import parse_config
 from restock.train.dqn.fitted_q import (
     FittedQConfig,
@@ -29,7 +30,7 @@ from restock.train.dqn.fitted_q import (
     soft_greedy,
     values,
 )
-from restock.train.dqn.network import Network, QNetwork
+from restock.train.dqn.network import QNetwork
 from restock.train.evaluation.ope_dataset import (
     Measure,
     OpeDataset,
@@ -120,7 +121,7 @@ def measures_of(task: Task) -> tuple[Measure, ...]:
 
 
 def evaluate_off_policy(
-    network: Network,
+    network: PolicyNetwork,
     dataset: OpeDataset,
     *,
     discount: float,
@@ -181,7 +182,7 @@ def evaluate_off_policy(
 
 
 def padded_episodes(
-    network: Network,
+    network: PolicyNetwork,
     q: QNetwork,
     steps: OpeSteps,
     probability: F64,

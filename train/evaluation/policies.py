@@ -12,9 +12,9 @@ import numpy as np
 from restock.arrays import F32, Ints
 from restock.errors import ConfigError, RunError
 from restock.ingest.task.task import Task
+from restock.train.dqn.behaviour import PolicyNetwork, make_policy
 from restock.train.dqn.config import parse_config
 from restock.train.dqn.learner import greedy_actions
-from restock.train.dqn.network import Network, make_network
 from restock.train.evaluation.evaluate import Score
 from restock.train.run import checkpoint
 from restock.train.run.run import Run
@@ -23,11 +23,11 @@ from restock.train.twin.env.interface import Policy
 
 
 class GreedyPolicy:
-    """A Q network, always taking its best action."""
+    """A Q network, always taking its best action, among the plausible where it is filtered."""
 
     name = "agent"
 
-    def __init__(self, network: Network, version: str = "") -> None:
+    def __init__(self, network: PolicyNetwork, version: str = "") -> None:
         self.network, self.version = network, version
 
     def act(self, env: Any, observation: F32) -> tuple[Ints, F32]:
@@ -83,13 +83,13 @@ def load_agent(run: Run) -> GreedyPolicy:
             where=str(run.best),
             remedy="train again: observations or actions have changed their meaning",
         )
-    network = make_network(config.network, state["observation_size"], state["actions"])
+    network = make_policy(config, state["observation_size"], state["actions"])
     network.load_state_dict(state["network"])
     return GreedyPolicy(network.eval(), version=f"{run.path.name}@{state['gradient_steps']}")
 
 
 def save_agent(
-    run: Run, network: Network, task: Task, score: Score, clocks: Mapping[str, int]
+    run: Run, network: PolicyNetwork, task: Task, score: Score, clocks: Mapping[str, int]
 ) -> None:
     """Keep a network as the best of a run so far; `clocks` are `env_steps` and `gradient_steps`."""
     state = {

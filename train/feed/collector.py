@@ -23,8 +23,10 @@ from restock.ingest.task.signals import STORED_SIGNALS, Signals
 from restock.ingest.task.task import Task
 from restock.replay.ring.ring import FreshRing
 from restock.state import Stateful, saved
+from restock.train.dqn.behaviour import UNKNOWN
 from restock.train.feed.fresh_log import FreshLog, FreshPerturbations, values_entries
 from restock.train.feed.held_rows import EpisodeLabels
+from restock.train.feed.teacher import AskedTeacher, Label
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.floors.layout import DEFAULT
 
@@ -73,6 +75,7 @@ class Collector(Stateful):
         "perturbations",
         "labels",
         "_unlabelled",
+        "teacher",
     )
 
     def __init__(
@@ -82,12 +85,14 @@ class Collector(Stateful):
         conditions: Sequence[Condition],
         task: Task,
         executor: Executor | None,
+        teacher: AskedTeacher | None = None,
     ) -> None:
         self.env, self.ring, self.task = env, ring, task
         self.goal = task.goal != "none"  # else success is not defined
         self.conditions = list(conditions)
         self._codes = {name: code for code, name in enumerate(ring.conditions)}
         self._executor = executor
+        self.teacher = teacher  # asked before each step, on the twin's thread
         self._actions = np.asarray(task.actions, np.float64)
         count, length = env.num_envs, task.time_limit_steps + 1
         self._history: dict[str, NDArray[Any]] = {
@@ -103,6 +108,7 @@ class Collector(Stateful):
         self._sent: tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int16]] | None = None
         self._future: Future[Any] | None = None
         self._result: Any = None
+        self._label: Label | int = UNKNOWN  # what the teacher would have done in the step
         self.perturbations = FreshPerturbations()
         self.labels = EpisodeLabels()  # of the episodes that ended, until the record takes them
         self.log: FreshLog | None = None
@@ -152,10 +158,15 @@ class Collector(Stateful):
         self._history["command_yaw_rate_radps"][envs, self._steps] = self._actions[action, 1]
         self._sent = (action, probability, np.broadcast_to(np.int16(policy), action.shape))
         if self._executor is not None:
-            self._future = self._executor.submit(self.env.step, action)
+            self._future = self._executor.submit(self._step, action)
         else:
-            self._result = self.env.step(action)
+            self._result = self._step(action)
         return self._result
+
+    def _step(self, action: NDArray[np.int64]) -> Any:
+        if self.teacher is not None:
+            self._label = self.teacher.ask(self.env, self.observation)
+        return self.env.step(action)
 
     def finish(
         self, *, env_steps: int, gradient_steps: int, acting_step: int
@@ -191,6 +202,7 @@ class Collector(Stateful):
             policy_version=acting_step,
             behaviour_policy=policy,
             action_probability=probability,
+            teacher_action=self._label,
         )
         if info["invalid"].any():
             self._drop(keys, info["invalid"])
@@ -271,6 +283,8 @@ class Collector(Stateful):
             order = slots[np.argsort(ring.meta["episode_step"][slots])]
             if len(order) > 1:
                 ring.rows[order[-1]] = ring.rows[order[-2]]
+                label = ring.meta["teacher_action"]
+                label[order[-1]] = label[order[-2]]
             self.invalid_steps += 1
 
     def forget(self, episodes: Sequence[EndedEpisode]) -> None:

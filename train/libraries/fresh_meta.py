@@ -43,6 +43,7 @@ class FreshMeta:
             name: np.zeros(capacity, dtype) for name, dtype in META.items()
         }
         self.meta["action_probability"][:] = np.nan
+        self.meta["teacher_action"][:] = -1
         self.strata = StratumSlots(capacity, len(self.conditions))
         self.filled = np.zeros(capacity, np.bool_)
         self.episode_key: Ints = np.arange(num_envs, dtype=np.int64)

@@ -24,8 +24,8 @@ from safetensors.torch import save_file
 from restock.errors import RunError
 from restock.files import temporary_name
 
-FORMAT = "restock-checkpoint/4"
-_EARLIER = tuple(f"restock-checkpoint/{number}" for number in (1, 2, 3))
+FORMAT = "restock-checkpoint/5"
+_EARLIER = tuple(f"restock-checkpoint/{number}" for number in (1, 2, 3, 4))
 _ARRAY, _STRINGS, _NUMPY = "__array__", "__strings__", "numpy"
 _RESTORE = "put back a copy of it, or train again"
 _PREFIX, _SUFFIX = "env_steps_", ".safetensors"

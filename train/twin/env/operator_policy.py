@@ -8,10 +8,13 @@ count. A few percent of the actions are mistakes.
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from restock.arrays import F64, Bools, Ints
 from restock.ingest.task.route import view_route
+from restock.state import Stateful
 from restock.train.twin.env.policies import SoftPolicy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.layout import Warehouse
@@ -32,10 +35,13 @@ STANDING_MPS = 0.12
 PATIENCE_STEPS = 20  # with somebody in the way; then it moves about, to be let pass
 
 
-class Operator(SoftPolicy):
+class Operator(SoftPolicy, Stateful):
     """Privileged: reads the simulation's state. Keeps a way of its own for each robot."""
 
     name = "operator"
+    STATE: ClassVar[tuple[str, ...]] = (
+        *("_rng", "_ways", "_episode", "_anchor", "_still", "_backing"),
+    )
 
     def __init__(self, *, epsilon: float = 0.03, seed: int = 0) -> None:
         super().__init__(epsilon=epsilon, seed=seed)

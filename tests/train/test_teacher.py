@@ -1,0 +1,329 @@
+"""A teacher's filter: plausible actions, what Q chooses among them, who is asked, what is kept."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from support.toy_run import assert_same_run, config, logs, run_to_end, session
+from support.toy_twin import CELLS, TASK
+from torch import Tensor, tensor
+
+from restock.errors import ConfigError
+from restock.train.dqn.behaviour import (
+    UNKNOWN,
+    FilteredNetwork,
+    Labelled,
+    imitation_gradient,
+    imitation_loss,
+    plausible_actions,
+)
+from restock.train.dqn.config import parse_config
+from restock.train.dqn.learner import Learner, greedy_actions
+from restock.train.dqn.loss import quantile_target, td_target
+from restock.train.loop import TrainingInterrupted, train
+
+STOP, FORWARD, BACK = range(3)
+
+
+def of(probability: list[list[float]]) -> Tensor:
+    """Logits of which G is the softmax."""
+    return tensor(probability).log() + 2.5
+
+
+@given(st.floats(0, 1), st.integers(0, 2**32 - 1))
+def test_plausible_is_what_the_ratio_says_of_the_probabilities(ratio: float, seed: int) -> None:
+    logits = torch.randn(6, 4, generator=torch.Generator().manual_seed(seed)).double()
+    found = plausible_actions(logits, tensor(ratio, dtype=torch.float64))
+    probability = logits.softmax(dim=1)
+    largest = probability.amax(dim=1, keepdim=True)
+    near = (probability / largest - ratio).abs() < 1e-9
+    assert bool(((probability >= ratio * largest) == found)[~near].all())
+    assert bool(found.any(dim=1).all())
+    assert bool(found.gather(1, probability.argmax(dim=1, keepdim=True)).all())
+
+
+def test_the_ends_of_the_ratio_are_all_and_the_likeliest() -> None:
+    logits = of([[0.7, 0.2, 0.1], [0.1, 0.1, 0.8]])
+    assert bool(plausible_actions(logits, tensor(0.0)).all())
+    assert plausible_actions(logits, tensor(1.0)).tolist() == [
+        [True, False, False],
+        [False, False, True],
+    ]
+    # .2 / .7 = .29: just short of .3
+    assert plausible_actions(logits, tensor(0.3)).tolist()[0] == [True, False, False]
+    assert plausible_actions(logits, tensor(0.25)).tolist()[0] == [True, True, False]
+
+
+def test_the_target_looks_among_the_plausible_alone() -> None:
+    reward, discount = tensor([1.0, 0.0]), tensor([0.5, 0.0])
+    slow = tensor([[4.0, 2.0, 8.0], [9.0, 9.0, 9.0]])
+    online = tensor([[1.0, 3.0, 5.0], [0.0, 1.0, 2.0]])
+    plausible = tensor([[True, True, False], [False, True, False]])
+    # Online's best is action 2, which is not plausible; of the others it is 1, worth 2 to slow.
+    assert td_target(reward, discount, slow, online, plausible).tolist() == [1 + 0.5 * 2, 0.0]
+    assert td_target(reward, discount, slow, plausible=plausible).tolist() == [1 + 0.5 * 4, 0.0]
+    spread = torch.stack([slow - 1, slow + 1], dim=2)
+    target = quantile_target(reward, discount, [spread], online, plausible)
+    assert target.tolist() == [[1 + 0.5 * 1, 1 + 0.5 * 3], [0.0, 0.0]]
+
+
+def test_imitation_is_cross_entropy_over_the_states_with_an_answer() -> None:
+    logits = of([[0.5, 0.25, 0.25], [0.1, 0.1, 0.8], [0.2, 0.2, 0.6]])
+    action = tensor([0, UNKNOWN, 2])
+    expected = -(np.log(0.5) + np.log(0.6)) / 2
+    assert float(imitation_loss(logits, action)) == pytest.approx(expected)
+    assert float(imitation_loss(logits, torch.full((3,), UNKNOWN))) == 0
+
+
+@pytest.mark.parametrize("known", [0, 1, 7, 16])
+def test_imitations_slope_is_autograds(known: int) -> None:
+    generator = torch.Generator().manual_seed(known)
+    logits = torch.randn(16, 5, generator=generator, dtype=torch.float64, requires_grad=True)
+    action = torch.randint(5, (16,), generator=generator)
+    action[known:] = UNKNOWN
+    (expected,) = torch.autograd.grad(imitation_loss(logits, action), logits)
+    torch.testing.assert_close(imitation_gradient(logits.detach(), action), expected)
+
+
+def learner(path: Any = None, **sections: dict[str, Any]) -> Learner:
+    document: dict[str, Any] = {"network": {"hidden": (16,)}, "teacher": {"source": "logs"}}
+    document |= sections
+    return Learner(parse_config(document, where="test"), 6, 3, path=path)
+
+
+def rows(seed: int) -> Tensor:
+    packed = torch.randn(32, 15, generator=torch.Generator().manual_seed(seed))
+    packed[:, -3] = torch.arange(32) % 3
+    packed[:, -1] = 0.9 * (torch.arange(32) % 5 != 0)
+    return packed
+
+
+@pytest.mark.parametrize("double", [True, False])
+@pytest.mark.parametrize("target", ["filtered", "all"])
+def test_learning_by_hand_is_learning_by_autograd(double: bool, target: str) -> None:
+    sections: dict[str, Any] = {
+        "loss": {"double": double},
+        "teacher": {"source": "logs", "target": target},
+    }
+    by_hand, by_graph = learner("manual", **sections), learner("autograd", **sections)
+    for step in range(1, 6):
+        batch = rows(step)
+        labelled = Labelled(batch[:, :6], torch.where(batch[:, 0] > 0, 1, UNKNOWN))
+        ours, theirs = (each.update(batch, labelled=labelled) for each in (by_hand, by_graph))
+        torch.testing.assert_close(ours.td, theirs.td, rtol=1e-4, atol=1e-5)
+    for part in ("network", "behaviour"):
+        one, two = by_hand.state_dict()[part], by_graph.state_dict()[part]
+        if part == "behaviour":
+            one, two = one["network"], two["network"]
+        torch.testing.assert_close(one, two, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("network", [{"quantiles": 5}, {"ensemble": 3}, {"dueling": True}], ids=str)
+def test_every_kind_of_network_is_filtered(network: dict[str, Any]) -> None:
+    one = learner(network={"hidden": (16,), **network})
+    one.update(rows(0), labelled=Labelled(rows(1)[:, :6], torch.full((32,), FORWARD)))
+    assert one.behaviour is not None
+    one.behaviour.in_force = 1.0
+    observation = rows(2)[:, :6]
+    likeliest = one.behaviour.network(observation).argmax(dim=1)
+    assert one.greedy(observation.numpy()).tolist() == likeliest.tolist()
+
+
+def test_an_unlikely_action_is_chosen_neither_in_acting_nor_in_the_target() -> None:
+    one = learner(teacher={"source": "logs", "learning_rate": 0.05, "hidden": (16,)})
+    behaviour = one.behaviour
+    assert behaviour is not None
+    state = torch.eye(6)
+    for _ in range(60):
+        behaviour.learn(Labelled(state, torch.full((6,), FORWARD)))
+    assert behaviour.plausible(state).tolist() == [[False, True, False]] * 6
+    with torch.no_grad():
+        one.network.members[0].advantage.bias.copy_(tensor([9.0, 0.0, 5.0]))
+    assert greedy_actions(one.network, state.numpy()).tolist() == [STOP] * 6
+    assert one.greedy(state.numpy()).tolist() == [FORWARD] * 6
+    behaviour.in_force = 0.0  # loosened to nothing
+    assert one.greedy(state.numpy()).tolist() == [STOP] * 6
+
+
+def forward(env: Any, observation: np.ndarray) -> np.ndarray:
+    """A teacher on the corridor: on, but nothing to say of the first cell."""
+    return np.where(observation[:, 0] == 1, UNKNOWN, FORWARD)
+
+
+TAUGHT = {"teacher": {"source": "given", "ratio": 0.5, "offline_updates": 40, "hidden": [16]}}
+
+
+@pytest.fixture(scope="module")
+def taught(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    path = tmp_path_factory.mktemp("taught") / "run"
+    return run_to_end(path, config(**TAUGHT), teacher=forward)
+
+
+def test_every_step_has_the_teachers_answer_for_its_own_state(taught: Any) -> None:
+    ring, count = taught.ring, len(taught.ring)
+    label = ring.meta["teacher_action"][:count]
+    first = ring.rows[:count, 0] == 1
+    assert first.any()
+    assert (label[first] == UNKNOWN).all()
+    assert (label[~first] == FORWARD).all()
+    epsilon = taught.config.epsilon.at(taught.progress.env_steps)
+    late = ring.meta["env_step"][:count] > 1200
+    probability = ring.meta["action_probability"][:count][late]
+    chosen = ring.rows[:count, -3][late] == FORWARD
+    assert probability[chosen].min() == pytest.approx(1 - epsilon + epsilon / 3)
+    assert probability[~chosen].max() == pytest.approx(epsilon / 3)  # explores over all actions
+
+
+def test_interrupted_and_resumed_is_bit_exact(taught: Any, tmp_path: Path) -> None:
+    class Walker:
+        """Draws, so that its state matters."""
+
+        def __init__(self) -> None:
+            self.rng = np.random.default_rng(1)
+
+        def act(self, env: Any, observation: np.ndarray) -> np.ndarray:
+            return self.rng.integers(3, size=len(observation))
+
+        def state_dict(self) -> dict[str, Any]:
+            return dict(self.rng.bit_generator.state)
+
+        def load_state_dict(self, state: dict[str, Any]) -> None:
+            self.rng.bit_generator.state = state
+
+    loosened = {"schedule": "linear", "start": 0.9, "end": 0.1, "to_env_steps": 1600}
+    settings = config(teacher={**TAUGHT["teacher"], "ratio": loosened})
+    whole = run_to_end(tmp_path / "whole", settings, teacher=Walker())
+    live = session(tmp_path / "cut", settings, teacher=Walker())
+    asked = iter(range(300))
+    with pytest.raises(TrainingInterrupted):
+        train(live, stop=lambda: next(asked, None) is None)
+    assert 0 < live.progress.env_steps < 1600
+    live.close()
+    again = session(tmp_path / "cut", settings, teacher=Walker(), resume=True)
+    assert again.learner.behaviour is not None
+    assert 0.1 < again.learner.behaviour.in_force < 0.9
+    train(again)
+    again.close()
+    assert_same_run(whole, again)
+    assert again.learner.behaviour.in_force == pytest.approx(0.1)
+
+
+def test_with_and_without_a_thread_it_is_the_same_run(taught: Any, tmp_path: Path) -> None:
+    settings = config(**TAUGHT, env={"overlap": not taught.config.env.overlap})
+    assert_same_run(taught, run_to_end(tmp_path / "other", settings, teacher=forward))
+
+
+def test_logged_rows_alone_make_a_filter_before_the_first_step(tmp_path: Path) -> None:
+    teacher = {"source": "logs", "ratio": 0.5, "offline_updates": 200, "hidden": [16]}
+    live = session(tmp_path / "a", config(teacher=teacher, schedule={"env_steps": 4}))
+    assert live.imitation is not None
+    policy = logs().behaviour_policy
+    operators = np.flatnonzero(policy.codes == policy.names.index("operator"))
+    assert np.isin(live.imitation.cloned, operators).all()
+    train(live)
+    behaviour = live.learner.behaviour
+    assert behaviour is not None
+    assert behaviour.updates == 200
+    # Seven of ten logged steps go on: nothing else is half as likely.
+    cells = torch.zeros(CELLS - 1, TASK.observation_size)
+    cells[range(CELLS - 1), range(CELLS - 1)] = 1
+    assert live.learner.greedy(cells.numpy()).tolist() == [FORWARD] * (CELLS - 1)
+    live.close()
+
+
+def test_cloned_rows_are_drawn_by_the_shares_of_their_strata(tmp_path: Path) -> None:
+    live = session(tmp_path / "a", config(teacher={"source": "logs"}))
+    imitation, shelf = live.imitation, logs()
+    assert imitation is not None
+    chance = np.diff(imitation._cumulative, prepend=0.0)
+    for share, members in zip(shelf.shares, shelf.stratum_rows, strict=True):
+        inside = np.isin(imitation.cloned, members)
+        assert chance[inside].sum() == pytest.approx(share)
+        assert np.ptp(chance[inside]) < 1e-9
+    live.close()
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (None, "returned nothing, not 4 whole numbers"),
+        ([1, 1], r"returned int64 \(2,\), not 4"),
+        ([1.0, 1.0, 1.0, 1.0], r"returned float64 \(4,\)"),
+        ([1, 1, 3, 1], "returned action 3 for environment 2: the task's are 0 to 2"),
+        ([1, -2, 0, 1], "returned action -2 for environment 1"),
+    ],
+)
+def test_a_teacher_that_gives_no_action_is_refused(
+    answer: Any, message: str, tmp_path: Path
+) -> None:
+    live = session(tmp_path / "a", config(**TAUGHT), teacher=lambda env, observation: answer)
+    with pytest.raises(ConfigError, match=message):
+        train(live)
+    live.close()
+    assert live.progress.online_updates == 0
+
+
+def test_who_cannot_be_asked_is_refused(tmp_path: Path) -> None:
+    live = session(tmp_path / "a", config(teacher={"source": "operator"}))
+    with pytest.raises(ConfigError, match="reads the warehouse twin, this is a ToyTwin"):
+        train(live)
+    live.close()
+    for source, message in (
+        ("no_such_module:name", "cannot be imported: No module named"),
+        ("restock.errors:nobody", "has no attribute 'nobody'"),
+        ("restock.train.dqn.behaviour:UNKNOWN", "is a int, which has no act"),
+        ("given", "passed in by Python, and none is here"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            session(tmp_path / source, config(teacher={"source": source}))
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [({"logs": None}, "this run has no logs"), ({}, "the logs have planner, operator\n")],
+)
+def test_logs_without_a_row_to_clone_are_refused(
+    parts: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    settings = config(teacher={"source": "logs", "policies": ["teleop"]})
+    with pytest.raises(ConfigError, match=f"clones the rows of teleop, and {message}"):
+        session(tmp_path / "a", settings, **parts)
+
+
+@pytest.mark.parametrize(
+    ("document", "message"),
+    [
+        ({"teacher": {"source": "the planner"}}, "source must be none, operator, logs"),
+        ({"teacher": {"source": "logs"}, "loss": {"munchausen": 0.9}}, "loss.munchausen averages"),
+        ({"teacher": {"ratio": 1.5}}, "ratio"),
+    ],
+)
+def test_settings_that_do_not_go_together_are_refused(
+    document: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        parse_config(document, where="test")
+
+
+def test_onnx_is_torch(taught: Any) -> None:
+    pytest.importorskip("onnx")
+    runtime = pytest.importorskip("onnxruntime")
+    from restock.train.evaluation.onnx_policy import to_onnx
+
+    policy = taught.learner.policy
+    assert isinstance(policy, FilteredNetwork)
+    file = runtime.InferenceSession(to_onnx(policy).SerializeToString())
+    rng = np.random.default_rng(0)
+    observation = rng.normal(size=(256, TASK.observation_size)).astype(np.float32)
+    values, action = file.run(["values", "action"], {"observation": observation})
+    with torch.no_grad():
+        expected = policy(torch.from_numpy(observation)).numpy()
+    assert 0 < np.isinf(expected).mean() < 1
+    np.testing.assert_allclose(values, expected, atol=1e-5)
+    np.testing.assert_array_equal(action, expected.argmax(axis=1))

@@ -1,0 +1,189 @@
+"""A behaviour network beside Q: what a teacher finds plausible, and Q's choice among that.
+
+G(a|s) is learnt by cross-entropy from what a teacher would do in the states that are met, and from
+what it did in the logs. An action is plausible where G(a|s) is at least `ratio` times the largest;
+Q takes the best of those, and its target may look no further (discrete BCQ, arXiv:1910.01708). The
+teacher is asked where the agent goes, not where it went itself (DAgger, arXiv:1011.0686).
+
+G has a network of its own: imitation and values pull one network apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from restock.replay.mixture.schedules import value_at
+from restock.state import Stateful
+from restock.train.dqn.config import TeacherConfig, TrainConfig
+from restock.train.dqn.flat_adam import FlatAdam, FlatParameters
+from restock.train.dqn.manual_backprop import ManualBackprop
+from restock.train.dqn.network import Network, QNetwork, clone, make_network
+
+UNKNOWN = -1  # the action of a state in which the teacher was not asked, or had no opinion
+_SEED = 1 << 32  # apart from that of Q, which may be as large
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """States, and what the teacher would do in them."""
+
+    observation: Tensor  # (M, D) float32
+    action: Tensor  # (M,) int64, or UNKNOWN
+
+
+def plausible_actions(logits: Tensor, ratio: Tensor) -> Tensor:
+    """Which actions (B, A) bool have G(a|s) >= ratio * max G(.|s); at least one of each row.
+
+    Args:
+        logits: (B, A), of which G is the softmax.
+        ratio: () from 0 (all of them) to 1 (the likeliest alone).
+    """
+    return logits >= logits.amax(dim=1, keepdim=True) + ratio.log().to(logits.dtype)
+
+
+def imitation_loss(logits: Tensor, action: Tensor) -> Tensor:
+    """The mean of -log G(a|s), (), over the rows (M,) whose action is known; 0 without any."""
+    known = action != UNKNOWN
+    each = functional.cross_entropy(logits, action, ignore_index=UNKNOWN, reduction="none")
+    return each.sum() / known.sum().clamp_min(1)
+
+
+def imitation_gradient(logits: Tensor, action: Tensor) -> Tensor:
+    """Of `imitation_loss`, (M, A): (softmax - one-hot of the action) / known rows; 0 elsewhere."""
+    known = (action != UNKNOWN).unsqueeze(1)
+    chosen = action.clamp_min(0).unsqueeze(1)
+    gradient = logits.softmax(dim=1)
+    gradient.scatter_add_(1, chosen, gradient.new_full(chosen.shape, -1.0))
+    gradient *= known
+    gradient /= known.sum().clamp_min(1)
+    return gradient
+
+
+class FilteredNetwork(nn.Module):
+    """Q where an action is plausible, -inf elsewhere: whatever takes its maximum is filtered."""
+
+    ratio: Tensor
+
+    def __init__(self, values: Network, behaviour: QNetwork, ratio: Tensor | None = None) -> None:
+        super().__init__()
+        self.values, self.behaviour = values, behaviour
+        self.observation_size, self.actions = values.observation_size, values.actions
+        self.register_buffer("ratio", torch.zeros(()) if ratio is None else ratio)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Action values (B, A) of observations (B, D)."""
+        plausible = plausible_actions(self.behaviour(observation), self.ratio)
+        q: Tensor = self.values(observation)
+        return q.masked_fill(~plausible, -torch.inf)
+
+
+PolicyNetwork = Network | FilteredNetwork
+
+
+def make_behaviour(
+    config: TeacherConfig,
+    observation_size: int,
+    actions: int,
+    generator: torch.Generator | None = None,
+) -> QNetwork:
+    """The network whose softmax is G."""
+    return QNetwork(observation_size, actions, hidden=config.hidden, generator=generator)
+
+
+def make_policy(config: TrainConfig, observation_size: int, actions: int) -> PolicyNetwork:
+    """What a run's config says acts, to load weights into."""
+    values = make_network(config.network, observation_size, actions)
+    if not config.teacher.filters:
+        return values
+    return FilteredNetwork(values, make_behaviour(config.teacher, observation_size, actions))
+
+
+class Behaviour(Stateful):
+    """G, how it learns, and the ratio in force. `average` is the G that is evaluated and kept.
+
+    Args:
+        averaging: the rate of the average of weights, as of Q's.
+        by_hand: gradients without autograd: on the CPU.
+    """
+
+    STATE: ClassVar[tuple[str, ...]] = ("network", "average", "optimizer", "updates", "in_force")
+
+    def __init__(
+        self,
+        config: TeacherConfig,
+        observation_size: int,
+        actions: int,
+        *,
+        seed: int,
+        averaging: float,
+        device: torch.device,
+        by_hand: bool,
+    ) -> None:
+        self.config, self._averaging = config, averaging
+        generator = torch.Generator().manual_seed(_SEED + seed)
+        self.network = make_behaviour(config, observation_size, actions, generator).to(device)
+        self.average = clone(self.network)
+        self.optimizer = FlatAdam(self.network, config.learning_rate)
+        self._slow = FlatParameters(self.average, learns=False).values
+        self._by_hand = ManualBackprop(self.network) if by_hand else None
+        self.updates = 0
+        self.ratio = torch.zeros((), device=device)  # shared with the networks that it filters
+        self.move_to(0)
+
+    def move_to(self, env_steps: int) -> None:
+        """The ratio after `env_steps` environment steps."""
+        self.in_force = value_at(self.config.ratio, env_steps)
+
+    @property
+    def in_force(self) -> float:
+        """The ratio, as a number."""
+        return float(self.ratio)
+
+    @in_force.setter
+    def in_force(self, ratio: float) -> None:
+        self.ratio.fill_(ratio)
+
+    def learn(self, labelled: Labelled) -> Tensor:
+        """One gradient step; the loss () before it."""
+        action = labelled.action
+        if self._by_hand is not None:
+            (logits,) = self._by_hand.forward(labelled.observation)
+            loss = imitation_loss(logits, action)
+            self._by_hand.backward(imitation_gradient(logits, action))
+        else:
+            loss = imitation_loss(self.network(labelled.observation), action)
+            self.optimizer.gradient.zero_()
+            loss.backward()  # type: ignore[no-untyped-call]
+        self.optimizer.step()
+        self.updates += 1
+        with torch.no_grad():
+            rate = max(self._averaging, 1.0 / self.updates)
+            self._slow.lerp_(self.optimizer.values, rate)
+        return loss.detach()
+
+    @torch.no_grad()
+    def plausible(self, observation: Tensor) -> Tensor:
+        """Which actions (B, A) bool are plausible in observations (B, D)."""
+        if self._by_hand is not None:
+            (logits,) = self._by_hand.forward(observation)
+        else:
+            logits = self.network(observation)
+        return plausible_actions(logits, self.ratio)
+
+
+__all__ = [
+    "UNKNOWN",
+    "Behaviour",
+    "FilteredNetwork",
+    "Labelled",
+    "PolicyNetwork",
+    "imitation_gradient",
+    "imitation_loss",
+    "make_policy",
+    "plausible_actions",
+]

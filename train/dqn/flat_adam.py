@@ -1,0 +1,118 @@
+"""Parameters in one block of memory, and Adam over it: one call moves all of them.
+
+Adam's step, the target's pull and the average of weights are each one operation over one tensor,
+instead of one a parameter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from restock.state import Stateful
+
+_ALIGNMENT = 16  # elements: every parameter begins on a cache line, as its own tensor would
+
+
+class FlatParameters:
+    """The parameters of `network`, moved into `values`; their gradients are views of `gradient`.
+
+    `load_state_dict` and in-place writes go through the views. Whatever replaces a parameter's
+    `.data` (`Module.to`) must come before.
+
+    Args:
+        network: whose parameters are moved.
+        learns: whether they have gradients; else `gradient` is empty.
+    """
+
+    def __init__(self, network: nn.Module, *, learns: bool) -> None:
+        parameters = list(network.parameters())
+        self._shapes = [parameter.shape for parameter in parameters]
+        self._offsets, size = [], 0
+        for parameter in parameters:
+            self._offsets.append(size)
+            size += -(-parameter.numel() // _ALIGNMENT) * _ALIGNMENT
+        self.values = parameters[0].detach().new_zeros(size)
+        self.gradient = self.values.new_zeros(size if learns else 0)
+        for parameter, view in zip(parameters, self.views(self.values), strict=True):
+            view.copy_(parameter.detach())
+            parameter.data = view
+        if learns:
+            self.values.grad = self.gradient
+            for parameter, view in zip(parameters, self.views(self.gradient), strict=True):
+                parameter.grad = view
+
+    def views(self, flat: Tensor) -> list[Tensor]:
+        """A tensor as long as `values`, parameter by parameter, in the network's order."""
+        return [
+            flat[offset : offset + shape.numel()].view(shape)
+            for offset, shape in zip(self._offsets, self._shapes, strict=True)
+        ]
+
+    def flat_of(self, pieces: list[Tensor]) -> Tensor:
+        """The inverse of `views`: a new tensor; what lies between parameters is 0."""
+        flat = torch.zeros_like(self.values)
+        for view, piece in zip(self.views(flat), pieces, strict=True):
+            view.copy_(piece)
+        return flat
+
+
+_MOMENTS = ("exp_avg", "exp_avg_sq")  # of Adam, as PyTorch names them
+
+
+class FlatAdam(Stateful):
+    """Adam on all parameters of `network` as one tensor.
+
+    Args:
+        network: whose parameters are moved into `values`, their gradients into `gradient`.
+        learning_rate: Adam's.
+        max_grad_norm: to which a longer gradient is cut; None: never.
+    """
+
+    STATE: ClassVar[tuple[str, ...]] = ("moments",)
+
+    def __init__(
+        self, network: nn.Module, learning_rate: float, max_grad_norm: float | None = None
+    ) -> None:
+        self._flat = FlatParameters(network, learns=True)
+        self.values, self.gradient = self._flat.values, self._flat.gradient
+        self.max_grad_norm = max_grad_norm
+        self._adam = torch.optim.Adam([self.values], lr=learning_rate, fused=True)
+
+    def step(self) -> None:
+        """Move the parameters by the gradient that they have."""
+        if self.max_grad_norm is not None:
+            torch.nn.utils.clip_grad_norm_([self.values], self.max_grad_norm)
+        self._adam.step()
+
+    def forget(self) -> None:
+        """Begin again without moments: the parameters were replaced."""
+        self._adam.state.clear()
+
+    @property
+    def moments(self) -> dict[str, dict[str, Tensor]]:
+        """Adam's moments a parameter, in the network's order, as if each were its own."""
+        if not (state := self._adam.state[self.values]):
+            return {}
+        moments = zip(*(self._flat.views(state[name]) for name in _MOMENTS), strict=True)
+        return {
+            str(index): {"step": state["step"], **dict(zip(_MOMENTS, pair, strict=True))}
+            for index, pair in enumerate(moments)
+        }
+
+    @moments.setter
+    def moments(self, entries: Mapping[str, Mapping[str, Tensor]]) -> None:
+        self.forget()
+        if not entries:
+            return
+        state = self._adam.state[self.values]
+        ordered = [entries[str(index)] for index in range(len(entries))]
+        state["step"] = ordered[0]["step"].to(self.values.device, copy=True)
+        for name in _MOMENTS:
+            state[name] = self._flat.flat_of([entry[name] for entry in ordered])
+
+
+__all__ = ["FlatAdam", "FlatParameters"]

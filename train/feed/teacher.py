@@ -1,0 +1,179 @@
+"""Who is asked what it would do where the agent is: the twin's operator, or a teacher of yours."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+from typing import Any, ClassVar, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.arrays import F32, Ints
+from restock.errors import ConfigError
+from restock.ingest.task.task import Task
+from restock.state import Stateful, restored, saved
+from restock.train.dqn.behaviour import UNKNOWN
+from restock.train.dqn.config import GIVEN, TeacherConfig
+
+Label = NDArray[np.int16]
+
+
+@runtime_checkable
+class Teacher(Protocol):
+    """Says what it would do in each of N environments; nobody has to do it.
+
+    It may look at the environment itself, beyond what the observation says. It is asked once a
+    step, in order, and once before training begins; where it keeps `state_dict` and
+    `load_state_dict`, a run that is resumed goes on exactly as it would have.
+    """
+
+    def act(self, env: Any, observation: F32, /) -> Ints:
+        """Actions (N,) for observations (N, D); -1 where it has no opinion."""
+        ...
+
+
+class OperatorTeacher(Stateful):
+    """The operator of the warehouse twin, without its slips of the hand."""
+
+    STATE: ClassVar[tuple[str, ...]] = ("_operator",)
+
+    def __init__(self, seed: int) -> None:
+        from restock.train.twin.env.operator_policy import Operator
+
+        self._operator = Operator(epsilon=0.0, seed=seed)
+
+    def act(self, env: Any, observation: F32, /) -> Ints:
+        """What it would do, (N,).
+
+        Raises:
+            ConfigError: the environment is not the warehouse twin.
+        """
+        from restock.train.twin.env.vector_env import WarehouseVectorEnv
+
+        if not isinstance(env, WarehouseVectorEnv):
+            raise ConfigError(
+                f'teacher.source = "operator" reads the warehouse twin, this is a'
+                f" {type(env).__name__}",
+                remedy="pass a teacher of its own, restock.train.train(teacher=…), or name one as"
+                " module:name",
+            )
+        return self._operator.choose(env)
+
+
+class _Called:
+    """A function that is a teacher."""
+
+    def __init__(self, function: Any) -> None:
+        self.act = function
+
+
+class AskedTeacher(Stateful):
+    """A teacher whose answers are checked.
+
+    Args:
+        teacher: who is asked.
+        task: whose actions it names.
+        name: for errors: `teacher.source` as it was given.
+    """
+
+    STATE: ClassVar[tuple[str, ...]] = ("_kept",)
+
+    def __init__(self, teacher: Teacher, task: Task, name: str) -> None:
+        self._teacher, self._actions, self._name = teacher, task.action_names, name
+
+    def ask(self, env: Any, observation: F32) -> Label:
+        """What it would do, (N,); UNKNOWN where it has no opinion.
+
+        Raises:
+            ConfigError: it gave no action, other than N of them, or one that the task has not.
+        """
+        given = self._teacher.act(env, observation)
+        label = np.asarray(given)
+        count = len(observation)
+        if label.shape != (count,) or not np.issubdtype(label.dtype, np.integer):
+            what = "nothing" if given is None else f"{label.dtype} {label.shape}"
+            raise self._refused(f"returned {what}, not {count} whole numbers, one an environment")
+        outside = (label < UNKNOWN) | (label >= len(self._actions))
+        if outside.any():
+            env_index = int(np.flatnonzero(outside)[0])
+            raise self._refused(
+                f"returned action {int(label[env_index])} for environment {env_index}: the task's"
+                f" are 0 to {len(self._actions) - 1}"
+            )
+        return label.astype(np.int16)
+
+    def _refused(self, what: str) -> ConfigError:
+        return ConfigError(
+            f"the teacher {self._name} {what}",
+            where="teacher.source",
+            remedy="return an action's index for each environment, (N,), or -1 for no opinion",
+        )
+
+    @property
+    def _kept(self) -> Any:
+        return saved(self._teacher) if hasattr(self._teacher, "state_dict") else None
+
+    @_kept.setter
+    def _kept(self, state: Any) -> None:
+        if state is not None:
+            restored(self._teacher, state)
+
+
+def open_teacher(
+    config: TeacherConfig, task: Task, *, seed: int, given: Any = None
+) -> AskedTeacher | None:
+    """The teacher that a run asks in the twin; None where it asks none.
+
+    Args:
+        given: in place of what the config names: an object with `act`, or a function like it.
+
+    Raises:
+        ConfigError: no such module or name, or nothing that can be asked.
+    """
+    if not config.asks:
+        return None
+    if config.source == "operator":
+        return AskedTeacher(OperatorTeacher(seed), task, config.source)
+    if given is None:
+        given = _imported(config.source)
+    name = config.source if config.source != GIVEN else type(given).__name__
+    if isinstance(given, type):
+        given = given()
+    if not hasattr(given, "act"):
+        if not callable(given):
+            raise ConfigError(
+                f"{name} is a {type(given).__name__}, which has no act and cannot be called",
+                where="teacher.source",
+                remedy="name an object with act(env, observation), or a function like it",
+            )
+        given = _Called(given)
+    return AskedTeacher(given, task, name)
+
+
+def _imported(source: str) -> Any:
+    """What `module:name` names; modules of the working directory are found too."""
+    if source == GIVEN:
+        raise ConfigError(
+            "the run's teacher was passed in by Python, and none is here",
+            where="teacher.source",
+            remedy="name it: --set teacher.source=module:name",
+        )
+    module, _, name = source.partition(":")
+    here = str(Path.cwd())
+    sys.path.insert(0, here)
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(
+            f"{source} cannot be imported: {error}",
+            where="teacher.source",
+            remedy="name a module that Python finds, or a file of the working directory, and what"
+            " in it is the teacher",
+        ) from error
+    finally:
+        sys.path.remove(here)
+
+
+__all__ = ["AskedTeacher", "Label", "OperatorTeacher", "Teacher", "open_teacher"]
