@@ -277,7 +277,7 @@ def fresh_ring(steps: int) -> dict[str, float]:
             50_000,
             envs,
             OBSERVATION,
-            discount=0.97,
+            discount=0.99,
             n_step=3,
             conditions=("rare", "nominal"),
             reserved=reserved,

@@ -109,7 +109,7 @@ def stable_baselines3(steps: int, seed: int) -> Stretch:
         buffer_size=100_000,
         learning_starts=WARMUP,
         batch_size=BATCH,
-        gamma=0.97,
+        gamma=0.99,
         tau=0.005,
         target_update_interval=1,
         train_freq=1,

@@ -22,7 +22,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-OBSERVATION, ACTIONS, ROWS, DISCOUNT = 94, 10, 50_000, 0.97
+OBSERVATION, ACTIONS, ROWS, DISCOUNT = 94, 10, 50_000, 0.99
 LEARNING_RATE, TAU, COPY_EVERY = 3e-4, 0.005, 500
 Arrays = dict[str, np.ndarray]
 Updates = Callable[[int], float | None]  # CPU seconds, where they are another process's

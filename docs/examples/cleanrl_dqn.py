@@ -40,7 +40,7 @@ def main(
     steps: int = 100_000,
     num_envs: int = 16,
     buffer_size: int = 100_000,
-    gamma: float = 0.97,
+    gamma: float = 0.99,
     target_network_frequency: int = 500,
     batch_size: int = 128,
     learning_starts: int = 1000,

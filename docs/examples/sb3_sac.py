@@ -22,7 +22,7 @@ def main(steps: int = 100_000, num_envs: int = 4, seed: int = 0) -> dict:
     model = SAC(
         "MlpPolicy",
         env,
-        gamma=0.97,
+        gamma=0.99,
         batch_size=128,
         learning_starts=min(1000, steps // 4),
         train_freq=4,

@@ -41,7 +41,7 @@ def main(
         eps_training=0.2,
     )
     algorithm = DQN(
-        policy=policy, optim=AdamOptimizerFactory(lr=3e-4), gamma=0.97, target_update_freq=500
+        policy=policy, optim=AdamOptimizerFactory(lr=3e-4), gamma=0.99, target_update_freq=500
     )
     if panel is None:
         buffer = VectorReplayBuffer(100_000, num_envs)

@@ -17,6 +17,7 @@ from restock.ingest.propose.footprint import Footprint
 from restock.ingest.propose.roles import KINDS, LATCHED, REQUIRED, FrameGuess, Kind, Roles
 from restock.ingest.propose.trial import Trial
 
+MOSTLY_FREE = 0.1  # of its messages, at most, in which a bumper is pressed
 GUESS = Footprint(0.6, 0.5, "A GUESS, as nothing in the recording says: MEASURE IT")
 
 
@@ -144,6 +145,7 @@ def _task_lines(seen: Evidence, trial: Trial) -> list[str]:
     origin = f"from {commands.count} {kind} of {commands.topic}" if commands.count else "a guess"
     return [
         "[task]",
+        *_bump_lines(seen.recording, roles),
         f'goal = "{"route" if routed else "none"}"'
         + ("" if routed else "  # no goal and plan seen: progress is forward displacement"),
         f"control_period_s = {seen.clock.period_s:g}",
@@ -155,6 +157,21 @@ def _task_lines(seen: Evidence, trial: Trial) -> list[str]:
         "",
         *_body_lines(seen, trial),
     ]
+
+
+def _bump_lines(recording: Recording, roles: Roles) -> list[str]:
+    """A bumper stops the robot, unless it is pressed so often that it hardly is one."""
+    if not roles["bumper"]:
+        return []
+    topic, kind = roles["bumper"][0]
+    fields = recording.read({topic.name: [kind.fields["pressed"]]})[topic.name].fields
+    pressed = np.asarray(fields[kind.fields["pressed"]], np.float64) > 0
+    if len(pressed) and pressed.mean() > MOSTLY_FREE:
+        return [
+            f"# {topic.name} is pressed in {pressed.mean():.0%} of its messages: CHECK its meaning",
+            "# bump_terminates = true  # a protective stop; what follows is another episode",
+        ]
+    return ["bump_terminates = true  # a protective stop; what follows is another episode"]
 
 
 def _body_lines(seen: Evidence, trial: Trial) -> list[str]:

@@ -1,7 +1,10 @@
 """Steps to episodes: where one begins, where it ends, and whether it terminated or was truncated.
 
-- The goal is reached (or a bump, where the task says so): **terminated**. The steps after it,
-  until there is another goal or the same one is ordered again, belong to no episode.
+- The goal is reached: **terminated**. The steps after it, until there is another goal or the same
+  one is ordered again, belong to no episode.
+- A bump, where the task says so: **terminated**, a protective stop. It lasts until the bumper has
+  been free for RELEASE_S, and its steps belong to no episode: a robot that scrapes along a rack
+  has one bump there, and not an episode of one step for each touch.
 - A new goal, a lost route, the time limit: **truncated**, on the tick at which that is so. That
   tick ends the old episode, seen with the old goal and plan, and is the first of the next one.
 - A gap, a clock jump, a pose jump, an unusable tick, the end: **truncated** on the tick before.
@@ -18,6 +21,8 @@ from restock.arrays import Bools, Ints
 from restock.ingest.steps.steps import Steps
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task, terminated
+
+RELEASE_S = 1.0  # that the bumper must have been free for before a robot drives on
 
 
 @dataclass(frozen=True)
@@ -74,6 +79,15 @@ def with_route(task: Task, steps: Steps, ticks: Ints, goal: Ints, plan: Ints) ->
     return now | steps.routing.signals(task, goal, plan, now)
 
 
+def protective_stop(task: Task, steps: Steps) -> Bools:
+    """Ticks (T,) less than RELEASE_S after the bumper was pressed, where a bump stops the robot."""
+    pressed = steps.signals["bumped"].astype(np.bool_) & task.bump_terminates
+    latest = np.maximum.accumulate(np.where(pressed, np.arange(len(steps)), -1))
+    stamp_ns = steps.signals["stamp_ns"]
+    since_s = (stamp_ns - stamp_ns[latest]) * 1e-9
+    return (latest >= 0) & (since_s >= 0) & (since_s < RELEASE_S)
+
+
 class _Walk:
     """Walks the ticks once, in order."""
 
@@ -85,6 +99,7 @@ class _Walk:
         self.order = steps.routing.order.tolist()
         self.episodes: list[EpisodeSpan] = []
         self.dropped: Counter[str] = Counter()
+        self.stopped = protective_stop(task, steps).tolist()
         self.first: int | None = None  # of the open episode
         self.done_with: tuple[int, int] | None = None  # the goal that was reached, and its order
 
@@ -127,6 +142,9 @@ class _Walk:
         problem = self.steps.problem[tick] or self.steps.route_problem[tick]
         if problem:
             self.dropped[problem] += 1
+            return
+        if self.stopped[tick]:
+            self.dropped[f"bumper: pressed within the last {RELEASE_S:g} s"] += 1
             return
         wanted = (goal, self.order[tick])
         if goal >= 0 and (wanted == self.done_with or self._at_goal(tick)):

@@ -38,7 +38,7 @@ class Rewards(Checked, frozen=True):
     harsh_mps2: float = 3.0
     slip_per_mps: float = -0.1  # times |wheel speed - localised speed| beyond 0.2 m/s
     goal: float = 5.0
-    bump: float = -1.0  # the bumper was pressed
+    bump: float = -6.0  # a contact began: once, however long the bumper stays pressed
 
 
 class Task(Checked, frozen=True):
@@ -55,7 +55,7 @@ class Task(Checked, frozen=True):
     far_m: float = 2.2
     goal_radius_m: float = 0.4
     time_limit_steps: int = 240
-    bump_terminates: bool = False
+    bump_terminates: bool = False  # a protective stop: what follows a bump is another episode
     rewards: Rewards = Rewards()
 
     def check(self) -> None:
@@ -190,7 +190,7 @@ def reward_parts(
         "harsh": weight.harsh * (harsh > weight.harsh_mps2),
         "slip_per_mps": weight.slip_per_mps * np.clip(slip - 0.2, 0.0, 2.0),
         "goal": weight.goal * reached_goal(task, after),
-        "bump": weight.bump * after["bumped"],
+        "bump": weight.bump * (after["bumped"] & ~now["bumped"].astype(np.bool_)),
     }
 
 

@@ -210,7 +210,7 @@ class Mixture(Checked, frozen=True):
     doc: str = ""
     seed: int = 0
     # How rows are packed.
-    discount: Fraction = 0.97  # gamma of one step
+    discount: Fraction = 0.99  # gamma of one step
     n_step: AtLeastOne = 1  # steps of a log row's return, cut at episode ends
     cut_at_off_policy: bool = True  # and where the behaviour policy or its version changes
     return_to_go: bool = False  # pack each row's discounted return to the end of its episode

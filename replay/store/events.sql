@@ -83,7 +83,7 @@ WITH steps AS (
         recording_id,
         episode_id,
         ended,
-        success,
+        ended_by,
         robot,
         site,
         firmware,
@@ -93,7 +93,7 @@ WITH steps AS (
         episode_end_ns,
         recording_end_ns,
         CAST(period_s * 1e9 AS BIGINT) AS period_ns
-    FROM (SELECT recording_id, episode_id, ended, success, end_ns AS episode_end_ns FROM episodes)
+    FROM (SELECT recording_id, episode_id, ended, ended_by, end_ns AS episode_end_ns FROM episodes)
     JOIN (
         SELECT
             recording_id,
@@ -111,9 +111,9 @@ WITH steps AS (
     SELECT
         *,
         coalesce(next_ns, end_ns + period_ns) AS over_ns,
-        coalesce(nominal_ns, CASE WHEN success THEN episode_end_ns + period_ns END) AS recovered_ns,
+        coalesce(nominal_ns, CASE WHEN ended_by = 'goal' THEN episode_end_ns + period_ns END) AS recovered_ns,
         CASE
-            WHEN nominal_ns IS NOT NULL OR success THEN 'recovered'
+            WHEN nominal_ns IS NOT NULL OR ended_by = 'goal' THEN 'recovered'
             WHEN ended = 'open' THEN 'open'
             WHEN ended = 'truncated' AND episode_end_ns + 2 * period_ns > recording_end_ns THEN 'open'
             ELSE 'not recovered'
@@ -147,7 +147,7 @@ SELECT
     policy_before,
     policy_after,
     clearance_min_m,
-    bumped,
+    bumped OR (coalesce(ended_by, '') = 'bump' AND end_ns = episode_end_ns) AS bumped,
     outcome,
     CASE WHEN outcome <> 'open' THEN outcome = 'recovered' END AS recovered,
     (recovered_ns - onset_ns) / 1e9 AS recovered_after_s

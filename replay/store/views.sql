@@ -95,9 +95,14 @@ FROM (
             WHEN bool_or(truncated) THEN 'truncated'
             ELSE 'open'
         END AS ended,
-        -- Terminated with the goal's reward: a bump may terminate too, and is no success.
+        -- Terminated with the goal's reward, or by a bump.
+        CASE
+            WHEN any_value(has_goal) AND bool_or(terminated AND reward > goal_reward / 2) THEN 'goal'
+            WHEN bool_or(terminated) THEN 'bump'
+        END AS ended_by,
         CASE WHEN any_value(has_goal)
             THEN bool_or(terminated AND reward > goal_reward / 2)
+                AND NOT bool_or(bumped AND step_index > 0)
         END AS success,
         sum(progress_m) AS progress_m,
         count(*) FILTER (WHERE bumped) AS bumped_steps,

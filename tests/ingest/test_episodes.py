@@ -88,10 +88,36 @@ def test_a_bump_terminates_where_the_task_says_so():
     pressed = np.zeros(len(time), np.bool_)
     pressed[103] = True
     topics["/bumper"] = columns(time, {"data": pressed}, stamped=False)
-    assert len(episodes_of(topics).episodes) == 1
+    assert len(episodes_of(topics, bump_terminates=False).episodes) == 1
     found = episodes_of(topics, bump_terminates=True)
-    assert found.episodes[0] == EpisodeSpan(0, 11, True, "bump", False)
-    assert found.episodes[1].first == 12
+    assert found.episodes == [
+        EpisodeSpan(0, 11, True, "bump", False),
+        EpisodeSpan(16, 29, False, "end of the recording", False),
+    ]
+    assert found.dropped == {"bumper: pressed within the last 1 s": 4}
+
+
+def test_scraping_along_something_is_one_bump_and_no_episodes_of_one_step():
+    topics = Drive().topics()
+    time = np.arange(0, 6, 0.02)
+    pressed = (time > 2.0) & (time < 4.0) & (time % 0.5 < 0.1)  # touches it every half second
+    topics["/bumper"] = columns(time, {"data": pressed}, stamped=False)
+    found = episodes_of(topics, bump_terminates=True)
+    assert [(e.first, e.last, e.ended_by) for e in found.episodes] == [
+        (0, 11, "bump"),
+        (23, 29, "end of the recording"),
+    ]
+    assert found.dropped == {"bumper: pressed within the last 1 s": 11}
+
+
+def test_a_bump_on_the_tick_of_a_new_goal_ends_the_old_episode_and_begins_none():
+    topics = Drive(goals=[(0.0, 11.0, 1.0), (2.0, 10.0, 1.0)]).topics()
+    time = np.arange(0, 6, 0.02)
+    topics["/bumper"] = columns(time, {"data": time == 2.0}, stamped=False)
+    found = episodes_of(topics, bump_terminates=True)
+    assert found.episodes[0] == EpisodeSpan(0, 10, True, "bump", True)
+    assert found.dropped == {"bumper: pressed within the last 1 s": 5}
+    assert found.episodes[1].first == 15
 
 
 def test_a_gap_truncates_on_the_tick_before():

@@ -127,7 +127,7 @@ class Trip:
         loaded = load_policy(policy)
         self.summary = record(self.path, self.plan, policy=loaded)
         # The same missions once more: the twin is deterministic, and nothing of it is on disk.
-        fleet = Fleet(case.hardware, scan_hz=self.plan.rates.scan)
+        fleet = Fleet(case.hardware, stops=case.policy != HANDOVER, scan_hz=self.plan.rates.scan)
         external = loaded and ExternalPolicy(loaded, epsilon=case.epsilon or 0.0, seed=7)
         drivers = BehaviourPolicies(
             fleet.env.num_envs, seed=7, epsilon=case.epsilon, external=external

@@ -20,6 +20,7 @@ from restock.ingest.task.task import (
     observe,
     reached_goal,
     reward,
+    reward_parts,
     terminated,
 )
 
@@ -139,10 +140,27 @@ def test_the_reward_by_hand(values, progress, actions, expected):
     assert found[0] == pytest.approx(expected, abs=1e-6)
 
 
+def test_a_bump_costs_once_however_long_the_bumper_stays_pressed():
+    def bump(now: bool, after: bool) -> float:
+        found = reward_parts(
+            TASK,
+            signals(bumped=now),
+            signals(bumped=after),
+            np.zeros(1),
+            np.zeros(1, np.int64),
+            np.zeros(1, np.int64),
+        )
+        return float(found["bump"][0])
+
+    assert bump(False, True) == TASK.rewards.bump
+    assert bump(True, True) == bump(True, False) == bump(False, False) == 0
+
+
 def test_a_bump_terminates_only_where_the_task_says_so():
     after = signals(bumped=True)
     assert not terminated(TASK, after).any()
     assert terminated(msgspec.structs.replace(TASK, bump_terminates=True), after).all()
+    assert load_profile("warehouse_amr").task.bump_terminates
     assert terminated(TASK, signals(goal_distance_m=0.3)).all()
 
 

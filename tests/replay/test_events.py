@@ -37,6 +37,7 @@ def events_by_hand(store: Store) -> dict[str, dict[str, Any]]:
         order = sorted(steps)
         last = steps[order[-1]]
         reached = last["terminated"] and last["reward"] > TASK.rewards.goal / 2
+        bump = last["terminated"] and not reached
         cut = not (last["terminated"] or last["truncated"]) or (
             last["truncated"] and last["stamp_ns"] + 2 * PERIOD_NS > ends[last["recording_id"]]
         )
@@ -67,7 +68,7 @@ def events_by_hand(store: Store) -> dict[str, dict[str, Any]]:
                     "policy_before": steps[order[max(place - 1, 0)]]["behaviour_policy"],
                     "policy_after": (later or held)[0 if later else -1]["behaviour_policy"],
                     "clearance_min_m": min(row["clearance_m"] for row in held),
-                    "bumped": any(row["bumped"] for row in held),
+                    "bumped": any(row["bumped"] for row in held) or (bump and not later),
                     "outcome": outcome,
                     "recovered": None if outcome == "open" else outcome == "recovered",
                     "recovered_after_s": (back - onset["stamp_ns"]) / 1e9 if back else None,

@@ -19,9 +19,9 @@ from support.panels import panel_of
 from support.stores import recording_transitions, write_store
 
 TASK = load_profile("warehouse_amr").task
-DISCOUNT = 0.97
+DISCOUNT = 0.99
 MIXTURE = """
-discount = 0.97
+discount = 0.99
 n_step = {n_step}
 correction = {{pre = "none", post = "{post}"}}
 [[strata]]

@@ -70,7 +70,7 @@ def recording_transitions(
         "action_probability": pa.nulls(rows, pa.float32()),
         "stamp_ns": START_NS + recording * 3600 * 10**9 + np.arange(rows) * 200_000_000,
         "goal_distance_m": np.where(last & reached[episode], 0.3, 4.0),
-        "bumped": labels["near_collision"] & (rng.random(rows) < 0.3),
+        "bumped": labels["near_collision"] & (rng.random(rows) < 0.3) & ~reached[episode],
         "ingest_id": [f"{recording_id}-{ingest}"] * rows,
         "source_file": [f"logs/{recording}.mcap"] * rows,
         "profile_hash": ["0123456789ab"] * rows,

@@ -49,7 +49,7 @@ class NetworkConfig(Checked, frozen=True):
 
 
 class LossConfig(Checked, frozen=True):
-    discount: Annotated[float, Meta(ge=0, lt=1)] = 0.97  # a step; a panel brings its own, the same
+    discount: Annotated[float, Meta(ge=0, lt=1)] = 0.99  # a step; a panel brings its own, the same
     n_step: Count = 3  # of fresh rows; the panel's rows bring their own
     double: bool = True
     huber_delta: Positive = 10.0  # above most errors: at 1, rare heavy costs are half unseen

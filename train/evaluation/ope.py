@@ -114,10 +114,8 @@ def evaluate_run_off_policy(
 
 
 def measures_of(task: Task) -> tuple[Measure, ...]:
-    """What can be measured of a task: where a contact terminates the episode, or there is no goal,
-    logs do not tell an arrival from another end."""
-    arrivals = task.goal == "route" and not task.bump_terminates
-    return ("return", "success") if arrivals else ("return",)
+    """What can be measured of a task: without a goal there is no success."""
+    return ("return", "success") if task.goal == "route" else ("return",)
 
 
 def evaluate_off_policy(

@@ -4,9 +4,17 @@
 SELECT
     behaviour_policy,
     count(*) AS rows,
-    avg(bumped::INTEGER) AS bumped_share,
-    count(DISTINCT episode_id) FILTER (bumped) AS episodes
-FROM transitions
+    avg(bumps::INTEGER) AS bumped_share,
+    count(DISTINCT episode_id) FILTER (bumps) AS episodes
+FROM (
+    SELECT
+        behaviour_policy,
+        episode_id,
+        -- Pressed at the start of a step, or what ended the episode.
+        bumped OR (terminated AND ended_by = 'bump') AS bumps
+    FROM transitions
+    JOIN (SELECT episode_id, ended_by FROM episodes) USING (episode_id)
+)
 GROUP BY behaviour_policy
-HAVING avg(bumped::INTEGER) > $max_bumped_share
+HAVING avg(bumps::INTEGER) > $max_bumped_share
 ORDER BY bumped_share DESC

@@ -11,8 +11,10 @@ from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
+from msgspec.structs import replace
 
 from restock.arrays import F32, F64, Ints
+from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.signals import Signals
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
@@ -75,6 +77,8 @@ class Fleet:
         layouts: the floors, as `restock.train.twin.floors.floors.open_floors` reads them; a mission
             that names none is on one that its seed draws.
         conditions: the kinds of the missions to come (keys), which must fit on the floors.
+        stops: a bump is a protective stop and ends the mission. Else the mission goes on: for
+            an operator who stands by, and drives the robot out.
         scan_hz: the lidar scans at every control tick, and above 5 Hz once more between two.
     """
 
@@ -84,11 +88,14 @@ class Fleet:
         *,
         layouts: str = DEFAULT,
         conditions: Mapping[str, float] | None = None,
+        stops: bool = True,
         scan_hz: float = 10.0,
         robots: int = ROBOTS,
     ) -> None:
+        task = load_profile("warehouse_amr").task
         self.env = WarehouseVectorEnv(
             robots,
+            task=replace(task, bump_terminates=task.bump_terminates and stops),
             perturbation=hardware,
             layouts=layouts,
             conditions=conditions,

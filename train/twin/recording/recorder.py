@@ -251,6 +251,7 @@ def record(
         plan.hardware,
         layouts=plan.layouts,
         conditions=plan.kinds,
+        stops=plan.policy != HANDOVER,
         scan_hz=plan.rates.scan,
     )
     robot = _robot(plan, fleet)
