@@ -63,7 +63,9 @@ MAY_IMPORT = {
     "train/twin/floors": "",
     "train/twin/physics": "twin/floors ingest/task",
     "train/twin/env": "twin/floors twin/physics replay/fleet ingest/profile ingest/task",
-    "train/twin/recording": "twin/env twin/floors twin/physics replay/fleet ingest/task",
+    "train/twin/recording": (
+        "twin/env twin/floors twin/physics replay/fleet ingest/profile ingest/task"
+    ),
     "train/twin/calibration": (
         "twin/floors twin/physics replay/store ingest/profile ingest/steps ingest/store ingest/task"
     ),
