@@ -10,6 +10,9 @@ if TYPE_CHECKING:
     from restock.train.comparison.compare import compare as compare
     from restock.train.comparison.diagnose import diagnose as diagnose
     from restock.train.comparison.run_difference import diff_runs as diff_runs
+    from restock.train.diagnosis.before_training import (
+        diagnose_before_training as diagnose_before_training,
+    )
     from restock.train.dqn.config import TrainConfig as TrainConfig
     from restock.train.evaluation.eval_run import evaluate as evaluate
     from restock.train.evaluation.ope import OpeConfig as OpeConfig
@@ -36,6 +39,7 @@ else:
             "restock.train.comparison.compare": ["compare"],
             "restock.train.comparison.run_difference": ["diff_runs"],
             "restock.train.comparison.diagnose": ["diagnose"],
+            "restock.train.diagnosis.before_training": ["diagnose_before_training"],
             "restock.train.dqn.config": ["TrainConfig"],
             "restock.train.evaluation.eval_run": ["evaluate"],
             "restock.train.evaluation.ope": ["OpeConfig", "evaluate_run_off_policy"],

@@ -54,6 +54,9 @@ MAY_IMPORT = {
         " ingest/store ingest/task"
     ),
     "train/comparison": "train dqn evaluation run replay/fleet replay/panel",
+    "train/diagnosis": (
+        "feed run twin/env twin/physics replay/panel replay/store ingest/profile ingest/task"
+    ),
     "train/libraries": (
         "train dqn evaluation feed run twin/floors twin/physics replay/mixture replay/panel"
         " replay/ring replay/store ingest/profile ingest/task"
@@ -79,8 +82,9 @@ MAY_IMPORT = {
         " replay/store report train/comparison train/dqn train/evaluation train/twin/physics"
     ),
     "cli/learning": (
-        "cli report ingest/store replay/store replay/trace train train/comparison"
-        " train/evaluation train/run train/study train/twin/calibration"
+        "cli report ingest/profile ingest/store replay/store replay/trace train train/comparison"
+        " train/diagnosis train/evaluation train/run train/study train/twin/calibration"
+        " train/twin/physics"
     ),
     "cli/twin": (
         "cli report ingest/profile ingest/store ingest/task replay/fleet replay/store"

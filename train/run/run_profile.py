@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from restock.errors import ConfigError, PanelError, RunError
+from restock.errors import ConfigError, PanelError, RestockError, RunError
 from restock.ingest.profile.profile import Profile, load_profile, shipped_profiles
 from restock.ingest.profile.profile_text import profile_toml, read_profile_toml
-from restock.replay.panel.panel import HEADER, Panel
+from restock.replay.panel.panel import Panel
 from restock.train.run.run import Run
 
 
@@ -55,23 +55,39 @@ def profile_of_panel(panel: Panel) -> Profile:
         PanelError: the panel carries none that can be used, and none that comes with Restock has
             its task.
     """
-    name, problem = panel.header.profile, ""
-    if panel.header.profile_toml:
+    header = panel.header
+    name, text = header.profile, header.profile_toml
+    option = f"--set profile={name or 'my_robot'}.toml"
+    return carried_profile(name, text, panel.task_hash, str(panel.path), option, PanelError)
+
+
+def carried_profile(
+    name: str, text: str, task_hash: str, where: str, option: str, error: type[RestockError]
+) -> Profile:
+    """The profile of a task: the `text` that its rows carry, else one that comes with Restock.
+
+    `option` says how another is given.
+
+    Raises:
+        error: neither has this task.
+    """
+    problem = ""
+    if text:
         try:
-            own = read_profile_toml(panel.header.profile_toml, where=str(panel.path / HEADER))
-            if own.task.hash == panel.task_hash:
+            own = read_profile_toml(text, where=where)
+            if own.task.hash == task_hash:
                 return own
             problem = f"; the profile that it carries defines {own.task.hash} now"
-        except ConfigError as error:
-            problem = f"; the profile that it carries cannot be read: {error.what}"
-    fitting = [p for p in map(load_profile, shipped_profiles()) if p.task.hash == panel.task_hash]
+        except ConfigError as refused:
+            problem = f"; the profile that it carries cannot be read: {refused.what}"
+    fitting = [p for p in map(load_profile, shipped_profiles()) if p.task.hash == task_hash]
     if not fitting:
-        raise PanelError(
-            f"its rows are of task {panel.task_hash}"
+        raise error(
+            f"its rows are of task {task_hash}"
             + (f", of profile {name!r}" if name else "")
             + f": no profile that comes with Restock has it{problem}",
-            where=str(panel.path),
-            remedy="give the file of the profile that its logs were ingested with: --set"
-            f" profile={name or 'my_robot'}.toml; if that changed since, ingest and mix again",
+            where=where,
+            remedy="give the file of the profile that its logs were ingested with:"
+            f" {option}; if that changed since, ingest and mix again",
         )
     return next((profile for profile in fitting if profile.name == name), fitting[0])

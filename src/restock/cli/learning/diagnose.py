@@ -10,6 +10,7 @@ import tyro
 
 if TYPE_CHECKING:
     from restock.train.comparison.diagnose import Diagnosis
+    from restock.train.diagnosis.before_training import RowDiagnosis
 
 
 @dataclass
@@ -23,11 +24,30 @@ class DiagnoseCommand:
     and the experiment that would confirm it. Figures are of the last three
     evaluations; most of the runs must agree.
 
+    With --before-training no run is needed: the rows of a panel or a store are held against fresh
+    rows of the twin and against the task's definitions: do actions explain the motion, are rewards
+    and ends what the task says, do rows follow from one another. Consistent mistakes, which no
+    figure of a run shows, are named there with the row of evidence.
+
     Example: `restock diagnose runs/a runs/a-seed1 runs/a-seed2`
     """
 
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = ()
     """Runs of one method (seeds)."""
+    before_training: Annotated[Path | None, tyro.conf.arg(metavar="PANEL_OR_STORE")] = None
+    """Diagnose the rows of this panel or store, without a run: some seconds."""
+    profile: str | None = None
+    """With --before-training: the profile that the rows were ingested with (default: the one that
+    they carry)."""
+    perturbation: Path | None = None
+    """With --before-training: the calibrated twin, e.g. what `restock twin fit` wrote."""
+    twin: bool = True
+    """With --before-training: hold rows against the twin. Without it only what holds by definition
+    is checked."""
+    seed: int = 0
+    """With --before-training: of the twin's episodes and the bootstrap."""
+    check: bool = False
+    """Exit 1 unless the verdict is HEALTHY."""
     confirm: Path | None = None
     """Run the experiment that would confirm it, into this new run directory."""
     json: bool = False
@@ -35,13 +55,17 @@ class DiagnoseCommand:
 
     def run(self) -> int:
         from restock.cli.output import print_json
-        from restock.errors import ConfigError
+        from restock.errors import ConfigError, ExitCode
         from restock.train.comparison.confirm import confirm
         from restock.train.comparison.diagnose import diagnose
         from restock.train.run.run import Run
 
+        if self.before_training is not None:
+            return self._before_training(self.before_training)
         if not self.runs:
-            raise ConfigError("needs a run", where="restock diagnose")
+            raise ConfigError(
+                "needs a run, or --before-training PANEL_OR_STORE", where="restock diagnose"
+            )
         runs = [Run.open(path) for path in self.runs]
         diagnosis = diagnose(runs)
         if not self.json:
@@ -53,7 +77,35 @@ class DiagnoseCommand:
             print_json(_document(diagnosis, self.runs) | {"confirmation": confirmation})
         elif confirmation is not None:
             _show_confirmation(confirmation)
-        return 0
+        failed = self.check and diagnosis.cause != "HEALTHY"
+        return int(ExitCode.FAILED if failed else ExitCode.OK)
+
+    def _before_training(self, path: Path) -> int:
+        from restock.cli.output import print_json
+        from restock.errors import ConfigError, ExitCode
+        from restock.ingest.profile.profile import load_profile
+        from restock.train.diagnosis.before_training import diagnose_before_training
+        from restock.train.twin.physics.perturbation import load_perturbation
+
+        if self.runs or self.confirm is not None:
+            raise ConfigError(
+                "--before-training takes no run and no --confirm", where="restock diagnose"
+            )
+        diagnosis = diagnose_before_training(
+            path,
+            profile=None if self.profile is None else load_profile(self.profile),
+            twin=self.twin,
+            perturbation=None
+            if self.perturbation is None
+            else load_perturbation(self.perturbation),
+            seed=self.seed,
+        )
+        if self.json:
+            print_json(diagnosis.document())
+        else:
+            _show_rows(diagnosis)
+        failed = self.check and diagnosis.verdict != "HEALTHY"
+        return int(ExitCode.FAILED if failed else ExitCode.OK)
 
 
 def _show(diagnosis: Diagnosis, paths: tuple[Path, ...]) -> None:
@@ -83,6 +135,54 @@ def _show(diagnosis: Diagnosis, paths: tuple[Path, ...]) -> None:
     for line in diagnosis.evidence:
         out.print(f"  {line}")
     out.print(f"to confirm: {diagnosis.experiment}")
+
+
+def _show_rows(diagnosis: RowDiagnosis) -> None:
+    from restock.cli.output import print_table, stdout
+
+    named = {check for one in diagnosis.findings for check in one.evidence}
+    chosen = [
+        row
+        for row in diagnosis.comparisons
+        if row.status in ("off", "undecided") or row.check in named
+    ]
+    if chosen:
+        print_table(
+            [
+                {
+                    "check": row.check,
+                    "status": row.status,
+                    "logs": row.logs,
+                    "twin": row.twin,
+                    "effect": row.effect,
+                    "low": row.low,
+                    "high": row.high,
+                    "allowed": _range(row.least, row.most),
+                    "rows": row.logs_rows,
+                    "of": row.measure,
+                }
+                for row in chosen
+            ],
+            title="what is past its limit, with 95 % intervals over episodes",
+        )
+    out, about = stdout(), diagnosis.about
+    compared = f"{about['rows']:,} rows of {about['episodes']:,} episodes"
+    against = (
+        f" against {about['twin_rows']:,} fresh rows of the twin" if about["twin_rows"] else ""
+    )
+    made = sum(row.status != "not run" for row in diagnosis.comparisons)
+    out.print(f"{diagnosis.verdict}: {compared}{against}, {made} comparisons")
+    for one in diagnosis.findings:
+        out.print(f"  {one.cause}: {one.text}", markup=False, soft_wrap=True)
+        out.print(f"    {one.remedy}", markup=False, soft_wrap=True)
+    for row in diagnosis.not_run:
+        out.print(f"  not run: {row.check}: {row.note}", markup=False, soft_wrap=True)
+
+
+def _range(least: float | None, most: float | None) -> str:
+    if least is None:
+        return "" if most is None else f"at most {most:.3g}"
+    return f"at least {least:.3g}" if most is None else f"{least:.3g} to {most:.3g}"
 
 
 def _show_confirmation(confirmation: dict[str, Any]) -> None:

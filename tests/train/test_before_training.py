@@ -1,0 +1,186 @@
+"""Rows are diagnosed before training: consistent mistakes are named, sound rows are left alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from support.stores import TASK, recording_transitions, write_store
+
+from restock.cli import main
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.profile.profile_text import profile_toml
+from restock.train.diagnosis.before_training import RowDiagnosis, diagnose_rows
+from restock.train.diagnosis.fed_rows import FedRows
+from restock.train.diagnosis.twin_rows import drive_twin
+
+Plant = Callable[[FedRows], FedRows]
+
+
+@pytest.fixture(scope="module")
+def logs() -> FedRows:
+    """What sound logs look like: the twin's, of other episodes than the twin's own."""
+    return _drive(seed=7)
+
+
+@pytest.fixture(scope="module")
+def twin() -> FedRows:
+    return _drive(seed=1)
+
+
+def _drive(seed: int) -> FedRows:
+    profile = load_profile("warehouse_amr")
+    return drive_twin(profile.task, profile.conditions, seed=seed, robots=8, steps=300)
+
+
+def _swapped(rows: FedRows) -> FedRows:
+    """Left and right exchanged wherever an action stands, in the observations too."""
+    table = [tuple(action) for action in rows.task.actions]
+    other = np.array([table.index((speed, -turn if turn else turn)) for speed, turn in table])
+    first = rows.task.observation_names.index("previous_action_0")
+    observations = []
+    for held in (rows.observation, rows.next_observation):
+        changed = held.copy()
+        changed[:, first : first + len(table)] = held[:, first + other]
+        observations.append(changed)
+    return replace(
+        rows, action=other[rows.action], observation=observations[0],
+        next_observation=observations[1],
+    )  # fmt: skip
+
+
+def _late(rows: FedRows) -> FedRows:
+    place, known = rows.before(2)
+    return replace(rows, action=np.where(known, rows.action[place], 0))
+
+
+def _degrees(rows: FedRows) -> FedRows:
+    """The gyroscope's readings, and the slip that is the wheels' less them."""
+    gyro, slip = map(rows.task.observation_names.index, ("gyro_yaw_rate", "slip_yaw_rate"))
+    made = [rows.observation.copy(), rows.next_observation.copy()]
+    for held in made:
+        held[:, slip] += held[:, gyro]
+        held[:, gyro] *= 180 / np.pi
+        held[:, slip] -= held[:, gyro]
+    return replace(rows, observation=made[0], next_observation=made[1])
+
+
+def _other_rows(rows: FedRows) -> FedRows:
+    order = np.random.default_rng(0).permutation(len(rows))
+    return replace(rows, next_observation=rows.next_observation[order])
+
+
+def _ahead(rows: FedRows) -> FedRows:
+    return replace(rows, observation=rows.next_observation)
+
+
+def _twice(rows: FedRows) -> FedRows:
+    some = rows.episode < 3
+    arrays = {
+        name: np.concatenate([value, value[some]])
+        for name, value in vars(rows).items()
+        if isinstance(value, np.ndarray) and name not in ("joined", "last", "_stretch")
+    }
+    arrays["episode"][len(rows) :] += rows.episode.max() + 1
+    return FedRows(task=rows.task, **arrays)
+
+
+PLANTED: dict[str, tuple[Plant, str]] = {
+    "left and right": (_swapped, "ACTIONS_MIRRORED"),
+    "actions .4 s late": (_late, "ACTIONS_SHIFTED"),
+    "rewards twice": (lambda rows: replace(rows, reward=2 * rows.reward), "REWARD_SCALED"),
+    "rewards of other rows": (
+        lambda rows: replace(rows, reward=np.random.default_rng(0).permutation(rows.reward)),
+        "REWARD_",
+    ),
+    "terminations": (
+        lambda rows: replace(rows, terminated=np.zeros(len(rows), np.bool_)),
+        "TERMINATIONS_LOST",
+    ),
+    "next observations of other rows": (_other_rows, "ROWS_APART"),
+    "observations of the step after": (_ahead, "FUTURE_IN_OBSERVATION"),
+    "episodes twice": (_twice, "EPISODES_REPEATED"),
+}
+
+
+@pytest.mark.parametrize("with_twin", [True, False])
+def test_sound_rows_are_healthy(logs: FedRows, twin: FedRows, with_twin: bool) -> None:
+    found = diagnose_rows(logs, twin if with_twin else None, "there is none")
+    assert (found.verdict, found.findings) == ("HEALTHY", [])
+    assert [row.note for row in found.not_run if row.check == "twin"] == (
+        [] if with_twin else ["there is none"]
+    )
+
+
+@pytest.mark.parametrize("fault", PLANTED)
+def test_what_is_wrong_is_named(logs: FedRows, twin: FedRows, fault: str) -> None:
+    plant, cause = PLANTED[fault]
+    for against in (twin, None):  # each shows without a twin too
+        found = diagnose_rows(plant(logs), against, "there is none")
+        assert found.verdict == "BUFFER"
+        assert found.findings[0].cause.startswith(cause)
+        rows = {row.check: row for row in found.comparisons}
+        assert all(rows[check].status == "off" for check in _named(found))
+
+
+def _named(found: RowDiagnosis) -> list[str]:
+    return [check for one in found.findings for check in one.evidence]
+
+
+def test_a_sensor_is_told_from_the_actions(logs: FedRows, twin: FedRows) -> None:
+    (finding,) = diagnose_rows(_degrees(logs), twin).findings
+    assert finding.cause == "SENSOR_SCALED"
+    assert "degrees in place of radians" in finding.text
+
+
+def test_half_of_the_rows_swapped_is_seen(logs: FedRows, twin: FedRows) -> None:
+    half = np.random.default_rng(0).random(len(logs)) < 0.5
+    swapped = _swapped(logs)
+    mixed = replace(logs, action=np.where(half, swapped.action, logs.action))
+    found = diagnose_rows(mixed, twin)
+    assert found.findings[0].cause == "ACTIONS_MIXED"
+
+
+def test_rows_that_say_little_are_not_called_healthy(logs: FedRows, twin: FedRows) -> None:
+    few = logs.take(np.arange(len(logs)) < 200)
+    assert diagnose_rows(few, twin).verdict == "UNDETERMINED"
+
+
+def test_the_verb_names_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Rows of pure noise: nothing follows from anything, and 'what' is said with its evidence."""
+    store = write_store(tmp_path / "store", [recording_transitions(index) for index in (1, 2)])
+    words = ["diagnose", "--before-training", str(store), "--no-twin"]
+    profile = tmp_path / "profile.toml"
+    assert main(words) == 2
+    assert "no profile that comes with Restock has it" in capsys.readouterr().err
+    profile.write_text(
+        profile_toml(msgspec.structs.replace(load_profile("warehouse_amr"), task=TASK))
+    )
+    assert main([*words, "--profile", str(profile), "--check"]) == 1
+    shown = capsys.readouterr().out
+    assert "BUFFER" in shown
+    assert "not run: twin: it was not asked for" in shown
+    assert main([*words, "--profile", str(profile), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["verdict"] == "BUFFER"
+    assert {row["status"] for row in document["comparisons"]} >= {"off", "not run"}
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--before-training", "nowhere"], "no such panel or store"),
+        (["--before-training", "."], "is neither a panel nor a store"),
+        (["run", "--before-training", "."], "takes no run"),
+    ],
+)
+def test_what_cannot_be_diagnosed_is_said(
+    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["diagnose", *words]) == 2
+    assert said in " ".join(capsys.readouterr().err.split())

@@ -1,0 +1,324 @@
+"""From comparisons that are off to what is wrong with the logs, in their owner's words.
+
+A sensor whose readings are scaled, turned round or late is off in every relation that it takes part
+in, and the others agree among themselves: the fewest ends that all relations which are off have in
+common are at fault.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from statistics import median
+
+from restock.ingest.task.task import Task
+from restock.train.diagnosis.answers import DELAY_STEPS, GAIN, Answer
+from restock.train.diagnosis.evidence import Comparison
+from restock.train.diagnosis.relations import (
+    ACTION_SPEED,
+    ACTION_TURN,
+    GYROSCOPE,
+    LIDAR,
+    PLAN,
+    POSE,
+    WHEEL_SPEED,
+    WHEEL_TURN,
+)
+
+GROUPS = {"actions": (ACTION_SPEED, ACTION_TURN), "wheels": (WHEEL_SPEED, WHEEL_TURN)}
+_KEYS = {  # where a profile says what fills it
+    ACTION_SPEED: "[inputs.command] fields.speed_mps",
+    ACTION_TURN: "[inputs.command] fields.yaw_rate_radps",
+    "actions": "[inputs.command]",
+    WHEEL_SPEED: "[inputs.wheels] fields.speed_mps",
+    WHEEL_TURN: "[inputs.wheels] fields.yaw_rate_radps",
+    "wheels": "[inputs.wheels]",
+    GYROSCOPE: "[inputs.imu] fields.yaw_rate_radps",
+    POSE: "[inputs.pose]",
+    PLAN: "[inputs.plan]",
+    LIDAR: "[inputs.scan]",
+    "accelerometer": "[inputs.imu] fields.accel_x_mps2",
+}
+_FIRST = ("ROWS_APART", "FUTURE_IN_OBSERVATION")  # nothing can be told of rows before these
+_ON_THEIR_OWN = ("EPISODES_REPEATED", "TERMINATIONS_WRONG")
+_UNITS = (
+    ((50.0, 65.0), "degrees in place of radians"),
+    ((3.2, 4.0), "km/h in place of m/s"),
+    ((85.0, 115.0), "centimetres in place of metres"),
+    ((850.0, 1150.0), "millimetres in place of metres"),
+)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that is wrong with the logs' rows."""
+
+    cause: str  # a name that docs and programs know it by
+    text: str  # what, by how much
+    remedy: str
+    evidence: tuple[str, ...]  # the comparisons it rests on, by `check`
+
+
+def findings(
+    answers: Sequence[Answer],
+    permuted: Sequence[tuple[Comparison, int]],
+    others: Iterable[Comparison],
+    task: Task,
+) -> list[Finding]:
+    """What is wrong, worst understood last."""
+    of_rows = _of_rows([row for row in others if row.off])
+    first = [one for one in of_rows if one.cause in _FIRST]
+    if first:  # what rows are made of, and all that is compared with their next, follows from it
+        return first + [one for one in of_rows if one.cause in _ON_THEIR_OWN]
+    ends = odd_ends(answers)
+    found = []
+    moved = [(row, place, other) for place, (row, other) in enumerate(permuted) if other != place]
+    one_to_one = len({other for _, _, other in moved}) == len(moved)
+    actions = [end for end in ends if end in (ACTION_SPEED, ACTION_TURN, "actions")]
+    # Actions that are late or early are found in place of others, too.
+    shifted = any(_is_shift(*_distortion(end, ends[end])) for end in actions)
+    if moved and one_to_one and not shifted and (actions or not ends):
+        found.append(_permuted(moved, task))
+        ends = {end: off for end, off in ends.items() if end not in actions}
+    return found + [_of_end(end, off, task) for end, off in ends.items()] + of_rows
+
+
+def odd_ends(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
+    """The ends (or groups of them) that relations which are off have in common, each with those."""
+    left = [one for one in answers if one.off]
+    fine = [one for one in answers if not one.off and one.relation.gain is not None]
+    names = dict.fromkeys(end for one in left for end in (one.relation.x, one.relation.y))
+    candidates = {name: (name,) for name in names} | GROUPS
+    odd: dict[str, list[Answer]] = {}
+    while left:
+        worth = {
+            name: (
+                sum(_has(one, ends) for one in left),
+                -sum(_has(one, ends) for one in fine),
+                name not in GROUPS,
+            )
+            for name, ends in candidates.items()
+        }
+        best = max(worth, key=worth.__getitem__)
+        odd[best] = [one for one in left if _has(one, candidates[best])]
+        left = [one for one in left if one not in odd[best]]
+    return odd
+
+
+def _has(answer: Answer, ends: tuple[str, ...]) -> bool:
+    return answer.relation.x in ends or answer.relation.y in ends
+
+
+def _distortion(end: str, off: Sequence[Answer]) -> tuple[float, float]:
+    """By how much an end's values are scaled, and how many steps later they are."""
+    ends = GROUPS.get(end, (end,))
+    scales, delays = [], []
+    for one in off:
+        is_answer = one.relation.y in ends
+        if one.gain == one.gain and one.gain:
+            scales.append(one.gain if is_answer else 1 / one.gain)
+        delays.append(one.delay if is_answer else -one.delay)
+    return median(scales) if scales else 1.0, median(delays) if delays else 0.0
+
+
+def _is_shift(scale: float, delay: float) -> bool:
+    return 1 / GAIN <= scale <= GAIN and abs(delay) > DELAY_STEPS
+
+
+def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
+    scale, delay = _distortion(end, off)
+    evidence = tuple(row.check for one in off for row in one.comparisons if row.off)
+    seconds = abs(delay) * task.control_period_s
+    is_action = end in (ACTION_SPEED, ACTION_TURN, "actions")
+    key = _KEYS[end]
+    gain = 1 / scale if scale else float("inf")
+    if is_action and gain < 1 / GAIN:
+        if gain < -1 / GAIN:
+            return _mirrored(end, evidence)
+        share = (1 - gain) / 2
+        return Finding(
+            "ACTIONS_MIXED",
+            f"the logs' {end} explains only {max(gain, 0):.0%} of the motion that it should, as if"
+            f" it were the opposite in {share:.0%} of the rows, or another's in {1 - gain:.0%}",
+            f"look at some of the recordings one by one: {key} may be right in some and wrong in"
+            " others (robots, firmware), or actions may belong to other rows",
+            evidence,
+        )
+    if not 1 / GAIN <= scale <= GAIN and scale < 0:
+        return Finding(
+            "SENSOR_MIRRORED",
+            f"the logs' {end} has the opposite sign ({scale:+.2f} of what the others say)",
+            f"turn the sign of {key} in the profile (or its frame of reference)",
+            evidence,
+        )
+    if not 1 / GAIN <= scale <= GAIN:
+        unit = next((name for (low, high), name in _UNITS if low <= scale <= high), "")
+        unit = unit or next(
+            (f"the inverse of {name}" for (low, high), name in _UNITS if low <= 1 / scale <= high),
+            "",
+        )
+        return Finding(
+            "SENSOR_SCALED" if not is_action else "COMMAND_SCALED",
+            f"the logs' {end} is {scale:.3g} times what the others say"
+            + (f": {unit}?" if unit else ""),
+            f"scale {key} in the profile by {1 / scale:.3g}, or calibrate the sensor",
+            evidence,
+        )
+    if _is_shift(scale, delay):
+        late = delay > 0
+        slower = (
+            ""
+            if late or not is_action
+            else " (a robot that answers so much later than the twin looks the same: `restock twin"
+            " fit` tells its latency)"
+        )
+        return Finding(
+            "ACTIONS_SHIFTED" if is_action else "SENSOR_SHIFTED",
+            f"the logs' {end} is {seconds:.2g} s ({abs(delay):.1f} steps)"
+            f" {'late' if late else 'early'} against what it is compared with{slower}",
+            f"look at the stamps of {key}: `restock info` shows each topic's clock; use the time"
+            " of measurement, or correct the offset",
+            evidence,
+        )
+    return Finding(
+        "UNLIKE_TWIN",
+        f"the logs' {end} does not go with the rest as it does in the twin",
+        f"look at {key}: values of other rows, outliers or heavy noise",
+        evidence,
+    )
+
+
+def _mirrored(end: str, evidence: tuple[str, ...]) -> Finding:
+    what = {
+        ACTION_TURN: "the logs' left is the twin's right",
+        ACTION_SPEED: "the logs' forward is the twin's backward",
+    }.get(end, "the logs' actions are the opposite of the twin's")
+    return Finding(
+        "ACTIONS_MIRRORED",
+        what,
+        f"swap the sign of {_KEYS[end]} in the profile, and ingest the logs again",
+        evidence,
+    )
+
+
+def _permuted(moved: Sequence[tuple[Comparison, int, int]], task: Task) -> Finding:
+    evidence = tuple(row.check for row, _, _ in moved)
+    mirror = all(
+        task.actions[other] == (task.actions[place][0], -task.actions[place][1])
+        for _, place, other in moved
+    )
+    if mirror:
+        return _mirrored(ACTION_TURN, evidence)
+    names = task.action_names
+    pairs = "; ".join(f"{names[place]!r} is {names[other]!r}" for _, place, other in moved)
+    return Finding(
+        "ACTIONS_PERMUTED",
+        f"the logs' actions are other actions of the twin: {pairs}",
+        "the logs were made with another table of actions, or other units: take [task] actions from"
+        " where they were made, check [inputs.command], and ingest them again",
+        evidence,
+    )
+
+
+def _of_rows(off: Sequence[Comparison]) -> list[Finding]:
+    """Findings of the checks that name their cause themselves; a check belongs to the first."""
+    left = {row.check: row for row in off}
+    found = []
+    for kind in KINDS:
+        beside = not kind.beside or any(check in left for check in kind.beside)
+        if kind.checks[0] in left and beside:
+            used = tuple(check for check in kind.checks if check in left)
+            text = kind.text.format(**{name.replace(" ", "_"): row for name, row in left.items()})
+            found.append(Finding(kind.cause, text, kind.remedy, used))
+            for check in used:
+                del left[check]
+    found += [
+        Finding("UNLIKE_TWIN", f"{row.what}: {row.note or 'off'}", "look at these rows", (name,))
+        for name, row in left.items()
+    ]
+    return found
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What checks of rows stand for. `text` has each check's comparison by its name."""
+
+    cause: str
+    checks: tuple[str, ...]  # the first must be off; the others belong to it
+    text: str
+    remedy: str
+    beside: tuple[str, ...] = ()  # one of these must be off too
+
+
+KINDS = (
+    Kind(
+        "FUTURE_IN_OBSERVATION",
+        ("foresight", "chain", "unchanged", "previous action", "own action", "closing"),
+        "in {foresight.logs:.0%} of the rows where the action changes the observation holds the"
+        " action that is only taken at it: observations are of the step after",
+        "observations must be made of what was known before acting: ingest the logs again",
+        beside=("chain", "unchanged"),
+    ),
+    Kind(
+        "ROWS_APART",
+        ("chain", "unchanged", "closing", "previous action", "own action"),
+        "in {chain.logs:.0%} of the rows the next observation is not the observation of the next"
+        " row: next observations are stale, or of other rows",
+        "ingest the logs again; look for software that rewrites rows after ingest",
+    ),
+    Kind(
+        "ROWS_APART",
+        ("unchanged", "closing"),
+        "in {unchanged.logs:.0%} of the rows in which the robot moves the next observation is the"
+        " observation itself",
+        "ingest the logs again; look for topics that are held (stale) in the recordings",
+    ),
+    Kind(
+        "REWARD_DIFFERENT",
+        ("reward rows", "goal reward", "reward scale"),
+        "{reward_rows.logs:.0%} of the logs' rewards are not what the task makes of their rows: are"
+        " they of other rows, or of another definition?",
+        "ingest the logs again with this profile",
+    ),
+    Kind(
+        "REWARD_SCALED",
+        ("reward scale", "goal reward"),
+        "the logs' rewards are {reward_scale.effect:.3g} times what the task makes of their rows",
+        "ingest the logs again with this profile, and scale rewards nowhere else",
+    ),
+    Kind(
+        "REWARD_DIFFERENT",
+        ("goal reward",),
+        "arriving earns {goal_reward.logs:.3g} in the logs and {goal_reward.twin:.3g} in the twin",
+        "ingest the logs again with this profile",
+    ),
+    Kind(
+        "TERMINATIONS_LOST",
+        ("terminated at the goal",),
+        "of the logs' episodes that end at their goal {terminated_at_the_goal.logs:.0%} are"
+        " terminated there: beyond the others' ends the critic bootstraps",
+        "has the profile's [task] the robot's goal radius? Ingest the logs again",
+    ),
+    Kind(
+        "TERMINATIONS_WRONG",
+        ("goes on after its end",),
+        "{goes_on_after_its_end.logs:.0%} of the terminated rows are not the last of their episode",
+        "terminations belong to other rows, or episodes were joined: ingest the logs again",
+    ),
+    Kind(
+        "ACTIONS_CHANGED",
+        ("own action", "previous action", "foresight"),
+        "in {own_action.logs:.0%} of the rows the next observation does not hold the row's own"
+        " action: the `action` column is not what the observations were made with",
+        "something changed actions after ingest: ingest the logs again",
+    ),
+    Kind(
+        "EPISODES_REPEATED",
+        ("repeated episodes",),
+        "{repeated_episodes.logs:.0%} of the rows are of episodes that are there twice",
+        "`restock audit` names the recordings (repeated_steps): take one of them out",
+    ),
+)
+
+
+__all__ = ["Finding", "findings", "odd_ends"]

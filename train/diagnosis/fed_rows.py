@@ -1,0 +1,226 @@
+"""The rows that a critic is fed, of whatever source: a panel, a store, or fresh from the twin.
+
+Rows lie in the order in which they were driven, episode by episode, so that a row's predecessors
+are those before it. What is compared later is compared in these terms alone: observations,
+actions, rewards and ends, by the task's own names. So a panel can be judged whose store is gone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from restock.arrays import F32, F64, Bools, Ints
+from restock.errors import StoreError
+from restock.ingest.task.task import Task
+from restock.replay.panel.panel import Panel
+from restock.replay.store.store import Store, passed_in
+
+MOST_ROWS = 40_000  # of a store or panel, in whole episodes chosen by hash
+
+
+@dataclass(frozen=True)
+class FedRows:
+    """N rows of one task, sorted by episode and step."""
+
+    task: Task
+    observation: F32  # (N, D)
+    next_observation: F32  # (N, D) at t + 1, whatever n the returns of a panel have
+    action: Ints  # (N,)
+    reward: F64  # (N,) of one step
+    terminated: Bools  # (N,)
+    truncated: Bools  # (N,)
+    episode: Ints  # (N,) codes, rising
+    step: Ints  # (N,) in its episode
+    recording: NDArray[np.str_]  # (N,)
+    condition: NDArray[np.str_]  # (N,)
+    transition_id: Ints  # (N,)
+    left_out: dict[str, int] = field(default_factory=dict)  # rows, by reason
+
+    def __len__(self) -> int:
+        return len(self.action)
+
+    def take(self, chosen: Bools, **left_out: int) -> FedRows:
+        """Some of the rows; `left_out` says how many are not, by reason."""
+        arrays: dict[str, Any] = {
+            item.name: value[chosen]
+            for item in fields(self)
+            if isinstance(value := getattr(self, item.name), np.ndarray)
+        }
+        return replace(self, left_out=self.left_out | left_out, **arrays)
+
+    @cached_property
+    def joined(self) -> Bools:
+        """Whether each row is the step after the row before it, (N,)."""
+        joined = np.zeros(len(self), np.bool_)
+        joined[1:] = (np.diff(self.episode) == 0) & (np.diff(self.step) == 1)
+        return joined
+
+    @cached_property
+    def last(self) -> Bools:
+        """The last row of each episode, (N,)."""
+        return np.asarray(
+            np.append(np.diff(self.episode) != 0, np.ones(min(len(self), 1))), np.bool_
+        )
+
+    @cached_property
+    def _stretch(self) -> Ints:
+        return np.asarray(np.cumsum(~self.joined), np.int64)
+
+    def before(self, lag: int) -> tuple[Ints, Bools]:
+        """The row (N,) `lag` steps before each (after, where negative), and whether it is known."""
+        place = np.arange(len(self)) - lag
+        inside = np.clip(place, 0, max(len(self) - 1, 0))
+        known = (place == inside) & (self._stretch[inside] == self._stretch)
+        return inside, np.asarray(known, np.bool_)
+
+    def now(self, name: str) -> F64:
+        """An entry of the observations at t, (N,)."""
+        return self._column(self.observation, name)
+
+    def after(self, name: str) -> F64:
+        """An entry of the observations at t + 1, (N,)."""
+        return self._column(self.next_observation, name)
+
+    def sectors(self, *, after: bool = False) -> F64:
+        """The clearance entries (N, sectors), in [0, 1], by rising bearing."""
+        first = next(
+            place
+            for place, name in enumerate(self.task.observation_names)
+            if name.startswith("clearance_")
+        )
+        rows = self.next_observation if after else self.observation
+        return rows[:, first : first + self.task.sectors].astype(np.float64)
+
+    def previous_action(self, *, after: bool = False) -> Ints:
+        """The action before t (N,), or before t + 1, that the observations hold."""
+        first = self.task.observation_names.index("previous_action_0")
+        rows = self.next_observation if after else self.observation
+        held = rows[:, first : first + len(self.task.actions)]
+        return np.asarray(held.argmax(axis=1), np.int64)
+
+    def command(self) -> F64:
+        """The speed (m/s) and yaw rate (rad/s) of each row's action, (N, 2)."""
+        return np.asarray(self.task.actions, np.float64)[self.action]
+
+    def _column(self, rows: F32, name: str) -> F64:
+        return rows[:, self.task.observation_names.index(name)].astype(np.float64)
+
+
+def of_panel(panel: Panel, most: int = MOST_ROWS) -> FedRows:
+    """The rows of a panel. Those whose next step is not in the panel are left out where its returns
+    are of several steps, and counted."""
+    meta = panel.meta
+    order, left = _whole_episodes(meta, most)
+    codes, numbers = _codes(meta, order)
+    packed = np.asarray(panel.rows[order])
+    parts = {name: packed[:, where] for name, where in panel.columns.items()}
+    rows = FedRows(
+        task=panel.task,
+        observation=parts["observation"],
+        next_observation=parts["next_observation"],
+        action=parts["action"][:, 0].astype(np.int64),
+        reward=_numbers(meta, "reward", order).astype(np.float64),
+        terminated=_numbers(meta, "terminated", order).astype(np.bool_),
+        truncated=_numbers(meta, "truncated", order).astype(np.bool_),
+        episode=codes,
+        step=numbers,
+        recording=_text(meta, "recording_id", order),
+        condition=_text(meta, "condition", order),
+        transition_id=_numbers(meta, "transition_id", order).astype(np.int64),
+        left_out=left,
+    )
+    far = _numbers(meta, "horizon", order) > 1
+    return _one_step(rows, np.asarray(far, np.bool_)) if far.any() else rows
+
+
+def of_store(store: Store, task_hash: str, most: int = MOST_ROWS) -> FedRows:
+    """The rows of a task of a store.
+
+    Raises:
+        StoreError: it has none.
+    """
+    keys = store.connection.sql(
+        "SELECT transition_id, episode_id, step_index, recording_id, condition FROM transitions"
+        " WHERE task_hash = ?",
+        params=[task_hash],
+    ).to_arrow_table()
+    if not len(keys):
+        raise StoreError(f"no transitions of task {task_hash}", where=str(store.path))
+    order, left = _whole_episodes(keys, most)
+    codes, numbers = _codes(keys, order)
+    task = store.task(task_hash)
+    wanted = pa.table({"transition_id": keys["transition_id"].take(pa.array(order)),
+                       "place": np.arange(len(order))})  # fmt: skip
+    with passed_in(store.connection, wanted=wanted):
+        table = store.connection.sql(
+            "SELECT observation, next_observation, action, reward, terminated, truncated"
+            " FROM wanted JOIN transitions USING (transition_id) ORDER BY place"
+        ).to_arrow_table()
+    return FedRows(
+        task=task,
+        observation=_vectors(table["observation"], task.observation_size),
+        next_observation=_vectors(table["next_observation"], task.observation_size),
+        action=table["action"].to_numpy().astype(np.int64),
+        reward=table["reward"].to_numpy().astype(np.float64),
+        terminated=table["terminated"].to_numpy().astype(np.bool_),
+        truncated=table["truncated"].to_numpy().astype(np.bool_),
+        episode=codes,
+        step=numbers,
+        recording=_text(keys, "recording_id", order),
+        condition=_text(keys, "condition", order),
+        transition_id=_numbers(keys, "transition_id", order).astype(np.int64),
+        left_out=left,
+    )
+
+
+def _whole_episodes(keys: pa.Table, most: int) -> tuple[Ints, dict[str, int]]:
+    """The rows to read, by episode and step: all, or whole episodes of about `most` rows."""
+    episode = np.unique(_text(keys, "episode_id", None), return_inverse=True)[1].reshape(-1)
+    step = _numbers(keys, "step_index", None)
+    order = np.lexsort((step, episode))
+    if len(order) <= most:
+        return order, {}
+    counts = np.bincount(episode)
+    shuffled = np.random.default_rng(0).permutation(len(counts))
+    kept = shuffled[np.cumsum(counts[shuffled]) <= most]
+    inside = np.isin(episode[order], kept)
+    return order[inside], {"more than are looked at, in whole episodes": int((~inside).sum())}
+
+
+def _codes(keys: pa.Table, order: Ints) -> tuple[Ints, Ints]:
+    episode = np.unique(_text(keys, "episode_id", order), return_inverse=True)[1].reshape(-1)
+    return episode.astype(np.int64), _numbers(keys, "step_index", order).astype(np.int64)
+
+
+def _one_step(rows: FedRows, far: Bools) -> FedRows:
+    """Next observations of one step, from the row after, where a panel's are of several."""
+    following, known = rows.before(-1)
+    after = rows.next_observation.copy()
+    after[far & known] = rows.observation[following[far & known]]
+    lost = far & ~known
+    left = {"the step after is not in the panel": int(lost.sum())}
+    return replace(rows, next_observation=after).take(~lost, **left)
+
+
+def _numbers(table: pa.Table, name: str, order: Ints | None) -> NDArray[Any]:
+    values: NDArray[Any] = table[name].to_numpy()
+    return values if order is None else values[order]
+
+
+def _text(table: pa.Table, name: str, order: Ints | None) -> NDArray[np.str_]:
+    values = np.asarray(table[name].cast(pa.string()).fill_null("").to_numpy()).astype(np.str_)
+    return values if order is None else values[order]
+
+
+def _vectors(column: pa.ChunkedArray, size: int) -> F32:
+    flat = column.combine_chunks().flatten().to_numpy(zero_copy_only=False)
+    return np.ascontiguousarray(flat, np.float32).reshape(-1, size)
+
+
+__all__ = ["MOST_ROWS", "FedRows", "of_panel", "of_store"]

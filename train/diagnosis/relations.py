@@ -1,0 +1,133 @@
+"""What answers to what on a robot, in rows of any source: the pairs that are compared.
+
+Each relation has two ends, each of one sensor or of the commands. A sensor whose readings are
+scaled, turned round or late shows in every relation that it takes part in, and in no other: so the
+end that is at fault can be named (`restock.train.diagnosis.odd_one_out`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from restock.arrays import F64, Ints
+from restock.train.diagnosis.fed_rows import FedRows
+from restock.train.diagnosis.response import Response, fit_response, lagged
+
+ACTION_SPEED, ACTION_TURN = "action (speed)", "action (turn)"
+WHEEL_SPEED, WHEEL_TURN = "wheels (speed)", "wheels (turn)"
+POSE, GYROSCOPE, ACCELEROMETER, PLAN, LIDAR = "pose", "gyroscope", "accelerometer", "plan", "lidar"
+COMMANDS = np.arange(-4, 8)  # lags of commands: robots answer late, logs may be wrong either way
+SENSORS = np.arange(-3, 4)
+NOW = np.zeros(1, np.int64)
+_JUMP_RAD = 0.8  # a plan was replaced, not turned
+_SLOW_MPS = 0.3  # slower than this a waypoint's bearing changes by turning, not by driving past it
+_JUMP_M = 0.6
+_FAR = 0.97  # of the lidar's range: nothing was seen
+
+
+@dataclass(frozen=True)
+class Relation:
+    """`y` answers to `x`; each end has a name that says whose it is."""
+
+    name: str
+    x: str
+    y: str
+    lags: Ints
+    of: Callable[[FedRows], tuple[F64, F64]]  # x and y of the rows, (N,) each; or (N, S)
+    gain: float | None = 1.0  # by definition, where there is no twin to ask
+
+    def fit(self, rows: FedRows, rng: np.random.Generator) -> Response | None:
+        """None where the rows say too little."""
+        x, y = self.of(rows)
+        if x.ndim == 2:
+            cluster = np.repeat(rows.episode, x.shape[1])
+            return fit_response(x.reshape(-1, 1), y.reshape(-1), cluster, NOW, rng)
+        before = [rows.before(int(lag)) for lag in self.lags]
+        return fit_response(lagged(x, before), y, rows.episode, self.lags, rng)
+
+
+def _speed(rows: FedRows) -> F64:
+    return rows.after("wheel_speed")
+
+
+def _gyro(rows: FedRows) -> F64:
+    return rows.after("gyro_yaw_rate")
+
+
+def _wheel_turn(rows: FedRows) -> F64:
+    return rows.after("slip_yaw_rate") + rows.after("gyro_yaw_rate")
+
+
+def _pose_speed(rows: FedRows) -> F64:
+    return rows.after("localised_speed")
+
+
+def _gained(rows: FedRows) -> F64:
+    """How much wheels speeded up over the step, m/s2."""
+    change = rows.after("wheel_speed") - rows.now("wheel_speed")
+    return np.asarray(change / rows.task.control_period_s)
+
+
+def _turned_waypoint(rows: FedRows) -> F64:
+    """The yaw rate that the near waypoint's bearing shows, rad/s; NaN where driving or the plan
+    moved it."""
+    now = np.arctan2(rows.now("near_sin"), rows.now("near_cos"))
+    after = np.arctan2(rows.after("near_sin"), rows.after("near_cos"))
+    change = (after - now + np.pi) % (2 * np.pi) - np.pi
+    driving = np.abs(rows.after("localised_speed")) > _SLOW_MPS
+    change[(np.abs(change) > _JUMP_RAD) | driving] = np.nan
+    return np.asarray(-change / rows.task.control_period_s)
+
+
+def _route_speed(rows: FedRows) -> F64:
+    """How fast the way to go became shorter, m/s; NaN where the plan jumped or reads its most."""
+    now, after = rows.now("goal_distance"), rows.after("goal_distance")
+    shorter = 10.0 * (now - after)
+    shorter[(np.abs(shorter) > _JUMP_M) | (now >= 1.0) | (after >= 1.0)] = np.nan
+    return np.asarray(shorter / rows.task.control_period_s)
+
+
+def _scan_flow(rows: FedRows, turn: F64) -> tuple[F64, F64]:
+    """How sectors changed (N, S), and how they would by a turn (rad/s, (N,)) on the spot."""
+    now, after = rows.sectors(), rows.sectors(after=True)
+    width = 2 * np.pi / rows.task.sectors
+    slope = (np.roll(now, -1, axis=1) - np.roll(now, 1, axis=1)) / (2 * width)
+    expected = slope * (turn * rows.task.control_period_s)[:, None]
+    changed = after - now
+    unseen = (now > _FAR) | (after > _FAR)
+    unseen |= np.roll(unseen, 1, axis=1) | np.roll(unseen, -1, axis=1)
+    unseen |= np.abs(slope) > 1.0  # an edge: what lies behind it comes into view
+    unseen |= (np.abs(turn) < 0.2)[:, None]
+    return expected, np.where(unseen, np.nan, changed)
+
+
+RELATIONS = (
+    Relation("speed of the wheels to the action", ACTION_SPEED, WHEEL_SPEED, COMMANDS,
+             lambda rows: (rows.command()[:, 0], _speed(rows))),
+    Relation("speed of the pose to the action", ACTION_SPEED, POSE, COMMANDS,
+             lambda rows: (rows.command()[:, 0], _pose_speed(rows))),
+    Relation("yaw rate of the gyroscope to the action", ACTION_TURN, GYROSCOPE, COMMANDS,
+             lambda rows: (rows.command()[:, 1], _gyro(rows))),
+    Relation("yaw rate of the wheels to the action", ACTION_TURN, WHEEL_TURN, COMMANDS,
+             lambda rows: (rows.command()[:, 1], _wheel_turn(rows))),
+    Relation("speed of the pose to the wheels", WHEEL_SPEED, POSE, SENSORS,
+             lambda rows: (_speed(rows), _pose_speed(rows))),
+    Relation("yaw rate of the wheels to the gyroscope", GYROSCOPE, WHEEL_TURN, SENSORS,
+             lambda rows: (_gyro(rows), _wheel_turn(rows))),
+    Relation("acceleration to the wheels", WHEEL_SPEED, ACCELEROMETER, SENSORS,
+             lambda rows: (_gained(rows), 5.0 * rows.after("accel_x")), None),
+    Relation("bearing of the waypoint to the gyroscope", GYROSCOPE, PLAN, NOW,
+             lambda rows: (_gyro(rows), _turned_waypoint(rows)), None),
+    Relation("way to go to the speed of the pose", POSE, PLAN, SENSORS,
+             lambda rows: (_pose_speed(rows), _route_speed(rows)), None),
+    Relation("what the lidar sees to the gyroscope", GYROSCOPE, LIDAR, NOW,
+             lambda rows: _scan_flow(rows, _gyro(rows)), None),
+    Relation("what the lidar sees to the turn of the wheels", WHEEL_TURN, LIDAR, NOW,
+             lambda rows: _scan_flow(rows, _wheel_turn(rows)), None),
+)  # fmt: skip
+
+
+__all__ = ["RELATIONS", "Relation"]
