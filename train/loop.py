@@ -294,7 +294,8 @@ def _evaluate(session: Session, notify: Notify) -> None:
     config, progress, learner = session.config, session.progress, session.learner
     names = list(config.env.conditions)  # also those with a share of 0: never trained on, yet met
     specs = fixed_episodes(names, config.evaluation.episodes, config.evaluation.seed)
-    results = session.evaluation_buffer.drive(GreedyPolicy(learner.policy), specs)
+    policy, discount = GreedyPolicy(learner.policy), config.loss.discount
+    results = session.evaluation_buffer.drive(policy, specs, discount)
     measured = session.evaluation_buffer.measure(learner)
     session.run.append("evaluation_buffer", [{**session.steps, **row} for row in measured])
     progress.evaluated_at = progress.env_steps

@@ -113,6 +113,8 @@ class ToyTwin:
         ended = success | truncated
         info: dict[str, Any] = {
             "signals": self.signals,
+            "travelled_m": np.abs(self.moved),
+            "closest_person_m": np.full(self.num_envs, np.inf),
             "success": success,
             "invalid": np.zeros(self.num_envs, np.bool_),
             "episode_number": self.number.copy(),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pytest
@@ -11,6 +12,8 @@ from support.kept_run import kept_run
 
 from restock.cli import main
 from restock.files import write_table
+from restock.ingest.profile.profile import load_profile
+from restock.train.evaluation.references import drive_references
 from restock.train.run.kept_evaluations import (
     add_evaluation,
     read_evaluations,
@@ -20,7 +23,7 @@ from restock.train.run.run_tables import EVAL_EPISODES
 from restock.train.twin.physics.episode import KINDS
 
 
-@pytest.mark.parametrize("policy", ["run:", "onnx:", "operator"])
+@pytest.mark.parametrize("policy", ["run:", "onnx:", "supervisor"])
 def test_an_unknown_policy_is_refused(
     policy: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -106,3 +109,27 @@ def test_what_an_earlier_restock_evaluated_is_still_shown(tmp_path: Path) -> Non
     shown, said = shown_evaluation(run)
     assert shown.num_rows == 1
     assert "floors not named, policy not named, seeds 3 to 3" in said
+
+
+def test_the_references_drive_the_same_missions_and_time_lost_is_against_the_planner(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = kept_run(tmp_path / "a")
+    line = ["eval", str(run), "--episodes", "1", "--perturbations", "none", "--json"]
+
+    def results(policies: str) -> dict[tuple[str, str], dict[str, Any]]:
+        assert main([*line, "--policies", policies]) == 0
+        rows = json.loads(capsys.readouterr().out)["results"]
+        return {(row["policy"], row["condition"]): row for row in rows}
+
+    planner = results("planner")["planner", "nominal"]
+    assert planner["time_lost_s"] == 0.0
+    operator = results("operator")["operator", "nominal"]  # against the planner of before
+    assert operator["success"] == 1.0
+    assert operator["time_lost_s"] == pytest.approx(operator["time_s"] - planner["time_s"])
+    # Without a run they are the same episodes.
+    task = load_profile("warehouse_amr").task
+    (driven,) = drive_references(task, ["planner"], kinds=["nominal"], episodes=1, discount=0.5)[
+        "planner"
+    ]
+    assert driven.time_s == planner["time_s"]

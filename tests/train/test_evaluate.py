@@ -16,8 +16,8 @@ from restock.train.evaluation.evaluate import (
     fixed_episodes,
     run_episodes,
     score,
-    summary_rows,
 )
+from restock.train.evaluation.measures import measures, mission_of, summary_rows, with_time_lost
 from restock.train.twin.physics.episode import EpisodeSpec
 
 
@@ -40,6 +40,7 @@ def drive(env: ToyTwin, action: int, specs: list[EpisodeSpec]) -> list[EpisodeRe
         specs,
         control_period_s=TASK.control_period_s,
         time_limit_steps=TASK.time_limit_steps,
+        discount=0.5,
     )
 
 
@@ -66,6 +67,12 @@ def test_an_episode_is_counted_by_hand() -> None:
     assert result.time_s == pytest.approx((CELLS - 1) * 0.2)
     assert result.undiscounted_return == pytest.approx(1.0 - 0.05 * (CELLS - 2))
     assert result.end_x_m == CELLS - 1
+    assert result.distance_m == CELLS - 1
+    steps = CELLS - 1
+    assert result.discounted_return == pytest.approx(
+        -0.05 * sum(0.5**step for step in range(steps - 1)) + 0.5 ** (steps - 1)
+    )
+    assert result.closest_person_m is None
     assert result.bumps == 0
 
 
@@ -108,3 +115,33 @@ def test_the_summary_tells_partial_and_full_blocks_apart() -> None:
     assert (partial["success_low"], partial["success_high"]) == wilson(1, 2)
     assert partial["time_s"] == 3.0
     assert cell_name("nominal", "none") == "nominal"
+
+
+def drove(seed: int, success: bool, time_s: float, bumps: int = 0, **more: Any) -> EpisodeResult:
+    return EpisodeResult(
+        "nominal", "none", seed, success, bumps, time_s, 1.0, 0.0, 0.0, None, **more
+    )
+
+
+def test_time_is_lost_where_both_arrived() -> None:
+    planner = [drove(1, True, 10.0), drove(2, False, 48.0), drove(3, True, 9.0)]
+    known = {mission_of(one): one.time_s for one in planner if one.success}
+    agent = [drove(1, True, 12.5), drove(2, True, 20.0), drove(3, False, 2.0), drove(4, True, 5.0)]
+    assert [one.time_lost_s for one in with_time_lost(agent, known)] == [2.5, None, None, None]
+    row = measures(with_time_lost(agent, known))
+    assert (row["time_lost_s"], row["time_lost_episodes"]) == (2.5, 1)
+    assert row["time_lost_s_low"] is None  # one episode has no interval
+
+
+def test_bumps_are_counted_by_the_kilometre_driven() -> None:
+    far = drove(1, True, 30.0, distance_m=1500.0)
+    near = drove(2, False, 1.0, bumps=1, distance_m=500.0, closest_person_m=0.2)
+    row = measures([far, near])
+    assert row["bumps_per_km"] == pytest.approx(0.5)
+    assert row["bumps_per_km_low"] <= 0.5 <= row["bumps_per_km_high"]
+    assert (row["closest_person_least_m"], row["episodes_with_people"]) == (0.2, 1)
+    # Two kilometres without a bump do not show that there will never be one.
+    clean = measures([far, drove(3, True, 9.0, distance_m=500.0)])
+    assert (clean["bumps_per_km"], clean["bumps_per_km_low"]) == (0.0, 0.0)
+    assert clean["bumps_per_km_high"] == pytest.approx(3.689 / 2, abs=1e-3)
+    assert clean["closest_person_m"] is None

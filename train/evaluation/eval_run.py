@@ -17,13 +17,17 @@ import pyarrow as pa
 
 from restock.errors import ConfigError
 from restock.train.dqn.config import TrainConfig, parse_config
-from restock.train.evaluation.evaluate import (
-    EpisodeResult,
-    run_episodes,
+from restock.train.evaluation.evaluate import EpisodeResult, run_episodes
+from restock.train.evaluation.measures import (
+    Mission,
+    mission_named,
+    mission_of,
     summary_rows,
+    with_time_lost,
 )
 from restock.train.evaluation.policies import load_agent, load_policy
-from restock.train.run.kept_evaluations import add_evaluation
+from restock.train.evaluation.references import FIRST_SEED, REFERENCES, reference
+from restock.train.run.kept_evaluations import add_evaluation, read_evaluations
 from restock.train.run.run import Run
 from restock.train.run.run_profile import profile_of_run
 from restock.train.run.run_tables import EVAL_EPISODES
@@ -40,7 +44,6 @@ from restock.train.twin.physics.perturbation import (
 
 CLEAN = "none"
 POLICIES = ("agent", "planner", "random")
-FIRST_SEED = 10_000
 
 Results = dict[tuple[str, str], list[EpisodeResult]]  # (policy, perturbation) -> episodes
 
@@ -91,7 +94,7 @@ def plan_evaluation(
     config = parse_config(run.document["config"], where=str(path / "config.json"))
     known = [CLEAN, *(name for name in PERTURBATIONS if name != "nominal")]
     for flag, names, choices in (
-        ("--policies", policies, list(POLICIES)),
+        ("--policies", policies, ["agent", *REFERENCES]),
         ("--perturbations", perturbations, known),
     ):
         unknown = [name for name in names if name not in choices and not _is_path(flag, name)]
@@ -142,11 +145,13 @@ def evaluate(
 ) -> list[dict[str, Any]]:
     """Drive a run's kept policy and its references through the same episodes, as `restock eval`.
 
-    Returns a row per policy, perturbation and condition: success with its 95 % Wilson interval,
-    bumps, time and return. The episodes are kept in the run's `eval/episodes.parquet`.
+    Returns a row per policy, perturbation and condition: success, return, bumps a kilometre,
+    closest approach to people and time lost against the planner, with 95 % intervals over episodes.
+    The episodes are kept in the run's `eval/episodes.parquet`.
 
     Args:
-        policies: agent (the run's best), planner, random, `onnx:FILE` or `run:DIRECTORY`.
+        policies: agent (the run's best), planner, operator, random, `onnx:FILE` or
+            `run:DIRECTORY`.
         perturbations: none, friction, latency, payload, wheels, sensors, or a TOML file.
         episodes: of each kind.
         layouts: floors to drive on; None: the run's own, of training floors the test split.
@@ -202,10 +207,13 @@ def drive_evaluation(
             control_period_s=task.control_period_s,
             time_limit_steps=task.time_limit_steps,
             goal=task.goal != "none",
+            discount=plan.config.loss.discount,
             progress=progress,
         )
         for (perturbation, _), result in zip(episodes, driven, strict=True):
             results.setdefault((policy, perturbation), []).append(result)
+    planner_s = _planner_times(plan, results)
+    results = {key: with_time_lost(driven, planner_s) for key, driven in results.items()}
     add_evaluation(plan.run.path, episodes_table(results, plan, versions))
     return results
 
@@ -237,14 +245,33 @@ def _perturb(name: str) -> Perturbation | None:
 
 def make_policy(name: str, plan: EvaluationPlan) -> Policy:
     """The run's kept policy, a scripted one, or one that is named."""
-    from restock.train.twin.env.policies import PlannerFollower, RandomPolicy
-
     if name == "agent":
         return load_agent(plan.run)
-    if name == "planner":
-        return PlannerFollower(epsilon=0.0, seed=plan.first_seed)
     named = load_policy(name, profile_of_run(plan.run).task)
-    return RandomPolicy(seed=plan.first_seed) if named is None else named
+    return reference(name, plan.first_seed) if named is None else named
+
+
+def _planner_times(plan: EvaluationPlan, results: Results) -> dict[Mission, float]:
+    """How long the planner took on the missions in which it arrived: as it has just driven, or in
+    an earlier evaluation of the run on these floors."""
+    driven = [
+        (mission_of(one), one.time_s, one.success)
+        for (policy, _), episodes in results.items()
+        if policy == "planner"
+        for one in episodes
+    ]
+    if not driven:
+        driven = [
+            (
+                mission_named(row["condition"], row["episode_seed"], row["perturbation_values"]),
+                row["time_s"],
+                row["success"],
+            )
+            for row in read_evaluations(plan.run.path).to_pylist()
+            if (row["policy"], row["version"], row["layouts"])
+            == ("planner", reference("planner").version, plan.layouts)
+        ]
+    return {mission: time_s for mission, time_s, success in driven if success}
 
 
 def episodes_table(results: Results, plan: EvaluationPlan, versions: Mapping[str, str]) -> pa.Table:
@@ -257,6 +284,7 @@ def episodes_table(results: Results, plan: EvaluationPlan, versions: Mapping[str
             "end_x_m": result.end_x_m,
             "end_y_m": result.end_y_m,
             "failure": result.failure,
+            "time_lost_s": result.time_lost_s,
             "version": versions[policy],
             "layouts": plan.layouts,
         }

@@ -6,7 +6,7 @@ and checkpoint meets the same episodes and results can be compared episode by ep
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +14,6 @@ import numpy as np
 
 from restock.arrays import F32, F64, Ints
 from restock.ingest.task.signals import Signals
-from restock.stats import wilson
 from restock.train.feed.fresh_log import values_entries
 from restock.train.twin.env.interface import Policy, Step, Twin
 from restock.train.twin.physics.episode import EpisodeSpec
@@ -41,6 +40,10 @@ class EpisodeResult:
     perturbation: str = "nominal"
     perturbation_values: str = "{}"  # JSON: those that are not nominal
     layout: str = "default"
+    distance_m: float | None = None  # driven, over ground
+    closest_person_m: float | None = None  # body edge to edge; None: nobody was about
+    discounted_return: float | None = None  # None: no discount was named
+    time_lost_s: float | None = None  # against the planner; None: one of both did not arrive
 
     @property
     def row(self) -> dict[str, Any]:
@@ -56,6 +59,9 @@ class EpisodeResult:
             "bumps": self.bumps,
             "time_s": self.time_s,
             "return": self.undiscounted_return,
+            "discounted_return": self.discounted_return,
+            "distance_m": self.distance_m,
+            "closest_person_m": self.closest_person_m,
         }
 
 
@@ -76,13 +82,14 @@ def run_episodes(
     control_period_s: float,
     time_limit_steps: int,
     goal: bool = True,
+    discount: float | None = None,
     step: Stepper | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[EpisodeResult]:
     """Drive every episode to its end, N at a time; results in the order of `specs`.
 
     `step` makes a step in place of `env.step`, given the observations (N, D) as well. Without a
-    `goal` success is None, and an episode fails by a bump alone.
+    `goal` success is None, and an episode fails by a bump alone. `discount` is of one step.
     """
     results: list[EpisodeResult | None] = [None] * len(specs)
     env.set_episodes(specs)
@@ -92,7 +99,8 @@ def run_episodes(
     steps = np.zeros(env.num_envs, np.int64)
     bumps = np.zeros(env.num_envs, np.int64)
     touching = np.zeros(env.num_envs, np.bool_)
-    total = np.zeros(env.num_envs)
+    total, discounted = np.zeros(env.num_envs), np.zeros(env.num_envs)
+    distance = np.zeros(env.num_envs)
     track = np.zeros((env.num_envs, time_limit_steps + 1, 2))
     track[:, 0] = _position(env.signals)
     left = len(specs)
@@ -101,8 +109,11 @@ def run_episodes(
         made = env.step(action) if step is None else step(observation, action)
         observation, reward, terminated, truncated, info = made
         after = info["signals"]
+        if discount is not None:
+            discounted += reward * discount**steps
         steps += 1
         total += reward
+        distance += info["travelled_m"]
         bumped = np.asarray(after["bumped"], np.bool_)
         bumps += bumped & ~touching
         touching = bumped
@@ -114,6 +125,7 @@ def run_episodes(
             # -1: the environment was done early and drives on, unrecorded.
             if index >= 0:
                 count = int(steps[place])
+                closest = info["closest_person_m"][place]
                 end = track[place, min(count, time_limit_steps)]
                 before = track[place, max(count - window, 0)]
                 success = bool(info["success"][place]) if goal else None
@@ -138,11 +150,15 @@ def run_episodes(
                         count < time_limit_steps,
                         float(np.hypot(*(end - before))) < STUCK_RADIUS_M,
                     ),
+                    distance_m=float(distance[place]),
+                    closest_person_m=float(closest) if np.isfinite(closest) else None,
+                    discounted_return=None if discount is None else float(discounted[place]),
                 )
                 left -= 1
                 if progress is not None:
                     progress(1)
-        steps[ended], bumps[ended], total[ended], touching[ended] = 0, 0, 0.0, False
+        steps[ended], bumps[ended], touching[ended] = 0, 0, False
+        total[ended], discounted[ended], distance[ended] = 0.0, 0.0, 0.0
         track[ended, 0] = _position(env.signals)[ended]
     return [result for result in results if result is not None]
 
@@ -189,45 +205,6 @@ def score(results: Sequence[EpisodeResult]) -> Score:
     return Score(success, average, float(np.mean(returns)))
 
 
-def summary_rows(
-    results: Mapping[tuple[str, str], Sequence[EpisodeResult]],
-) -> list[dict[str, Any]]:
-    """Per (policy, perturbation) and condition, blocked aisles by partial and full: a table's rows.
-
-    Success comes with its Wilson 95 % interval; all three are None where the task has no goal.
-    """
-    rows = []
-    for (policy, perturbation), episodes in results.items():
-        cells: dict[str, list[EpisodeResult]] = {}
-        for result in episodes:
-            cells.setdefault(cell_name(result.condition, result.block), []).append(result)
-        for cell in sorted(cells, key=_cell_order):
-            group = cells[cell]
-            successes = sum(bool(result.success) for result in group)
-            goal = all(result.success is not None for result in group)
-            low, high = wilson(successes, len(group)) if goal else (None, None)
-            arrived = [result.time_s for result in group if result.success]
-            rows.append(
-                {
-                    "policy": policy,
-                    "perturbation": perturbation,
-                    "condition": cell,
-                    "episodes": len(group),
-                    "success": successes / len(group) if goal else None,
-                    "success_low": low,
-                    "success_high": high,
-                    "bumps_per_episode": float(np.mean([r.bumps for r in group])),
-                    "time_s": float(np.mean(arrived)) if arrived else None,
-                    "return": float(np.mean([r.undiscounted_return for r in group])),
-                }
-            )
-    return rows
-
-
 def cell_name(condition: str, block: str) -> str:
     """`blocked_aisle (partial)`, but `nominal`."""
     return condition if block in ("none", "") else f"{condition} ({block})"
-
-
-def _cell_order(cell: str) -> tuple[int, str]:
-    return (0 if cell == "nominal" else 1, cell)

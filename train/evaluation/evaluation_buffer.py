@@ -46,7 +46,9 @@ class EvaluationBuffer:
         self._task, self._conditions, self._like, self._logs = task, conditions, like, logs
         self._collector = self._empty()
 
-    def drive(self, policy: Policy, specs: Sequence[EpisodeSpec]) -> list[EpisodeResult]:
+    def drive(
+        self, policy: Policy, specs: Sequence[EpisodeSpec], discount: float | None = None
+    ) -> list[EpisodeResult]:
         """Drive every episode, in the order of `specs`; what was kept before is forgotten."""
         self._collector = self._empty()
         return run_episodes(
@@ -56,6 +58,7 @@ class EvaluationBuffer:
             control_period_s=self._task.control_period_s,
             time_limit_steps=self._task.time_limit_steps,
             goal=self._task.goal != "none",
+            discount=discount,
             step=self._step,
         )
 

@@ -158,6 +158,7 @@ class Evaluations:
             control_period_s=self.task.control_period_s,
             time_limit_steps=self.task.time_limit_steps,
             goal=self.task.goal != "none",
+            discount=self.config.loss.discount,
         )
         self.at, evaluated = env_steps, score(results)
         clocks = {"env_steps": env_steps, "gradient_steps": gradient_steps}

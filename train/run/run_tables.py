@@ -22,6 +22,11 @@ _STEPS = [
     ("env_steps", _I, "environment steps so far, all environments together"),
     ("gradient_steps", _I, "updates so far"),
 ]
+_MEASURES = [
+    ("discounted_return", _F, "from the first step, by the run's `loss.discount`"),
+    ("distance_m", _F, "driven, over ground"),
+    ("closest_person_m", _F, "least true distance to a person or forklift; null: nobody about"),
+]
 
 
 def _schema(doc: str, *columns: tuple[str, pa.DataType, str]) -> pa.Schema:
@@ -283,6 +288,7 @@ TABLES: dict[str, pa.Schema] = {
         ("bumps", _I, "times that it began to touch something"),
         ("time_s", _F, "of the episode, simulated"),
         ("return", _F, "undiscounted"),
+        *_MEASURES,
         ("best", _B, "this evaluation was the best so far"),
     ),
 }
@@ -301,6 +307,12 @@ EVAL_EPISODES = _schema(
     ("bumps", _I, "times that it began to touch something"),
     ("time_s", _F, "of the episode, simulated"),
     ("return", _F, "undiscounted"),
+    *_MEASURES,
+    (
+        "time_lost_s",
+        _F,
+        "against the planner on the same mission; null unless both arrived",
+    ),
     ("end_x_m", _F, "where it ended"),
     ("end_y_m", _F, "where it ended"),
     ("failure", _S, "null | stuck | timeout | bump | cut"),

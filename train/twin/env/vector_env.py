@@ -22,6 +22,9 @@ termination.
   nominal;
 - `success` (at the goal without any bump, at the episode's end), `bumps` (steps with a bump so
   far), `episode_steps`, `true_pose` (N, 3);
+- `travelled_m`, over ground in [t, t + 1); `closest_person_m`, the least true distance so far from
+  the body's edge to a person or forklift, as the crow flies, of the episodes of `set_episodes`:
+  inf where nobody is on the floor, NaN in others, where it is not measured;
 - `invalid`: the physics diverged: the episode is truncated and the step must not enter replay;
 - `final_obs`, with the mask `_final_obs`;
 - in the continuous action space `action`, the nearest of the task's, and `action_residual`.
@@ -236,6 +239,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         for env in ids.tolist():
             spec, self.episode_number[env], self.mission_arm[env] = self.queue.next(env)
             self._lay_out(env, spec)
+            if self.episode_number[env] >= 0:  # asked for: how near it comes to people matters
+                self.simulation.traffic.closest_m[env] = np.inf
         self.steps[ids] = self.bumps[ids] = self.previous_action[ids] = 0
         first = self.sensing.sense(ids, self.steps[ids])
         add_motion(first, None)
@@ -368,6 +373,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
             "true_condition": condition,
             "success": ended & reached_goal(self.task, after) & (self.bumps == 0),
             "invalid": invalid.copy(),
+            "travelled_m": sim.travelled_m,
+            "closest_person_m": sim.traffic.closest_m.copy(),
         }
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:

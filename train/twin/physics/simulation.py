@@ -121,6 +121,7 @@ class Simulation(Stateful):
         self.bumped = np.zeros(num_envs, np.bool_)  # in the last control period
         self.accel = np.zeros((num_envs, 3))  # mean over the last half block
         self.slipped = np.zeros(num_envs, np.bool_)  # on a patch, in the last control period
+        self.travelled_m = np.zeros(num_envs)  # in the last control period, over ground
         self.diverged = np.zeros(num_envs, np.bool_)
         self.base_friction = np.full(num_envs, FLOOR_FRICTION)
         self.left_friction = np.ones(num_envs)
@@ -185,6 +186,7 @@ class Simulation(Stateful):
         self.bumped[:] = False
         self.slipped[:] = False
         touched = self.bumped.copy()
+        start = self.qpos[:, :2].copy()
         for block in range(self.blocks):
             pose = self.pose()
             self.scenery.walk(self.traffic.advance(pose, self.qvel[:, :2], touched, BLOCK_S))
@@ -194,6 +196,8 @@ class Simulation(Stateful):
             self.bumped |= touched
             if slippery.any():
                 self.slipped[icy] |= self._slipping(icy, slippery)
+            self.traffic.note_closest(self.qpos[:, :2], self._yaw)
+        self.travelled_m = np.hypot(*(self.qpos[:, :2] - start).T)
         warnings = np.asarray(self.batch.warning).reshape(self.num_envs, -1)
         self.diverged = np.asarray((warnings > 0).any(axis=1), np.bool_)
 
@@ -246,6 +250,9 @@ class Simulation(Stateful):
     def pose(self) -> F64:
         """True x, y and heading, (N, 3)."""
         return np.column_stack([self.qpos[:, :2], yaw_of(self.qpos[:, 3:7])])
+
+    def _yaw(self, ids: Ints) -> F64:
+        return yaw_of(self.qpos[ids, 3:7])
 
     def _write_friction(self, ids: Ints, pose: F64) -> Bools:
         """Friction under the wheels of `ids`; returns (n, 2) which of them stand on a patch."""

@@ -8,6 +8,7 @@ robot, not the reverse.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,13 @@ import numpy as np
 from restock.arrays import F64, Bools, Ints
 from restock.state import Stateful
 from restock.train.twin.floors.layout import Warehouse
-from restock.train.twin.physics.model import FORKLIFTS, PARKED_M, PEOPLE, PERSON_RADIUS_M
+from restock.train.twin.physics.model import (
+    FORKLIFT_HALF_M,
+    FORKLIFTS,
+    PARKED_M,
+    PEOPLE,
+    PERSON_RADIUS_M,
+)
 
 AGENTS = PEOPLE + FORKLIFTS  # the people first
 WAY_POINTS = 24
@@ -27,6 +34,8 @@ RETREAT_M = 2.0  # how far off the robot a retreat ends
 DRIVEN_AT_MPS = 0.15  # closing speed from which on a robot counts as driving at someone
 WAIT_S = 2.0
 HIDDEN, WAITING, WALKING, RETREATING = 0, 1, 2, 3
+_TRUCK_HALF_M = FORKLIFT_HALF_M[:2]
+_CORNERS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
 
 
 @dataclass(frozen=True)
@@ -134,12 +143,20 @@ class Traffic(Stateful):
     """The agents of N environments: positions over time. All arrays are (N, AGENTS, ...)."""
 
     # What changes on the way; ways and triggers are those of the episodes.
-    STATE = ("state", "travelled_m", "waited_s", "position_m", "heading_rad", "attentive")
+    STATE = (
+        *("state", "travelled_m", "waited_s", "position_m", "heading_rad", "attentive"),
+        "closest_m",
+    )
 
     def __init__(self, num_envs: int, body_half_m: tuple[float, float]) -> None:
         shape = (num_envs, AGENTS)
         self.body_half_m = np.array(body_half_m)
         self.radius_m = np.array([PERSON_RADIUS_M] * PEOPLE + [FORKLIFT_RADIUS_M] * FORKLIFTS)
+        circle_m = [PERSON_RADIUS_M] * PEOPLE + [float(np.hypot(*_TRUCK_HALF_M))] * FORKLIFTS
+        self._reach_m = np.array(circle_m) + np.hypot(*body_half_m)  # of two middles that may touch
+        # In the episode so far, from the robot's outline: infinite where nobody is about, NaN where
+        # it is not measured, which takes time.
+        self.closest_m = np.full(num_envs, np.nan)
         self.way_m = np.zeros((*shape, WAY_POINTS, 2))
         self.length_m = np.ones(shape)
         self.speed_mps = np.zeros(shape)
@@ -156,6 +173,7 @@ class Traffic(Stateful):
         """Lay out the ways of one environment's agents."""
         self.active[env] = any(walk is not None for walk in walks)
         self.state[env] = HIDDEN
+        self.closest_m[env] = np.nan
         self.travelled_m[env] = self.waited_s[env] = self.heading_rad[env] = 0.0
         self.position_m[env] = PARKED_M[0]
         for agent, walk in enumerate(walks):
@@ -232,16 +250,59 @@ class Traffic(Stateful):
         ) / distance
         return np.asarray(closing > DRIVEN_AT_MPS, np.bool_)
 
+    def note_closest(self, place_m: F64, yaw_of: Callable[[Ints], F64]) -> None:
+        """Note how near anyone is to the robots' outlines now, (N, 2) their middles.
+
+        `yaw_of` is asked where somebody may be nearer than ever in the episode.
+        """
+        ids = np.flatnonzero(self.active & ~np.isnan(self.closest_m))
+        if not len(ids):
+            return
+        delta = self.position_m[ids] - place_m[ids, None]
+        at_least = (np.hypot(delta[..., 0], delta[..., 1]) - self._reach_m).min(axis=1)
+        nearer = at_least < self.closest_m[ids]
+        if nearer.any():
+            ids = ids[nearer]
+            gap = self._outline_gap(ids, delta[nearer], yaw_of(ids)[:, None])
+            self.closest_m[ids] = np.minimum(self.closest_m[ids], gap)
+
+    def _outline_gap(self, ids: Ints, delta: F64, yaw: F64) -> F64:
+        """From the robots' outlines to the nearest person, a circle, or forklift, a box, (n,).
+
+        Args:
+            delta: from the robots' middles to theirs, (n, AGENTS, 2); yaw: the robots', (n, 1).
+        """
+        gap = np.empty(delta.shape[:2])
+        outside = _outside_m(_turned(delta[:, :PEOPLE], -yaw), self.body_half_m)
+        gap[:, :PEOPLE] = outside - PERSON_RADIUS_M
+        # Two rectangles apart are nearest at a corner of one of them.
+        turn, truck = (self.heading_rad[ids, PEOPLE:] - yaw)[..., None], np.array(_TRUCK_HALF_M)
+        away = _turned(delta[:, PEOPLE:], -yaw)[:, :, None]
+        corners = away + _turned(_CORNERS * truck, turn)
+        back = _turned(_CORNERS * self.body_half_m - away, -turn)
+        gap[:, PEOPLE:] = np.minimum(
+            _outside_m(corners, self.body_half_m).min(axis=-1), _outside_m(back, truck).min(axis=-1)
+        )
+        gap[self.state[ids] == HIDDEN] = np.inf
+        return np.asarray(np.maximum(gap.min(axis=1), 0.0), np.float64)
+
     def _gap(self, ids: Ints, pose: F64) -> tuple[F64, Bools]:
         """From each agent's circle to the robot's outline, and whether it walks toward it."""
         delta = self.position_m[ids] - pose[:, None, :2]
-        cos, sin = np.cos(pose[:, 2])[:, None], np.sin(pose[:, 2])[:, None]
-        local = np.stack(
-            [cos * delta[..., 0] + sin * delta[..., 1], -sin * delta[..., 0] + cos * delta[..., 1]],
-            axis=-1,
-        )
-        outside = np.maximum(np.abs(local) - self.body_half_m, 0.0)
-        gap = np.hypot(outside[..., 0], outside[..., 1]) - self.radius_m
+        gap = _outside_m(_turned(delta, -pose[:, None, 2]), self.body_half_m) - self.radius_m
         heading = self.heading_rad[ids]
         toward = -(np.cos(heading) * delta[..., 0] + np.sin(heading) * delta[..., 1]) > 0
         return gap, toward
+
+
+def _turned(vectors: F64, angle_rad: F64) -> F64:
+    """Vectors (..., 2) turned to the left by angles that broadcast against (...)."""
+    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+
+
+def _outside_m(points: F64, half_m: F64) -> F64:
+    """From a rectangle around 0 to points (..., 2); 0 inside."""
+    outside = np.maximum(np.abs(points) - half_m, 0.0)
+    return np.asarray(np.hypot(outside[..., 0], outside[..., 1]), np.float64)

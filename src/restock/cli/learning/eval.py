@@ -14,8 +14,9 @@ class EvalCommand:
     """Drive a run's kept policy through fixed episodes, beside the scripted and a random policy.
 
     Every policy drives the same seeded episodes of every condition that its floors have room for,
-    clean and under each perturbation. Prints success with 95 % Wilson intervals, contacts, time and
-    return, with partly and wholly blocked aisles apart, and adds to RUN/eval/episodes.parquet.
+    clean and under each perturbation. Prints success, return, bumps a kilometre, the closest
+    approach to people and the time lost against the planner, with 95 % intervals, with partly and
+    wholly blocked aisles apart, and adds to RUN/eval/episodes.parquet.
 
     With --baseline it is compared with another run or a saved baseline on the same episodes.
     With --on-logs nothing drives: off-policy evaluation on logged episodes that it did not
@@ -32,7 +33,8 @@ class EvalCommand:
     """Comma-separated: none, friction, latency, payload, wheels, sensors, or FILE.toml (as
     `restock twin fit` writes it)."""
     policies: str = "agent,planner,random"
-    """Comma-separated: agent (the run's best), planner, random, onnx:FILE, run:DIRECTORY."""
+    """Comma-separated: agent (the run's best), planner, operator, random, onnx:FILE,
+    run:DIRECTORY."""
     seed: int = 10_000
     """Seed of the first episode; the same seeds for every policy."""
     baseline: str | None = None
@@ -69,7 +71,7 @@ class EvalCommand:
         from restock.cli.output import print_json, progress, say
         from restock.errors import ConfigError, ExitCode
         from restock.train.evaluation.eval_run import drive_evaluation, plan_evaluation, settings
-        from restock.train.evaluation.evaluate import summary_rows
+        from restock.train.evaluation.measures import summary_rows
         from restock.train.evaluation.regression import of_baseline, of_run, regressed, regression
         from restock.train.evaluation.regression import save_baseline as save
 
@@ -113,25 +115,11 @@ class EvalCommand:
         return int(ExitCode.FAILED if failed else ExitCode.OK)
 
     def _show(self, document: dict[str, Any]) -> None:
-        from restock.cli.learning.eval_tables import show_regression
-        from restock.cli.output import print_table, say
+        from restock.cli.learning.eval_tables import show_measures, show_regression
+        from restock.cli.output import say
 
         if (rows := document.get("results")) is not None:
-            shown = [
-                {
-                    **{
-                        name: row[name]
-                        for name in ("perturbation", "condition", "policy", "episodes")
-                    },
-                    "success": "no goal"
-                    if row["success"] is None
-                    else f"{row['success']:.2f} [{row['success_low']:.2f}, "
-                    f"{row['success_high']:.2f}]",
-                    **{name: row[name] for name in ("bumps_per_episode", "time_s", "return")},
-                }
-                for row in _by_cell(rows)
-            ]
-            print_table(shown, title="success [95 % Wilson interval]; time of the successful ones")
+            show_measures(rows)
             say(f"added to {self.run_path / 'eval' / 'episodes.parquet'}")
         if "regression" in document:
             show_regression(document["regression"], document["baseline"], self.margin)
@@ -159,10 +147,3 @@ class EvalCommand:
 
 def _names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
-
-
-def _by_cell(rows: list[dict[str, object]]) -> list[dict[str, object]]:
-    """Policies next to each other within a perturbation and condition."""
-    cells = list(dict.fromkeys((row["perturbation"], row["condition"]) for row in rows))
-    place = {cell: index for index, cell in enumerate(cells)}
-    return sorted(rows, key=lambda row: place[row["perturbation"], row["condition"]])

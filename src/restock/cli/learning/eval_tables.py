@@ -1,4 +1,4 @@
-"""What `restock eval` prints for `--on-logs` and for `--baseline`."""
+"""What `restock eval` prints: of what was driven, for `--on-logs` and for `--baseline`."""
 
 from __future__ import annotations
 
@@ -7,6 +7,49 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from restock.train.evaluation.ope import OpeConfig, OpeResult
+
+
+def show_measures(rows: list[dict[str, Any]]) -> None:
+    """A table a perturbation: success, return and safety side by side, policies beneath each
+    other within a condition."""
+    from restock.cli.output import print_table, say
+
+    for perturbation in dict.fromkeys(row["perturbation"] for row in rows):
+        own = [row for row in rows if row["perturbation"] == perturbation]
+        cells = list(dict.fromkeys(row["condition"] for row in own))
+        own.sort(key=lambda row: cells.index(row["condition"]))
+        print_table(
+            [_measures_row(row) for row in own],
+            title=f"perturbation {perturbation} [95 % over episodes]; time of the successful ones",
+        )
+    if not any(row["policy"] == "planner" for row in rows) and not any(
+        row["time_lost_episodes"] for row in rows
+    ):
+        say("time lost is not known: name the planner in --policies once")
+
+
+def _measures_row(row: dict[str, Any]) -> dict[str, Any]:
+    nearest = row["closest_person_least_m"]
+    return {
+        "condition": row["condition"],
+        "policy": row["policy"],
+        "episodes": row["episodes"],
+        "success": "no goal" if row["success"] is None else _with_interval(row, "success", ".2f"),
+        "discounted return": _with_interval(row, "discounted_return", ".2f"),
+        "bumps a km": _with_interval(row, "bumps_per_km", ".1f"),
+        "people, least (mean) m": ""
+        if nearest is None
+        else f"{nearest:.2f} ({row['closest_person_m']:.2f})",
+        "time s": "" if row["time_s"] is None else f"{row['time_s']:.1f}",
+        "lost s": _with_interval(row, "time_lost_s", "+.1f"),
+    }
+
+
+def _with_interval(row: dict[str, Any], name: str, form: str) -> str:
+    value, low, high = (row[name + end] for end in ("", "_low", "_high"))
+    if value is None:
+        return ""
+    return format(value, form) + (f" [{low:{form}}, {high:{form}}]" if low is not None else "")
 
 
 def show_off_policy(path: Path, result: OpeResult, config: OpeConfig, *, as_json: bool) -> None:
@@ -98,4 +141,4 @@ def _regression_row(row: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-__all__ = ["show_off_policy", "show_regression"]
+__all__ = ["show_measures", "show_off_policy", "show_regression"]

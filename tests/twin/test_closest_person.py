@@ -1,0 +1,91 @@
+"""How near the robot comes to people and forklifts: true, and measured where it is asked for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.physics.episode import EpisodeSpec
+from restock.train.twin.physics.model import (
+    FORKLIFT_HALF_M,
+    PARKED_M,
+    PEOPLE,
+    PERSON_RADIUS_M,
+)
+from restock.train.twin.physics.traffic import HIDDEN, WALKING, Traffic
+
+ROBOT_HALF_M = (0.35, 0.25)
+places = st.floats(-4.0, 4.0)
+angles = st.floats(-3.1, 3.1)
+
+
+def outline(x: float, y: float, yaw: float, half: tuple[float, float]) -> np.ndarray:
+    """Points all along a rectangle's edge."""
+    along = np.linspace(-1, 1, 201)
+    edge = np.full_like(along, 1.0)
+    local = np.concatenate(
+        [np.stack(side, -1) for side in ((along, edge), (along, -edge), (edge, along))]
+        + [np.stack((-edge, along), -1)]
+    ) * np.array(half)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    turned: np.ndarray = local @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
+    return turned
+
+
+def closest(
+    robot: tuple[float, float, float], agents: dict[int, tuple[float, float, float]]
+) -> Traffic:
+    traffic = Traffic(1, ROBOT_HALF_M)
+    traffic.active[0] = True
+    traffic.closest_m[0] = np.inf
+    traffic.position_m[0] = PARKED_M[0]
+    for agent, (x, y, heading) in agents.items():
+        traffic.state[0, agent] = WALKING
+        traffic.position_m[0, agent], traffic.heading_rad[0, agent] = (x, y), heading
+    pose = np.array([robot])
+    traffic.note_closest(pose[:, :2], lambda ids: pose[ids, 2])
+    return traffic
+
+
+@settings(max_examples=60, deadline=None)
+@given(places, places, angles, places, places, angles, st.booleans())
+def test_the_distance_is_that_of_the_outlines(
+    x: float, y: float, yaw: float, px: float, py: float, heading: float, truck: bool
+) -> None:
+    found = closest((x, y, yaw), {PEOPLE if truck else 0: (px, py, heading)}).closest_m[0]
+    mine = outline(x, y, yaw, ROBOT_HALF_M)
+    if truck:
+        theirs = outline(px, py, heading, FORKLIFT_HALF_M[:2])
+        true = np.hypot(*(mine[:, None] - theirs[None]).transpose(2, 0, 1)).min()
+    else:
+        true = np.hypot(*(mine - (px, py)).T).min() - PERSON_RADIUS_M
+    if true > 0.4:  # else one may stand in the other, which has no distance of outlines
+        assert found == pytest.approx(true, abs=2e-3)
+    assert found <= max(true, 0) + 2e-3
+
+
+def test_the_least_of_an_episode_is_kept_and_who_is_hidden_does_not_count() -> None:
+    traffic = closest((0.0, 0.0, 0.0), {0: (1.6, 0.0, 0.0), 1: (0.0, 2.5, 0.0)})
+    assert traffic.closest_m[0] == pytest.approx(1.6 - 0.35 - PERSON_RADIUS_M)
+    traffic.position_m[0, 0] = (9.0, 9.0)
+    traffic.note_closest(np.zeros((1, 2)), lambda ids: np.zeros(len(ids)))
+    assert traffic.closest_m[0] == pytest.approx(1.0)
+    traffic.state[0] = HIDDEN
+    traffic.closest_m[0] = np.inf
+    traffic.note_closest(np.zeros((1, 2)), lambda ids: np.zeros(len(ids)))
+    assert np.isinf(traffic.closest_m[0])
+
+
+def test_it_is_measured_in_episodes_that_were_asked_for() -> None:
+    env = WarehouseVectorEnv(2, conditions={"near_collision": 1.0})
+    env.set_episodes([EpisodeSpec("near_collision", 3), EpisodeSpec("nominal", 3)])
+    env.reset(seed=0)
+    near, nobody = env.step(np.array([2, 2]))[4]["closest_person_m"]
+    assert 0 < near < 20
+    assert np.isinf(nobody)
+    env = WarehouseVectorEnv(1, conditions={"near_collision": 1.0})
+    env.reset(seed=0)
+    assert np.isnan(env.step(np.array([2]))[4]["closest_person_m"]).all()
