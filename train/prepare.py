@@ -12,7 +12,6 @@ import msgspec
 from restock.arrays import F32, Ints
 from restock.errors import PanelError, RunError
 from restock.ingest.profile.profile import Profile, load_profile
-from restock.replay.fleet.missions_file import MissionOrder, read_missions
 from restock.replay.panel.logged_sampler import controller_for
 from restock.replay.panel.panel import Panel
 from restock.replay.sampling.share_controller import PlannedDraws
@@ -24,11 +23,11 @@ from restock.train.dqn.manual_backprop import update_path
 from restock.train.dqn.target import describe
 from restock.train.feed.collector import conditions_in_twin
 from restock.train.feed.imitation import refuse_nothing_to_learn
-from restock.train.feed.logs import Coded, Logs
-from restock.train.feed.practice import Practice, logged_shares
+from restock.train.feed.logs import Logs
 from restock.train.feed.teacher import Teacher, open_teacher
 from restock.train.finite import STOPPED
 from restock.train.loop import Notify, TrainResult
+from restock.train.missions import check_missions, mission_orders, reference_success
 from restock.train.ring_capacity import resolve_ring_capacity
 from restock.train.run.checkpoint import check_earlier, go_back
 from restock.train.run.run import Run, check_free, now_ns, panel_document, software_versions
@@ -41,15 +40,11 @@ from restock.train.run.run_profile import (
 from restock.train.session import Session, open_session
 from restock.train.twin.env.floor_report import refuse_unfit, sealed
 from restock.train.twin.env.interface import AFTER_LOGS, Twin
-from restock.train.twin.env.mission_arms import MissionArms
-from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.floors.floors import layouts_of_split, open_floors
-from restock.train.twin.floors.planner import planners
 from restock.train.twin.physics.episode import KINDS
-from restock.train.twin.physics.perturbation import PERTURBATIONS, Schedule, find_perturbation
+from restock.train.twin.physics.perturbation import PERTURBATIONS, find_perturbation
 
 _EVALUATION_ENVS = 16
-MISSIONS = "env.missions"
 
 
 @dataclass
@@ -95,7 +90,15 @@ class Prepared:
             logs=_logs(self.panel, self.config, self.document) if self.panel is not None else None,
             teacher=teacher,
             resume=self.resumed is not None,
+            reference=self._reference() if self.resumed is None else None,
         )
+
+    def _reference(self) -> dict[str, float] | None:
+        """The success of whom practice by regret is against; None of another rule."""
+        if self.config.practice.rule != "regret":
+            return None
+        env = make_twin(self.config, self.profile, _EVALUATION_ENVS, nthread=0)
+        return reference_success(self.config, env, self.profile.task)
 
     def describe(self) -> str:
         """What is about to happen, for people."""
@@ -302,46 +305,6 @@ def make_twin(
         missions_share=config.env.missions_share,
     )
     return twin
-
-
-def mission_orders(config: TrainConfig) -> tuple[MissionOrder, ...]:
-    """The missions that a share of the episodes follows; none where the config names none.
-
-    Raises:
-        ConfigError: their file cannot be read, or says something else.
-    """
-    missions = config.env.missions
-    return read_missions(missions).missions if isinstance(missions, str) else missions or ()
-
-
-def check_missions(config: TrainConfig, profile: Profile, panel: Panel | None) -> None:
-    """What the twin is to drive: refused now, before anything is written.
-
-    Raises:
-        ConfigError: an order, arm, share or floor of practice that the floors cannot hold.
-    """
-    ordered, practice = mission_orders(config), config.practice
-    if not ordered and practice == type(practice)():
-        return
-    floors = open_floors(config.env.layouts)
-    routes = planners(floors)
-    orders = MissionOrders(ordered, floors, routes, where=MISSIONS) if ordered else None
-    perturbation = find_perturbation(config.env.perturbation, where="env.perturbation")
-    arms = MissionArms(
-        floors,
-        routes,
-        config.env.conditions,
-        by=practice.by,
-        schedule=perturbation if isinstance(perturbation, Schedule) else None,
-        orders=orders,
-        orders_share=config.env.missions_share,
-    ).arms
-    logged = None
-    if panel is not None:
-        meta = panel.meta
-        met, episode = Coded.of(meta["condition"]), Coded.of(meta["episode_id"])
-        logged = logged_shares(met, episode, list(config.env.conditions))
-    Practice(practice, arms, goal=profile.task.goal != "none", logged=logged)
 
 
 def _evaluation_layouts(config: TrainConfig) -> str:

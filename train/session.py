@@ -210,8 +210,12 @@ def open_session(
     logs: Logs | None,
     teacher: AskedTeacher | None = None,
     resume: bool = False,
+    reference: Mapping[str, float] | None = None,
 ) -> Session:
-    """Put the parts of a run together, new or as its latest checkpoint left them."""
+    """Put the parts of a run together, new or as its latest checkpoint left them.
+
+    `reference` is the success by arm of whom practice by regret is against.
+    """
     torch.set_num_threads(config.threads)
     seed = config.seed
     learner = Learner(config, task.observation_size, len(task.actions))
@@ -273,7 +277,12 @@ def open_session(
             resume=resume,
         ),
         practice=Practice.of(
-            config.practice, env, config.env.conditions, logs, goal=task.goal != "none"
+            config.practice,
+            env,
+            config.env.conditions,
+            logs,
+            goal=task.goal != "none",
+            reference=reference,
         ),
         imitation=Imitation(
             config.teacher,
@@ -291,6 +300,7 @@ def open_session(
         session.restore()
     else:
         session.collector.reset(seed)
+    session.practice.check_reference()
     session.events = Events(
         run.path / "tensorboard",
         enabled=config.record.tensorboard,

@@ -170,7 +170,7 @@ class EnvConfig(Checked, frozen=True):
 class PracticeConfig(Checked, frozen=True):
     """Which missions the twin gives next: see `restock.train.feed.practice`."""
 
-    rule: Literal["natural", "even", "shares", "logs", "missions", "success"] = "natural"
+    rule: Literal["natural", "even", "shares", "logs", "missions", "success", "regret"] = "natural"
     # What tells missions of one kind apart: "block", "layout", fields of a schedule's ranges.
     by: tuple[str, ...] = ("block",)
     shares: dict[str, NonNegative] = msgspec.field(default_factory=dict)  # of kinds or arms
@@ -180,6 +180,8 @@ class PracticeConfig(Checked, frozen=True):
     warmup_episodes: NonNegativeInt = 5  # of an arm, before its rate is believed
     half_life_episodes: Positive = 20.0  # of an arm: an older episode counts half
     max_change: Annotated[float, Meta(gt=0, le=1)] = 0.1  # of a share, in an interval
+    reference: Literal["operator", "planner"] = "operator"  # against whom regret is
+    reference_missions: Count = 20  # of each arm, that it drives before training
 
     def check(self) -> None:
         if self.rule == "shares" and sum(self.shares.values()) <= 0:

@@ -6,7 +6,9 @@ An arm is a kind of missions (`restock.train.twin.env.mission_arms`). The rules:
 - even: every arm alike; shares: as given; logs: the kinds as often as the logs' episodes met them;
   missions: the ordered missions alone, each at its part;
 - success: an arm's weight is its rate of failures, while the agent explores. The failures and
-  successes of an arm fade by a half-life; an arm with too few episodes counts as if all failed.
+  successes of an arm fade by a half-life; an arm with too few episodes counts as if all failed;
+- regret: what the agent's rate of success lacks to that of a reference driver on the same arm
+  (prioritised level replay, arXiv:2010.03934, by arm). What nobody can do is not practised.
 
 Weights become shares that sum to 1, none below its floor, and a share moves at most so far in an
 interval. Nothing is drawn here: the twin draws its missions from its own seed.
@@ -31,7 +33,7 @@ from restock.train.feed.logs import Coded, Logs
 from restock.train.twin.env.interface import ArmedTwin, KindsTwin, Twin
 from restock.train.twin.env.mission_arms import MissionArm
 
-MOVING = ("success",)  # rules whose shares follow what happens
+MOVING = ("success", "regret")  # rules whose shares follow what happens
 FLOOR = 0.05  # of an arm under those, unless the config says otherwise
 WHERE = "practice"
 
@@ -46,7 +48,7 @@ class Practice(Stateful):
     SAME: ClassVar[tuple[str, ...]] = ("names",)
     STATE: ClassVar[tuple[str, ...]] = (
         *("shares", "_episodes", "_failures", "_seen"),
-        *("_interval_episodes", "_interval_successes", "_closed_at"),
+        *("_interval_episodes", "_interval_successes", "_closed_at", "reference"),
     )
 
     def __init__(
@@ -57,8 +59,12 @@ class Practice(Stateful):
         *,
         goal: bool = True,
         logged: Mapping[str, float] | None = None,
+        reference: Mapping[str, float] | None = None,
     ) -> None:
-        """`logged` are the kinds' shares of the logs' episodes; `goal`: success is defined."""
+        """`logged` are the kinds' shares of the logs' episodes; `goal`: success is defined.
+
+        `reference` is the success by arm of whom regret is against.
+        """
         self.config, self._set = config, set_shares
         # Where nothing is chosen, ordered missions count as what they are.
         self.arms = unordered(arms) if config.rule == "natural" else list(arms)
@@ -77,6 +83,9 @@ class Practice(Stateful):
         self._interval_episodes: Ints = np.zeros(count, np.int64)
         self._interval_successes: Ints = np.zeros(count, np.int64)
         self._closed_at = 0  # environment steps
+        self.reference: F64 = np.full(count, np.nan)
+        if reference is not None:
+            self.reference = np.array([reference[name] for name in self.names])
         self._fixed = self._fixed_weights(logged)
         self.shares: F64 = (
             self.natural if config.rule == "natural" else with_floors(self.weights, self.floors)
@@ -92,8 +101,9 @@ class Practice(Stateful):
         logs: Logs | None,
         *,
         goal: bool,
+        reference: Mapping[str, float] | None = None,
     ) -> Practice:
-        """For a twin, of `conditions` (`env.conditions`).
+        """For a twin, of `conditions` (`env.conditions`); a restored one has its `reference`.
 
         Raises:
             ConfigError: the twin cannot be given shares, or as the class.
@@ -108,10 +118,11 @@ class Practice(Stateful):
             logged = logged_shares(logs.condition, logs.episode, [arm.kind for arm in kinds])
         if isinstance(env, ArmedTwin):
             arms = list(env.mission_arms(config.by))
-            return cls(config, arms, env.set_mission_shares, goal=goal, logged=logged)
+            tell = env.set_mission_shares
+            return cls(config, arms, tell, goal=goal, logged=logged, reference=reference)
         if isinstance(env, KindsTwin):
             tell = partial(_set_kinds, env, [arm.kind for arm in kinds])
-            return cls(config, kinds, tell, goal=goal, logged=logged)
+            return cls(config, kinds, tell, goal=goal, logged=logged, reference=reference)
         if config.rule != "natural":
             raise ConfigError(
                 f'the rule "{config.rule}" chooses missions, and {type(env).__name__} cannot be'
@@ -161,7 +172,11 @@ class Practice(Stateful):
         """(K,) what the rule goes by, before floors: above 0 somewhere."""
         if self._fixed is not None:
             return self._fixed
-        return np.where(self.believed, self.failure_rate, 1.0)
+        success = np.where(self.believed, 1 - self.failure_rate, 0.0)
+        if self.config.rule == "success":
+            return 1 - success
+        regret = np.maximum(self.reference - success, 0.0)
+        return regret if regret.any() else np.ones(len(self.arms))
 
     @property
     def believed(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
@@ -173,6 +188,15 @@ class Practice(Stateful):
         """(K,) of an arm's fading episodes, with half a failure more in one more (Jeffreys)."""
         rate: F64 = (self._failures + 0.5) / (self._episodes + 1)
         return rate
+
+    def check_reference(self) -> None:
+        """Raises ConfigError where regret is against nobody."""
+        if self.config.rule == "regret" and np.isnan(self.reference).any():
+            raise ConfigError(
+                'the rule "regret" needs the success of a reference driver on each arm',
+                where=f"{WHERE}.rule",
+                remedy='train with Restock\'s own twin, which measures it, or use "success"',
+            )
 
     def restored(self) -> None:
         """The twin draws by the shares of then; another rule than then goes by its own."""
@@ -210,6 +234,9 @@ class Practice(Stateful):
                 if self._interval_episodes[place]
                 else None,
                 "success_rate": 1 - float(rate[place]) if self.believed[place] else None,
+                "reference": None
+                if np.isnan(self.reference[place])
+                else float(self.reference[place]),
                 "weight": float(weights[place]),
                 "total_episodes": int(self._seen[place]),
             }

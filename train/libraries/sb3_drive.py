@@ -28,7 +28,7 @@ from restock.train.libraries.fresh_meta import InfoLabels
 from restock.train.libraries.library_arm import Evaluations, as_network
 from restock.train.libraries.library_run import PartialTables, episode_row
 from restock.train.libraries.sb3_buffer import MixtureReplayBuffer, dqn_critic
-from restock.train.prepare import mission_orders
+from restock.train.missions import mission_orders
 from restock.train.run.run import Run
 from restock.train.twin.physics.perturbation import find_perturbation
 

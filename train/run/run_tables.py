@@ -234,7 +234,7 @@ TABLES: dict[str, pa.Schema] = {
     "practice": _schema(
         "an interval of practice x arm: the missions that the twin was to give, and gave",
         *_STEPS,
-        ("rule", _S, "natural | even | shares | logs | missions | success"),
+        ("rule", _S, "natural | even | shares | logs | missions | success | regret"),
         ("arm", _S, "the kind of missions, with its block, floor or part of a range"),
         ("condition", _S, "the arm's kind of episode"),
         ("natural_share", _F, "of the missions, as `env` says"),
@@ -243,6 +243,7 @@ TABLES: dict[str, pa.Schema] = {
         ("episodes", _I, "that ended in it, while exploring"),
         ("success", _F, "of those; null where none ended"),
         ("success_rate", _F, "over its fading episodes; null: too few to be believed"),
+        ("reference", _F, "success of whom regret is against; null under other rules"),
         ("weight", _F, "what the rule goes by, before floors and the limit of change"),
         ("total_episodes", _I, "of the arm since the run began"),
     ),

@@ -8,13 +8,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
-import msgspec
 import numpy as np
 
 from restock.arrays import F64
 from restock.errors import ConfigError
 from restock.state import Stateful
-from restock.train.twin.env.mission_arms import MissionArms, floor_place
+from restock.train.twin.env.mission_arms import MissionArms, floor_place, perturbed
 from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.planner import Planner
@@ -117,18 +116,14 @@ class EpisodeQueue(Stateful):
         draw = np.random.SeedSequence([self.seed, env, int(self.drawn[env])]).generate_state(5)
         self.drawn[env] += 1
         seed = int(draw[1]) << 20 ^ int(draw[2])
-        schedule, arm = self.schedule, -1
         if self._arms is not None:
             arm = _drawn(self._arm_shares, draw[0])
-            spec, schedule = self._arms.spec(arm, seed), self._arms.schedule(arm)
-        elif self._orders is not None and draw[3] / 2**32 < self._orders_share:
+            return self._arms.spec(arm, seed), -1, arm
+        if self._orders is not None and draw[3] / 2**32 < self._orders_share:
             spec = self._orders.spec(_drawn(np.cumsum(self._orders.shares), draw[4]), seed)
         else:
             spec = EpisodeSpec(KINDS[_drawn(self._cumulative, draw[0])], seed)
-        if schedule is not None:
-            rng = np.random.default_rng([spec.seed, 1])
-            spec = msgspec.structs.replace(spec, perturbation=schedule.draw(rng))
-        return spec, -1, arm
+        return perturbed(spec, self.schedule), -1, -1
 
     def floor_of(self, spec: EpisodeSpec) -> int:
         """Which floor an episode is on. Raises ConfigError where there is none of its name."""

@@ -111,19 +111,19 @@ class MissionArms:
         self.arms: list[MissionArm] = arms
 
     def spec(self, number: int, seed: int) -> EpisodeSpec:
-        """A mission of an arm: the same for the same seed. Without its perturbation.
+        """A mission of an arm, with its perturbation: the same for the same seed.
 
         Raises:
             ConfigError: none of many seeds had the arm's block.
         """
         arm = self.arms[number]
         if arm.order >= 0 and self._orders is not None:
-            return self._orders.spec(arm.order, seed)
+            return perturbed(self._orders.spec(arm.order, seed), self._schedule)
         layout, rng = arm.layout or None, np.random.default_rng([seed, 3])
         for _ in range(TRIES):
             spec = EpisodeSpec(arm.kind, seed, layout=layout)
             if not arm.block or self._block(spec) == arm.block:
-                return spec
+                return perturbed(spec, self._narrowed(arm))
             seed = int(rng.integers(1 << 31))
         raise ConfigError(
             f"none of {TRIES} seeds gave a mission of {arm.name}",
@@ -131,9 +131,9 @@ class MissionArms:
             remedy="its floor hardly has room for it: leave `block` out of practice.by",
         )
 
-    def schedule(self, number: int) -> Schedule | None:
+    def _narrowed(self, arm: MissionArm) -> Schedule | None:
         """What draws an arm's perturbations: the schedule, in the arm's part of its ranges."""
-        ranges = {name: (low, high) for name, low, high in self.arms[number].ranges}
+        ranges = {name: (low, high) for name, low, high in arm.ranges}
         if self._schedule is None or not ranges:
             return self._schedule
         return msgspec.structs.replace(self._schedule, ranges=self._schedule.ranges | ranges)
@@ -189,6 +189,14 @@ def _by_range(arm: MissionArm, field: str, ends: tuple[float, float]) -> list[Mi
     ]
 
 
+def perturbed(spec: EpisodeSpec, schedule: Schedule | None) -> EpisodeSpec:
+    """An episode with what a schedule draws by its seed; as it is without a schedule."""
+    if schedule is None:
+        return spec
+    rng = np.random.default_rng([spec.seed, 1])
+    return msgspec.structs.replace(spec, perturbation=schedule.draw(rng))
+
+
 def floor_place(spec: EpisodeSpec, places: Mapping[str, int]) -> int:
     """Which floor an episode is on, among those named: by name, or by its seed.
 
@@ -209,4 +217,4 @@ def floor_place(spec: EpisodeSpec, places: Mapping[str, int]) -> int:
     return places[spec.layout]
 
 
-__all__ = ["MissionArm", "MissionArms", "floor_place"]
+__all__ = ["MissionArm", "MissionArms", "floor_place", "perturbed"]

@@ -1,0 +1,99 @@
+"""What a run is to drive: its orders and arms, checked, and how a reference driver does on them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from restock.ingest.profile.profile import Profile
+from restock.ingest.task.task import Task
+from restock.replay.fleet.missions_file import MissionOrder, read_missions
+from restock.replay.panel.panel import Panel
+from restock.train.dqn.config import PracticeConfig, TrainConfig
+from restock.train.evaluation.evaluate import run_episodes
+from restock.train.feed.logs import Coded
+from restock.train.feed.practice import Practice, logged_shares
+from restock.train.twin.env.interface import Policy, Twin
+from restock.train.twin.env.mission_arms import MissionArms
+from restock.train.twin.env.mission_orders import MissionOrders
+from restock.train.twin.floors.floors import open_floors
+from restock.train.twin.floors.planner import planners
+from restock.train.twin.physics.perturbation import Schedule, find_perturbation
+
+MISSIONS = "env.missions"
+REFERENCE_SEED = 70_000  # of the first mission that a reference drives of each arm
+
+
+def mission_orders(config: TrainConfig) -> tuple[MissionOrder, ...]:
+    """The missions that a share of the episodes follows; none where the config names none.
+
+    Raises:
+        ConfigError: their file cannot be read, or says something else.
+    """
+    missions = config.env.missions
+    return read_missions(missions).missions if isinstance(missions, str) else missions or ()
+
+
+def mission_arms(config: TrainConfig) -> MissionArms:
+    """The arms that a run's missions are of.
+
+    Raises:
+        ConfigError: an order that the floors cannot hold, or `practice.by` that says nothing.
+    """
+    floors, ordered = open_floors(config.env.layouts), mission_orders(config)
+    routes = planners(floors)
+    perturbation = find_perturbation(config.env.perturbation, where="env.perturbation")
+    return MissionArms(
+        floors,
+        routes,
+        config.env.conditions,
+        by=config.practice.by,
+        schedule=perturbation if isinstance(perturbation, Schedule) else None,
+        orders=MissionOrders(ordered, floors, routes, where=MISSIONS) if ordered else None,
+        orders_share=config.env.missions_share,
+    )
+
+
+def check_missions(config: TrainConfig, profile: Profile, panel: Panel | None) -> None:
+    """What the twin is to drive is refused now, before anything is written, if it cannot be.
+
+    Raises:
+        ConfigError: an order, arm, share or floor of practice that the floors cannot hold.
+    """
+    if not mission_orders(config) and config.practice == PracticeConfig():
+        return
+    logged = None
+    if panel is not None:
+        meta = panel.meta
+        met, episode = Coded.of(meta["condition"]), Coded.of(meta["episode_id"])
+        logged = logged_shares(met, episode, list(config.env.conditions))
+    arms, goal = mission_arms(config).arms, profile.task.goal != "none"
+    Practice(config.practice, arms, goal=goal, logged=logged)
+
+
+def reference_success(config: TrainConfig, env: Twin, task: Task) -> dict[str, float]:
+    """Success by arm of `practice.reference`, on a pool of missions that every run has the same."""
+    arms, missions = mission_arms(config), config.practice.reference_missions
+    specs = [
+        arms.spec(number, REFERENCE_SEED + mission)
+        for number in range(len(arms.arms))
+        for mission in range(missions)
+    ]
+    results = run_episodes(
+        env,
+        _driver(config.practice.reference),
+        specs,
+        control_period_s=task.control_period_s,
+        time_limit_steps=task.time_limit_steps,
+    )
+    success = np.array([bool(result.success) for result in results]).reshape(-1, missions)
+    return {arm.name: float(of.mean()) for arm, of in zip(arms.arms, success, strict=True)}
+
+
+def _driver(name: str) -> Policy:
+    from restock.train.twin.env.operator_policy import Operator
+    from restock.train.twin.env.policies import PlannerFollower
+
+    return Operator(epsilon=0.0) if name == "operator" else PlannerFollower(epsilon=0.0)
+
+
+__all__ = ["check_missions", "mission_arms", "mission_orders", "reference_success"]
