@@ -17,12 +17,14 @@ from support.toy_twin import ToyTwin
 
 from restock.cli import main
 from restock.errors import ConfigError, RunError
+from restock.ingest.profile.profile import load_profile
 from restock.replay.fleet.missions_file import MissionOrder
 from restock.train.dqn.config import PracticeConfig, load_config
 from restock.train.feed.collector import EndedEpisode
 from restock.train.feed.practice import Practice, logged_shares, moved, unordered, with_floors
 from restock.train.loop import train
-from restock.train.prepare import prepare_new
+from restock.train.missions import reference_success
+from restock.train.prepare import make_twin, prepare_new
 from restock.train.twin.env.mission_arms import MissionArm
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.perturbation import Schedule
@@ -121,6 +123,22 @@ def test_success_practises_what_fails_once_it_is_believed() -> None:
     assert [row["episodes"] for row in rows] == [50, 50, 3, 0]
     assert sum(row["given_share"] for row in rows) == pytest.approx(1.0)
     assert rows[0]["wanted_share"] == 0.25  # what was in force, not what comes
+
+
+def test_regret_practises_what_the_reference_does_better() -> None:
+    reference = dict(zip((arm.name for arm in ARMS), (1.0, 0.9, 0.0, 0.6), strict=True))
+    settings = PracticeConfig(rule="regret", warmup_episodes=1, max_change=1.0, floor=0.05)
+    found = Practice(settings, ARMS, reference=reference)
+    found.note(ended("nominal", True, 99) + ended("wheel_slip", False, 99))
+    found.note(ended("blocked_aisle", False, 99, "partial"))  # as the reference: nobody can
+    found.note(ended("blocked_aisle", False, 99, "full"))
+    rows = found.advance(at(1000))
+    assert [row["reference"] for row in rows] == [1.0, 0.9, 0.0, 0.6]
+    nominal, slip, partial, full = found.shares
+    assert (nominal, partial) == pytest.approx((0.05, 0.05))
+    assert slip / full == pytest.approx((0.9 - 0.02) / (0.6 - 0.02), rel=0.03)
+    with pytest.raises(ConfigError, match="needs the success of a reference driver"):
+        practice(rule="regret").check_reference()
 
 
 def test_old_episodes_fade_by_their_half_life() -> None:
@@ -289,6 +307,21 @@ def test_an_order_is_an_arm_and_says_so() -> None:
     twin.set_mission_shares([0, 1])
     _, info = twin.reset(seed=1)
     assert (info["episode_condition"][0], info["mission_arm"][0]) == ("near_collision", 1)
+
+
+def test_a_reference_drives_the_same_pool_of_every_arm_whatever_the_seed() -> None:
+    given = [
+        "practice={rule='regret', reference='planner', reference_missions=3}",
+        "env.conditions={nominal=1, blocked_aisle=1}",
+    ]
+    profile = load_profile("warehouse_amr")
+    found = []
+    for seed in (0, 1):
+        settings = load_config(None, [*given, f"seed={seed}"])
+        found.append(reference_success(settings, make_twin(settings, profile, 9), profile.task))
+    assert found[0] == found[1]
+    assert list(found[0]) == ["nominal", "blocked_aisle (partial)", "blocked_aisle (full)"]
+    assert found[0]["nominal"] == 1.0  # the planner knows the dry, empty floor
 
 
 # -- the gate -------------------------------------------------------------------------------------
