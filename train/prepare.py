@@ -303,6 +303,7 @@ def make_twin(
         # Evaluation has its own floors and fixed episodes.
         missions=() if layouts is not None else mission_orders(config),
         missions_share=config.env.missions_share,
+        nav_command=profile.inputs.nav_command is not None,
     )
     return twin
 

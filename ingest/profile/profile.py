@@ -51,6 +51,7 @@ INPUT_FIELDS: dict[str, dict[str, bool]] = {
     "goal": {"x_m": True, "y_m": True},
     "plan": {"x_m": True, "y_m": True},
     "bumper": {"pressed": True},
+    "nav_command": {"speed_mps": True, "yaw_rate_radps": True},
     "behaviour_policy": {"text": True},
     "true_condition": {"text": True},
     "perturbation": {"text": True},
@@ -61,6 +62,7 @@ FALLBACKS: dict[str, str] = {
     "scan": "no lidar: every bearing counts as free up to range_max_m",
     "imu": "gyro yaw rate taken from the wheels, acceleration 0",
     "bumper": "never pressed",
+    "nav_command": "unknown: null, and 0 in the observation",
     "behaviour_policy": "the profile's behaviour_policy",
     "true_condition": "unknown: labels are not scored",
     "perturbation": "unknown: null, as of hardware",
@@ -92,6 +94,7 @@ class Inputs(Checked, frozen=True):
     goal: Input | None = None
     plan: Input | None = None
     bumper: Input | None = None
+    nav_command: Input | None = None  # what navigation proposes, before whoever drives decides
     behaviour_policy: Input | None = None
     true_condition: Input | None = None
     perturbation: Input | None = None
@@ -295,6 +298,15 @@ def _check(profile: Profile, where: str) -> None:
                 where=where,
                 remedy=f'name the topic of the {name}, or set task.goal = "none"',
             )
+    proposed = profile.inputs.nav_command
+    if proposed is not None and proposed.topic == profile.inputs.command.topic:
+        raise ConfigError(
+            f"`inputs.nav_command.topic` is the command's own, {proposed.topic}: an observation"
+            " would hold the action that is chosen after it",
+            where=where,
+            remedy="name the topic on which the navigation stack proposes, ahead of whoever"
+            " decides, or leave [inputs.nav_command] out",
+        )
     for name in profile.signals:
         if problem := name_problem(name):
             raise ConfigError(f"`signals.{name}`: {problem}", where=where)

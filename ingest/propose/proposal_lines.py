@@ -250,6 +250,15 @@ def _input_lines(
             if role == "command" and seen.commands.measured
             else []
         ),
+        *(
+            [
+                "# What the navigation stack proposes, by its name, beside the command that is"
+                f" driven ({seen.commands.topic}):",
+                "# part of the observation. Wrong where it comes after that command.",
+            ]
+            if role == "nav_command"
+            else []
+        ),
         f"[inputs.{role}]  # {rate:.1f} Hz" + (f"; or {others}?" if others else ""),
         f"topic = {json.dumps(topic.name)}",
         f'type = "{topic.type}"',

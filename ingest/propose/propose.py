@@ -122,6 +122,8 @@ def gather(
     roles = {role: topics_for(topics, kinds) for role, kinds in KINDS.items()}
     if not roles["command"] and odometry_as_command:
         roles["command"] = topics_for(topics, ODOMETRY_AS_COMMAND)
+    driven = {topic.name for topic, _ in roles["command"][:1]}
+    roles["nav_command"] = [fit for fit in roles["nav_command"] if fit[0].name not in driven]
     if not (roles["goal"] and roles["plan"]):
         roles["goal"] = roles["plan"] = []
     frames = transform_frames(recording)

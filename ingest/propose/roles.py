@@ -26,13 +26,28 @@ class Kind:
     words: tuple[str, ...] = ()  # in the topic's name, they speak for it
     must: bool = False  # … and without one of them it is not taken
     never: tuple[str, ...] = ()  # in the topic's name, they speak against it
+    rather: tuple[str, ...] = ()  # in the topic's name, they put it after all others
 
+
+# A name of what may drive but is only proposed: to a multiplexer, a smoother, a person's remote.
+_NAVIGATION = ("nav", "move_base", "planner", "autonom", "cmd_vel_raw", "raw_cmd_vel")
+_BY_HAND = ("teleop", "joy", "key", "web", "remote")
 
 # Best first.
 KINDS: dict[str, tuple[Kind, ...]] = {
     "command": (
-        Kind("geometry_msgs/msg/Twist", _TWIST, ("cmd_vel",)),
-        Kind("geometry_msgs/msg/TwistStamped", _under("twist", _TWIST), ("cmd_vel",)),
+        Kind(
+            "geometry_msgs/msg/Twist",
+            _TWIST,
+            ("cmd_vel",),
+            rather=(*_NAVIGATION, *_BY_HAND),
+        ),
+        Kind(
+            "geometry_msgs/msg/TwistStamped",
+            _under("twist", _TWIST),
+            ("cmd_vel",),
+            rather=(*_NAVIGATION, *_BY_HAND),
+        ),
     ),
     "pose": (
         Kind(
@@ -85,6 +100,16 @@ KINDS: dict[str, tuple[Kind, ...]] = {
         ),
     ),
     "bumper": (Kind("std_msgs/msg/Bool", {"pressed": "data"}, ("bump", "contact"), must=True),),
+    "nav_command": (
+        Kind("geometry_msgs/msg/Twist", _TWIST, _NAVIGATION, must=True, never=_BY_HAND),
+        Kind(
+            "geometry_msgs/msg/TwistStamped",
+            _under("twist", _TWIST),
+            _NAVIGATION,
+            must=True,
+            never=_BY_HAND,
+        ),
+    ),
     "behaviour_policy": (
         Kind("std_msgs/msg/String", {"text": "data"}, ("policy", "mode", "behavi"), must=True),
     ),
@@ -113,11 +138,13 @@ def topics_for(
     fitting = []
     for rank, kind in enumerate(kinds):
         for topic in topics.values():
-            named = [place for place, word in enumerate(kind.words) if word in topic.name.lower()]
-            against = any(word in topic.name.lower() for word in kind.never)
+            name = topic.name.lower()
+            named = [place for place, word in enumerate(kind.words) if word in name]
+            against = any(word in name for word in kind.never)
+            later = any(word in name for word in kind.rather)
             if topic.type == kind.type and not against and (named or not kind.must):
-                order = (rank, min(named, default=len(kind.words)), -topic.expected, topic.name)
-                fitting.append((order, topic, kind))
+                place = min(named, default=len(kind.words))
+                fitting.append(((later, rank, place, -topic.expected, topic.name), topic, kind))
     return [(topic, kind) for _, topic, kind in sorted(fitting, key=lambda item: item[0])]
 
 

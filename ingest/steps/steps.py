@@ -92,7 +92,7 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
         aligned.commands_between,
         custom,
         topic_clocks(topics, profile.clock.jump_s),
-        [*aligned.notes, *custom.notes, *perturbed.notes],
+        [*aligned.notes, *filling.notes, *custom.notes, *perturbed.notes],
     )
 
 
@@ -110,6 +110,7 @@ class Filling:
         self.break_reason = np.full(len(self.tick_ns), "", object)  # why one does not follow
         self.signals: Signals = {"stamp_ns": self.tick_ns}
         self.routing = Routing.none(len(self.tick_ns))
+        self.notes: list[str] = []
 
     def fill(self) -> Signals:
         """Every signal; what else is known of the ticks is in the attributes afterwards."""
@@ -125,6 +126,7 @@ class Filling:
             self.signals["accel_x_mps2"] = np.zeros(len(self.tick_ns))
         self._scan()
         self._bumper()
+        self._nav_command()
         if self.task.goal == "route":
             self._route()
         signals, routing = self.signals, self.routing
@@ -249,6 +251,31 @@ class Filling:
                 for segment, ticks in zip(self.aligned.segments, self.aligned.ticks, strict=True)
             ]
         self.signals["bumped"] = np.concatenate(bumped)
+
+    def _nav_command(self) -> None:
+        """What navigation proposes; a tick at which that is not known stays usable."""
+        count, name = len(self.tick_ns), "nav_command"
+        unknown = np.full(count, np.nan)
+        source = self.inputs.by_name.get(name)
+        if source is None or not len(self.inputs.topics[source.topic]):
+            self.signals |= {"nav_speed_mps": unknown, "nav_yaw_rate_radps": unknown.copy()}
+            return
+        latest = self.aligned.latest(name)
+        keys = ("speed_mps", "yaw_rate_radps")
+        values = np.stack([self.inputs.numbers(name, key)[latest.row] for key in keys])
+        sane = (np.abs(values) <= LARGEST).all(axis=0)  # False for NaN
+        known = latest.fresh & sane
+        for key, column in zip(keys, values, strict=True):
+            self.signals[f"nav_{key}"] = np.where(known, column, np.nan)
+        reasons = {
+            "not yet received": ~latest.known,
+            "stale": latest.known & ~latest.fresh,
+            "not finite": latest.fresh & ~sane,
+        }
+        counted = [f"{reason} {int(bad.sum()):,}" for reason, bad in reasons.items() if bad.any()]
+        if counted:
+            unknown_at = f"{int((~known).sum()):,} of {count:,} ticks"
+            self.notes.append(f"{name}: unknown at {unknown_at} ({', '.join(counted)})")
 
     def _route(self) -> None:
         latest = {name: self._required(name, route=True) for name in ("goal", "plan")}

@@ -14,7 +14,7 @@ from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.episodes import Split, changed_route, with_route
 from restock.ingest.steps.steps import Steps
 from restock.ingest.task.conditions import label_with_probabilities
-from restock.ingest.task.schema import SIGNAL_COLUMNS
+from restock.ingest.task.schema import signal_columns
 from restock.ingest.task.signals import Signals
 
 ENDS = b"restock.episode_ends"  # key in the rows' metadata
@@ -112,12 +112,7 @@ def episode_rows(
 
 def label_table(signals: Signals, episode: Ints, step: Ints, custom: pa.Table) -> pa.Table:
     """The steps as conditions see them: stored signals and custom ones, as they are stored."""
-    columns = {
-        column.name: pa.array(np.asarray(signals[column.name]), pa.float64()).cast(column.type)
-        if column.type == pa.float32()
-        else pa.array(np.asarray(signals[column.name]), column.type)
-        for column in SIGNAL_COLUMNS
-    }
+    columns = signal_columns(signals)
     columns |= dict(zip(custom.column_names, custom.columns, strict=True))
     return pa.table({"episode_index": episode, "step_index": step, **columns})
 

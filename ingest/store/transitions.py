@@ -19,7 +19,7 @@ from restock.ingest.steps.steps import Steps
 from restock.ingest.store.episode_rows import ENDS, EpisodeRows, episode_rows, groups, packed
 from restock.ingest.task.conditions import NOMINAL, primary, too_near_to_call
 from restock.ingest.task.label_scores import true_names, truth_text
-from restock.ingest.task.schema import COVERAGE, SIGNAL_COLUMNS, STEP_BITS, transition_schema
+from restock.ingest.task.schema import COVERAGE, STEP_BITS, signal_columns, transition_schema
 from restock.ingest.task.task import observe, reward
 
 # Columns that rows of an older store may lack.
@@ -160,7 +160,7 @@ def transition_table(
         "action_probability": values.probability,
         "action_residual": values.residual,
         "progress_m": values.progress_m,
-        **{column.name: rows.signals[column.name][begin] for column in SIGNAL_COLUMNS},
+        **signal_columns(rows.signals, begin),
         "ingest_id": provenance.ingest_id,
         "source_file": provenance.source_file,
         "profile_hash": profile.hash,

@@ -9,9 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import pyarrow as pa
 
-from restock.ingest.task.signals import STORED_SIGNALS
+from restock.arrays import Ints
+from restock.ingest.task.signals import OPTIONAL_SIGNALS, STORED_SIGNALS, Signals
 
 # transition_id = (a number from the recording's id) << STEP_BITS | (step of the recording)
 STEP_BITS = 25
@@ -97,10 +99,27 @@ def _signal_type(dtype: str) -> pa.DataType:
 
 # float32 holds a millimetre up to 16 km from the map's origin; stamps stay int64.
 SIGNAL_COLUMNS: tuple[Column, ...] = tuple(
-    Column(signal.name, _signal_type(signal.dtype), signal.meaning) for signal in STORED_SIGNALS
+    Column(signal.name, _signal_type(signal.dtype), signal.meaning, nullable=signal.optional)
+    for signal in STORED_SIGNALS
 )
 
 COLUMNS: tuple[Column, ...] = IDENTITY + TRANSITION + COVERAGE + SIGNAL_COLUMNS + PROVENANCE
+
+
+def signal_arrays(signals: Signals) -> dict[str, pa.Array]:
+    """Signals as SQL sees them: what is not known is null, where NaN would pass for a number."""
+    return {
+        name: pa.array(np.asarray(values), from_pandas=name in OPTIONAL_SIGNALS)
+        for name, values in signals.items()
+    }
+
+
+def signal_columns(signals: Signals, rows: Ints | slice = slice(None)) -> dict[str, pa.Array]:
+    """The stored signals (of some rows) as columns of the table."""
+    arrays = signal_arrays({column.name: signals[column.name][rows] for column in SIGNAL_COLUMNS})
+    return {
+        column.name: arrays[column.name].cast(column.type, safe=False) for column in SIGNAL_COLUMNS
+    }
 
 
 def steps_schema(custom: Sequence[pa.Field] = ()) -> pa.Schema:

@@ -28,6 +28,7 @@ class Signal:
     dtype: str = "float64"
     per_sector: bool = False  # shape (sectors,) instead of ()
     stored: bool = True  # kept as a column of the transition table
+    optional: bool = False  # NaN where it is not known; null in the table
 
 
 SIGNALS: tuple[Signal, ...] = (
@@ -59,9 +60,12 @@ SIGNALS: tuple[Signal, ...] = (
     Signal("bumped", "the bumper was pressed since the step before", "bool"),
     Signal("command_speed_mps", "commanded forward speed in force until the next step"),
     Signal("command_yaw_rate_radps", "commanded yaw rate in force until the next step"),
+    Signal("nav_speed_mps", "forward speed that navigation proposes, or unknown", optional=True),
+    Signal("nav_yaw_rate_radps", "yaw rate that navigation proposes, or unknown", optional=True),
 )
 
 STORED_SIGNALS: tuple[Signal, ...] = tuple(signal for signal in SIGNALS if signal.stored)
+OPTIONAL_SIGNALS = frozenset(signal.name for signal in SIGNALS if signal.optional)
 
 
 def localised_velocity(

@@ -23,7 +23,7 @@ from restock.toml import Checked
 
 # How observation and reward are computed. Raised when that changes, so that rows made by
 # different code are never mixed unseen.
-TASK_CODE_VERSION = 1
+TASK_CODE_VERSION = 2
 
 
 class Rewards(Checked, frozen=True):
@@ -75,11 +75,12 @@ class Task(Checked, frozen=True):
             *(f"previous_action_{index}" for index in range(len(self.actions))),
             *(f"clearance_{bearing:+.0f}deg" for bearing in bearings),
             *(f"closing_{bearing:+.0f}deg" for bearing in bearings),
+            *("nav_known", "nav_speed", "nav_yaw_rate"),
         ]
 
     @property
     def observation_size(self) -> int:
-        return 12 + len(self.actions) + 2 * self.sectors
+        return 12 + len(self.actions) + 2 * self.sectors + 3
 
     @property
     def action_names(self) -> list[str]:
@@ -118,7 +119,9 @@ def observe(task: Task, now: Signals, before: Signals, previous_action: Ints) ->
         axis=-1,
     )
     one_hot = np.eye(len(task.actions))[previous_action]
-    return np.concatenate([scalars, one_hot, clearance, closing], axis=-1).astype(np.float32)
+    proposed = _proposed(task, now)
+    parts = [scalars, one_hot, clearance, closing, proposed]
+    return np.concatenate(parts, axis=-1).astype(np.float32)
 
 
 def nearest_action(
@@ -129,7 +132,7 @@ def nearest_action(
     Distance is measured in units of the fastest action on each axis. Ties go to the first action.
     """
     table = np.asarray(task.actions, np.float64)  # (A, 2)
-    scale = np.maximum(np.abs(table).max(axis=0), 1e-9)
+    scale = _fastest(task)
     command = np.stack([speed_mps, yaw_rate_radps], axis=-1) / scale
     distance = np.linalg.norm(command[:, None, :] - (table / scale)[None], axis=-1)
     action = np.argmin(distance, axis=1)
@@ -203,6 +206,22 @@ def clearance_ahead(
     around = (middle[:, None] + np.array([-1, 0, 1])) % task.sectors
     nearest: NDArray[np.float64] = np.take_along_axis(sector_clearance_m, around, axis=1).min(1)
     return nearest
+
+
+def _proposed(task: Task, now: Signals) -> NDArray[np.float64]:
+    """What the navigation stack proposes, (N, 3): whether it is known, speed and yaw rate.
+
+    In units of the fastest action on each axis, up to twice that; all 0 where it is not known.
+    """
+    command = np.stack([now["nav_speed_mps"], now["nav_yaw_rate_radps"]], axis=-1)
+    known = np.isfinite(command).all(axis=-1, keepdims=True)
+    scaled = np.clip(np.where(known, command, 0.0) / _fastest(task), -2.0, 2.0)
+    return np.concatenate([known, scaled], axis=-1)
+
+
+def _fastest(task: Task) -> NDArray[np.float64]:
+    """The largest speed (m/s) and yaw rate (rad/s) among the actions, (2,)."""
+    return np.maximum(np.abs(np.asarray(task.actions, np.float64)).max(axis=0), 1e-9)
 
 
 def _nearness(clearance_m: NDArray[Any], range_max_m: float) -> NDArray[Any]:

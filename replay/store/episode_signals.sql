@@ -50,12 +50,17 @@ WITH tasks AS (
         task_hash,
         top_mps,
         top_radps,
+        actions,
         CAST(json_extract_string(task_json, '$.sectors') AS INTEGER) AS sectors,
         CAST(json_extract_string(task_json, '$.control_period_s') AS DOUBLE) AS period_s,
         CAST(json_extract_string(task_json, '$.range_max_m') AS DOUBLE) AS range_max_m
     FROM recordings
     JOIN (
-        SELECT task_hash, max(abs(speed_mps)) AS top_mps, max(abs(yaw_rate_radps)) AS top_radps
+        SELECT
+            task_hash,
+            count(*) AS actions,
+            max(abs(speed_mps)) AS top_mps,
+            max(abs(yaw_rate_radps)) AS top_radps
         FROM actions
         GROUP BY task_hash
     ) USING (task_hash)
@@ -63,7 +68,7 @@ WITH tasks AS (
     SELECT
         * EXCLUDE (observation, next_observation),
         list_transform(
-            observation[-2 * sectors:-sectors - 1], lambda nearness: nearness * nearness * range_max_m
+            observation[13 + actions:12 + actions + sectors], lambda nearness: nearness * nearness * range_max_m
         ) AS sector_m
     FROM transitions
     JOIN tasks USING (task_hash)

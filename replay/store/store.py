@@ -203,9 +203,16 @@ class Store:
         return dict(rows)
 
     def _observation_type(self) -> str:
-        """Fixed-size where all tasks agree on the size: DuckDB reads Delta's lists as FLOAT[]."""
-        sizes = {self._decode(text, Task, "task").observation_size for text in self._tasks.values()}
-        return f"FLOAT[{sizes.pop()}]" if len(sizes) == 1 else "FLOAT[]"
+        """Fixed-size where all tasks agree on the size: DuckDB reads Delta's lists as FLOAT[].
+
+        The size of another version's observation is not known.
+        """
+        tasks = {name: self._decode(text, Task, "task") for name, text in self._tasks.items()}
+        sizes = {
+            task.observation_size if task.hash == name else None for name, task in tasks.items()
+        }
+        size = sizes.pop() if len(sizes) == 1 else None
+        return f"FLOAT[{size}]" if size else "FLOAT[]"
 
     def attach(self, connection: duckdb.DuckDBPyConnection, schema: str) -> None:
         """Views and macros of this store in a schema of another connection, beside other stores'.

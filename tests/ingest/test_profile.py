@@ -107,8 +107,15 @@ def test_a_file_that_is_not_text(tmp_path):
 def test_what_stands_in_is_said():
     assert load_profile("warehouse_amr").fallbacks == {}
     assert set(load_profile("turtlebot3").fallbacks) == {
-        "bumper", "behaviour_policy", "true_condition", "perturbation", "goal", "plan",
+        "bumper", "nav_command", "behaviour_policy", "true_condition", "perturbation", "goal",
+        "plan",
     }  # fmt: skip
+
+
+def test_a_proposal_is_not_read_from_the_command_itself():
+    text = TEXT.replace('"/cmd_vel_nav"', '"/cmd_vel"')
+    with pytest.raises(ConfigError, match=r"`inputs.nav_command.topic` is the command's own"):
+        parse_profile(text, where="mine")
 
 
 @pytest.fixture(scope="session")

@@ -15,6 +15,7 @@ from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.propose.propose import propose_profile
+from restock.replay.store.store import Store
 
 SAMPLES = ROOT / "sample_logs"
 ROWS = sample_transitions("amr_tuesday")
@@ -70,6 +71,28 @@ def test_of_the_sample_bag_and_with_all_its_signals(tmp_path, capsys):
     assert not any("ground_truth" in name for name in names)  # no robot knows it
 
 
+@pytest.mark.parametrize("topic", ["/cmd_vel_nav", "/nav_vel", "/cmd_vel_raw", "/mux/input/navi"])
+def test_what_navigation_proposes_is_taken_for_that(topic, tmp_path, capsys):
+    bag = write_bag(Drive(proposals=topic), tmp_path / "bag")
+    file = proposed(bag, tmp_path, capsys)
+    inputs = load_profile(file).inputs
+    assert inputs.command.topic == "/cmd_vel"
+    assert (inputs.nav_command.topic, inputs.nav_command.optional) == (topic, True)
+    assert "beside the command that is driven (/cmd_vel)" in file.read_text()
+    assert main(["ingest", str(bag), "--profile", str(file), "--store", str(tmp_path / "s")]) == 0
+    with Store(tmp_path / "s") as store:
+        found = store.sql("SELECT DISTINCT nav_speed_mps, nav_yaw_rate_radps FROM transitions")
+        assert found.fetchall() == [(pytest.approx(0.3), pytest.approx(0.1))]
+
+
+def test_the_only_command_is_no_proposal(tmp_path):
+    for topic in ("/joy/cmd_vel", None):
+        with open_recording(write_bag(Drive(proposals=topic), tmp_path / f"{topic}"[-4:])) as bag:
+            profile = parse_profile(propose_profile(bag, "mine").toml, where="p")
+        assert profile.inputs.nav_command is None
+        assert profile.inputs.command.topic == "/cmd_vel"
+
+
 def test_it_says_rates_roles_clock_lidar_and_frames(capsys):
     with open_recording(SAMPLES / "amr_tuesday") as recording:
         text = propose_profile(recording, "amr").toml
@@ -119,7 +142,7 @@ def test_without_commands_what_the_robot_did_stands_for_them(tmp_path, capsys):
     outcome = check(file, bag, capsys)
     assert outcome["transitions"] > 20
     stand_ins = {item["input"] for item in outcome["stand_ins"]}
-    assert stand_ins == {"command", "scan", "true_condition", "perturbation"}
+    assert stand_ins == {"command", "scan", "nav_command", "true_condition", "perturbation"}
 
 
 def test_every_type_of_a_bag_without_a_robot_is_gone_through(tmp_path, capsys):

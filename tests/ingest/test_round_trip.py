@@ -208,6 +208,20 @@ def test_observations_are_what_the_twin_saw(trip: Trip) -> None:
     assert not now[first][:, closing].any()
 
 
+def test_what_navigation_proposed_is_what_the_twin_saw(trip: Trip) -> None:
+    kept = ("nav_speed_mps", "nav_yaw_rate_radps")
+    seen = [np.concatenate([d.drive.signals[name][:-1] for d in trip.driven]) for name in kept]
+    for name, values in zip(kept, seen, strict=True):
+        np.testing.assert_array_equal(trip.row(name), values.astype(np.float32))
+    # Whoever drives: the planner does as it proposes unless it explores, others as they like.
+    given = np.concatenate([d.drive.command for d in trip.driven])
+    same = (np.stack(seen, axis=-1) == given).all(axis=1)
+    who = [entry for driven in trip.driven for entry in driven.drive.policy]
+    planned = np.array([entry[:2] == ("planner", "1") and entry[2] > 0.5 for entry in who])
+    assert same[planned].all()
+    assert same[~planned].mean() < 0.9
+
+
 def test_a_next_observation_is_the_observation_of_the_next_row(trip: Trip) -> None:
     same = np.diff(trip.row("episode_index")) == 0
     now, after = trip.row("observation"), trip.row("next_observation")

@@ -53,7 +53,7 @@ def test_nothing_of_a_step_comes_from_later_messages():
         part = steps_of(PROFILE, cut)
         assert len(part) == tick + 1
         for name, column in part.signals.items():
-            assert np.array_equal(column, whole.signals[name][: tick + 1]), name
+            np.testing.assert_array_equal(column, whole.signals[name][: tick + 1], name)
 
 
 def test_a_stale_input_makes_the_tick_unusable_by_name():
@@ -103,6 +103,40 @@ def test_scans_of_inf_and_nan_and_changing_geometry():
     assert np.isfinite(clearance).all()
     assert clearance.max() == PROFILE.task.range_max_m  # sectors with nothing but inf and NaN
     assert clearance[-1].max() < 3.0
+
+
+def proposed(time_s, speed_mps):
+    fields = {"linear.x": np.asarray(speed_mps, float), "angular.z": np.full(len(time_s), -0.2)}
+    return columns(np.asarray(time_s), fields, stamped=False)
+
+
+def test_a_proposal_is_the_latest_at_or_before_the_tick():
+    topics = Drive().topics()
+    commands_s = 0.005 + np.arange(30) * PERIOD_S  # the ticks
+    # One 3 ms ahead of each tick, one at the tick itself, and one 1 ms after it.
+    times = np.sort(np.concatenate([commands_s - 0.003, commands_s, commands_s + 0.001]))
+    for keep, expected in (([0, 1, 2], 0.2), ([0, 2], 0.1)):
+        chosen = np.isin(np.arange(90) % 3, keep)
+        speeds = np.tile([0.1, 0.2, 0.9], 30)
+        topics["/cmd_vel_nav"] = proposed(times[chosen], speeds[chosen])
+        steps = steps_of(PROFILE, topics)
+        assert steps.signals["nav_speed_mps"] == pytest.approx(np.full(30, expected))
+        assert steps.signals["nav_yaw_rate_radps"] == pytest.approx(np.full(30, -0.2))
+        assert not [note for note in steps.notes if "nav_command" in note]
+
+
+def test_an_unknown_proposal_is_counted_and_leaves_the_tick_usable():
+    topics = Drive().topics()
+    topics["/cmd_vel_nav"] = proposed([1.0, 1.2, 1.4, 1.6, 3.0], [0.5, 0.5, np.nan, 0.5, 0.5])
+    steps = steps_of(PROFILE, topics)
+    known = np.isfinite(steps.signals["nav_speed_mps"])
+    assert np.flatnonzero(known).tolist() == [5, 6, 8, 9, 10, 15, 16, 17]
+    np.testing.assert_array_equal(known, np.isfinite(steps.signals["nav_yaw_rate_radps"]))
+    assert (
+        "nav_command: unknown at 22 of 30 ticks (not yet received 5, stale 16, not finite 1)"
+        in steps.notes
+    )
+    assert set(steps.problem) == {""}
 
 
 def test_a_plan_for_another_goal_is_not_followed():

@@ -156,6 +156,19 @@ def test_a_bump_costs_once_however_long_the_bumper_stays_pressed():
     assert bump(True, True) == bump(True, False) == bump(False, False) == 0
 
 
+def test_a_proposal_is_in_units_of_the_fastest_action():
+    # The actions reach 1 m/s and 1 rad/s.
+    def seen(**values):
+        now = signals() | {name: np.array([value]) for name, value in values.items()}
+        return observe(TASK, now, signals(), np.array([0]))[0, -3:].tolist()
+
+    assert TASK.observation_names[-3:] == ["nav_known", "nav_speed", "nav_yaw_rate"]
+    assert seen(nav_speed_mps=0.5, nav_yaw_rate_radps=-0.25) == [1, 0.5, -0.25]
+    assert seen(nav_speed_mps=9.0, nav_yaw_rate_radps=-9.0) == [1, 2, -2]
+    assert seen(nav_speed_mps=0.5, nav_yaw_rate_radps=np.nan) == [0, 0, 0]
+    assert seen(nav_speed_mps=np.nan, nav_yaw_rate_radps=0.5) == [0, 0, 0]
+
+
 def test_a_bump_terminates_only_where_the_task_says_so():
     after = signals(bumped=True)
     assert not terminated(TASK, after).any()

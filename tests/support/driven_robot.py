@@ -29,6 +29,7 @@ class Drive:
     goals: list[tuple[float, float, float]] = field(default_factory=lambda: [(0.0, *GOAL)])
     policies: list[tuple[float, str]] = field(default_factory=lambda: [(0.0, "planner")])
     truth: str | None = None
+    proposals: str | None = None  # the topic of what navigation proposes, 5 ms ahead of commands
 
     def x_at(self, time_s: NDArray[Any]) -> NDArray[Any]:
         return 1.0 + SPEED_MPS * time_s
@@ -84,6 +85,9 @@ class Drive:
             found["/ground_truth/condition"] = columns(
                 ticks, {"data": np.full(len(ticks), self.truth, object)}, stamped=False
             )
+        if self.proposals is not None:
+            fields = {"linear.x": np.full(len(ticks), 0.3), "angular.z": np.full(len(ticks), 0.1)}
+            found[self.proposals] = columns(ticks, fields, stamped=False)
         return found
 
 
@@ -159,6 +163,8 @@ def write_bag(drive: Drive, folder: Path, *, storage: str = "sqlite3") -> Path:
         "/battery": "sensor_msgs/msg/BatteryState",
     }
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
+    if drive.proposals is not None:
+        names[drive.proposals] = names["/cmd_vel"]
     with Writer(folder, version=9, storage_plugin=plugin) as writer:
         lines = []
         for topic, messages in drive.topics().items():

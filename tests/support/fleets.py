@@ -103,7 +103,8 @@ def _drive(robot: SyntheticRobot, number: int, week: int, episodes: int, seed: i
     clearance[:, : int(factor.get("silent_sectors", 0))] = TASK.range_max_m
     nearness = np.sqrt(np.clip(clearance / TASK.range_max_m, 0, 1))
     observation = np.stack(table["observation"].to_pylist()).astype(np.float32)
-    observation[:, -2 * TASK.sectors : -TASK.sectors] = nearness
+    first = next(i for i, n in enumerate(TASK.observation_names) if n.startswith("clearance_"))
+    observation[:, first : first + TASK.sectors] = nearness
     stamp = MONDAY_NS + (week - 1) * WEEK_NS + number * 600 * 10**9 + np.arange(rows) * STEP_NS
     values = {
         "observation": list(observation),

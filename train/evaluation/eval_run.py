@@ -187,6 +187,7 @@ def drive_evaluation(
         seed=plan.first_seed,
         layouts=plan.layouts,
         conditions={kind: DEFAULT_CONDITIONS[kind] for kind in plan.kinds},
+        nav_command=profile.inputs.nav_command is not None,
     )
     # One queue a policy, over all perturbations: few environments then wait for the last episodes.
     episodes = [

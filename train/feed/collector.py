@@ -18,7 +18,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from restock.ingest.task.conditions import NOMINAL, Condition, label, primary, runnable
-from restock.ingest.task.schema import steps_schema
+from restock.ingest.task.schema import signal_arrays, steps_schema
 from restock.ingest.task.signals import STORED_SIGNALS, Signals
 from restock.ingest.task.task import Task
 from restock.replay.ring.ring import FreshRing
@@ -384,6 +384,8 @@ def steps_table(episodes: Sequence[EndedEpisode]) -> pa.Table:
         "episode_index": np.repeat(np.arange(len(episodes)), lengths),
         "step_index": np.concatenate([np.arange(length) for length in lengths]),
     }
-    for name in episodes[0].signals:
-        columns[name] = np.concatenate([episode.signals[name] for episode in episodes])
-    return pa.table(columns)
+    signals = {
+        name: np.concatenate([episode.signals[name] for episode in episodes])
+        for name in episodes[0].signals
+    }
+    return pa.table(columns | signal_arrays(signals))

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import Bools, Ints
 from restock.ingest.task.conditions import NOMINAL, Condition, label, primary
+from restock.ingest.task.schema import signal_arrays
 from restock.ingest.task.signals import STORED_SIGNALS
 from restock.replay.ring.ring import META
 from restock.replay.ring.slots import NONE, StratumSlots
@@ -168,8 +169,11 @@ class InfoLabels:
             "episode_index": np.repeat(np.arange(len(lengths)), lengths),
             "step_index": np.concatenate([np.arange(length) for length in lengths]),
         }
-        for signal in STORED_SIGNALS:
-            columns[signal.name] = np.array([row[signal.name] for row in rows], signal.dtype)
+        signals = {
+            signal.name: np.array([row[signal.name] for row in rows], signal.dtype)
+            for signal in STORED_SIGNALS
+        }
+        columns |= signal_arrays(signals)
         held = label(pa.table(columns), self.conditions)
         codes = np.array([self._codes[n] for n in primary(held, self.conditions)], np.int64)
         if not self.conditions:

@@ -172,7 +172,8 @@ def _observation_rows(
     """Mean absolute gap of every component that the twin could get wrong."""
     sources = {name: result.observation for name, result in stepped.twins.items()}
     sources |= {PERSISTENCE: stepped.now}
-    left_out = ["previous_action_"]  # the action that was applied
+    # The action that was applied, and what the log's own navigation proposed.
+    left_out = ["previous_action_", "nav_"]
     left_out += [] if stepped.lidar else ["clearance_", "closing_"]
     left_out += [] if steps.task.goal == "route" else ["near_", "far_", "goal_"]
     for column, component in enumerate(steps.task.observation_names):

@@ -1,4 +1,4 @@
-"""Navigation of N robots: whose plan is in force, and when it is made again.
+"""Navigation of N robots: whose plan is in force, when it is made again, and how it is followed.
 
 A plan is made again when the robot strays from it, or when its lidar shows an aisle to be wholly
 blocked, which is remembered for the rest of the episode.
@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from restock.arrays import F64, Ints
+from restock.arrays import F64, Bools, Ints
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task
 from restock.state import Stateful
@@ -107,3 +107,59 @@ class Navigation(Stateful):
                 self.closures[env].append(closure)
                 changed.add(env)
         return changed
+
+
+class PathFollower:
+    """Follows the plan, slows for turns and obstacles, stops when something is close ahead.
+
+    It sees what the robot sees: waypoints and lidar clearances. It never leaves its plan, so a
+    pallet that blocks part of the aisle stops it for good.
+
+    Args:
+        stop_m: something this near ahead stops it.
+        slow_m: and this near slows it down.
+    """
+
+    pivot_m = 0.14  # room that turning on the spot needs around the body
+
+    def __init__(self, task: Task, *, stop_m: float = 0.30, slow_m: float = 0.80) -> None:
+        self.stop_m, self.slow_m = stop_m, slow_m
+        self.table = np.asarray(task.actions, np.float64)  # (A, 2)
+        half = max(round(task.sectors * 30 / 360), 1)
+        self._ahead = slice(task.sectors // 2 - half, task.sectors // 2 + half)
+        # Rows: fast, slow; columns: straight on, to the left, to the right.
+        bends = [((1.0, 0.0), (0.8, 0.7), (0.8, -0.7)), ((0.4, 0.0), (0.35, 0.6), (0.35, -0.6))]
+        self._drive = np.array([[self._index(*one) for one in row] for row in bends])
+        self._pivot = np.array([0, self._index(0.0, 1.2), self._index(0.0, -1.2)])
+
+    def choose(self, signals: Signals) -> Ints:
+        """The action (N,) whose velocity is nearest to what the plan asks for."""
+        near = np.arctan2(signals["waypoint_near_y_m"], signals["waypoint_near_x_m"])
+        far = np.arctan2(signals["waypoint_far_y_m"], signals["waypoint_far_x_m"])
+        front, bend = self.front(signals), np.abs(near)
+        slow = (np.abs(far) > 0.5) | (front < self.slow_m) | (signals["goal_distance_m"] < 0.8)
+        side = np.where(near > 0, 1, 2)  # left, right
+        careful = (slow | (bend > 0.45)) & (bend > 0.12)
+        action = self._drive[(slow | careful).astype(np.intp), np.where(bend > 0.12, side, 0)]
+        action[front < self.stop_m] = 0
+        pivot = (bend > 0.9) & (signals["clearance_m"] > self.pivot_m)
+        return np.where(pivot, self._pivot[side], action)
+
+    def propose(self, signals: Signals) -> None:
+        """Add the velocity of that action to the signals: what navigation would do next."""
+        command = self.table[self.choose(signals)]
+        signals["nav_speed_mps"], signals["nav_yaw_rate_radps"] = command.T.copy()
+
+    def front(self, signals: Signals) -> F64:
+        """The smallest clearance (N,) within 30 degrees of straight ahead."""
+        front: F64 = signals["sector_clearance_m"][:, self._ahead].min(axis=1)
+        return front
+
+    def near(self, signals: Signals) -> Bools:
+        """Where (N,) anything is near."""
+        return np.asarray(
+            (signals["clearance_m"] < self.stop_m) | (self.front(signals) < 2 * self.stop_m)
+        )
+
+    def _index(self, speed_mps: float, yaw_rate_radps: float) -> int:
+        return int(np.abs(self.table - (speed_mps, yaw_rate_radps)).sum(axis=1).argmin())

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Bools, Ints
 from restock.train.twin.env.interface import Policy
+from restock.train.twin.env.navigation import PathFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
 STUCK_STEPS = 15
@@ -85,61 +86,25 @@ class RandomPolicy(SoftPolicy):
 
 
 class PlannerFollower(SoftPolicy):
-    """Follows the plan, slows for turns and obstacles, stops when something is close ahead.
-
-    It sees what the robot sees: waypoints and lidar clearances. It never leaves its plan, so a
-    pallet that blocks part of the aisle stops it for good.
-    """
+    """Follows the plan, as `restock.train.twin.env.navigation.PathFollower` does."""
 
     name = "planner"
     stop_m = 0.30
     slow_m = 0.80
-    pivot_m = 0.14  # room that turning on the spot needs around the body
 
     def __init__(self, *, epsilon: float = 0.02, seed: int = 0) -> None:
         super().__init__(epsilon=epsilon, seed=seed)
 
     def choose(self, env: WarehouseVectorEnv) -> Ints:
         """The action whose velocity is nearest to the plan's."""
-        signals = env.signals
-        near = np.arctan2(signals["waypoint_near_y_m"], signals["waypoint_near_x_m"])
-        far = np.arctan2(signals["waypoint_far_y_m"], signals["waypoint_far_x_m"])
-        front = self._front(env)
-        left, right = near > 0, near < 0
-        bend = np.abs(near)
-
-        action = np.full(env.num_envs, self._index(env, 1.0, 0.0))
-        slow = (np.abs(far) > 0.5) | (front < self.slow_m) | (signals["goal_distance_m"] < 0.8)
-        action[slow] = self._index(env, 0.4, 0.0)
-        for turning, side in ((left, 1.0), (right, -1.0)):
-            fast = turning & (bend > 0.12) & ~slow
-            action[fast] = self._index(env, 0.8, side * 0.7)
-            careful = turning & (bend > 0.12) & slow
-            careful |= turning & (bend > 0.45)
-            action[careful] = self._index(env, 0.35, side * 0.6)
-        blocked = front < self.stop_m
-        action[blocked] = 0
-        for turning, side in ((left, 1.0), (right, -1.0)):
-            pivot = turning & (bend > 0.9) & (signals["clearance_m"] > self.pivot_m)
-            action[pivot] = self._index(env, 0.0, side * 1.2)
-        return action
+        return self._follower(env).choose(env.signals)
 
     def certain(self, env: WarehouseVectorEnv) -> Bools:
         """Its safety stop leaves nothing to chance, nor does it where anything is near."""
-        near = env.signals["clearance_m"] < self.stop_m
-        return np.asarray(near | (self._front(env) < 2 * self.stop_m), np.bool_)
+        return self._follower(env).near(env.signals)
 
-    def _front(self, env: WarehouseVectorEnv) -> F64:
-        """The smallest clearance (N,) within 30 degrees of straight ahead."""
-        clearance = env.signals["sector_clearance_m"]
-        count = clearance.shape[1]
-        half = max(round(count * 30 / 360), 1)
-        front: F64 = clearance[:, count // 2 - half : count // 2 + half].min(axis=1)
-        return front
-
-    def _index(self, env: WarehouseVectorEnv, speed_mps: float, yaw_rate_radps: float) -> int:
-        table = np.asarray(env.task.actions)
-        return int(np.abs(table - (speed_mps, yaw_rate_radps)).sum(axis=1).argmin())
+    def _follower(self, env: WarehouseVectorEnv) -> PathFollower:
+        return PathFollower(env.task, stop_m=self.stop_m, slow_m=self.slow_m)
 
 
 @dataclass(frozen=True)

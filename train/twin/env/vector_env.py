@@ -58,7 +58,7 @@ from restock.train.twin.env.floor_report import refuse_unfit
 from restock.train.twin.env.interface import DEFAULT_CONDITIONS, Info, Step
 from restock.train.twin.env.mission_arms import MissionArm, MissionArms
 from restock.train.twin.env.mission_orders import MissionOrders
-from restock.train.twin.env.navigation import Navigation
+from restock.train.twin.env.navigation import Navigation, PathFollower
 from restock.train.twin.floors.floors import floors_of
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.physics.episode import EpisodeSpec, draw_episode
@@ -101,6 +101,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         layouts: str | Sequence[Warehouse] = DEFAULT,
         missions: Sequence[MissionOrder] = (),
         missions_share: float = 0.5,
+        nav_command: bool = True,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         action: ActionKind = "discrete",
         physics: Physics = "mujoco",
@@ -115,6 +116,9 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         `layouts` are floors, or what `restock.train.twin.floors.floors.open_floors` reads, such as
         `generated:train`: an episode whose spec names none of them is on one that its seed draws.
         `warehouse` is the one floor, in their place.
+
+        `nav_command`: the navigation stack's proposal is among the signals, as on a robot whose
+        profile has that input; where the task has no route it is unknown in any case.
 
         Of the drawn episodes `missions_share` are of the ordered `missions`, where there are some.
 
@@ -163,6 +167,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         self.sensing = Sensing(self.simulation, self.task)
         self.truth = Truth(self.task, num_envs)
         self.navigation = Navigation(self.floors, num_envs, self.task)
+        follows = nav_command and self.task.goal == "route"
+        self._follower = PathFollower(self.task) if follows else None
         if missions:
             planners = self.navigation.planners
             orders = MissionOrders(missions, self.floors, planners, where="env.missions")
@@ -245,6 +251,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         first = self.sensing.sense(ids, self.steps[ids])
         add_motion(first, None)
         add_route(self.task, first, self.navigation.plans_m[ids], self.navigation.goals_m[ids])
+        self._propose(first)
         observed = observe(self.task, first, first, self.previous_action[ids])
         self.observation[ids] = _bounded(observed)
         if self.signals:
@@ -318,6 +325,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         changed = self.navigation.update(after, offset, self.sensing)
         if len(changed):  # a new plan counts from t + 1 on: it never makes progress jump
             self._see_new_plans(after, changed)
+        self._propose(after)
 
         terminated &= ~invalid
         truncated = ((self.steps >= task.time_limit_steps) & ~terminated) | invalid
@@ -334,6 +342,14 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
             self.signals = {name: column.copy() for name, column in after.items()}
             self._begin(np.flatnonzero(done))
         return self.observation.copy(), earned, terminated, truncated, info
+
+    def _propose(self, signals: Signals) -> None:
+        """What navigation would do, whoever drives: by the plan in force and this step's scan."""
+        if self._follower is not None:
+            self._follower.propose(signals)
+        else:
+            unknown = np.full(len(signals["stamp_ns"]), np.nan)
+            signals["nav_speed_mps"], signals["nav_yaw_rate_radps"] = unknown, unknown.copy()
 
     def _see_new_plans(self, after: Signals, ids: Ints) -> None:
         rows: Signals = {name: column[ids] for name, column in after.items()}

@@ -4,7 +4,8 @@ Three times belong to a message. The header's stamp is when the thing was measur
 time is when the driver sent it; the log time is when the recorder received it. Sensors run on
 their own rates, and one of their samples falls on every control tick (the navigation stack waits
 for the scan, then commands), so that what the policy saw is what the recording says at the tick.
-A command is sent some milliseconds after its tick: the planner has to think.
+A command is sent some milliseconds after its tick: the planner has to think. What the navigation
+stack proposes is there before whoever drives decides.
 
 At a tick a sensor's value is the twin's own measurement; between ticks it is the true motion plus
 noise of the same size. All values then take the resolution of the hardware, which also is what
@@ -39,7 +40,8 @@ from restock.train.twin.recording.scene import (
 GYRO_LSB_RADPS = 2.0**-10
 ACCEL_LSB_MPS2 = 2.0**-8
 LIDAR_LSB_M = 2.0**-9  # some 2 mm
-THINKING_S = (0.012, 0.016)  # from a tick to its command; longer than any sensor's delay
+PLANNING_S = (0.005, 0.007)  # from a tick to what the navigation stack proposes
+THINKING_S = (0.012, 0.016)  # and to its command; longer than any other topic's delay
 BUMPER_POLL_S = 0.02
 JITTER_S = 4e-4  # of a sensor's timer
 TICK_TOLERANCE_S = 1e-6
@@ -71,6 +73,7 @@ DELAYS = {
     "/diagnostics": Delay(2.0),
     "/tf_static": Delay(0.5),
     "/map": Delay(0.5),
+    "/cmd_vel_nav": Delay(0.2),
     "/cmd_vel": Delay(0.2),
 }
 MOST_NETWORK_MS = 3.0
@@ -254,12 +257,20 @@ class Robot:
         return self._send("/bumper", polls[sent], topics.bumpers(pressed[sent]))
 
     def _ticks(self, drive: Drive) -> list[Message]:
-        """The command of every tick, a stop at the last, and the simulator's own truth."""
+        """The simulator's truth, what navigation proposes and then the command of every tick.
+
+        The command of the last is a stop.
+        """
         command = np.concatenate([drive.command, np.zeros((1, 2))])
         thinking = self.rng.uniform(*THINKING_S, len(command))
         truth = [*drive.true_condition, drive.true_condition[-1]]
+        proposed = np.stack(
+            [drive.signals[f"nav_{key}"] for key in ("speed_mps", "yaw_rate_radps")]
+        )
+        planned_s = drive.tick_s + self.rng.uniform(*PLANNING_S, len(command))
         return [
             *self._send("/ground_truth/condition", drive.tick_s, [topics.text(t) for t in truth]),
+            *self._send("/cmd_vel_nav", planned_s, topics.commands(*proposed)),
             *self._send("/cmd_vel", drive.tick_s + thinking, topics.commands(*command.T)),
         ]
 
