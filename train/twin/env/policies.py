@@ -86,7 +86,10 @@ class RandomPolicy(SoftPolicy):
 
 
 class PlannerFollower(SoftPolicy):
-    """Follows the plan, as `restock.train.twin.env.navigation.PathFollower` does."""
+    """Follows the plan, slows for turns and obstacles, stops when something is close ahead.
+
+    It does what the navigation stack proposes (the signals `nav_*`) but for its random actions.
+    """
 
     name = "planner"
     stop_m = 0.30
