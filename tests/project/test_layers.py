@@ -55,7 +55,8 @@ MAY_IMPORT = {
     ),
     "train/comparison": "train dqn evaluation run replay/fleet replay/panel",
     "train/diagnosis": (
-        "feed run twin/env twin/physics replay/panel replay/store ingest/profile ingest/task"
+        "feed run twin/calibration twin/env twin/physics replay/panel replay/store ingest/profile"
+        " ingest/store ingest/task"
     ),
     "train/libraries": (
         "train dqn evaluation feed run twin/floors twin/physics replay/mixture replay/panel"

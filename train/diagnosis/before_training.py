@@ -25,7 +25,9 @@ from restock.train.diagnosis.evidence import Comparison, not_run
 from restock.train.diagnosis.fed_rows import FedRows, of_panel, of_store
 from restock.train.diagnosis.outcomes import outcomes
 from restock.train.diagnosis.row_order import row_order
+from restock.train.diagnosis.stored import stored
 from restock.train.diagnosis.twin_rows import drive_twin
+from restock.train.diagnosis.values import values
 from restock.train.feed.collector import conditions_in_twin
 from restock.train.run.run_profile import carried_profile, profile_of_panel
 from restock.train.twin.physics.perturbation import Perturbation
@@ -81,7 +83,7 @@ def diagnose_before_training(
         ConfigError: the profile's task is not that of the rows.
     """
     begun = time.perf_counter()
-    rows, own = _open(Path(path), profile, task_hash)
+    rows, own, more = _open(Path(path), profile, task_hash)
     if own.task.hash != rows.task.hash:
         raise ConfigError(
             f"profile {own.name!r} defines task {own.task.hash}, the rows are of {rows.task.hash}",
@@ -89,7 +91,7 @@ def diagnose_before_training(
             remedy="name the profile that they were ingested with",
         )
     fresh, reason = _drive(own, perturbation, seed) if twin else (None, "it was not asked for")
-    diagnosis = diagnose_rows(rows, fresh, reason, seed=seed)
+    diagnosis = diagnose_rows(rows, fresh, reason, seed=seed, more=more)
     diagnosis.about.update(
         path=str(path), profile=own.name, task_hash=rows.task.hash,
         seconds=round(time.perf_counter() - begun, 1),
@@ -105,7 +107,7 @@ def diagnose_rows(
     made elsewhere, count like these."""
     compared = answers(rows, twin, seed)
     permuted = list(permuted_actions(rows, twin))
-    others = [*outcomes(rows, twin, seed), *row_order(rows), *more]
+    others = [*outcomes(rows, twin, seed), *row_order(rows), *values(rows, twin, seed), *more]
     found = findings(compared, permuted, others, rows.task)
     comparisons = [row for one in compared for row in one.comparisons]
     comparisons += [row for row, _ in permuted] + others
@@ -123,19 +125,34 @@ def diagnose_rows(
     return RowDiagnosis(verdict, found, comparisons, about)
 
 
-def _open(path: Path, profile: Profile | None, task_hash: str | None) -> tuple[FedRows, Profile]:
+def _open(
+    path: Path, profile: Profile | None, task_hash: str | None
+) -> tuple[FedRows, Profile, list[Comparison]]:
+    """The rows of a panel or store, the profile, and what the store alone can tell of them."""
     if (path / HEADER).is_file():
         panel = Panel.open(path)
-        return of_panel(panel), profile or profile_of_panel(panel)
+        rows, own = of_panel(panel), profile or profile_of_panel(panel)
+        store_path, version = Path(panel.header.store), panel.store_version
+        if version < 0 or not is_store(store_path):
+            reason = f"the panel's store is not at {store_path} any more"
+            return rows, own, [not_run("labels", "labels by the stored signals", reason)]
+        with Store(store_path, version=version) as store:
+            return rows, own, _of_store(store, rows, own)
     if is_store(path):
         with Store(path) as store:
             chosen = task_hash or store.task().hash
-            return of_store(store, chosen), profile or _profile_of_store(store, chosen)
+            rows, own = of_store(store, chosen), profile or _profile_of_store(store, chosen)
+            return rows, own, _of_store(store, rows, own)
     raise RunError(
         "is neither a panel nor a store" if path.exists() else "no such panel or store",
         where=str(path),
         remedy="`restock mix STORE --mixture coverage --out PANEL` makes a panel",
     )
+
+
+def _of_store(store: Store, rows: FedRows, profile: Profile) -> list[Comparison]:
+    conditions = conditions_in_twin(profile.conditions, profile.signals)[0]
+    return list(stored(store, rows, profile, conditions))
 
 
 def _profile_of_store(store: Store, task_hash: str) -> Profile:

@@ -15,6 +15,7 @@ from restock.ingest.task.task import Task
 from restock.train.diagnosis.answers import DELAY_STEPS, GAIN, Answer
 from restock.train.diagnosis.evidence import Comparison
 from restock.train.diagnosis.relations import (
+    ACCELEROMETER,
     ACTION_SPEED,
     ACTION_TURN,
     GYROSCOPE,
@@ -37,7 +38,19 @@ _KEYS = {  # where a profile says what fills it
     POSE: "[inputs.pose]",
     PLAN: "[inputs.plan]",
     LIDAR: "[inputs.scan]",
-    "accelerometer": "[inputs.imu] fields.accel_x_mps2",
+    ACCELEROMETER: "[inputs.imu] fields.accel_x_mps2",
+}
+VALUES = "VALUES_UNLIKE_TWIN"
+VALUES_OF = {  # checks of values that follow from what is wrong with an end
+    end: tuple(f"{figure}: {entry}" for figure in ("range", "spread") for entry in entries)
+    for end, entries in {
+        GYROSCOPE: ("gyro_yaw_rate",),
+        WHEEL_SPEED: ("wheel_speed", "accel_x"),
+        "wheels": ("wheel_speed", "accel_x"),
+        POSE: ("localised_speed", "lateral_speed", "goal_distance"),
+        ACCELEROMETER: ("accel_x",),
+        LIDAR: ("clearances",),
+    }.items()
 }
 _FIRST = ("ROWS_APART", "FUTURE_IN_OBSERVATION")  # nothing can be told of rows before these
 _ON_THEIR_OWN = ("EPISODES_REPEATED", "TERMINATIONS_WRONG")
@@ -80,6 +93,8 @@ def findings(
     if moved and one_to_one and not shifted and (actions or not ends):
         found.append(_permuted(moved, task))
         ends = {end: off for end, off in ends.items() if end not in actions}
+    said = {name for end in ends for name in VALUES_OF.get(end, ())}
+    of_rows = [one for one in of_rows if not (one.cause == VALUES and said & set(one.evidence))]
     return found + [_of_end(end, off, task) for end, off in ends.items()] + of_rows
 
 
@@ -232,8 +247,20 @@ def _of_rows(off: Sequence[Comparison]) -> list[Finding]:
             found.append(Finding(kind.cause, text, kind.remedy, used))
             for check in used:
                 del left[check]
+    if labels := [row for name, row in left.items() if name.startswith("labels: ")]:
+        shares = ", ".join(f"{row.check.removeprefix('labels: ')} {row.logs:.0%}" for row in labels)
+        text = f"labels are not what their conditions give on the stored signals: wrong in {shares}"
+        remedy = "`restock label STORE` computes them again; corrections by people are kept"
+        used = tuple(row.check for row in labels)
+        found.append(Finding("LABELS_WRONG", text, remedy, used))
+        left = {name: row for name, row in left.items() if name not in used}
     found += [
-        Finding("UNLIKE_TWIN", f"{row.what}: {row.note or 'off'}", "look at these rows", (name,))
+        Finding(
+            VALUES,
+            f"{row.what}: {row.logs:.3g} in the logs" + (f" ({row.note})" if row.note else ""),
+            "look at the unit and the source of this value in the profile",
+            (name,),
+        )
         for name, row in left.items()
     ]
     return found
@@ -294,7 +321,7 @@ KINDS = (
     ),
     Kind(
         "TERMINATIONS_LOST",
-        ("terminated at the goal",),
+        ("terminated at the goal", "terminations"),
         "of the logs' episodes that end at their goal {terminated_at_the_goal.logs:.0%} are"
         " terminated there: beyond the others' ends the critic bootstraps",
         "has the profile's [task] the robot's goal radius? Ingest the logs again",
@@ -311,6 +338,19 @@ KINDS = (
         "in {own_action.logs:.0%} of the rows the next observation does not hold the row's own"
         " action: the `action` column is not what the observations were made with",
         "something changed actions after ingest: ingest the logs again",
+    ),
+    Kind(
+        "LIDAR_TURNED",
+        ("lidar bearing",),
+        "the logs' lidar is turned by {lidar_bearing.effect:+.0f} degrees against the twin's: what"
+        " comes nearer when driving on does not lie ahead",
+        "look at the lidar's mounting: [task.body] lidar_yaw_rad, the scan's frame, [inputs.scan]",
+    ),
+    Kind(
+        "TERMINATIONS_WRONG",
+        ("terminations",),
+        "{terminations.logs:.0%} of the logs' terminations are not what their signals say",
+        "ingest the logs again with this profile",
     ),
     Kind(
         "EPISODES_REPEATED",

@@ -42,7 +42,7 @@ class Comparison:
         neutral = 1.0 if self.measure == "ratio" else 0.0
         if self.status != "undecided" or self.low is None or self.high is None:
             return False
-        return not self.low <= neutral <= self.high
+        return self.low > neutral or self.high < neutral
 
 
 def judged(

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from restock.arrays import F64, Bools
-from restock.ingest.task.signals import Signals
+from restock.ingest.task.signals import STORED_SIGNALS, Signals
 from restock.ingest.task.task import reward_parts
 from restock.stats import ConfidenceInterval, clustered_quantiles
 from restock.train.diagnosis.evidence import (
@@ -39,13 +39,13 @@ def implied_reward(rows: FedRows) -> F64:
     """The reward (N,) that the observations come to; NaN where they do not say."""
     task = rows.task
     clearance = rows.sectors(after=True).min(axis=1) ** 2 * task.range_max_m
-    now: Signals = {"wheel_speed_mps": rows.now("wheel_speed")}
-    after: Signals = {
+    unknown: Signals = {signal.name: np.zeros(len(rows), signal.dtype) for signal in STORED_SIGNALS}
+    now: Signals = unknown | {"wheel_speed_mps": rows.now("wheel_speed")}
+    after: Signals = unknown | {
         "wheel_speed_mps": rows.after("wheel_speed"),
         "localised_speed_mps": rows.after("localised_speed"),
         "clearance_m": clearance,
         "goal_distance_m": np.full(len(rows), np.inf),
-        "bumped": np.zeros(len(rows), np.bool_),
     }
     progress = _progress(rows)
     parts = reward_parts(task, now, after, progress, rows.action, rows.previous_action())

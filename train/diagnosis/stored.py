@@ -1,0 +1,121 @@
+"""Do stored labels and ends follow from the stored signals, by the very rules that made them?
+
+A store keeps the signals that conditions were computed from, so conditions can be computed again,
+and so can terminations. A panel is held against the store that it was made from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pyarrow as pa
+
+from restock.arrays import Bools
+from restock.errors import ConfigError
+from restock.ingest.profile.profile import Profile
+from restock.ingest.store.episode_rows import label_table
+from restock.ingest.task.conditions import Condition, label
+from restock.ingest.task.task import terminated
+from restock.replay.store.store import Store
+from restock.train.diagnosis.evidence import Comparison, not_run, share_judged
+from restock.train.diagnosis.fed_rows import MOST_ROWS, FedRows
+from restock.train.twin.calibration.logged_steps import LoggedSteps, logged_steps, rows_of
+
+DIFFERENT = 0.02  # of the rows that have a label, or should
+_LABELS = "row's label is not what its conditions give on the stored signals"
+_ENDS = "row is terminated and its signals do not say so, or they do and it is not"
+
+
+def stored(
+    store: Store, rows: FedRows, profile: Profile, conditions: Sequence[Condition]
+) -> Iterator[Comparison]:
+    """Labels of each condition, and terminations; of whole recordings of some 40,000 rows.
+
+    `conditions` are those of the profile that the stored signals can say; `rows` are of the store.
+    """
+    recordings, left_out = _recordings(store, rows.task.hash, profile.labels_version)
+    if not recordings:
+        for check, what in (("labels", _LABELS), ("terminations", _ENDS)):
+            yield not_run(check, what, left_out)
+        return
+    steps = logged_steps(store, rows.task.hash, recordings)
+    whole = _whole(steps)
+    yield from _labels(steps, whole, conditions, left_out)
+    yield _terminations(steps, rows)
+
+
+def _recordings(store: Store, task_hash: str, version: str) -> tuple[list[str], str]:
+    """Recordings that these rules labelled and nobody corrected, and what is said of the others."""
+    found = store.connection.sql(
+        "SELECT recording_id, labels_version, count(*) FROM transitions WHERE task_hash = ?"
+        " GROUP BY ALL ORDER BY ALL",
+        params=[task_hash],
+    ).fetchall()
+    same = [(name, count) for name, labels, count in found if labels == version]
+    total = np.cumsum([count for _, count in same])
+    chosen = [name for (name, _), sum_ in zip(same, total, strict=True) if sum_ <= MOST_ROWS]
+    chosen = chosen or [name for name, _ in same[:1]]
+    others = len(found) - len(same)
+    note = (
+        f"{others} of {len(found)} recordings were labelled by other rules than the profile's, or"
+        " corrected by people: `restock label STORE` brings them up to date"
+        if others
+        else ""
+    )
+    return chosen, note
+
+
+def _whole(steps: LoggedSteps) -> Bools:
+    """The rows (N,) of episodes that are stored whole, their end too."""
+    ended = np.isin(steps.episode_id, steps.episode_id[steps.ending])
+    broken = steps.episode_id[steps.begins & (steps.step_index > 0)]
+    return np.asarray(ended & ~np.isin(steps.episode_id, broken), np.bool_)
+
+
+def _labels(
+    steps: LoggedSteps, whole: Bools, conditions: Sequence[Condition], note: str
+) -> Iterator[Comparison]:
+    if not whole.any():
+        yield not_run("labels", _LABELS, "no episode is stored whole")
+        return
+    kept = np.flatnonzero(whole)
+    ends = np.flatnonzero(whole[steps.ending])
+    rows = np.concatenate([kept, steps.ending[ends]])
+    step = np.concatenate([steps.step_index[kept], steps.step_index[steps.ending[ends]] + 1])
+    episode = np.unique(steps.episode_id[rows], return_inverse=True)[1].reshape(-1)
+    order = np.lexsort((step, episode))
+    of_ends = rows_of(steps.ends, ends)
+    signals = {
+        name: np.concatenate([column[kept], of_ends[name]])[order]
+        for name, column in steps.now.items()
+    }
+    custom = pa.table({"_": pa.nulls(len(order))}).select([])
+    table = label_table(signals, episode[order].astype(np.int64), step[order], custom)
+    try:
+        again = label(table, list(conditions))
+    except ConfigError as error:
+        yield not_run("labels", _LABELS, str(error))
+        return
+    is_row = order < len(kept)
+    back = np.argsort(order[is_row])
+    for name, holds in again.items():
+        now = holds[is_row][back]
+        before = steps.conditions.get(name, np.zeros(len(steps), np.bool_))[kept]
+        either = int((now | before).sum())
+        yield share_judged(
+            f"labels: {name}", _LABELS, int((now != before).sum()), either, DIFFERENT, note=note
+        )
+
+
+def _terminations(steps: LoggedSteps, rows: FedRows) -> Comparison:
+    place = {number: index for index, number in enumerate(rows.transition_id.tolist())}
+    at = np.array([place.get(number, -1) for number in steps.transition_id.tolist()], np.int64)
+    known = steps.followed & (at >= 0)
+    again = terminated(steps.task, rows_of(steps.after, np.flatnonzero(known)))
+    stored_ends = rows.terminated[at[known]]
+    either = int((again | stored_ends).sum())
+    return share_judged("terminations", _ENDS, int((again != stored_ends).sum()), either, DIFFERENT)
+
+
+__all__ = ["stored"]
