@@ -57,7 +57,11 @@ def run(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         "[each_condition]\nshare = 'natural'\n[evaluation_split]\nby = 'none'\n"
     )
     panel = panel_of(store_path, mixture, root / "panel", task=TASK)
-    config = {"target": {"rule": "hard", "every": 500}, "replay": {"ring_capacity": 4096}}
+    config = {
+        "target": {"rule": "hard", "every": 500},
+        "replay": {"ring_capacity": 4096},
+        "practice": {"rule": "success"},
+    }
     began_ns = panel.header.newest_ns + 3 * 86_400 * 10**9
     document = {
         "config": config,
@@ -107,6 +111,22 @@ def run(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
             filled("off_policy", condition=condition, estimator=name, **values)
             for condition in ("all", "nominal")
             for name, values in estimates.items()
+        ],
+    )
+    made.append(
+        "practice",
+        [
+            filled(
+                "practice",
+                env_steps=4 * n,
+                rule="success",
+                arm=arm,
+                wanted_share=share if n == 500 else 0.5,
+                episodes=episodes,
+                success=None if episodes == 0 else 0.25,
+            )
+            for n in steps
+            for arm, share, episodes in (("wheel_slip", 0.2, 12), (HOSTILE, 0.8, 0))
         ],
     )
     made.append("ages", [filled("ages", source="logs", unit="days", bucket=b) for b in (-1, 0, 3)])
@@ -171,6 +191,11 @@ def test_the_replay_card_answers_every_question(run: Path, capsys) -> None:
         ("fqe", 0.5),
         ("wdr", None),
     ]
+    assert card["practice"]["rule"] == "success"
+    slip, other = card["practice"]["arms"]
+    assert (slip["first_share"], slip["last_share"], slip["given_share"]) == (0.2, 0.5, 1.0)
+    assert (slip["episodes"], slip["success"]) == (24, 0.25)
+    assert (other["episodes"], other["success"]) == (0, None)
     assert "biases it most" in card["imbalance"]
     assert json.loads((run / "replay_card.json").read_text()) == card
 
@@ -255,6 +280,7 @@ def test_every_section_has_its_figures(html: str) -> None:
     for section, figures in (
         ("success", 1),
         ("fed", 3),
+        ("practice", 1),
         ("actions", 1),
         ("capacity", 1),
         ("learning", 2),

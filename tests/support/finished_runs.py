@@ -97,6 +97,7 @@ def make_run(
         run.append_columns(
             "evaluations",
             {
+                **dict.fromkeys(run.table("evaluations").schema.names),
                 "env_steps": ENV_STEPS,
                 "gradient_steps": updates,
                 "condition": condition,
@@ -108,8 +109,6 @@ def make_run(
                 "return": won.astype(float),
                 "best": True,
                 "perturbation": "none",
-                "layout": None,
-                "perturbation_values": None,
             },
         )
     run.flush()

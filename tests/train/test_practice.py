@@ -19,12 +19,14 @@ from restock.cli import main
 from restock.errors import ConfigError, RunError
 from restock.ingest.profile.profile import load_profile
 from restock.replay.fleet.missions_file import MissionOrder
+from restock.train.comparison.arms import differences
 from restock.train.dqn.config import PracticeConfig, load_config
 from restock.train.feed.collector import EndedEpisode
 from restock.train.feed.practice import Practice, logged_shares, moved, unordered, with_floors
 from restock.train.loop import train
 from restock.train.missions import reference_success
 from restock.train.prepare import make_twin, prepare_new
+from restock.train.run.run import Run
 from restock.train.twin.env.mission_arms import MissionArm
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.perturbation import Schedule
@@ -333,6 +335,9 @@ def test_runs_practised_differently_are_compared_as_practice_alone(tmp_path: Pat
     for treatment, code in (("algorithm", 1), ("mixture", 1), ("practice", 0)):
         assert main(["compare", first, even, "--treatment", treatment]) == code, treatment
     assert "REFUSED: the runs differ in config.practice.rule" in capsys.readouterr().err
+    tuned = document(3, config__practice__floor=0.2)  # which the natural rule does not read
+    found = differences(Run.open(Path(first)), Run.create(tmp_path / "d", tuned))
+    assert [difference.setting for difference in found] == ["config.seed"]
     other = str(
         make_run(tmp_path / "c", document(2, config__practice__rule="even"), slip_share=0.5)
     )

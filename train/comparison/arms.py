@@ -204,6 +204,10 @@ def differences(first: Run, second: Run) -> list[Difference]:
             for name in [name for name in settings if name.split(".")[0] == "panel"]:
                 if not (name == "panel.id" and has):
                     del settings[name]
+    for settings in (a, b):  # what the natural rule does not read makes no difference
+        if settings.setdefault("config.practice.rule", "natural") == "natural":
+            for name in [n for n in settings if n.startswith("config.practice.")]:
+                settings[name] = "natural" if name.endswith(".rule") else None
     return [
         Difference(name, kind_of(name), a.get(name), b.get(name))
         for name in dict.fromkeys([*a, *b])
