@@ -30,7 +30,7 @@ from restock.ingest.store.corrections import (
 from restock.ingest.store.manifest import count_rows, score_rows
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
-from restock.ingest.task.conditions import Condition, held
+from restock.ingest.task.conditions import Condition, Kind, held, stored
 from restock.ingest.task.label_scores import label_scores
 from restock.ingest.task.schema import recording_schema
 from restock.ingest.task.task import Task
@@ -110,7 +110,9 @@ def remove_corrections(
         for row in live:
             conditions = stored_conditions(row)
             before = store.rows(row["recording_id"], row["ingest_id"])
-            manifest, rows, _ = relabel_rows(store, row | {COLUMN: []}, conditions)
+            manifest, rows, _ = relabel_rows(
+                store, row | {COLUMN: []}, [*conditions, *stored_conditions(row, "exposure")]
+            )
             outcomes.append(_outcome(row, before, rows, corrections_in(row), conditions))
             yield manifest, rows
 
@@ -118,14 +120,14 @@ def remove_corrections(
     return outcomes, _write(store, plain(), replaced_ingests, dry_run)
 
 
-def stored_conditions(manifest: Mapping[str, Any]) -> list[Condition]:
-    """The conditions that labelled a recording, as its manifest keeps them.
+def stored_conditions(manifest: Mapping[str, Any], kind: Kind = "outcome") -> list[Condition]:
+    """The conditions of a kind that labelled a recording, as its manifest keeps them.
 
     Raises:
         StoreError: a newer Restock wrote them.
     """
     try:
-        return msgspec.json.decode(manifest["conditions_json"], type=list[Condition], strict=False)
+        return stored(manifest, kind)
     except msgspec.MsgspecError as error:
         raise StoreError(
             f"the conditions in its manifest cannot be read: {error}",

@@ -57,6 +57,7 @@ class IngestResult:
     messages: dict[str, int] = field(default_factory=dict)  # of used topics; and of unused ones
     conditions: dict[str, int] = field(default_factory=dict)  # transitions a label holds on
     named: dict[str, int] = field(default_factory=dict)  # … and is the row's one condition
+    exposures: dict[str, int] = field(default_factory=dict)  # transitions an exposure holds on
     scores: list[LabelScore] = field(default_factory=list)
     endings: dict[str, int] = field(default_factory=dict)  # episodes by what ended them
     lost_messages: list[str] = field(default_factory=list)  # or lost bytes, and why
@@ -196,6 +197,7 @@ class _Ingest:
             self._messages(),
             counts,
             first,
+            {name: int(holds[rows.starts].sum()) for name, holds in rows.exposures.items()},
             scores,
             dict(Counter(episode.ended_by for episode in episodes.episodes).most_common()),
             self._lost_messages(steps),

@@ -36,6 +36,7 @@ from restock.ingest.task.conditions import (
     Condition,
     label_with_probabilities,
     labels_version,
+    of_kind,
     primary,
     runnable,
     too_near_to_call,
@@ -72,8 +73,9 @@ def relabel_store(
 
     A `version` of the store is labelled in a dry run alone: what was is not written over.
 
-    `conditions_of` gives the conditions for the profile (by name) that read a recording. Returns
-    what became of each, and the version of `transitions` (None where nothing was written).
+    `conditions_of` gives the definitions, of both kinds, for the profile (by name) that read a
+    recording. Returns what became of each, and the version of `transitions` (None where nothing
+    was written).
 
     Raises:
         StoreError: rows were written before their episodes' ends were kept, or changed meanwhile.
@@ -110,9 +112,11 @@ def relabel_store(
 
 
 def relabel_rows(
-    store: StoreWriter, row: dict[str, Any], conditions: Sequence[Condition]
+    store: StoreWriter, row: dict[str, Any], definitions: Sequence[Condition]
 ) -> tuple[pa.Table, pa.Table, Relabelled]:
     """One recording's manifest (of which `row` is the old one) and rows with new labels.
+
+    `definitions` are conditions of both kinds.
 
     Raises:
         StoreError: its rows were written before their episodes' ends were kept.
@@ -127,13 +131,16 @@ def relabel_rows(
             remedy="ingest the recording again",
         )
     stored = rows.select(ends.column_names)  # the signals, and the profile's own
-    every_condition = conditions
+    every_condition = conditions = of_kind(definitions, "outcome")
+    every_exposure = of_kind(definitions, "exposure")
     if row["format"] == TWIN:  # which fills none of the profile's own signals
         conditions = runnable(stored, conditions)
+    # An older store has not all signals that exposures are told by: then they stay unknown.
+    exposures = runnable(stored, every_exposure)
     steps = pa.concat_tables([stored, ends.cast(stored.schema)])
     begin = np.arange(len(rows))
     try:
-        every, probable = label_with_probabilities(steps, conditions)
+        every, probable = label_with_probabilities(steps, [*conditions, *exposures])
     except ConfigError as error:
         raise ConfigError(
             f"{error.where}: {error.what}",
@@ -141,7 +148,10 @@ def relabel_rows(
             remedy=f"they hold {', '.join(ends.column_names)}; for signals that are new in the"
             " profile ingest the recordings again",
         ) from error
-    labels = {name: holds[: len(rows)] for name, holds in every.items()}
+    labels, situations = (
+        {one.name: every[one.name][: len(rows)] for one in several}
+        for several in (conditions, exposures)
+    )
     named = primary(labels, conditions) or [NOMINAL] * len(rows)
     before = rows["condition"].to_pylist()
     ingest_id = uuid.uuid4().hex[:16]
@@ -150,7 +160,10 @@ def relabel_rows(
         "conditions": names_of(labels, begin),
         "probabilities": by_name(probable, begin),
         "uncertain": names_of(too_near_to_call(probable, conditions), begin),
-        "labels_version": labels_version(every_condition),
+        "exposures": names_of(situations, begin)
+        if exposures or not every_exposure
+        else pa.nulls(len(rows), pa.list_(pa.string())),
+        "labels_version": labels_version(definitions),
         "ingest_id": ingest_id,
     }
     rows = replaced(rows, new)
@@ -167,7 +180,8 @@ def relabel_rows(
         "label_counts": count_rows(scores),
         "corrections": correction_rows(corrections),
         "conditions_json": conditions_json(every_condition),
-        "profile_toml": _with_conditions(row["profile_toml"], every_condition),
+        "exposures_json": conditions_json(every_exposure),
+        "profile_toml": _with_conditions(row["profile_toml"], definitions),
     }
     outcome = Relabelled(
         row["recording_id"],

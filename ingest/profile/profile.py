@@ -1,9 +1,9 @@
 """Profiles: how one kind of robot's topics fill the signals, and the task that is learnt on them.
 
-A profile is a TOML file: `name`, the shipped `conditions` it uses and `[[condition]]` of its own,
-`[task]`, `[clock]`, `[episodes]`, `[inputs.*]` (which topic fills what), `[frames]` (poses from
-transforms), `[signals.*]` (custom columns), `[tags]` (whose drive it is) and `[[zone]]` (named
-rectangles of the map).
+A profile is a TOML file: `name`, the shipped `conditions` and `exposures` it uses, `[[condition]]`
+of its own, `[task]`, `[clock]`, `[episodes]`, `[inputs.*]` (which topic fills what), `[frames]`
+(poses from transforms), `[signals.*]` (custom columns), `[tags]` (whose drive it is) and
+`[[zone]]` (named rectangles of the map).
 `load_profile("warehouse_amr")` reads one that comes with Restock, `load_profile("my_robot.toml")`
 one of yours.
 """
@@ -11,7 +11,7 @@ one of yours.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
@@ -28,9 +28,11 @@ from restock.ingest.profile.tag_rules import TagRules
 from restock.ingest.task.condition_files import with_files
 from restock.ingest.task.conditions import (
     Condition,
+    Kind,
     Noise,
     label_with_probabilities,
     labels_version,
+    of_kind,
     shipped,
 )
 from restock.ingest.task.schema import steps_schema
@@ -54,6 +56,7 @@ INPUT_FIELDS: dict[str, dict[str, bool]] = {
     "nav_command": {"speed_mps": True, "yaw_rate_radps": True},
     "behaviour_policy": {"text": True},
     "true_condition": {"text": True},
+    "true_exposure": {"text": True},
     "perturbation": {"text": True},
 }
 
@@ -65,6 +68,7 @@ FALLBACKS: dict[str, str] = {
     "nav_command": "unknown: null, and 0 in the observation",
     "behaviour_policy": "the profile's behaviour_policy",
     "true_condition": "unknown: labels are not scored",
+    "true_exposure": "unknown: exposures are not scored",
     "perturbation": "unknown: null, as of hardware",
 }
 MOTION = "nav_msgs/msg/Odometry"  # what was measured: commands are of other types
@@ -97,6 +101,7 @@ class Inputs(Checked, frozen=True):
     nav_command: Input | None = None  # what navigation proposes, before whoever drives decides
     behaviour_policy: Input | None = None
     true_condition: Input | None = None
+    true_exposure: Input | None = None
     perturbation: Input | None = None
 
     def items(self) -> Iterator[tuple[str, Input]]:
@@ -157,6 +162,7 @@ class Profile(Checked, frozen=True):
     inputs: Inputs
     doc: str = ""
     shipped_conditions: list[str] = msgspec.field(default_factory=list, name="conditions")
+    shipped_exposures: list[str] = msgspec.field(default_factory=list, name="exposures")
     own_conditions: list[Condition] = msgspec.field(default_factory=list, name="condition")
     behaviour_policy: str = "unknown"  # who drove, where no topic says
     clock: Clock = Clock()
@@ -169,14 +175,28 @@ class Profile(Checked, frozen=True):
 
     @property
     def conditions(self) -> list[Condition]:
-        """The conditions that label this robot's steps."""
-        known = shipped(self.noise)
-        own = [one.with_constants(self.noise.constants) for one in self.own_conditions]
-        return [known[name] for name in self.shipped_conditions] + own
+        """The conditions that label this robot's steps: outcomes."""
+        return self._of("outcome", self.shipped_conditions)
+
+    @property
+    def exposures(self) -> list[Condition]:
+        """The situations that are listed beside them."""
+        return self._of("exposure", self.shipped_exposures)
+
+    def _of(self, kind: Kind, names: Sequence[str]) -> list[Condition]:
+        known = shipped(self.noise, kind)
+        own = of_kind(self.own_conditions, kind)
+        constants = self.noise.constants
+        return [known[name] for name in names] + [one.with_constants(constants) for one in own]
+
+    @property
+    def definitions(self) -> list[Condition]:
+        """Both, conditions first."""
+        return [*self.conditions, *self.exposures]
 
     @property
     def labels_version(self) -> str:
-        return labels_version(self.conditions)
+        return labels_version(self.definitions)
 
     @property
     def hash(self) -> str:
@@ -185,7 +205,9 @@ class Profile(Checked, frozen=True):
         That leaves out conditions, which can be changed without the recordings (labels depend on
         `labels_version`), their [noise], and whose drive it is.
         """
-        without = msgspec.structs.replace(self, shipped_conditions=[], own_conditions=[])
+        without = msgspec.structs.replace(
+            self, shipped_conditions=[], shipped_exposures=[], own_conditions=[]
+        )
         values = msgspec.to_builtins(without)
         rest = {key: value for key, value in values.items() if key not in ("tags", "noise")}
         return hashlib.blake2b(msgspec.json.encode(rest), digest_size=6).hexdigest()
@@ -272,15 +294,21 @@ def _typed(document: dict[str, Any], *, where: str, folder: Path | None) -> Prof
 
 def _check(profile: Profile, where: str) -> None:
     """What the types alone do not say."""
-    known = shipped()
-    for name in profile.shipped_conditions:
-        if name not in known:
-            raise ConfigError(
-                f"`conditions`: no condition named {name!r}",
-                where=where,
-                remedy=f"shipped are {', '.join(known)}; write your own as [[condition]]",
-            )
-    names = [condition.name for condition in profile.conditions]
+    kinds: tuple[tuple[Kind, str, Sequence[str]], ...] = (
+        ("outcome", "conditions", profile.shipped_conditions),
+        ("exposure", "exposures", profile.shipped_exposures),
+    )
+    for kind, key, given in kinds:
+        known = shipped(kind=kind)
+        for name in given:
+            if name not in known:
+                raise ConfigError(
+                    f"`{key}`: no {'condition' if kind == 'outcome' else kind} named {name!r}",
+                    where=where,
+                    remedy=f"shipped are {', '.join(known)}; write your own as [[condition]]"
+                    + (' with kind = "exposure"' if kind == "exposure" else ""),
+                )
+    names = [condition.name for condition in profile.definitions]
     if doubled := sorted({name for name in names if names.count(name) > 1}):
         raise ConfigError(f"`conditions`: {', '.join(doubled)} given twice", where=where)
     for name, source in profile.inputs.items():

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 
 from restock.ingest.profile.profile import Profile, parse_profile
-from restock.ingest.task.conditions import Condition, shipped
+from restock.ingest.task.conditions import Condition, of_kind, shipped
 from restock.toml import toml_value
 
 
@@ -43,10 +43,14 @@ def read_profile_toml(text: str, *, where: str) -> Profile:
 
 def with_conditions(profile: Profile, conditions: Sequence[Condition]) -> Profile:
     """The same profile with other conditions; those that come with Restock go by their names."""
-    known = shipped(profile.noise)
-    named = [c.name for c in conditions if known.get(c.name) == c]
-    own = [c for c in conditions if c.name not in named]
-    return msgspec.structs.replace(profile, shipped_conditions=named, own_conditions=own)
+    known = shipped(profile.noise) | shipped(profile.noise, "exposure")
+    named = [c for c in conditions if known.get(c.name) == c]
+    return msgspec.structs.replace(
+        profile,
+        shipped_conditions=[c.name for c in of_kind(named, "outcome")],
+        shipped_exposures=[c.name for c in of_kind(named, "exposure")],
+        own_conditions=[c for c in conditions if c not in named],
+    )
 
 
 def _given(value: Any) -> Any:

@@ -114,8 +114,15 @@ KINDS: dict[str, tuple[Kind, ...]] = {
         Kind("std_msgs/msg/String", {"text": "data"}, ("policy", "mode", "behavi"), must=True),
     ),
     "true_condition": (
-        Kind("std_msgs/msg/String", {"text": "data"}, ("ground_truth", "true_cond"), must=True),
+        Kind(
+            "std_msgs/msg/String",
+            {"text": "data"},
+            ("ground_truth", "true_cond"),
+            must=True,
+            never=("exposure",),
+        ),
     ),
+    "true_exposure": (Kind("std_msgs/msg/String", {"text": "data"}, ("exposure",), must=True),),
     "perturbation": (Kind("std_msgs/msg/String", {"text": "data"}, ("perturbation",), must=True),),
 }
 # Where that is asked for: the measured motion in place of commands that were not recorded.
@@ -126,7 +133,7 @@ REQUIRED = ("command", "wheels", "pose")
 FIXED_FRAMES = ("map", "odom", "world")  # best first
 BASE_FRAMES = ("base_link", "base_footprint", "base")
 LATCHED = ("goal", "plan", "behaviour_policy", "perturbation")
-SPENT = (*LATCHED, "true_condition")  # nothing else is in their topics
+SPENT = (*LATCHED, "true_condition", "true_exposure")  # nothing else is in their topics
 
 Roles = dict[str, list[tuple[TopicInfo, Kind]]]  # input -> …, best first
 

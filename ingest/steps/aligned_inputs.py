@@ -169,6 +169,7 @@ class AlignedInputs:
             # of it is the one in force at its middle. On the command clock it opens the interval.
             "command": half_s if by_rate else 0.0,
             "true_condition": half_s,  # the message nearest to the tick
+            "true_exposure": half_s,
             "behaviour_policy": PROVENANCE_LEAD_S,
             "perturbation": PROVENANCE_LEAD_S,
         }

@@ -24,7 +24,8 @@ from restock.ingest.steps.needs import field_paths
 from restock.ingest.steps.steps import Filling
 from restock.ingest.task.task import nearest_action, observe
 
-PROVENANCE = ("behaviour_policy", "true_condition", "perturbation")  # no robot acts by these
+# No robot acts by these.
+PROVENANCE = ("behaviour_policy", "true_condition", "true_exposure", "perturbation")
 
 
 @dataclass(frozen=True)

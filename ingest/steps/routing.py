@@ -10,6 +10,7 @@ import numpy as np
 from restock.arrays import F64, Ints
 from restock.ingest.task.route import RouteView, pad_plans, view_route
 from restock.ingest.task.signals import Signals
+from restock.ingest.task.surroundings import way_to_return
 from restock.ingest.task.task import Task, clearance_ahead
 
 # A number beyond this, in any unit that a signal has, is a fault and counts as not finite.
@@ -72,6 +73,7 @@ class Routing:
             "clearance_ahead_m": clearance_ahead(
                 task, now["sector_clearance_m"], near[:, 0], near[:, 1]
             ),
+            "plan_return_m": way_to_return(task, now["sector_clearance_m"], near, far),
         }
 
     def progress_m(self, task: Task, plan: Ints, now: Signals, after: Signals) -> F64:

@@ -7,7 +7,7 @@ finite) is kept beside it as a reason, so that everything left out can be counte
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
@@ -27,7 +27,10 @@ from restock.ingest.steps.custom_columns import Custom, custom_signals
 from restock.ingest.steps.routing import LARGEST, Routing, plan_ends, plan_problems, same_goals
 from restock.ingest.task.perturbation_columns import Perturbed
 from restock.ingest.task.signals import Signals, localised_velocity
+from restock.ingest.task.surroundings import SCANNED, came_nearer
 from restock.ingest.task.task import nearest_action
+
+_CHUNK = 4096  # steps
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,7 @@ class Steps:
     policy_version: list[str | None]  # (T,)
     probability: list[float | None]  # (T,)
     truth: list[str | None]  # (T,) true condition, where a simulator published it
+    true_exposure: list[str | None]  # (T,) the same of exposures
     perturbed: Perturbed  # (T,) a simulator's parameters in force
     clock: ClockReport
     commands_between: int  # commands that got no tick of their own
@@ -87,6 +91,7 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
         [version for _, version, _ in policies],
         [probability for _, _, probability in policies],
         filling.texts("true_condition"),
+        filling.texts("true_exposure"),
         perturbed,
         aligned.clock,
         aligned.commands_between,
@@ -137,6 +142,11 @@ class Filling:
             signals, {name: signals[name][before] for name in signals if name.startswith("pose_")}
         )
         signals |= {"localised_speed_mps": forward, "localised_lateral_mps": lateral}
+        came = [
+            came_nearer(self.task, *({name: signals[name][at] for name in SCANNED} for at in pair))
+            for pair in _chunks(before)
+        ]
+        signals["came_nearer_m"] = np.concatenate([np.zeros(0), *came])
         return signals
 
     @property
@@ -302,6 +312,13 @@ class Filling:
         usable = self.route_problem == ""
         goal, plan = np.where(usable, goal, -1), np.where(usable, plan, -1)
         self.routing = Routing(goals, plans, goal, plan, latest["goal"].row.astype(np.int64))
+
+
+def _chunks(before: Ints) -> Iterator[tuple[slice, Ints]]:
+    """Steps and the ones before them, some at a time: what is made of scans takes memory."""
+    for start in range(0, len(before), _CHUNK):
+        rows = slice(start, start + _CHUNK)
+        yield rows, before[rows]
 
 
 def pressed_since(bumper: Samples, pressed: Bools, tick_ns: Ints) -> Bools:

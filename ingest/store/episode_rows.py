@@ -33,6 +33,7 @@ class EpisodeRows:
     labels: dict[str, Bools]  # condition -> (R,)
     custom: pa.Table  # (R,) the profile's own signals
     probabilities: dict[str, F32]  # condition that has a rule for it -> (R,); NaN: not known
+    exposures: dict[str, Bools]  # as `labels`
 
     @property
     def starts(self) -> Ints:
@@ -54,7 +55,10 @@ class EpisodeRows:
     def join(cls, parts: Sequence[EpisodeRows]) -> EpisodeRows:
         """Steps of several groups of episodes, without their signals."""
         none: Signals = {}
-        labels = {name: np.concatenate([p.labels[name] for p in parts]) for name in parts[0].labels}
+        labels, exposures = (
+            {name: np.concatenate([getattr(p, kind)[name] for p in parts]) for name in first}
+            for kind, first in (("labels", parts[0].labels), ("exposures", parts[0].exposures))
+        )
         return cls(
             np.concatenate([part.tick for part in parts]),
             np.concatenate([part.episode for part in parts]),
@@ -67,6 +71,7 @@ class EpisodeRows:
                 name: np.concatenate([part.probabilities[name] for part in parts])
                 for name in parts[0].probabilities
             },
+            exposures,
         )
 
 
@@ -106,8 +111,12 @@ def episode_rows(
             signals[name][old] = column
     custom = steps.custom.take(tick)
     table = label_table(signals, episode, step, custom)
-    labels, probable = label_with_probabilities(table, profile.conditions)
-    return EpisodeRows(tick, episode, step, is_end, signals, labels, custom, probable)
+    held, probable = label_with_probabilities(table, profile.definitions)
+    labels, exposures = (
+        {condition.name: held[condition.name] for condition in several}
+        for several in (profile.conditions, profile.exposures)
+    )
+    return EpisodeRows(tick, episode, step, is_end, signals, labels, custom, probable, exposures)
 
 
 def label_table(signals: Signals, episode: Ints, step: Ints, custom: pa.Table) -> pa.Table:

@@ -78,6 +78,7 @@ def manifest_row(
         "corrections": [],
         "task_json": msgspec.json.encode(profile.task).decode(),
         "conditions_json": conditions_json(profile.conditions),
+        "exposures_json": conditions_json(profile.exposures),
         "profile_toml": profile_toml(profile),
         **recorded,
     }
@@ -162,7 +163,7 @@ def count_rows(scores: Sequence[LabelScore]) -> list[dict[str, Any]]:
 
 
 def conditions_json(conditions: Sequence[Condition]) -> str:
-    """Conditions as the manifest holds them: all but their doc."""
+    """Conditions of one kind as the manifest holds them: all but their kind and doc."""
     names = ("name", "timing", "priority", "sql", "let", "probability", "uncertain", "constants")
     return msgspec.json.encode(
         [{name: getattr(condition, name) for name in names} for condition in conditions]

@@ -52,6 +52,7 @@ class TransitionValues:
     policy_version: Sequence[str | None]  # (N,)
     probability: Sequence[float | None] | NDArray[np.floating]  # (N,) of the action
     perturbation: tuple[pa.Array, pa.Array]  # (N,) its name and its values
+    true_exposure: Sequence[str | None] | None = None  # (N,); None: not known of any
 
 
 def recording_table(
@@ -110,6 +111,7 @@ def transitions(
         policy_version=[steps.policy_version[index] for index in tick],
         probability=[steps.probability[index] for index in tick],
         perturbation=steps.perturbed.columns(tick),
+        true_exposure=[_sorted_truth(steps.true_exposure[index]) for index in tick],
     )
     return transition_table(profile, rows, values, provenance)
 
@@ -152,6 +154,8 @@ def transition_table(
         "true_condition": values.truth,
         "probabilities": by_name(rows.probabilities, begin),
         "uncertain": names_of(too_near_to_call(rows.probabilities, evaluated), begin),
+        "exposures": names_of(rows.exposures, begin),
+        "true_exposure": values.true_exposure or pa.nulls(count, pa.string()),
         "perturbation": values.perturbation[0],
         "perturbation_values": values.perturbation[1],
         "zone": values.zone,

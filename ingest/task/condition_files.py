@@ -25,11 +25,11 @@ from restock.errors import ConfigError
 
 LARGEST_BYTES = 100_000  # of a condition's file
 _PART = re.compile(r"-- (?:let ([A-Za-z]\w*)|(label|probability)):\s*")
-_SETTINGS = ("timing", "priority", "uncertain")
+_SETTINGS = ("kind", "timing", "priority", "uncertain")
 
 
 def settings_of(text: str) -> dict[str, Any]:
-    """`sql`, `doc`, and what else of `let`, `probability`, `timing`, `priority`, `uncertain`."""
+    """`sql`, `doc`, and what else of `let`, `probability`, `kind`, `timing`, `priority`, …"""
     settings: dict[str, Any] = {}
     doc: list[str] = []
     parts: dict[str, list[str]] = {}

@@ -15,6 +15,12 @@ A condition may have a **probability** beside its label: an expression of the sa
 0 to 1, from how far the signals are from the rule's limits against the noise of the sensors. A step
 whose probability lies within the condition's `uncertain` band is too near to call.
 
+A condition is of one of two kinds. An **outcome** (the default) names what came of it, and gives a
+row its one `condition`. An **exposure** names the situation, whatever came of it: someone close by,
+a blocked plan. It is `pre`, has no probability, is listed beside the outcomes (`exposures`), and
+never takes a row's condition from them. Strata and comparisons of success are chosen on exposures
+where an outcome would choose the failures.
+
 The difference of timings matters to replay: boosting a `post` stratum resamples the outcome of an
 action and biases what the critic learns, unless it is corrected for. What else a condition may not
 say is in `restock.ingest.task.condition_sql`. Where a simulator says the truth, labels are scored
@@ -25,10 +31,10 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from importlib.resources import files
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import duckdb
 import msgspec
@@ -44,6 +50,7 @@ from restock.ingest.task.condition_sql import SANDBOX, WINDOW, refusal, select_o
 from restock.toml import Checked
 
 Timing = Literal["pre", "post"]
+Kind = Literal["outcome", "exposure"]
 Expression = Literal["sql", "probability"]  # of a condition
 Columns = dict[tuple[str, Expression], pa.ChunkedArray]  # by the condition's name
 NOMINAL = "nominal"
@@ -61,6 +68,7 @@ class Condition(Checked, frozen=True):
     probability: str = ""  # SQL, 0 to 1; "": none
     uncertain: tuple[float, float] = (0.2, 0.8)  # within it a step is too near to call
     constants: dict[str, float] = msgspec.field(default_factory=dict)  # that its SQL may name
+    kind: Kind = "outcome"  # or the situation, whatever comes of it
 
     def with_constants(self, constants: Mapping[str, float]) -> Condition:
         """The condition with those of the constants that its SQL names; its own win."""
@@ -72,6 +80,11 @@ class Condition(Checked, frozen=True):
     def check(self) -> None:
         if not 0 <= self.uncertain[0] <= self.uncertain[1] <= 1:
             raise ValueError(f"uncertain must be [low, high] in [0, 1], got {self.uncertain}")
+        if self.kind == "exposure" and (self.timing != "pre" or self.probability):
+            raise ValueError(
+                f"an exposure is a situation known before acting: timing must be 'pre', without a"
+                f" probability, got timing {self.timing!r}"
+            )
         for name in (*self.constants, *self.let):
             if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
                 raise ValueError(f"let and constants: a name is letters, digits and _: {name!r}")
@@ -99,8 +112,8 @@ class Noise(Checked, frozen=True):
         return {"_noise_".join(name.rsplit("_", 1)): value for name, value in named.items()}
 
 
-def shipped(noise: Noise | None = None) -> dict[str, Condition]:
-    """The conditions that come with Restock, by name: `ingest/task/conditions/*.sql`.
+def shipped(noise: Noise | None = None, kind: Kind = "outcome") -> dict[str, Condition]:
+    """The conditions of a kind that come with Restock, by name: `ingest/task/conditions/*.sql`.
 
     `noise` is of the sensors of the robot whose steps they label; None: as the profile's defaults.
     """
@@ -112,8 +125,25 @@ def shipped(noise: Noise | None = None) -> dict[str, Condition]:
             name = entry.name.removesuffix(".sql")
             text = entry.read_text(encoding="utf-8")
             made = msgspec.convert({"name": name, **settings_of(text)}, Condition)
-            conditions[name] = made.with_constants(constants)
+            if made.kind == kind:
+                conditions[name] = made.with_constants(constants)
     return conditions
+
+
+def of_kind(conditions: Iterable[Condition], kind: Kind) -> list[Condition]:
+    """The conditions of one kind, in their order."""
+    return [condition for condition in conditions if condition.kind == kind]
+
+
+def stored(manifest: Mapping[str, Any], kind: Kind = "outcome") -> list[Condition]:
+    """The conditions of a kind of a manifest row; no exposures in one of an older Restock.
+
+    Raises:
+        msgspec.MsgspecError: a newer Restock wrote them.
+    """
+    text = manifest.get("conditions_json" if kind == "outcome" else "exposures_json") or "[]"
+    read = msgspec.json.decode(text, type=list[Condition], strict=False)
+    return [msgspec.structs.replace(condition, kind=kind) for condition in read]
 
 
 def labels_version(conditions: Sequence[Condition]) -> str:
@@ -123,6 +153,7 @@ def labels_version(conditions: Sequence[Condition]) -> str:
         # Nothing more where there is nothing more: so that the version of a plain rule stays.
         + ((c.probability, c.uncertain) if c.probability else ())
         + ((list(c.let.items()), sorted(c.constants.items())) if c.let or c.constants else ())
+        + ((c.kind,) if c.kind != "outcome" else ())
         for c in conditions
     ]
     content = msgspec.json.encode(sorted(said, key=str))
@@ -289,8 +320,9 @@ def _query(
 
 
 def primary(labels: dict[str, Bools], conditions: Sequence[Condition]) -> list[str]:
-    """The one condition of each row: the one of lowest priority number, or `nominal`."""
-    ordered = sorted(conditions, key=lambda condition: (condition.priority, condition.name))
+    """The one condition of each row: the outcome of lowest priority number, or `nominal`."""
+    outcomes = of_kind(conditions, "outcome")
+    ordered = sorted(outcomes, key=lambda condition: (condition.priority, condition.name))
     if not ordered:
         return []
     table = np.stack([labels[condition.name] for condition in ordered], axis=1)

@@ -169,10 +169,29 @@ def touched(runs: Ints, holds: Bools) -> Bools:
 
 
 def label_scores(rows: pa.Table, names: Iterable[str], period_s: float) -> list[LabelScore]:
-    """How well every condition of each transition agrees with the true ones, for these labels."""
-    labels = held(rows["conditions"], list(names))
+    """How well every condition of each transition agrees with the true ones, for these labels.
+
+    `names` are of outcomes; the exposures that a row or the truth names are scored too.
+    """
     episode, step = rows["episode_index"].to_numpy(), rows["step_index"].to_numpy()
-    return score(labels, rows["true_condition"].to_pylist(), episode, step, period_s)
+    scores = []
+    for column, truth, asked in (
+        ("conditions", "true_condition", list(names)),
+        ("exposures", "true_exposure", exposures_named(rows)),
+    ):
+        if asked:
+            labels = held(rows[column], asked)
+            scores += score(labels, rows[truth].to_pylist(), episode, step, period_s)
+    return scores
+
+
+def exposures_named(rows: pa.Table) -> list[str]:
+    """The exposures that labels or truth of rows name, sorted; none in rows of an older store."""
+    if not {"exposures", "true_exposure"} <= set(rows.column_names):
+        return []
+    labelled = set(rows["exposures"].combine_chunks().flatten().unique().to_pylist())
+    true = rows["true_exposure"].unique().to_pylist()
+    return sorted(labelled.union(*(true_names(text) for text in true if text is not None)))
 
 
 def pooled(scores: Iterable[LabelScore]) -> list[LabelScore]:

@@ -69,6 +69,18 @@ COVERAGE: tuple[Column, ...] = (
         "conditions too near to call by their probability; null: older than such rules",
         nullable=True,
     ),
+    Column(
+        "exposures",
+        pa.list_(pa.string()),
+        "every exposure that holds, whatever the condition; null: older than exposures",
+        nullable=True,
+    ),
+    Column(
+        "true_exposure",
+        pa.string(),
+        "all exposures that a simulator knows to be so, sorted, commas between; or nominal",
+        nullable=True,
+    ),
     Column("perturbation", pa.string(), "name of the twin's parameters in force", nullable=True),
     Column(
         "perturbation_values",
@@ -237,6 +249,12 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
     ),
     Column("task_json", pa.string(), "the task, as JSON"),
     Column("conditions_json", pa.string(), "the conditions: name, timing, sql, …, as JSON"),
+    Column(
+        "exposures_json",
+        pa.string(),
+        "the exposures, as conditions_json; null: older than exposures",
+        nullable=True,
+    ),
     Column(
         "corrections",
         _rows_of(

@@ -57,6 +57,15 @@ SIGNALS: tuple[Signal, ...] = (
     Signal("goal_distance_m", "straight distance from the pose to the goal"),
     Signal("localised_speed_mps", "forward speed from the last two localised poses"),
     Signal("localised_lateral_mps", "sideways speed (left) from the last two localised poses"),
+    Signal(
+        "came_nearer_m",
+        "how far something within 2 m came nearer since the step before, the robot's own motion"
+        " taken off; 0: nothing",
+    ),
+    Signal(
+        "plan_return_m",
+        "way along the look-ahead points to the first lidar return on it; range_max_m: none",
+    ),
     Signal("bumped", "the bumper was pressed since the step before", "bool"),
     Signal("command_speed_mps", "commanded forward speed in force until the next step"),
     Signal("command_yaw_rate_radps", "commanded yaw rate in force until the next step"),

@@ -16,6 +16,7 @@ from restock.stats import NOT_KNOWN, ConfidenceInterval, cluster_counts, percent
 
 RESAMPLES = 1000
 ALL = "all"
+LABELS, TRUTHS = ("conditions", "exposures"), ("true_condition", "true_exposure")
 
 
 @dataclass(frozen=True)
@@ -82,16 +83,25 @@ class _Recording:
 def _read(store: Store, ingest_id: str, names: Sequence[str], period_s: float) -> _Recording | None:
     """None where no truth is known."""
     rows = store.connection.sql(
-        "SELECT episode_index, step_index, conditions, true_condition, uncertain FROM transitions"
-        " WHERE ingest_id = ? AND true_condition IS NOT NULL ORDER BY episode_index, step_index",
+        "SELECT episode_index, step_index, conditions, true_condition, uncertain, exposures,"
+        " true_exposure FROM transitions WHERE ingest_id = ?"
+        " AND coalesce(true_condition, true_exposure) IS NOT NULL"
+        " ORDER BY episode_index, step_index",
         params=[ingest_id],
     ).to_arrow_table()
     if not len(rows):
         return None
     scores = label_scores(rows, names, period_s)
     episode = np.unique(rows["episode_index"].to_numpy(), return_inverse=True)[1]
-    truth = [frozenset(text.split(",")) for text in rows["true_condition"].to_pylist()]
-    held = [frozenset(names or ()) for names in rows["conditions"].to_pylist()]
+    # Names of the two kinds differ: a set of both says of each what its own column does.
+    truth = [
+        frozenset(f"{one or ''},{other or ''}".split(","))
+        for one, other in zip(*(rows[name].to_pylist() for name in TRUTHS), strict=True)
+    ]
+    held = [
+        frozenset([*(one or ()), *(other or ())])
+        for one, other in zip(*(rows[name].to_pylist() for name in LABELS), strict=True)
+    ]
     unsure = [frozenset(names or ()) for names in rows["uncertain"].to_pylist()]
     episodes: dict[str, F64] = {}
     for score in scores:

@@ -17,7 +17,7 @@ from restock.replay.store.column_docs import install_columns
 T = TypeVar("T")
 
 # In their order: a view may use those before it.
-VIEWS = ("rows.sql", "views.sql", "labels.sql", "events.sql", "fleet.sql")
+VIEWS = ("rows.sql", "views.sql", "labels.sql", "events.sql", "fleet.sql", "exposure.sql")
 MACROS = (
     "macros.sql",
     "capacity.sql",
@@ -27,7 +27,11 @@ MACROS = (
     "drift.sql",
 )
 # To bind these takes more than half of the time to open a store: only for queries that name them.
-ON_DEMAND = (("events.sql", "fleet.sql"), ("episode_signals.sql", "drift.sql"))
+ON_DEMAND = (
+    ("events.sql", "fleet.sql"),
+    ("episode_signals.sql", "drift.sql"),
+    ("exposure.sql",),
+)
 _LISTS = {
     "columns",
     "information_schema",

@@ -21,6 +21,7 @@ FROM (
     UNION ALL BY NAME
     SELECT
         NULL::MAP(VARCHAR, VARCHAR) AS tags,
+        NULL::VARCHAR AS exposures_json,
         NULL::STRUCT(
             condition VARCHAR, known BIGINT, labelled BIGINT, support BIGINT, agreed BIGINT,
             event_labelled BIGINT, event_right BIGINT, event_support BIGINT, event_found BIGINT
@@ -50,6 +51,10 @@ FROM (
     SELECT
         NULL::MAP(VARCHAR, FLOAT) AS probabilities,
         NULL::VARCHAR[] AS uncertain,
+        NULL::VARCHAR[] AS exposures,
+        NULL::VARCHAR AS true_exposure,
+        NULL::FLOAT AS came_nearer_m,
+        NULL::FLOAT AS plan_return_m,
         NULL::VARCHAR AS perturbation,
         NULL::MAP(VARCHAR, DOUBLE) AS perturbation_values
     WHERE false

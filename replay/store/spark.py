@@ -84,11 +84,16 @@ _LATER = {
     TRANSITIONS: {
         "probabilities": "CAST(NULL AS MAP<STRING, FLOAT>) AS probabilities",
         "uncertain": "CAST(NULL AS ARRAY<STRING>) AS uncertain",
+        "exposures": "CAST(NULL AS ARRAY<STRING>) AS exposures",
+        "true_exposure": "CAST(NULL AS STRING) AS true_exposure",
+        "came_nearer_m": "CAST(NULL AS FLOAT) AS came_nearer_m",
+        "plan_return_m": "CAST(NULL AS FLOAT) AS plan_return_m",
         "perturbation": "CAST(NULL AS STRING) AS perturbation",
         "perturbation_values": "CAST(NULL AS MAP<STRING, DOUBLE>) AS perturbation_values",
     },
     RECORDINGS: {
         "tags": "CAST(NULL AS MAP<STRING, STRING>) AS tags",
+        "exposures_json": "CAST(NULL AS STRING) AS exposures_json",
         "label_counts": (
             "CAST(NULL AS ARRAY<STRUCT<condition: STRING, known: BIGINT, labelled: BIGINT,"
             " support: BIGINT, agreed: BIGINT, event_labelled: BIGINT, event_right: BIGINT,"

@@ -149,6 +149,14 @@ class Store:
             return ()
         return tuple(self._decode(rows[0][0], list[Condition], "conditions"))
 
+    def exposures(self) -> tuple[Condition, ...]:
+        """The exposures listed beside them, of the newest ingest; an older store has none."""
+        rows = self.connection.sql(
+            "SELECT exposures_json FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1"
+        ).fetchall()
+        found = self._decode(rows[0][0] or "[]", list[Condition], "exposures") if rows else []
+        return tuple(msgspec.structs.replace(one, kind="exposure") for one in found)
+
     def profile_name(self, task_hash: str) -> str:
         """The profile that read the rows of a task, by the newest ingest; "" where none did."""
         profiles = profiles_of(self.connection, task_hash)

@@ -35,7 +35,7 @@ from restock.ingest.store.corrections import (
     merged,
 )
 from restock.ingest.store.writer import StoreWriter
-from restock.ingest.task.conditions import Condition, labels_version
+from restock.ingest.task.conditions import Condition
 from restock.replay.store.store import Store
 
 NOW = dt.datetime(2026, 3, 1, tzinfo=dt.UTC)
@@ -102,7 +102,7 @@ def test_corrections_survive_new_rules_a_new_ingest_and_a_changed_profile(
     wanted = [2, 3, 4, *before[2:]]
     assert soon(store) == wanted
     (version,) = {version for (version,) in labels(store, "labels_version")}
-    rules = labels_version(load_profile(tmp_path / "amr.toml").conditions)
+    rules = load_profile(tmp_path / "amr.toml").labels_version
     assert version.startswith(f"{rules}+")
 
     capsys.readouterr()

@@ -24,6 +24,7 @@ TASK = Task(
     sectors=4,
 )
 CONDITIONS = [shipped()[name] for name in sorted(shipped())]
+EXPOSURES = list(shipped(kind="exposure").values())
 LABEL_CHANCE = {"wheel_slip": 0.03, "blocked_aisle": 0.06, "near_collision": 0.02, "recovery": 0.03}
 START_NS = 1_700_000_000 * 10**9
 
@@ -45,6 +46,7 @@ def recording_transitions(
     observation = rng.normal(size=(rows, size)).astype(np.float32)
     after = np.where(last[:, None], rng.normal(size=(rows, size)), np.roll(observation, -1, 0))
     recording_id = f"{recording:016x}"
+    where = list(zip(episode.tolist(), step.tolist(), strict=True))
     values: dict[str, object] = {
         "transition_id": (np.int64(recording) << STEP_BITS) + np.arange(rows),
         "recording_id": [recording_id] * rows,
@@ -62,6 +64,8 @@ def recording_transitions(
         "true_condition": [None] * rows,
         "probabilities": [[("recovery", p)] for p in chance.random(rows)],
         "uncertain": [["recovery"] if row % 97 == 0 else [] for row in range(rows)],
+        "exposures": [["closing_traffic"] if e % 3 == 0 and s < 6 else [] for e, s in where],
+        "true_exposure": pa.nulls(rows, pa.string()),
         "perturbation": np.where(np.arange(rows) % 3 > 0, "wet", None),
         "perturbation_values": [[("friction_scale", 0.5)] if r % 3 else None for r in range(rows)],
         "zone": rng.choice(["aisle_1", "aisle_2", "cross"], rows),
@@ -75,7 +79,7 @@ def recording_transitions(
         "source_file": [f"logs/{recording}.mcap"] * rows,
         "profile_hash": ["0123456789ab"] * rows,
         "task_hash": [task.hash] * rows,
-        "labels_version": [labels_version(CONDITIONS)] * rows,
+        "labels_version": [labels_version([*CONDITIONS, *EXPOSURES])] * rows,
         "restock_version": ["0.1.0"] * rows,
     }
     schema = transition_schema(size)
@@ -93,10 +97,13 @@ def manifest(
 ) -> pa.Table:
     """The `recordings` row of one recording's transitions."""
     first = transitions.slice(0, 1).to_pylist()[0]
-    conditions = [
-        {"name": c.name, "timing": c.timing, "priority": c.priority, "sql": c.sql}
-        for c in CONDITIONS
-    ]
+    conditions, exposures = (
+        [
+            {"name": c.name, "timing": c.timing, "priority": c.priority, "sql": c.sql}
+            for c in several
+        ]
+        for several in (CONDITIONS, EXPOSURES)
+    )
     row = {
         "recording_id": first["recording_id"],
         "ingest_id": first["ingest_id"],
@@ -130,6 +137,7 @@ def manifest(
         ],
         "task_json": msgspec.json.encode(task).decode(),
         "conditions_json": msgspec.json.encode(conditions).decode(),
+        "exposures_json": msgspec.json.encode(exposures).decode(),
     }
     schema = recording_schema()
     blank = {pa.string(): "", pa.int64(): 0, pa.int32(): 0, pa.float64(): 0.0}

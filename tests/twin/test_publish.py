@@ -59,6 +59,7 @@ def _drive(rng: np.random.Generator) -> Drive:
         ranges_m=rng.uniform(0.3, 9, (41, 90)),
         command=np.tile([0.5, 0.5], (20, 1)),
         true_condition=["nominal"] * 20,
+        true_exposure=["nominal"] * 20,
         policy=[("planner", "1", 0.98)] * 12 + [("operator", "1", 0.97)] * 8,
         plans=[(0, np.zeros((5, 2))), (10, np.ones((7, 2)))],
         scene=replace(EMPTY, perturbation=NOISELESS),
@@ -108,6 +109,7 @@ def test_every_topic_has_its_rate(messages: list[Message]) -> None:
         "/tf": 81,
         "/bumper": 43,  # 41 at 10 Hz, pressed and released between
         "/ground_truth/condition": 21,
+        "/ground_truth/exposure": 21,
         "/cmd_vel": 21,  # 20 steps and the stop at the end
         "/diagnostics": 5,
         "/ground_truth/perturbation": 1,

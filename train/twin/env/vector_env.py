@@ -15,11 +15,11 @@ termination.
 
 - `signals`: the stored signals at t + 1, before any autoreset (`env.signals`: after it). Its
   `command_*` columns are the commands of [t, t + 1); `progress_m` along the plan in force at t;
-- `true_condition`: what was physically so over [t, t + 1); `episode_condition`, `block` (none,
-  partial, full), `episode_seed`, `perturbation` and `layout` (their names), `floor` (the layout
-  itself), `episode_number` (place in `set_episodes`, or -1), `mission_arm` (place among
-  `mission_arms`, -1 where none was asked for); `perturbation_values`, as JSON those that are not
-  nominal;
+- `true_condition`: what was physically so over [t, t + 1); `true_exposure`: the situation at t;
+  `episode_condition`, `block` (none, partial, full), `episode_seed`, `perturbation` and `layout`
+  (their names), `floor` (the layout itself), `episode_number` (place in `set_episodes`, or -1),
+  `mission_arm` (place among `mission_arms`, -1 where none was asked for); `perturbation_values`,
+  as JSON those that are not nominal;
 - `success` (at the goal without any bump, at the episode's end), `bumps` (steps with a bump so
   far), `episode_steps`, `true_pose` (N, 3);
 - `travelled_m`, over ground in [t, t + 1); `closest_person_m`, the least true distance so far from
@@ -249,7 +249,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
                 self.simulation.traffic.closest_m[env] = np.inf
         self.steps[ids] = self.bumps[ids] = self.previous_action[ids] = 0
         first = self.sensing.sense(ids, self.steps[ids])
-        add_motion(first, None)
+        add_motion(self.task, first, None)
         add_route(self.task, first, self.navigation.plans_m[ids], self.navigation.goals_m[ids])
         self._propose(first)
         observed = observe(self.task, first, first, self.previous_action[ids])
@@ -309,12 +309,12 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         action, command, chosen = self._actions.read(actions)
         now, sim, task = self.signals, self.simulation, self.task
         everyone = np.arange(self.num_envs)
-        self.truth.note_blocked(sim.pose(), self.navigation.plans_m, sim.pallets, everyone)
+        self.truth.note_situation(sim, self.navigation.plans_m)
         sim.drive(command)
         self.steps += 1
 
         after = self.sensing.sense(everyone, self.steps)
-        add_motion(after, now)
+        add_motion(self.task, after, now)
         plans, goals = self.navigation.plans_m, self.navigation.goals_m
         offset = add_route(task, after, plans, goals)
         progress = now["route_remaining_m"] - after["route_remaining_m"]
@@ -387,6 +387,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
             "signals": after,
             "progress_m": progress_m,
             "true_condition": condition,
+            "true_exposure": self.truth.exposure(),
             "success": ended & reached_goal(self.task, after) & (self.bumps == 0),
             "invalid": invalid.copy(),
             "travelled_m": sim.travelled_m,

@@ -16,6 +16,7 @@ from restock.arrays import F64, Ints
 from restock.ingest.task.route import view_route
 from restock.ingest.task.scan import SectorMap
 from restock.ingest.task.signals import Signals, localised_velocity, wrap_angle
+from restock.ingest.task.surroundings import came_nearer, way_to_return
 from restock.ingest.task.task import Task, clearance_ahead
 from restock.state import Stateful
 from restock.train.twin.physics.model import body_velocity
@@ -127,10 +128,13 @@ class Sensing(Stateful):
         }
 
 
-def add_motion(signals: Signals, before: Signals | None) -> None:
-    """Speeds from the last two localised poses; from the wheels at an episode's first step."""
-    forward, lateral = localised_velocity(signals, signals if before is None else before)
+def add_motion(task: Task, signals: Signals, before: Signals | None) -> None:
+    """Speeds from the last two localised poses, and who came nearer; at an episode's first step
+    speeds are the wheels'."""
+    before = signals if before is None else before
+    forward, lateral = localised_velocity(signals, before)
     signals["localised_speed_mps"], signals["localised_lateral_mps"] = forward, lateral
+    signals["came_nearer_m"] = came_nearer(task, signals, before)
 
 
 def add_route(task: Task, signals: Signals, plans_m: F64, goals_m: F64) -> F64:
@@ -145,4 +149,5 @@ def add_route(task: Task, signals: Signals, plans_m: F64, goals_m: F64) -> F64:
     signals["clearance_ahead_m"] = clearance_ahead(
         task, signals["sector_clearance_m"], near[:, 0], near[:, 1]
     )
+    signals["plan_return_m"] = way_to_return(task, signals["sector_clearance_m"], near, far)
     return view.offset_m

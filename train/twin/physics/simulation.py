@@ -261,7 +261,17 @@ class Simulation(Stateful):
         left, right = self.handles.wheel_geoms
         self._friction[ids, left, 0] = friction[:, 0] * self.left_friction[ids]
         self._friction[ids, right, 0] = friction[:, 1]
-        return friction < np.minimum(SLIPPERY_BELOW, base[:, None] - 1e-9)
+        return _slippery(friction, base)
+
+    def on_patch(self) -> Bools:
+        """Whose wheel stands on a slippery patch now, (N,)."""
+        stands = np.zeros(self.num_envs, np.bool_)
+        icy = np.flatnonzero(self._has_patches)
+        if len(icy):
+            base = self.base_friction[icy]
+            friction = friction_at(self._wheel_points(self.pose()[icy]), self.patches[icy], base)
+            stands[icy] = _slippery(friction, base).any(axis=1)
+        return stands
 
     def _wheel_points(self, pose: F64) -> F64:
         across = np.stack([-np.sin(pose[:, 2]), np.cos(pose[:, 2])], axis=-1) * (TRACK_M / 2)
@@ -305,6 +315,11 @@ class Simulation(Stateful):
     @_physics.setter
     def _physics(self, state: NDArray[Any]) -> None:
         self.batch.state[:] = state
+
+
+def _slippery(friction: F64, base: F64) -> Bools:
+    """Which wheels (n, 2) stand on a patch, by the friction under them and the floor's (n,)."""
+    return np.asarray(friction < np.minimum(SLIPPERY_BELOW, base[:, None] - 1e-9), np.bool_)
 
 
 def _batch(physics: Physics) -> Any:

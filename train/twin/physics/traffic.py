@@ -228,6 +228,15 @@ class Traffic(Stateful):
         self._place(ids)
         return ids
 
+    def gaps_m(self, pose: F64) -> F64:
+        """From each agent's circle to the outline of a robot at `pose` (N, 3); inf: not there."""
+        gaps = np.full(self.state.shape, np.inf)
+        ids = np.flatnonzero(self.active)
+        if len(ids):
+            shown = self.state[ids] != HIDDEN
+            gaps[ids] = np.where(shown, self._gap(ids, pose[ids])[0], np.inf)
+        return gaps
+
     def _place(self, ids: Ints) -> None:
         """Positions from how far each has travelled along its way."""
         shown = self.state[ids] != HIDDEN

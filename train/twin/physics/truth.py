@@ -7,6 +7,12 @@ A step's conditions are what was physically so over [t, t + 1), by the contract'
 - recovery: after such an event until .3 m of room or 2 s, known at t;
 - blocked_aisle: at t, pallets lay on the plan within `BLOCK_AHEAD_M` of the robot's middle.
 
+Exposures are what was so at t, whatever came of it:
+
+- closing_traffic: someone within 2 m of the body had come nearer, over the step before, by .1 m/s;
+- plan_blocked: pallets lay on the plan within 2.2 m of the robot's middle;
+- slippery_floor: a wheel stood on a slippery patch.
+
 Several may hold at once: the text of a step names all of them, sorted, with commas between, and is
 "nominal" where none holds. `restock.ingest.task.label_scores.primary_of` makes it one.
 """
@@ -22,44 +28,71 @@ from restock.ingest.task.route import view_route
 from restock.ingest.task.task import Task
 from restock.state import Stateful
 from restock.train.twin.physics.model import pallet_half_m
+from restock.train.twin.physics.simulation import Simulation
+from restock.train.twin.physics.traffic import AGENTS
 
 NAMES = ("blocked_aisle", "near_collision", "recovery", "wheel_slip")
-# The text of every set of conditions: bit i of its place is NAMES[i].
-_TEXTS = np.array(
-    [
-        truth_text(name for bit, name in enumerate(NAMES) if place >> bit & 1)
-        for place in range(1 << len(NAMES))
-    ]
-)
+EXPOSURES = ("closing_traffic", "plan_blocked", "slippery_floor")
+
+
+def _texts(names: tuple[str, ...]) -> NDArray[np.str_]:
+    """The text of every set of names: bit i of its place is names[i]."""
+    sets = range(1 << len(names))
+    return np.array([truth_text(n for bit, n in enumerate(names) if s >> bit & 1) for s in sets])
+
+
+_TEXTS, _EXPOSED = _texts(NAMES), _texts(EXPOSURES)
 NEAR_M, CLEAR_M, AFTERMATH_S = 0.15, 0.3, 2.0
-BLOCK_AHEAD_M = (0.2, 0.4, 0.6, 0.8, 1.0, 1.2)
-REACH_M = BLOCK_AHEAD_M[-1] + 1.5  # a pallet farther off than this is not just ahead
+CLOSING_WITHIN_M, CLOSING_MPS = 2.0, 0.1
+VIEW_M = tuple(0.2 * step for step in range(1, 12))  # of the plan; the look-ahead's far end
+BLOCK_AHEAD = 6  # of them are just ahead: to 1.2 m
+REACH_M = VIEW_M[-1] + 1.5  # a pallet farther off than this is not in view
 BODY_MARGIN_M = 0.2  # how far beside the plan a pallet is still in the way
 
 
 class Truth(Stateful):
     """Keeps what the true condition needs to remember, for N environments."""
 
-    STATE = ("aftermath_s", "blocked")
+    STATE = ("aftermath_s", "blocked", "traffic_gap_m", "exposed")
 
     def __init__(self, task: Task, num_envs: int) -> None:
         self._period_s = task.control_period_s
         self.aftermath_s = np.zeros(num_envs)  # left of it; 0: none
         self.blocked = np.zeros(num_envs, np.bool_)  # at t
+        self.traffic_gap_m = np.full((num_envs, AGENTS), np.inf)  # to each, at t; inf: not there
+        self.exposed = np.zeros((num_envs, len(EXPOSURES)), np.bool_)  # at t
 
     def reset(self, ids: Ints) -> None:
         self.aftermath_s[ids] = 0.0
         self.blocked[ids] = False
+        self.traffic_gap_m[ids] = np.inf
+        self.exposed[ids] = False
 
-    def note_blocked(self, pose: F64, plans_m: F64, pallets: F64, ids: Ints) -> None:
-        """Note whose plan is blocked just ahead, at the start of a step, for `ids`."""
-        self.blocked[ids] = False
-        gap = np.abs(pallets[ids, :, :2] - pose[ids, None, :2]).max(axis=-1).min(axis=1)
-        with_pallets = ids[gap < REACH_M]
+    def note_situation(self, simulation: Simulation, plans_m: F64) -> None:
+        """Note what everyone is exposed to, at the start of a step."""
+        pose, pallets = simulation.pose(), simulation.pallets
+        ahead = np.zeros((len(pose), len(VIEW_M)), np.bool_)
+        gap = np.abs(pallets[:, :, :2] - pose[:, None, :2]).max(axis=-1).min(axis=1)
+        with_pallets = np.flatnonzero(gap < REACH_M)
         if len(with_pallets):
-            self.blocked[with_pallets] = _blocked(
+            ahead[with_pallets] = _blocked(
                 pose[with_pallets], plans_m[with_pallets], pallets[with_pallets]
             )
+        self.blocked[:] = ahead[:, :BLOCK_AHEAD].any(axis=1)
+        gaps_m = simulation.traffic.gaps_m(pose)
+        with np.errstate(invalid="ignore"):  # who was not there, or is not, is at infinity
+            came_m = self.traffic_gap_m - gaps_m
+        came = np.isfinite(came_m) & (came_m > CLOSING_MPS * self._period_s)
+        self.exposed[:, 0] = (came & (gaps_m < CLOSING_WITHIN_M)).any(axis=1)
+        self.exposed[:, 1] = ahead.any(axis=1)
+        self.exposed[:, 2] = simulation.on_patch()
+        self.traffic_gap_m = gaps_m
+
+    def exposure(self) -> NDArray[np.str_]:
+        """All exposures (N,) of the step under way, as one text each."""
+        which = (self.exposed << np.arange(len(EXPOSURES))).sum(axis=1)
+        texts: NDArray[np.str_] = _EXPOSED[which]
+        return texts
 
     def condition(self, slipped: Bools, bumped: Bools, clearance_m: F64) -> NDArray[np.str_]:
         """All conditions (N,) of the step that ends now, as one text each."""
@@ -74,10 +107,9 @@ class Truth(Stateful):
 
 
 def _blocked(pose: F64, plans_m: F64, pallets: F64) -> Bools:
-    """Whether a pallet lies within the robot's breadth of the plan just ahead, (n,)."""
-    view = view_route(plans_m, pose[:, 0], pose[:, 1], np.zeros(len(pose)), BLOCK_AHEAD_M)
+    """Whether a pallet lies within the robot's breadth of the plan at VIEW_M, (n, VIEW_M)."""
+    view = view_route(plans_m, pose[:, 0], pose[:, 1], np.zeros(len(pose)), VIEW_M)
     points = view.look_ahead_m + pose[:, None, :2]  # heading 0: offsets in the map frame
     gap = np.abs(points[:, :, None] - pallets[:, None, :, :2])
     half = pallet_half_m(pallets[:, None, :, 2]) + BODY_MARGIN_M
-    inside = (gap <= half).all(axis=-1).reshape(len(pose), -1)
-    return np.asarray(inside.any(axis=1), np.bool_)
+    return np.asarray((gap <= half).all(axis=-1).any(axis=-1), np.bool_)

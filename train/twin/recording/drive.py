@@ -59,6 +59,7 @@ class Drive:
     ranges_m: F64  # (K, B) as measured; inf where nothing came back
     command: F64  # (T, 2) speed_mps, yaw_rate_radps
     true_condition: list[str]  # T
+    true_exposure: list[str]  # T
     policy: list[tuple[str, str, float]]  # T of (name, version, probability of the action)
     plans: list[tuple[int, F64]]  # (tick from which it is in force, (P, 2) points)
     scene: Scene = EMPTY

@@ -62,6 +62,7 @@ class _Log:
     reward: list[float] = field(default_factory=list)
     policy: list[tuple[str, str, float]] = field(default_factory=list)
     truth: list[str] = field(default_factory=list)
+    exposure: list[str] = field(default_factory=list)
     scan_s: list[float] = field(default_factory=list)
     ranges_m: list[F64] = field(default_factory=list)
     plans: list[tuple[int, F64]] = field(default_factory=list)
@@ -127,6 +128,7 @@ class Fleet:
                     log.policy.append((*tags[robot], float(probability[robot])))
                     log.reward.append(float(reward[robot]))
                     log.truth.append(str(info["true_condition"][robot]))
+                    log.exposure.append(str(info["true_exposure"][robot]))
                     self._note_step(log, robot, info)
             for robot in ended.tolist():
                 if (log := self._logs[robot]) is not None:
@@ -225,6 +227,7 @@ class Fleet:
             ranges_m=np.array(log.ranges_m),
             command=np.asarray(env.task.actions, np.float64)[action],
             true_condition=log.truth,
+            true_exposure=log.exposure,
             policy=log.policy,
             plans=log.plans,
             scene=Scene(

@@ -64,6 +64,7 @@ DELAYS = {
     "/amcl_pose": Delay(5.0),
     "/tf": Delay(1.5),
     "/ground_truth/condition": Delay(7.0),
+    "/ground_truth/exposure": Delay(7.0),
     "/ground_truth/perturbation": Delay(2.0),
     "/ground_truth/markers": Delay(2.0),
     "/ground_truth/traffic": Delay(7.0),
@@ -263,13 +264,21 @@ class Robot:
         """
         command = np.concatenate([drive.command, np.zeros((1, 2))])
         thinking = self.rng.uniform(*THINKING_S, len(command))
-        truth = [*drive.true_condition, drive.true_condition[-1]]
+        told = {"condition": drive.true_condition, "exposure": drive.true_exposure}
         proposed = np.stack(
             [drive.signals[f"nav_{key}"] for key in ("speed_mps", "yaw_rate_radps")]
         )
         planned_s = drive.tick_s + self.rng.uniform(*PLANNING_S, len(command))
         return [
-            *self._send("/ground_truth/condition", drive.tick_s, [topics.text(t) for t in truth]),
+            *(
+                message
+                for name, truth in told.items()
+                for message in self._send(
+                    f"/ground_truth/{name}",
+                    drive.tick_s,
+                    [topics.text(text) for text in (*truth, truth[-1])],
+                )
+            ),
             *self._send("/cmd_vel_nav", planned_s, topics.commands(*proposed)),
             *self._send("/cmd_vel", drive.tick_s + thinking, topics.commands(*command.T)),
         ]

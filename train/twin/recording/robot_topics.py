@@ -35,6 +35,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("/amcl_pose", "geometry_msgs/msg/PoseWithCovarianceStamped", latched=True),
     Topic("/tf", "tf2_msgs/msg/TFMessage"),
     Topic("/ground_truth/condition", "std_msgs/msg/String"),
+    Topic("/ground_truth/exposure", "std_msgs/msg/String"),
     Topic("/cmd_vel_nav", "geometry_msgs/msg/Twist"),
     Topic("/cmd_vel", "geometry_msgs/msg/Twist"),
     Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"),

@@ -149,6 +149,7 @@ def as_json(outcome: IngestResult) -> dict[str, Any]:
         "messages": outcome.messages,
         "conditions": outcome.conditions,
         "named": outcome.named,
+        "exposures": outcome.exposures,
         "label_scores": [
             {
                 **counts.get(score["condition"], {}),
@@ -220,6 +221,16 @@ def show(outcome: IngestResult) -> None:
             ]
         )
     scores = {score.condition: score for score in outcome.scores}
+
+    def against_truth(name: str) -> dict[str, Any]:
+        score = scores.get(name)
+        return {
+            "precision": score.precision if score else None,
+            "recall": score.recall if score else None,
+            "truly": score.support if score else None,
+            "": score.shortfall if score else "",
+        }
+
     output.print_table(
         [
             {
@@ -227,14 +238,18 @@ def show(outcome: IngestResult) -> None:
                 "transitions": count,
                 "named by it": outcome.named[name],
                 "share": outcome.named[name] / max(row["transitions"], 1),
-                "precision": scores[name].precision if name in scores else None,
-                "recall": scores[name].recall if name in scores else None,
-                "truly": scores[name].support if name in scores else None,
-                "": scores[name].shortfall if name in scores else "",
+                **against_truth(name),
             }
             for name, count in outcome.conditions.items()
         ]
     )
+    if outcome.exposures:  # whatever came of them
+        output.print_table(
+            [
+                {"exposure": name, "transitions": count, **against_truth(name)}
+                for name, count in outcome.exposures.items()
+            ]
+        )
     console.print(
         f"{_count(row['ticks'], 'tick')} = {_count(row['transitions'], 'transition')}"
         f" + {_count(row['episode_ends'], 'episode end')}"

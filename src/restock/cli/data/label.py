@@ -146,12 +146,12 @@ class LabelCommand:
 
         def conditions_of(name: str) -> Sequence[Condition]:
             if given is not None and (self.all or given.name == name):
-                return given.conditions
+                return given.definitions
             try:
-                return load_profile(name).conditions
+                return load_profile(name).definitions
             except ConfigError as error:
                 if text := carried[name]:
-                    return read_profile_toml(text, where=f"profile {name!r}").conditions
+                    return read_profile_toml(text, where=f"profile {name!r}").definitions
                 raise ConfigError(
                     f"recordings of the profile {name!r} are in the store, and it is not at hand",
                     where=str(self.store),

@@ -1,0 +1,14 @@
+-- A slippery patch is underfoot: up to now, without a look ahead, the wheels turned more than the poses
+-- and the gyroscope moved. It holds on for a second. Of a patch that is crossed without slip there is
+-- no sign: this sees less than what lies on the floor, and sooner than the outcome `wheel_slip`.
+-- kind: exposure
+-- timing: pre
+-- let over_mps:
+coalesce((wheel_speed_mps + lag(wheel_speed_mps) OVER episode) / 2 - localised_speed_mps, 0)
+-- let slip_mps:
+0.5 * abs(over_mps + coalesce(lag(over_mps) OVER episode, 0))
++ 0.3 * abs(wheel_yaw_rate_radps - gyro_yaw_rate_radps)
++ 0.25 * abs(localised_lateral_mps + coalesce(lag(localised_lateral_mps) OVER episode, 0))
+-- label:
+max(CASE WHEN step_index > 1 THEN slip_mps ELSE 0 END)
+    OVER (episode ROWS BETWEEN 4 PRECEDING AND CURRENT ROW) > 0.16 + 4 * localiser_noise_m

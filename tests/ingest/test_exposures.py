@@ -1,0 +1,217 @@
+"""Exposures: situations beside the conditions, which take no row's condition from them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from support.driven_robot import Drive, write_bag
+from support.profile_texts import WAREHOUSE as TEXT
+
+from restock.cli import main
+from restock.errors import ConfigError
+from restock.ingest.profile.profile import load_profile, parse_profile
+from restock.ingest.profile.profile_text import profile_toml, read_profile_toml
+from restock.ingest.store.episode_rows import ENDS, episode_ends, packed
+from restock.ingest.store.writer import StoreWriter
+from restock.ingest.task.conditions import Condition, label, labels_version, primary, shipped
+from restock.ingest.task.label_scores import label_scores
+from restock.ingest.task.schema import SIGNAL_COLUMNS
+from restock.replay.store.store import Store
+
+SHIPPED = list(shipped().values())
+EXPOSURES = list(shipped(kind="exposure").values())
+LISTED = 'exposures = ["closing_traffic", "plan_blocked", "slippery_floor"]'
+assert LISTED in TEXT
+OWN = """
+[[condition]]
+name = "far_out"
+kind = "exposure"
+timing = "pre"
+sql = "pose_x_m > 2"
+"""
+
+
+def steps(count: int, **signals: object) -> pa.Table:
+    """Steps of one episode of a robot that drives at .5 m/s with nothing near, but for these."""
+    usual = {"wheel_speed_mps": np.full(count, 0.5), "localised_speed_mps": np.full(count, 0.5),
+             "clearance_m": np.full(count, 2.0), "clearance_ahead_m": np.full(count, 2.0),
+             "plan_return_m": np.full(count, 4.0)} | signals  # fmt: skip
+    columns = {
+        column.name: pa.array(usual.get(column.name, np.zeros(count))).cast(column.type, safe=False)
+        for column in SIGNAL_COLUMNS
+    }
+    index = np.arange(count)
+    return pa.table({"episode_index": np.zeros(count, np.int32), "step_index": index, **columns})
+
+
+def changed(value: float, usual: float, at: slice) -> np.ndarray:
+    column = np.full(20, usual)
+    column[at] = value
+    return column
+
+
+def exposed(table: pa.Table, name: str) -> list[int]:
+    return np.flatnonzero(label(table, [shipped(kind="exposure")[name]])[name]).tolist()
+
+
+def test_each_situation_is_told_by_what_is_known_before_acting():
+    assert exposed(steps(20), "closing_traffic") == []
+    someone = steps(20, came_nearer_m=changed(0.15, 0.0, slice(8, 10)))
+    assert exposed(someone, "closing_traffic") == [9, 10, 11, *range(12, 17)]
+    noise = steps(20, came_nearer_m=np.full(20, 0.03))
+    assert exposed(noise, "closing_traffic") == []
+    pallet = {"plan_return_m": changed(1.5, 4.0, slice(5, 15))}
+    assert exposed(steps(20, **pallet), "plan_blocked") == list(range(9, 15))
+    walker = {"came_nearer_m": changed(0.15, 0.0, slice(3, 5))}
+    assert exposed(steps(20, **pallet, **walker), "plan_blocked") == []
+    ice = steps(20, wheel_speed_mps=changed(1.0, 0.5, slice(10, 12)))
+    assert exposed(ice, "slippery_floor") == list(range(11, 17))
+    assert exposed(steps(20), "slippery_floor") == []
+
+
+def test_no_exposure_looks_ahead():
+    """A row's exposures are the same whatever comes after it."""
+    rng = np.random.default_rng(0)
+    signals = {
+        "came_nearer_m": rng.uniform(0, 0.2, 40),
+        "plan_return_m": rng.uniform(1, 4, 40),
+        "wheel_speed_mps": rng.uniform(0, 1, 40),
+    }
+    whole = label(steps(40, **signals), EXPOSURES)
+    part = label(steps(25, **{name: column[:25] for name, column in signals.items()}), EXPOSURES)
+    assert any(held.any() for held in whole.values())
+    for name, held in part.items():
+        assert held.tolist() == whole[name][:25].tolist()
+
+
+def test_an_exposure_takes_no_row_from_a_condition():
+    first = Condition("busy", "pre", "true", priority=0, kind="exposure")
+    every = [*SHIPPED, first]
+    table = steps(20, clearance_m=changed(0.05, 2.0, slice(8, 10)))
+    labels = label(table, every)
+    assert labels["busy"].all()
+    named = primary(labels, every)
+    assert named == primary({name: labels[name] for name in labels if name != "busy"}, SHIPPED)
+    assert {"nominal", "near_collision"} <= set(named)
+    assert labels_version(every) != labels_version(SHIPPED)
+
+
+@pytest.mark.parametrize("more", ['timing = "post"', 'timing = "pre"\nprobability = "0.5"'])
+def test_an_exposure_is_known_before_acting_and_has_no_probability(more):
+    text = f'{TEXT}\n[[condition]]\nname = "x"\nkind = "exposure"\nsql = "true"\n{more}\n'
+    with pytest.raises(ConfigError, match="exposure is a situation known before acting"):
+        parse_profile(text, where="here")
+
+
+def test_a_name_that_is_none_is_refused_with_those_there_are():
+    with pytest.raises(ConfigError, match="no exposure named 'wheel_slip'") as caught:
+        parse_profile(TEXT.replace(LISTED, 'exposures = ["wheel_slip"]'), where="here")
+    assert "closing_traffic" in str(caught.value.remedy)
+    with pytest.raises(ConfigError, match="no condition named 'closing_traffic'"):
+        parse_profile(
+            TEXT.replace("conditions = [", 'conditions = ["closing_traffic", ', 1), where="here"
+        )
+
+
+@pytest.fixture
+def profile(tmp_path: Path) -> Path:
+    path = tmp_path / "amr.toml"
+    path.write_text(TEXT.replace(LISTED, 'exposures = ["closing_traffic"]') + OWN)
+    return path
+
+
+@pytest.fixture
+def store(tmp_path: Path, profile: Path) -> Path:
+    write_bag(Drive(goals=[(0.0, 3.0, 1.0)]), tmp_path / "a")
+    path = tmp_path / "store"
+    assert (
+        main(["ingest", str(tmp_path / "a"), "--store", str(path), "--profile", str(profile)]) == 0
+    )
+    return path
+
+
+def test_a_store_lists_exposures_beside_its_conditions(store, profile):
+    with Store(store) as opened:
+        assert [one.name for one in opened.exposures()] == ["closing_traffic", "far_out"]
+        assert "far_out" not in {one.name for one in opened.conditions()}
+        held = opened.sql(
+            "SELECT DISTINCT pose_x_m > 2, exposures, condition FROM transitions ORDER BY ALL"
+        ).fetchall()
+        assert held == [(False, [], "nominal"), (True, ["far_out"], "nominal")]
+        rows = {row[0]: row[1:] for row in opened.sql(
+            "SELECT exposure, rows, episodes, episode_share, success_share"
+                " FROM coverage_by_exposure"
+        ).fetchall()}  # fmt: skip
+        (count,) = opened.sql("SELECT count(*) FROM transitions WHERE pose_x_m > 2").fetchall()[0]
+        assert rows == {"closing_traffic": (0, 0, 0.0, None), "far_out": (count, 1, 1.0, 1.0)}
+        shelves = opened.sql("SELECT condition FROM coverage_by_condition").fetchall()
+        assert not {"far_out", "closing_traffic"} & {name for (name,) in shelves}
+        carried = opened.sql("SELECT profile_toml FROM recordings").fetchall()[0][0]
+    assert read_profile_toml(carried, where="").exposures == load_profile(profile).exposures
+    again = read_profile_toml(profile_toml(load_profile(profile)), where="")
+    assert again.labels_version == load_profile(profile).labels_version
+
+
+def test_changed_exposures_are_told_again_from_the_store(store, profile):
+    profile.write_text(profile.read_text().replace("pose_x_m > 2", "pose_x_m > 2.2"))
+    assert main(["label", str(store), "--profile", str(profile)]) == 0
+    with Store(store) as opened:
+        assert opened.sql(
+            "SELECT min(pose_x_m) > 2.2, any_value(condition) FROM transitions"
+            " WHERE len(exposures) > 0"
+        ).fetchall() == [(True, "nominal")]
+        assert "2.2" in opened.exposures()[-1].sql
+
+
+def test_a_store_from_before_exposures_opens_and_says_null(store, profile):
+    """And is labelled again without those whose signals it does not have."""
+    store = _before_exposures(store, store.parent / "older")
+    with Store(store) as opened:
+        assert opened.exposures() == ()
+        assert opened.sql("SELECT DISTINCT exposures FROM transitions").fetchall() == [(None,)]
+        assert opened.sql("FROM coverage_by_exposure").fetchall() == []
+    assert main(["label", str(store), "--profile", str(profile)]) == 0
+    with Store(store) as opened:
+        held = opened.sql("SELECT DISTINCT unnest(exposures) FROM transitions").fetchall()
+        assert held == [("far_out",)]
+
+
+def _before_exposures(store: Path, out: Path) -> Path:
+    """The same store as it was written before exposures and the signals that they are told by."""
+    gone = {"exposures", "true_exposure", "came_nearer_m", "plan_return_m", "exposures_json"}
+
+    def older(table: pa.Table) -> pa.Table:
+        return table.drop_columns([name for name in table.column_names if name in gone])
+
+    manifest = StoreWriter(store).live()
+    row = manifest.to_pylist()[0]
+    rows = StoreWriter(store).rows(row["recording_id"], row["ingest_id"])
+    ends = episode_ends(rows)
+    assert ends is not None
+    version = manifest.column_names.index("labels_version")
+    manifest = manifest.set_column(version, "labels_version", pa.array(["before"]))
+    StoreWriter(out).write(
+        older(manifest), older(rows).replace_schema_metadata({ENDS: packed(older(ends))})
+    )
+    return out
+
+
+def test_exposures_are_scored_against_their_own_truth():
+    rows = pa.table(
+        {
+            "episode_index": [0] * 6,
+            "step_index": list(range(6)),
+            "conditions": [[], ["wheel_slip"], [], [], [], []],
+            "true_condition": ["nominal", "wheel_slip", "nominal", "nominal", "nominal", None],
+            "exposures": [["busy"], ["busy"], [], [], [], []],
+            "true_exposure": ["nominal", "busy", "busy", "nominal", "nominal", None],
+        }
+    )
+    by_name = {one.condition: one for one in label_scores(rows, ["wheel_slip"], 0.2)}
+    assert (by_name["wheel_slip"].agreed, by_name["wheel_slip"].support) == (1, 1)
+    busy = by_name["busy"]
+    assert (busy.known, busy.labelled, busy.support, busy.agreed) == (5, 2, 2, 1)
+    assert (busy.event_support, busy.event_found) == (1, 1)

@@ -1,0 +1,107 @@
+"""Who came nearer between two scans, and what lies on the plan: a scan of points, seen by rays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from restock.ingest.task.scan import Body, SectorMap
+from restock.ingest.task.surroundings import came_nearer, way_to_return
+from restock.ingest.task.task import Task
+
+TASK = Task(body=Body(length_m=0.7, width_m=0.5), actions=((0.0, 0.0), (1.0, 0.0)))
+BEARINGS = (np.arange(360) + 0.5) * (2 * np.pi / 360) - np.pi
+SECTORS = SectorMap.build(BEARINGS, TASK.sectors, TASK.body)
+PERIOD_S = 0.2
+Disc = tuple[float, float, float]  # x, y, radius
+
+
+def scan(pose: tuple[float, float, float], discs: list[Disc], walls_m: float = 6.0) -> Any:
+    """Sector clearances (1, K) in a square room of half-width `walls_m` with round things in it."""
+    x, y, yaw = pose
+    rays = np.stack([np.cos(BEARINGS + yaw), np.sin(BEARINGS + yaw)], axis=-1)
+    with np.errstate(divide="ignore"):
+        reach = np.where(rays > 0, walls_m - np.array([x, y]), walls_m + np.array([x, y]))
+        ranges = (reach / np.abs(rays)).min(axis=1)
+    for cx, cy, radius in discs:
+        to = np.array([cx - x, cy - y])
+        along = rays @ to
+        off2 = (to**2).sum() - along**2
+        hits = (off2 < radius**2) & (along > 0)
+        near = along - np.sqrt(np.maximum(radius**2 - off2, 0.0))
+        ranges = np.where(hits, np.minimum(ranges, near), ranges)
+    return SECTORS.clearance(ranges[None], TASK.range_min_m, TASK.range_max_m)
+
+
+def signals(step: int, clearance: Any, forward_m: float, turn_rad: float) -> dict[str, Any]:
+    return {
+        "stamp_ns": np.array([round((step + 1) * PERIOD_S * 1e9)]),
+        "gyro_yaw_rate_radps": np.array([turn_rad / PERIOD_S]),
+        "localised_speed_mps": np.array([forward_m / PERIOD_S]),
+        "localised_lateral_mps": np.zeros(1),
+        "sector_clearance_m": clearance,
+    }
+
+
+def between(
+    discs: list[Disc], then: list[Disc], forward_m: float = 0.0, turn: float = 0.0
+) -> float:
+    """What came nearer while the robot drove an arc and things moved from `discs` to `then`."""
+    pose = (forward_m * np.cos(turn / 2), forward_m * np.sin(turn / 2), turn)
+    before = signals(0, scan((0.0, 0.0, 0.0), discs), forward_m, turn)
+    now = signals(1, scan(pose, then), forward_m, turn)
+    return float(came_nearer(TASK, now, before)[0])
+
+
+@pytest.mark.parametrize("bearing_deg", range(-175, 180, 23))
+@pytest.mark.parametrize("step_m", [0.1, 0.2, 0.3])
+def test_who_walks_toward_a_robot_comes_nearer_by_what_they_walk(bearing_deg, step_m):
+    way = np.array([np.cos(np.radians(bearing_deg)), np.sin(np.radians(bearing_deg))])
+    start, end = ((*(way * far), 0.25) for far in (2.0, 2.0 - step_m))
+    came = between([start], [end], 0.0)
+    assert step_m - 0.06 < came < step_m + 0.02
+    assert between([start], [start]) == 0
+    assert between([end], [start]) == 0  # goes away
+    assert between([(*(way * 3.4), 0.25)], [(*(way * 3.2), 0.25)]) == 0  # beyond 2 m
+
+
+@given(
+    st.lists(
+        st.tuples(st.floats(-3, 3), st.floats(-3, 3), st.floats(0.2, 0.6)), min_size=0, max_size=4
+    ),
+    st.floats(-0.1, 0.2),
+    st.floats(-0.24, 0.24),
+    st.floats(1.5, 6.0),
+)
+@settings(max_examples=150, deadline=None)
+def test_what_stands_does_not_come_nearer_however_the_robot_moves(discs, forward_m, turn, walls):
+    """But for what a sector's breadth leaves open: less than what a walk of .5 m/s adds up to."""
+    discs = [disc for disc in discs if np.hypot(disc[0], disc[1]) > disc[2] + 0.5]
+    pose = (forward_m * np.cos(turn / 2), forward_m * np.sin(turn / 2), turn)
+    before = signals(0, scan((0.0, 0.0, 0.0), discs, walls), forward_m, turn)
+    now = signals(1, scan(pose, discs, walls), forward_m, turn)
+    assert came_nearer(TASK, now, before)[0] < 0.1
+
+
+def test_the_same_scan_again_tells_nothing():
+    """Of a lidar slower than the steps: the robot went on, the scan did not."""
+    held = scan((0.0, 0.0, 0.0), [(-1.5, 0.0, 0.3)])
+    before, now = signals(0, held, 0.2, 0.0), signals(1, held, 0.2, 0.0)
+    assert came_nearer(TASK, now, before)[0] == 0
+
+
+def test_a_return_on_the_plan_is_found_along_it_and_beside_it_not():
+    near, far = np.array([[1.0, 0.0]]), np.array([[1.8, 0.9]])  # a plan that bends left
+
+    def way(discs: list[Disc]) -> float:
+        return float(way_to_return(TASK, scan((0.0, 0.0, 0.0), discs), near, far)[0])
+
+    assert way([]) == TASK.range_max_m
+    assert way([(1.0, 0.0, 0.2)]) == pytest.approx(0.8, abs=0.05)
+    assert way([(1.6, 0.68, 0.2)]) == pytest.approx(1.0 + 0.9 - 0.2, abs=0.15)
+    assert way([(2.0, -0.3, 0.2)]) == TASK.range_max_m  # straight on, where the plan does not go
+    assert way([(0.5, 0.7, 0.2)]) == TASK.range_max_m  # beside it

@@ -1,0 +1,59 @@
+"""What the twin says of exposures: where their causes are, and that the rules find them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from restock.ingest.store.episode_rows import label_table
+from restock.ingest.task.conditions import label, shipped
+from restock.ingest.task.label_scores import true_names
+from restock.ingest.task.signals import STORED_SIGNALS
+from restock.train.twin.env.policies import PlannerFollower
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.physics.episode import KINDS, EpisodeSpec
+from restock.train.twin.physics.truth import EXPOSURES
+
+STORED = [signal.name for signal in STORED_SIGNALS]
+
+
+def test_the_true_exposure_shows_where_its_cause_is_and_the_rules_find_its_episodes() -> None:
+    """Truth comes from what is there; exposures are told by what the robot senses."""
+    told: dict[str, set[tuple[str, int]]] = {name: set() for name in EXPOSURES}
+    true: dict[str, set[tuple[str, int]]] = {name: set() for name in EXPOSURES}
+    for kind in KINDS:
+        made = WarehouseVectorEnv(12)
+        made.set_episodes([EpisodeSpec(kind, seed) for seed in range(12)])
+        made.reset(seed=0)
+        driver = PlannerFollower(epsilon=0.0)
+        steps: list[dict[str, Any]] = []
+        number: list[Any] = []
+        for _ in range(80):
+            at = made.episode_number.copy()
+            steps.append({name: column.copy() for name, column in made.signals.items()})
+            number.append(at)
+            *_, info = made.step(driver.act(made, made.observation)[0])
+            for env in np.flatnonzero(at >= 0).tolist():
+                for name in true_names(str(info["true_exposure"][env])):
+                    true[name].add((kind, int(at[env])))
+        table = label_table(
+            {name: np.stack([row[name] for row in steps], axis=1).ravel() for name in STORED},
+            np.stack(number, axis=1).ravel(),
+            np.tile(np.arange(80), 12),
+            pa.table({}),
+        ).filter(pa.array(np.stack(number, axis=1).ravel() >= 0))
+        for name, held in label(table, list(shipped(kind="exposure").values())).items():
+            episodes = table["episode_index"].to_numpy()[held]
+            told[name] |= {(kind, int(episode)) for episode in np.unique(episodes)}
+    causes = {"closing_traffic": "near_collision", "plan_blocked": "blocked_aisle",
+              "slippery_floor": "wheel_slip"}  # fmt: skip
+    for name, cause in causes.items():
+        assert {kind for kind, _ in true[name]} == {cause}
+        assert len(true[name]) >= 8
+        assert len(told[name] & true[name]) >= 0.8 * len(true[name])
+    for name in ("closing_traffic", "slippery_floor"):
+        assert len(told[name] & true[name]) >= 0.8 * len(told[name])
+    # Who stands on the plan cannot be told from a pallet.
+    assert {kind for kind, _ in told["plan_blocked"]} <= {"blocked_aisle", "near_collision"}
