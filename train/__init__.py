@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from restock.train.evaluation.ope import evaluate_run_off_policy as evaluate_run_off_policy
     from restock.train.evaluation.regression import compare_with_baseline as compare_with_baseline
     from restock.train.evaluation.regression import regressed as regressed
+    from restock.train.feed.teacher import Teacher as Teacher
     from restock.train.libraries.mixed_feed import FeedOptions as FeedOptions
     from restock.train.libraries.sb3_buffer import MixtureReplayBuffer as MixtureReplayBuffer
     from restock.train.libraries.sb3_buffer import dqn_critic as dqn_critic
@@ -44,6 +45,7 @@ else:
             "restock.train.evaluation.eval_run": ["evaluate"],
             "restock.train.evaluation.ope": ["OpeConfig", "evaluate_run_off_policy"],
             "restock.train.evaluation.regression": ["compare_with_baseline", "regressed"],
+            "restock.train.feed.teacher": ["Teacher"],
             "restock.train.libraries.mixed_feed": ["FeedOptions"],
             "restock.train.libraries.sb3_buffer": ["MixtureReplayBuffer", "dqn_critic"],
             "restock.train.libraries.tianshou_buffer": ["MixtureVectorReplayBuffer"],

@@ -237,6 +237,9 @@ def _close_interval(session: Session, phase: str, notify: Notify) -> None:
     if session.probe is not None:
         measured, lag = session.probe.measure(learner)
         session.run.append("probe", [{**session.steps, **row} for row in measured])
+    if session.imitation is not None:
+        filtered = session.imitation.measure(learner)
+        session.run.append("teacher", [{**session.steps, **row} for row in filtered])
     before_sync = interval.distance_before_sync is not None
     wall_s = session.wall_s
     elapsed_s = max(wall_s - interval.wall_s_before, 1e-9)

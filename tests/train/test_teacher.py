@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -15,18 +18,30 @@ from support.toy_twin import CELLS, TASK
 from torch import Tensor, tensor
 
 from restock.errors import ConfigError
+from restock.ingest.profile.profile import load_profile
+from restock.report.card import as_markdown, replay_card
+from restock.report.facts import Facts
+from restock.state import restored, saved
+from restock.train.comparison.arms import differences
 from restock.train.dqn.behaviour import (
     UNKNOWN,
     FilteredNetwork,
     Labelled,
     imitation_gradient,
     imitation_loss,
+    make_policy,
     plausible_actions,
 )
-from restock.train.dqn.config import parse_config
+from restock.train.dqn.config import TeacherConfig, parse_config
+from restock.train.dqn.fitted_q import soft_greedy
 from restock.train.dqn.learner import Learner, greedy_actions
 from restock.train.dqn.loss import quantile_target, td_target
+from restock.train.feed.teacher import open_teacher
 from restock.train.loop import TrainingInterrupted, train
+from restock.train.prepare import train as train_new
+from restock.train.run import checkpoint
+from restock.train.run.run import Run
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
 STOP, FORWARD, BACK = range(3)
 
@@ -327,3 +342,108 @@ def test_onnx_is_torch(taught: Any) -> None:
     assert 0 < np.isinf(expected).mean() < 1
     np.testing.assert_allclose(values, expected, atol=1e-5)
     np.testing.assert_array_equal(action, expected.argmax(axis=1))
+
+
+def test_the_record_says_what_the_filter_did(taught: Any) -> None:
+    rows = taught.run.table("teacher").to_pylist()
+    assert {(row["source"], row["condition"]) for row in rows} >= {
+        ("logs", "nominal"),
+        ("fresh", "nominal"),
+        ("fresh", "near_goal"),
+    }
+    last = [row for row in rows if row["env_steps"] == taught.progress.env_steps]
+    for row in last:
+        assert 0 < row["asked_rows"] <= row["rows"] <= 128
+        assert 1 <= row["plausible_actions"] <= 3
+        assert row["teacher_plausible"] >= row["agreement"]
+        assert row["ratio"] == 0.5
+    fresh = [row for row in last if row["source"] == "fresh"]
+    assert all(row["agreement"] == row["chosen_agreement"] == 1 for row in fresh)  # "on" it said
+    near = [row["loss"] for row in rows if row["condition"] == "near_goal"]
+    assert near[-1] < near[0]
+
+
+def test_the_replay_card_names_the_teacher(taught: Any) -> None:
+    known: dict[str, Any] = {field.name: [] for field in dataclasses.fields(Facts)}
+    known |= {"run": taught.run.path, "config": {}, "panel": None}
+    untaught = replay_card(Facts(**known))
+    assert untaught["teacher"] is None
+    assert "none: every action may be chosen" in as_markdown(untaught)
+    known["config"] = {"config": msgspec.to_builtins(taught.config)}
+    known["teacher"] = taught.run.table("teacher").to_pylist()[-1:]
+    card = replay_card(Facts(**known))
+    assert card["teacher"]["source"] == "given"
+    page = as_markdown(card)
+    assert "given; logged rows of operator cloned; an action is plausible from 0.5 of" in page
+    assert "| fresh | nominal |" in page.split("## What the teacher's filter did at the end")[1]
+
+
+def test_a_teacher_is_part_of_the_algorithm(taught: Any, tmp_path: Path) -> None:
+    def opened(name: str, **settings: Any) -> Run:
+        document = {"config": msgspec.to_builtins(config(**settings))}
+        return Run.create(tmp_path / name, document)
+
+    found = differences(opened("a", **TAUGHT), opened("b"))
+    assert {(d.setting.split(".")[1], d.kind) for d in found} == {("teacher", "algorithm")}
+
+
+def test_a_kept_policy_comes_back_with_its_filter(taught: Any) -> None:
+    weights = checkpoint.load(taught.run.best)["network"]
+    policy = make_policy(taught.config, TASK.observation_size, len(TASK.actions))
+    policy.load_state_dict(weights)
+    assert isinstance(policy, FilteredNetwork)
+    assert float(policy.ratio) == 0.5
+    learner = Learner(taught.config, TASK.observation_size, len(TASK.actions))
+    assert learner.behaviour is not None
+    learner.behaviour.in_force = 0.25
+    learner.take_over(weights)
+    assert learner.behaviour.in_force == 0.25  # the run's own
+    for one, other in (
+        (learner.network, policy.values),
+        (learner.behaviour.network, policy.behaviour),
+    ):
+        for name, value in one.state_dict().items():
+            assert torch.equal(value, other.state_dict()[name]), name
+
+
+def test_off_policy_evaluation_is_of_the_filtered_policy(taught: Any) -> None:
+    observation = np.eye(TASK.observation_size, dtype=np.float32)[: CELLS - 1]
+    policy = taught.learner.policy
+    chosen = greedy_actions(policy, observation)
+    probability = soft_greedy(policy, observation, 0.1)
+    assert probability.argmax(axis=1).tolist() == chosen.tolist()
+    np.testing.assert_allclose(probability.sum(axis=1), 1, rtol=1e-6)
+
+
+def test_the_operator_teaches_in_the_warehouse_and_its_state_is_kept() -> None:
+    task = load_profile("warehouse_amr").task
+    teacher = open_teacher(TeacherConfig(source="operator"), task, seed=0)
+    assert teacher is not None
+    env = WarehouseVectorEnv(3, seed=5)
+    observation, _ = env.reset(seed=5)
+
+    def drive(steps: int) -> list[list[int]]:
+        answers = []
+        for _ in range(steps):
+            answers.append(teacher.ask(env, observation).tolist())
+            env.step(np.array(answers[-1]))
+        return answers
+
+    drive(12)
+    before = json.loads(json.dumps(saved(teacher), default=np.ndarray.tolist))
+    world = env.state_dict()
+    first = drive(8)
+    env.load_state_dict(world)
+    restored(teacher, before)
+    assert drive(8) == first
+    assert len({action for answers in first for action in answers}) > 1
+
+
+def test_what_cannot_teach_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with pytest.raises(ConfigError, match="the teacher function returned nothing"):
+        train_new(out=out, teacher=lambda env, observation: None)
+    assert not out.exists()
+    with pytest.raises(ConfigError, match="this run has no logs"):
+        train_new(out=out, settings=["teacher.source=logs"])
+    assert not out.exists()

@@ -58,6 +58,7 @@ _KINDS: dict[str, Kind] = {
     "config.network": "algorithm",
     "config.loss": "algorithm",
     "config.optimizer": "algorithm",
+    "config.teacher": "algorithm",
     "config.practice": "practice",
     "config.env.conditions": "practice",
     "config.env.perturbation": "environment",

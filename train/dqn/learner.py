@@ -271,7 +271,10 @@ class Learner(Stateful):
     @property
     def is_finite(self) -> bool:
         """Whether every parameter is: a gradient that is not finite leaves its mark on them."""
-        return bool(torch.isfinite(self.optimizer.values).all())
+        of_values = [self.optimizer.values]
+        if self.behaviour is not None:
+            of_values.append(self.behaviour.optimizer.values)
+        return all(bool(torch.isfinite(values).all()) for values in of_values)
 
     @torch.no_grad()
     def _average(self) -> None:

@@ -6,19 +6,22 @@ majority finds nothing plausible in the rare cases (arXiv:2310.04413). Fresh row
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import ClassVar
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
-from restock.arrays import F64, Ints
+from restock.arrays import F32, F64, Ints
 from restock.errors import ConfigError
 from restock.replay.ring.ring import FreshRing
 from restock.state import Stateful
-from restock.train.dqn.behaviour import Labelled
+from restock.train.dqn.behaviour import UNKNOWN, Labelled, imitation_loss, plausible_actions
 from restock.train.dqn.config import TeacherConfig
+from restock.train.dqn.learner import Learner
 from restock.train.feed.logs import Logs
+
+_MEASURED = 128  # rows a condition
 
 
 class Imitation(Stateful):
@@ -45,7 +48,7 @@ class Imitation(Stateful):
         device: torch.device,
     ) -> None:
         self.logs, self.ring, self.device = logs, ring, device
-        self.batch_size = batch_size
+        self.batch_size, self._seed = batch_size, seed
         self._rng = np.random.default_rng([seed, 7])
         self.cloned: Ints = np.empty(0, np.int64)  # rows of the logs
         self._cumulative: F64 = np.empty(0)
@@ -68,21 +71,82 @@ class Imitation(Stateful):
         return self._gather(self._logged if len(self.ring) else self.batch_size)
 
     def _gather(self, logged: int) -> Labelled:
-        observation = np.empty((self.batch_size, self.ring.observation_size), np.float32)
-        action = np.empty(self.batch_size, np.int64)
-        columns = self.ring.columns["observation"]
-        if logged and self.logs is not None:
-            place = np.searchsorted(self._cumulative, self._rng.random(logged), side="right")
-            rows = self.cloned[np.minimum(place, len(self.cloned) - 1)]
-            packed = self.logs.rows[torch.from_numpy(rows)].numpy()
-            observation[:logged], action[:logged] = packed[:, columns], packed[:, -3]
-        if fresh := self.batch_size - logged:
-            slots = self.ring.sample(fresh, self._rng)
-            observation[logged:] = self.ring.rows[slots, columns]
-            action[logged:] = self.ring.meta["teacher_action"][slots]
+        place = np.searchsorted(self._cumulative, self._rng.random(logged), side="right")
+        rows = self.cloned[np.minimum(place, len(self.cloned) - 1)]
+        fresh = self.batch_size - logged
+        slots = self.ring.sample(fresh, self._rng) if fresh else np.empty(0, np.int64)
+        parts = [self._logged_states(rows), self._fresh_states(slots)]
+        observation, action = (np.concatenate(columns) for columns in zip(*parts, strict=True))
         return Labelled(
             torch.from_numpy(observation).to(self.device), torch.from_numpy(action).to(self.device)
         )
+
+    def _logged_states(self, rows: Ints) -> tuple[F32, Ints]:
+        """Observations (n, D) of rows of the logs, and the actions (n,) that were taken."""
+        if self.logs is None or not len(rows):
+            return self._fresh_states(np.empty(0, np.int64))
+        packed = self.logs.rows[torch.from_numpy(rows)].numpy()
+        return packed[:, self.ring.columns["observation"]], packed[:, -3].astype(np.int64)
+
+    def _fresh_states(self, slots: Ints) -> tuple[F32, Ints]:
+        """Observations (n, D) of slots of the ring, and the teacher's answers (n,)."""
+        observation = self.ring.rows[slots, self.ring.columns["observation"]]
+        return observation, self.ring.meta["teacher_action"][slots].astype(np.int64)
+
+    def measure(self, learner: Learner) -> list[dict[str, Any]]:
+        """Rows of the run's `teacher`: what the filter does now, by source and condition.
+
+        Of up to 128 rows a condition that learning draws from, chosen at random.
+        """
+        rng = np.random.default_rng([self._seed, 8, learner.gradient_steps])
+        groups: dict[tuple[str, str], tuple[F32, Ints]] = {}
+        if self.logs is not None and len(self.cloned):
+            codes = self.logs.condition.codes[self.cloned]
+            for code in np.unique(codes).tolist():
+                rows = _some(self.cloned[codes == code], rng)
+                groups["logs", self.logs.condition.names[code]] = self._logged_states(rows)
+        for code, name in enumerate(self.ring.conditions):
+            slots = _some(np.sort(self.ring.strata.members(code)), rng)
+            if len(slots):
+                groups["fresh", name] = self._fresh_states(slots)
+        return [
+            {"source": source, "condition": name, **_measured(learner, *states)}
+            for (source, name), states in groups.items()
+        ]
+
+
+def _some(rows: Ints, rng: np.random.Generator) -> Ints:
+    return rows if len(rows) <= _MEASURED else rng.choice(rows, _MEASURED, replace=False)
+
+
+@torch.no_grad()
+def _measured(learner: Learner, observation: F32, action: Ints) -> Mapping[str, Any]:
+    """What the filter does in states (n, D), of which the teacher's actions are (n,)."""
+    if learner.behaviour is None:
+        raise RuntimeError("there is no behaviour network to measure")
+    states = torch.from_numpy(observation).to(learner.device)
+    logits = learner.behaviour.network(states)
+    plausible = plausible_actions(logits, learner.behaviour.ratio)
+    q = learner.network(states)
+    chosen = q.masked_fill(~plausible, -torch.inf).argmax(dim=1)
+    answer = torch.from_numpy(action).to(learner.device)
+    asked = answer != UNKNOWN
+    teachers = answer.clamp_min(0)
+
+    def share(of: torch.Tensor) -> float | None:
+        return float(of[asked].float().mean()) if bool(asked.any()) else None
+
+    return {
+        "ratio": learner.behaviour.in_force,
+        "rows": len(action),
+        "asked_rows": int(asked.sum()),
+        "loss": float(imitation_loss(logits, answer)) if bool(asked.any()) else None,
+        "agreement": share(logits.argmax(dim=1) == teachers),
+        "plausible_actions": float(plausible.sum(dim=1).float().mean()),
+        "teacher_plausible": share(plausible.gather(1, teachers.unsqueeze(1)).squeeze(1)),
+        "changed": float((chosen != q.argmax(dim=1)).float().mean()),
+        "chosen_agreement": share(chosen == teachers),
+    }
 
 
 def refuse_nothing_to_learn(config: TeacherConfig, logged: Sequence[str] | None) -> None:

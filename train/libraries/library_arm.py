@@ -86,6 +86,7 @@ def resolve(settings: tuple[str, ...], library: Library) -> TrainConfig:
             ("guard.margin", config.guard.margin is not None),
             ('replay.ring_capacity "auto"', config.replay.ring_capacity == "auto"),
             ("jump_start.env_steps", config.jump_start.env_steps > 0),
+            ("teacher.source", config.teacher.filters),
             ("practice.rule", config.practice.rule != "natural"),
         )
         if bad

@@ -23,7 +23,7 @@ _UNKNOWN = "unknown: run `restock eval` on a run whose panel and store are at ha
 def replay_card(facts: Facts) -> dict[str, Any]:
     """The card as JSON values; null where the run does not say."""
     settings = facts.config.get("config", {})
-    replay = settings.get("replay", {})
+    replay, teacher = settings.get("replay", {}), settings.get("teacher", {})
     panel = facts.panel
     mixture = msgspec.to_builtins(panel.header.mixture) if panel is not None else None
     logs = [row for row in facts.sampled if row["source"] == "logs"]
@@ -66,6 +66,16 @@ def replay_card(facts: Facts) -> dict[str, Any]:
                 *("episodes", "success"),
             ),
         },
+        "teacher": {
+            **{name: teacher.get(name) for name in ("source", "ratio", "target", "policies")},
+            "states": _columns(
+                facts.teacher,
+                *("source", "condition", "asked_rows", "agreement", "plausible_actions"),
+                *("changed", "chosen_agreement"),
+            ),
+        }
+        if teacher.get("source", "none") != "none"
+        else None,
         "behaviour_policies": _columns(
             facts.policies, "source", "behaviour_policy", "rows", "share"
         ),
@@ -144,6 +154,17 @@ _PRACTICE = {
 }
 
 
+_TEACHER = {
+    "source": "source",
+    "condition": "condition",
+    "asked_rows": "states",
+    "agreement": "behaviour network as the teacher",
+    "plausible_actions": "plausible actions",
+    "changed": "choice of Q changed",
+    "chosen_agreement": "choice as the teacher",
+}
+
+
 def as_markdown(card: dict[str, Any]) -> str:
     """The card as a page of Markdown."""
     capacity, sampling = card["capacity"], card["sampling"]
@@ -154,6 +175,7 @@ def as_markdown(card: dict[str, Any]) -> str:
         "Sampling rule": f"batches of {_or_none(sampling['batch_size'])},"
         f" {_percent(sampling['logs_share'])} of all rows from logs, the offline phase among them:"
         f" {sampling['logs'] or 'rule unknown'}; fresh: {sampling['fresh'] or 'none'}",
+        "Teacher": _teacher(card["teacher"]),
         "Practice": f"missions by the rule {card['practice']['rule']}",
         "Returns": f"{_or_none(sampling['n_step']['logs'])}-step in the logs,"
         f" {_or_none(sampling['n_step']['fresh'])}-step fresh",
@@ -171,9 +193,25 @@ def as_markdown(card: dict[str, Any]) -> str:
             lines += ["", f"## {title}", "", *_table(card[key], columns)]
     lines += ["", "## Missions that the twin gave", ""]
     lines += _table(card["practice"]["arms"], _PRACTICE)
+    if card["teacher"] is not None:
+        lines += ["", "## What the teacher's filter did at the end", ""]
+        lines += _table(card["teacher"]["states"], _TEACHER)
     if card["missing"]:
         lines += ["", "## Unknown", "", *(f"- {_cell(line)}" for line in card["missing"])]
     return "\n".join(lines) + "\n"
+
+
+def _teacher(teacher: dict[str, Any] | None) -> str:
+    """Who says what is plausible."""
+    if teacher is None:
+        return "none: every action may be chosen"
+    ratio = teacher["ratio"]
+    ratio = f"{ratio:g}" if isinstance(ratio, int | float) else f"a schedule ({_words(ratio)})"
+    cloned = ", ".join(teacher["policies"]) or "nobody"
+    return (
+        f"{teacher['source']}; logged rows of {cloned} cloned; an action is plausible from {ratio}"
+        f" of the likeliest's probability on; the target looks at {teacher['target']} actions"
+    )
 
 
 def _panel(capacity: dict[str, Any]) -> str:
@@ -242,9 +280,11 @@ def _table(rows: Rows, columns: dict[str, str]) -> list[str]:
 
 def _shown(row: dict[str, Any], name: str) -> str:
     """A row's column as its cell shows it."""
-    if name in ("available_rows", "drawn_rows", "rows", "episodes"):
+    if name in ("available_rows", "drawn_rows", "rows", "episodes", "asked_rows"):
         return count(row[name])
-    if name.endswith("share"):
+    if name == "plausible_actions":
+        return number(row[name])
+    if name.endswith("share") or name in ("agreement", "changed", "chosen_agreement"):
         return _percent(row[name])
     if name == "td_abs_mean":
         return number(row[name])

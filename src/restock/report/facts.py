@@ -57,6 +57,7 @@ class Facts:
     reliability: Rows = field(default_factory=list)  # of their probabilities
     off_policy: Rows = field(default_factory=list)  # off-policy estimates, over all conditions
     practice: Rows = field(default_factory=list)  # an interval x arm of missions
+    teacher: Rows = field(default_factory=list)  # what its filter did at last
     missing: list[str] = field(default_factory=list)  # what could not be read, and why
 
     @property
@@ -116,12 +117,18 @@ def gather(path: Path) -> Facts:
         row for row in run.table("off_policy").to_pylist() if row["condition"] == "all"
     ]
     facts.practice = run.table("practice").to_pylist()
+    taught = run.table("teacher").to_pylist()
+    facts.teacher = [row for row in taught if _clocks(row) == _clocks(taught[-1])]
     if not facts.cells:
         facts.missing.append("`restock eval` has not been run: success is of training only.")
     _add_panel(facts)
     if facts.visited:
         _add_floor(facts)
     return facts
+
+
+def _clocks(row: dict[str, Any]) -> tuple[int, int]:
+    return row["env_steps"], row["gradient_steps"]
 
 
 def _add_panel(facts: Facts) -> None:
