@@ -44,6 +44,7 @@ class ToyTwin:
         self, num_envs: int, conditions: Mapping[str, float] | None = None, seed: int = 0
     ) -> None:
         self.num_envs = num_envs
+        self.bump_terminates = False
         shares = conditions or {"nominal": 0.5, "wheel_slip": 0.5}
         self._names = list(shares)
         self._shares = np.array(list(shares.values())) / sum(shares.values())
@@ -110,7 +111,9 @@ class ToyTwin:
         success = self.cell == CELLS - 1
         reward = np.where(success, 1.0, -0.05).astype(np.float32)
         truncated = (self.steps >= TASK.time_limit_steps) & ~success
-        ended = success | truncated
+        terminated = success | (self.signals["bumped"] & self.bump_terminates)
+        truncated &= ~terminated
+        ended = terminated | truncated
         info: dict[str, Any] = {
             "signals": self.signals,
             "travelled_m": np.abs(self.moved),
@@ -129,7 +132,7 @@ class ToyTwin:
         for place in np.flatnonzero(ended):
             info["final_obs"][place] = final[place]
             self._begin(place)
-        return self._observe(), reward, success.copy(), truncated, info
+        return self._observe(), reward, terminated, truncated, info
 
     def state_dict(self) -> dict[str, Any]:
         return {

@@ -13,12 +13,13 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from support.toy_run import SMALL, assert_same_run, config, logs, run_to_end, session
-from support.toy_twin import CELLS, TASK
+from support.toy_twin import CELLS, CONDITIONS, TASK, ToyTwin
 
 from restock.errors import ConfigError, RunError
 from restock.ingest.task.conditions import Condition
 from restock.train.dqn.learner import Learner
 from restock.train.evaluation.evaluate import fixed_episodes
+from restock.train.evaluation.evaluation_buffer import EvaluationBuffer
 from restock.train.evaluation.policies import GreedyPolicy
 from restock.train.feed.logs import Logs, LogTerms
 from restock.train.loop import TrainingInterrupted, train
@@ -511,3 +512,22 @@ def test_a_condition_that_cannot_run_is_refused_before_the_first_step(tmp_path: 
     broken = Condition("wet", "pre", "humidity > 3")
     with pytest.raises(ConfigError, match="condition 'wet'"):
         session(tmp_path / "a", config(), conditions=[broken])
+
+
+def test_a_bump_that_ends_an_evaluations_episode_is_counted(tmp_path: Path) -> None:
+    class Backwards:
+        """Into the wall behind the first cell."""
+
+        name = version = ""
+
+        def act(self, env: Any, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            return np.full(len(observation), 2), np.ones(len(observation), np.float32)
+
+    live = session(tmp_path / "a", config())
+    live.close()
+    twin = ToyTwin(3)
+    twin.bump_terminates = True
+    buffer = EvaluationBuffer(twin, TASK, CONDITIONS, live.ring, None)
+    results = buffer.drive(Backwards(), fixed_episodes(["nominal"], 5, 7))
+    assert [result.bumps for result in results] == [1] * 5
+    assert [result.failure for result in results] == ["bump"] * 5

@@ -116,7 +116,7 @@ def run_episodes(
         distance += info["travelled_m"]
         bumped = np.asarray(after["bumped"], np.bool_)
         bumps += bumped & ~touching
-        touching = bumped
+        touching = bumped.copy()
         envs = np.arange(env.num_envs)
         track[envs, np.minimum(steps, time_limit_steps)] = _position(after)
         ended = np.flatnonzero(terminated | truncated)

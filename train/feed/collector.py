@@ -223,7 +223,7 @@ class Collector(Stateful):
         self._steps += 1
         self._return += reward
         self._bumps += bumped & ~self._touching
-        self._touching = bumped
+        self._touching = bumped.copy()  # the step's own array is another reader's too
         values = info.get("perturbation_values", _NO_VALUES * self.env.num_envs)
         self.perturbations.note(keys, info["perturbation"], values)
         finished = []
