@@ -85,7 +85,8 @@ def protective_stop(task: Task, steps: Steps) -> Bools:
     latest = np.maximum.accumulate(np.where(pressed, np.arange(len(steps)), -1))
     stamp_ns = steps.signals["stamp_ns"]
     since_s = (stamp_ns - stamp_ns[latest]) * 1e-9
-    return (latest >= 0) & (since_s >= 0) & (since_s < RELEASE_S)
+    until_s = RELEASE_S - task.control_period_s / 2  # stamps jitter: to the nearest tick
+    return (latest >= 0) & (since_s >= 0) & (since_s < until_s)
 
 
 class _Walk:
