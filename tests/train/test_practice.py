@@ -336,7 +336,8 @@ def test_runs_practised_differently_are_compared_as_practice_alone(tmp_path: Pat
         assert main(["compare", first, even, "--treatment", treatment]) == code, treatment
     assert "REFUSED: the runs differ in config.practice.rule" in capsys.readouterr().err
     tuned = document(3, config__practice__floor=0.2)  # which the natural rule does not read
-    found = differences(Run.open(Path(first)), Run.create(tmp_path / "d", tuned))
+    Run.create(tmp_path / "d", tuned)
+    found = differences(Run.open(Path(first)), Run.open(tmp_path / "d"))
     assert [difference.setting for difference in found] == ["config.seed"]
     other = str(
         make_run(tmp_path / "c", document(2, config__practice__rule="even"), slip_share=0.5)
