@@ -1,8 +1,9 @@
 """Statistics of evaluations and logs: intervals that say how much a number can be trusted.
 
-Every bootstrap is a percentile interval (Efron and Tibshirani 1993) over what varies on its own:
-values within a stratum, episodes that two arms share, or whole clusters, because segments of one
-episode are not independent. All draws come from the generator that is given.
+Over episodes, of which there are many, it is a percentile bootstrap (Efron and Tibshirani 1993) of
+what varies on its own: values within a stratum, or whole clusters, because segments of one episode
+are not independent. All draws come from the generator that is given. Over training seeds, of which
+there are few, it is Student's t.
 """
 
 from __future__ import annotations
@@ -132,30 +133,93 @@ def mean_over_strata(
 
 
 def difference_of_arms(
-    first: NDArray[Any],
-    second: NDArray[Any],
-    *,
-    rng: np.random.Generator,
-    resamples: int = 2000,
-    confidence: float = 0.95,
+    first: NDArray[Any], second: NDArray[Any], *, confidence: float = 0.95
 ) -> ConfidenceInterval:
     """mean(second) - mean(first) of two arms that drove the same episodes.
 
-    Runs are drawn within each arm and episodes jointly for both (the pairing), so the interval
-    holds both what another seed and what other episodes would have changed.
+    Runs and episodes are crossed random effects, runs of each arm, episodes common to both (the
+    pairing), so the interval holds both what another seed and what other episodes would have
+    changed. Student's t, with Satterthwaite's degrees of freedom: with five runs an arm a
+    percentile bootstrap is too narrow. The ends are NaN for an arm of one run, or one episode.
 
     Args:
         first, second: (runs, episodes), the same episodes in the same order.
     """
-    draws = np.empty(resamples)
-    for index in range(resamples):
-        episodes = rng.integers(first.shape[1], size=first.shape[1])
-        means = [
-            arm[rng.integers(len(arm), size=len(arm))][:, episodes].mean()
+    from scipy.stats import t
+
+    first, second = np.asarray(first, np.float64), np.asarray(second, np.float64)
+    value, episodes = float(second.mean() - first.mean()), first.shape[1]
+    if min(len(first), len(second), episodes) < 2:
+        return ConfidenceInterval(value, float("nan"), float("nan"))
+    parts = [  # of the variance of the difference, with degrees of freedom
+        (float(np.var(second.mean(axis=0) - first.mean(axis=0), ddof=1)) / episodes, episodes - 1),
+        *(
+            (float(np.var(arm.mean(axis=1), ddof=1)) / len(arm), len(arm) - 1)
             for arm in (first, second)
-        ]
-        draws[index] = means[1] - means[0]
-    return ConfidenceInterval(float(second.mean() - first.mean()), *percentiles(draws, confidence))
+        ),
+    ]
+    # What runs and episodes have together is in both: it counts once.
+    both = sum(_interaction(arm) / arm.size for arm in (first, second))
+    variance = max(sum(part for part, _ in parts) - both, max(part for part, _ in parts))
+    if variance == 0:
+        return ConfidenceInterval(value, value, value)
+    freedom = sum(part for part, _ in parts) ** 2 / sum(part**2 / df for part, df in parts)
+    half = float(t.ppf(0.5 + confidence / 2, freedom)) * math.sqrt(variance)
+    return ConfidenceInterval(value, value - half, value + half)
+
+
+def _interaction(arm: F64) -> float:
+    """The variance of (runs, episodes) that neither the run nor the episode explains."""
+    left = arm - arm.mean(axis=1, keepdims=True) - arm.mean(axis=0, keepdims=True) + arm.mean()
+    return float((left**2).sum() / ((arm.shape[0] - 1) * (arm.shape[1] - 1)))
+
+
+def paired_t(
+    differences: NDArray[Any], confidence: float = 0.95
+) -> tuple[ConfidenceInterval, float]:
+    """The mean of paired differences (n,), its Student's t interval, and p of no difference.
+
+    With n of 5 it covers what it says (a percentile bootstrap .84 to .91 of .95). Below two
+    differences, ends and p are NaN; where all are the same, p is 0, or 1 if that is 0.
+    """
+    from scipy.stats import t
+
+    values = np.asarray(differences, np.float64)
+    value, count = float(values.mean()), len(values)
+    if count < 2:
+        return ConfidenceInterval(value, float("nan"), float("nan")), float("nan")
+    error = float(values.std(ddof=1)) / math.sqrt(count)
+    half = float(t.ppf(0.5 + confidence / 2, count - 1)) * error
+    if error == 0:
+        return ConfidenceInterval(value, value, value), float(value == 0)
+    p = 2 * float(t.sf(abs(value) / error, count - 1))
+    return ConfidenceInterval(value, value - half, value + half), p
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """p values adjusted for their number, in their order (Holm 1979): below alpha is significant,
+    with a probability of alpha at most that any of them is by chance."""
+    order = sorted(range(len(p_values)), key=lambda place: p_values[place])
+    adjusted, least = [0.0] * len(p_values), 0.0
+    for rank, place in enumerate(order):
+        least = max(least, min((len(p_values) - rank) * p_values[place], 1.0))
+        adjusted[place] = least
+    return adjusted
+
+
+def paired_t_power(effect: float, sd: float, pairs: int, *, confidence: float = 0.95) -> float:
+    """The probability that `paired_t` finds a true mean difference, from the noncentral t.
+
+    Args:
+        sd: of one paired difference.
+    """
+    from scipy.stats import nct, t
+
+    if pairs < 2:
+        return 0.0
+    freedom, shift = pairs - 1, effect / (sd / math.sqrt(pairs))
+    limit = float(t.ppf(0.5 + confidence / 2, freedom))
+    return float(nct.sf(limit, freedom, shift) + nct.cdf(-limit, freedom, shift))
 
 
 def cluster_counts(clusters: int, resamples: int, rng: np.random.Generator) -> F64:

@@ -62,7 +62,7 @@ MAY_IMPORT = {
         "train dqn evaluation feed run twin/floors twin/physics replay/mixture replay/panel"
         " replay/ring replay/store ingest/profile ingest/task"
     ),
-    "train/study": "comparison dqn libraries ingest",
+    "train/study": "comparison dqn evaluation libraries run twin/physics ingest",
     "train/twin": "",
     "train/twin/floors": "",
     "train/twin/physics": "twin/floors ingest/task",

@@ -12,9 +12,13 @@ from restock.stats import (
     clustered_quantiles,
     clustered_ratio,
     difference_of_arms,
+    holm,
     iqm,
     mean_over_strata,
     paired_improvement,
+    paired_t,
+    paired_t_power,
+    percentiles,
     probability_of_improvement,
     wilson,
 )
@@ -66,8 +70,7 @@ def test_pairing_removes_what_the_episodes_share() -> None:
     episodes = rng.normal(0, 10, 40)  # far more than what sets the arms apart
     first = episodes + rng.normal(0, 0.1, (3, 40))
     second = episodes + 1 + rng.normal(0, 0.1, (4, 40))
-    found = difference_of_arms(first, second, rng=np.random.default_rng(1))
-    assert found == difference_of_arms(first, second, rng=np.random.default_rng(1))
+    found = difference_of_arms(first, second)
     assert found.value == pytest.approx(1, abs=0.1)
     assert found.low < found.value < found.high < found.low + 0.2
 
@@ -111,3 +114,75 @@ def test_an_interval_holds_the_truth_as_often_as_it_says() -> None:
         )
         hits += mean.low <= 0 <= mean.high
     assert 0.88 <= hits / 200 <= 0.99
+
+
+def test_paired_t_against_a_published_value() -> None:
+    # Student 1908 (Biometrika 6), hours of sleep gained by ten patients under two drugs.
+    gained = np.array([1.2, 2.4, 1.3, 1.3, 0.0, 1.0, 1.8, 0.8, 4.6, 1.4])
+    interval, p = paired_t(gained)
+    assert (interval.value, p) == pytest.approx((1.58, 0.00283), abs=1e-5)
+    assert (interval.low, interval.high) == pytest.approx((0.7001, 2.4599), abs=1e-4)
+    one, unknown = paired_t(np.array([0.3]))
+    assert one.value == 0.3
+    assert np.isnan([one.low, one.high, unknown]).all()
+
+
+def test_over_five_seeds_t_covers_what_it_says_and_a_bootstrap_does_not() -> None:
+    rng = np.random.default_rng(0)
+    t_hits = bootstrap_hits = 0
+    for _ in range(2000):
+        ahead = rng.normal(0.1, 0.06, 5)
+        interval, _ = paired_t(ahead)
+        t_hits += interval.low <= 0.1 <= interval.high
+        low, high = percentiles(ahead[rng.integers(5, size=(400, 5))].mean(axis=1))
+        bootstrap_hits += low <= 0.1 <= high
+    assert t_hits / 2000 == pytest.approx(0.95, abs=0.015)
+    assert bootstrap_hits / 2000 < 0.87
+
+
+@pytest.mark.parametrize(("runs", "episodes"), [(3, 40), (5, 60)])
+def test_a_difference_of_arms_covers_other_seeds_and_other_episodes(
+    runs: int, episodes: int
+) -> None:
+    rng = np.random.default_rng(1)
+    hits = 0
+    for _ in range(600):
+        hard = rng.normal(0, 1, episodes)  # to both arms alike
+        arms = [
+            hard
+            + rng.normal(0, 0.5, episodes)  # to this method
+            + rng.normal(0, 0.3, (runs, 1))  # a seed's luck
+            + rng.normal(0, 1, (runs, episodes))
+            > 0
+            for _ in range(2)
+        ]
+        found = difference_of_arms(*arms)
+        hits += found.low <= 0 <= found.high
+    assert hits / 600 == pytest.approx(0.95, abs=0.03)
+
+
+def test_one_run_of_an_arm_has_no_interval() -> None:
+    found = difference_of_arms(np.zeros((1, 5)), np.ones((3, 5)))
+    assert found.value == 1.0
+    assert np.isnan([found.low, found.high]).all()
+
+
+def test_holm_against_a_worked_example() -> None:
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([]) == []
+
+
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=8))
+def test_holm_keeps_the_order_and_lowers_nothing(p_values: list[float]) -> None:
+    adjusted = holm(p_values)
+    assert all(p <= q <= 1 for p, q in zip(p_values, adjusted, strict=True))
+    ranked = [adjusted[place] for place in np.argsort(p_values)]
+    assert ranked == sorted(ranked)
+
+
+def test_power_is_how_often_the_test_finds_it() -> None:
+    rng = np.random.default_rng(2)
+    found = [paired_t(rng.normal(0.1, 0.1, 8))[1] < 0.05 for _ in range(3000)]
+    assert paired_t_power(0.1, 0.1, 8) == pytest.approx(np.mean(found), abs=0.025)
+    assert paired_t_power(0.0, 0.1, 8) == pytest.approx(0.05)  # of nothing: the error of the test
+    assert paired_t_power(0.1, 0.1, 1) == 0.0

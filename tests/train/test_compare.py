@@ -11,7 +11,7 @@ from support.finished_runs import UPDATES, document, make_run
 
 from restock.cli import main
 from restock.train.run.run import Run
-from restock.train.study.study import as_markdown
+from restock.train.study.page import as_markdown
 
 EXTRA = ("update_path",)
 
@@ -153,7 +153,7 @@ def test_a_run_against_itself_is_comparable_by_identity(tmp_path, capsys) -> Non
         (1, 40, "1 run an arm, at least 3 are needed"),
         (2, 40, "2 runs an arm, at least 3 are needed"),
         (3, 1, "1 episode, at least 10 are needed"),
-        (3, 40, "every run ended every episode alike: resamples do not vary"),
+        (3, 40, "every run ended every episode alike: nothing varies"),
     ],
 )
 def test_too_little_gives_values_without_intervals(tmp_path, capsys, seeds, episodes, why) -> None:

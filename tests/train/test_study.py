@@ -27,12 +27,16 @@ evaluation.episodes = 1
 record.tensorboard = false
 [evaluation]
 episodes = 1
+references = []
 [[arms]]
 name = "plain"
 [[arms]]
 name = "dueling"
 settings = { network.dueling = true }
 """
+
+TWO = "[[arms]]\nname = 'a'\n[[arms]]\nname = 'b'\n"
+PRIMARY = "primary = { arm = 'b', baseline = 'a', measure = 'auc_rare' }"
 
 
 @pytest.mark.slow
@@ -60,12 +64,12 @@ def test_a_study_runs_every_arm_once_and_ends_in_a_comparison(tmp_path: Path, ca
 
 
 def test_a_run_that_fails_says_where_its_words_are(tmp_path: Path, capsys) -> None:
-    text = SMALL.replace("[settings]", "[settings]\nnetwork.hiden = [3]")
+    text = SMALL.replace("[settings]", "[settings]\nenv.layouts = 'nowhere.toml'")
     (tmp_path / "s.toml").write_text(text)
     assert main(["study", str(tmp_path / "s.toml"), "--out", str(tmp_path / "o")]) == 2
     said = " ".join(capsys.readouterr().err.split())
     assert "plain-0.log: `restock train` failed with exit code 2" in said
-    assert "hiden" in said
+    assert "nowhere.toml" in said
 
 
 def test_the_plan_is_shown_before_anything_is_run(tmp_path: Path, capsys) -> None:
@@ -109,7 +113,7 @@ treatment = "method"
 
 def test_each_comparison_has_its_own_treatment(tmp_path: Path, capsys, monkeypatch) -> None:
     arm = '\n[[arms]]\nname = "again"\nbaseline = "dueling"\ntreatment = "method"'
-    (tmp_path / "s.toml").write_text(SMALL + arm)
+    (tmp_path / "s.toml").write_text(f"measures = []{SMALL}{arm}")
     out = tmp_path / "out"
     plan = StudyPlan(load_study(tmp_path / "s.toml"), tmp_path, out)
     for job in plan.jobs:  # all were trained and evaluated before
@@ -180,6 +184,23 @@ def test_panels_of_mixtures_are_the_studys_own(tmp_path: Path) -> None:
             "evaluation.episodes must be at least 1, got 0",
         ),
         ("arms = [", "is not TOML"),
+        (f"{TWO}[settings]\nnetwork.hiden = [3]", "unknown key `network.hiden`"),
+        (f"{TWO}[evaluation]\nepisodes = {{ slip = 3 }}", "episodes: there is no 'slip'"),
+        (f"measures = ['auc']\n{TWO}", "measure 'auc' must be auc_WHAT or success_WHAT"),
+        (f"rare = ['ice']\n{TWO}", "rare: there is no 'ice'"),
+        (f"{PRIMARY.replace('b', 'c', 1)}\n{TWO}", "primary: 'c' is not one of the arms"),
+        (
+            f"primary = {{ arm = 'a', baseline = 'b', measure = 'auc_rare' }}\n{TWO}",
+            "primary: 'a' is not compared with 'b'",
+        ),
+        (f"power = {{ sd = 0.1, effect = 0.1 }}\n{TWO}", "power: of which contrast"),
+        (f"{PRIMARY}\npower = {{ sd = 0, effect = 0.1 }}\n{TWO}", "power.sd"),
+        # A policy is the best of its own fixed episodes (seeds 90000 on): others must judge it.
+        (f"{TWO}[evaluation]\nseed = 89_990", "among them those that choose its policy"),
+        (
+            f"{TWO}[settings]\nevaluation.seed = 10_039",
+            "judged by seeds 10000 to 10039, among them those that choose",
+        ),
     ],
 )
 def test_an_invalid_study_is_refused(tmp_path: Path, text: str, said: str) -> None:

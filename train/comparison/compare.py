@@ -3,10 +3,10 @@
 A comparison of methods that were fed differently measures the feed. It is refused, with what
 differs, unless the feed is what is compared (`treatment="mixture"`).
 
-Outcomes are differences with intervals, paired by episode. Runs (seeds) are resampled within each
-arm and episodes jointly for both (the pairing), so that an interval holds both what another seed
-and what other episodes would have changed. From fewer than `LEAST_RUNS` runs an arm or
-`LEAST_EPISODES` episodes there is none, nor where every resample is the same: only values. The
+Outcomes are differences with intervals, paired by episode: Student's t over runs (seeds) and
+episodes, so that an interval holds both what another seed and what other episodes would have
+changed. From fewer than `LEAST_RUNS` runs an arm or `LEAST_EPISODES` episodes there is none, nor
+where every run ended every episode alike: only values. The
 probability of improvement and the interquartile mean are those of arXiv:2108.13264.
 """
 
@@ -101,7 +101,7 @@ def compare(
     verdict = "incomparable" if refused else worst([check.verdict for check in deciding])
     if identical:  # what was fed is the same by identity: there is nothing to estimate
         verdict = "comparable"
-    source, rows = _outcomes(*arms, rng) if verdict == "comparable" else (None, [])
+    source, rows = _outcomes(*arms) if verdict == "comparable" else (None, [])
     return Comparison(
         treatment, verdict, differing, refused, totals, checks, source, rows, identical
     )
@@ -125,9 +125,7 @@ def _total(name: str, first: float, second: float) -> Check:
     return Check.exact(shown, first, second, ratio, _SAME_TOTAL)
 
 
-def _outcomes(
-    first: Arm, second: Arm, rng: np.random.Generator
-) -> tuple[str, list[dict[str, Any]]]:
+def _outcomes(first: Arm, second: Arm) -> tuple[str, list[dict[str, Any]]]:
     """Where the episodes are from, and one row a perturbation and condition that both arms drove.
 
     Raises:
@@ -143,7 +141,7 @@ def _outcomes(
         seeds = sorted(scores[0][cell].keys() & scores[1].get(cell, {}).keys())
         if seeds:
             a, b = (np.stack([score[cell][seed] for seed in seeds], 1) for score in scores)
-            rows.append(_outcome(cell, a, b, rng))
+            rows.append(_outcome(cell, a, b))
     if not rows:
         raise RunError(
             f"was evaluated on none of the episodes of {first.runs[0].path}",
@@ -157,9 +155,8 @@ def _outcome(
     cell: Cell,
     a: F64,  # (runs, episodes, 2) success and return
     b: F64,
-    rng: np.random.Generator,
 ) -> dict[str, Any]:
-    difference = difference_of_arms(a[..., 0], b[..., 0], rng=rng)
+    difference = difference_of_arms(a[..., 0], b[..., 0])
     missing = _why_no_interval(a, b, difference)
     # Episode by episode, over all pairs of runs.
     better = [
@@ -195,7 +192,7 @@ def _why_no_interval(a: F64, b: F64, difference: ConfidenceInterval) -> str | No
     if episodes < LEAST_EPISODES:
         return f"{episodes} episode{'s' * (episodes > 1)}, at least {LEAST_EPISODES} are needed"
     if difference.low == difference.high:
-        return "every run ended every episode alike: resamples do not vary"
+        return "every run ended every episode alike: nothing varies"
     return None
 
 

@@ -56,7 +56,7 @@ class EvaluationPlan:
     config: TrainConfig
     policies: tuple[str, ...]
     perturbations: dict[str, Perturbation | None]  # by the name or file that was asked for
-    episodes: int  # per kind of episode
+    episodes: Mapping[str, int]  # by kind
     first_seed: int = FIRST_SEED
     num_envs: int = 32
     nthread: int = 0  # all cores
@@ -65,13 +65,28 @@ class EvaluationPlan:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """The kinds of episodes that every floor has room for."""
-        return tuple(kind for kind in KINDS if kind not in self.left_out)
+        """The kinds of episodes that were asked for and every floor has room for."""
+        return tuple(kind for kind in KINDS if kind in self.episodes and kind not in self.left_out)
+
+    @property
+    def warnings(self) -> list[str]:
+        """Episodes among those that chose the policy that is kept: they flatter it."""
+        chosen = self.config.evaluation
+        last = self.first_seed + max(self.episodes.values())
+        if "agent" not in self.policies or not (
+            chosen.seed < last and self.first_seed < chosen.seed + chosen.episodes
+        ):
+            return []
+        return [
+            f"seeds {self.first_seed} to {last - 1} are among those that chose the run's policy"
+            f" ({chosen.seed} to {chosen.seed + chosen.episodes - 1}): its success is flattered"
+        ]
 
     @property
     def total(self) -> int:
         """Episodes to drive."""
-        return len(self.policies) * len(self.perturbations) * len(self.kinds) * self.episodes
+        episodes = sum(self.episodes[kind] for kind in self.kinds)
+        return len(self.policies) * len(self.perturbations) * episodes
 
 
 def plan_evaluation(
@@ -79,7 +94,7 @@ def plan_evaluation(
     *,
     policies: Sequence[str] = POLICIES,
     perturbations: Sequence[str] = (CLEAN,),
-    episodes: int = 20,
+    episodes: int | str | Mapping[str, int] = 20,
     first_seed: int = FIRST_SEED,
     layouts: str | None = None,
 ) -> EvaluationPlan:
@@ -105,8 +120,7 @@ def plan_evaluation(
                 remedy=f"choose from {', '.join(choices)}"
                 + (", onnx:FILE, run:DIRECTORY" if flag == "--policies" else ", FILE.toml"),
             )
-    if episodes < 1:
-        raise ConfigError(f"must be at least 1, got {episodes}", where="--episodes")
+    of_kind = episodes_of_kind(episodes)
     layouts = layouts or layouts_of_split(config.env.layouts, "test")
     floors = open_floors(layouts)
     plan = EvaluationPlan(
@@ -114,17 +128,47 @@ def plan_evaluation(
         config,
         tuple(dict.fromkeys(policies)),
         {name: _perturb(name) for name in perturbations},
-        episodes,
+        of_kind,
         first_seed,
         layouts=layouts,
         left_out=unfit_kinds(floors),
     )
     if not plan.kinds:
-        refuse_unfit(floors, KINDS)
+        refuse_unfit(floors, list(of_kind))
     for name in plan.policies:
         if name == "agent" or _is_path("--policies", name):
             make_policy(name, plan)  # refused before anything is driven
     return plan
+
+
+def episodes_of_kind(asked: int | str | Mapping[str, int]) -> dict[str, int]:
+    """Episodes by kind: so many of each, or those that are named, as text `kind=N,kind=N`.
+
+    Raises:
+        ConfigError: no such kind, or not a number of at least 1.
+    """
+    where = "--episodes"
+    if isinstance(asked, str):
+        parts = [part.partition("=") for part in asked.split(",") if part.strip()]
+        named = any(sign for _, sign, _ in parts)
+        try:
+            found = {kind.strip(): int(count) for kind, _, count in parts} if named else None
+            asked = int(asked) if found is None else found
+        except ValueError:
+            raise ConfigError(
+                f"{asked!r} is neither a number nor kind=number,…",
+                where=where,
+                remedy="write 20, or nominal=1000,wheel_slip=300",
+            ) from None
+    if isinstance(asked, int):
+        asked = dict.fromkeys(KINDS, asked)
+    if unknown := [kind for kind in asked if kind not in KINDS]:
+        remedy = f"choose from {', '.join(KINDS)}"
+        raise ConfigError(f"there is no kind {unknown[0]!r}", where=where, remedy=remedy)
+    least = min(asked.values(), default=0)
+    if least < 1:
+        raise ConfigError(f"must be at least 1, got {least}", where=where)
+    return dict(asked)
 
 
 def _is_path(flag: str, name: str) -> bool:
@@ -139,7 +183,7 @@ def evaluate(
     *,
     policies: Sequence[str] = POLICIES,
     perturbations: Sequence[str] = (CLEAN,),
-    episodes: int = 20,
+    episodes: int | str | Mapping[str, int] = 20,
     first_seed: int = FIRST_SEED,
     layouts: str | None = None,
 ) -> list[dict[str, Any]]:
@@ -153,7 +197,7 @@ def evaluate(
         policies: agent (the run's best), planner, operator, random, `onnx:FILE` or
             `run:DIRECTORY`.
         perturbations: none, friction, latency, payload, wheels, sensors, or a TOML file.
-        episodes: of each kind.
+        episodes: of each kind, or by kind: `{"nominal": 1000, "wheel_slip": 300}`.
         layouts: floors to drive on; None: the run's own, of training floors the test split.
 
     Raises:
@@ -193,8 +237,9 @@ def drive_evaluation(
     episodes = [
         (name, EpisodeSpec(kind, plan.first_seed + index, perturbation))
         for name, perturbation in plan.perturbations.items()
-        for index in range(plan.episodes)
+        for index in range(max(plan.episodes[kind] for kind in plan.kinds))
         for kind in plan.kinds
+        if index < plan.episodes[kind]
     ]
     results: Results = {}
     versions: dict[str, str] = {}
@@ -304,7 +349,7 @@ def settings(plan: EvaluationPlan) -> dict[str, Any]:
             name: msgspec.to_builtins(perturbation or Perturbation())
             for name, perturbation in plan.perturbations.items()
         },
-        "episodes_per_kind": plan.episodes,
+        "episodes_per_kind": dict(plan.episodes),
         "first_seed": plan.first_seed,
         "layouts": plan.layouts,
         "kinds": list(plan.kinds),

@@ -1,20 +1,23 @@
-"""A study: arms x seeds as its TOML file asks for, what there is to do, and the page it ends in."""
+"""A study: arms x seeds as its TOML file asks for, and what there is to do."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
 
+from restock.errors import ConfigError
 from restock.toml import Checked, read_toml, typed
 from restock.train.comparison.arms import Treatment
-from restock.train.comparison.compare import LEAST_EPISODES, LEAST_RUNS, Comparison
-from restock.train.dqn.config import as_overrides
+from restock.train.dqn.config import apply_overrides, as_overrides, parse_config
 from restock.train.libraries.library_arm import Library
+from restock.train.study.contrasts import CELLS, RARE, unknown_measure
+from restock.train.study.power import PowerConfig
+from restock.train.twin.physics.episode import KINDS
 
 
 class ArmConfig(Checked, frozen=True):
@@ -40,10 +43,43 @@ class ArmConfig(Checked, frozen=True):
             raise ValueError("library: it learns from no logs here, give no mixture or panel")
 
 
+Count = Annotated[int, msgspec.Meta(ge=1)]
+
+
 class StudyEvaluation(Checked, frozen=True):
-    episodes: Annotated[int, msgspec.Meta(ge=1)] = 40  # per kind
+    # Of each kind, or by kind; a kind that a table leaves out is not driven.
+    episodes: Count | dict[str, Count] = 40
     perturbations: tuple[str, ...] = ("none",)
     seed: int = 10_000
+    references: tuple[str, ...] = ("planner", "operator")  # who drives the same episodes, once
+
+    def check(self) -> None:
+        kinds = list(self.episodes) if isinstance(self.episodes, dict) else []
+        if unknown := [kind for kind in kinds if kind not in KINDS]:
+            raise ValueError(f"episodes: there is no {unknown[0]!r}, of {', '.join(KINDS)}")
+
+    @property
+    def of_kind(self) -> Mapping[str, int]:
+        """Episodes by kind."""
+        if isinstance(self.episodes, dict):
+            return self.episodes
+        return dict.fromkeys(KINDS, self.episodes)
+
+
+class Primary(Checked, frozen=True):
+    """The one contrast that a study is for, named before its runs."""
+
+    arm: str
+    baseline: str
+    measure: str
+
+    @property
+    def pair(self) -> tuple[str, str]:
+        return self.arm, self.baseline
+
+    @property
+    def named(self) -> tuple[str, str, str]:
+        return self.arm, self.baseline, self.measure
 
 
 @dataclass(frozen=True)
@@ -66,6 +102,11 @@ class Study(Checked, frozen=True):
     baseline: str | None = None  # where an arm names none; None: the first arm
     settings: dict[str, Any] = msgspec.field(default_factory=dict)  # of every arm
     evaluation: StudyEvaluation = StudyEvaluation()
+    primary: Primary | None = None
+    power: PowerConfig | None = None  # what pilots found, for the primary contrast
+    # Of the other contrasts, whose p values are adjusted for their number.
+    measures: tuple[str, ...] = ("auc_rare", "success_rare", "success_nominal")
+    rare: tuple[str, ...] = RARE  # whose mean is `rare`
 
     def check(self) -> None:
         names = [arm.name for arm in self.arms]
@@ -90,6 +131,24 @@ class Study(Checked, frozen=True):
             "seed" in settings for settings in (self.settings, *(a.settings for a in self.arms))
         ):
             raise ValueError("seeds are the study's: `settings` must not set seed")
+        self._check_contrasts(names)
+
+    def _check_contrasts(self, names: list[str]) -> None:
+        measures = (*self.measures, *((self.primary.measure,) if self.primary else ()))
+        for wrong in filter(None, map(unknown_measure, measures)):
+            raise ValueError(wrong)
+        if unknown := [name for name in self.rare if name not in CELLS]:
+            raise ValueError(f"rare: there is no {unknown[0]!r}, of {', '.join(CELLS)}")
+        if self.primary is not None:
+            if missing := [name for name in self.primary.pair if name not in names]:
+                raise ValueError(f"primary: {missing[0]!r} is not one of the arms {names}")
+            if self.primary.pair not in [(p.arm.name, p.baseline.name) for p in self.pairs]:
+                raise ValueError(
+                    f"primary: {self.primary.arm!r} is not compared with {self.primary.baseline!r}:"
+                    " name that as the arm's `baseline`"
+                )
+        if self.power is not None and self.primary is None:
+            raise ValueError("power: of which contrast? name the primary one")
 
     @property
     def base(self) -> ArmConfig:
@@ -120,7 +179,27 @@ def load_study(path: Path) -> Study:
         ConfigError: no such file, no TOML, an unknown key or an invalid value; names the key.
     """
     remedy = "docs/study.md lists every key with its meaning"
-    return typed(read_toml(path), Study, where=str(path), remedy=remedy)
+    study = typed(read_toml(path), Study, where=str(path), remedy=remedy)
+    _refuse_judging_by_the_choice(study, str(path))
+    return study
+
+
+def _refuse_judging_by_the_choice(study: Study, where: str) -> None:
+    """The policy that a run keeps is the best on its own fixed episodes: others must judge it."""
+    judged = study.evaluation.seed, study.evaluation.seed + max(study.evaluation.of_kind.values())
+    for arm in study.arms:
+        sets = [*as_overrides(study.settings), *as_overrides(arm.settings)]
+        chosen = parse_config(apply_overrides({}, sets), where=where).evaluation
+        if chosen.seed < judged[1] and judged[0] < chosen.seed + chosen.episodes:
+            raise ConfigError(
+                f"arm {arm.name!r} would be judged by seeds {judged[0]} to {judged[1] - 1}, among"
+                f" them those that choose its policy ({chosen.seed} on)",
+                where=where,
+                remedy="set evaluation.seed of the study apart from settings' evaluation.seed",
+            )
+
+
+DONE = "study.json"  # in a run that was trained and evaluated as the study asks
 
 
 @dataclass(frozen=True)
@@ -134,7 +213,7 @@ class StudyJob:
     @property
     def done(self) -> Path:
         """There when the run was trained and evaluated as the study asks."""
-        return self.path / "study.json"
+        return self.path / DONE
 
 
 @dataclass(frozen=True)
@@ -181,97 +260,13 @@ class StudyPlan:
         return json.dumps(request, indent=1) + "\n"
 
 
-def findings(plan: StudyPlan, comparisons: Sequence[Comparison]) -> dict[str, Any]:
-    """The study and every comparison, as JSON values."""
-    return {
-        "doc": plan.study.doc,
-        "seeds": list(plan.study.seeds),
-        "runs": {arm.name: [str(path) for path in plan.runs(arm)] for arm in plan.study.arms},
-        "comparisons": [
-            {"arm": pair.arm.name, "baseline": pair.baseline.name, **comparison.as_json()}
-            for pair, comparison in zip(plan.study.pairs, comparisons, strict=True)
-        ],
-    }
-
-
-def as_markdown(study: dict[str, Any]) -> str:
-    """The same for people."""
-    lines = [f"# Study: {', '.join(study['runs'])}", ""]
-    lines += [study["doc"], ""] if study["doc"] else []
-    lines += [
-        f"Seeds of each arm: {', '.join(map(str, study['seeds']))}. All are evaluated on the same"
-        " episodes. Intervals are 95 %, over seeds and episodes; bold where they exclude 0. From"
-        f" fewer than {LEAST_RUNS} seeds or {LEAST_EPISODES} episodes, and where resamples do not"
-        " vary, there are values alone.",
-    ]
-    for comparison in study["comparisons"]:
-        baseline, treatment = comparison["baseline"], comparison["treatment"]
-        lines += ["", f"## {comparison['arm']} against {baseline}", ""]
-        lines += [f"Compared: the {treatment}.", ""]
-        if treatment == "method":
-            lines += [_held(comparison), ""]
-        if comparison["verdict"] != "comparable":
-            lines += [_refusal(comparison)]
-            continue
-        lines += [
-            f"| perturbation | condition | {baseline} | {comparison['arm']} | difference |"
-            " P(higher return) |",
-            "| --- | --- | --- | --- | --- | --- |",
-        ]
-        for row in comparison["outcomes"]:
-            low, high = row["difference_low"], row["difference_high"]
-            known = low is not None
-            apart = "**" if known and (low > 0 or high < 0) else ""
-            interval = f" [{low:+.2f}, {high:+.2f}]" if known else ""
-            lines.append(
-                f"| {row['perturbation']} | {row['condition']} | {_cell(row['success'][0], '.2f')}"
-                f" | {_cell(row['success'][1], '.2f')} | {apart}{_cell(row['difference'], '+.2f')}"
-                f"{interval}{apart} | {row['improvement']:.2f} |"
-            )
-    return "\n".join(lines) + "\n"
-
-
-def _cell(value: float | None, form: str) -> str:
-    return "no goal" if value is None else format(value, form)
-
-
-def _refusal(comparison: dict[str, Any]) -> str:
-    """Why there are no outcomes."""
-    if comparison["refused"]:
-        return (
-            f"Not compared: they differ in {', '.join(comparison['refused'])}, which"
-            f' treatment = "{comparison["treatment"]}" does not allow.'
-        )
-    verdict = comparison["verdict"]
-    names = [check["name"] for check in comparison["checks"] if check["verdict"] == verdict]
-    return f"Not compared: {verdict} in {', '.join(dict.fromkeys(names))}."
-
-
-def _held(comparison: dict[str, Any]) -> str:
-    """What a comparison of methods holds fixed, and what it does not."""
-    kinds = ("feed", "target", "algorithm")
-    differ: dict[str, list[str]] = {kind: [] for kind in kinds}
-    for difference in comparison["differences"]:
-        name = difference["setting"]
-        if name.startswith("library.arguments."):  # its own: one name for all of them
-            name = "library.arguments"
-        if name not in differ.get(difference["kind"], [name]):
-            differ[difference["kind"]].append(name)
-    words = {"feed": "replay", "target": "the target rule", "algorithm": "the algorithm"}
-    free = [f"{words[kind]} ({', '.join(names)})" for kind, names in differ.items() if names]
-    same = [words[kind] for kind in kinds[:2] if not differ[kind]]
-    fixed = ", ".join(["the environment and its conditions", "environment steps", *same])
-    return f"Held fixed: {fixed} and the evaluation. Not held: {'; '.join(free) or 'nothing'}."
-
-
 __all__ = [
     "ArmConfig",
     "Pair",
+    "Primary",
     "Study",
     "StudyEvaluation",
     "StudyJob",
     "StudyPlan",
-    "as_markdown",
-    "findings",
     "load_study",
 ]

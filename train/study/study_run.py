@@ -22,7 +22,7 @@ from restock.errors import RestockError, RunError
 from restock.files import write_text
 from restock.train.comparison.compare import Comparison, compare
 from restock.train.libraries.library_arm import DONE, Library, LibraryArm, check_installed, resolve
-from restock.train.study.study import ArmConfig, StudyJob, StudyPlan
+from restock.train.study.study import ArmConfig, StudyEvaluation, StudyJob, StudyPlan
 
 Say = Callable[[str], None]
 Engine = Literal["processes", "ray"]
@@ -62,6 +62,7 @@ def run_study(
         _run_on_ray(plan, todo, workers, say)
     else:
         _run_here(plan, todo, workers, say)
+    _drive_references(plan, say)
     return [
         compare(plan.runs(pair.baseline), plan.runs(pair.arm), treatment=pair.treatment)
         for pair in plan.study.pairs
@@ -151,11 +152,35 @@ def run_job(plan: StudyPlan, job: StudyJob, say: Say) -> None:
     _restock(
         [
             *("eval", str(job.path), "--policies", "agent", "--perturbations", perturbations),
-            *("--episodes", str(evaluation.episodes), "--seed", str(evaluation.seed)),
+            *_episodes_flags(evaluation),
         ],
         log,
     )
     write_text(job.done, plan.fingerprint(job))
+
+
+def _episodes_flags(evaluation: StudyEvaluation) -> list[str]:
+    given = evaluation.episodes
+    if isinstance(given, dict):
+        text = ",".join(f"{kind}={count}" for kind, count in given.items())
+    else:
+        text = str(given)
+    return ["--episodes", text, "--seed", str(evaluation.seed)]
+
+
+def _drive_references(plan: StudyPlan, say: Say) -> None:
+    """The planner and the operator on the episodes of the runs, once; kept by the first run."""
+    evaluation, path = plan.study.evaluation, plan.jobs[0].path
+    done, asked = path / "references.json", msgspec.json.encode(evaluation).decode() + "\n"
+    if not evaluation.references:
+        return
+    if done.exists() and done.read_text(encoding="utf-8") == asked:
+        return
+    say(f"driving {', '.join(evaluation.references)}")
+    policies = ",".join(evaluation.references)
+    arguments = ["eval", str(path), "--policies", policies, "--perturbations", "none"]
+    _restock([*arguments, *_episodes_flags(evaluation)], plan.out / "logs" / "references.log")
+    write_text(done, asked)
 
 
 def _train_library(plan: StudyPlan, job: StudyJob, library: Library, log: Path, say: Say) -> None:

@@ -27,8 +27,9 @@ class EvalCommand:
 
     run_path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The run directory."""
-    episodes: int = 20
-    """Episodes per kind (nominal, wheel_slip, blocked_aisle, near_collision)."""
+    episodes: Annotated[str, tyro.conf.arg(metavar="N|KIND=N,...")] = "20"
+    """Episodes per kind (nominal, wheel_slip, blocked_aisle, near_collision); or by kind, as
+    nominal=1000,wheel_slip=300: kinds that are not named are not driven."""
     perturbations: str = "none,friction,latency"
     """Comma-separated: none, friction, latency, payload, wheels, sensors, or FILE.toml (as
     `restock twin fit` writes it)."""
@@ -96,6 +97,8 @@ class EvalCommand:
             return 0
         document: dict[str, Any] = {}
         if self.drive:
+            for line in plan.warnings:
+                say(line)
             for kind, floors in plan.left_out.items():
                 say(f"left out: {kind}, no room for it on {', '.join(floors)}")
             with progress("driving", plan.total) as advance:

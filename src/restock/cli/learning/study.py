@@ -17,19 +17,22 @@ class StudyCommand:
     The study is a TOML file: a store, arms (a mixture or a panel, and settings), seeds, what is
     compared. Each run is a directory under OUT/runs. What already exists is not done again, so
     the same command continues an interrupted study. Ends with OUT/study.md and
-    OUT/study.json. See docs/study.md.
+    OUT/study.json. --power says beforehand what so many seeds can see. See docs/study.md.
 
     Example: `restock study mixtures.toml --out studies/mixtures --workers 2`
     """
 
     study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")]
     """The study."""
-    out: Path
-    """Where its panels, runs and logs go."""
+    out: Path | None = None
+    """Where its panels, runs and logs go (needed but for --power)."""
     workers: int = 1
     """Runs at a time, each a process."""
     engine: Literal["processes", "ray"] = "processes"
     """`ray`: runs on a Ray cluster, RAY_ADDRESS's or one started here; needs `restock[ray]`."""
+    power: bool = False
+    """Print the power for the primary contrast and the least effect that is seen, and run
+    nothing: from finished runs under --out, else from the study's `power`."""
     dry_run: bool = False
     """Check the study and print what would be run; write nothing."""
     json: bool = False
@@ -41,12 +44,37 @@ class StudyCommand:
         from restock.cli.output import plain, print_json, print_table, say
         from restock.errors import ConfigError, ExitCode
         from restock.files import write_text
-        from restock.train.study.study import StudyPlan, as_markdown, findings, load_study
+        from restock.train.study.findings import findings, power_of
+        from restock.train.study.page import as_markdown, power_sentence
+        from restock.train.study.power import warning
+        from restock.train.study.study import StudyPlan, load_study
         from restock.train.study.study_run import run_study
 
         if self.workers < 1:
             raise ConfigError(f"must be at least 1, got {self.workers}", where="--workers")
-        plan = StudyPlan(load_study(self.study), self.study.parent, self.out)
+        if self.out is None and not self.power:
+            raise ConfigError(
+                "is needed: the study's panels, runs and page go there",
+                where="--out",
+                remedy="name a directory, or only ask for --power",
+            )
+        out = self.out if self.out is not None else self.study.parent
+        plan = StudyPlan(load_study(self.study), self.study.parent, out)
+        power = power_of(plan)
+        if self.power:
+            if power is None:
+                raise ConfigError(
+                    "names no primary contrast"
+                    if plan.study.primary is None
+                    else "says nothing of the spread between seeds, and no seeds are finished",
+                    where=str(self.study),
+                    remedy="give `primary` and `power = { sd = …, effect = … }`: docs/study.md",
+                )
+            document = power.as_json()
+            print_json(document) if self.json else sys.stdout.write(power_sentence(document) + "\n")
+            return 0
+        if power is not None and power.too_small:
+            say(warning(power))
         if self.dry_run:
             against = {
                 pair.arm.name: f"{pair.baseline.name} ({pair.treatment})"
@@ -70,8 +98,8 @@ class StudyCommand:
         comparisons = run_study(plan, workers=self.workers, engine=self.engine, say=say)
         document = findings(plan, comparisons)
         page = as_markdown(document)
-        write_text(self.out / "study.md", page)
-        write_text(self.out / "study.json", dumps(plain(document), indent=1) + "\n")
+        write_text(out / "study.md", page)
+        write_text(out / "study.json", dumps(plain(document), indent=1) + "\n")
         if self.json:
             print_json(document)
         else:

@@ -1,0 +1,222 @@
+"""Contrasts of a study: measures of runs, paired by seed; and what so many seeds can see."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.finished_runs import document, make_run
+
+from restock.cli import main
+from restock.train.comparison.compare import compare
+from restock.train.run.kept_evaluations import add_evaluation
+from restock.train.run.run import Run
+from restock.train.run.run_tables import EVAL_EPISODES
+from restock.train.study.contrasts import RunCurve, area, contrast
+from restock.train.study.findings import contrasts, findings, power_of
+from restock.train.study.page import as_markdown
+from restock.train.study.power import PowerConfig, least_effect, seeds_needed, spread
+from restock.train.study.study import StudyPlan, load_study
+
+STUDY = """
+seeds = [0, 1, 2, 3]
+primary = { arm = "quotas", baseline = "uniform", measure = "auc_wheel_slip" }
+measures = ["auc_rare", "success_rare", "auc_nominal"]
+rare = ["wheel_slip"]
+[[arms]]
+name = "uniform"
+[[arms]]
+name = "quotas"
+"""
+
+
+def curve(path: Path, seed: int, success: dict[int, float], *, full: bool = True) -> Path:
+    """A finished run whose slipping missions succeed so often at each evaluation; whole tens."""
+    run = Run.create(path, document(seed))
+    for step, share in success.items():
+        for cell, of in ((("nominal", "none"), 1.0), (("wheel_slip", "none"), share)):
+            for number in range(10):
+                _append(run, step, cell, number, number < round(10 * of))
+        _append(run, step, ("blocked_aisle", "partial"), 1, False)
+        if full:
+            for number in (2, 3, 4):
+                _append(run, step, ("blocked_aisle", "full"), number, True)
+    run.flush()
+    return path
+
+
+def _append(run: Run, step: int, cell: tuple[str, str], number: int, success: bool) -> None:
+    row = dict.fromkeys(run.table("evaluations").schema.names)
+    clocks = {"env_steps": step, "gradient_steps": step + 5}
+    told = {"condition": cell[0], "block": cell[1], "episode_seed": number, "success": success}
+    run.append("evaluations", [{**row, **clocks, **told}])
+
+
+@given(st.lists(st.floats(0, 1), min_size=2, max_size=9), st.floats(0, 1))
+def test_the_area_is_between_the_least_and_the_most(values: list[float], level: float) -> None:
+    steps = np.cumsum(np.arange(1, len(values) + 1)).astype(float)
+    found = area(steps, np.array(values))
+    assert min(values) - 1e-9 <= found <= max(values) + 1e-9
+    assert area(steps, np.full(len(values), level)) == pytest.approx(level)
+
+
+def test_the_area_by_hand() -> None:
+    steps, values = np.array([0.0, 10.0, 30.0]), np.array([0.0, 1.0, 0.5])
+    assert area(steps, values) == pytest.approx((5 + 15) / 30)
+    assert area(steps, values, (5.0, 20.0)) == pytest.approx((3.75 + 8.75) / 15)
+    assert np.isnan(area(steps[:1], values[:1]))
+
+
+def test_blocked_aisles_count_by_half_each_whatever_was_drawn(tmp_path: Path) -> None:
+    run = RunCurve(curve(tmp_path / "a", 0, {0: 0.5, 100: 0.7}), ("wheel_slip", "blocked_aisle"))
+    assert run.value("auc_blocked_aisle") == 0.5  # one partly blocked, three wholly
+    assert run.value("auc_partly_blocked") == 0.0
+    assert run.value("auc_rare") == pytest.approx((0.6 + 0.5) / 2)
+    assert np.isnan(run.value("success_rare"))  # `restock eval` has not driven it
+    alone = RunCurve(curve(tmp_path / "b", 0, {0: 0.5, 100: 0.7}, full=False))
+    assert alone.value("auc_blocked_aisle") == 0.0
+
+
+def test_curves_are_compared_over_the_steps_that_all_have(tmp_path: Path) -> None:
+    whole = RunCurve(curve(tmp_path / "a", 0, {0: 0.0, 100: 1.0, 200: 1.0}))
+    late = RunCurve(curve(tmp_path / "b", 0, {100: 0.5, 200: 0.5}))
+    found = contrast("a", "b", "auc_wheel_slip", [(whole, late)])
+    assert found is not None
+    assert (found.arm_mean, found.baseline_mean) == (1.0, 0.5)
+    assert (found.low, found.p) == (None, None)  # one seed has no interval
+    assert contrast("a", "b", "success_wheel_slip", [(whole, late)]) is None
+
+
+def study(tmp_path: Path, text: str = STUDY) -> StudyPlan:
+    (tmp_path / "s.toml").write_text(text)
+    plan = StudyPlan(load_study(tmp_path / "s.toml"), tmp_path, tmp_path / "out")
+    (tmp_path / "out" / "runs").mkdir(parents=True)
+    return plan
+
+
+def finish(plan: StudyPlan, ahead: tuple[float, ...]) -> None:
+    for job in plan.jobs:
+        more = ahead[job.seed] if job.arm.name == "quotas" else 0.0
+        level = 0.3 + 0.1 * (job.seed % 2)
+        curve(job.path, job.seed, {0: level, 400: level + more})
+        job.done.write_text(plan.fingerprint(job))
+
+
+def test_a_study_names_its_primary_contrast_and_adjusts_the_others(tmp_path: Path) -> None:
+    plan = study(tmp_path)
+    finish(plan, (0.2, 0.4, 0.4, 0.2))
+    first, *others = contrasts(plan, set())
+    assert (first.primary, first.measure, first.pairs) == (True, "auc_wheel_slip", 4)
+    assert first.difference == pytest.approx(0.15)
+    assert first.low is not None
+    assert first.low < 0.15 < first.high
+    assert first.p_holm is None
+    assert [one.measure for one in others] == ["auc_rare", "auc_nominal"]  # nothing at the end
+    assert others[0].p_holm == pytest.approx(2 * others[0].p)
+    assert (others[1].difference, others[1].p_holm) == (0.0, 1.0)
+    assert contrasts(plan, {("quotas", "uniform")}) == []  # refused
+
+
+def test_the_spread_is_that_of_finished_seeds_or_of_pilots(tmp_path: Path) -> None:
+    plan = study(tmp_path)
+    assert power_of(plan) is None  # nothing tells
+    finish(plan, (0.2, 0.4, 0.4, 0.2))
+    power = power_of(plan)
+    assert power is not None
+    assert power.spread_from == "4 seeds of this study"
+    assert power.sd == pytest.approx(np.std([0.1, 0.2, 0.2, 0.1], ddof=1))
+    assert power.effect is None
+
+
+def test_power_of_pilots() -> None:
+    sd, _ = spread(PowerConfig(0.06, 0.12), at_end=True, kinds=3, episodes=40)
+    assert sd == pytest.approx(0.06 * 2**0.5)
+    more, _ = spread(PowerConfig(0.06, 0.12, episodes=60), at_end=True, kinds=3, episodes=300)
+    assert more < sd  # more episodes than the pilots': less noise
+    same, _ = spread(PowerConfig(0.06, 0.12, episodes=60), at_end=False, kinds=3, episodes=300)
+    assert same == pytest.approx(sd)
+    paired, _ = spread(PowerConfig(0.06, 0.12, 0.5), at_end=True, kinds=3, episodes=40)
+    assert paired == pytest.approx(0.06)
+    for seeds in (5, 10, 30):
+        least = least_effect(sd, seeds)
+        assert seeds_needed(least + 1e-9, sd) == seeds
+        assert seeds_needed(least - 1e-6, sd) == seeds + 1
+    assert seeds_needed(1e-9, sd) is None
+
+
+def test_a_study_too_small_for_its_contrast_is_named_before_its_runs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = STUDY.replace("rare =", "power = { sd = 0.06, effect = 0.05 }\nrare =")
+    study(tmp_path, text)
+    line = ["study", str(tmp_path / "s.toml")]
+    assert main([*line, "--power"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "auc_wheel_slip of quotas against uniform, 4 seeds" in said
+    assert main([*line, "--power", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["power"] < 0.2
+    assert found["too_small"]
+    assert found["seeds_needed"] > 20
+    assert main([*line, "--out", str(tmp_path / "out"), "--dry-run"]) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert "a study too small for its contrast: auc_wheel_slip of quotas against uniform" in said
+    assert f"{found['seeds_needed']} seeds would do" in said
+    (tmp_path / "s.toml").write_text(text.replace("effect = 0.05", "effect = 0.5"))
+    assert main([*line, "--out", str(tmp_path / "out"), "--dry-run"]) == 0
+    assert "too small" not in capsys.readouterr().err
+
+
+def test_power_needs_a_contrast_and_a_spread(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    study(tmp_path)
+    assert main(["study", str(tmp_path / "s.toml"), "--power"]) == 2
+    assert "says nothing of the spread" in capsys.readouterr().err
+    assert main(["study", str(tmp_path / "s.toml")]) == 2
+    assert "--out" in capsys.readouterr().err
+
+
+def driven(policy: str, success: float, time_s: float) -> pa.Table:
+    rows = []
+    for condition, block in (("nominal", "none"), ("wheel_slip", "none")):
+        for number in range(20):
+            row = dict.fromkeys(EVAL_EPISODES.names)
+            won = condition == "nominal" or number < 20 * success
+            row |= {"policy": policy, "condition": condition, "block": block, "success": won}
+            row |= {"episode_seed": 10_000 + number, "perturbation": "none", "layouts": "default"}
+            row |= {"version": "1", "bumps": int(not won), "time_s": time_s, "return": 1.0}
+            rows.append({**row, "distance_m": 10.0, "perturbation_values": []})
+    return pa.Table.from_pylist(rows, schema=EVAL_EPISODES)
+
+
+def test_the_page_has_contrasts_then_success_and_safety_side_by_side(tmp_path: Path) -> None:
+    text = STUDY.replace("[0, 1, 2, 3]", "[0, 1, 2]").replace("auc_wheel_slip", "success_rare")
+    plan = study(tmp_path, text)
+    for job in plan.jobs:
+        level = 0.2 if job.arm.name == "uniform" else 0.7 + 0.05 * job.seed
+        make_run(job.path, document(job.seed), success=level)
+        add_evaluation(job.path, driven("agent", level, 12.0))
+        job.done.write_text(plan.fingerprint(job))
+    add_evaluation(plan.jobs[0].path, driven("planner", 0.5, 10.0))
+    one, other = plan.study.arms
+    found = findings(plan, [compare(plan.runs(one), plan.runs(other), treatment="mixture")])
+    primary = found["contrasts"][0]
+    assert (primary["measure"], primary["difference"]) == ("success_rare", pytest.approx(0.55))
+    rows = {row["arm"]: row for row in found["arms"]}
+    assert rows["quotas"]["success wheel_slip"][0] == pytest.approx(0.75)
+    assert rows["uniform"]["bumps_per_km"][0] == pytest.approx(80.0)  # 16 in 200 m
+    assert rows["quotas"]["time_lost_s"][0] == pytest.approx(2.0)
+    assert rows["planner"]["success wheel_slip"] == [0.5, None, None]  # one policy: no seeds
+    page = as_markdown(found)
+    places = [
+        page.index(head)
+        for head in ("## Contrasts", "## Success and safety", "## quotas against uniform")
+    ]
+    assert places == sorted(places)
+    assert "| **primary**: quotas against uniform | success_rare | 0.750 | 0.200 |" in page

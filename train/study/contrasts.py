@@ -1,0 +1,212 @@
+"""What the runs of a study came to, one number a run, and contrasts of arms, paired by seed.
+
+A measure is named `auc_WHAT` or `success_WHAT`. `auc` is the area under the run's own curve of
+success over environment steps (trapezoids, divided by the steps: a mean success on the way),
+`success` is the kept policy's, on the episodes that judge it and did not choose it. WHAT is a cell
+(`CELLS`), or `rare`, the mean over the study's rare conditions. Of blocked aisles the partly and
+the wholly blocked count by half each, however many of each were drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from restock.arrays import F64
+from restock.stats import holm, paired_t
+from restock.train.evaluation.regression import agent_episodes
+from restock.train.run.run import Run
+
+CELLS = {  # what a measure may name: condition and block
+    "nominal": (("nominal", None),),
+    "wheel_slip": (("wheel_slip", None),),
+    "blocked_aisle": (("blocked_aisle", "partial"), ("blocked_aisle", "full")),
+    "partly_blocked": (("blocked_aisle", "partial"),),
+    "wholly_blocked": (("blocked_aisle", "full"),),
+    "near_collision": (("near_collision", None),),
+}
+RARE = ("wheel_slip", "blocked_aisle", "near_collision")
+KINDS_OF_MEASURE = ("auc", "success")
+
+
+def unknown_measure(name: str) -> str | None:
+    """What is wrong with the name of a measure, or None."""
+    kind, _, what = name.partition("_")
+    if kind in KINDS_OF_MEASURE and what in (*CELLS, "rare"):
+        return None
+    return (
+        f"measure {name!r} must be {' or '.join(f'{one}_WHAT' for one in KINDS_OF_MEASURE)}, and"
+        f" WHAT rare, {', '.join(CELLS)}"
+    )
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """An arm less its baseline in one measure, paired by seed."""
+
+    arm: str
+    baseline: str
+    measure: str
+    primary: bool
+    pairs: int  # seeds of which both runs are there
+    arm_mean: float
+    baseline_mean: float
+    difference: float
+    low: float | None  # of its 95 % interval, Student's t; None from one pair
+    high: float | None
+    sd: float | None  # of the paired differences
+    p: float | None  # of no difference
+    p_holm: float | None = None  # adjusted for all contrasts that are not the primary one
+
+    def as_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+class RunCurve:
+    """A finished run's success by cell: on the way, and of the policy that it kept."""
+
+    def __init__(self, path: Path, rare: Sequence[str] = RARE) -> None:
+        run = Run.open(path)
+        self._rare = rare
+        self._at = _by_step(run.table("evaluations"))
+        self.end = _success(agent_episodes(run))
+        self.steps = np.array(sorted(self._at))
+
+    def value(self, measure: str, reach: tuple[float, float] | None = None) -> float:
+        """The run's value of a measure, over a range of environment steps; NaN: not known."""
+        kind, _, what = measure.partition("_")
+        if kind == "success":
+            return self._of(self.end, what)
+        curve = np.array([self._of(self._at[step], what) for step in self.steps.tolist()])
+        return area(self.steps, curve, reach)
+
+    def _of(self, success: Mapping[tuple[str, str], float], what: str) -> float:
+        if what == "rare":
+            return _mean(self._of(success, kind) for kind in self._rare)
+        own = [
+            success.get((condition, block or "none"), float("nan"))
+            for condition, block in CELLS[what]
+        ]
+        # Few episodes may all be blocked one way: that half then stands for both.
+        known = [value for value in own if not np.isnan(value)]
+        return _mean(known) if known else float("nan")
+
+
+def area(steps: F64, values: F64, reach: tuple[float, float] | None = None) -> float:
+    """The area under a curve by trapezoids, divided by its range of steps; NaN from one point.
+
+    Args:
+        steps, values: (n,); `reach` is the range, where the curve is cut or None for all of it.
+    """
+    low, high = reach if reach is not None else (float(steps[0]), float(steps[-1]))
+    if len(steps) < 2 or high <= low:
+        return float("nan")
+    inside = (steps > low) & (steps < high)
+    at = np.concatenate([[low], steps[inside], [high]])
+    return float(np.trapezoid(np.interp(at, steps, values), at) / (high - low))
+
+
+def contrast(
+    arm: str,
+    baseline: str,
+    measure: str,
+    runs: Sequence[tuple[RunCurve, RunCurve]],
+    *,
+    primary: bool = False,
+) -> Contrast | None:
+    """One contrast; None where no pair of runs has the measure. Runs are (the arm's, the
+    baseline's) of each seed; curves are compared where all of them have evaluations."""
+    if not runs:
+        return None
+    curves = [curve for pair in runs for curve in pair if len(curve.steps)]
+    reach = None
+    if measure.startswith("auc_"):
+        if len(curves) < 2 * len(runs):
+            return None
+        first = max(float(curve.steps[0]) for curve in curves)
+        reach = first, min(float(curve.steps[-1]) for curve in curves)
+    values = np.array([[curve.value(measure, reach) for curve in pair] for pair in runs])
+    values = values[~np.isnan(values).any(axis=1)]
+    if not len(values):
+        return None
+    ahead = values[:, 0] - values[:, 1]
+    interval, p = paired_t(ahead)
+    return Contrast(
+        arm,
+        baseline,
+        measure,
+        primary,
+        len(values),
+        float(values[:, 0].mean()),
+        float(values[:, 1].mean()),
+        interval.value,
+        _known(interval.low),
+        _known(interval.high),
+        float(ahead.std(ddof=1)) if len(ahead) > 1 else None,
+        _known(p),
+    )
+
+
+def with_holm(contrasts: Sequence[Contrast]) -> list[Contrast]:
+    """The same with p adjusted for all that are not the primary one."""
+    places = [i for i, one in enumerate(contrasts) if not one.primary and one.p is not None]
+    adjusted = holm([float(contrasts[i].p or 0.0) for i in places])
+    found = list(contrasts)
+    for place, value in zip(places, adjusted, strict=True):
+        found[place] = replace(found[place], p_holm=value)
+    return found
+
+
+def _by_step(table: pa.Table) -> dict[int, dict[tuple[str, str], float]]:
+    """Success by cell at each evaluation; of two at one step, the later one."""
+    by_step: dict[int, tuple[int, list[dict[str, Any]]]] = {}
+    for row in table.to_pylist():
+        step, update = int(row["env_steps"]), int(row["gradient_steps"])
+        at = by_step.get(step)
+        if at is None or at[0] < update:
+            at = by_step[step] = (update, [])
+        if at[0] == update:
+            at[1].append(row)
+    return {step: _success_of(rows) for step, (_, rows) in by_step.items()}
+
+
+def _success(table: pa.Table | None) -> dict[tuple[str, str], float]:
+    """Of the unperturbed episodes, by condition and block."""
+    if table is None:
+        return {}
+    return _success_of([row for row in table.to_pylist() if row["perturbation"] == "none"])
+
+
+def _success_of(rows: Sequence[dict[str, Any]]) -> dict[tuple[str, str], float]:
+    cells: dict[tuple[str, str], list[bool]] = {}
+    for row in rows:
+        if row["success"] is not None:
+            cell = row["condition"], row["block"] or "none"
+            cells.setdefault(cell, []).append(row["success"])
+    return {cell: float(np.mean(values)) for cell, values in cells.items()}
+
+
+def _mean(values: Any) -> float:
+    values = list(values)
+    return float(np.mean(values)) if values else float("nan")
+
+
+def _known(value: float) -> float | None:
+    return None if np.isnan(value) else value
+
+
+__all__ = [
+    "CELLS",
+    "RARE",
+    "Contrast",
+    "RunCurve",
+    "area",
+    "contrast",
+    "unknown_measure",
+    "with_holm",
+]

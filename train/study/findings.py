@@ -1,0 +1,209 @@
+"""What a study found: its comparisons, its contrasts, what each arm came to, and its power."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from restock.stats import paired_t, paired_t_power
+from restock.train.comparison.compare import Comparison
+from restock.train.evaluation.evaluate import cell_name
+from restock.train.evaluation.measures import mission_named
+from restock.train.run.kept_evaluations import read_evaluations
+from restock.train.study import power as study_power
+from restock.train.study.contrasts import Contrast, RunCurve, contrast, with_holm
+from restock.train.study.power import LEAST_PAIRS, Power
+from restock.train.study.study import DONE, ArmConfig, StudyPlan
+
+# Columns of the table of arms, besides success by cell.
+SAFETY = ("bumps_per_km", "closest_person_m", "time_lost_s", "discounted_return")
+
+
+def findings(plan: StudyPlan, comparisons: Sequence[Comparison]) -> dict[str, Any]:
+    """The study and all that it found, as JSON values."""
+    refused = {
+        (pair.arm.name, pair.baseline.name)
+        for pair, comparison in zip(plan.study.pairs, comparisons, strict=True)
+        if comparison.verdict != "comparable"
+    }
+    power = power_of(plan)
+    return {
+        "doc": plan.study.doc,
+        "seeds": list(plan.study.seeds),
+        "rare": list(plan.study.rare),
+        "runs": {arm.name: [str(path) for path in plan.runs(arm)] for arm in plan.study.arms},
+        "power": None if power is None else power.as_json(),
+        "contrasts": [one.as_json() for one in contrasts(plan, refused)],
+        "arms": arms(plan),
+        "comparisons": [
+            {"arm": pair.arm.name, "baseline": pair.baseline.name, **comparison.as_json()}
+            for pair, comparison in zip(plan.study.pairs, comparisons, strict=True)
+        ],
+    }
+
+
+def contrasts(plan: StudyPlan, refused: set[tuple[str, str]]) -> list[Contrast]:
+    """The primary contrast, then every comparison's in the study's measures; those that were
+    refused have none."""
+    study, curves = plan.study, _Curves(plan)
+    wanted = [
+        (pair.arm, pair.baseline, measure, False)
+        for pair in study.pairs
+        for measure in study.measures
+    ]
+    if (first := study.primary) is not None:
+        own = next(p for p in study.pairs if (p.arm.name, p.baseline.name) == first.pair)
+        wanted = [one for one in wanted if (one[0].name, one[1].name, one[2]) != first.named]
+        wanted.insert(0, (own.arm, own.baseline, first.measure, True))
+    found = [
+        contrast(arm.name, baseline.name, measure, curves.pairs(arm, baseline), primary=primary)
+        for arm, baseline, measure, primary in wanted
+        if (arm.name, baseline.name) not in refused
+    ]
+    return with_holm([one for one in found if one is not None])
+
+
+def power_of(plan: StudyPlan) -> Power | None:
+    """Of the primary contrast, from finished runs of its arms or from the study's pilots; None
+    where the study names no primary contrast, or nothing tells the spread."""
+    study = plan.study
+    if study.primary is None:
+        return None
+    arm, baseline, measure = study.primary.named
+    pair = next(p for p in study.pairs if (p.arm.name, p.baseline.name) == (arm, baseline))
+    pairs = _Curves(plan).pairs(pair.arm, pair.baseline)
+    made = contrast(arm, baseline, measure, pairs)
+    if made is not None and made.sd and made.pairs >= LEAST_PAIRS:
+        sd, source = made.sd, f"{made.pairs} seeds of this study"
+    elif study.power is not None:
+        kinds = len(study.rare) if measure.endswith("_rare") else 1
+        sd, source = study_power.spread(
+            study.power,
+            at_end=measure.startswith("success_"),
+            kinds=kinds,
+            episodes=min(study.evaluation.of_kind.values()),
+        )
+    else:
+        return None
+    effect, seeds = study.power.effect if study.power is not None else None, len(study.seeds)
+    return Power(
+        arm,
+        baseline,
+        measure,
+        seeds,
+        sd,
+        source,
+        effect,
+        None if effect is None else paired_t_power(effect, sd, seeds),
+        study_power.least_effect(sd, seeds),
+        None if effect is None else study_power.seeds_needed(effect, sd),
+    )
+
+
+def arms(plan: StudyPlan) -> list[dict[str, Any]]:
+    """A row an arm and reference: success by cell, and safety and return in the rare missions,
+    unperturbed; each [mean, low, high] over the seeds, or the mean alone."""
+    planner_s, references = _references(plan)
+    rows = []
+    for arm in plan.study.arms:
+        runs = [
+            _measured(plan, _driven_by(path, "agent"), planner_s)
+            for path in plan.runs(arm)
+            if (path / DONE).exists()
+        ]
+        if runs:
+            rows.append({"arm": arm.name, "runs": len(runs), **_over_seeds(runs)})
+    for name, episodes in references.items():
+        measured = _measured(plan, episodes, planner_s)
+        rows.append({"arm": name, "runs": None, **_over_seeds([measured])})
+    return rows
+
+
+class _Curves:
+    """Finished runs of a study, each read once."""
+
+    def __init__(self, plan: StudyPlan) -> None:
+        self._plan = plan
+        self._read: dict[Path, RunCurve] = {}
+
+    def pairs(self, arm: ArmConfig, baseline: ArmConfig) -> list[tuple[RunCurve, RunCurve]]:
+        """Of the seeds that both arms have finished."""
+        both = zip(self._plan.runs(arm), self._plan.runs(baseline), strict=True)
+        return [
+            (self._curve(first), self._curve(second))
+            for first, second in both
+            if (first / DONE).exists() and (second / DONE).exists()
+        ]
+
+    def _curve(self, path: Path) -> RunCurve:
+        if path not in self._read:
+            self._read[path] = RunCurve(path, self._plan.study.rare)
+        return self._read[path]
+
+
+def _driven_by(path: Path, policy: str) -> list[dict[str, Any]]:
+    """Unperturbed episodes."""
+    return [
+        row
+        for row in read_evaluations(path).to_pylist()
+        if row["policy"] == policy and row["perturbation"] == "none"
+    ]
+
+
+def _references(plan: StudyPlan) -> tuple[dict[Any, float], dict[str, list[dict[str, Any]]]]:
+    """The planner's times where it arrived, and the references' episodes, by name."""
+    path = plan.jobs[0].path
+    names = plan.study.evaluation.references if path.is_dir() else ()
+    episodes = {name: rows for name in names if (rows := _driven_by(path, name))}
+    times = {_mission(row): row["time_s"] for row in episodes.get("planner", []) if row["success"]}
+    return times, episodes
+
+
+def _mission(row: dict[str, Any]) -> Any:
+    return mission_named(row["condition"], row["episode_seed"], row["perturbation_values"])
+
+
+def _measured(
+    plan: StudyPlan, episodes: list[dict[str, Any]], planner_s: dict[Any, float]
+) -> dict[str, float]:
+    """One run's measures; NaN where nothing tells."""
+    cells: dict[str, list[float]] = {}
+    for row in episodes:
+        if row["success"] is not None:
+            cells.setdefault(cell_name(row["condition"], row["block"]), []).append(row["success"])
+    rare = [row for row in episodes if row["condition"] in plan.study.rare]
+    lost = [
+        row["time_s"] - planner_s[_mission(row)]
+        for row in rare
+        if row["success"] and _mission(row) in planner_s
+    ]
+    km = sum(row["distance_m"] or 0.0 for row in rare) / 1000
+    return {
+        **{f"success {cell}": float(np.mean(values)) for cell, values in sorted(cells.items())},
+        "bumps_per_km": sum(row["bumps"] for row in rare) / km if km else float("nan"),
+        "closest_person_m": _mean([row["closest_person_m"] for row in rare]),
+        "time_lost_s": _mean(lost),
+        "discounted_return": _mean([row["discounted_return"] for row in rare]),
+    }
+
+
+def _over_seeds(runs: Sequence[dict[str, float]]) -> dict[str, list[float | None]]:
+    found: dict[str, list[float | None]] = {}
+    for name in dict.fromkeys(name for run in runs for name in run):
+        values = np.array([run[name] for run in runs if not np.isnan(run.get(name, np.nan))])
+        if len(values):
+            interval, _ = paired_t(values)
+            ends = [interval.low, interval.high]
+            found[name] = [interval.value, *(None if np.isnan(end) else end for end in ends)]
+    return found
+
+
+def _mean(values: Sequence[float | None]) -> float:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else float("nan")
+
+
+__all__ = ["SAFETY", "arms", "contrasts", "findings", "power_of"]
