@@ -26,6 +26,7 @@ def steps(count: int, episodes: list[int] | None = None, **signals: object) -> p
         "localised_speed_mps": np.full(count, 0.5),
         "clearance_m": np.full(count, 2.0),
         "clearance_ahead_m": np.full(count, 2.0),
+        "plan_return_m": np.full(count, 4.0),
         "bumped": np.zeros(count, np.bool_),
         "command_speed_mps": np.full(count, 0.5),
         "waypoint_near_x_m": np.ones(count),
@@ -74,20 +75,38 @@ def test_a_bump_makes_the_step_before_it_a_near_collision():
     assert given_to(steps(20, bumped=bumped), "near_collision") == [8]
 
 
-def test_an_obstacle_in_the_way_is_a_blocked_aisle_only_when_it_stays():
-    passing = steps(20, clearance_ahead_m=changed(0.5, 2.0, 20, slice(8, 9)))
+def in_the_way(drive: dict[str, np.ndarray], ahead: np.ndarray) -> pa.Table:
+    """Steps of a robot that sees something this far ahead of its middle, and who came nearer."""
+    seen = np.where(ahead < 2.2, ahead, 4.0)
+    driven = np.concatenate([[0.0], drive["wheel_speed_mps"][:-1] * 0.2])
+    came = np.concatenate([[0.0], ahead[:-1] - ahead[1:]]) - driven
+    return steps(
+        len(ahead),
+        **drive,
+        plan_return_m=seen,
+        came_nearer_m=np.where(ahead < 2.2, np.clip(came, 0.0, 1.0), 0.0),
+        clearance_ahead_m=np.maximum(ahead - 0.35, 0.0),
+        clearance_m=np.minimum(ahead, 0.5),
+    )
+
+
+@pytest.mark.parametrize("planned", [True, False])
+def test_an_obstacle_in_the_way_is_a_blocked_aisle_only_when_it_stays(planned):
+    speed = np.where(np.arange(60) < 20, 0.9, 0.0)  # up to a pallet, and stop before it
+    x = np.concatenate([[0.0], np.cumsum(speed * 0.2)[:-1]])
+    drive = {
+        "pose_x_m": x,
+        "wheel_speed_mps": speed,
+        "route_remaining_m": 9.0 - x if planned else np.zeros(60),
+    }
+    passing = in_the_way(drive, changed(0.8, 4.0, 60, slice(8, 9)))
     assert given_to(passing, "blocked_aisle") == []
-    x = np.minimum(np.arange(60) * 0.18, 3.68)  # up to a pallet, and stop before it
-    drive = {"pose_x_m": x, "wheel_speed_mps": np.where(x < 3.68, 0.9, 0.0)}
-    ahead = 3.9 - x
-    pallet = steps(60, **drive, clearance_ahead_m=ahead, clearance_m=np.minimum(ahead, 0.5))
-    found = given_to(pallet, "blocked_aisle")
-    assert {20, 30, 50, 59} <= set(found)
-    assert found[0] >= 14  # 1.4 m before it
-    # Somebody walks up to the robot as fast as it drives, and is away after a second.
-    ahead = np.concatenate([np.linspace(4, 0.3, 10), np.full(5, 0.3), np.full(45, 4.0)])
-    person = steps(60, **drive, clearance_ahead_m=ahead, clearance_m=np.minimum(ahead, 0.5))
-    assert given_to(person, "blocked_aisle") == []
+    found = given_to(in_the_way(drive, 4.5 - x), "blocked_aisle")
+    assert {22, 30, 50, 59} <= set(found)
+    assert found[0] >= 14  # 1.9 m before it
+    # Somebody walks up to the robot as fast as it drives, stands there, and is away after a while.
+    ahead = np.concatenate([np.linspace(4, 0.6, 10), np.full(15, 0.6), np.full(35, 4.0)])
+    assert given_to(in_the_way(drive, ahead), "blocked_aisle") == []
 
 
 def test_recovery_lasts_until_there_is_room_again():
@@ -114,6 +133,8 @@ def tables(draw: st.DrawFn) -> pa.Table:
         gyro_yaw_rate_radps=rng.uniform(-1, 1, count),
         clearance_m=rng.choice([0.05, 0.2, 0.5, 2.0], count),
         clearance_ahead_m=rng.choice([0.3, 0.9, 1.4, 3.0], count),
+        plan_return_m=rng.choice([0.4, 0.9, 1.3, 4.0], count),
+        came_nearer_m=rng.choice([0.0, 0.0, 0.02, 0.3], count),
         bumped=rng.random(count) < 0.2,
         goal_distance_m=rng.uniform(0, 9, count),
         route_remaining_m=rng.uniform(0, 9, count),
