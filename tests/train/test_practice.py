@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -125,6 +126,18 @@ def test_success_practises_what_fails_once_it_is_believed() -> None:
     assert [row["episodes"] for row in rows] == [50, 50, 3, 0]
     assert sum(row["given_share"] for row in rows) == pytest.approx(1.0)
     assert rows[0]["wanted_share"] == 0.25  # what was in force, not what comes
+
+
+def test_an_arm_with_too_few_missions_goes_by_its_kind() -> None:
+    arms = [MissionArm(f"slip on {x}", "wheel_slip", 0.1, layout=f"{x}") for x in range(9)]
+    found = practice([*arms, ARMS[0]], rule="success", warmup_episodes=4, floor=0.0)
+    slip = replace(ended("wheel_slip", True)[0], layout="0")
+    found.note([slip, replace(slip, layout="1", success=False), *[replace(slip, layout="2")] * 6])
+    rates = found.failure_rate
+    assert rates[2] == pytest.approx(0.5 / 7, abs=0.01)  # its own six successes
+    np.testing.assert_allclose(np.delete(rates[:9], 2), rates[0])  # the kind's: one of eight
+    assert rates[0] == pytest.approx(1.5 / 9, abs=0.02)
+    assert rates[9] == 1.0  # never driven
 
 
 def test_regret_practises_what_the_reference_does_better() -> None:

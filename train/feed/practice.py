@@ -6,7 +6,8 @@ An arm is a kind of missions (`restock.train.twin.env.mission_arms`). The rules:
 - even: every arm alike; shares: as given; logs: the kinds as often as the logs' episodes met them;
   missions: the ordered missions alone, each at its part;
 - success: an arm's weight is its rate of failures, while the agent explores. The failures and
-  successes of an arm fade by a half-life; an arm with too few episodes counts as if all failed;
+  successes of an arm fade by a half-life; an arm with too few episodes goes by its kind's rate, and
+  a kind with too few counts as if all failed;
 - regret: what the agent's rate of success lacks to that of a reference driver on the same arm
   (prioritised level replay, arXiv:2010.03934, by arm). What nobody can do is not practised.
 
@@ -23,8 +24,9 @@ from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from restock.arrays import F64, Ints
+from restock.arrays import F64, Bools, Ints
 from restock.errors import ConfigError, RunError
 from restock.state import Stateful
 from restock.train.dqn.config import PracticeConfig
@@ -172,22 +174,31 @@ class Practice(Stateful):
         """(K,) what the rule goes by, before floors: above 0 somewhere."""
         if self._fixed is not None:
             return self._fixed
-        success = np.where(self.believed, 1 - self.failure_rate, 0.0)
         if self.config.rule == "success":
-            return 1 - success
-        regret = np.maximum(self.reference - success, 0.0)
+            return self.failure_rate
+        regret = np.maximum(self.reference - (1 - self.failure_rate), 0.0)
         return regret if regret.any() else np.ones(len(self.arms))
 
     @property
-    def believed(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    def believed(self) -> Bools:
         """(K,) whether an arm has ended often enough."""
         return self._seen >= self.config.warmup_episodes
 
     @property
     def failure_rate(self) -> F64:
-        """(K,) of an arm's fading episodes, with half a failure more in one more (Jeffreys)."""
-        rate: F64 = (self._failures + 0.5) / (self._episodes + 1)
-        return rate
+        """(K,) of an arm's fading episodes, with half a failure more in one more (Jeffreys).
+
+        That of its kind where it has too few; 1 where the kind has.
+        """
+        kinds = np.unique([arm.kind for arm in self.arms], return_inverse=True)[1]
+
+        def of_kind(values: NDArray[Any]) -> NDArray[Any]:
+            return np.bincount(kinds, values)[kinds]
+
+        failures, episodes = of_kind(self._failures), of_kind(self._episodes)
+        known = of_kind(self._seen) >= self.config.warmup_episodes
+        rate = np.where(known, (failures + 0.5) / (episodes + 1), 1.0)
+        return np.where(self.believed, (self._failures + 0.5) / (self._episodes + 1), rate)
 
     def check_reference(self) -> None:
         """Raises ConfigError where regret is against nobody."""
