@@ -191,7 +191,7 @@ class StratumLimits(Checked, frozen=True, kw_only=True):
 class StratumRule(StratumLimits, frozen=True, kw_only=True):
     """What one stratum gets. A row goes to the matching stratum of the lowest priority number."""
 
-    name: str  # a condition's name or "nominal", unless `where` says otherwise
+    name: str  # a condition's or an exposure's name or "nominal", unless `where` says otherwise
     where: str | None = None  # SQL predicate over `transitions`
     share: Share = "natural"  # of its source's part of a batch
     priority: int | None = None  # default: the condition's; `where` strata 50; nominal 1000
@@ -202,6 +202,9 @@ class EachCondition(StratumLimits, frozen=True, kw_only=True):
     """A stratum for every condition of the store (and nominal) that `strata` does not name."""
 
     share: Literal["natural", "equal"] = "natural"
+    kind: Literal["outcome", "exposure"] = (
+        "outcome"  # conditions, or situations whatever came of them
+    )
 
 
 class Mixture(Checked, frozen=True):

@@ -21,7 +21,15 @@ from restock import __version__
 from restock.errors import PanelError, StoreError
 from restock.files import is_running
 from restock.ingest.store.location import Location
-from restock.ingest.task.conditions import NOMINAL, Condition, labels_version, shipped
+from restock.ingest.task.conditions import (
+    NOMINAL,
+    Condition,
+    Kind,
+    Timing,
+    labels_version,
+    of_kind,
+    shipped,
+)
 from restock.ingest.task.task import Task
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.packed_row import PACKING_VERSION
@@ -42,7 +50,7 @@ class TransitionSource:
     name: str
     version: int
     task_json: Callable[[str], str]  # task hash -> the task as JSON; "" where nothing is known
-    conditions: tuple[Condition, ...]
+    conditions: tuple[Condition, ...]  # of both kinds
     others: tuple[PinnedStore, ...] = ()  # whose rows are in the view too
     # task hash -> the profiles that read its rows, newest ingest first
     profiles: Callable[[str], list[StoredProfile]] = lambda task_hash: []
@@ -64,7 +72,11 @@ def open_source(
     Without `conditions` a table's are the shipped ones that its labels name.
     """
     if isinstance(transitions, Store):
-        named = transitions.conditions() if conditions is None else tuple(conditions)
+        named = (
+            (*transitions.conditions(), *transitions.exposures())
+            if conditions is None
+            else tuple(conditions)
+        )
         with contextlib.ExitStack() as opened:
             stores = AllStores(transitions.connection, ())
             if mixture is not None:
@@ -84,11 +96,7 @@ def open_source(
         connection.register("given", transitions)
         connection.execute("CREATE VIEW transitions AS SELECT *, stamp_ns AS logged_ns FROM given")
         if conditions is None:
-            names = connection.sql("SELECT DISTINCT unnest(conditions) FROM transitions").fetchall()
-            known = shipped()
-            conditions = [
-                known.get(name) or Condition(name, "post", "false") for (name,) in sorted(names)
-            ]
+            conditions = _named_conditions(connection)
 
         def task_json(task_hash: str) -> str:
             if task is None:
@@ -98,6 +106,21 @@ def open_source(
             return msgspec.json.encode(task).decode()
 
         yield TransitionSource(connection, "table in memory", -1, task_json, tuple(conditions))
+
+
+def _named_conditions(connection: duckdb.DuckDBPyConnection) -> list[Condition]:
+    """The conditions and exposures that labels name: the shipped ones, or of the name alone."""
+    found = []
+    columns: dict[str, Kind] = {"conditions": "outcome", "exposures": "exposure"}
+    for column in columns.keys() & set(connection.sql("FROM transitions LIMIT 0").columns):
+        kind, known = columns[column], shipped(kind=columns[column])
+        names = connection.sql(f"SELECT DISTINCT unnest({column}) FROM transitions").fetchall()
+        timing: Timing = "post" if kind == "outcome" else "pre"
+        found += [
+            known.get(name) or Condition(name, timing, "false", kind=kind)
+            for (name,) in sorted(names)
+        ]
+    return sorted(found, key=lambda condition: (condition.kind != "outcome", condition.name))
 
 
 def build_panel(
@@ -281,7 +304,8 @@ def _header(
     partial: Path,
 ) -> Header:
     read_by = (*source.profiles(plan.task_hash), StoredProfile("", "", ""))[0]
-    by_priority = sorted(source.conditions, key=lambda c: (c.priority, c.name))
+    outcomes = of_kind(source.conditions, "outcome")
+    by_priority = sorted(outcomes, key=lambda c: (c.priority, c.name))
     return Header(
         id=identity,
         store=source.name,

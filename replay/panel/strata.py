@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import Bools, Ints
 from restock.errors import ConfigError
-from restock.ingest.task.conditions import NOMINAL, Condition
+from restock.ingest.task.conditions import NOMINAL, Condition, of_kind
 from restock.replay.mixture.mixture import (
     Correction,
     EachCondition,
@@ -85,6 +85,8 @@ class ResolvedStratum:
 def resolve_strata(mixture: Mixture, conditions: Sequence[Condition]) -> list[ResolvedStratum]:
     """The mixture's strata, and those of `each_condition`, in the order of the table they make.
 
+    `conditions` are the store's, of both kinds.
+
     Raises:
         ConfigError: a stratum that is neither a condition of the store nor has a `where`.
     """
@@ -92,7 +94,14 @@ def resolve_strata(mixture: Mixture, conditions: Sequence[Condition]) -> list[Re
     rules = list(mixture.strata)
     if mixture.each_condition is not None:
         listed = {rule.name for rule in rules}
-        names = [NOMINAL, *(c.name for c in sorted(conditions, key=lambda c: (c.priority, c.name)))]
+        asked = of_kind(conditions, mixture.each_condition.kind)
+        if not asked and mixture.each_condition.kind == "exposure":
+            raise ConfigError(
+                "each_condition asks for exposures, and the store knows none",
+                where="mixture",
+                remedy="name some in the profile (`exposures`) and ingest the recordings again",
+            )
+        names = [NOMINAL, *(c.name for c in sorted(asked, key=lambda c: (c.priority, c.name)))]
         rules += [_rule_for(name, mixture.each_condition) for name in names if name not in listed]
     return [_resolve(rule, known, mixture) for rule in rules]
 
@@ -105,7 +114,8 @@ def rules_of(mixture: Mixture, names: Sequence[str]) -> list[StratumRule]:
 
 
 def _rule_for(name: str, each: EachCondition) -> StratumRule:
-    return StratumRule(name=name, **msgspec.structs.asdict(each))
+    given = msgspec.structs.asdict(each)
+    return StratumRule(name=name, **{key: given[key] for key in given if key != "kind"})
 
 
 def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -> ResolvedStratum:
@@ -116,15 +126,17 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
     elif rule.name == NOMINAL:
         predicate, priority, timing = "len(conditions) = 0", NOMINAL_PRIORITY, "pre"
         # A slip that nothing announced happened in a nominal state.
-        before = ", ".join(f"'{c.name}'" for c in known.values() if c.timing == "pre")
+        states = (c for c in of_kind(known.values(), "outcome") if c.timing == "pre")
+        before = ", ".join(f"'{c.name}'" for c in states)
         state_predicate = f"NOT list_has_any(conditions, [{before}]::VARCHAR[])"
     elif rule.name in known:
         condition = known[rule.name]
-        predicate = f"list_contains(conditions, '{rule.name}')"
+        column = "conditions" if condition.kind == "outcome" else "exposures"
+        predicate = f"list_contains({column}, '{rule.name}')"
         priority, timing = condition.priority, condition.timing
     else:
         raise ConfigError(
-            f"stratum {rule.name!r} is not a condition of this store and has no `where`",
+            f"stratum {rule.name!r} is no condition or exposure of this store and has no `where`",
             where="mixture",
             remedy=f"the store knows {', '.join([NOMINAL, *sorted(known)])}",
         )

@@ -58,3 +58,70 @@ FULL JOIN (
 ) AS by_episode USING (exposure)
 CROSS JOIN (SELECT count(*) AS all_rows, count(DISTINCT episode_id) AS all_episodes FROM transitions)
 ORDER BY episodes DESC, exposure;
+
+-- Each condition against the situations that its episodes met: does it leave out what went well? One
+-- line a condition and exposure that share episodes. `situation` 1 is the exposure that most sets the
+-- condition's episodes apart: of those that half of them met or more, the one that others meet least.
+CREATE OR REPLACE VIEW success_by_exposure AS
+WITH met AS (
+    SELECT DISTINCT exposure, episode_id FROM held_exposures
+), named AS (
+    SELECT DISTINCT condition, episode_id FROM held_conditions WHERE condition <> 'nominal'
+), judged AS (
+    SELECT episode_id, CAST(success AS DOUBLE) AS success FROM episodes WHERE success IS NOT NULL
+), of_condition AS (
+    SELECT condition, count(*) AS episodes, avg(success) AS success_share
+    FROM named
+    JOIN judged USING (episode_id)
+    GROUP BY condition
+), of_exposure AS (
+    SELECT exposure, count(*) AS exposed_episodes, avg(success) AS exposed_success_share
+    FROM met
+    JOIN judged USING (episode_id)
+    GROUP BY exposure
+), shared AS (
+    SELECT condition, exposure, count(*) AS shared_episodes, sum(success) AS shared_successes
+    FROM named
+    JOIN met USING (episode_id)
+    JOIN judged USING (episode_id)
+    GROUP BY condition, exposure
+), counted AS (
+    SELECT
+        condition,
+        exposure,
+        episodes,
+        success_share,
+        exposed_episodes,
+        exposed_success_share,
+        shared_episodes / episodes AS met_share,
+        exposed_episodes - shared_episodes AS left_out_episodes,
+        (exposed_episodes * exposed_success_share - shared_successes)
+            / nullif(exposed_episodes - shared_episodes, 0) AS left_out_success_share
+    FROM shared
+    JOIN of_condition USING (condition)
+    JOIN of_exposure USING (exposure)
+)
+SELECT
+    condition,
+    exposure,
+    row_number() OVER (
+        PARTITION BY condition
+        ORDER BY met_share < 0.5, met_share / exposed_episodes DESC, exposure
+    ) AS situation,
+    episodes,
+    success_share,
+    exposed_episodes,
+    exposed_success_share,
+    met_share,
+    left_out_episodes,
+    left_out_success_share,
+    -- Of the two shares' difference, in standard errors where there were none.
+    (left_out_success_share - success_share) / nullif(sqrt(
+        (episodes * success_share + left_out_episodes * left_out_success_share)
+        / (episodes + left_out_episodes)
+        * (1 - (episodes * success_share + left_out_episodes * left_out_success_share)
+            / (episodes + left_out_episodes))
+        * (1 / episodes + 1 / left_out_episodes)
+    ), 0) AS z
+FROM counted
+ORDER BY condition, situation;

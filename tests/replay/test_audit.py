@@ -295,8 +295,8 @@ def test_each_audit_finds_its_planted_fault_and_nothing_else(
 
 def test_every_shipped_audit_of_a_store_has_a_planted_fault() -> None:
     alone = {name for name, audit in AUDITS.items() if audit.needs is None}
-    # The stand-in data itself has no action probabilities.
-    assert {name for name, *_ in PLANTS} | {"no_action_probability"} == alone
+    # The stand-in data itself has no action probabilities; test_exposure_strata plants the other.
+    assert {name for name, *_ in PLANTS} | {"no_action_probability", "chosen_on_outcome"} == alone
 
 
 def test_missing_action_probabilities_are_said(clean: Tables) -> None:

@@ -13,7 +13,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from support.panels import EVERY, moment, planned
 from support.paths import ROOT
-from support.stores import CONDITIONS, TASK
+from support.stores import CONDITIONS, EXPOSURES, TASK
 
 from restock import cli
 from restock.errors import ConfigError, MixtureError
@@ -50,7 +50,7 @@ def shares(plan: PanelPlan) -> dict[str, float]:
 def test_the_shipped_mixtures_load_and_fill(name: str, transitions: pa.Table) -> None:
     mixture = load_mixture(name)
     assert mixture.doc
-    with open_source(transitions, conditions=CONDITIONS) as source:
+    with open_source(transitions, conditions=[*CONDITIONS, *EXPOSURES]) as source:
         plan = plan_panel(source.connection, mixture, source.conditions)
     assert sum(line.share for line in plan.strata) == pytest.approx(1)
 
@@ -107,7 +107,7 @@ def test_an_unknown_key_is_named_with_its_path(tmp_path: Path) -> None:
         load_mixture(tmp_path / "m.toml")
     with pytest.raises(ConfigError, match=r"`held_out`\n.*now called `evaluation_split`"):
         parse_mixture("[held_out]\nby = 'none'\n" + EVERY)
-    with pytest.raises(ConfigError, match="coverage, steps, uniform"):
+    with pytest.raises(ConfigError, match="coverage, exposure, steps, uniform"):
         load_mixture("coverag")
 
 

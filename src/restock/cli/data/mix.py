@@ -39,7 +39,7 @@ class MixCommand:
     store: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")] = None
     """The store to take transitions from."""
     mixture: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "coverage"
-    """A TOML file, or a shipped mixture: coverage, steps or uniform. See docs/mixture.md."""
+    """A TOML file, or one of coverage, exposure, steps and uniform. See docs/mixture.md."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
     """The panel's directory, which must not exist yet."""
     dry_run: bool = False

@@ -1,0 +1,167 @@
+"""Strata by the situation instead of its outcome: quotas, and the audit that tells them apart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from support.stores import CONDITIONS, recording_transitions, write_store
+
+from restock.cli import main
+from restock.errors import ConfigError
+from restock.ingest.store.transitions import replaced
+from restock.replay.mixture.mixture import load_mixture, parse_mixture
+from restock.replay.panel.build import build_panel, open_source
+from restock.replay.panel.plan import PanelPlan, plan_panel
+from restock.replay.store.audit import load_thresholds, run_audits, shipped_audits
+from restock.replay.store.store import Store
+
+EPISODES = 60
+GOAL_REWARD = 5.0  # of the task
+# Every third episode met someone; every other of those came too near, and failed.
+EXPOSED = [number % 3 == 0 for number in range(EPISODES)]
+NEAR = [number % 6 == 0 for number in range(EPISODES)]
+
+
+def planted(failed: Callable[[int], bool], near: list[bool] = NEAR) -> pa.Table:
+    """A recording whose episodes are exposed as EXPOSED, `near` where they came too near."""
+    rows = recording_transitions(1, episodes=EPISODES, seed=3)
+    episode = rows["episode_index"].to_numpy()
+    step = rows["step_index"].to_numpy()
+    last = np.append(step[1:] == 0, True)
+    held = [near[e] and s in (3, 4) for e, s in zip(episode, step, strict=True)]
+    success = np.array([not failed(number) for number in range(EPISODES)])[episode]
+    return replaced(
+        rows,
+        {
+            "conditions": [["near_collision"] if one else [] for one in held],
+            "condition": ["near_collision" if one else "nominal" for one in held],
+            "uncertain": [[] for _ in held],
+            "exposures": [
+                ["closing_traffic"] if EXPOSED[e] and s < 6 else []
+                for e, s in zip(episode, step, strict=True)
+            ],
+            "bumped": np.zeros(len(rows), np.bool_),
+            "reward": np.where(last & success, GOAL_REWARD, -0.02),
+            "terminated": last & success,
+            "truncated": last & ~success,
+        },
+    )
+
+
+def store_of(rows: pa.Table, path: Path) -> Path:
+    return write_store(path, [rows])
+
+
+def planned(store: Path, mixture: str) -> PanelPlan:
+    asked = parse_mixture(mixture)
+    with Store(store) as opened, open_source(opened, asked) as source:
+        return plan_panel(source.connection, asked, source.conditions)
+
+
+def success_in(plan: PanelPlan, stratum: str, rows: pa.Table) -> float:
+    """Of the episodes in a stratum of the panel, those that reached the goal."""
+    (code,) = [place for place, line in enumerate(plan.strata) if line.name == stratum]
+    mine = set(plan.rows.filter(pa.array(plan.stratum == code))["episode_id"].to_pylist())
+    good = set(rows.filter(rows["terminated"])["episode_id"].to_pylist())
+    return len(mine & good) / len(mine)
+
+
+NOMINAL = "[evaluation_split]\nby = 'none'\n[[strata]]\nname = 'nominal'\nunit = 'episode'\n"
+BY_OUTCOME = NOMINAL + "share = 0.5\n[each_condition]\nunit = 'episode'\nshare = 'equal'"
+BY_EXPOSURE = BY_OUTCOME + "\nkind = 'exposure'"
+
+
+def test_a_stratum_of_the_exposure_keeps_what_went_well(tmp_path):
+    rows = planted(lambda number: NEAR[number])
+    store = store_of(rows, tmp_path / "store")
+    outcome, exposure = planned(store, BY_OUTCOME), planned(store, BY_EXPOSURE)
+    names = {line.name: line.episodes for line in exposure.strata}
+    assert names == {"nominal": 40, "closing_traffic": 20, "plan_blocked": 0, "slippery_floor": 0}
+    assert "closing_traffic" not in {line.name for line in outcome.strata}
+    assert success_in(outcome, "near_collision", rows) == 0
+    assert success_in(exposure, "closing_traffic", rows) == 0.5
+    assert success_in(outcome, "nominal", rows) == success_in(exposure, "nominal", rows) == 1
+
+
+def test_an_exposure_beside_a_condition_by_name_takes_its_rows_by_priority(tmp_path):
+    """Of steps: a condition goes first, as its priority number is lower."""
+    store = store_of(planted(lambda number: False), tmp_path / "store")
+    text = "[evaluation_split]\nby = 'none'\n[correction]\npost = 'none'\n" + "".join(
+        f"[[strata]]\nname = '{name}'\n"
+        for name in ("nominal", "near_collision", "closing_traffic")
+    )
+    lines = {line.name: line for line in planned(store, text).strata}
+    assert lines["closing_traffic"].timing == "pre"
+    # Six steps of each exposed episode; two of every other of them are the condition's.
+    assert lines["near_collision"].rows == 20
+    assert lines["closing_traffic"].rows == 6 * 20 - 20
+
+
+def test_a_panel_of_exposures_is_packed_and_knows_its_conditions(tmp_path):
+    store = store_of(planted(lambda number: NEAR[number]), tmp_path / "store")
+    with Store(store) as opened:
+        panel = build_panel(opened, load_mixture("exposure"), tmp_path / "panel")
+    assert {"closing_traffic", "nominal"} <= {line.name for line in panel.header.strata}
+    assert panel.header.conditions == [  # of which each row has one: exposures are none
+        *("recovery", "near_collision", "wheel_slip", "blocked_aisle", "nominal")
+    ]
+
+
+def test_a_table_in_memory_names_its_exposures(tmp_path):
+    panel = build_panel(planted(lambda number: False), parse_mixture(BY_EXPOSURE), tmp_path / "p")
+    assert "closing_traffic" in {line.name for line in panel.header.strata}
+
+
+def test_a_store_without_exposures_has_none_to_ask_for(tmp_path):
+    store = store_of(planted(lambda number: False), tmp_path / "store")
+    with Store(store) as opened, pytest.raises(ConfigError, match="knows none") as caught:
+        plan_panel(opened.connection, load_mixture("exposure"), CONDITIONS)
+    assert "ingest" in str(caught.value.remedy)
+
+
+def audited(store: Path) -> tuple[str, list[dict[str, object]]]:
+    chosen = [audit for audit in shipped_audits() if audit.name == "chosen_on_outcome"]
+    thresholds = {"chosen_on_outcome": load_thresholds()["chosen_on_outcome"]}
+    with Store(store) as opened:
+        (finding,) = run_audits(opened.connection, chosen, thresholds)
+    return finding.status, finding.sample
+
+
+def test_the_audit_names_the_condition_that_is_chosen_on_its_outcome_and_the_exposure(
+    tmp_path, capsys
+):
+    store = store_of(planted(lambda number: NEAR[number]), tmp_path / "store")
+    status, sample = audited(store)
+    assert status == "warn"
+    assert sample == [
+        {
+            "condition": "near_collision",
+            "exposure": "closing_traffic",
+            "episodes": 10,
+            "success_share": 0.0,
+            "exposed_episodes": 20,
+            "exposed_success_share": 0.5,
+            "left_out_episodes": 10,
+            "left_out_success_share": 1.0,
+        }
+    ]
+    capsys.readouterr()
+    assert main(["audit", str(store), "--strict"]) == 1
+    assert "shipped mixture `exposure`" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("failed", "near"),
+    [
+        (lambda number: False, NEAR),  # nothing failed
+        (lambda number: EXPOSED[number] and number % 2 == 0, [n % 12 < 4 for n in range(60)]),
+        (lambda number: NEAR[number], EXPOSED),  # the condition is the situation
+    ],
+)
+def test_the_audit_passes_where_the_condition_is_no_choice_of_failures(tmp_path, failed, near):
+    store = store_of(planted(failed, near), tmp_path / "store")
+    assert audited(store) == ("pass", [])
