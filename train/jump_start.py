@@ -21,7 +21,7 @@ from restock.train.dqn.fitted_q import FittedQConfig, cloned_behaviour, cloned_p
 from restock.train.dqn.network import QNetwork
 from restock.train.feed.logs import Logs
 
-POLICIES = ("dqn", "cloned")  # who acts, by its code in the ring
+POLICIES = ("dqn", "cloned", "start")  # who acts, by its code in the ring
 
 
 class JumpStart(Stateful):
@@ -77,12 +77,14 @@ class JumpStart(Stateful):
         observation: NDArray[np.float32],
         step: Ints,
         env_steps: int,
+        driver: int = 0,
     ) -> tuple[Ints, NDArray[np.float32], NDArray[np.int16]]:
         """Who acts, and how: action (N,), its probability (N,), and the code into POLICIES (N,).
 
-        `action` and `probability` are the learner's; `step` (N,) counts in each episode from 0.
+        `action` and `probability` are of who drives otherwise, whose code `driver` is; `step` (N,)
+        counts in each episode from 0.
         """
-        policy = np.zeros(len(action), np.int16)
+        policy = np.full(len(action), driver, np.int16)
         begins, horizon = np.flatnonzero(step == 0), self.config.horizon(env_steps)
         self._until[begins] = self._rng.integers(horizon + 1, size=len(begins))
         cloned = np.flatnonzero(step < self._until)

@@ -22,6 +22,7 @@ from restock.train.evaluation.evaluate import (
     fixed_episodes,
     score,
 )
+from restock.train.evaluation.offline_start import choose_start
 from restock.train.evaluation.ope import OpeConfig, evaluate_off_policy, measures_of
 from restock.train.evaluation.ope_dataset import load_ope_dataset
 from restock.train.evaluation.policies import GreedyPolicy
@@ -29,6 +30,7 @@ from restock.train.feed.batches import ReplayBatch
 from restock.train.feed.probe import Probe
 from restock.train.finite import check_loss, check_parameters
 from restock.train.guard import enforce, falls
+from restock.train.jump_start import POLICIES
 from restock.train.session import Interval, Session
 from restock.train.twin.env.interface import epsilon_greedy
 
@@ -84,24 +86,27 @@ def train(
             _close_interval(session, "offline", notify)
         if config.evaluation.off_policy:
             _evaluate_off_policy(session)  # on held-out logs, before it drives
+        if config.offline_start.choose:
+            _choose_start(session)
         _evaluate(session, notify)
 
     while progress.env_steps < schedule.env_steps and _time_left(session) and not progress.stopped:
         _interrupt(session, stop)
-        # 2. Warm-up: the offline policy drives, and nothing is learnt from its rows yet.
+        # 2. Warm-up: what came of the logs drives, and nothing is learnt from its rows yet.
         warm = progress.env_steps >= schedule.warmup_env_steps
         if progress.online_from is None and warm and len(session.ring) >= config.replay.batch_size:
             progress.online_from = progress.env_steps
             _close_interval(session, "warmup", notify)
 
         # 3. Act, epsilon-greedy; the twin steps on its own thread …
-        greedy = learner.greedy(session.collector.observation)
+        greedy = session.greedy(session.collector.observation)
         epsilon = epsilon_at(progress.env_steps)
         action, probability = epsilon_greedy(
             greedy, learner.network.actions, epsilon, session.exploration
         )
         acting_step = learner.gradient_steps
-        policy: NDArray[np.int16] | int = 0
+        driver = POLICIES.index("dqn" if session.starting is None else "start")
+        policy: NDArray[np.int16] | int = driver
         if session.jump_start is not None:  # the logs' behaviour drives an episode's first steps
             action, probability, policy = session.jump_start.take_over(
                 action,
@@ -109,6 +114,7 @@ def train(
                 session.collector.observation,
                 session.collector.steps,
                 progress.env_steps,
+                driver,
             )
         session.collector.start(action, probability, policy)
 
@@ -291,13 +297,27 @@ def _evaluate_off_policy(session: Session) -> None:
     session.run.append("off_policy", [{**session.steps, **row} for row in rows])
 
 
+def _choose_start(session: Session) -> None:
+    """Which policy drives first, by held-out logs, into the table `offline_start`."""
+    if session.logs is None or session.logs.panel is None:
+        return
+    session.start, rows = choose_start(
+        session.learner,
+        session.task,
+        load_ope_dataset(session.logs.panel, session.task, seed=session.config.seed),
+        session.config,
+    )
+    session.run.append("offline_start", [{**session.steps, **row} for row in rows])
+
+
 def _evaluate(session: Session, notify: Notify) -> None:
     """The fixed episodes, greedily; the policy is kept if it is the best so far."""
     check_parameters(session)
     config, progress, learner = session.config, session.progress, session.learner
     names = list(config.env.conditions)  # also those with a share of 0: never trained on, yet met
     specs = fixed_episodes(names, config.evaluation.episodes, config.evaluation.seed)
-    policy, discount = GreedyPolicy(learner.policy), config.loss.discount
+    policy = GreedyPolicy(session.starting or learner.policy)
+    discount = config.loss.discount
     results = session.evaluation_buffer.drive(policy, specs, discount)
     measured = session.evaluation_buffer.measure(learner)
     session.run.append("evaluation_buffer", [{**session.steps, **row} for row in measured])

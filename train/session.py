@@ -15,13 +15,16 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
+from restock.arrays import F32, Ints
 from restock.errors import RunError
 from restock.ingest.task.conditions import Condition
 from restock.ingest.task.task import Task
 from restock.replay.ring.ring import FreshRing
 from restock.state import Stateful
+from restock.train.dqn.behaviour import PolicyNetwork
 from restock.train.dqn.config import TrainConfig
-from restock.train.dqn.learner import Learner
+from restock.train.dqn.learner import Learner, greedy_actions
+from restock.train.dqn.start_policy import StartPolicy, start_network
 from restock.train.evaluation.evaluate import Score
 from restock.train.evaluation.evaluation_buffer import EvaluationBuffer
 from restock.train.evaluation.policies import save_agent
@@ -88,6 +91,7 @@ class Session(Stateful):
         "feed",
         "probe",
         "jump_start",
+        "start",
         "imitation",
         "exploration",
     )
@@ -95,6 +99,7 @@ class Session(Stateful):
         "best": Score | None,
         "last": Score | None,
         "probe": Probe | None,
+        "start": StartPolicy | None,
     }
 
     run: Run
@@ -120,6 +125,7 @@ class Session(Stateful):
     interval: Interval = field(default_factory=Interval)
     best: Score | None = None
     last: Score | None = None
+    start: StartPolicy | None = None  # what was chosen to drive first; None: what is learnt
     _started: float = field(default_factory=time.monotonic)
 
     @property
@@ -184,13 +190,27 @@ class Session(Stateful):
                 remedy=f"go back to an earlier one: --from-env-steps {whole}",
             ) from error
 
+    @property
+    def starting(self) -> PolicyNetwork | None:
+        """What drives until online updates begin, where it is not what is learnt."""
+        if self.start is None or self.progress.online_from is not None:
+            return None
+        return start_network(self.start, self.learner.policy, self.task.scaled_actions)
+
+    def greedy(self, observation: F32) -> Ints:
+        """What acts now without exploration, (N,)."""
+        if (starting := self.starting) is not None:
+            return greedy_actions(starting, observation)
+        return self.learner.greedy(observation)
+
     def save_best(self, results: Score) -> None:
         """Keep the policy as it is now as the run's best."""
         clocks = {
             "env_steps": self.progress.env_steps,
             "gradient_steps": self.learner.gradient_steps,
         }
-        save_agent(self.run, self.learner.policy, self.task, results, clocks)
+        start = self.start if self.progress.online_from is None else None
+        save_agent(self.run, self.learner.policy, self.task, results, clocks, start)
 
     def close(self) -> None:
         """Release the thread and the event files."""

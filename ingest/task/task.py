@@ -83,6 +83,11 @@ class Task(Checked, frozen=True):
         return 12 + len(self.actions) + 2 * self.sectors + 3
 
     @property
+    def scaled_actions(self) -> NDArray[np.float64]:
+        """The actions (A, 2) in units of the fastest on each axis, as an observation has them."""
+        return np.asarray(self.actions, np.float64) / _fastest(self)
+
+    @property
     def action_names(self) -> list[str]:
         """The actions for people, e.g. `0.8 m/s left 0.7`."""
         return [_action_name(*action) for action in self.actions]
@@ -131,10 +136,8 @@ def nearest_action(
 
     Distance is measured in units of the fastest action on each axis. Ties go to the first action.
     """
-    table = np.asarray(task.actions, np.float64)  # (A, 2)
-    scale = _fastest(task)
-    command = np.stack([speed_mps, yaw_rate_radps], axis=-1) / scale
-    distance = np.linalg.norm(command[:, None, :] - (table / scale)[None], axis=-1)
+    command = np.stack([speed_mps, yaw_rate_radps], axis=-1) / _fastest(task)
+    distance = np.linalg.norm(command[:, None, :] - task.scaled_actions[None], axis=-1)
     action = np.argmin(distance, axis=1)
     return action.astype(np.int64), distance[np.arange(len(action)), action]
 

@@ -146,6 +146,14 @@ class TeacherConfig(Checked, frozen=True):
             raise ValueError("hidden must name the width of at least one layer, got []")
 
 
+class OfflineStartConfig(Checked, frozen=True):
+    """What drives until online updates begin: see `restock.train.evaluation.offline_start`."""
+
+    choose: bool = False  # the best of several on held-out logs; else what was learnt offline
+    # Filters beside the run's own, where it has a teacher with logged rows; 1: the clone alone.
+    ratios: tuple[Annotated[float, Meta(gt=0, le=1)], ...] = (0.1, 0.3, 1.0)
+
+
 class EnvConfig(Checked, frozen=True):
     num_envs: Count = 16
     # Shares of true conditions among the episodes of the twin.
@@ -235,6 +243,7 @@ class TrainConfig(Checked, frozen=True):
     epsilon: LinearEpsilon = LinearEpsilon()
     jump_start: JumpStartConfig = JumpStartConfig()
     teacher: TeacherConfig = TeacherConfig()
+    offline_start: OfflineStartConfig = OfflineStartConfig()
     env: EnvConfig = msgspec.field(default_factory=EnvConfig)
     practice: PracticeConfig = msgspec.field(default_factory=PracticeConfig)
     evaluation: EvaluationConfig = EvaluationConfig()
@@ -321,6 +330,7 @@ def _apply(document: dict[str, Any], override: str) -> None:
 
 __all__ = [
     "JumpStartConfig",
+    "OfflineStartConfig",
     "PracticeConfig",
     "TeacherConfig",
     "TrainConfig",

@@ -21,7 +21,7 @@ from restock.arrays import F32, Ints
 from restock.errors import ConfigError, RunError
 from restock.files import write_bytes
 from restock.ingest.task.task import Task
-from restock.train.dqn.behaviour import FilteredNetwork, PolicyNetwork
+from restock.train.dqn.behaviour import FilteredNetwork, PolicyNetwork, ProposedNetwork
 from restock.train.dqn.network import QNetwork
 from restock.train.evaluation.policies import load_agent
 from restock.train.run.run import Run
@@ -68,14 +68,15 @@ def to_onnx(network: PolicyNetwork) -> Any:
     """The network as an ONNX model, node for layer; where it is filtered, both in one graph."""
     onnx = _library("onnx")
     graph = _Graph(onnx)
-    filtered = isinstance(network, FilteredNetwork)
-    members = network.values.members if isinstance(network, FilteredNetwork) else network.members
-    each = [graph.values(member, f"m{index}") for index, member in enumerate(members)]
-    values = graph.node(
-        "Mean" if len(each) > 1 else "Identity", each, "all_values" if filtered else "values"
-    )
-    if isinstance(network, FilteredNetwork):
-        graph.filter(network, values, "values")
+    inner = network.inner if isinstance(network, ProposedNetwork) else network
+    plain = inner.values if isinstance(inner, FilteredNetwork) else inner
+    each = [graph.values(member, f"m{index}") for index, member in enumerate(plain.members)]
+    values = graph.node("Mean" if len(each) > 1 else "Identity", each, "all_values")
+    if isinstance(inner, FilteredNetwork):
+        values = graph.filter(inner, values, "plausible_values")
+    if isinstance(network, ProposedNetwork):
+        values = graph.follow(network, values, "followed_values")
+    graph.node("Identity", [values], "values")
     graph.node("ArgMax", ["values"], "action", axis=1, keepdims=0)
     tensor, kinds = onnx.helper.make_tensor_value_info, onnx.TensorProto
     return onnx.helper.make_model(
@@ -157,6 +158,31 @@ class _Graph:
         plausible = self.node("GreaterOrEqual", [logits, least], "plausible")
         none = self.constant("behaviour.none", np.array(-np.inf, np.float32))
         return self.node("Where", [plausible, values, none], output)
+
+    def follow(self, network: ProposedNetwork, values: str, output: str) -> str:
+        """The values (N, A); -inf but for the proposed action, where that is plausible."""
+        spread = np.zeros((network.observation_size, network.actions), np.float32)
+        spread[-2:] = _array(network.weight)
+        known = np.zeros((network.observation_size, 1), np.float32)
+        known[-3] = 1.0
+        zero = self.constant("proposed.zero", np.array(0.0, np.float32))
+        none = self.constant("proposed.none", np.array(-np.inf, np.float32))
+        axes = self.constant("proposed.axes", np.array([1], np.int64))
+        weight = self.constant("proposed.weight", spread)
+        bias = self.constant("proposed.bias", _array(network.bias))
+        nearness = self.node("Gemm", ["observation", weight, bias], "proposed.nearness")
+        largest = self.node("ReduceMax", [nearness, axes], "proposed.largest", keepdims=1)
+        nearest = self.node("GreaterOrEqual", [nearness, largest], "proposed.nearest")
+        possible = self.node("Greater", [values, none], "proposed.possible")
+        allowed = self.node("And", [nearest, possible], "proposed.allowed")
+        kept = self.node("Where", [allowed, values, none], "proposed.values")
+        best = self.node("ReduceMax", [kept, axes], "proposed.best", keepdims=1)
+        any_allowed = self.node("Greater", [best, none], "proposed.any")
+        entry = self.constant("proposed.entry", known)
+        said = self.node("MatMul", ["observation", entry], "proposed.said")
+        is_known = self.node("Greater", [said, zero], "proposed.known")
+        followed = self.node("And", [is_known, any_allowed], "proposed.followed")
+        return self.node("Where", [followed, kept, values], output)
 
     def mean(self, inputs: str, axis: int, name: str, *, keep: bool = True) -> str:
         axes = self.constant(f"{name}.axes", np.array([axis], np.int64))

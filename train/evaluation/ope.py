@@ -130,7 +130,7 @@ def evaluate_off_policy(
     """Rows of `off_policy`: measure x condition of the episode x estimator."""
     results: list[dict[str, Any]] = []
     gate = EssGate(config.ess_share, config.ess_episodes)
-    probability, estimated = _behaviour_probability(dataset, network.actions, config)
+    probability, estimated = behaviour_probability(dataset, network.actions, config)
     for measure in measures:
         training = dataset.training.measured(measure)
         evaluation = dataset.evaluation.measured(measure)
@@ -216,7 +216,7 @@ def padded_episodes(
     )
 
 
-def _behaviour_probability(
+def behaviour_probability(
     dataset: OpeDataset, actions: int, config: OpeConfig
 ) -> tuple[F64, float]:
     """Of each logged action (N,), and the share of rows in which it had to be estimated.

@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from restock.arrays import F32, Ints
@@ -15,6 +16,7 @@ from restock.ingest.task.task import Task
 from restock.train.dqn.behaviour import PolicyNetwork, make_policy
 from restock.train.dqn.config import parse_config
 from restock.train.dqn.learner import greedy_actions
+from restock.train.dqn.start_policy import StartPolicy, start_network
 from restock.train.evaluation.evaluate import Score
 from restock.train.run import checkpoint
 from restock.train.run.run import Run
@@ -85,13 +87,24 @@ def load_agent(run: Run) -> GreedyPolicy:
         )
     network = make_policy(config, state["observation_size"], state["actions"])
     network.load_state_dict(state["network"])
+    if (start := state.get("start")) is not None:  # what the run began with is not beaten yet
+        made = msgspec.convert(start, StartPolicy)
+        network = start_network(made, network, task.scaled_actions)
     return GreedyPolicy(network.eval(), version=f"{run.path.name}@{state['gradient_steps']}")
 
 
 def save_agent(
-    run: Run, network: PolicyNetwork, task: Task, score: Score, clocks: Mapping[str, int]
+    run: Run,
+    network: PolicyNetwork,
+    task: Task,
+    score: Score,
+    clocks: Mapping[str, int],
+    start: StartPolicy | None = None,
 ) -> None:
-    """Keep a network as the best of a run so far; `clocks` are `env_steps` and `gradient_steps`."""
+    """Keep a network as the best of a run so far; `clocks` are `env_steps` and `gradient_steps`.
+
+    `start` says how the policy is made of it, where that is what the run began to drive with.
+    """
     state = {
         "network": dict(network.state_dict()),
         "observation_size": task.observation_size,
@@ -99,6 +112,7 @@ def save_agent(
         "task_hash": task.hash,
         **clocks,
         "score": asdict(score),
+        "start": None if start is None else msgspec.to_builtins(start),
     }
     checkpoint.save(run.best, state)
 

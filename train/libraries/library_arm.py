@@ -87,6 +87,7 @@ def resolve(settings: tuple[str, ...], library: Library) -> TrainConfig:
             ('replay.ring_capacity "auto"', config.replay.ring_capacity == "auto"),
             ("jump_start.env_steps", config.jump_start.env_steps > 0),
             ("teacher.source", config.teacher.filters),
+            ("offline_start.choose", config.offline_start.choose),
             ("practice.rule", config.practice.rule != "natural"),
         )
         if bad

@@ -56,6 +56,7 @@ class Facts:
     labels: Rows = field(default_factory=list)  # scores of the store's labels, pooled
     reliability: Rows = field(default_factory=list)  # of their probabilities
     off_policy: Rows = field(default_factory=list)  # off-policy estimates, over all conditions
+    offline_start: Rows = field(default_factory=list)  # what might have driven first, over all
     practice: Rows = field(default_factory=list)  # an interval x arm of missions
     teacher: Rows = field(default_factory=list)  # what its filter did at last
     missing: list[str] = field(default_factory=list)  # what could not be read, and why
@@ -115,6 +116,9 @@ def gather(path: Path) -> Facts:
     facts.evaluation = shown
     facts.off_policy = [
         row for row in run.table("off_policy").to_pylist() if row["condition"] == "all"
+    ]
+    facts.offline_start = [
+        row for row in run.table("offline_start").to_pylist() if row["condition"] == "all"
     ]
     facts.practice = run.table("practice").to_pylist()
     taught = run.table("teacher").to_pylist()
