@@ -17,6 +17,7 @@ from restock.files import read_json
 from restock.ingest.store.location import Location
 from restock.ingest.store.version import Version
 from restock.replay.panel.panel import EVALUATION_SPLIT, HEADER, META, Panel
+from restock.replay.store.query import definitions
 from restock.replay.store.store import Store, is_store, read_parquet
 
 RUN_CONFIG = "config.json"
@@ -98,6 +99,8 @@ def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> bool
                 )
     if "audit" in files:
         _add_replay_audit(connection, path, schema)
+    if "eval_episodes" in files:
+        _add_returns(connection, files["eval_episodes"], schema)
     return True
 
 
@@ -117,6 +120,15 @@ def _add_replay_audit(connection: duckdb.DuckDBPyConnection, run: Path, schema: 
     }
     _keep(connection, schema, "action_names", pa.table(table))
     text = resources.files("restock.replay").joinpath("replay_audit.sql").read_text("utf-8")
+    connection.execute(text.replace("{schema}", schema))
+
+
+def _add_returns(connection: duckdb.DuckDBPyConnection, file: Path, schema: str) -> None:
+    """The views `driven_episodes` and `returns`, where evaluations have discounted returns."""
+    if "discounted_return" not in pq.read_schema(file).names:
+        return
+    connection.execute(definitions(names=("return_order.sql",)))
+    text = resources.files("restock.replay.store").joinpath("run_returns.sql").read_text("utf-8")
     connection.execute(text.replace("{schema}", schema))
 
 

@@ -25,12 +25,15 @@ MACROS = (
     "corrections.sql",
     "episode_signals.sql",
     "drift.sql",
+    "return_order.sql",
+    "returns.sql",
 )
 # To bind these takes more than half of the time to open a store: only for queries that name them.
 ON_DEMAND = (
     ("events.sql", "fleet.sql"),
     ("episode_signals.sql", "drift.sql"),
     ("exposure.sql",),
+    ("return_order.sql", "returns.sql"),
 )
 _LISTS = {
     "columns",

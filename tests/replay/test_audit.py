@@ -235,6 +235,23 @@ def mostly_easy_operator(table: pa.Table, recordings: pa.Table) -> Tables:
     ), recordings
 
 
+def haste_pays(table: pa.Table, recordings: pa.Table) -> Tables:
+    """The operator always arrives; the planner bumps in half of its episodes, and earns more."""
+    episode = np.array(table["episode_id"].to_pylist())
+    number = np.array([int(name.split("/")[1]) for name in episode])
+    last = np.append(episode[1:] != episode[:-1], True)
+    operator = number % 2 == 0
+    arrives = last & (operator | (number % 4 == 1))
+    table = replaced(table, "true_condition", ["nominal"] * len(table))
+    table = replaced(table, "behaviour_policy", np.where(operator, "operator", "planner"))
+    table = replaced(table, "bumped", np.zeros(len(table), bool))
+    table = replaced(table, "terminated", last)
+    table = replaced(table, "truncated", np.zeros(len(table), bool))
+    return replaced(
+        table, "reward", np.where(arrives, 5.0, np.where(operator, -0.1, 0.5)).astype(np.float32)
+    ), recordings
+
+
 def two_robots(table: pa.Table, recordings: pa.Table) -> Tables:
     return table, replaced(recordings, "tags", [{"robot": "a", "site": "o"}, {"robot": "b"}])
 
@@ -269,6 +286,7 @@ PLANTS: list[tuple[str, Plant, int, dict[str, object]]] = [
     ("untagged_recordings", two_robots, 1, {"recording_id": f"{2:016x}", "untold": "site"}),
     ("single_robot", only_one_robot_slips, 1, {"condition": "wheel_slip", "robot": "a"}),
     ("policy_bias", picky_operator, 1, {"behaviour_policy": "operator"}),
+    ("reward_order", haste_pays, 1, {"driver": "operator 1", "other": "planner 1"}),
     ("policy_bias", mostly_easy_operator, 1, {"behaviour_policy": "operator"}),
 ]
 
@@ -295,8 +313,10 @@ def test_each_audit_finds_its_planted_fault_and_nothing_else(
 
 def test_every_shipped_audit_of_a_store_has_a_planted_fault() -> None:
     alone = {name for name, audit in AUDITS.items() if audit.needs is None}
-    # The stand-in data itself has no action probabilities; test_exposure_strata plants the other.
-    assert {name for name, *_ in PLANTS} | {"no_action_probability", "chosen_on_outcome"} == alone
+    # The stand-in data itself has no action probabilities and drivers that do about as well;
+    # test_exposure_strata plants the other.
+    elsewhere = {"no_action_probability", "reward_undetermined", "chosen_on_outcome"}
+    assert {name for name, *_ in PLANTS} | elsewhere == alone
 
 
 def test_missing_action_probabilities_are_said(clean: Tables) -> None:

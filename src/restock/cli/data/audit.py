@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,6 +12,7 @@ import tyro
 from restock.errors import ConfigError, ExitCode, RunError
 
 if TYPE_CHECKING:
+    from restock.replay.reward_audit import RewardAudit
     from restock.replay.store.audit import Finding
 
 
@@ -24,7 +26,7 @@ class AuditCommand:
     """
 
     store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
-    """The store to audit."""
+    """The store to audit; with --reward, a run will do as well."""
     panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
     """A panel made from it, audited too."""
     run_dir: Annotated[Path | None, tyro.conf.arg(name="run", metavar="RUN")] = None
@@ -37,6 +39,11 @@ class AuditCommand:
     """Instead of auditing, show how coverage grows with the rows kept, and how many are enough."""
     apply: Annotated[Path | None, tyro.conf.arg(metavar="CONFIG")] = None
     """With --capacity: write the number into this training config, as replay.ring_capacity."""
+    reward: bool = False
+    """Only ask whether the reward wants what is measured: returns by driver, condition and outcome,
+    and whether more success earns more (docs/reward.md)."""
+    discount: float | None = None
+    """With --reward: of one step, in a store; 0.99. A run's evaluations have their own."""
     strict: bool = False
     """Let warnings fail, too."""
     version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
@@ -53,6 +60,7 @@ class AuditCommand:
         from restock.cli import output
         from restock.ingest.store.version import given_version
         from restock.replay.places import RUN_CONFIG, open_place
+        from restock.replay.reward_audit import audit_reward
         from restock.replay.store.audit import junit_xml, load_audits, load_thresholds, run_audits
 
         beside = {"panel": self.panel, "run": self.run_dir}
@@ -65,24 +73,47 @@ class AuditCommand:
                 where="restock audit",
                 remedy="give both",
             )
+        if self.discount is not None and not (self.reward and 0 <= self.discount <= 1):
+            raise ConfigError(
+                f"must be within [0, 1], got {self.discount:g}"
+                if self.reward
+                else "is of the returns that --reward looks at",
+                where="--discount",
+                remedy="give --reward, and the discount of one step: 0.99 say",
+            )
         if self.run_dir is not None and not (self.run_dir / RUN_CONFIG).is_file():
             raise RunError("is not a run directory", where=str(self.run_dir))
         audits, thresholds = load_audits(self.audits), load_thresholds(self.thresholds)
         version = given_version(self.version)
-        with open_place(self.store, beside=given, only_store=True, version=version) as connection:
-            findings = run_audits(connection, audits, thresholds, beside=given)
+        reward: RewardAudit | None = None
+        if self.reward:
+            reward = audit_reward(
+                self.store, audits, thresholds, discount=self.discount, version=version
+            )
+            findings = reward.findings
+        else:
+            place = open_place(self.store, beside=given, only_store=True, version=version)
+            with place as connection:
+                findings = run_audits(connection, audits, thresholds, beside=given)
         failing = {"fail", "warn"} if self.strict else {"fail"}
         failed = [finding for finding in findings if finding.status in failing]
         if self.junit is not None:
             self._write_junit(self.junit, junit_xml(findings, f"audit {self.store}"))
         if self.json:
-            output.print_json(
-                {
-                    "store": str(self.store),
-                    "failed": len(failed),
-                    "audits": [_document(finding) for finding in findings],
+            document: dict[str, Any] = {
+                "store": str(self.store),
+                "failed": len(failed),
+                "audits": [_document(finding) for finding in findings],
+            }
+            if reward is not None:
+                document |= {
+                    "discount": reward.discount,
+                    "returns": reward.returns,
+                    "order": reward.order,
                 }
-            )
+            output.print_json(document)
+        elif reward is not None:
+            _print_reward(reward)
         else:
             _print(findings, self.rows)
         return int(ExitCode.FAILED if failed else ExitCode.OK)
@@ -183,6 +214,62 @@ def _print(findings: list[Finding], shown: int) -> None:
         output.print_table(finding.sample[:shown], finding.columns, title=title)
         output.stdout().print(f"  {finding.audit.advice}", markup=False)
     output.stdout().print(f"\n{_summary(findings)}")
+
+
+def _print_reward(reward: RewardAudit) -> None:
+    """Returns by driver, whether more success earns more, and what to do where it does not."""
+    from restock.cli import output
+
+    outcomes: dict[tuple[str, str], list[str]] = {}
+    for row in reward.returns:
+        if row["outcome"] != "all":
+            text = f"{row['outcome']} {row['episodes']} ({row['discounted_mean']:.2f})"
+            outcomes.setdefault((row["condition"], row["driver"]), []).append(text)
+    shown = [
+        {
+            "condition": row["condition"],
+            "driver": row["driver"],
+            "episodes": row["episodes"],
+            "success": row["success_share"],
+            f"return by {reward.discount:g}": row["discounted_mean"],
+            "undiscounted": row["return_mean"],
+            "by outcome (return)": ", ".join(outcomes[row["condition"], row["driver"]]),
+        }
+        for row in reward.returns
+        if row["outcome"] == "all"
+    ]
+    output.print_table(shown, title="what drivers earned")
+    output.stdout().print()
+    pairs = [
+        {
+            "condition": row["condition"],
+            "more success": row["driver"],
+            "than": row["other"],
+            "more by": _interval(row["success"] - row["other_success"], row["more_success"]),
+            "return more by": _interval(
+                row["discounted_return"] - row["other_discounted_return"], row["more_return"]
+            ),
+            "episodes": f"{row['episodes']}, {row['other_episodes']}",
+            "verdict": row["verdict"] + (f": {row['why']}" if row["why"] else ""),
+        }
+        for row in reward.order
+    ]
+    if pairs:
+        output.print_table(pairs, title="does more success earn more? [95 % intervals]")
+    told = Counter(row["verdict"] for row in reward.order)
+    for finding in reward.findings:
+        if finding.rows:
+            output.stdout().print(f"{finding.status}: {finding.audit.doc}", markup=False)
+            output.stdout().print(f"  {finding.audit.advice}", markup=False)
+    counts = ", ".join(f"{told[name]} {name}" for name in VERDICTS if told[name])
+    output.stdout().print(f"\n{counts or 'nothing to compare: undetermined'}")
+
+
+VERDICTS = ("reversed", "undetermined", "agrees", "same success")  # of a pair of drivers
+
+
+def _interval(value: float, ends: list[float]) -> str:
+    return f"{value:.2f} [{ends[0]:.2f}, {ends[1]:.2f}]"
 
 
 def _summary(findings: list[Finding]) -> str:

@@ -1,0 +1,122 @@
+-- Does the reward want what is measured? Macros over a table of driven episodes, named by `source`
+-- (`driven_episodes` of a store, see returns.sql; `run_episodes` of a run, see run_episodes.sql):
+--
+--     mission (null: every driver had missions of its own), driver, handed_over, condition, outcome,
+--     success, return, discounted_return
+--
+-- Not translated for Spark: `query_table` is DuckDB's.
+
+-- One row a condition and driver, and one an outcome of those (`all` is every outcome).
+CREATE OR REPLACE MACRO returns_of(source) AS TABLE
+SELECT
+    condition,
+    driver,
+    CASE WHEN grouping(outcome) = 1 THEN 'all' ELSE outcome END AS outcome,
+    count(*) AS episodes,
+    avg(success::INTEGER) AS success_share,
+    avg(return) AS return_mean,
+    avg(discounted_return) AS discounted_mean,
+    discounted_mean - 1.96 * stddev_samp(discounted_return) / sqrt(count(*)) AS discounted_low,
+    discounted_mean + 1.96 * stddev_samp(discounted_return) / sqrt(count(*)) AS discounted_high
+FROM query_table(source)
+GROUP BY GROUPING SETS ((condition, driver), (condition, driver, outcome))
+ORDER BY condition, driver, outcome <> 'all', outcome;
+
+-- One row a condition and pair of drivers: by how much the one with more success has more of it, and
+-- how much more it earns, each with its 95 % interval. Episodes of the same missions are compared
+-- mission by mission. Episodes in which control was handed over count for no driver: the operator is
+-- called to the harder ones.
+CREATE OR REPLACE MACRO return_order(source, min_episodes, same_success) AS TABLE
+WITH driven AS (
+    SELECT condition, driver, mission, success::INTEGER AS success, discounted_return AS earned
+    FROM query_table(source)
+    WHERE success IS NOT NULL AND discounted_return IS NOT NULL AND NOT handed_over
+), by_driver AS (
+    SELECT
+        condition,
+        driver,
+        count(*) AS n,
+        avg(success) AS success,
+        avg(earned) AS earned,
+        coalesce(var_samp(earned), 0) AS earned_variance,
+        -- Wilson's interval: its centre and half width, z = 1.96.
+        (avg(success) + 1.9208 / count(*)) / (1 + 3.8416 / count(*)) AS centre,
+        1.96 / (1 + 3.8416 / count(*))
+            * sqrt(avg(success) * (1 - avg(success)) / count(*) + 0.9604 / (count(*) * count(*))) AS half
+    FROM driven
+    GROUP BY condition, driver
+), paired AS (
+    SELECT
+        a.condition AS condition,
+        a.driver AS more,
+        b.driver AS less,
+        count(*) AS n,
+        count(*) FILTER (WHERE a.success > b.success) AS only_more,
+        count(*) FILTER (WHERE a.success < b.success) AS only_less,
+        avg(a.success) AS success,
+        avg(b.success) AS success_less,
+        avg(a.earned) AS earned,
+        avg(b.earned) AS earned_less,
+        coalesce(var_samp(a.earned - b.earned), 0) AS earned_variance
+    FROM driven AS a
+    JOIN driven AS b ON a.condition = b.condition AND a.mission = b.mission AND a.driver <> b.driver
+    GROUP BY a.condition, a.driver, b.driver
+), differences AS (
+    SELECT
+        condition, more, less, n AS episodes, n AS episodes_less,
+        success, success_less, earned, earned_less,
+        -- Of paired shares: Agresti and Min, with half an episode added to each of the four cells.
+        (only_more - only_less) / (n + 2) AS success_middle,
+        1.96 * sqrt(only_more + only_less + 1 - pow(only_more - only_less, 2) / (n + 2)) / (n + 2) AS success_below,
+        success_below AS success_above,
+        1.96 * sqrt(earned_variance / n) AS earned_half
+    FROM paired
+    UNION ALL
+    SELECT
+        a.condition, a.driver, b.driver, a.n, b.n,
+        a.success, b.success, a.earned, b.earned,
+        -- Of two shares: Newcombe, from the two intervals of Wilson.
+        a.success - b.success,
+        sqrt(pow(a.success - (a.centre - a.half), 2) + pow(b.centre + b.half - b.success, 2)),
+        sqrt(pow(a.centre + a.half - a.success, 2) + pow(b.success - (b.centre - b.half), 2)),
+        1.96 * sqrt(a.earned_variance / a.n + b.earned_variance / b.n)
+    FROM by_driver AS a
+    JOIN by_driver AS b ON a.condition = b.condition AND a.driver <> b.driver
+    WHERE NOT EXISTS (FROM paired WHERE paired.condition = a.condition AND more = a.driver AND less = b.driver)
+), intervals AS (
+    SELECT
+        *,
+        success_middle - success_below AS success_low,
+        success_middle + success_above AS success_high,
+        earned - earned_less - earned_half AS earned_low,
+        earned - earned_less + earned_half AS earned_high
+    FROM differences
+    WHERE success > success_less OR (success = success_less AND more < less)
+)
+SELECT
+    condition,
+    more AS driver,
+    less AS other,
+    CASE
+        WHEN least(episodes, episodes_less) < min_episodes THEN 'undetermined'
+        WHEN success_low > 0 AND earned_high < 0 THEN 'reversed'
+        WHEN success_low > 0 AND earned_low > 0 THEN 'agrees'
+        WHEN success_low > -same_success AND success_high < same_success THEN 'same success'
+        ELSE 'undetermined'
+    END AS verdict,
+    CASE
+        WHEN verdict <> 'undetermined' THEN NULL
+        WHEN least(episodes, episodes_less) < min_episodes THEN 'too few episodes'
+        WHEN success_low > 0 THEN 'it may earn more or less'
+        ELSE 'either may succeed more'
+    END AS why,
+    episodes,
+    episodes_less AS other_episodes,
+    success,
+    success_less AS other_success,
+    [success_low, success_high] AS more_success,
+    earned AS discounted_return,
+    earned_less AS other_discounted_return,
+    [earned_low, earned_high] AS more_return
+FROM intervals
+ORDER BY condition, driver, other;

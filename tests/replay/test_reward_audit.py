@@ -1,0 +1,217 @@
+"""Whether more success earns more: told of planted drivers, and not told where it cannot be."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.finished_runs import document, make_run
+from support.stores import recording_transitions, write_store
+
+from restock import cli
+from restock.errors import RunError
+from restock.replay.reward_audit import audit_reward
+from restock.replay.store.audit import load_audits, load_thresholds
+from restock.replay.store.query import definitions
+from restock.replay.store.store import Store
+from restock.stats import wilson
+from restock.train.run.kept_evaluations import add_evaluation
+from restock.train.run.run_tables import EVAL_EPISODES
+
+Episode = tuple[str, list[float], str]  # driver, reward of each step, goal | bump
+STEP = -0.02
+
+
+def earlier(way: float, steps: int, bumps: bool) -> tuple[list[float], str]:
+    """A mission as it was paid: -3 a step pressed (two of them), and it goes on to the goal."""
+    rewards = [way / steps + STEP] * steps
+    if bumps:
+        rewards[steps // 2] -= 3.0
+        rewards[steps // 2 + 1] -= 3.0
+    rewards[-1] += 5.0
+    return rewards, "goal after a bump" if bumps else "goal"
+
+
+def shipped(way: float, steps: int, bumps: bool) -> tuple[list[float], str]:
+    """A bump ends the episode, and costs 6."""
+    rewards, _ = earlier(way, steps, False)
+    if not bumps:
+        return rewards, "goal"
+    rewards = rewards[: steps // 2 + 1]
+    rewards[-1] -= 6.0
+    return rewards, "bump"
+
+
+def hasty_and_careful(pay: Callable[..., tuple[list[float], str]], count: int) -> list[Episode]:
+    """The planner touches nothing; an agent is quicker by a third, and bumps in a quarter."""
+    rng = np.random.default_rng(0)
+    ways = rng.uniform(6, 10, count).tolist()
+    careful: list[Episode] = [("planner", *pay(way, round(way * 9), False)) for way in ways]
+    hasty: list[Episode] = [
+        ("agent", *pay(way, round(way * 6), number % 4 == 0)) for number, way in enumerate(ways)
+    ]
+    return careful + hasty
+
+
+@cache
+def some_rows() -> pa.Table:
+    """More rows than any of these stores has; what is asked about is replaced."""
+    return recording_transitions(1, episodes=500)
+
+
+def store_of(path: Path, episodes: Sequence[Episode]) -> Path:
+    """A store of these episodes, in order."""
+    lengths = np.array([len(rewards) for _, rewards, _ in episodes])
+    rows = int(lengths.sum())
+    table = some_rows().slice(0, rows)
+    of_row = np.repeat(np.arange(len(episodes)), lengths)
+    step = np.concatenate([np.arange(length) for length in lengths])
+    last = np.append(step[1:] == 0, True)
+    how = np.array([outcome for *_, outcome in episodes])[of_row]
+    changed = {
+        "episode_id": [f"{1:016x}/{index}" for index in of_row],
+        "episode_index": of_row,
+        "step_index": step,
+        "reward": np.concatenate([rewards for _, rewards, _ in episodes]),
+        "terminated": last,
+        "truncated": np.zeros(rows, bool),
+        "behaviour_policy": np.array([driver for driver, *_ in episodes])[of_row],
+        "bumped": (how == "goal after a bump") & (step == 5),
+        "true_condition": ["nominal"] * rows,
+    }
+    for name, values in changed.items():
+        field = table.schema.field(name)
+        table = table.set_column(
+            table.schema.get_field_index(name), field, pa.array(values, field.type)
+        )
+    return write_store(path, [table])
+
+
+def audited(place: Path, **options: Any) -> dict[str, str]:
+    """Verdicts of a place by condition and pair, and what its audits came to."""
+    found = audit_reward(place, load_audits(), load_thresholds(), **options)
+    status = {
+        finding.audit.name.removeprefix("evaluated_"): finding.status for finding in found.findings
+    }
+    pairs = {f"{r['condition']}: {r['driver']} > {r['other']}": r["verdict"] for r in found.order}
+    return status | pairs
+
+
+PAIR = "nominal: planner 1 > agent 1"
+
+
+def test_a_reward_that_pays_for_haste_fails_and_one_that_stops_at_a_bump_passes(tmp_path) -> None:
+    paid_for_haste = store_of(tmp_path / "earlier", hasty_and_careful(earlier, 120))
+    found = audited(paid_for_haste, discount=0.97)
+    assert (found["reward_order"], found[PAIR]) == ("fail", "reversed")
+    stops = store_of(tmp_path / "shipped", hasty_and_careful(shipped, 120))
+    found = audited(stops)
+    assert found == {"reward_order": "pass", "reward_undetermined": "pass", PAIR: "agrees"}
+
+
+def test_the_command_fails_with_the_numbers_and_the_remedy(tmp_path, capsys) -> None:
+    place = str(store_of(tmp_path / "store", hasty_and_careful(earlier, 120)))
+    assert cli.main(["audit", place, "--reward", "--discount", "0.97"]) == 1
+    shown = capsys.readouterr().out
+    assert all(text in shown for text in ("goal after a bump 30", "bump_terminates", "1 reversed"))
+    assert cli.main(["audit", place, "--reward", "--discount", "0.97", "--json"]) == 1
+    document = json.loads(capsys.readouterr().out)
+    (pair,) = document["order"]
+    assert (pair["driver"], pair["verdict"], document["failed"]) == ("planner 1", "reversed", 1)
+    assert pair["more_success"][0] > 0 > pair["more_return"][1]
+    of_all = {r["driver"]: r for r in document["returns"] if r["outcome"] == "all"}
+    assert of_all["agent 1"]["success_share"] == 0.75
+    assert of_all["agent 1"]["discounted_mean"] > of_all["planner 1"]["discounted_mean"]
+    # What the drivers are told from is a view as well.
+    assert cli.main(["sql", place, "SELECT sum(episodes) FROM returns WHERE outcome = 'all'"]) == 0
+
+
+def test_returns_are_discounted_from_the_first_step(tmp_path) -> None:
+    rewards = [1.0, 2.0, 4.0]
+    place = store_of(tmp_path / "store", [("planner", rewards, "goal"), ("agent", [9.0], "goal")])
+    with Store(place) as store:
+        rows = store.sql("SELECT discounted_return FROM discounted_episodes(0.5) ORDER BY ALL")
+        assert [value for (value,) in rows.fetchall()] == [1.0 + 1.0 + 1.0, 9.0]
+
+
+@pytest.mark.parametrize("drivers", ["few", "one", "handed over"])
+def test_what_cannot_be_told_is_undetermined_and_no_pass(tmp_path, capsys, drivers) -> None:
+    episodes = hasty_and_careful(earlier, 19 if drivers == "few" else 60)
+    if drivers == "one":
+        episodes = [("planner", rewards, outcome) for _, rewards, outcome in episodes]
+    place = store_of(tmp_path / "store", episodes)
+    if drivers == "handed over":
+        place = store_of(tmp_path / "other", [e for e in episodes if e[0] == "planner"])
+    found = audited(place)
+    assert (found["reward_order"], found["reward_undetermined"]) == ("pass", "warn")
+    assert cli.main(["audit", str(place), "--reward", "--strict"]) == 1
+    assert "undetermined" in capsys.readouterr().out
+
+
+def test_an_evaluation_is_compared_mission_by_mission(tmp_path) -> None:
+    """Missions differ far more than drivers do: only their pairs tell."""
+    run = make_run(tmp_path / "run", document())
+    with pytest.raises(RunError, match="no evaluation with discounted returns"):
+        audited(run)
+    rng = np.random.default_rng(1)
+    worth = rng.normal(0, 20, 60)
+    rows: list[dict[str, Any]] = []
+    for policy, success, bonus in (("operator", 1.0, -0.5), ("agent", 0.7, 0.0)):
+        rows += [
+            dict.fromkeys(EVAL_EPISODES.names)
+            | {
+                "policy": policy,
+                "version": "1",
+                "perturbation": "none",
+                "condition": "near_collision",
+                "block": "none",
+                "episode_seed": seed,
+                "success": bool(seed < success * len(worth)),
+                "discounted_return": float(worth[seed] + bonus + rng.normal(0, 0.1)),
+                "return": 0.0,
+                "failure": None if seed < success * len(worth) else "bump",
+            }
+            for seed in range(len(worth))
+        ]
+    add_evaluation(run, pa.Table.from_pylist(rows, EVAL_EPISODES))
+    found = audited(run)
+    assert found["reward_order"] == "fail"
+    assert found["near_collision: operator 1 > agent 1"] == "reversed"
+    assert cli.main(["audit", str(run), "--reward", "--discount", "0.5"]) == 2  # it has its own
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.tuples(st.integers(1, 60), st.integers(0, 60)),
+    st.tuples(st.integers(1, 60), st.integers(0, 60)),
+)
+def test_the_difference_of_success_has_newcombes_interval(first, second) -> None:
+    (n, k), (m, j) = ((total, min(hits, total)) for total, hits in (first, second))
+    rows = [("a", index < k) for index in range(n)] + [("b", index < j) for index in range(m)]
+    with duckdb.connect() as connection:
+        table = pa.table({
+            "condition": ["c"] * len(rows),
+            "driver": [driver for driver, _ in rows],
+            "mission": pa.nulls(len(rows), pa.string()),
+            "success": [success for _, success in rows],
+            "discounted_return": [float(success) for _, success in rows],
+            "handed_over": [False] * len(rows),
+        })  # fmt: skip
+        connection.register("driven", table)
+        connection.execute(definitions(names=("return_order.sql",)))
+        query = "SELECT driver, more_success FROM return_order('driven', 1, 0.1)"
+        ((driver, ends),) = connection.execute(query).fetchall()
+    (a, total_a), (b, total_b) = ((k, n), (j, m)) if driver == "a" else ((j, m), (k, n))
+    p, q = a / total_a, b / total_b
+    (low_a, high_a), (low_b, high_b) = wilson(a, total_a), wilson(b, total_b)
+    assert ends[0] == pytest.approx(p - q - np.hypot(p - low_a, high_b - q), abs=1e-4)
+    assert ends[1] == pytest.approx(p - q + np.hypot(high_a - p, q - low_b), abs=1e-4)
