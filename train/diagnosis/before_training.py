@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from restock.errors import ConfigError, RestockError, RunError, StoreError
 from restock.ingest.profile.profile import Profile
@@ -60,6 +60,14 @@ class RowDiagnosis:
         }
 
 
+class OpenedRows(NamedTuple):
+    """Rows at hand, and what needs more than them."""
+
+    rows: FedRows
+    profile: Profile
+    comparisons: list[Comparison]  # with the signals of their store
+
+
 def diagnose_before_training(
     path: Path | str,
     *,
@@ -83,17 +91,12 @@ def diagnose_before_training(
         ConfigError: the profile's task is not that of the rows.
     """
     begun = time.perf_counter()
-    rows, own, more = _open(Path(path), profile, task_hash)
-    if own.task.hash != rows.task.hash:
-        raise ConfigError(
-            f"profile {own.name!r} defines task {own.task.hash}, the rows are of {rows.task.hash}",
-            where=str(path),
-            remedy="name the profile that they were ingested with",
-        )
+    opened = open_rows(Path(path), profile, task_hash)
+    own = opened.profile
     fresh, reason = _drive(own, perturbation, seed) if twin else (None, "it was not asked for")
-    diagnosis = diagnose_rows(rows, fresh, reason, seed=seed, more=more)
+    diagnosis = diagnose_rows(opened.rows, fresh, reason, seed=seed, more=opened.comparisons)
     diagnosis.about.update(
-        path=str(path), profile=own.name, task_hash=rows.task.hash,
+        path=str(path), profile=own.name, task_hash=own.task.hash,
         seconds=round(time.perf_counter() - begun, 1),
     )  # fmt: skip
     return diagnosis
@@ -125,24 +128,40 @@ def diagnose_rows(
     return RowDiagnosis(verdict, found, comparisons, about)
 
 
-def _open(
-    path: Path, profile: Profile | None, task_hash: str | None
-) -> tuple[FedRows, Profile, list[Comparison]]:
-    """The rows of a panel or store, the profile, and what the store alone can tell of them."""
+def open_rows(
+    path: Path, profile: Profile | None = None, task_hash: str | None = None
+) -> OpenedRows:
+    """The rows of a panel or a store.
+
+    Raises:
+        as `diagnose_before_training`.
+    """
+    opened = _open(path, profile, task_hash)
+    own, of_rows = opened.profile, opened.rows.task.hash
+    if own.task.hash != of_rows:
+        raise ConfigError(
+            f"profile {own.name!r} defines task {own.task.hash}, the rows are of {of_rows}",
+            where=str(path),
+            remedy="name the profile that they were ingested with",
+        )
+    return opened
+
+
+def _open(path: Path, profile: Profile | None, task_hash: str | None) -> OpenedRows:
     if (path / HEADER).is_file():
         panel = Panel.open(path)
         rows, own = of_panel(panel), profile or profile_of_panel(panel)
         store_path, version = Path(panel.header.store), panel.store_version
         if version < 0 or not is_store(store_path):
             reason = f"the panel's store is not at {store_path} any more"
-            return rows, own, [not_run("labels", "labels by the stored signals", reason)]
+            return OpenedRows(rows, own, [not_run("labels", "labels by stored signals", reason)])
         with Store(store_path, version=version) as store:
-            return rows, own, _of_store(store, rows, own)
+            return OpenedRows(rows, own, _of_store(store, rows, own))
     if is_store(path):
         with Store(path) as store:
             chosen = task_hash or store.task().hash
             rows, own = of_store(store, chosen), profile or _profile_of_store(store, chosen)
-            return rows, own, _of_store(store, rows, own)
+            return OpenedRows(rows, own, _of_store(store, rows, own))
     raise RunError(
         "is neither a panel nor a store" if path.exists() else "no such panel or store",
         where=str(path),
@@ -171,4 +190,11 @@ def _drive(
         return None, f"the twin cannot be driven with this profile: {error.what}"
 
 
-__all__ = ["RowDiagnosis", "Verdict", "diagnose_before_training", "diagnose_rows"]
+__all__ = [
+    "OpenedRows",
+    "RowDiagnosis",
+    "Verdict",
+    "diagnose_before_training",
+    "diagnose_rows",
+    "open_rows",
+]
