@@ -295,14 +295,16 @@ def rewrite(
         manifest = source.live(row["recording_id"])
         target.write(manifest, fault.rows(rows, rng) if fault.rows else rows)
         if rng.random() < fault.again:
-            other = "f" + row["recording_id"][1:]
+            other, copy = ("f" + row[name][1:] for name in ("recording_id", "ingest_id"))
             episodes = [f"{other}/{index}" for index in rows["episode_index"].to_pylist()]
-            ids = rows["transition_id"].to_numpy() ^ (1 << 55)
+            named = {"recording_id": [other], "ingest_id": [copy]}
             copied = with_columns(
-                rows, recording_id=[other] * len(rows), episode_id=episodes, transition_id=ids,
-                ingest_id=["f" * 16] * len(rows),
-            )  # fmt: skip
-            target.write(with_columns(manifest, recording_id=[other], ingest_id=["f" * 16]), copied)
+                rows,
+                **{name: values * len(rows) for name, values in named.items()},
+                episode_id=episodes,
+                transition_id=rows["transition_id"].to_numpy() ^ (1 << 55),
+            )
+            target.write(with_columns(manifest, **named), copied)
 
 
 def outcome(fault: Fault, verdict: str, findings: list[Finding]) -> str:

@@ -21,6 +21,10 @@ from restock.ingest.task.task import Task
 from restock.replay.panel.panel import Panel
 from restock.replay.store.store import Store, passed_in
 
+_COLUMNS = (
+    *("transition_id", "episode_id", "step_index", "recording_id", "condition", "action", "reward"),
+    *("terminated", "truncated", "observation", "next_observation"),
+)
 MOST_ROWS = 40_000  # of a store or panel, in whole episodes chosen by hash
 
 
@@ -116,26 +120,19 @@ def of_panel(panel: Panel, most: int = MOST_ROWS) -> FedRows:
     """The rows of a panel. Those whose next step is not in the panel are left out where its returns
     are of several steps, and counted."""
     meta = panel.meta
-    order, left = _whole_episodes(meta, most)
-    codes, numbers = _codes(meta, order)
+    order = _by_step(meta)
+    counts = np.unique(_text(meta, "episode_id"), return_counts=True)[1]
+    kept = np.repeat(np.isin(np.arange(len(counts)), _some(counts, most)), counts)
+    order = order[kept]
     packed = np.asarray(panel.rows[order])
-    parts = {name: packed[:, where] for name, where in panel.columns.items()}
     rows = FedRows(
         task=panel.task,
-        observation=parts["observation"],
-        next_observation=parts["next_observation"],
-        action=parts["action"][:, 0].astype(np.int64),
-        reward=_numbers(meta, "reward", order).astype(np.float64),
-        terminated=_numbers(meta, "terminated", order).astype(np.bool_),
-        truncated=_numbers(meta, "truncated", order).astype(np.bool_),
-        episode=codes,
-        step=numbers,
-        recording=_text(meta, "recording_id", order),
-        condition=_text(meta, "condition", order),
-        transition_id=_numbers(meta, "transition_id", order).astype(np.int64),
-        left_out=left,
+        observation=packed[:, panel.columns["observation"]],
+        next_observation=packed[:, panel.columns["next_observation"]],
+        left_out=_not_looked_at(int((~kept).sum())),
+        **_columns(meta, order),
     )
-    far = _numbers(meta, "horizon", order) > 1
+    far = _numbers(meta, "horizon")[order] > 1
     return _one_step(rows, np.asarray(far, np.bool_)) if far.any() else rows
 
 
@@ -145,57 +142,61 @@ def of_store(store: Store, task_hash: str, most: int = MOST_ROWS) -> FedRows:
     Raises:
         StoreError: it has none.
     """
-    keys = store.connection.sql(
-        "SELECT transition_id, episode_id, step_index, recording_id, condition FROM transitions"
-        " WHERE task_hash = ?",
+    counted = store.connection.sql(
+        "SELECT episode_id, count(*) AS rows FROM transitions WHERE task_hash = ?"
+        " GROUP BY ALL ORDER BY ALL",
         params=[task_hash],
     ).to_arrow_table()
-    if not len(keys):
+    if not len(counted):
         raise StoreError(f"no transitions of task {task_hash}", where=str(store.path))
-    order, left = _whole_episodes(keys, most)
-    codes, numbers = _codes(keys, order)
-    task = store.task(task_hash)
-    wanted = pa.table({"transition_id": keys["transition_id"].take(pa.array(order)),
-                       "place": np.arange(len(order))})  # fmt: skip
+    counts = counted["rows"].to_numpy()
+    kept = _some(counts, most)
+    wanted = counted.select(["episode_id"]).take(pa.array(kept))
+    names = ", ".join(_COLUMNS)
     with passed_in(store.connection, wanted=wanted):
         table = store.connection.sql(
-            "SELECT observation, next_observation, action, reward, terminated, truncated"
-            " FROM wanted JOIN transitions USING (transition_id) ORDER BY place"
+            f"SELECT {names} FROM transitions SEMI JOIN wanted USING (episode_id)"
+            " WHERE task_hash = $task",
+            params={"task": task_hash},
         ).to_arrow_table()
+    order = _by_step(table)
+    task = store.task(task_hash)
     return FedRows(
         task=task,
-        observation=_vectors(table["observation"], task.observation_size),
-        next_observation=_vectors(table["next_observation"], task.observation_size),
-        action=table["action"].to_numpy().astype(np.int64),
-        reward=table["reward"].to_numpy().astype(np.float64),
-        terminated=table["terminated"].to_numpy().astype(np.bool_),
-        truncated=table["truncated"].to_numpy().astype(np.bool_),
-        episode=codes,
-        step=numbers,
-        recording=_text(keys, "recording_id", order),
-        condition=_text(keys, "condition", order),
-        transition_id=_numbers(keys, "transition_id", order).astype(np.int64),
-        left_out=left,
+        observation=_vectors(table["observation"], task.observation_size)[order],
+        next_observation=_vectors(table["next_observation"], task.observation_size)[order],
+        left_out=_not_looked_at(int(counts.sum()) - len(order)),
+        **_columns(table, order),
     )
 
 
-def _whole_episodes(keys: pa.Table, most: int) -> tuple[Ints, dict[str, int]]:
-    """The rows to read, by episode and step: all, or whole episodes of about `most` rows."""
-    episode = np.unique(_text(keys, "episode_id", None), return_inverse=True)[1].reshape(-1)
-    step = _numbers(keys, "step_index", None)
-    order = np.lexsort((step, episode))
-    if len(order) <= most:
-        return order, {}
-    counts = np.bincount(episode)
+def _some(counts: Ints, most: int) -> Ints:
+    """Which episodes (E,) of so many rows to read: all, or some of about `most` rows."""
     shuffled = np.random.default_rng(0).permutation(len(counts))
-    kept = shuffled[np.cumsum(counts[shuffled]) <= most]
-    inside = np.isin(episode[order], kept)
-    return order[inside], {"more than are looked at, in whole episodes": int((~inside).sum())}
+    return np.sort(shuffled[np.cumsum(counts[shuffled]) <= max(most, counts[shuffled[:1]].sum())])
 
 
-def _codes(keys: pa.Table, order: Ints) -> tuple[Ints, Ints]:
-    episode = np.unique(_text(keys, "episode_id", order), return_inverse=True)[1].reshape(-1)
-    return episode.astype(np.int64), _numbers(keys, "step_index", order).astype(np.int64)
+def _by_step(table: pa.Table) -> Ints:
+    episode = np.unique(_text(table, "episode_id"), return_inverse=True)[1].reshape(-1)
+    return np.lexsort((_numbers(table, "step_index"), episode))
+
+
+def _not_looked_at(rows: int) -> dict[str, int]:
+    return {"more than are looked at, in whole episodes": rows} if rows else {}
+
+
+def _columns(table: pa.Table, order: Ints) -> dict[str, Any]:
+    """What a store and a panel's `meta` have by the same names, as `FedRows` has it."""
+    episode = np.unique(_text(table, "episode_id")[order], return_inverse=True)[1].reshape(-1)
+    kinds: dict[str, Any] = {"action": np.int64, "reward": np.float64, "transition_id": np.int64}
+    kinds |= {"terminated": np.bool_, "truncated": np.bool_}
+    found = {name: _numbers(table, name)[order].astype(kind) for name, kind in kinds.items()}
+    return found | {
+        "episode": episode.astype(np.int64),
+        "step": _numbers(table, "step_index")[order].astype(np.int64),
+        "recording": _text(table, "recording_id")[order],
+        "condition": _text(table, "condition")[order],
+    }
 
 
 def _one_step(rows: FedRows, far: Bools) -> FedRows:
@@ -208,14 +209,14 @@ def _one_step(rows: FedRows, far: Bools) -> FedRows:
     return replace(rows, next_observation=after).take(~lost, **left)
 
 
-def _numbers(table: pa.Table, name: str, order: Ints | None) -> NDArray[Any]:
+def _numbers(table: pa.Table, name: str) -> NDArray[Any]:
     values: NDArray[Any] = table[name].to_numpy()
-    return values if order is None else values[order]
+    return values
 
 
-def _text(table: pa.Table, name: str, order: Ints | None) -> NDArray[np.str_]:
-    values = np.asarray(table[name].cast(pa.string()).fill_null("").to_numpy()).astype(np.str_)
-    return values if order is None else values[order]
+def _text(table: pa.Table, name: str) -> NDArray[np.str_]:
+    values = table[name].cast(pa.string()).fill_null("").to_numpy()
+    return np.asarray(values).astype(np.str_)
 
 
 def _vectors(column: pa.ChunkedArray, size: int) -> F32:

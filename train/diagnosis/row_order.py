@@ -76,13 +76,14 @@ def _still(rows: FedRows) -> Comparison:
 
 
 def _repeated(rows: FedRows) -> Comparison:
-    """Rows of episodes that are another's, byte for byte."""
+    """Rows of episodes that are another's, byte for byte, or steps that are there twice."""
     what = "row is of an episode that is in it under another name too"
     if not len(rows):
         return not_run("repeated episodes", what, "no rows")
     starts = np.append(np.flatnonzero(np.append(True, rows.last[:-1])), len(rows))
     seen: set[int] = set()
-    repeated = 0
+    same_step = (np.diff(rows.episode) == 0) & (np.diff(rows.step) == 0)
+    repeated = int(same_step.sum())
     for begin, end in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
         if end - begin < _FEWEST_STEPS:
             continue
