@@ -53,7 +53,9 @@ MAY_IMPORT = {
         "dqn feed run twin/env twin/floors twin/physics replay/panel replay/ring replay/store"
         " ingest/store ingest/task"
     ),
-    "train/comparison": "train dqn evaluation run replay/fleet replay/panel",
+    "train/comparison": (
+        "train diagnosis dqn evaluation run twin/physics replay/fleet replay/panel"
+    ),
     "train/diagnosis": (
         "feed run twin/calibration twin/env twin/physics replay/panel replay/store ingest/profile"
         " ingest/store ingest/task"

@@ -10,12 +10,18 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from support.paths import ROOT
 from support.stores import TASK, recording_transitions, write_store
 
 from restock.cli import main
+from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.profile_text import profile_toml
-from restock.train.diagnosis.before_training import RowDiagnosis, diagnose_rows
+from restock.ingest.store.transitions import replaced
+from restock.ingest.store.writer import StoreWriter
+from restock.train.comparison.diagnose import Cause, Diagnosis
+from restock.train.comparison.rows_verdict import with_rows
+from restock.train.diagnosis.before_training import RowDiagnosis, diagnose_rows, open_rows
 from restock.train.diagnosis.fed_rows import FedRows
 from restock.train.diagnosis.twin_rows import drive_twin
 
@@ -169,6 +175,45 @@ def test_the_verb_names_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixt
     document = json.loads(capsys.readouterr().out)
     assert document["verdict"] == "BUFFER"
     assert {row["status"] for row in document["comparisons"]} >= {"off", "not run"}
+
+
+def test_labels_and_ends_are_computed_again_from_the_stored_signals(tmp_path: Path) -> None:
+    logs, store = ROOT / "sample_logs/amr_tuesday", StoreWriter(tmp_path / "store")
+    ingest(logs, load_profile("warehouse_amr"), store=store)
+    as_stored = open_rows(tmp_path / "store")
+    compared = {row.check: row for row in as_stored.comparisons}
+    assert len(compared) > 3
+    assert {row.status for row in compared.values()} <= {"ok", "not run"}
+    assert compared["terminations"].status == "ok"
+
+    (row,) = store.live().to_pylist()
+    rows = store.rows(row["recording_id"], row["ingest_id"])
+    given = rows["conditions"].to_pylist()
+    changed = {
+        "conditions": [names or ["blocked_aisle"] for names in given],
+        "terminated": [not ended for ended in rows["terminated"].to_pylist()],
+    }
+    other = StoreWriter(tmp_path / "other")
+    other.write(store.live(row["recording_id"]), replaced(rows, changed))
+    opened = open_rows(tmp_path / "other")
+    off = [row.check for row in opened.comparisons if row.off]
+    assert off == ["labels: blocked_aisle", "terminations"]
+    found = diagnose_rows(opened.rows, None, "there is none", more=opened.comparisons).findings
+    assert {"LABELS_WRONG", "TERMINATIONS_LOST"} <= {one.cause for one in found}
+
+
+@pytest.mark.parametrize(
+    ("of_run", "together"),
+    [("HEALTHY", "BUFFER"), ("TARGET", "BOTH"), ("DIVERGENCE", "DIVERGENCE")],
+)
+def test_a_run_is_judged_with_its_rows(
+    logs: FedRows, twin: FedRows, of_run: Cause, together: Cause
+) -> None:
+    alone = Diagnosis(of_run, [of_run], [], [], ["a figure"], "none needed")
+    assert with_rows(alone, diagnose_rows(logs, twin)) == alone
+    both = with_rows(alone, diagnose_rows(_swapped(logs), twin))
+    assert (both.cause, both.runs) == (together, [of_run])
+    assert both.evidence[-1] == "rows: ACTIONS_MIRRORED: the logs' left is the twin's right"
 
 
 @pytest.mark.parametrize(

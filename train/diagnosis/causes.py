@@ -41,16 +41,20 @@ _KEYS = {  # where a profile says what fills it
     ACCELEROMETER: "[inputs.imu] fields.accel_x_mps2",
 }
 VALUES = "VALUES_UNLIKE_TWIN"
-VALUES_OF = {  # checks of values that follow from what is wrong with an end
-    end: tuple(f"{figure}: {entry}" for figure in ("range", "spread") for entry in entries)
-    for end, entries in {
-        GYROSCOPE: ("gyro_yaw_rate",),
-        WHEEL_SPEED: ("wheel_speed", "accel_x"),
-        "wheels": ("wheel_speed", "accel_x"),
-        POSE: ("localised_speed", "lateral_speed", "goal_distance"),
-        ACCELEROMETER: ("accel_x",),
-        LIDAR: ("clearances",),
-    }.items()
+_ARRIVAL = ("terminated at the goal", "goal reward")
+FOLLOW_FROM = {  # checks that are off because an end is
+    GYROSCOPE: ("range: gyro_yaw_rate", "spread: gyro_yaw_rate"),
+    **dict.fromkeys(
+        (WHEEL_SPEED, "wheels"),
+        ("range: wheel_speed", "spread: wheel_speed", "range: accel_x", "spread: accel_x"),
+    ),
+    POSE: (
+        *("range: localised_speed", "spread: localised_speed", "range: lateral_speed"),
+        *("spread: lateral_speed", "range: goal_distance", "spread: goal_distance", *_ARRIVAL),
+    ),
+    PLAN: ("range: goal_distance", "spread: goal_distance", *_ARRIVAL),
+    ACCELEROMETER: ("range: accel_x", "spread: accel_x"),
+    LIDAR: ("range: clearances", "spread: clearances"),
 }
 _FIRST = ("ROWS_APART", "FUTURE_IN_OBSERVATION")  # nothing can be told of rows before these
 _ON_THEIR_OWN = ("EPISODES_REPEATED", "TERMINATIONS_WRONG")
@@ -93,8 +97,8 @@ def findings(
     if moved and one_to_one and not shifted and (actions or not ends):
         found.append(_permuted(moved, task))
         ends = {end: off for end, off in ends.items() if end not in actions}
-    said = {name for end in ends for name in VALUES_OF.get(end, ())}
-    of_rows = [one for one in of_rows if not (one.cause == VALUES and said & set(one.evidence))]
+    follow = {check for end in ends for check in FOLLOW_FROM.get(end, ())}
+    of_rows = [one for one in of_rows if not set(one.evidence) <= follow]
     return found + [_of_end(end, off, task) for end, off in ends.items()] + of_rows
 
 

@@ -22,7 +22,7 @@ class DiagnoseCommand:
     target network; and what the policy wants with what the logs have of each action. The verdict is
     HEALTHY, BUFFER, ACTION_COVERAGE, TARGET, BOTH, DIVERGENCE or UNDETERMINED, with the evidence
     and the experiment that would confirm it. Figures are of the last three
-    evaluations; most of the runs must agree.
+    evaluations; most of the runs must agree. Rows of the panel at fault make HEALTHY a BUFFER.
 
     With --before-training no run is needed: the rows of a panel or a store are held against fresh
     rows of the twin and against the task's definitions: do actions explain the motion, are rewards
@@ -46,6 +46,8 @@ class DiagnoseCommand:
     is checked."""
     seed: int = 0
     """With --before-training: of the twin's episodes and the bootstrap."""
+    rows: bool = True
+    """Hold the rows of the runs' panel against the twin too: some seconds."""
     check: bool = False
     """Exit 1 unless the verdict is HEALTHY."""
     confirm: Path | None = None
@@ -54,10 +56,11 @@ class DiagnoseCommand:
     """Print the verdict, the evidence and every window as JSON."""
 
     def run(self) -> int:
-        from restock.cli.output import print_json
+        from restock.cli.output import print_json, say
         from restock.errors import ConfigError, ExitCode
         from restock.train.comparison.confirm import confirm
         from restock.train.comparison.diagnose import diagnose
+        from restock.train.comparison.rows_verdict import rows_of, with_rows
         from restock.train.run.run import Run
 
         if self.before_training is not None:
@@ -68,13 +71,20 @@ class DiagnoseCommand:
             )
         runs = [Run.open(path) for path in self.runs]
         diagnosis = diagnose(runs)
+        found, reason = rows_of(runs) if self.rows else (None, "it was not asked for")
+        if found is not None:
+            diagnosis = with_rows(diagnosis, found)
         if not self.json:
             _show(diagnosis, self.runs)
+            if found is None:
+                say(f"the rows of its panel were not held against the twin: {reason}")
         confirmation = (
             confirm(runs[0], diagnosis, self.confirm) if self.confirm is not None else None
         )
         if self.json:
-            print_json(_document(diagnosis, self.runs) | {"confirmation": confirmation})
+            of_rows = None if found is None else found.document()
+            document = _document(diagnosis, self.runs)
+            print_json(document | {"rows": of_rows, "confirmation": confirmation})
         elif confirmation is not None:
             _show_confirmation(confirmation)
         failed = self.check and diagnosis.cause != "HEALTHY"
