@@ -18,6 +18,6 @@ least((room_m + coalesce(lead(room_m, 2) OVER episode, 0.35)) / 2, after_m + 2 *
 coalesce(lead(bumped) OVER episode, false)
 -- label:
 bump
-OR (odds > -0.4 AND max(odds) OVER (episode ROWS BETWEEN 2 PRECEDING AND 2 FOLLOWING) > 0.2)
+OR (odds > -0.8 AND max(odds) OVER (episode ROWS BETWEEN 2 PRECEDING AND 2 FOLLOWING) > 0)
 -- probability:
 CASE WHEN bump THEN 1 ELSE 1 / (1 + exp(-odds)) END
