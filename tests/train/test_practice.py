@@ -26,7 +26,7 @@ from restock.train.feed.collector import EndedEpisode
 from restock.train.feed.practice import Practice, logged_shares, moved, unordered, with_floors
 from restock.train.loop import train
 from restock.train.missions import reference_success
-from restock.train.prepare import make_twin, prepare_new
+from restock.train.prepare import make_twin, prepare_new, prepare_resumed
 from restock.train.run.run import Run
 from restock.train.twin.env.mission_arms import MissionArm
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
@@ -322,6 +322,26 @@ def test_an_order_is_an_arm_and_says_so() -> None:
     twin.set_mission_shares([0, 1])
     _, info = twin.reset(seed=1)
     assert (info["episode_condition"][0], info["mission_arm"][0]) == ("near_collision", 1)
+
+
+@pytest.mark.slow
+def test_a_run_in_the_warehouse_goes_back_and_practises_as_it_did(tmp_path: Path) -> None:
+    settings = [
+        *("env.num_envs=4", "schedule.env_steps=1600", "schedule.warmup_env_steps=200"),
+        *("replay.batch_size=16", "record.checkpoint_every_env_steps=800", "evaluation.episodes=1"),
+        "practice={rule='success', every_env_steps=200, warmup_episodes=1, max_change=0.5}",
+    ]
+    first = prepare_new(tmp_path / "run", None, None, settings).open()
+    train(first)
+    first.close()
+    names = ("practice", "episodes", "evaluations")
+    before = {name: first.run.table(name) for name in names}
+    again = prepare_resumed(tmp_path / "run", [], 800).open()
+    train(again)
+    again.close()
+    assert all(again.run.table(name).equals(table) for name, table in before.items())
+    assert len(set(before["practice"]["wanted_share"].to_pylist())) > 5
+    np.testing.assert_array_equal(first.ring.rows, again.ring.rows)
 
 
 def test_a_reference_drives_the_same_pool_of_every_arm_whatever_the_seed() -> None:
