@@ -1,185 +1,227 @@
-"""The evidence: does coverage-aware replay of rare logs pay off? One command, start to end.
+"""The evidence: does it pay to feed a critic what is rare? One command a question, start to end.
 
-    python benchmarks/evidence.py --out /tmp/evidence [--hours 24] [--workers 2]
+    python benchmarks/evidence.py twin-nominal --out /tmp/evidence [--workers 2] [--quick]
 
-Records hours of the stand-in fleet at natural rates (88 % of missions nominal, 4 % each of wheel
-slip, blocked aisles and near collisions), ingests them, and runs the study of benchmarks/evidence/:
-every arm with every seed at equal environment steps and updates. What is there is not done again.
-The comparisons are in OUT/study/study.md; the tables of docs/evidence.md are printed at the end.
+Questions, each a study of benchmarks/evidence/NAME.toml whose primary contrast was named before its
+runs (docs/evidence.md):
+
+    twin-nominal  the twin cannot make what is rare: quotas, PER, margins, cloning on the logs
+    lead          the same for four times the steps: where the lead of quotas ends
+    ring          a small ring of fresh rows, with and without its reserve
+    practice      the twin can make it: practice by success, quotas on the logs, both, neither
+
+Records what a question needs of the stand-in fleet (a day of hours, and for the first three an
+archive of incident bags) and ingests it, then runs the study. What is there is not done again: the
+same command goes on where it was cut off. Ends in OUT/NAME/study.md. `--quick` has ten minutes of
+logs, two seeds, the two arms of the primary contrast and 2,000 steps: it shows that all of it runs.
 """
 
 from __future__ import annotations
 
 import argparse
-import shutil
+import json
 import subprocess
 import sys
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
-import duckdb
+import msgspec
 import numpy as np
-from harness import markdown, mean_interval, run_restock
+from harness import markdown, run_restock
 
-from restock.cli import main as restock
-from restock.stats import percentiles
-from restock.train.study.study import StudyPlan, load_study
+from restock.cli.output import plain
+from restock.errors import RestockError
+from restock.files import write_text
+from restock.stats import paired_t
+from restock.train.study.contrasts import RunCurve
+from restock.train.study.findings import findings, power_of
+from restock.train.study.page import as_markdown
+from restock.train.study.power import warning
+from restock.train.study.study import DONE, Study, StudyPlan, load_study
+from restock.train.study.study_run import run_study
 
 HERE = Path(__file__).parent / "evidence"
-NATURAL = "nominal=.88,wheel_slip=.04,blocked_aisle=.04,near_collision=.04"
+QUESTIONS = ("twin-nominal", "lead", "ring", "practice")
 RATES = "odom=10,imu=10,scan=5,joint_states=5,amcl_pose=5,tf=5,bumper=5"
-CELLS = ("nominal", "wheel_slip", "partly blocked", "wholly blocked", "near_collision")
-# Of one condition: each counts by half.
-RARE = {"wheel_slip": 2, "partly blocked": 1, "wholly blocked": 1, "near_collision": 2}
-CELL = """CASE WHEN condition <> 'blocked_aisle' THEN condition
-    WHEN block = 'partial' THEN 'partly blocked' ELSE 'wholly blocked' END"""
-RESAMPLES = 4000
+RARE = ("wheel_slip", "blocked_aisle", "near_collision")
+
+
+@dataclass(frozen=True)
+class Logs:
+    """A day of the fleet, at shares of missions, and an archive of incident bags."""
+
+    rare_share: float  # of the missions, each rare kind
+    first_seed: int
+    incidents: int  # missions of each rare kind
+
+    @property
+    def conditions(self) -> str:
+        shares = {"nominal": 1 - len(RARE) * self.rare_share}
+        shares |= dict.fromkeys(RARE, self.rare_share)
+        return ",".join(f"{kind}={share:.4g}" for kind, share in shares.items())
+
+
+LOGS = {"store-rare": Logs(1 / 250, 100, 30), "store-natural": Logs(0.04, 200, 0)}
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
+    parser.add_argument("question", choices=QUESTIONS)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--hours", type=int, default=24, help="one recording each")
+    parser.add_argument("--hours", type=int, default=24, help="of logs, one recording each")
     parser.add_argument("--workers", type=int, default=1, help="recordings, then runs, at a time")
+    parser.add_argument("--quick", action="store_true", help="a tiny one, to see that it runs")
     options = parser.parse_args()
-    logs = options.out / "logs"
-    logs.mkdir(parents=True, exist_ok=True)
-    hours = [(logs / f"hour{hour}.mcap", 100 + hour) for hour in range(1, options.hours + 1)]
-    with ThreadPoolExecutor(options.workers) as pool:
-        list(pool.map(_record, *zip(*hours, strict=True)))
-    if not (options.out / "store").exists():
-        run_restock(["ingest", str(logs), "--store", str(options.out / "store")])
-    for file in HERE.glob("*.toml"):
-        shutil.copy(file, options.out / file.name)
-    study, out = options.out / "study.toml", options.out / "study"
-    code = restock(["study", str(study), "--out", str(out), "--workers", str(options.workers)])
-    plan = StudyPlan(load_study(study), study.parent, out)
-    print(f"\n{ends(plan)}\n\n{curves(plan)}\n\n{leads(plan)}")
-    return code
+    try:
+        return _answer(options)
+    except RestockError as error:
+        print(f"evidence: {error}", file=sys.stderr)
+        return int(error.exit_code)
 
 
-def _record(recording: Path, seed: int) -> None:
+def _answer(options: argparse.Namespace) -> int:
+    study = load_study(HERE / f"{options.question}.toml")
+    hours = 1 if options.quick else options.hours
+    if options.quick:
+        study = quick(study)
+    store = options.out / str(study.store)
+    _make_store(store, LOGS[str(study.store)], hours, options.workers, options.quick)
+    study = msgspec.structs.replace(study, store=str(store.resolve()))
+    plan = StudyPlan(study, HERE, options.out / options.question)
+    power = power_of(plan)
+    if power is not None and power.too_small:
+        _say(warning(power))
+    comparisons = run_study(plan, workers=options.workers, say=_say)
+    found = findings(plan, comparisons)
+    page = f"{as_markdown(found)}\n{curves(plan)}"
+    write_text(plan.out / "study.md", page)
+    write_text(plan.out / "study.json", json.dumps(plain(found), indent=1) + "\n")
+    sys.stdout.write(page)
+    return int(any(comparison.verdict != "comparable" for comparison in comparisons))
+
+
+def quick(study: Study) -> Study:
+    """Two seeds of the primary contrast's arms, for 2,000 steps."""
+    assert study.primary is not None
+    arms = [arm for arm in study.arms if arm.name in study.primary.pair]
+    base = next(arm for arm in arms if arm.name == study.primary.baseline)
+    arms = [
+        msgspec.structs.replace(arm, treatment=None, baseline=None) if arm is base else arm
+        for arm in arms
+    ]
+    settings = json.loads(json.dumps(study.settings))
+    settings["schedule"] |= {"offline_updates": 200, "env_steps": 2_000, "warmup_env_steps": 500}
+    settings["evaluation"] |= {"every_env_steps": 1_000, "episodes": 2}
+    return msgspec.structs.replace(
+        study,
+        arms=tuple(arms),
+        baseline=base.name,
+        seeds=study.seeds[:2],
+        settings=settings,
+        evaluation=msgspec.structs.replace(study.evaluation, episodes=4),
+    )
+
+
+def _make_store(store: Path, logs: Logs, hours: int, workers: int, small: bool) -> None:
+    """Record and ingest what is not there yet."""
+    if store.exists():
+        return
+    folder = store.parent / store.name.replace("store", "logs")
+    folder.mkdir(parents=True, exist_ok=True)
+    asked = [
+        (
+            folder / f"hour{hour:02}.mcap",
+            ["--minutes", "60", "--seed", str(logs.first_seed + hour)],
+            logs.conditions,
+        )
+        for hour in range(1, hours + 1)
+    ]
+    if small:
+        asked = [(path, ["--minutes", "10", *flags[2:]], told) for path, flags, told in asked]
+    incidents = 3 if small and logs.incidents else logs.incidents
+    if incidents:
+        asked += [
+            (
+                folder / f"incidents_{kind}.mcap",
+                [
+                    *("--missions", str(incidents), "--seed", str(logs.first_seed + 50 + number)),
+                    *("--tag", "archive=incidents"),
+                ],
+                f"{kind}=1",
+            )
+            for number, kind in enumerate(RARE)
+        ]
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(lambda one: _record(*one), asked))
+    run_restock(["ingest", str(folder), "--store", str(store)])
+
+
+def _record(recording: Path, flags: list[str], conditions: str) -> None:
     if not recording.exists():
-        flags = ["--minutes", "60", "--seed", str(seed), "--rates", RATES, "--conditions", NATURAL]
+        _say(f"recording {recording.name}")
         command = [sys.executable, "-m", "restock", "record", "--out", str(recording), *flags]
-        subprocess.run(command, check=True)
-
-
-def ends(plan: StudyPlan) -> str:
-    """Success of each arm in each cell on the study's episodes, with 95 % intervals."""
-    weights: list[dict[str, int]] = [{cell: 1} for cell in CELLS] + [RARE]
-    rows = []
-    for arm in plan.study.arms:
-        runs = [_successes(path / "eval" / "episodes.parquet") for path in plan.runs(arm)]
-        if all(runs):
-            rows.append([f"`{arm.name}`", *(_interval(runs, cells) for cells in weights)])
-    return markdown(["", *CELLS, "rare conditions"], rows)
+        command += ["--rates", RATES, "--conditions", conditions]
+        subprocess.run(command, check=True, stdout=sys.stderr)
 
 
 def curves(plan: StudyPlan) -> str:
-    """Success in the rare conditions at each periodic evaluation, the mean over seeds."""
-    by_arm: dict[str, dict[int, float]] = {}
-    for arm in plan.study.arms:
-        by_step: dict[int, list[float]] = {}
-        for path in plan.runs(arm):
-            if not (path / "evaluations.parquet").exists():
-                continue
-            rows = duckdb.sql(
-                f"SELECT env_steps, {CELL} AS cell, avg(success::INT) AS success"
-                " FROM read_parquet(?) GROUP BY ALL",
-                params=[str(path / "evaluations.parquet")],
-            ).fetchall()
-            for step in {row[0] for row in rows}:
-                cells = {cell: success for at, cell, success in rows if at == step}
-                by_step.setdefault(step, []).append(_weighted(cells))
-        by_arm[arm.name] = {step: float(np.mean(values)) for step, values in by_step.items()}
-    steps = sorted({step for curve in by_arm.values() for step in curve if step % 1000 == 0})
-    return _by_steps(steps, {name: _formatted(curve) for name, curve in by_arm.items()})
-
-
-def leads(plan: StudyPlan) -> str:
-    """How far each arm is ahead of the baseline in the rare conditions, paired, by steps."""
-    base = [_rare_episodes(path) for path in plan.runs(plan.study.base)]
-    if not all(base):
-        return ""
-    steps = sorted(set.intersection(*map(set, base)))
-    by_arm: dict[str, dict[int, str]] = {}
-    for arm in plan.study.arms:
-        runs = [_rare_episodes(path) for path in plan.runs(arm)]
-        evaluated = [step for step in steps if all(step in run for run in runs)]
-        if arm == plan.study.base or len(evaluated) < 2:
-            continue
-        pairs = list(zip(runs, base, strict=True))
-        by_arm[arm.name] = {
-            step: _lead(np.array([run[step] - other[step] for run, other in pairs]))
-            for step in evaluated
+    """Success in the rare conditions at each periodic evaluation, the mean over seeds; and how far
+    each arm is ahead of its baseline there, paired by seed."""
+    runs = {
+        arm.name: [
+            RunCurve(path, plan.study.rare) if (path / DONE).exists() else None
+            for path in plan.runs(arm)
+        ]
+        for arm in plan.study.arms
+    }
+    of = {
+        name: [{} if run is None else run.curve("rare") for run in own]
+        for name, own in runs.items()
+    }
+    steps = sorted({step for own in of.values() for curve in own for step in curve})
+    levels = {
+        name: {
+            step: f"{np.mean([curve[step] for curve in own if step in curve]):.2f}"
+            for step in steps
+            if any(step in curve for curve in own)
         }
-    return _by_steps(steps, by_arm)
-
-
-def _formatted(curve: dict[int, float]) -> dict[int, str]:
-    return {step: f"{success:.2f}" for step, success in curve.items()}
-
-
-def _by_steps(steps: list[int], by_arm: dict[str, dict[int, str]]) -> str:
-    rows = [[f"`{name}`", *(at.get(step, "") for step in steps)] for name, at in by_arm.items()]
-    return markdown(["steps", *(f"{step:,}" for step in steps)], rows)
-
-
-def _rare_episodes(path: Path) -> dict[int, np.ndarray]:
-    """0 or 1 of each rare episode of a run's periodic evaluations, by environment steps."""
-    rows = duckdb.sql(
-        "SELECT env_steps, list(success::INT ORDER BY condition, episode_seed)"
-        " FROM read_parquet(?) WHERE condition <> 'nominal' GROUP BY ALL",
-        params=[str(path / "evaluations.parquet")],
-    ).fetchall()
-    return {step: np.array(values, np.float64) for step, values in rows}
-
-
-def _lead(ahead: np.ndarray) -> str:
-    """The mean of (runs, episodes), and 95 % of it with both drawn again."""
-    low, high = mean_interval(ahead, np.random.default_rng(0), RESAMPLES)
-    return f"{ahead.mean():+.2f} [{low:+.2f}, {high:+.2f}]"
-
-
-def _successes(path: Path) -> dict[str, np.ndarray]:
-    """0 or 1 of each episode of a run, by cell, in the order of the episodes' seeds."""
-    if not path.exists():
-        return {}
-    rows = duckdb.sql(
-        f"SELECT {CELL} AS cell, list(success::INT ORDER BY episode_seed)"
-        " FROM read_parquet(?) GROUP BY ALL",
-        params=[str(path)],
-    ).fetchall()
-    return {cell: np.array(values, np.float64) for cell, values in rows}
-
-
-def _weighted(success: dict[str, float], weights: dict[str, int] = RARE) -> float:
-    known = {cell: weight for cell, weight in weights.items() if cell in success}
-    return sum(success[cell] * weight for cell, weight in known.items()) / sum(known.values())
-
-
-def _interval(runs: Sequence[dict[str, np.ndarray]], weights: dict[str, int]) -> str:
-    """The mean over runs, and 95 % of its values with runs and episodes drawn again: all
-    runs drove the same ones."""
-    rng = np.random.default_rng(0)
-    cells = {cell: np.stack([run[cell] for run in runs]) for cell in weights}  # (runs, episodes)
-    means = []
-    for _ in range(RESAMPLES):
-        chosen = rng.integers(len(runs), size=len(runs))
-        drawn = {
-            cell: float(
-                values[chosen][:, rng.integers(values.shape[1], size=values.shape[1])].mean()
+        for name, own in of.items()
+    }
+    leads = {
+        f"{pair.arm.name} against {pair.baseline.name}": {
+            step: _lead(
+                [
+                    one[step] - other[step]
+                    for one, other in zip(of[pair.arm.name], of[pair.baseline.name], strict=True)
+                    if step in one and step in other
+                ]
             )
-            for cell, values in cells.items()
+            for step in steps
         }
-        means.append(_weighted(drawn, weights))
-    centre = _weighted({cell: float(values.mean()) for cell, values in cells.items()}, weights)
-    low, high = percentiles(np.array(means))
-    return f"{centre:.2f} [{low:.2f}, {high:.2f}]"
+        for pair in plan.study.pairs
+    }
+    lines = ["## Success in the rare conditions on the way", "", _by_steps(steps, levels), ""]
+    return "\n".join([*lines, "How far each is ahead:", "", _by_steps(steps, leads), ""])
+
+
+def _lead(ahead: list[float]) -> str:
+    if not ahead:
+        return ""
+    found, _ = paired_t(np.array(ahead))
+    ends = "" if np.isnan(found.low) else f" [{found.low:+.2f}, {found.high:+.2f}]"
+    return f"{found.value:+.2f}{ends}"
+
+
+def _by_steps(steps: list[int], rows: dict[str, dict[int, str]]) -> str:
+    table = [[name, *(at.get(step, "") for step in steps)] for name, at in rows.items()]
+    return markdown(["steps", *(f"{step:,}" for step in steps)], table)
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

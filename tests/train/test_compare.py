@@ -111,6 +111,20 @@ def test_even_mixtures_need_one_store_and_one_evaluation(tmp_path, capsys, chang
     assert (code, found["refused"]) == (1, [next(iter(changes)).replace("__", ".")])
 
 
+def test_replay_and_practice_may_differ_together_where_the_data_are_the_treatment(
+    tmp_path, capsys
+) -> None:
+    first = arm(tmp_path, "a", range(3))
+    second = arm(tmp_path, "b", range(3), slip_share=0.15, config__practice__rule="even")
+    for treatment in ("mixture", "practice"):
+        code, _ = compared(capsys, first, second, "--treatment", treatment)
+        assert code == 1
+    code, found = compared(capsys, first, second, "--treatment", "data")
+    assert (code, found["verdict"]) == (0, "comparable")
+    third = arm(tmp_path, "c", range(3), config__loss__margin=0.5)
+    assert compared(capsys, first, third, "--treatment", "data")[0] == 1
+
+
 def test_online_only_is_a_mixture_without_logs(tmp_path, capsys) -> None:
     first = arm(tmp_path, "a", range(1))
     second = [str(make_run(tmp_path / "b", document(1, panel=None)))]

@@ -114,9 +114,11 @@ def test_a_study_names_its_primary_contrast_and_adjusts_the_others(tmp_path: Pat
     assert (first.primary, first.measure, first.pairs) == (True, "auc_wheel_slip", 4)
     assert first.difference == pytest.approx(0.15)
     assert first.low is not None
+    assert first.high is not None
     assert first.low < 0.15 < first.high
     assert first.p_holm is None
     assert [one.measure for one in others] == ["auc_rare", "auc_nominal"]  # nothing at the end
+    assert others[0].p is not None
     assert others[0].p_holm == pytest.approx(2 * others[0].p)
     assert (others[1].difference, others[1].p_holm) == (0.0, 1.0)
     assert contrasts(plan, {("quotas", "uniform")}) == []  # refused
@@ -183,7 +185,7 @@ def test_power_needs_a_contrast_and_a_spread(
 
 
 def driven(policy: str, success: float, time_s: float) -> pa.Table:
-    rows = []
+    rows: list[dict[str, object]] = []
     for condition, block in (("nominal", "none"), ("wheel_slip", "none")):
         for number in range(20):
             row = dict.fromkeys(EVAL_EPISODES.names)

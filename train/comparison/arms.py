@@ -21,7 +21,7 @@ from restock.errors import RunError
 from restock.train.comparison.comparability import Feed
 from restock.train.run.run import Run
 
-Treatment = Literal["algorithm", "target", "mixture", "practice", "method"]
+Treatment = Literal["algorithm", "target", "mixture", "practice", "data", "method"]
 Kind = Literal[
     "algorithm",
     "target",
@@ -41,6 +41,7 @@ ALLOWED: Mapping[Treatment, frozenset[Kind]] = {
     "target": frozenset({"target"}),
     "mixture": frozenset({"feed", "environment"}),
     "practice": frozenset({"practice"}),
+    "data": frozenset({"feed", "environment", "practice"}),  # all that is learnt from
     # Off-policy and policy-gradient methods have no replay in common: what is held is the twin,
     # its conditions, the environment steps and the evaluation.
     "method": frozenset({"algorithm", "target", "feed"}),

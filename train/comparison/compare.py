@@ -116,7 +116,7 @@ def _deciding(treatment: Treatment, totals: list[Check], checks: list[Check]) ->
         return [check for check in totals if check.name == "env steps"]
     if treatment == "practice":  # fresh rows are of what was practised; the logs' must be the same
         return totals + [check for check in checks if " logs/" in check.name]
-    return totals + ([] if treatment == "mixture" else checks)
+    return totals + ([] if treatment in ("mixture", "data") else checks)
 
 
 def _total(name: str, first: float, second: float) -> Check:

@@ -82,8 +82,11 @@ class RunCurve:
         kind, _, what = measure.partition("_")
         if kind == "success":
             return self._of(self.end, what)
-        curve = np.array([self._of(self._at[step], what) for step in self.steps.tolist()])
-        return area(self.steps, curve, reach)
+        return area(self.steps, np.array(list(self.curve(what).values())), reach)
+
+    def curve(self, what: str) -> dict[int, float]:
+        """Success at each periodic evaluation, by environment steps in their order."""
+        return {step: self._of(self._at[step], what) for step in self.steps.tolist()}
 
     def _of(self, success: Mapping[tuple[str, str], float], what: str) -> float:
         if what == "rare":

@@ -7,6 +7,7 @@ there are at least `LEAST_PAIRS` of both arms, else from the pilots that the stu
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from dataclasses import asdict, dataclass
 from typing import Annotated, Any
 
@@ -86,10 +87,9 @@ def least_effect(sd: float, seeds: int) -> float:
 
 def seeds_needed(effect: float, sd: float) -> int | None:
     """The fewest seeds that find an effect with a probability of `ENOUGH`."""
-    for seeds in range(2, MOST_SEEDS + 1):
-        if paired_t_power(effect, sd, seeds) >= ENOUGH:
-            return seeds
-    return None
+    tried = range(2, MOST_SEEDS + 1)
+    place = bisect_left(tried, ENOUGH, key=lambda seeds: paired_t_power(effect, sd, seeds))
+    return tried[place] if place < len(tried) else None
 
 
 def warning(power: Power) -> str:

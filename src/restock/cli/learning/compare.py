@@ -35,7 +35,7 @@ class CompareCommand:
     """Two runs; or, with --against, all runs (seeds) of the first method."""
     against: tuple[Path, ...] = ()
     """The runs of the second method."""
-    treatment: Literal["algorithm", "target", "mixture", "practice", "method"] = "algorithm"
+    treatment: Literal["algorithm", "target", "mixture", "practice", "data", "method"] = "algorithm"
     """What is compared, and so may differ."""
     all_checks: bool = False
     """Show every check, not only the deciding ones."""
@@ -85,6 +85,7 @@ def _show(comparison: Comparison, all_checks: bool) -> None:
         treated = {
             "mixture": " (the treatment: shown, not compared)",
             "method": " (the treatment: shown, not compared)",
+            "data": " (the treatment: shown, not compared)",
             "practice": " (of fresh rows it is the treatment: shown, not compared)",
         }.get(comparison.treatment, "")
         print_table([_check(check) for check in shown], title=f"what was fed{treated}")
