@@ -69,6 +69,7 @@ def restock(steps: int, seed: int, *, layer_norm: bool) -> Stretch:
                 f"schedule.env_steps={10 * (WARMUP + steps)}",
                 f"schedule.warmup_env_steps={WARMUP}",
                 f"schedule.updates_per_env_step={UPDATES_PER_STEP}",
+                "teacher.source=none",  # its peers have none
                 f"evaluation.every_env_steps={100 * (WARMUP + steps)}",
                 f"record.checkpoint_every_env_steps={100 * (WARMUP + steps)}",
             ],

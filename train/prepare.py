@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -117,6 +118,7 @@ class Prepared:
                 if (chosen := self.document.get("ring_capacity"))
                 else ""
             )
+            + _describe_teacher(config, self.panel)
             + "".join(
                 f"\ncondition {name!r} is not evaluated in the twin, which has no"
                 f" {', '.join(signals)}: its stratum is of logs alone"
@@ -203,7 +205,8 @@ def prepare_new(
         profile = load_profile(config.profile)
     panel = open_panel(panel_path, config, profile) if panel_path is not None else None
     check_missions(config, profile, panel)
-    refuse_nothing_to_learn(config.teacher, None if panel is None else _policies(panel))
+    config = _resolve_teacher(config, profile)
+    refuse_nothing_to_learn(config.teacher, None if panel is None else sorted(_policies(panel)))
     config, ring = resolve_ring_capacity(resolve_config(config, panel), panel)
     written = _document(config, profile, panel)
     if ring is not None:
@@ -243,15 +246,6 @@ def prepare_resumed(
                 where=str(path),
                 remedy="put the old panel back, or start a new run",
             )
-    began = stored.get("teacher", {}).get("source", "none")
-    if config.teacher.filters != (began != "none"):
-        raise RunError(
-            f"was begun with teacher.source = {began!r}, not"
-            f" {config.teacher.source!r}: its checkpoint has"
-            f" {'no' if config.teacher.filters else 'a'} behaviour network",
-            where=str(path),
-            remedy="leave teacher.source as it is, or start a new run",
-        )
     if from_env_steps is not None:
         check_earlier(run.latest, from_env_steps)
     return Prepared(path, config, profile, panel, run.document, run, from_env_steps)
@@ -348,9 +342,33 @@ def _logs(panel: Panel, config: TrainConfig, document: dict[str, Any]) -> Logs:
     )
 
 
-def _policies(panel: Panel) -> list[str]:
-    """The behaviour policies of a panel's rows."""
-    return sorted({name for name in panel.meta_column("behaviour_policy").tolist() if name})
+def _resolve_teacher(config: TrainConfig, profile: Profile) -> TrainConfig:
+    """What the config leaves open: the operator drives to goals; where there are none, nobody."""
+    teacher = config.teacher
+    if teacher.source is None:
+        soft = config.loss.munchausen > 0 and teacher.target == "filtered"
+        source = "operator" if profile.task.goal == "route" and not soft else "none"
+        teacher = msgspec.structs.replace(teacher, source=source)
+    if teacher.offline_updates is None:
+        count = config.schedule.offline_updates
+        teacher = msgspec.structs.replace(teacher, offline_updates=count)
+    return msgspec.structs.replace(config, teacher=teacher)
+
+
+def _policies(panel: Panel) -> Counter[str]:
+    """Rows by behaviour policy."""
+    return Counter(name for name in panel.meta_column("behaviour_policy").tolist() if name)
+
+
+def _describe_teacher(config: TrainConfig, panel: Panel | None) -> str:
+    teacher = config.teacher
+    if not teacher.filters:
+        return ""
+    rows = 0 if panel is None else sum(_policies(panel)[name] for name in teacher.policies)
+    cloned = f"{rows:,} logged rows of {', '.join(teacher.policies)} are cloned first"
+    return f"\nteacher {teacher.source}: Q chooses among what is plausible to it; " + (
+        cloned if rows else "no logged rows to clone, so at first everything is"
+    )
 
 
 def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dict[str, Any]:

@@ -13,12 +13,14 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from support.paths import ROOT
 from support.toy_run import assert_same_run, config, logs, run_to_end, session
 from support.toy_twin import CELLS, TASK
 from torch import Tensor, tensor
 
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
+from restock.replay.mixture.schedules import Linear
 from restock.report.card import as_markdown, replay_card
 from restock.report.facts import Facts
 from restock.state import restored, saved
@@ -38,6 +40,7 @@ from restock.train.dqn.learner import Learner, greedy_actions
 from restock.train.dqn.loss import quantile_target, td_target
 from restock.train.feed.teacher import open_teacher
 from restock.train.loop import TrainingInterrupted, train
+from restock.train.prepare import prepare_new
 from restock.train.prepare import train as train_new
 from restock.train.run import checkpoint
 from restock.train.run.run import Run
@@ -447,3 +450,24 @@ def test_what_cannot_teach_is_refused_before_anything_is_written(tmp_path: Path)
     with pytest.raises(ConfigError, match="this run has no logs"):
         train_new(out=out, settings=["teacher.source=logs"])
     assert not out.exists()
+
+
+def test_the_operator_teaches_where_there_is_a_goal(tmp_path: Path) -> None:
+    def source(*settings: str) -> str | None:
+        return prepare_new(tmp_path / "run", None, None, settings).config.teacher.source
+
+    assert source() == "operator"
+    assert source("teacher.source=none") == "none"
+    assert source("loss.munchausen=0.9") == "none"
+    text = (ROOT / "ingest/profile/profiles/warehouse_amr.toml").read_text("utf-8")
+    aimless = tmp_path / "aimless.toml"
+    aimless.write_text(text.replace('goal = "route"', 'goal = "none"'))
+    assert source(f"profile={aimless}") == "none"
+    loosened = prepare_new(
+        tmp_path / "run",
+        None,
+        None,
+        ['teacher.ratio={schedule = "linear", start = 0.3, end = 0.1, to_env_steps = 9}'],
+    )
+    assert loosened.config.teacher.ratio == Linear(0.3, 0.1, 9)
+    assert "teacher operator: Q chooses among what is plausible to it" in loosened.describe()

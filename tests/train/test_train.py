@@ -347,7 +347,7 @@ def test_the_docs_list_every_key_of_the_config_and_no_other() -> None:
     def keys(values: dict[str, object], prefix: str = "") -> set[str]:
         found = set()
         for name, value in values.items():
-            nested = isinstance(value, dict) and name != "conditions"
+            nested = isinstance(value, dict) and value and name != "conditions"
             found |= keys(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}"}  # type: ignore[arg-type]
         return found
 

@@ -179,23 +179,20 @@ class Behaviour(Stateful):
     def in_force(self, ratio: float) -> None:
         self.ratio.fill_(ratio)
 
-    def learn(self, labelled: Labelled) -> Tensor:
-        """One gradient step; the loss () before it."""
-        action = labelled.action
+    def learn(self, labelled: Labelled) -> None:
+        """One gradient step."""
         if self._by_hand is not None:
             (logits,) = self._by_hand.forward(labelled.observation)
-            loss = imitation_loss(logits, action)
-            self._by_hand.backward(imitation_gradient(logits, action))
+            self._by_hand.backward(imitation_gradient(logits, labelled.action))
         else:
-            loss = imitation_loss(self.network(labelled.observation), action)
             self.optimizer.gradient.zero_()
+            loss = imitation_loss(self.network(labelled.observation), labelled.action)
             loss.backward()  # type: ignore[no-untyped-call]
         self.optimizer.step()
         self.updates += 1
         with torch.no_grad():
             rate = max(self._averaging, 1.0 / self.updates)
             self._slow.lerp_(self.optimizer.values, rate)
-        return loss.detach()
 
     @torch.no_grad()
     def plausible(self, observation: Tensor) -> Tensor:

@@ -97,7 +97,7 @@ class ScheduleConfig(Checked, frozen=True):
     seconds: Positive | None = None  # stop earlier, after this much training time
     offline_updates: NonNegativeInt = 2_000  # on the panel alone, before the first environment step
     warmup_env_steps: NonNegativeInt = 2_000  # rollouts before the first online update
-    updates_per_env_step: Positive = 0.125
+    updates_per_env_step: Positive = 0.25
 
 
 class JumpStartConfig(Checked, frozen=True):
@@ -115,29 +115,31 @@ class JumpStartConfig(Checked, frozen=True):
 class TeacherConfig(Checked, frozen=True):
     """Who says what it would do where the agent is, and how far Q may go from that."""
 
-    # operator: the twin's; logs: rows of `policies` alone; none; or your own, as module:name
-    source: str = "none"
+    # operator: the twin's; logs: rows of `policies` alone; none; or your own, as module:name.
+    # None: the operator where the task has a goal, else none.
+    source: str | None = None
     ratio: Portion = 0.3  # plausible: G(a|s) >= ratio * max G; a number, or a schedule
     target: Literal["filtered", "all"] = "filtered"  # actions that the target's maximum looks at
     policies: tuple[str, ...] = ("operator",)  # behaviour policies whose logged rows are cloned
     logs_share: Share = 0.25  # of the behaviour network's online batch, where there are such rows
-    offline_updates: NonNegativeInt = 2_000  # of it on those rows, before any of the critic's
+    # Of it on those rows, before any of the critic's; None: as many as the critic's will be.
+    offline_updates: NonNegativeInt | None = None
     learning_rate: Positive = 1e-3
     hidden: tuple[Count, ...] = (256, 256)  # widths of the behaviour network
 
     @property
     def filters(self) -> bool:
         """Whether there is a behaviour network."""
-        return self.source != "none"
+        return self.source not in (None, "none")
 
     @property
     def asks(self) -> bool:
         """Whether somebody is asked in the twin."""
-        return self.source not in ("none", "logs")
+        return self.source not in (None, "none", "logs")
 
     def check(self) -> None:
-        named = ("none", "logs", "operator", GIVEN)
-        if self.source not in named and not re.fullmatch(r"[\w.]+:\w+", self.source):
+        named = (None, "none", "logs", "operator", GIVEN)
+        if self.source not in named and not re.fullmatch(r"[\w.]+:\w+", str(self.source)):
             raise ValueError(
                 "source must be none, operator, logs, or your own teacher as module:name,"
                 f" got {self.source!r}"
@@ -155,7 +157,7 @@ class OfflineStartConfig(Checked, frozen=True):
 
 
 class EnvConfig(Checked, frozen=True):
-    num_envs: Count = 16
+    num_envs: Count = 32
     # Shares of true conditions among the episodes of the twin.
     conditions: dict[str, NonNegative] = msgspec.field(
         default_factory=lambda: dict(DEFAULT_CONDITIONS)

@@ -57,7 +57,7 @@ class Imitation(Stateful):
         if not len(self.cloned):
             names = None if logs is None else logs.behaviour_policy.names[:-1]  # the last: unknown
             refuse_nothing_to_learn(config, names)
-        self.offline_updates = config.offline_updates if len(self.cloned) else 0
+        self.offline_updates = (config.offline_updates or 0) if len(self.cloned) else 0
         self._logged = 0  # of an online batch
         if len(self.cloned):
             self._logged = round(batch_size * config.logs_share) if config.asks else batch_size

@@ -50,9 +50,7 @@ class OperatorTeacher(Stateful):
         Raises:
             ConfigError: the environment is not the warehouse twin.
         """
-        from restock.train.twin.env.vector_env import WarehouseVectorEnv
-
-        if not isinstance(env, WarehouseVectorEnv):
+        if not (hasattr(env, "simulation") and hasattr(env, "navigation")):  # what it looks at
             raise ConfigError(
                 f'teacher.source = "operator" reads the warehouse twin, this is a'
                 f" {type(env).__name__}",
@@ -132,7 +130,7 @@ def open_teacher(
     Raises:
         ConfigError: no such module or name, or nothing that can be asked.
     """
-    if not config.asks:
+    if config.source is None or not config.asks:
         return None
     if config.source == "operator":
         return AskedTeacher(OperatorTeacher(seed), task, config.source)
@@ -158,7 +156,7 @@ def _imported(source: str) -> Any:
         raise ConfigError(
             "the run's teacher was passed in by Python, and none is here",
             where="teacher.source",
-            remedy="name it: --set teacher.source=module:name",
+            remedy="begin a run that names it as module:name, to be able to go on with it",
         )
     module, _, name = source.partition(":")
     here = str(Path.cwd())

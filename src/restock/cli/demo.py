@@ -133,10 +133,12 @@ def stages(logs: Path, out: Path, seconds: float, episodes: int, device: str) ->
         Stage(
             "Train: first on the panel, then online in the twin",
             f"About {seconds:.0f} s of double DQN. Half of each batch comes from the logs by"
-            " quotas, half is fresh. Every row the critic is fed is recorded.",
+            " quotas, half is fresh, of missions that go wrong more often. Q chooses among what"
+            " the twin's operator finds plausible. Every row the critic is fed is recorded.",
             [
                 *("train", "--panel", str(panel), "--out", str(run)),
                 *("--seconds", f"{seconds:g}", "--device", device),
+                *("--set", "practice.rule=success"),
             ],
         ),
         Stage(
