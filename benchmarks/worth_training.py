@@ -51,7 +51,6 @@ AGENTS: dict[str, list[str]] = {
     "agent, nominal only": ["env.conditions={nominal=1.0}"],
 }
 SETTINGS = [
-    "loss.discount=0.99",  # patience: what a careful second costs is little beside a bump
     "evaluation.every_env_steps=20000",
     "record.tensorboard=false",
 ]

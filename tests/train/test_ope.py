@@ -98,19 +98,25 @@ def test_without_a_panel_half_the_episodes_are_evaluated_on(store: Path) -> None
     assert "no panel" in dataset.notes[0]
 
 
-def test_success_is_arriving_before_any_contact(store: Path) -> None:
-    with Store(store) as opened:
+def test_success_is_arriving_before_any_contact(tmp_path: Path) -> None:
+    table = recording_transitions(1)
+    stops = table["terminated"].to_numpy() & (table["episode_index"].to_numpy() % 3 == 0)
+    reward = pa.array(np.where(stops, np.float32(-6), table["reward"].to_numpy()))
+    place = table.schema.get_field_index("reward")
+    table = table.set_column(place, table.schema.field(place), reward)
+    with Store(write_store(tmp_path / "store", [table])) as opened:
         ids = opened.sql("SELECT transition_id FROM transitions").fetchnumpy()["transition_id"]
         steps = read_steps(opened.connection, np.asarray(ids, np.int64))
         rows = opened.sql(
-            "SELECT episode_id, step_index, bumped, terminated FROM transitions"
+            "SELECT episode_id, step_index, bumped, terminated, reward FROM transitions"
             " ORDER BY recording_id, episode_index, step_index"
         ).fetchall()
     expected, ends = [], []
     for name in dict.fromkeys(row[0] for row in rows):
         episode = [row for row in rows if row[0] == name]
-        # The contact of a step is what the bumper says at the next one.
-        bumps = [any_after[2] for any_after in episode[1:]] + [False]
+        # The contact of a step is what the bumper says at the next one, or what ended the episode.
+        bumps = [any_after[2] for any_after in episode[1:]]
+        bumps.append(episode[-1][3] and episode[-1][4] < TASK.rewards.goal / 2)
         until = bumps.index(True) if True in bumps else len(episode) - 1
         arrived = episode[until][3] and not bumps[until]
         expected.append([0.0] * until + [float(arrived)])
@@ -120,6 +126,7 @@ def test_success_is_arriving_before_any_contact(store: Path) -> None:
         measured.rows.reward[measured.episode == index] for index in np.unique(measured.episode)
     ]
     assert [part.tolist() for part in found] == expected
+    assert stops.any()
     last = np.flatnonzero(np.diff(measured.episode, append=-1))
     assert measured.rows.terminated[last].tolist() == ends
     assert measured.rows.terminated.sum() == sum(ends)

@@ -71,13 +71,17 @@ def carried_profile(
     Raises:
         error: neither has this task.
     """
-    problem = ""
+    problem, remedy = "", f"give the file of the profile that its logs were ingested with: {option}"
     if text:
         try:
             own = read_profile_toml(text, where=where)
             if own.task.hash == task_hash:
                 return own
-            problem = f"; the profile that it carries defines {own.task.hash} now"
+            problem = f"; by this Restock the profile that it carries defines {own.task.hash}"
+            remedy = (
+                "observation or reward have another meaning since: ingest its recordings again"
+                " (`restock ingest RECORDINGS --store STORE`), and mix again"
+            )
         except ConfigError as refused:
             problem = f"; the profile that it carries cannot be read: {refused.what}"
     fitting = [p for p in map(load_profile, shipped_profiles()) if p.task.hash == task_hash]
@@ -87,7 +91,6 @@ def carried_profile(
             + (f", of profile {name!r}" if name else "")
             + f": no profile that comes with Restock has it{problem}",
             where=where,
-            remedy="give the file of the profile that its logs were ingested with:"
-            f" {option}; if that changed since, ingest and mix again",
+            remedy=remedy,
         )
     return next((profile for profile in fitting if profile.name == name), fitting[0])

@@ -1,5 +1,5 @@
 -- severity: error
--- advice: Observations, actions and rewards mean different things here: use one store per task, or choose one in the mixture's `where`.
+-- advice: Observations, actions and rewards mean different things here: ingest the recordings of the older one again (`restock ingest`; labels can be made anew in place, rewards cannot), or choose one in the mixture's `where`.
 -- doc: Rows made by more than one definition of the task.
 SELECT task_hash, count(*) AS rows, count(DISTINCT recording_id) AS recordings
 FROM transitions
