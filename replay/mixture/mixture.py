@@ -43,6 +43,7 @@ Unit = Literal["step", "episode"]
 Uncertain = Literal["drop", "keep", "nominal"]
 Prefer = Literal["rarest", "priority"]
 Within = Literal["uniform", "without_replacement", "per", "lap"]
+Represents = Literal["natural", "archive"] | dict[str, Fraction]  # rates of rows, by stratum
 
 
 class OtherStore(Checked, frozen=True):
@@ -52,8 +53,11 @@ class OtherStore(Checked, frozen=True):
     path: str  # as it is, or from the folder of the mixture's file
     share: Portion  # of a batch
     version: int | None = None  # of the store; the newest, which the panel then pins
+    # What its rows stand for: how often things occur, the main store's rates, or these.
+    represents: Represents | None = None
 
     def check(self) -> None:
+        _check_rates(self.represents)
         _require(bool(self.name) and "/" not in self.name, f"no name for a store: {self.name!r}")
         _require(
             self.name not in ("logs", "fresh"), f"a store cannot be called {self.name!r}: taken"
@@ -66,8 +70,15 @@ class SourceShares(Checked, frozen=True):
     logs: Portion = 0.5
     fresh: Fraction | None = None  # default: what logs and stores leave, at every step
     stores: tuple[OtherStore, ...] = ()
+    represents: Represents | None = None  # what the main store's rows stand for: rates, if chosen
 
     def check(self) -> None:
+        _check_rates(self.represents)
+        _require(
+            self.represents != "archive",
+            'sources.represents: an "archive" stands for the main store\'s rates, and this is it:'
+            " give the rates as a table",
+        )
         portions = [self.logs, *(store.share for store in self.stores)]
         names = [store.name for store in self.stores]
         _require(len(set(names)) == len(names), f"stores named twice: {sorted(names)}")
@@ -100,9 +111,23 @@ class SourceShares(Checked, frozen=True):
         return {"logs": self.logs, **{store.name: store.share for store in self.stores}}
 
     @property
+    def said(self) -> dict[str, Represents | None]:
+        """What the rows of each source that is not fresh stand for; None: it does not say."""
+        return {"logs": self.represents, **{store.name: store.represents for store in self.stores}}
+
+    def chosen(self, name: str) -> bool:
+        """Whether a source's rows stand for other rates than their own."""
+        return self.said[name] not in (None, "natural")
+
+    @property
     def last_bend(self) -> int:
         """The environment step at which the last schedule ends, 0 without one."""
         return max((step for part in self.parts.values() for step in knots(part)), default=0)
+
+
+def _check_rates(represents: Represents | None) -> None:
+    total = sum(represents.values()) if isinstance(represents, dict) else 0.0
+    _require(total <= 1 + 1e-6, f"the rates of `represents` sum to {total:g}, above 1")
 
 
 def _require(ok: bool, message: str) -> None:

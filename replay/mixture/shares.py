@@ -31,15 +31,17 @@ def plan_shares(
     *,
     draws: float,
     env_steps: float = 0,
+    natural: F64 | None = None,
 ) -> SharePlan:
     """Shares from the mixture's rules and how many rows (S,) and episodes (S,) there are.
 
-    `draws` is how many rows will be drawn in all, `env_steps` when, for shares with a schedule.
+    `draws` is how many rows will be drawn in all, `env_steps` when, for shares with a schedule,
+    `natural` (S,) the shares that the rows stand for, where that is not their own.
 
     Raises:
         MixtureError: shares that cannot sum to 1, or a shortfall where the mixture refuses one.
     """
-    wanted = wanted_shares(rules, rows, env_steps)
+    wanted = wanted_shares(rules, rows if natural is None else natural, env_steps)
     limit = row_limits(mixture, rules, rows, episodes, draws)
     caps = np.array([rule.cap for rule in rules])
 
@@ -94,8 +96,10 @@ def within_limits(
     return SharePlan(wanted, got, 1.0, tuple(np.where(more, "took the surplus", notes).tolist()))
 
 
-def wanted_shares(rules: Sequence[StratumRule], rows: Ints, env_steps: float = 0) -> F64:
+def wanted_shares(rules: Sequence[StratumRule], rows: Ints | F64, env_steps: float = 0) -> F64:
     """Given shares as they are; the rest to "equal" and "natural" strata, within floor and cap.
+
+    "natural" strata are divided by their rows (S,), or by what is in their place.
 
     Raises:
         MixtureError: shares that cannot sum to 1 within their floors and caps.
@@ -124,14 +128,15 @@ def wanted_shares(rules: Sequence[StratumRule], rows: Ints, env_steps: float = 0
     return given + rest_within(base, low, high, max(rest, 0.0))
 
 
-def _flexible_parts(shares: Sequence[Share], flexible: Bools, rows: Ints) -> F64:
+def _flexible_parts(shares: Sequence[Share], flexible: Bools, rows: Ints | F64) -> F64:
     """Relative sizes: an equal part each, the natural strata's parts pooled and split by rows."""
     natural = np.array([share == "natural" for share in shares], np.bool_)
     parts = flexible.astype(np.float64)
     if natural.any():
         pool = natural.sum() if (flexible & ~natural).any() else 1.0
         natural_rows = np.where(natural, rows, 0)
-        parts[natural] = pool * natural_rows[natural] / max(int(natural_rows.sum()), 1)
+        total = float(natural_rows.sum())
+        parts[natural] = pool * natural_rows[natural] / (total if total > 0 else 1.0)
     return parts
 
 

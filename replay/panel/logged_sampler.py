@@ -321,7 +321,14 @@ def controller_for(
     mixture, sizes = panel.header.mixture, [len(rows) for rows in panel.stratum_rows()]
     names = [stratum.name.removeprefix(f"{stratum.source}/") for stratum in panel.strata]
     strata = [
-        SampledStratum(stratum.name, stratum.source, rule, size, stratum.episodes)
+        SampledStratum(
+            stratum.name,
+            stratum.source,
+            rule,
+            size,
+            stratum.episodes,
+            stratum.natural_share if mixture.sources.chosen(stratum.source) else None,
+        )
         for stratum, rule, size in zip(panel.strata, rules_of(mixture, names), sizes, strict=True)
     ]
     return ShareController(mixture, strata, planned, logs_share=logs_share)
@@ -346,4 +353,10 @@ def _weights(panel: Panel) -> WeightsInForce | F32 | None:
         1 + len(panel.header.others),
         panel.header.mixture.correction,
         outcome,
+        [
+            np.array([stratum.natural_share for stratum in strata[place : place + size]])
+            if panel.header.mixture.sources.chosen(strata[place].source)
+            else None
+            for place in range(0, len(strata), size)
+        ],
     )

@@ -21,6 +21,7 @@ from restock.arrays import F32, Bools, Ints
 from restock.errors import MixtureError, StoreError
 from restock.ingest.task.conditions import NOMINAL, Condition
 from restock.replay.mixture.mixture import Mixture, nanoseconds
+from restock.replay.mixture.represented import represented_shares
 from restock.replay.mixture.schedules import mean_over
 from restock.replay.panel.candidates import (
     META_COLUMNS,
@@ -146,7 +147,11 @@ def plan_panel(
     leave_out_of_strata(table, mixture, strata, stratum, out)
     stratum[out.gone] = NO_STRATUM
     given = _sources(mixture, table, stratum, state_code)
-    worked_out = [plan_source(connection, mixture, strata, source) for source in given]
+    occurs = represented_shares(mixture, strata, given, NOMINAL)
+    worked_out = [
+        plan_source(connection, mixture, strata, source, natural)
+        for source, natural in zip(given, occurs, strict=True)
+    ]
     return _joined(
         mixture,
         strata,

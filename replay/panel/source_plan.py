@@ -9,7 +9,7 @@ import duckdb
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.arrays import F32, Bools, Ints
+from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.shares import SharePlan, missing_rows, plan_shares
@@ -22,6 +22,7 @@ from restock.replay.panel.weights import (
     effective_shares,
     estimate_outcomes,
     importance_weights,
+    stands_for,
 )
 
 # A share of the gradient this much below the natural one is no rounding.
@@ -65,8 +66,11 @@ def plan_source(
     mixture: Mixture,
     strata: Sequence[ResolvedStratum],
     source: SourceRows,
+    natural: F64 | None = None,
 ) -> SourcePlan:
     """Shares, weights and lines of one source.
+
+    `natural` (S,) are the shares that its rows stand for, where that is not their own.
 
     Raises:
         MixtureError: too few rows, or weights that take a stratum below its natural share, where
@@ -80,15 +84,18 @@ def plan_source(
     episodes = np.array([len(counts) for counts in per_episode], np.int64)
     draws = mixture.planned.updates * mixture.planned.batch_size * source.part
     rules = [stratum.rule for stratum in strata]
-    shares = plan_shares(mixture, rules, rows, episodes, draws=draws)
+    shares = plan_shares(mixture, rules, rows, episodes, draws=draws, natural=natural)
     # A share with a schedule may begin at 0; others that are 0 are never drawn.
     drawn = (shares.got > 0) | [not isinstance(rule.share, int | float | str) for rule in rules]
     kept = np.asarray(drawn[source.code], np.bool_)
     code, state = source.code[kept], source.state_code[kept]
-    outcome, fit = _outcomes(connection, mixture, strata, source, kept)
-    weight = importance_weights(code, state, strata, shares.got, mixture.correction, outcome)
+    outcome, fit = _outcomes(connection, mixture, strata, source, kept, natural)
+    weight = importance_weights(
+        code, state, strata, shares.got, mixture.correction, outcome, natural
+    )
     after = effective_shares(code, weight, shares.got)
     missing = missing_rows(mixture, rules, rows, episodes, shares.wanted, draws)
+    occurs = rows / max(rows.sum(), 1) if natural is None else natural
     lines = [
         Stratum(
             name=stratum.name,
@@ -98,7 +105,7 @@ def plan_source(
             within=stratum.within,
             rows=int(rows[i]),
             episodes=int(episodes[i]),
-            natural_share=float(rows[i] / max(rows.sum(), 1)),
+            natural_share=float(occurs[i]),
             wanted_share=float(shares.wanted[i]),
             share=float(shares.got[i]),
             replays_per_row=float(draws * shares.scale * shares.got[i] / max(rows[i], 1)),
@@ -153,6 +160,7 @@ def _outcomes(
     strata: Sequence[ResolvedStratum],
     source: SourceRows,
     kept: Bools,
+    natural: F64 | None,
 ) -> tuple[F32 | None, RatioFit | None]:
     """P(k | s, a) of the strata that a density ratio corrects, (kept, S), or None for none."""
     code = source.code[kept]
@@ -162,7 +170,12 @@ def _outcomes(
         return None, None
     ids = source.transition_id[kept]
     rows = RatioRows(
-        ids, source.action[kept], source.state_code[kept], code, scramble(ids, mixture.seed)
+        ids,
+        source.action[kept],
+        source.state_code[kept],
+        code,
+        scramble(ids, mixture.seed),
+        stands_for(code, len(strata), natural),
     )
     names = tuple(strata[index].name for index in estimated.tolist())
     estimate, fit = estimate_outcomes(connection, rows, estimated, names, source.name)

@@ -61,6 +61,8 @@ class RowWeights:
         strata: (S,) whose timing and correction decide.
         outcome: (N, S) the probability of each "density_ratio" stratum given a row's state and
             action (0 for the other strata), or None.
+        natural: (S,) how often each stratum occurs, where the rows were chosen (an archive);
+            None: as often as it has rows.
     """
 
     def __init__(
@@ -70,25 +72,27 @@ class RowWeights:
         strata: Sequence[Corrected],
         rule: CorrectionRule,
         outcome: F32 | None = None,
+        natural: F64 | None = None,
     ) -> None:
         size = len(strata)
         self.strata, self.rule, self.outcome = list(strata), rule, outcome
         self.rows = np.bincount(code, minlength=size)
+        self._occurs = self.rows if natural is None else np.where(self.rows > 0, natural, 0.0)
         # State -1 is the last column.
         self._cell = code.astype(np.int32) * (size + 1) + state_code % (size + 1)
         self._in_cell = np.bincount(self._cell, minlength=size * (size + 1)).reshape(size, size + 1)
 
     def boost(self, shares: F64) -> F64:
         """How much more often a stratum is drawn than it occurs, (S,); 1 where it has no rows."""
-        total = self.rows.sum()
         ones = np.ones(len(shares))
-        return np.asarray(np.divide(shares * total, self.rows, out=ones, where=self.rows > 0))
+        drawn = shares * self._occurs.sum()
+        return np.asarray(np.divide(drawn, self._occurs, out=ones, where=self._occurs > 0))
 
     def under(self, shares: F64) -> F32:
         """The weights (N,) under these shares (S,)."""
         boost = self.boost(shares)
         table, state_aim = self._table(boost)
-        drawn = boost / max(int(self.rows.sum()), 1)
+        drawn = np.divide(shares, self.rows, out=np.zeros(len(shares)), where=self.rows > 0)
         if self.outcome is None:
             table /= max(float((drawn[:, None] * self._in_cell * table).sum()), 1e-12)
             return np.asarray(table.ravel()[self._cell], np.float32)
@@ -127,9 +131,20 @@ def importance_weights(
     shares: F64,
     rule: CorrectionRule,
     outcome: F32 | None = None,
+    natural: F64 | None = None,
 ) -> F32:
     """Weights (N,) of the rows of one source, see `RowWeights`."""
-    return RowWeights(code, state_code, strata, rule, outcome).under(shares)
+    return RowWeights(code, state_code, strata, rule, outcome, natural).under(shares)
+
+
+def stands_for(code: NDArray[np.int16], size: int, natural: F64 | None) -> F64:
+    """How many rows each row (N,) stands for, of N drawn as strata occur: 1 of a natural sample."""
+    if natural is None:
+        return np.ones(len(code))
+    rows = np.bincount(code, minlength=size)
+    occurs = np.where(rows > 0, natural, 0.0)
+    each = occurs * len(code) / max(float(occurs.sum()), 1e-12) / np.maximum(rows, 1)
+    return np.asarray(each[code], np.float64)
 
 
 def effective_shares(code: NDArray[np.int16], weights: F32, shares: F64) -> F64:
@@ -154,6 +169,7 @@ class WeightsInForce:
         strata: (K * S,) timing and correction of each.
         sources: K, stores that the panel is from.
         outcome: (n, S) as `RowWeights` has it, or None.
+        natural: of each source (S,) as `RowWeights` has it, or None; () for all None.
     """
 
     def __init__(
@@ -164,6 +180,7 @@ class WeightsInForce:
         sources: int,
         rule: CorrectionRule,
         outcome: F32 | None,
+        natural: Sequence[F64 | None] = (),
     ) -> None:
         self._size = len(strata) // sources
         self._parts = []
@@ -172,9 +189,9 @@ class WeightsInForce:
             span = slice(number * self._size, (number + 1) * self._size)
             of_source = code[at] - number * self._size
             probability = None if outcome is None else outcome[at]
-            self._parts.append(
-                (at, span, RowWeights(of_source, state_code[at], strata[span], rule, probability))
-            )
+            occurs = natural[number] if natural else None
+            of_rows = RowWeights(of_source, state_code[at], strata[span], rule, probability, occurs)
+            self._parts.append((at, span, of_rows))
         self._weight: F32 = np.ones(len(code), np.float32)
 
     def set_shares(self, shares: F64) -> None:
@@ -270,6 +287,7 @@ class RatioRows:
     state_code: NDArray[np.int16]  # of the strata, -1 for none
     code: NDArray[np.int16]  # the stratum of each row
     order: NDArray[np.uint64]  # a fixed shuffle of ids: which rows are fitted on
+    stands_for: F64  # how many rows each is worth, of as many that came as they occur
 
 
 def estimate_outcomes(
@@ -291,7 +309,7 @@ def estimate_outcomes(
         members = np.flatnonzero(label == outcome)
         some = members[np.argsort(rows.order[members], kind="stable")[:FIT_ROWS]]
         parts.append(some)
-        weights.append(np.full(len(some), len(members) / max(len(some), 1)))
+        weights.append(rows.stands_for[some] * (len(members) / max(len(some), 1)))
     chosen, weight = np.concatenate(parts), np.concatenate(weights)
     actions, states = int(rows.action.max()) + 1, np.unique(rows.state_code)
 
@@ -320,7 +338,8 @@ def estimate_outcomes(
         _log_loss(model.probability(x[validation]), y[validation], weight[validation]),
         _log_loss(
             np.tile(
-                np.bincount(label, minlength=len(estimated) + 1) / len(label), (validation.sum(), 1)
+                np.bincount(label, rows.stands_for, len(estimated) + 1) / rows.stands_for.sum(),
+                (validation.sum(), 1),
             ),
             y[validation],
             weight[validation],

@@ -44,6 +44,7 @@ class SampledStratum:
     rule: StratumRule
     rows: int  # in the panel; 0 where it is never drawn
     episodes: int
+    occurs: float | None = None  # how often, where its rows were chosen (an archive)
 
 
 class GroupDro(Stateful):
@@ -114,6 +115,7 @@ class _SourceDraws(Stateful):
     offline: float  # planned draws
     online: float
     got: F64  # shares of its strata now
+    natural: Ints | F64  # what divides "natural" shares: rows, or how often strata occur
     dro: GroupDro | None = None
 
 
@@ -197,6 +199,7 @@ class ShareController(Stateful):
             planned.offline * parts[name] / max(sum(parts.values()), 1e-12),
             planned.online * mean[name],
             np.zeros(len(strata)),
+            np.array([s.rows if s.occurs is None else s.occurs for s in strata]),
         )
 
     def _cap_of(self, rule: StratumRule) -> float:
@@ -280,7 +283,7 @@ class ShareController(Stateful):
     def _plan(self, source: _SourceDraws, shortfall: Shortfall) -> tuple[F64, float, float]:
         """A source's shares, and how much it can fill of its draws to come, and of online ones."""
         wanted = (
-            wanted_shares(source.rules, source.rows, self.env_steps)
+            wanted_shares(source.rules, source.natural, self.env_steps)
             if source.dro is None
             else source.dro.shares
         )

@@ -135,6 +135,11 @@ def describe(plan: PanelPlan) -> dict[str, Any]:
         "largest_weight": float(plan.weight.max(initial=0.0)),
         "density_ratios": [asdict(fit) for fit in plan.ratios],
         "other_stores": [msgspec.structs.asdict(store) for store in plan.others],
+        "represents": {
+            name: rates
+            for name, rates in plan.mixture.sources.said.items()
+            if plan.mixture.sources.chosen(name)
+        },
         "planned_draws": plan.mixture.planned.updates * plan.mixture.planned.batch_size,
         "max_replays_per_row": plan.mixture.max_replays_per_row,
         "schedules": {
@@ -234,6 +239,9 @@ def _summary(document: dict[str, Any]) -> list[str]:
         f" {document['effective_rows']:,.0f} equally weighted rows; largest weight"
         f" {document['largest_weight']:.3g}",
     ]
+    for name, rates in document["represents"].items():
+        of = "the main store's" if rates == "archive" else "given"
+        lines.append(f"the rows of {name} were chosen: their natural shares are {of}")
     if len(read_by := [f"{p['name']} {p['hash']}" for p in document["profiles"]]) > 1:
         lines.append(
             f"profiles of this task: {', '.join(read_by)}; the panel carries {read_by[0]}, of the"

@@ -1,0 +1,231 @@
+"""An archive of incidents stands for natural rates: those of the main store, or given ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.stores import recording_transitions, write_store
+
+from restock.errors import ConfigError, MixtureError
+from restock.ingest.store.transitions import replaced
+from restock.replay.mixture.mixture import CorrectionRule, StratumRule, parse_mixture
+from restock.replay.panel.build import open_source, write_panel
+from restock.replay.panel.logged_sampler import sampler_for
+from restock.replay.panel.panel import Panel
+from restock.replay.panel.plan import PanelPlan, plan_panel
+from restock.replay.panel.strata import ResolvedStratum
+from restock.replay.panel.weights import effective_shares, importance_weights, stands_for
+from restock.replay.store.store import Store
+
+TWO = """
+[evaluation_split]
+by = "none"
+[sources]
+logs = 0.25
+{main}
+[[sources.stores]]
+name = "incidents"
+path = "incidents"
+share = 0.25
+{archive}
+[[strata]]
+name = "nominal"
+unit = "episode"
+share = 0.5
+[[strata]]
+name = "near_collision"
+unit = "episode"
+share = 0.5
+[correction]
+pre = "{rule}"
+below_natural = "allow"
+"""
+
+
+def recording(number: int, episodes: int, near: int) -> pa.Table:
+    """Of whose episodes the first `near` come too near to something, and the rest to nothing."""
+    rows = recording_transitions(number, episodes=episodes)
+    episode, step = rows["episode_index"].to_numpy(), rows["step_index"].to_numpy()
+    held = (episode < near) & (step == 3)
+    return replaced(
+        rows,
+        {
+            "conditions": [["near_collision"] if one else [] for one in held],
+            "condition": np.where(held, "near_collision", "nominal").tolist(),
+            "uncertain": [[] for _ in held],
+        },
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store in which one mission of fifty is a near collision, and an archive of those."""
+    folder = tmp_path_factory.mktemp("fleet")
+    write_store(folder / "main", [recording(1, 100, 2)])
+    write_store(folder / "incidents", [recording(2, 30, 25)])
+    return folder
+
+
+def planned(
+    folder: Path, archive: str = "", main: str = "", rule: str = "none", first: str = "main"
+) -> PanelPlan:
+    text = TWO.format(archive=archive, main=main, rule=rule)
+    if first == "incidents":
+        text = text.replace('path = "incidents"', 'path = "main"').replace(
+            'name = "incidents"', 'name = "other"'
+        )
+    mixture = parse_mixture(text)
+    with Store(folder / first) as store, open_source(store, mixture, folder=folder) as source:
+        return plan_panel(source.connection, mixture, source.conditions, source.others)
+
+
+def natural(plan: PanelPlan) -> dict[str, float]:
+    return {line.name: line.natural_share for line in plan.strata}
+
+
+def test_an_archive_that_does_not_say_so_is_refused_by_name(folder):
+    with pytest.raises(MixtureError, match="'incidents' looks like an archive: 25 of its 30") as no:
+        planned(folder)
+    assert "2 of 100" in no.value.what
+    assert 'represents = "archive"' in str(no.value.remedy)
+    assert "near_collision = 0.02" in str(no.value.remedy)
+
+
+def test_the_main_store_may_be_the_archive(folder):
+    with pytest.raises(MixtureError, match="'logs' looks like an archive") as no:
+        planned(folder, first="incidents")
+    assert "[sources]" in str(no.value.remedy)
+    assert '"archive"' not in str(no.value.remedy)  # of itself
+    plan = planned(folder, main="represents = { near_collision = 0.03 }", first="incidents")
+    assert natural(plan)["near_collision"] == pytest.approx(0.03)
+    assert natural(plan)["nominal"] == pytest.approx(0.97)
+
+
+def test_an_archive_stands_for_the_main_stores_rates_or_for_given_ones(folder):
+    own = natural(planned(folder, 'represents = "natural"'))
+    assert own["incidents/near_collision"] > 0.7 > 0.05 > own["near_collision"]
+    told = natural(planned(folder, 'represents = "archive"'))
+    assert told["incidents/near_collision"] == told["near_collision"] == own["near_collision"]
+    given_ = natural(planned(folder, "represents = { near_collision = 0.004 }"))
+    assert given_["incidents/near_collision"] == pytest.approx(0.004)
+    assert given_["incidents/nominal"] == pytest.approx(0.996)
+    assert given_["near_collision"] == own["near_collision"]
+
+
+def test_natural_shares_are_the_represented_ones(folder):
+    text = TWO.replace("share = 0.5", 'share = "natural"')
+    mixture = parse_mixture(text.format(archive='represents = "archive"', main="", rule="none"))
+    with Store(folder / "main") as store, open_source(store, mixture, folder=folder) as source:
+        plan = plan_panel(source.connection, mixture, source.conditions, source.others)
+    lines = {line.name: line for line in plan.strata}
+    assert lines["incidents/near_collision"].share == pytest.approx(
+        lines["near_collision"].share  # half of the logs' part is of each store
+    )
+
+
+def test_full_correction_weighs_an_archive_back_to_the_rates_it_stands_for(folder, tmp_path):
+    """In the plan, and in a run whose weights follow the shares."""
+    archive = "represents = { near_collision = 0.02 }"
+    plan = planned(folder, archive, rule="full")
+    lines = {line.name: line for line in plan.strata}
+    of_logs = lines["incidents/near_collision"].share + lines["incidents/nominal"].share
+    rare = lines["incidents/near_collision"].effective_share / of_logs
+    assert rare == pytest.approx(0.02, rel=1e-5)
+    uncorrected = planned(folder, archive)
+    boosted = next(s for s in uncorrected.strata if s.name == "incidents/near_collision")
+    assert boosted.effective_share == boosted.share  # weighed only where that is asked for
+
+    mixture = plan.mixture
+    with Store(folder / "main") as store, open_source(store, mixture, folder=folder) as source:
+        panel = write_panel(source, plan, tmp_path / "panel")
+    assert weighed_share(panel, "incidents/near_collision", "incidents/nominal") == pytest.approx(
+        0.02, rel=1e-4
+    )
+
+
+def weighed_share(panel: Panel, stratum: str, other: str) -> float:
+    """Of what a run draws of two strata, the first one's part of the weight."""
+    sampler, batches = sampler_for(panel, 128, seed=0), 40
+    names = [line.name for line in panel.strata]
+    part = dict.fromkeys((stratum, other), 0.0)
+    for _ in range(batches):
+        drawn = sampler.draw()
+        for name in part:
+            part[name] += float(drawn.weight[drawn.strata == names.index(name)].sum())
+    return part[stratum] / sum(part.values())
+
+
+@given(
+    st.lists(st.integers(1, 200), min_size=2, max_size=5),
+    st.data(),
+    st.sampled_from(["pre", "post"]),
+)
+@settings(max_examples=100, deadline=None)
+def test_weights_recover_natural_rates_exactly(rows, data, timing):
+    """Whatever was kept, and whatever shares it is drawn in: full correction gives the rates."""
+    size = len(rows)
+    parts = st.lists(st.floats(0.01, 1.0), min_size=size, max_size=size)
+    rates, shares = (np.array(data.draw(parts)) for _ in range(2))
+    rates, shares = rates / rates.sum(), shares / shares.sum()
+    strata = [
+        ResolvedStratum(StratumRule(name=f"s{i}"), "true", None, i, timing, "full")
+        for i in range(size)
+    ]
+    code = np.repeat(np.arange(size), rows).astype(np.int16)
+    state = code if timing == "pre" else np.full(len(code), -1, np.int16)
+    rule = CorrectionRule(pre="full", post="full")
+    weights = importance_weights(code, state, strata, shares, rule, None, rates)
+    assert effective_shares(code, weights, shares) == pytest.approx(rates, rel=1e-4)
+    # And so do the rows that an outcome's probability is fitted on.
+    worth = stands_for(code, size, rates)
+    assert worth.sum() == pytest.approx(len(code))
+    assert np.bincount(code, worth) / len(code) == pytest.approx(rates)
+
+
+@given(st.lists(st.integers(1, 50), min_size=2, max_size=4), st.data())
+@settings(max_examples=30, deadline=None)
+def test_a_natural_sample_stands_for_itself(rows, data):
+    size = len(rows)
+    shares = np.array(data.draw(st.lists(st.floats(0.1, 1), min_size=size, max_size=size)))
+    strata = [
+        ResolvedStratum(StratumRule(name=f"s{i}"), "true", None, i, "pre", "full")
+        for i in range(size)
+    ]
+    code = np.repeat(np.arange(size), rows).astype(np.int16)
+    own = np.bincount(code) / len(code)
+    rule, shares = CorrectionRule(), shares / shares.sum()
+    assert importance_weights(code, code, strata, shares, rule, None, own) == pytest.approx(
+        importance_weights(code, code, strata, shares, rule), rel=1e-5
+    )
+    assert stands_for(code, size, None).tolist() == [1.0] * len(code)
+
+
+@pytest.mark.parametrize(
+    ("archive", "main", "message"),
+    [
+        ("represents = { near_colision = 0.1 }", "", "near_colision, which is no stratum"),
+        ('represents = "archive"', "represents = { near_collision = 0 }", "never occur"),
+    ],
+)
+def test_rates_that_cannot_be_meant_are_refused(folder, archive, main, message):
+    with pytest.raises(MixtureError, match=message):
+        planned(folder, archive, main, rule="full")
+
+
+@pytest.mark.parametrize(
+    ("archive", "main", "message"),
+    [
+        ('represents = "incidents"', "", "represents"),
+        ("represents = { near_collision = 0.7, nominal = 0.6 }", "", "sum to 1.3"),
+        ("represents = { near_collision = 1.5 }", "", "near_collision|<= 1"),
+        ("", 'represents = "archive"', "this is it"),
+    ],
+)
+def test_a_file_that_says_it_wrongly_is_refused(archive, main, message):
+    with pytest.raises(ConfigError, match=message):
+        parse_mixture(TWO.format(archive=archive, main=main, rule="none"))
