@@ -1,80 +1,98 @@
 """Labels against the truth, on fresh logs of the twin's stand-in: by step and by event.
 
-    python benchmarks/labels.py --cache FOLDER [--part held-out] [--minutes 24] [--quick]
+    python benchmarks/labels.py --cache FOLDER [--part held-out] [--minutes 24] [--quick] [--bound]
+    python benchmarks/labels.py --cache FOLDER --fit blocked_aisle
 
 Records logs of seeds that no rule was set on, on the default floor and on `generated:test` floors
 (`--part development`: the seeds and `generated:train` floors that the rules were set on), ingests
 them, and prints precision and recall of each condition with 95 % intervals, the share that is too
-near to call, the reliability of the probabilities, and `bound`: what a network of two layers
-reaches that saw the development logs, all stored signals of 5 steps before to 4 after (`pre`
-conditions: 12 before) and the truth. What is in FOLDER is not recorded again; labels follow the
-rules as they are now.
+near to call, and the reliability of the probabilities. `--bound` adds the best that any rule could
+do: `label_bound.py`. `--fit` prints the weights of a condition's `odds` that suit the development
+logs best. What is in FOLDER is not recorded again; labels follow the rules as they are now.
 """
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
+import pyarrow as pa
 from harness import finish, markdown, option_parser, run_restock
+from label_bound import Log, bounds, has, logs_of, with_known
+from scipy.optimize import minimize
+from scipy.special import expit
 
-from restock.arrays import F32, Bools
-from restock.ingest.profile.profile import load_profile
-from restock.ingest.store.episode_rows import episode_ends
-from restock.ingest.store.writer import StoreWriter
-from restock.ingest.task.label_scores import LabelScore, pooled, score, true_names
+from restock.arrays import F64
+from restock.ingest.task.conditions import let_values, shipped
+from restock.ingest.task.label_scores import LabelScore
+from restock.ingest.task.schema import signal_columns
+from restock.ingest.task.signals import STORED_SIGNALS
 from restock.replay.store.label_quality import LabelQuality, label_quality, reliability
 from restock.replay.store.store import Store
 from restock.train.twin.recording.recorder import RecordingPlan, record
 
 SEEDS = {
-    "development": {"default": range(101, 107), "generated:train": range(111, 119)},
+    "development": {"default": range(2001, 2017), "generated:train": range(2101, 2117)},
     "held-out": {"default": range(901, 907), "generated:test": range(911, 917)},
 }
 TARGETS = {"event": 0.9, "step": 0.85}
-BACK = {"pre": 12, "post": 4}
-AHEAD = {"pre": 0, "post": 3}
-EPOCHS, BATCH, WIDTH = 12, 512, 128
-HOLDS, CLEAR, NEAR_STEPS = 0.4, 0.7, 2  # of the bound's probabilities: as the shipped rules hold on
+RIDGE = 1e-3  # of standardised terms
 
 
 def main() -> int:
-    parser = option_parser(__doc__, quick="two logs of 6 minutes each, no bound")
+    parser = option_parser(__doc__, quick="two logs of 6 minutes each")
     parser.add_argument(
         "--cache", type=Path, required=True, help="folder for recordings and stores"
     )
     parser.add_argument("--part", choices=sorted(SEEDS), default="held-out")
     parser.add_argument("--minutes", type=float, default=24.0, help="of each log")
-    parser.add_argument("--no-bound", action="store_true", help="train no network")
+    parser.add_argument("--bound", action="store_true", help="train networks: what is possible")
+    parser.add_argument("--fit", metavar="CONDITION", help="print the weights that suit it best")
     options = parser.parse_args()
-    if options.quick:
-        options.minutes = 6.0
-    trained = not (options.quick or options.no_bound)
-    parts = sorted({"development", options.part}) if trained else [options.part]
+    count = 2 if options.quick else None
+    minutes = 6.0 if options.quick else options.minutes
+    if options.fit:
+        weights = fit(development(options.cache, minutes, count), options.fit)
+        lines = [f"{value:+.2f} {name}" for name, value in weights.items()]
+        return finish(options, weights, [], lines)
     stores = {
-        (part, floors): stored(options.cache, floors, list(seeds)[: 2 if options.quick else None],
-                               options.minutes)
-        for part in parts
-        for floors, seeds in SEEDS[part].items()
-    }  # fmt: skip
-    measured = {key: path for key, path in stores.items() if key[0] == options.part}
-    bound = bounds(stores, options.part) if trained else {}
-    lines: list[str] = []
+        floors: stored(options.cache, floors, list(seeds)[:count], minutes)
+        for floors, seeds in SEEDS[options.part].items()
+    }
+    bound: dict[str, dict[str, LabelScore]] = {}
+    if options.bound:
+        measured = {floors: list(logs_of(path)) for floors, path in stores.items()}
+        bound = bounds(development(options.cache, minutes, count), measured)
+    lines = []
     figures: dict[str, Any] = {}
     missed: list[str] = []
-    for (_, floors), path in measured.items():
+    for floors, path in stores.items():
         with Store(path) as store:
-            found = label_quality(store)
+            found = [one for one in label_quality(store) if one.score.condition in shipped()]
             bins = reliability(store).to_pylist()
         lines += [f"\n{options.part}, floors {floors}:\n", table(found, bound.get(floors, {}))]
         lines += ["", reliability_table(bins)]
         figures[floors] = {one.score.condition: vars(one.score) for one in found}
         missed += [miss for one in found for miss in misses(floors, one)]
     return finish(options, figures, missed, lines)
+
+
+def development(cache: Path, minutes: float, count: int | None) -> list[Log]:
+    """The steps of the development logs, kept in `cache` beside what is measured."""
+    logs = []
+    for floors, seeds in SEEDS["development"].items():
+        for seed in list(seeds)[:count]:
+            file = cache / f"{floors.replace(':', '_')}_{seed}_{minutes:g}.npz"
+            if not file.exists():
+                for one in logs_of(stored(cache, floors, [seed], minutes)):
+                    np.savez_compressed(file, **one)
+            with np.load(file) as kept:
+                logs.append(with_known(dict(kept)))
+    return logs
 
 
 def stored(cache: Path, floors: str, seeds: Sequence[int], minutes: float) -> Path:
@@ -149,133 +167,59 @@ def misses(floors: str, one: LabelQuality) -> list[str]:
     ]
 
 
-# -- the bound --------------------------------------------------------------------------------
+# -- the weights ------------------------------------------------------------------------------
+
+_TERM = re.compile(r"([+-]\s*[\d.]+) \* (\w+)")
+_CONSTANT = re.compile(r"[+-]\s*[\d.]+(?!\S| \*)")
 
 
-def bounds(stores: Mapping[tuple[str, str], Path], part: str) -> dict[str, dict[str, LabelScore]]:
-    """Floors -> condition -> what a network reaches there that was trained on development logs."""
-    logs = {key: signals_of(path) for key, path in stores.items()}
-    found: dict[str, dict[str, LabelScore]] = {}
-    for condition in load_profile("warehouse_amr").conditions:
-        span = BACK[condition.timing], AHEAD[condition.timing]
-        seen = [one for key, several in logs.items() if key[0] == "development" for one in several]
-        x = np.concatenate([features(one, *span)[one["known"]] for one in seen])
-        y = np.concatenate([has(one, condition.name)[one["known"]] for one in seen])
-        predict = fitted(x, y)
-        for (of_part, floors), several in logs.items():
-            if of_part == part:
-                scores = [scored(one, condition.name, predict(features(one, *span)))
-                          for one in several]  # fmt: skip
-                found.setdefault(floors, {})[condition.name] = pooled(scores)[0]
-    return found
+def fit(logs: Sequence[Log], name: str) -> dict[str, float]:
+    """The weights of the terms of a condition's `odds`, by a logistic regression on these logs.
+
+    `odds` is written as `+ .27 + 3.52 * near_m ...`, perhaps within `CASE WHEN`; each term is a
+    `let`. It sees the steps whose odds that sum is, and no other branch's.
+    """
+    condition = shipped()[name]
+    written = {term: _number(weight) for weight, term in _TERM.findall(condition.let["odds"])}
+    constant = _CONSTANT.search(condition.let["odds"])
+    if not written or constant is None:
+        sys.exit(f"the `odds` of {name} are no sum such as `+ 0.27 + 3.52 * near_m`")
+    parts = []
+    for one in logs:
+        values = let_values(steps_of(one), condition)
+        terms = np.stack([values[term] for term in written], axis=1)
+        total = _number(constant.group()) + terms @ np.array(list(written.values()))
+        decided = one["known"] & (np.abs(total - values["odds"]) < 1e-3)
+        parts.append((terms[decided], has(one, name)[decided]))
+    x, y = (np.concatenate(part) for part in zip(*parts, strict=True))
+    middle, scale = x.mean(0), x.std(0) + 1e-9
+    scaled = (x - middle) / scale
+
+    def loss(weights: F64) -> tuple[float, F64]:
+        odds = scaled @ weights[1:] + weights[0]
+        wrong = expit(odds) - y
+        gradient = np.concatenate([[wrong.mean()], (wrong[:, None] * scaled).mean(0)])
+        gradient[1:] += 2 * RIDGE * weights[1:]
+        value = np.logaddexp(0, odds).mean() - (odds * y).mean() + RIDGE * (weights[1:] ** 2).sum()
+        return float(value), gradient
+
+    found = minimize(loss, np.zeros(1 + x.shape[1]), jac=True, method="L-BFGS-B").x
+    weights = found[1:] / scale
+    return {
+        "": float(found[0] - weights @ middle),
+        **dict(zip(written, weights.tolist(), strict=True)),
+    }
 
 
-def signals_of(path: Path) -> list[dict[str, Any]]:
-    """Of each recording every step's signals, ends of episodes included, in order."""
-    writer = StoreWriter(path)
-    logs = []
-    for row in writer.live().to_pylist():
-        rows = writer.rows(row["recording_id"], row["ingest_id"])
-        ends = episode_ends(rows)
-        if ends is None:
-            continue
-        episode, step, truth = (
-            [*rows["episode_index"].to_pylist(), *ends["episode_index"].to_pylist()],
-            [*rows["step_index"].to_pylist(), *ends["step_index"].to_pylist()],
-            [*rows["true_condition"].to_pylist(), *[None] * len(ends)],
-        )
-        order = np.lexsort((step, episode))
-        one: dict[str, Any] = {
-            name: np.concatenate([rows[name].to_numpy(), ends[name].to_numpy()])[order].astype(
-                float
-            )
-            for name in ends.column_names
-        }
-        one["truth"] = [truth[place] for place in order]
-        one["known"] = np.array([text is not None for text in one["truth"]])
-        logs.append(one)
-    return logs
+def _number(text: str) -> float:
+    return float(text.replace(" ", ""))
 
 
-def has(one: Mapping[str, Any], name: str) -> Bools:
-    return np.array([text is not None and name in true_names(text) for text in one["truth"]])
-
-
-def features(one: Mapping[str, Any], back: int, ahead: int) -> F32:
-    """The signals of the steps around each, (N, F): no other episode's."""
-    moved = one["wheel_speed_mps"], one["localised_speed_mps"]
-    bearing = one["pose_yaw_rad"] + np.arctan2(one["waypoint_near_y_m"], one["waypoint_near_x_m"])
-    reach = np.minimum(one["clearance_ahead_m"], 4) + 0.35
-    place = (one["pose_x_m"] + reach * np.cos(bearing), one["pose_y_m"] + reach * np.sin(bearing))
-    turned = one["wheel_yaw_rate_radps"] - one["gyro_yaw_rate_radps"]
-    plain = [*moved, one["localised_lateral_mps"], turned, one["gyro_yaw_rate_radps"],
-             one["accel_x_mps2"] / 3, 4 * np.minimum(one["clearance_m"], 0.4),
-             np.minimum(one["clearance_m"], 1.5), np.minimum(one["clearance_ahead_m"], 3),
-             one["waypoint_near_x_m"], one["waypoint_near_y_m"], one["waypoint_far_x_m"],
-             one["waypoint_far_y_m"], one["bumped"], one["command_speed_mps"],
-             one["command_yaw_rate_radps"], np.minimum(one["route_remaining_m"], 3)]  # fmt: skip
-    columns = []
-    for k in range(-back, ahead + 1):
-        columns += [np.nan_to_num(at(one, column, k)) for column in plain]
-        columns += [np.clip(np.nan_to_num(at(one, column, k) - column), -2, 2) for column in place]
-        way = (at(one, moved[0], k) + at(one, moved[0], k + 1)) / 2 - at(one, moved[1], k + 1)
-        columns += [np.abs(np.nan_to_num(way)), np.abs(np.nan_to_num(at(one, turned, k)))]
-    # What every rule compares a distance with is near .15 m: finer there.
-    near = [np.nan_to_num(at(one, one["clearance_m"], k), nan=4.0) for k in range(-3, ahead + 1)]
-    columns += [np.clip(20 * (column - 0.15), -2, 2) for column in near]
-    return np.stack(columns, axis=1).astype(np.float32)
-
-
-def at(one: Mapping[str, Any], column: Any, k: int) -> Any:
-    """The column k steps later, NaN beyond the episode, (N,)."""
-    episode = one["episode_index"]
-    there = np.arange(len(column)) + k
-    inside = (there >= 0) & (there < len(column))
-    there = np.clip(there, 0, len(column) - 1)
-    return np.where(inside & (episode[there] == episode), column[there], np.nan)
-
-
-def fitted(x: F32, y: Bools) -> Any:
-    """A network's probabilities, as a function of features."""
-    torch.manual_seed(0)
-    middle, scale = x.mean(0), x.std(0) + 1e-3
-    inputs, wanted = torch.from_numpy((x - middle) / scale), torch.from_numpy(y.astype(np.float32))
-    net = torch.nn.Sequential(
-        torch.nn.Linear(x.shape[1], WIDTH), torch.nn.LayerNorm(WIDTH), torch.nn.ReLU(),
-        torch.nn.Dropout(0.3), torch.nn.Linear(WIDTH, WIDTH), torch.nn.ReLU(),
-        torch.nn.Dropout(0.3), torch.nn.Linear(WIDTH, 1),
-    )  # fmt: skip
-    optimizer = torch.optim.AdamW(net.parameters(), 1e-3, weight_decay=1e-2)
-    steps = EPOCHS * (len(x) // BATCH + 1)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 3e-3, total_steps=steps)
-    for _ in range(EPOCHS):
-        for batch in torch.randperm(len(x)).split(BATCH):
-            loss = torch.nn.functional.binary_cross_entropy_with_logits(
-                net(inputs[batch])[:, 0], wanted[batch]
-            )
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            schedule.step()
-    net.eval()
-
-    def predict(features: F32) -> F32:
-        with torch.no_grad():
-            scaled = torch.from_numpy((features - middle) / scale)
-            return np.asarray(torch.sigmoid(net(scaled)[:, 0]).numpy())
-
-    return predict
-
-
-def scored(one: Mapping[str, Any], name: str, probability: F32) -> LabelScore:
-    """The label that holds where a step near it is clear, as the shipped rules do."""
-    clear = np.max([np.nan_to_num(at(one, probability, k)) for k in range(-NEAR_STEPS, 1)], axis=0)
-    known = one["known"]
-    holds = ((probability > HOLDS) & (clear > CLEAR))[known]
-    truth = [text for text in one["truth"] if text is not None]
-    episode, step = (one[key][known].astype(np.int64) for key in ("episode_index", "step_index"))
-    found = score({name: holds}, truth, episode, step, 0.2)
-    return found[0] if found else LabelScore(name, len(truth), *[0] * 7)
+def steps_of(one: Log) -> pa.Table:
+    """The steps as conditions see them, of a log's signals."""
+    columns = signal_columns({s.name: one[s.name].astype(s.dtype) for s in STORED_SIGNALS})
+    places = {name: one[name].astype(np.int64) for name in ("episode_index", "step_index")}
+    return pa.table(places | columns)
 
 
 if __name__ == "__main__":

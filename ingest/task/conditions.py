@@ -43,7 +43,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from msgspec import Meta
 
-from restock.arrays import F32, Bools
+from restock.arrays import F32, F64, Bools
 from restock.errors import ConfigError
 from restock.ingest.task.condition_files import settings_of
 from restock.ingest.task.condition_sql import SANDBOX, WINDOW, refusal, select_of
@@ -221,6 +221,27 @@ def _probabilities(columns: Columns, conditions: Sequence[Condition]) -> dict[st
             raise ConfigError(f"it must be in [0, 1], and gives {wrong[0]:.4g}", where=where)
         found[condition.name] = values.astype(np.float32)
     return found
+
+
+def let_values(steps: pa.Table, condition: Condition) -> dict[str, F64]:
+    """What every `let` of a condition gives at each step, (N,): what a rule goes by; NaN for null.
+
+    Raises:
+        ConfigError: its SQL does not run, or gives other than numbers.
+    """
+    values = {}
+    for name in condition.let:
+        asked = msgspec.structs.replace(condition, sql=name)
+        column = _evaluate(steps, [asked], ("sql",))[condition.name, "sql"]
+        try:
+            numbers = column.cast(pa.float64())
+        except pa.ArrowInvalid as error:
+            raise ConfigError(
+                f"its SQL gives {column.type}, not a number",
+                where=f"`let` {name!r} of condition {condition.name!r}",
+            ) from error
+        values[name] = np.asarray(numbers.combine_chunks().to_numpy(zero_copy_only=False))
+    return values
 
 
 def too_near_to_call(

@@ -11,7 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from restock.errors import ConfigError
-from restock.ingest.task.conditions import Condition, label, labels_version, primary, shipped
+from restock.ingest.task.conditions import (
+    Condition,
+    label,
+    labels_version,
+    let_values,
+    primary,
+    shipped,
+)
 from restock.ingest.task.schema import SIGNAL_COLUMNS
 
 SHIPPED = list(shipped().values())
@@ -304,3 +311,19 @@ def test_the_version_names_what_the_conditions_say():
     assert labels_version([one]) == labels_version([one])
     assert labels_version([one]) != labels_version([Condition("a", "post", "true")])
     assert labels_version([one, SHIPPED[0]]) == labels_version([SHIPPED[0], one])
+
+
+def test_what_a_rule_goes_by_can_be_looked_at():
+    rule = Condition(
+        name="fast",
+        timing="pre",
+        sql="change_mps > limit_mps",
+        let={"change_mps": "wheel_speed_mps - lag(wheel_speed_mps) OVER episode"},
+        constants={"limit_mps": 0.1},
+    )
+    table = steps(3, wheel_speed_mps=np.array([0.0, 0.5, 0.25]))
+    found = let_values(table, rule)["change_mps"]
+    assert np.isnan(found[0])  # null: there is no step before
+    assert found[1:].tolist() == [0.5, -0.25]
+    with pytest.raises(ConfigError, match=r"VARCHAR|string"):
+        let_values(table, Condition(name="text", timing="pre", sql="true", let={"word": "'a'"}))
