@@ -102,7 +102,9 @@ def test_a_slippery_floor_is_named_and_a_dry_one_is_not(gap: TwinGap) -> None:
     assert said["wheel_slip"].verdict == UNTRUSTED
     assert "metres" in said["wheel_slip"].reasons[0] or " m " in said["wheel_slip"].reasons[0]
     assert said["nominal"].verdict == TRUSTED
-    assert gap.untrusted == ["wheel_slip"]
+    # Right beside a rack the twin touches it where the log's robot did not, which costs most.
+    assert gap.untrusted == ["recovery", "wheel_slip"]
+    assert "reward" in said["recovery"].reasons[0]
     assert any("patches" in line for line in gap.not_done)
 
 
@@ -193,7 +195,7 @@ def test_a_gap_is_read_back_as_written_and_is_a_page(gap: TwinGap, tmp_path: Pat
     assert again.about == json.loads(json.dumps(gap.about))
     assert again.paths == gap.paths
     page = write_gap_page(tmp_path / "gap").read_text()
-    assert "Do not trust the twin in: wheel slip" in page
+    assert "Do not trust the twin in: recovery, wheel slip" in page
     assert "<script" not in page
     write_gap(gap, tmp_path / "gap")  # a gap measured before is replaced
     (tmp_path / "other").mkdir()
@@ -221,7 +223,7 @@ def test_the_command_line(stored: Path, tmp_path: Path, capsys: pytest.CaptureFi
     given = (stored, *few, "--perturbation", tmp_path / "true.toml", "--out", tmp_path / "gap")
     assert run(*given, "--json", "--check") == 1
     document = json.loads(capsys.readouterr().out)
-    assert document["untrusted"] == ["wheel_slip"]
+    assert document["untrusted"] == ["recovery", "wheel_slip"]
     assert document["about"]["twins"]["calibrated"]["wheel_radius_scale"] == 0.96
     assert (tmp_path / "gap" / "index.html").is_file()
     assert run(stored, "--horizons", "soon") == 2
