@@ -71,6 +71,7 @@ def test_the_node_sees_what_ingest_stores_and_acts_as_torch_does(
     stored = np.stack(rows["observation"].to_pylist()).astype(np.float32)
     times = rows["log_time_ns"].to_pylist()
     assert len(times) > 700
+    assert stored[:, TASK.observation_names.index("nav_known")].all()
     assert set(times) <= decisions.keys()  # a decision for every step
     live = np.stack([decisions[at][0].observation for at in times])
     assert not any(decisions[at][0].problem for at in times)

@@ -424,7 +424,7 @@ def test_a_query_that_lacks_columns_is_refused_by_their_names(
         (
             {"query": "SELECT * REPLACE (observation[1:3] AS observation) FROM transitions"},
             StoreError,
-            "observations have 3 entries, next observations 25",
+            "observations have 3 entries, next observations 28",
         ),
         (
             {
@@ -432,7 +432,7 @@ def test_a_query_that_lacks_columns_is_refused_by_their_names(
                 " next_observation[1:3] AS next_observation) FROM transitions"
             },
             StoreError,
-            "observations have 3 entries, those of its task 25",
+            "observations have 3 entries, those of its task 28",
         ),
         (
             {"query": "SELECT * REPLACE (NULL::FLOAT AS reward) FROM transitions"},
