@@ -60,8 +60,11 @@ def way_to_return(task: Task, clearance_m: F64, near_m: F64, far_m: F64) -> F64:
     """Way (m) along the plan in view to the first lidar return on it, (N,); else `range_max_m`.
 
     The plan in view is the line over the look-ahead points `near_m` (N, 2) and `far_m` (N, 2) of
-    the body frame. A return within half the body's width of it is on it.
+    the body frame. A return within half the body's width of it is on it. A task without a goal has
+    no plan, and nothing is on it.
     """
+    if task.goal == "none":
+        return np.full(len(clearance_m), float(task.range_max_m))
     bearing, reach = _sectors(task.sectors, task.body)
     distance = clearance_m + reach
     points = np.stack(

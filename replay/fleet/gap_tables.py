@@ -13,7 +13,7 @@ from pathlib import Path
 import pyarrow as pa
 
 from restock.replay.fleet.shopping_list import ShoppingList, document, shopping_list
-from restock.replay.panel.mixture_tables import install_function
+from restock.replay.panel.mixture_tables import check_names, install_function
 from restock.replay.store.store import Store
 
 COLUMNS = {
@@ -61,6 +61,7 @@ def install_gaps(store: Store) -> None:
         return shopping_list(yields, gaps)
 
     install_function(store.connection, "planned_gaps", COLUMNS, gaps_table, planned)
+    store.checks.append(functools.partial(check_names, ("gaps",)))
     text = files("restock.replay.fleet").joinpath("gap_tables.sql").read_text(encoding="utf-8")
     store.connection.execute(text)
 

@@ -147,6 +147,13 @@ class EvaluationSplit(Checked, frozen=True):
 
     by: Literal["episode", "recording", "robot", "site", "time", "none"] = "episode"
     share: Annotated[float, Meta(ge=0, lt=1)] = 0.1
+    robots: tuple[str, ...] = ()  # these, by their tags, in place of a share of all
+
+    def check(self) -> None:
+        _require(
+            not self.robots or self.by == "robot",
+            f'evaluation_split.robots names robots: it needs by = "robot", not {self.by!r}',
+        )
 
 
 class Safety(Checked, frozen=True):

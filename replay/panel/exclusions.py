@@ -206,10 +206,10 @@ def split_for_evaluation(table: pa.Table, rule: EvaluationSplit, seed: int) -> B
     latest episodes.
 
     Raises:
-        MixtureError: the rule would take everything, there is only one group to split, or rows that
-            the mixture admits are of an unknown robot or site.
+        MixtureError: the rule would take everything, there is only one group to split, a robot that
+            it names is not there, or rows that the mixture admits are of an unknown robot or site.
     """
-    if rule.by == "none" or rule.share == 0:
+    if rule.by == "none" or (rule.share == 0 and not rule.robots):
         return np.zeros(len(table), np.bool_)
     column, group = _GROUPS.get(rule.by, ("episode_id", "episode"))
     code = codes(table, column)
@@ -224,6 +224,19 @@ def split_for_evaluation(table: pa.Table, rule: EvaluationSplit, seed: int) -> B
         )
     names = table[column].combine_chunks().dictionary.to_pylist()
     rows = np.bincount(code[code >= 0], minlength=len(names))
+    if rule.robots:
+        there = sorted(name for name, count in zip(names, rows.tolist(), strict=True) if count)
+        if absent := sorted(set(rule.robots) - set(there)):
+            raise MixtureError(
+                f"evaluation_split.robots: no rows of {', '.join(absent)}",
+                remedy=f"there is {', '.join(there)}",
+            )
+        if set(there) == set(rule.robots):
+            raise MixtureError(
+                "evaluation_split.robots names every robot: nothing would be left to learn from",
+                remedy="name some of them",
+            )
+        return np.isin(code, [names.index(robot) for robot in rule.robots])
     if rule.by == "time":
         newest = np.zeros(len(names), np.int64)
         np.maximum.at(newest, code, table["logged_ns"].to_numpy())

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -113,6 +113,8 @@ class Store:
             ) from error
         self._tasks = self._read_tasks()
         self.observation_type = self._observation_type()
+        # Of a query's text, before it runs: what only fails while rows are fetched is said here.
+        self.checks: list[Callable[[str], None]] = []
         install_first(self.connection, self.observation_type)
         install_computed(self)
 
@@ -133,8 +135,11 @@ class Store:
     def sql(self, text: str) -> duckdb.DuckDBPyRelation:
         """The result of a query: `.to_arrow_table()`, `.df()`, `.pl()`, `.fetchall()`.
 
-        Raises QueryError with DuckDB's message, or where the query would write.
+        Raises QueryError with DuckDB's message, or where the query would write; ConfigError where
+        it names a mixture that there is not.
         """
+        for check in self.checks:
+            check(text)
         return query(self.connection, text, where=str(self.path))
 
     def conditions(self) -> tuple[Condition, ...]:

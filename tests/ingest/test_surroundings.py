@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -105,3 +106,6 @@ def test_a_return_on_the_plan_is_found_along_it_and_beside_it_not():
     assert way([(1.6, 0.68, 0.2)]) == pytest.approx(1.0 + 0.9 - 0.2, abs=0.15)
     assert way([(2.0, -0.3, 0.2)]) == TASK.range_max_m  # straight on, where the plan does not go
     assert way([(0.5, 0.7, 0.2)]) == TASK.range_max_m  # beside it
+    free = msgspec.structs.replace(TASK, goal="none")
+    ahead = scan((0.0, 0.0, 0.0), [(1.0, 0.0, 0.2)])
+    assert way_to_return(free, ahead, near, far)[0] == TASK.range_max_m

@@ -9,7 +9,7 @@ import pytest
 from support.panels import EVERY, NO_SPLIT, panel_of, planned
 from support.stores import recording_transitions, write_store
 
-from restock.errors import MixtureError
+from restock.errors import ConfigError, MixtureError
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.panel import Panel
 from restock.replay.panel.plan import plan_panel
@@ -47,6 +47,28 @@ def test_whole_robots_and_sites_are_held_out(fleet, by):
             assert held | kept == {tags[by] for tags in TAGS}
             held_by_seed |= held
     assert len(held_by_seed) > 1
+
+
+def test_a_robot_can_be_held_out_by_its_name(fleet):
+    text = "[evaluation_split]\nby = 'robot'\nrobots = ['c', 'd']\nshare = 0\n" + EVERY
+    with Store(fleet) as store:
+        plan = plan_panel(store.connection, parse_mixture(text), store.conditions())
+    robots = np.array(plan.rows["robot"].to_pylist())
+    assert set(robots[plan.evaluation_split]) == {"c", "d"}
+    assert set(robots[plan.panel_rows]) == {"a", "b"}
+
+
+@pytest.mark.parametrize(
+    ("robots", "message"),
+    [("['c', 'amr-99']", "no rows of amr-99"), ("['a','b','c','d']", "every")],
+)
+def test_robots_that_cannot_be_held_out_are_refused(fleet, robots, message):
+    text = f"[evaluation_split]\nby = 'robot'\nrobots = {robots}\n" + EVERY
+    with Store(fleet) as store, pytest.raises(MixtureError, match=message) as caught:
+        plan_panel(store.connection, parse_mixture(text), store.conditions())
+    assert caught.value.remedy
+    with pytest.raises(ConfigError, match='it needs by = "robot"'):
+        parse_mixture(text.replace("'robot'", "'site'"))
 
 
 def test_a_panel_with_rows_of_a_robot_that_is_held_out_fails_its_audit(fleet, tmp_path):
