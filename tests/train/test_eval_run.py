@@ -13,6 +13,7 @@ from support.kept_run import kept_run
 from restock.cli import main
 from restock.files import write_table
 from restock.ingest.profile.profile import load_profile
+from restock.train.evaluation.eval_run import plan_evaluation
 from restock.train.evaluation.references import drive_references
 from restock.train.run.kept_evaluations import (
     add_evaluation,
@@ -127,9 +128,40 @@ def test_the_references_drive_the_same_missions_and_time_lost_is_against_the_pla
     operator = results("operator")["operator", "nominal"]  # against the planner of before
     assert operator["success"] == 1.0
     assert operator["time_lost_s"] == pytest.approx(operator["time_s"] - planner["time_s"])
+    # Who drove before the planner did is told as well, now that it is known.
+    assert main([*line, "--policies", "random"]) == 0
+    alone = {(row["policy"], row["condition"]): row for row in read_evaluations(run).to_pylist()}
+    assert alone["operator", "nominal"]["time_lost_s"] == operator["time_lost_s"]
+    assert alone["random", "nominal"]["time_lost_s"] is None  # it did not arrive
+    capsys.readouterr()
     # Without a run they are the same episodes.
     task = load_profile("warehouse_amr").task
     (driven,) = drive_references(task, ["planner"], kinds=["nominal"], episodes=1, discount=0.5)[
         "planner"
     ]
     assert driven.time_s == planner["time_s"]
+
+
+def test_episodes_may_be_asked_for_by_kind(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = kept_run(tmp_path / "a")
+    line = ["eval", str(run), "--policies", "agent", "--perturbations", "none", "--dry-run"]
+    assert main([*line, "--episodes", "nominal=1000, wheel_slip=300"]) == 0
+    planned = json.loads(capsys.readouterr().out)
+    assert (planned["episodes"], planned["kinds"]) == (1300, ["nominal", "wheel_slip"])
+    for wrong, said in (
+        ("nominal=ten", "is neither a number nor kind=number"),
+        ("ice=3", "there is no kind 'ice'"),
+        ("nominal=0", "must be at least 1, got 0"),
+    ):
+        assert main([*line, "--episodes", wrong]) == 2
+        assert said in " ".join(capsys.readouterr().err.split())
+
+
+def test_episodes_that_chose_the_policy_flatter_it(tmp_path: Path) -> None:
+    run = kept_run(tmp_path / "a")  # its evaluation's seeds are 90000 to 90009
+    assert plan_evaluation(run, episodes=1000).warnings == []
+    assert plan_evaluation(run, first_seed=90_000, policies=["planner"]).warnings == []
+    (said,) = plan_evaluation(run, first_seed=89_991, episodes=10).warnings
+    assert "among those that chose the run's policy (90000 to 90009)" in said

@@ -12,12 +12,11 @@ from restock.stats import wilson
 from restock.train.evaluation.evaluate import (
     EpisodeResult,
     Score,
-    cell_name,
     fixed_episodes,
     run_episodes,
     score,
 )
-from restock.train.evaluation.measures import measures, mission_of, summary_rows, with_time_lost
+from restock.train.run.measures import cell_name, measures, summary_rows
 from restock.train.twin.physics.episode import EpisodeSpec
 
 
@@ -104,7 +103,8 @@ def test_the_summary_tells_partial_and_full_blocks_apart() -> None:
         return EpisodeResult(condition, block, 0, success, 1, 3.0, 2.0, 0.0, 0.0, None)
 
     episodes = [result("full", True), result("partial", False), result("none", True)]
-    rows = summary_rows({("agent", "none"): [*episodes, result("partial", True)]})
+    told = {"policy": "agent", "time_lost_s": None}
+    rows = summary_rows({**one.row, **told} for one in [*episodes, result("partial", True)])
     assert [row["condition"] for row in rows] == [
         "nominal",
         "blocked_aisle (full)",
@@ -123,25 +123,19 @@ def drove(seed: int, success: bool, time_s: float, bumps: int = 0, **more: Any) 
     )
 
 
-def test_time_is_lost_where_both_arrived() -> None:
-    planner = [drove(1, True, 10.0), drove(2, False, 48.0), drove(3, True, 9.0)]
-    known = {mission_of(one): one.time_s for one in planner if one.success}
-    agent = [drove(1, True, 12.5), drove(2, True, 20.0), drove(3, False, 2.0), drove(4, True, 5.0)]
-    assert [one.time_lost_s for one in with_time_lost(agent, known)] == [2.5, None, None, None]
-    row = measures(with_time_lost(agent, known))
-    assert (row["time_lost_s"], row["time_lost_episodes"]) == (2.5, 1)
-    assert row["time_lost_s_low"] is None  # one episode has no interval
+def came_to(results: list[EpisodeResult]) -> dict[str, Any]:
+    return measures([{**one.row, "time_lost_s": None} for one in results])
 
 
 def test_bumps_are_counted_by_the_kilometre_driven() -> None:
     far = drove(1, True, 30.0, distance_m=1500.0)
     near = drove(2, False, 1.0, bumps=1, distance_m=500.0, closest_person_m=0.2)
-    row = measures([far, near])
+    row = came_to([far, near])
     assert row["bumps_per_km"] == pytest.approx(0.5)
     assert row["bumps_per_km_low"] <= 0.5 <= row["bumps_per_km_high"]
     assert (row["closest_person_least_m"], row["episodes_with_people"]) == (0.2, 1)
     # Two kilometres without a bump do not show that there will never be one.
-    clean = measures([far, drove(3, True, 9.0, distance_m=500.0)])
+    clean = came_to([far, drove(3, True, 9.0, distance_m=500.0)])
     assert (clean["bumps_per_km"], clean["bumps_per_km_low"]) == (0.0, 0.0)
     assert clean["bumps_per_km_high"] == pytest.approx(3.689 / 2, abs=1e-3)
     assert clean["closest_person_m"] is None

@@ -18,16 +18,10 @@ import pyarrow as pa
 from restock.errors import ConfigError
 from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.evaluation.evaluate import EpisodeResult, run_episodes
-from restock.train.evaluation.measures import (
-    Mission,
-    mission_named,
-    mission_of,
-    summary_rows,
-    with_time_lost,
-)
 from restock.train.evaluation.policies import load_agent, load_policy
 from restock.train.evaluation.references import FIRST_SEED, REFERENCES, reference
-from restock.train.run.kept_evaluations import add_evaluation, read_evaluations
+from restock.train.run.kept_evaluations import add_evaluation
+from restock.train.run.measures import summary_rows
 from restock.train.run.run import Run
 from restock.train.run.run_profile import profile_of_run
 from restock.train.run.run_tables import EVAL_EPISODES
@@ -217,8 +211,8 @@ def evaluate(
 
 def drive_evaluation(
     plan: EvaluationPlan, progress: Callable[[int], None] | None = None
-) -> Results:
-    """Drive all episodes, and add them to the run's `eval/episodes.parquet`."""
+) -> list[dict[str, Any]]:
+    """Drive all episodes, and add them to the run's `eval/episodes.parquet`: those rows."""
     from restock.train.twin.env.interface import DEFAULT_CONDITIONS
     from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
@@ -258,10 +252,8 @@ def drive_evaluation(
         )
         for (perturbation, _), result in zip(episodes, driven, strict=True):
             results.setdefault((policy, perturbation), []).append(result)
-    planner_s = _planner_times(plan, results)
-    results = {key: with_time_lost(driven, planner_s) for key, driven in results.items()}
-    add_evaluation(plan.run.path, episodes_table(results, plan, versions))
-    return results
+    added = add_evaluation(plan.run.path, episodes_table(results, plan, versions))
+    return added.to_pylist()
 
 
 def _perturb(name: str) -> Perturbation | None:
@@ -297,29 +289,6 @@ def make_policy(name: str, plan: EvaluationPlan) -> Policy:
     return reference(name, plan.first_seed) if named is None else named
 
 
-def _planner_times(plan: EvaluationPlan, results: Results) -> dict[Mission, float]:
-    """How long the planner took on the missions in which it arrived: as it has just driven, or in
-    an earlier evaluation of the run on these floors."""
-    driven = [
-        (mission_of(one), one.time_s, one.success)
-        for (policy, _), episodes in results.items()
-        if policy == "planner"
-        for one in episodes
-    ]
-    if not driven:
-        driven = [
-            (
-                mission_named(row["condition"], row["episode_seed"], row["perturbation_values"]),
-                row["time_s"],
-                row["success"],
-            )
-            for row in read_evaluations(plan.run.path).to_pylist()
-            if (row["policy"], row["version"], row["layouts"])
-            == ("planner", reference("planner").version, plan.layouts)
-        ]
-    return {mission: time_s for mission, time_s, success in driven if success}
-
-
 def episodes_table(results: Results, plan: EvaluationPlan, versions: Mapping[str, str]) -> pa.Table:
     """One row an episode."""
     rows = [
@@ -330,7 +299,6 @@ def episodes_table(results: Results, plan: EvaluationPlan, versions: Mapping[str
             "end_x_m": result.end_x_m,
             "end_y_m": result.end_y_m,
             "failure": result.failure,
-            "time_lost_s": result.time_lost_s,
             "version": versions[policy],
             "layouts": plan.layouts,
         }

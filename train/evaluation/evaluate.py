@@ -43,7 +43,6 @@ class EpisodeResult:
     distance_m: float | None = None  # driven, over ground
     closest_person_m: float | None = None  # body edge to edge; None: nobody was about
     discounted_return: float | None = None  # None: no discount was named
-    time_lost_s: float | None = None  # against the planner; None: one of both did not arrive
 
     @property
     def row(self) -> dict[str, Any]:
@@ -203,8 +202,3 @@ def score(results: Sequence[EpisodeResult]) -> Score:
     returns = [float(np.mean([r.undiscounted_return for r in group])) for group in by.values()]
     average = float(np.mean(list(success.values()))) if success else 0.0
     return Score(success, average, float(np.mean(returns)))
-
-
-def cell_name(condition: str, block: str) -> str:
-    """`blocked_aisle (partial)`, but `nominal`."""
-    return condition if block in ("none", "") else f"{condition} ({block})"

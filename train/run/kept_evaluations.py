@@ -7,7 +7,9 @@ floors, and of the run's own policy its newest version.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -16,6 +18,7 @@ from restock.errors import RunError
 from restock.files import read_table, write_table
 from restock.train.run.run_tables import EVAL_EPISODES
 
+Mission = tuple[str | None, str, int, str]
 FILE = Path("eval") / "episodes.parquet"  # in a run
 _NAME = ("policy", "version", "layouts", "perturbation", "perturbation_values", "condition")
 
@@ -34,11 +37,43 @@ def read_evaluations(run: Path) -> pa.Table:
     )
 
 
-def add_evaluation(run: Path, driven: pa.Table) -> None:
-    """Put an evaluation beside the earlier ones; episodes that were driven again are replaced."""
+def add_evaluation(run: Path, driven: pa.Table) -> pa.Table:
+    """Put an evaluation beside the earlier ones; episodes that were driven again are replaced.
+
+    Time lost is against the planner as it last drove the mission, of all that was ever driven.
+    Returns what was added, with it.
+    """
     earlier, new = read_evaluations(run), set(_names(driven))
     kept = [name not in new for name in _names(earlier)]
-    write_table(pa.concat_tables([earlier.filter(pa.array(kept, pa.bool_())), driven]), run / FILE)
+    whole = pa.concat_tables([earlier.filter(pa.array(kept, pa.bool_())), driven])
+    rows = whole.to_pylist()
+    planner_s = planner_times(rows)
+    lost = [
+        row["time_s"] - planner_s[mission_of(row)]
+        if row["success"] and mission_of(row) in planner_s
+        else None
+        for row in rows
+    ]
+    place = whole.schema.get_field_index("time_lost_s")
+    column = pa.array(lost, pa.float64())
+    whole = whole.set_column(place, whole.schema.field(place), column)
+    write_table(whole, run / FILE)
+    return whole.slice(whole.num_rows - driven.num_rows)
+
+
+def planner_times(rows: Iterable[Mapping[str, Any]]) -> dict[Mission, float]:
+    """How long the planner took on the missions in which it arrived, of rows of an evaluation."""
+    return {
+        mission_of(row): row["time_s"]
+        for row in rows
+        if row["policy"] == "planner" and row["success"]
+    }
+
+
+def mission_of(row: Mapping[str, Any]) -> Mission:
+    """What makes two rows the same mission: floors, condition, seed, and parameters in force."""
+    values = str(sorted(row["perturbation_values"] or ()))
+    return row["layouts"], row["condition"], row["episode_seed"], values
 
 
 def shown_evaluation(run: Path) -> tuple[pa.Table, str]:
@@ -71,4 +106,12 @@ def _names(table: pa.Table) -> list[tuple[str, ...]]:
     return list(zip(*columns, map(str, table["episode_seed"].to_pylist()), strict=True))
 
 
-__all__ = ["FILE", "add_evaluation", "read_evaluations", "shown_evaluation"]
+__all__ = [
+    "FILE",
+    "Mission",
+    "add_evaluation",
+    "mission_of",
+    "planner_times",
+    "read_evaluations",
+    "shown_evaluation",
+]

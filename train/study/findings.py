@@ -10,9 +10,8 @@ import numpy as np
 
 from restock.stats import paired_t, paired_t_power
 from restock.train.comparison.compare import Comparison
-from restock.train.evaluation.evaluate import cell_name
-from restock.train.evaluation.measures import mission_named
-from restock.train.run.kept_evaluations import read_evaluations
+from restock.train.run.kept_evaluations import mission_of, planner_times, read_evaluations
+from restock.train.run.measures import cell_name
 from restock.train.study import power as study_power
 from restock.train.study.contrasts import Contrast, RunCurve, contrast, with_holm
 from restock.train.study.power import LEAST_PAIRS, Power
@@ -158,12 +157,7 @@ def _references(plan: StudyPlan) -> tuple[dict[Any, float], dict[str, list[dict[
     path = plan.jobs[0].path
     names = plan.study.evaluation.references if path.is_dir() else ()
     episodes = {name: rows for name in names if (rows := _driven_by(path, name))}
-    times = {_mission(row): row["time_s"] for row in episodes.get("planner", []) if row["success"]}
-    return times, episodes
-
-
-def _mission(row: dict[str, Any]) -> Any:
-    return mission_named(row["condition"], row["episode_seed"], row["perturbation_values"])
+    return planner_times(episodes.get("planner", [])), episodes
 
 
 def _measured(
@@ -176,9 +170,9 @@ def _measured(
             cells.setdefault(cell_name(row["condition"], row["block"]), []).append(row["success"])
     rare = [row for row in episodes if row["condition"] in plan.study.rare]
     lost = [
-        row["time_s"] - planner_s[_mission(row)]
+        row["time_s"] - planner_s[mission_of(row)]
         for row in rare
-        if row["success"] and _mission(row) in planner_s
+        if row["success"] and mission_of(row) in planner_s
     ]
     km = sum(row["distance_m"] or 0.0 for row in rare) / 1000
     return {

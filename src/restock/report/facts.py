@@ -14,8 +14,8 @@ from restock.replay.panel.panel import Panel
 from restock.replay.panel.strata import Stratum
 from restock.replay.store.store import Store
 from restock.report.blocks import Rows, words
-from restock.stats import wilson
 from restock.train.run.kept_evaluations import shown_evaluation
+from restock.train.run.measures import measures
 from restock.train.run.run import Run
 from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
@@ -107,10 +107,8 @@ def gather(path: Path) -> Facts:
             remedy="let it train past its first logging interval",
         )
     for row in rows["cells"]:
-        row["success"] = row["low"] = row["high"] = None
-        if row["successes"] is not None:
-            row["success"] = row["successes"] / row["episodes"]
-            row["low"], row["high"] = wilson(int(row["successes"]), int(row["episodes"]))
+        row |= measures(row.pop("driven"))
+        row["low"], row["high"] = row["success_low"], row["success_high"]
     kept = rows.pop("kept")
     facts = Facts(run=path, config=run.document, kept=kept[0] if kept else None, **rows)  # type: ignore[arg-type]
     facts.evaluation = shown

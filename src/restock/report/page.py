@@ -47,7 +47,7 @@ def _headline(facts: Facts) -> str:
     if not cells:
         return f"Run {facts.run.name}: trained, not yet evaluated"
     if facts.no_goal:
-        mean = sum(row["mean_return"] for row in cells) / len(cells)
+        mean = sum(row["return"] for row in cells) / len(cells)
         return f"No goal, so no success: mean return {mean:.2f} over {len(cells)} kinds of episode"
     average = mean_success(cells)
     worst = min(cells, key=lambda row: row["success"])

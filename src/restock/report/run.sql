@@ -119,11 +119,12 @@ ORDER BY gradient_steps;
 -- `restock eval`: success per policy, perturbation and condition, blocks apart.
 SELECT policy, perturbation,
        CASE WHEN block IN ('partial', 'full') THEN condition || ' (' || block || ')' ELSE condition END AS cell,
-       count(*) AS episodes, sum(success::INT) AS successes, avg(bumps) AS bumps,
-       avg(CASE WHEN success THEN time_s END) AS time_s, avg("return") AS mean_return
+       list({'success': success, 'bumps': bumps, 'time_s': time_s, 'return': "return",
+             'discounted_return': discounted_return, 'distance_m': distance_m,
+             'closest_person_m': closest_person_m, 'time_lost_s': time_lost_s}) AS driven
 FROM evaluated
 GROUP BY ALL
-ORDER BY ALL;
+ORDER BY policy, perturbation, cell;
 
 -- name: failures
 -- Where the agent's episodes ended that did not reach the goal.

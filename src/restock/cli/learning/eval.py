@@ -72,9 +72,9 @@ class EvalCommand:
         from restock.cli.output import print_json, progress, say
         from restock.errors import ConfigError, ExitCode
         from restock.train.evaluation.eval_run import drive_evaluation, plan_evaluation, settings
-        from restock.train.evaluation.measures import summary_rows
         from restock.train.evaluation.regression import of_baseline, of_run, regressed, regression
         from restock.train.evaluation.regression import save_baseline as save
+        from restock.train.run.measures import summary_rows
 
         if self.check and self.baseline is None:
             raise ConfigError(
