@@ -21,8 +21,8 @@ from restock.replay.panel.panel import Panel
 from restock.stats import mean_over_strata
 from restock.train.comparison.arms import differences
 from restock.train.comparison.compare import LEAST_EPISODES, compare, last_evaluation
-from restock.train.evaluation.evaluate import cell_name
 from restock.train.evaluation.regression import agent_episodes
+from restock.train.run.measures import cell_name
 from restock.train.run.run import Run
 
 Rows = list[dict[str, Any]]

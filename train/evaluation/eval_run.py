@@ -252,8 +252,9 @@ def drive_evaluation(
         )
         for (perturbation, _), result in zip(episodes, driven, strict=True):
             results.setdefault((policy, perturbation), []).append(result)
-    added = add_evaluation(plan.run.path, episodes_table(results, plan, versions))
-    return added.to_pylist()
+    table = episodes_table(results, plan, versions)
+    added: list[dict[str, Any]] = add_evaluation(plan.run.path, table).to_pylist()
+    return added
 
 
 def _perturb(name: str) -> Perturbation | None:
