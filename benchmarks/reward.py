@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Rewards, reward_parts
 from restock.train.dqn.config import LossConfig
-from restock.train.evaluation.evaluate import cell_name
 from restock.train.evaluation.policies import load_agent
+from restock.train.run.measures import cell_name
 from restock.train.run.run import Run
 from restock.train.twin.env.interface import Policy
 from restock.train.twin.env.operator_policy import Operator
