@@ -54,6 +54,8 @@ def _drive(rng: np.random.Generator) -> Drive:
             "wheel_yaw_rate_radps": np.full(21, 0.5),
             "gyro_yaw_rate_radps": np.full(21, 0.48),
             "accel_x_mps2": np.full(21, 0.1),
+            "nav_speed_mps": np.full(21, 0.4),
+            "nav_yaw_rate_radps": np.zeros(21),
         },
         scan_s=np.arange(41) * 0.1,
         ranges_m=rng.uniform(0.3, 9, (41, 90)),
@@ -110,6 +112,7 @@ def test_every_topic_has_its_rate(messages: list[Message]) -> None:
         "/bumper": 43,  # 41 at 10 Hz, pressed and released between
         "/ground_truth/condition": 21,
         "/ground_truth/exposure": 21,
+        "/cmd_vel_nav": 21,
         "/cmd_vel": 21,  # 20 steps and the stop at the end
         "/diagnostics": 5,
         "/ground_truth/perturbation": 1,
