@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import msgspec
@@ -88,9 +88,9 @@ def _ahead(rows: FedRows) -> FedRows:
 def _twice(rows: FedRows) -> FedRows:
     some = rows.episode < 3
     arrays = {
-        name: np.concatenate([value, value[some]])
-        for name, value in vars(rows).items()
-        if isinstance(value, np.ndarray) and name not in ("joined", "last", "_stretch")
+        item.name: np.concatenate([value, value[some]])
+        for item in fields(rows)
+        if isinstance(value := getattr(rows, item.name), np.ndarray)
     }
     arrays["episode"][len(rows) :] += rows.episode.max() + 1
     return FedRows(task=rows.task, **arrays)

@@ -56,7 +56,10 @@ FOLLOW_FROM = {  # checks that are off because an end is
     ACCELEROMETER: ("range: accel_x", "spread: accel_x"),
     LIDAR: ("range: clearances", "spread: clearances"),
 }
-_FIRST = ("ROWS_APART", "FUTURE_IN_OBSERVATION")  # nothing can be told of rows before these
+_FIRST = (  # nothing can be told of rows before these
+    *("ROWS_APART", "ROWS_UNCHANGED", "FUTURE_IN_OBSERVATION"),
+)
+COARSE = "ACTIONS_COARSE"  # then actions explain less of the motion, whatever else is right
 _ON_THEIR_OWN = ("EPISODES_REPEATED", "TERMINATIONS_WRONG")
 _UNITS = (
     ((50.0, 65.0), "degrees in place of radians"),
@@ -94,12 +97,15 @@ def findings(
     actions = [end for end in ends if end in (ACTION_SPEED, ACTION_TURN, "actions")]
     # Actions that are late or early are found in place of others, too.
     shifted = any(_is_shift(*_distortion(end, ends[end])) for end in actions)
-    if moved and one_to_one and not shifted and (actions or not ends):
+    if len(moved) > 1 and one_to_one and not shifted and (actions or not ends):
         found.append(_permuted(moved, task))
         ends = {end: off for end, off in ends.items() if end not in actions}
     follow = {check for end in ends for check in FOLLOW_FROM.get(end, ())}
     of_rows = [one for one in of_rows if not set(one.evidence) <= follow]
-    return found + [_of_end(end, off, task) for end, off in ends.items()] + of_rows
+    found += [_of_end(end, off, task) for end, off in ends.items()]
+    if any(one.cause == COARSE for one in of_rows):
+        found = [one for one in found if one.cause not in ("ACTIONS_MIXED", "COMMAND_SCALED")]
+    return found + of_rows
 
 
 def odd_ends(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
@@ -134,9 +140,10 @@ def _distortion(end: str, off: Sequence[Answer]) -> tuple[float, float]:
     scales, delays = [], []
     for one in off:
         is_answer = one.relation.y in ends
-        if one.gain == one.gain and one.gain:
+        if one.gain == one.gain and one.gain and one.is_off("gain"):
             scales.append(one.gain if is_answer else 1 / one.gain)
-        delays.append(one.delay if is_answer else -one.delay)
+        if one.is_off("delay"):
+            delays.append(one.delay if is_answer else -one.delay)
     return median(scales) if scales else 1.0, median(delays) if delays else 0.0
 
 
@@ -298,11 +305,12 @@ KINDS = (
         "ingest the logs again; look for software that rewrites rows after ingest",
     ),
     Kind(
-        "ROWS_APART",
+        "ROWS_UNCHANGED",
         ("unchanged", "closing"),
         "in {unchanged.logs:.0%} of the rows in which the robot moves the next observation is the"
         " observation itself",
-        "ingest the logs again; look for topics that are held (stale) in the recordings",
+        "are topics slower than the control clock? Take a longer control_period_s, or record them"
+        " faster",
     ),
     Kind(
         "REWARD_DIFFERENT",
@@ -342,6 +350,14 @@ KINDS = (
         "in {own_action.logs:.0%} of the rows the next observation does not hold the row's own"
         " action: the `action` column is not what the observations were made with",
         "something changed actions after ingest: ingest the logs again",
+    ),
+    Kind(
+        COARSE,
+        ("far commands",),
+        "{far_commands.logs:.0%} of the commands are more than .25 (of the fastest action) from the"
+        " action that stands for them",
+        "give [task] actions that are nearer to what the robot is commanded, or look at the unit of"
+        " [inputs.command]; the audit `far_actions` shows them",
     ),
     Kind(
         "LIDAR_TURNED",

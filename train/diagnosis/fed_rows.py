@@ -25,6 +25,8 @@ _COLUMNS = (
     *("transition_id", "episode_id", "step_index", "recording_id", "condition", "action", "reward"),
     *("terminated", "truncated", "observation", "next_observation"),
 )
+FEW_EPISODES = 20  # fewer than these are drawn in stretches of
+BLOCK_STEPS = 50  # steps: longer than what a step still shows of those before it
 MOST_ROWS = 40_000  # of a store or panel, in whole episodes chosen by hash
 
 
@@ -64,6 +66,14 @@ class FedRows:
         joined = np.zeros(len(self), np.bool_)
         joined[1:] = (np.diff(self.episode) == 0) & (np.diff(self.step) == 1)
         return joined
+
+    @cached_property
+    def cluster(self) -> Ints:
+        """What a bootstrap draws whole, codes (N,): episodes, or stretches of few long ones."""
+        if len(np.unique(self.episode)) >= FEW_EPISODES:
+            return self.episode
+        stretch = self.step // BLOCK_STEPS
+        return self.episode * (int(stretch.max(initial=0)) + 1) + stretch
 
     @cached_property
     def last(self) -> Bools:

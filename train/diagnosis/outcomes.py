@@ -82,12 +82,12 @@ def _rewards(logs: FedRows, twin: FedRows | None, rng: np.random.Generator) -> I
     what = "reward against the task's own, of the same observations"
     implied = implied_reward(logs)
     telling = np.abs(implied) > _TELLING  # False for NaN
-    if len(np.unique(logs.episode[telling])) < FEWEST_CLUSTERS:
+    if len(np.unique(logs.cluster[telling])) < FEWEST_CLUSTERS:
         yield not_run("reward scale", what, "too few rows whose observations say their reward")
         return
     ratio = logs.reward[telling] / implied[telling]
     (scale,) = clustered_quantiles(
-        ratio, logs.episode[telling], (0.5,), rng=rng, resamples=RESAMPLES
+        ratio, logs.cluster[telling], (0.5,), rng=rng, resamples=RESAMPLES
     )
     yield judged(
         "reward scale", what, "ratio", scale, logs=float(np.median(ratio)), twin=1.0,

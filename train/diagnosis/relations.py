@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from restock.arrays import F64, Ints
+from restock.arrays import F64, Bools, Ints
 from restock.train.diagnosis.fed_rows import FedRows
 from restock.train.diagnosis.response import Response, fit_response, lagged
 
@@ -25,6 +25,8 @@ NOW = np.zeros(1, np.int64)
 _JUMP_RAD = 0.8  # a plan was replaced, not turned
 _SLOW_MPS = 0.3  # slower than this a waypoint's bearing changes by turning, not by driving past it
 _JUMP_M = 0.6
+_MOST = 0.5  # of what moves
+_NEAR_STEPS = 5
 _FAR = 0.97  # of the lidar's range: nothing was seen
 
 
@@ -39,14 +41,39 @@ class Relation:
     of: Callable[[FedRows], tuple[F64, F64]]  # x and y of the rows, (N,) each; or (N, S)
     gain: float | None = 1.0  # by definition, where there is no twin to ask
 
-    def fit(self, rows: FedRows, rng: np.random.Generator) -> Response | None:
+    def fit(
+        self, rows: FedRows, rng: np.random.Generator, without_slip: bool = False
+    ) -> Response | None:
         """None where the rows say too little."""
         x, y = self.of(rows)
+        if without_slip:
+            y = y.copy()
+            y[_slips(rows)] = np.nan
         if x.ndim == 2:
-            cluster = np.repeat(rows.episode, x.shape[1])
+            cluster = np.repeat(rows.cluster, x.shape[1])
             return fit_response(x.reshape(-1, 1), y.reshape(-1), cluster, NOW, rng)
         before = [rows.before(int(lag)) for lag in self.lags]
-        return fit_response(lagged(x, before), y, rows.episode, self.lags, rng)
+        return fit_response(lagged(x, before), y, rows.cluster, self.lags, rng)
+
+    def tells_without_slip(self, rows: FedRows) -> bool:
+        """Whether most of what moves is left when rows labelled as slipping are left out.
+
+        Where wheels slip, how a robot moves is the floor's; but a sensor that is wrong looks like
+        slip too, and then most of what moves is so labelled.
+        """
+        x, y = self.of(rows)
+        moves = np.where(np.isfinite(y), x, 0.0) ** 2
+        return bool(moves[~_slips(rows)].sum() >= _MOST * moves.sum())
+
+
+def _slips(rows: FedRows) -> Bools:
+    """Rows (N,) labelled as slipping, and those a few steps from them."""
+    slips = np.asarray(rows.condition == "wheel_slip", np.bool_)
+    near = slips.copy()
+    for lag in (*range(-_NEAR_STEPS, 0), *range(1, _NEAR_STEPS + 1)):
+        place, known = rows.before(lag)
+        near |= slips[place] & known
+    return near
 
 
 def _speed(rows: FedRows) -> F64:

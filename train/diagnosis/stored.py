@@ -22,6 +22,8 @@ from restock.train.diagnosis.evidence import Comparison, not_run, share_judged
 from restock.train.diagnosis.fed_rows import MOST_ROWS, FedRows
 from restock.train.twin.calibration.logged_steps import LoggedSteps, logged_steps, rows_of
 
+FAR = 0.25  # from a command to its action, in units of the fastest action
+COARSE = 0.1  # of the commands, those so far
 DIFFERENT = 0.02  # of the rows that have a label, or should
 _LABELS = "row's label is not what its conditions give on the stored signals"
 _ENDS = "row is terminated and its signals do not say so, or they do and it is not"
@@ -30,10 +32,11 @@ _ENDS = "row is terminated and its signals do not say so, or they do and it is n
 def stored(
     store: Store, rows: FedRows, profile: Profile, conditions: Sequence[Condition]
 ) -> Iterator[Comparison]:
-    """Labels of each condition, and terminations; of whole recordings of some 40,000 rows.
+    """Commands and actions, labels, and terminations; of whole recordings of some 40,000 rows.
 
     `conditions` are those of the profile that the stored signals can say; `rows` are of the store.
     """
+    yield _far_commands(store, rows.task.hash)
     recordings, left_out = _recordings(store, rows.task.hash, profile.labels_version)
     if not recordings:
         for check, what in (("labels", _LABELS), ("terminations", _ENDS)):
@@ -43,6 +46,16 @@ def stored(
     whole = _whole(steps)
     yield from _labels(steps, whole, conditions, left_out)
     yield _terminations(steps, rows)
+
+
+def _far_commands(store: Store, task_hash: str) -> Comparison:
+    ((far, count),) = store.connection.sql(
+        "SELECT count(*) FILTER (action_residual > ?), count(action_residual) FROM transitions"
+        " WHERE task_hash = ?",
+        params=[FAR, task_hash],
+    ).fetchall()
+    what = "command is far from the action that stands for it"
+    return share_judged("far commands", what, far, count, COARSE)
 
 
 def _recordings(store: Store, task_hash: str, version: str) -> tuple[list[str], str]:

@@ -23,7 +23,7 @@ from restock.train.diagnosis.fed_rows import FedRows
 from restock.train.diagnosis.response import FEWEST_CLUSTERS, RESAMPLES
 
 BEYOND = 0.02  # of the rows
-SPREAD = 4.0  # of logs over the twin's, or its inverse
+SPREAD = 10.0  # of logs over the twin's, or its inverse
 TURNED_DEG = 20.0
 MEASURED = (
     *("wheel_speed", "localised_speed", "lateral_speed", "gyro_yaw_rate", "accel_x"),
@@ -64,7 +64,7 @@ def _entry(
         f" {low:.3g} to {high:.3g}",
     )  # fmt: skip
     least, most = clustered_quantiles(
-        of_logs, logs.episode, (0.05, 0.95), rng=rng, resamples=RESAMPLES
+        of_logs, logs.cluster, (0.05, 0.95), rng=rng, resamples=RESAMPLES
     )
     expected = float(np.subtract(*np.quantile(of_twin, [0.95, 0.05])))
     spread = ConfidenceInterval(
@@ -114,7 +114,7 @@ def _approach(rows: FedRows, rng: np.random.Generator) -> F64 | None:
     straight &= np.abs(driven) > _DRIVING_MPS * task.control_period_s
     most = _FAR**2 * task.range_max_m
     seen: Bools = straight[:, None] & (now < most) & (after < most) & (np.abs(after - now) < 0.5)
-    place = np.unique(rows.episode, return_inverse=True)[1].reshape(-1)
+    place = np.unique(rows.cluster, return_inverse=True)[1].reshape(-1)
     clusters = int(place.max(initial=-1)) + 1
     if clusters < FEWEST_CLUSTERS or seen.sum() < 100:
         return None

@@ -185,8 +185,11 @@ def _show_rows(diagnosis: RowDiagnosis) -> None:
     for one in diagnosis.findings:
         out.print(f"  {one.cause}: {one.text}", markup=False, soft_wrap=True)
         out.print(f"    {one.remedy}", markup=False, soft_wrap=True)
+    by_reason: dict[str, list[str]] = {}
     for row in diagnosis.not_run:
-        out.print(f"  not run: {row.check}: {row.note}", markup=False, soft_wrap=True)
+        by_reason.setdefault(row.note, []).append(row.check)
+    for reason, checks in by_reason.items():
+        out.print(f"  not run: {', '.join(checks)}: {reason}", markup=False, soft_wrap=True)
 
 
 def _range(least: float | None, most: float | None) -> str:
