@@ -224,7 +224,8 @@ def _proposed(task: Task, now: Signals) -> NDArray[np.float64]:
 
 def _fastest(task: Task) -> NDArray[np.float64]:
     """The largest speed (m/s) and yaw rate (rad/s) among the actions, (2,)."""
-    return np.maximum(np.abs(np.asarray(task.actions, np.float64)).max(axis=0), 1e-9)
+    largest = np.abs(np.asarray(task.actions, np.float64)).max(axis=0)
+    return np.asarray(np.maximum(largest, 1e-9), np.float64)
 
 
 def _nearness(clearance_m: NDArray[Any], range_max_m: float) -> NDArray[Any]:
