@@ -143,8 +143,8 @@ def _show(diagnosis: Diagnosis, paths: tuple[Path, ...]) -> None:
     out = stdout()
     out.print(f"{diagnosis.cause}")
     for line in diagnosis.evidence:
-        out.print(f"  {line}")
-    out.print(f"to confirm: {diagnosis.experiment}")
+        out.print(f"  {line}", markup=False, soft_wrap=True)
+    out.print(f"to confirm: {diagnosis.experiment}", markup=False, soft_wrap=True)
 
 
 def _show_rows(diagnosis: RowDiagnosis) -> None:
