@@ -45,7 +45,10 @@ class Collecting:
 
     def __post_init__(self) -> None:
         shipped = load_profile("warehouse_amr")
-        task = msgspec.structs.replace(shipped.task, time_limit_steps=LONGEST)
+        # Every episode goes on to the time limit: at random the robot bumps into something.
+        task = msgspec.structs.replace(
+            shipped.task, time_limit_steps=LONGEST, bump_terminates=False
+        )
         self.profile: Profile = msgspec.structs.replace(shipped, task=task)
         drawn = Schedule(ranges={"payload_kg": (10.0, 60.0)}, name="laden")
         self.env = WarehouseVectorEnv(ENVS, seed=1, task=task, perturbation=drawn)
