@@ -179,7 +179,7 @@ def test_a_profile_comes_back_from_its_text_as_it_was(
 
 def test_conditions_that_come_with_restock_go_by_their_names() -> None:
     profile = load_profile("warehouse_amr")
-    assert with_conditions(profile, profile.conditions) == profile
+    assert with_conditions(profile, profile.definitions) == profile
     other = msgspec.structs.replace(profile.conditions[0], sql="false")
     changed = with_conditions(profile, [other])
     assert (changed.shipped_conditions, changed.own_conditions) == ([], [other])

@@ -88,4 +88,4 @@ def test_it_is_measured_in_episodes_that_were_asked_for() -> None:
     assert np.isinf(nobody)
     env = WarehouseVectorEnv(1, conditions={"near_collision": 1.0})
     env.reset(seed=0)
-    assert np.isnan(env.step(np.array([2]))[4]["closest_person_m"]).all()
+    assert np.isposinf(env.step(np.array([2]))[4]["closest_person_m"]).all()

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
 import gymnasium
+import msgspec
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -17,6 +19,7 @@ from scipy.sparse import csgraph
 import restock  # noqa: F401 - registers the environment
 from restock.cli import main
 from restock.errors import ConfigError, RunError
+from restock.ingest.profile.profile import load_profile
 from restock.train.prepare import prepare_new
 from restock.train.twin.env.floor_report import describe_floor
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
@@ -299,16 +302,21 @@ def _drive(env: WarehouseVectorEnv, specs: list[EpisodeSpec], steps: int) -> np.
 
 def test_an_episode_is_the_same_alone_and_among_other_floors_whatever_the_threads() -> None:
     floors = open_floors("default,generated:train:3,narrow:1")
+    # What comes after a bump is drawn among the floors that are there.
+    task = msgspec.structs.replace(load_profile("warehouse_amr").task, bump_terminates=False)
+
+    def warehouse(envs: int, floors: Sequence[Warehouse], nthread: int = 1) -> WarehouseVectorEnv:
+        return WarehouseVectorEnv(envs, layouts=tuple(floors), task=task, nthread=nthread)
+
     specs = [EpisodeSpec(KINDS[i % 4], 70 + i, layout=floors[i % 5].name) for i in range(10)]
-    among = _drive(WarehouseVectorEnv(10, layouts=floors), specs, 40)
-    threads = WarehouseVectorEnv(10, layouts=floors[::-1], nthread=2)
+    among = _drive(warehouse(10, floors), specs, 40)
+    threads = warehouse(10, floors[::-1], nthread=2)
     np.testing.assert_array_equal(_drive(threads, specs, 40), among)
     for index in (0, 1, 4):
-        alone = _drive(WarehouseVectorEnv(2, layouts=(floors[index],)), specs[index::5], 0)
+        alone = _drive(warehouse(2, floors[index : index + 1]), specs[index::5], 0)
         np.testing.assert_array_equal(alone[0], among[0, index::5])
-    one = WarehouseVectorEnv(10, layouts=(floors[2],))
+    one, many = warehouse(10, floors[2:3]), warehouse(10, floors)
     there = [replace_layout(spec, floors[2].name) for spec in specs]
-    many = WarehouseVectorEnv(10, layouts=floors)
     np.testing.assert_array_equal(_drive(one, there, 40), _drive(many, there, 40))
 
 

@@ -24,7 +24,7 @@ termination.
   far), `episode_steps`, `true_pose` (N, 3);
 - `travelled_m`, over ground in [t, t + 1); `closest_person_m`, the least true distance so far from
   the body's edge to a person or forklift, as the crow flies, of the episodes of `set_episodes`:
-  inf where nobody is on the floor, NaN in others, where it is not measured;
+  inf where nobody is on the floor, and in others, where it is not measured;
 - `invalid`: the physics diverged: the episode is truncated and the step must not enter replay;
 - `final_obs`, with the mask `_final_obs`;
 - in the continuous action space `action`, the nearest of the task's, and `action_residual`.
@@ -391,7 +391,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
             "success": ended & reached_goal(self.task, after) & (self.bumps == 0),
             "invalid": invalid.copy(),
             "travelled_m": sim.travelled_m,
-            "closest_person_m": sim.traffic.closest_m.copy(),
+            # Not NaN, which Gymnasium's checker takes for two different values.
+            "closest_person_m": np.nan_to_num(sim.traffic.closest_m, nan=np.inf, posinf=np.inf),
         }
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
