@@ -132,6 +132,7 @@ def _values(
         terminates=np.array([episode.terminated for episode in episodes])[number],
         zone=_zones(rows, episodes, profile)[begin].tolist(),
         truth=each("truth").tolist(),
+        true_exposure=[told or None for told in each("exposure").tolist()],
         policy=[POLICIES[code] for code in each("policy")],
         policy_version=[version[episode] for episode in number],
         probability=each("probability"),

@@ -193,6 +193,7 @@ def episodes_of(rows: pa.Table, profile: Profile) -> list[FreshEpisode]:
                 reward=part["reward"].to_numpy(),
                 progress_m=part["progress_m"].to_numpy(),
                 truth=np.array(part["true_condition"].to_pylist(), "<U64"),
+                exposure=np.array(part["true_exposure"].to_pylist(), "<U64"),
                 signals={name: signals[name].to_numpy() for name in names},
                 labels={name: np.array([name in held for held in named]) for name in conditions},
                 perturbation="nominal",

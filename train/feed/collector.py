@@ -32,6 +32,7 @@ from restock.train.twin.floors.layout import DEFAULT
 
 _EPISODES_PER_QUERY = 8
 _NO_VALUES = ("{}",)  # of a twin that has only a name for them
+_NOT_SAID = ("",)  # of a twin that does not tell situations
 
 
 @dataclass(frozen=True)
@@ -216,6 +217,7 @@ class Collector(Stateful):
                 reward=reward,
                 progress_m=info["progress_m"],
                 truth=info["true_condition"],
+                exposure=info.get("true_exposure", _NOT_SAID * self.env.num_envs),
             )
         self.observation = np.array(observation, copy=True)
         after = info["signals"]

@@ -23,8 +23,8 @@ from restock.train.run import checkpoint
 if TYPE_CHECKING:
     from restock.train.feed.collector import EndedEpisode
 
-_STEP = ("action", "probability", "policy", "reward", "progress_m", "truth")
-_KINDS = {"action": "i2", "policy": "i2", "truth": "<U64"}
+_STEP = ("action", "probability", "policy", "reward", "progress_m", "truth", "exposure")
+_KINDS = {"action": "i2", "policy": "i2", "truth": "<U64", "exposure": "<U64"}
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,7 @@ class FreshEpisode:
     reward: F32  # (T,)
     progress_m: F32  # (T,)
     truth: NDArray[np.str_]  # (T,) the true conditions
+    exposure: NDArray[np.str_]  # (T,) the true exposures; empty where the twin does not say
     signals: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # (T + 1,) each
     labels: Mapping[str, Bools] = field(default_factory=dict)  # (T + 1,) each
 
@@ -91,7 +92,7 @@ class FreshLog(Stateful):
         self._observation[np.arange(len(at)), at] = observation
 
     def took(self, at: NDArray[np.int64], **values: NDArray[Any]) -> None:
-        """After it: action, probability, policy, reward, progress_m and truth (N,)."""
+        """After it: action, probability, policy, reward, progress_m, truth and exposure (N,)."""
         for name, value in values.items():
             self._steps[name][np.arange(len(at)), at] = value
 
