@@ -166,13 +166,17 @@ def test_changed_exposures_are_told_again_from_the_store(store, profile):
         assert "2.2" in opened.exposures()[-1].sql
 
 
-def test_a_store_from_before_exposures_opens_and_says_null(store, profile):
+def test_a_store_from_before_exposures_opens_and_says_null(store, profile, capsys):
     """And is labelled again without those whose signals it does not have."""
     store = _before_exposures(store, store.parent / "older")
     with Store(store) as opened:
         assert opened.exposures() == ()
         assert opened.sql("SELECT DISTINCT exposures FROM transitions").fetchall() == [(None,)]
         assert opened.sql("FROM coverage_by_exposure").fetchall() == []
+    # A condition is not left out so: the recordings have to be read again for its signals.
+    assert main(["label", str(store), "--profile", str(profile)]) == 2
+    assert "ingest the recordings again" in capsys.readouterr().err
+    profile.write_text(profile.read_text().replace(', "blocked_aisle"]', "]"))
     assert main(["label", str(store), "--profile", str(profile)]) == 0
     with Store(store) as opened:
         held = opened.sql("SELECT DISTINCT unnest(exposures) FROM transitions").fetchall()

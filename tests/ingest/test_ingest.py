@@ -262,6 +262,8 @@ def test_the_sample_log_is_labelled_about_as_well_as_the_page_says(run):
     assert code == 0
     page = (ROOT / "docs" / "ingest.md").read_text()
     scores = {score["condition"]: score for score in said["recordings"][0]["label_scores"]}
+    for exposure in said["recordings"][0]["exposures"]:  # docs/profile.md tells of those
+        assert scores.pop(exposure)["support"] > 0
     for name, score in scores.items():
         found = re.search(rf"^\| `{name}` \| default \| ([.\d]+) / ([.\d]+) \|", page, re.M)
         assert found, name

@@ -107,8 +107,8 @@ def test_a_file_that_is_not_text(tmp_path):
 def test_what_stands_in_is_said():
     assert load_profile("warehouse_amr").fallbacks == {}
     assert set(load_profile("turtlebot3").fallbacks) == {
-        "bumper", "nav_command", "behaviour_policy", "true_condition", "perturbation", "goal",
-        "plan",
+        "bumper", "nav_command", "behaviour_policy", "true_condition", "true_exposure",
+        "perturbation", "goal", "plan",
     }  # fmt: skip
 
 
