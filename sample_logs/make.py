@@ -79,7 +79,7 @@ def record_all(folder: Path, *, quick: bool) -> dict[str, object]:
     tuesday = Rates(
         odom=5,
         imu=5,
-        joint_states=1,
+        joint_states=0.5,
         scan=5,
         amcl_pose=5,
         tf=2,
