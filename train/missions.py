@@ -10,9 +10,11 @@ from restock.replay.fleet.missions_file import MissionOrder, read_missions
 from restock.replay.panel.panel import Panel
 from restock.train.dqn.config import PracticeConfig, TrainConfig
 from restock.train.evaluation.evaluate import run_episodes
+from restock.train.evaluation.references import reference
 from restock.train.feed.logs import Coded
-from restock.train.feed.practice import Practice, logged_shares
-from restock.train.twin.env.interface import Policy, Twin
+from restock.train.feed.practice import Practice
+from restock.train.feed.practice_shares import logged_shares
+from restock.train.twin.env.interface import Twin
 from restock.train.twin.env.mission_arms import MissionArms
 from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.floors.floors import open_floors
@@ -80,20 +82,13 @@ def reference_success(config: TrainConfig, env: Twin, task: Task) -> dict[str, f
     ]
     results = run_episodes(
         env,
-        _driver(config.practice.reference),
+        reference(config.practice.reference),
         specs,
         control_period_s=task.control_period_s,
         time_limit_steps=task.time_limit_steps,
     )
     success = np.array([bool(result.success) for result in results]).reshape(-1, missions)
     return {arm.name: float(of.mean()) for arm, of in zip(arms.arms, success, strict=True)}
-
-
-def _driver(name: str) -> Policy:
-    from restock.train.twin.env.operator_policy import Operator
-    from restock.train.twin.env.policies import PlannerFollower
-
-    return Operator(epsilon=0.0) if name == "operator" else PlannerFollower(epsilon=0.0)
 
 
 __all__ = ["check_missions", "mission_arms", "mission_orders", "reference_success"]

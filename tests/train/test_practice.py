@@ -23,7 +23,8 @@ from restock.replay.fleet.missions_file import MissionOrder
 from restock.train.comparison.arms import differences
 from restock.train.dqn.config import PracticeConfig, load_config
 from restock.train.feed.collector import EndedEpisode
-from restock.train.feed.practice import Practice, logged_shares, moved, unordered, with_floors
+from restock.train.feed.practice import Practice
+from restock.train.feed.practice_shares import logged_shares, moved, unordered, with_floors
 from restock.train.loop import train
 from restock.train.missions import reference_success
 from restock.train.prepare import make_twin, prepare_new, prepare_resumed
