@@ -1,5 +1,5 @@
 -- Does the reward want what is measured? Macros over a table of driven episodes, named by `source`
--- (`driven_episodes` of a store, see returns.sql; `run_episodes` of a run, see run_episodes.sql):
+-- (`driven_episodes` of a store, see returns.sql, or of a run, see run_returns.sql):
 --
 --     mission (null: every driver had missions of its own), driver, handed_over, condition, outcome,
 --     success, return, discounted_return
@@ -120,3 +120,13 @@ SELECT
     [earned_low, earned_high] AS more_return
 FROM intervals
 ORDER BY condition, driver, other;
+
+-- The pairs that too few episodes tell apart; one row that says so where there is no pair at all.
+CREATE OR REPLACE MACRO undetermined_order(source, min_episodes, same_success) AS TABLE
+WITH pairs AS (FROM return_order(source, min_episodes, same_success))
+SELECT condition, driver, other, why, episodes, other_episodes, more_success, more_return
+FROM pairs
+WHERE verdict = 'undetermined'
+UNION ALL
+SELECT NULL, NULL, NULL, 'no condition in which two drivers had a goal', 0, 0, NULL, NULL
+WHERE NOT EXISTS (FROM pairs);
