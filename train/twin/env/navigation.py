@@ -25,13 +25,19 @@ LOOK_M = 1.9  # something this near ahead makes the finder look at the scan
 
 
 class Navigation(Stateful):
-    """Plans and goals of N robots, each on one of `floors`."""
+    """Plans and goals of N robots, each on one of `floors`.
+
+    `proposes`: where there is a route, the stack's next command is known beside it.
+    """
 
     STATE = ("plans_m", "plan_number", "closures", "finder")
     STATE_TYPES: ClassVar[Mapping[str, Any]] = {"closures": list[list[Closure]]}
 
-    def __init__(self, floors: Sequence[Warehouse], num_envs: int, task: Task) -> None:
+    def __init__(
+        self, floors: Sequence[Warehouse], num_envs: int, task: Task, *, proposes: bool = True
+    ) -> None:
         self.task = task
+        self._follower = PathFollower(task) if proposes and task.goal == "route" else None
         self.planners = planners(floors)
         self.finder = BlockFinder(floors, num_envs)
         self.floor = self.finder.floor  # (N,) on which of the floors
@@ -66,6 +72,15 @@ class Navigation(Stateful):
             )
             self.plan_number[env] += 1
         return np.array(sorted(again), np.int64)
+
+    def propose(self, signals: Signals) -> None:
+        """Add what it would do next, whoever drives: by the plan in force and this step's scan."""
+        if self._follower is not None:
+            command = self._follower.table[self._follower.choose(signals)]
+            signals["nav_speed_mps"], signals["nav_yaw_rate_radps"] = command.T.copy()
+        else:
+            unknown = np.full(len(signals["stamp_ns"]), np.nan)
+            signals["nav_speed_mps"], signals["nav_yaw_rate_radps"] = unknown, unknown.copy()
 
     def _find_blocks(self, signals: Signals, sensing: Sensing) -> set[int]:
         """Look for blocked aisles where something is near ahead; returns whose map changed."""
@@ -144,11 +159,6 @@ class PathFollower:
         action[front < self.stop_m] = 0
         pivot = (bend > 0.9) & (signals["clearance_m"] > self.pivot_m)
         return np.where(pivot, self._pivot[side], action)
-
-    def propose(self, signals: Signals) -> None:
-        """Add the velocity of that action to the signals: what navigation would do next."""
-        command = self.table[self.choose(signals)]
-        signals["nav_speed_mps"], signals["nav_yaw_rate_radps"] = command.T.copy()
 
     def front(self, signals: Signals) -> F64:
         """The smallest clearance (N,) within 30 degrees of straight ahead."""

@@ -11,23 +11,7 @@ Autoreset is SAME_STEP (in the metadata): where an episode ends, `observation` i
 episode's first, and the last one is in `info["final_obs"]`. Bootstrap on truncation, never on
 termination.
 
-`info` holds arrays (N,) about the step just taken, whole even where an episode ended:
-
-- `signals`: the stored signals at t + 1, before any autoreset (`env.signals`: after it). Its
-  `command_*` columns are the commands of [t, t + 1); `progress_m` along the plan in force at t;
-- `true_condition`: what was physically so over [t, t + 1); `true_exposure`: the situation at t;
-  `episode_condition`, `block` (none, partial, full), `episode_seed`, `perturbation` and `layout`
-  (their names), `floor` (the layout itself), `episode_number` (place in `set_episodes`, or -1),
-  `mission_arm` (place among `mission_arms`, -1 where none was asked for); `perturbation_values`,
-  as JSON those that are not nominal;
-- `success` (at the goal without any bump, at the episode's end), `bumps` (steps with a bump so
-  far), `episode_steps`, `true_pose` (N, 3);
-- `travelled_m`, over ground in [t, t + 1); `closest_person_m`, the least true distance so far from
-  the body's edge to a person or forklift, as the crow flies, of the episodes of `set_episodes`:
-  inf where nobody is on the floor, and in others, where it is not measured;
-- `invalid`: the physics diverged: the episode is truncated and the step must not enter replay;
-- `final_obs`, with the mask `_final_obs`;
-- in the continuous action space `action`, the nearest of the task's, and `action_residual`.
+`info` is told of in `restock.train.twin.env.info`.
 """
 
 from __future__ import annotations
@@ -43,11 +27,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from restock.arrays import F32, F64, Bools, Ints
+from restock.arrays import F32, Ints
 from restock.errors import ConfigError, RunError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.signals import Signals
-from restock.ingest.task.task import Task, observe, reached_goal, reward
+from restock.ingest.task.task import Task, observe, reward
 from restock.ingest.task.task import terminated as is_terminated
 from restock.replay.fleet.missions_file import MissionOrder
 from restock.state import Stateful
@@ -55,10 +39,11 @@ from restock.train.twin.env.action_space import ActionKind, action_space
 from restock.train.twin.env.camera import Renderer, View
 from restock.train.twin.env.episode_queue import EpisodeQueue
 from restock.train.twin.env.floor_report import refuse_unfit
+from restock.train.twin.env.info import info_after, info_now
 from restock.train.twin.env.interface import DEFAULT_CONDITIONS, Info, Step
 from restock.train.twin.env.mission_arms import MissionArm, MissionArms
 from restock.train.twin.env.mission_orders import MissionOrders
-from restock.train.twin.env.navigation import Navigation, PathFollower
+from restock.train.twin.env.navigation import Navigation
 from restock.train.twin.floors.floors import floors_of
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.physics.episode import EpisodeSpec, draw_episode
@@ -137,9 +122,9 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         if warehouse is not None and layouts != DEFAULT:
             raise ConfigError("give a warehouse or layouts, not both", where="the twin")
         self.floors = floors_of(layouts) if warehouse is None else (warehouse,)
-        self._layout_names = np.array([floor.name for floor in self.floors])
-        self._floor_objects = np.empty(len(self.floors), object)
-        self._floor_objects[:] = self.floors
+        self.layout_names = np.array([floor.name for floor in self.floors])
+        self.floor_objects = np.empty(len(self.floors), object)
+        self.floor_objects[:] = self.floors
         self.layout = np.zeros(num_envs, np.int64)  # of the running episodes, among the floors
         schedule = perturbation if isinstance(perturbation, Schedule) else None
         base = perturbation.base if isinstance(perturbation, Schedule) else perturbation
@@ -166,9 +151,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         )
         self.sensing = Sensing(self.simulation, self.task)
         self.truth = Truth(self.task, num_envs)
-        self.navigation = Navigation(self.floors, num_envs, self.task)
-        follows = nav_command and self.task.goal == "route"
-        self._follower = PathFollower(self.task) if follows else None
+        self.navigation = Navigation(self.floors, num_envs, self.task, proposes=nav_command)
         if missions:
             planners = self.navigation.planners
             orders = MissionOrders(missions, self.floors, planners, where="env.missions")
@@ -251,7 +234,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         first = self.sensing.sense(ids, self.steps[ids])
         add_motion(self.task, first, None)
         add_route(self.task, first, self.navigation.plans_m[ids], self.navigation.goals_m[ids])
-        self._propose(first)
+        self.navigation.propose(first)
         observed = observe(self.task, first, first, self.previous_action[ids])
         self.observation[ids] = _bounded(observed)
         if self.signals:
@@ -302,7 +285,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         else:
             self.signals = {name: column.copy() for name, column in self.signals.items()}
         self._begin(ids)
-        return self.observation.copy(), self._info_now()
+        return self.observation.copy(), info_now(self)
 
     def step(self, actions: NDArray[Any]) -> Step:
         """One control period everywhere. `actions` (N,) index the task's actions, or are (N, 2)."""
@@ -325,12 +308,13 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         changed = self.navigation.update(after, offset, self.sensing)
         if len(changed):  # a new plan counts from t + 1 on: it never makes progress jump
             self._see_new_plans(after, changed)
-        self._propose(after)
+        self.navigation.propose(after)
 
         terminated &= ~invalid
         truncated = ((self.steps >= task.time_limit_steps) & ~terminated) | invalid
         observed = _bounded(observe(task, after, now, action))
-        info = self._info_after(after, progress, terminated, invalid) | chosen
+        truth = self.truth.condition(sim.slipped, sim.bumped, self.sensing.true_clearance_m)
+        info = info_after(self, after, progress, truth, terminated) | chosen
         if invalid.any():
             self.diverged += int(invalid.sum())
             earned = np.where(invalid, np.float32(0), earned)
@@ -343,57 +327,11 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
             self._begin(np.flatnonzero(done))
         return self.observation.copy(), earned, terminated, truncated, info
 
-    def _propose(self, signals: Signals) -> None:
-        """What navigation would do, whoever drives: by the plan in force and this step's scan."""
-        if self._follower is not None:
-            self._follower.propose(signals)
-        else:
-            unknown = np.full(len(signals["stamp_ns"]), np.nan)
-            signals["nav_speed_mps"], signals["nav_yaw_rate_radps"] = unknown, unknown.copy()
-
     def _see_new_plans(self, after: Signals, ids: Ints) -> None:
         rows: Signals = {name: column[ids] for name, column in after.items()}
         add_route(self.task, rows, self.navigation.plans_m[ids], self.navigation.goals_m[ids])
         for name, column in rows.items():
             after[name][ids] = column
-
-    def _info_now(self) -> Info:
-        return {
-            "signals": {name: column.copy() for name, column in self.signals.items()},
-            "episode_condition": self.episode_condition.copy(),
-            "block": self.block.copy(),
-            "episode_seed": self.episode_seed.copy(),
-            "perturbation": self.perturbation_name.copy(),
-            "perturbation_values": self.perturbation_values.copy(),
-            "layout": self._layout_names[self.layout],
-            "floor": self._floor_objects[self.layout],
-            "episode_number": self.episode_number.copy(),
-            "mission_arm": self.mission_arm.copy(),
-            "episode_steps": self.steps.copy(),
-            "bumps": self.bumps.copy(),
-            "true_pose": self.simulation.pose(),
-        }
-
-    def _info_after(
-        self,
-        after: Signals,
-        progress_m: F64,
-        ended: Bools,
-        invalid: Bools,
-    ) -> Info:
-        sim = self.simulation
-        condition = self.truth.condition(sim.slipped, sim.bumped, self.sensing.true_clearance_m)
-        return self._info_now() | {
-            "signals": after,
-            "progress_m": progress_m,
-            "true_condition": condition,
-            "true_exposure": self.truth.exposure(),
-            "success": ended & reached_goal(self.task, after) & (self.bumps == 0),
-            "invalid": invalid.copy(),
-            "travelled_m": sim.travelled_m,
-            # Not NaN, which Gymnasium's checker takes for two different values.
-            "closest_person_m": np.nan_to_num(sim.traffic.closest_m, nan=np.inf, posinf=np.inf),
-        }
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """A frame of every environment, (H, W, 3) uint8 each; the top-down map needs no GL.
