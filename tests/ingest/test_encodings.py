@@ -547,7 +547,7 @@ def test_the_same_drive_in_every_encoding(tmp_path: Path) -> None:
         outcome = ingest(path, using, store=store)
         assert not outcome.lost_messages
         tables[encoding] = DeltaTable(str(tmp_path / encoding / "transitions")).to_pyarrow_table()
-        assert outcome.manifest["transitions"] > 250
+        assert outcome.manifest["transitions"] == 291
     for encoding in ("json", "protobuf"):
         for name in ("observation", "action", "reward", "condition", "stamp_ns"):
             assert tables[encoding][name].equals(tables["cdr"][name]), (encoding, name)
