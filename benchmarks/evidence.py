@@ -12,8 +12,9 @@ runs (docs/evidence.md):
 
 Records what a question needs of the stand-in fleet (a day of hours, and for the first three an
 archive of incident bags) and ingests it, then runs the study. What is there is not done again: the
-same command goes on where it was cut off. Ends in OUT/NAME/study.md. `--quick` has ten minutes of
-logs, two seeds, the two arms of the primary contrast and 2,000 steps: it shows that all of it runs.
+same command goes on where it was cut off. Ends in OUT/NAME/study.md. `--primary` runs the two arms of
+the primary contrast only, with all seeds; without it the same command adds the others. `--quick` has
+those two arms, ten minutes of logs, two seeds and 2,000 steps: it shows that all of it runs.
 """
 
 from __future__ import annotations
@@ -73,6 +74,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--hours", type=int, default=24, help="of logs, one recording each")
     parser.add_argument("--workers", type=int, default=1, help="recordings, then runs, at a time")
+    parser.add_argument("--primary", action="store_true", help="only the primary contrast's arms")
     parser.add_argument("--quick", action="store_true", help="a tiny one, to see that it runs")
     options = parser.parse_args()
     try:
@@ -85,6 +87,8 @@ def main() -> int:
 def _answer(options: argparse.Namespace) -> int:
     study = load_study(HERE / f"{options.question}.toml")
     hours = 1 if options.quick else options.hours
+    if options.primary or options.quick:
+        study = primary_arms(study)
     if options.quick:
         study = quick(study)
     store = options.out / str(study.store)
@@ -103,8 +107,8 @@ def _answer(options: argparse.Namespace) -> int:
     return int(any(comparison.verdict != "comparable" for comparison in comparisons))
 
 
-def quick(study: Study) -> Study:
-    """Two seeds of the primary contrast's arms, for 2,000 steps."""
+def primary_arms(study: Study) -> Study:
+    """The study with the two arms of its primary contrast alone."""
     assert study.primary is not None
     arms = [arm for arm in study.arms if arm.name in study.primary.pair]
     base = next(arm for arm in arms if arm.name == study.primary.baseline)
@@ -112,13 +116,16 @@ def quick(study: Study) -> Study:
         msgspec.structs.replace(arm, treatment=None, baseline=None) if arm is base else arm
         for arm in arms
     ]
+    return msgspec.structs.replace(study, arms=tuple(arms), baseline=base.name)
+
+
+def quick(study: Study) -> Study:
+    """Two seeds, for 2,000 steps."""
     settings = json.loads(json.dumps(study.settings))
     settings["schedule"] |= {"offline_updates": 200, "env_steps": 2_000, "warmup_env_steps": 500}
     settings["evaluation"] |= {"every_env_steps": 1_000, "episodes": 2}
     return msgspec.structs.replace(
         study,
-        arms=tuple(arms),
-        baseline=base.name,
         seeds=study.seeds[:2],
         settings=settings,
         evaluation=msgspec.structs.replace(study.evaluation, episodes=4),
