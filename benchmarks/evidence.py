@@ -12,9 +12,9 @@ runs (docs/evidence.md):
 
 Records what a question needs of the stand-in fleet (a day of hours, and for the first three an
 archive of incident bags) and ingests it, then runs the study. What is there is not done again: the
-same command goes on where it was cut off. Ends in OUT/NAME/study.md. `--primary` runs the two arms of
-the primary contrast only, with all seeds; without it the same command adds the others. `--quick` has
-those two arms, ten minutes of logs, two seeds and 2,000 steps: it shows that all of it runs.
+same command goes on where it was cut off. Ends in OUT/NAME/study.md. `--primary` runs the two arms
+of the primary contrast only, with all seeds; without it the same command adds the others. `--quick`
+has those two arms, ten minutes of logs, two seeds and 2,000 steps: it shows that all of it runs.
 """
 
 from __future__ import annotations
