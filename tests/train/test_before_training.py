@@ -19,11 +19,21 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.profile_text import profile_toml
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
+from restock.stats import ConfidenceInterval
 from restock.train.comparison.diagnose import Cause, Diagnosis
 from restock.train.comparison.rows_verdict import with_rows
 from restock.train.diagnosis.before_training import RowDiagnosis, diagnose_rows, open_rows
 from restock.train.diagnosis.fed_rows import FedRows
+from restock.train.diagnosis.gap_evidence import gap_evidence, untrusted
 from restock.train.diagnosis.twin_rows import drive_twin
+from restock.train.diagnosis.values import values
+from restock.train.twin.calibration.twin_gap import (
+    TrustLimits,
+    TwinGap,
+    Verdict,
+    trust_verdict,
+    write_gap,
+)
 
 Plant = Callable[[FedRows], FedRows]
 
@@ -155,6 +165,57 @@ def test_half_of_the_rows_swapped_is_seen(logs: FedRows, twin: FedRows) -> None:
 def test_rows_that_say_little_are_not_called_healthy(logs: FedRows, twin: FedRows) -> None:
     few = logs.take(np.arange(len(logs)) < 200)
     assert diagnose_rows(few, twin).verdict == "UNDETERMINED"
+
+
+def test_one_episode_without_spread_is_not_a_broken_sensor(logs: FedRows, twin: FedRows) -> None:
+    """An ideal simulator, or a floor on which nothing happens: its sensors are not at fault."""
+    place = logs.task.observation_names.index
+    still = logs.observation.copy()
+    still[:, place("lateral_speed")] *= 0.001
+    calm = still.copy()
+    calm[:, place("accel_x")] *= 0.001
+    spread = {
+        name: {row.check: row.status for row in values(rows, twin)}
+        for name, rows in {
+            "still": replace(logs, observation=still),
+            "calm": replace(logs, observation=calm),
+            "calm in one": replace(logs, observation=calm).take(logs.episode == logs.episode[0]),
+        }.items()
+    }
+    assert spread["still"]["spread: lateral_speed"] == "ok"
+    assert spread["calm"]["spread: accel_x"] == "off"
+    assert spread["calm in one"]["spread: accel_x"] == "undecided"
+
+
+@pytest.fixture
+def gap() -> TwinGap:
+    def verdict(condition: str, metres: float) -> Verdict:
+        ends = ConfidenceInterval(metres, metres * 0.9, metres * 1.1)
+        limits = TrustLimits()
+        return trust_verdict(
+            condition, limits=limits, segments=60, episodes=12 if metres else 2,
+            position_p90=ends, reward_ratio=ConfidenceInterval(0.1, 0.1, 0.1),
+        )  # fmt: skip
+
+    told = (verdict("nominal", 0.1), verdict("wheel_slip", 0.4), verdict("recovery", 0.0))
+    return TwinGap({}, [], [], [], told, ())
+
+
+def test_a_measured_gap_is_evidence_and_no_verdict(tmp_path: Path, gap: TwinGap) -> None:
+    (missing,) = gap_evidence([tmp_path])
+    assert (missing.status, missing.note) == (
+        "not run", f"`restock twin gap STORE --out {tmp_path / 'gap'}` measures it",
+    )  # fmt: skip
+    write_gap(gap, tmp_path / "gap")
+    rows = {row.check: row for row in gap_evidence([tmp_path / "run", tmp_path])}
+    assert {name: row.status for name, row in rows.items()} == {
+        "twin gap: nominal": "ok", "twin gap: wheel_slip": "off", "twin gap: recovery": "not run",
+    }  # fmt: skip
+    assert "0.40 m" in rows["twin gap: wheel_slip"].note
+    assert untrusted(list(rows.values())) == ["wheel_slip"]
+    (tmp_path / "gap/gap.json").write_text("{")
+    (damaged,) = gap_evidence([tmp_path])
+    assert (damaged.status, "no gap that can be read" in damaged.note) == ("not run", True)
 
 
 def test_the_verb_names_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -37,7 +37,10 @@ def rows_of(runs: Sequence[Run]) -> tuple[RowDiagnosis | None, str]:
         given = find_perturbation(env.get("perturbation", "nominal"), where="env.perturbation")
         twin = given.base if isinstance(given, Schedule) else given
         profile = profile_of_run(run)
-        return diagnose_before_training(Path(path), profile=profile, perturbation=twin), ""
+        found = diagnose_before_training(
+            Path(path), profile=profile, perturbation=twin, run=run.path
+        )
+        return found, ""
     except RestockError as error:  # a run may be read where its panel is not
         return None, f"{path}: {error.what}"
 
@@ -51,6 +54,8 @@ def with_rows(diagnosis: Diagnosis, rows: RowDiagnosis) -> Diagnosis:
     if cause in ("BUFFER", "BOTH"):
         experiment = f"first correct the rows ({rows.findings[0].remedy}), mix and train again"
     said = [f"rows: {one.cause}: {one.text}" for one in rows.findings]
+    if rows.untrusted:
+        said.append(f"rows: the twin strays from these logs: {', '.join(rows.untrusted)}")
     return replace(
         diagnosis, cause=cause, evidence=[*diagnosis.evidence, *said], experiment=experiment
     )

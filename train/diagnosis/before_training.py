@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -23,6 +23,7 @@ from restock.train.diagnosis.answers import answers, permuted_actions
 from restock.train.diagnosis.causes import Finding, findings
 from restock.train.diagnosis.evidence import Comparison, not_run
 from restock.train.diagnosis.fed_rows import FedRows, of_panel, of_store
+from restock.train.diagnosis.gap_evidence import gap_evidence, untrusted
 from restock.train.diagnosis.outcomes import outcomes
 from restock.train.diagnosis.row_order import row_order
 from restock.train.diagnosis.stored import stored
@@ -50,10 +51,16 @@ class RowDiagnosis:
         """Checks that could not be made, each with the reason in `note`."""
         return [row for row in self.comparisons if row.status == "not run"]
 
+    @property
+    def untrusted(self) -> list[str]:
+        """The conditions in which `restock twin gap` found the twin far from these logs."""
+        return untrusted(self.comparisons)
+
     def document(self) -> dict[str, Any]:
         """As JSON has it."""
         return {
             "verdict": self.verdict,
+            "untrusted": self.untrusted,
             "findings": [asdict(one) for one in self.findings],
             "comparisons": [asdict(row) for row in self.comparisons],
             "about": self.about,
@@ -66,6 +73,7 @@ class OpenedRows(NamedTuple):
     rows: FedRows
     profile: Profile
     comparisons: list[Comparison]  # with the signals of their store
+    folders: list[Path]  # of the store and the panel: where a measured gap may be
 
 
 def diagnose_before_training(
@@ -75,6 +83,7 @@ def diagnose_before_training(
     twin: bool = True,
     perturbation: Perturbation | None = None,
     task_hash: str | None = None,
+    run: Path | None = None,
     seed: int = 0,
 ) -> RowDiagnosis:
     """Hold the rows of a panel or a store against the twin, and against the task's definitions.
@@ -84,6 +93,7 @@ def diagnose_before_training(
         twin: False: only the checks that need none.
         perturbation: of the twin, as `restock twin fit` finds it; None: the nominal one.
         task_hash: whose rows, where a store has several tasks.
+        run: the run that was fed these rows, whose measured gap counts first.
 
     Raises:
         RunError: there is neither a panel nor a store.
@@ -95,6 +105,8 @@ def diagnose_before_training(
     own = opened.profile
     fresh, reason = _drive(own, perturbation, seed) if twin else (None, "it was not asked for")
     diagnosis = diagnose_rows(opened.rows, fresh, reason, seed=seed, more=opened.comparisons)
+    places = [*([run] if run is not None else []), *opened.folders]
+    diagnosis = replace(diagnosis, comparisons=[*diagnosis.comparisons, *gap_evidence(places)])
     diagnosis.about.update(
         path=str(path), profile=own.name, task_hash=own.task.hash,
         seconds=round(time.perf_counter() - begun, 1),
@@ -154,14 +166,15 @@ def _open(path: Path, profile: Profile | None, task_hash: str | None) -> OpenedR
         store_path, version = Path(panel.header.store), panel.store_version
         if version < 0 or not is_store(store_path):
             reason = f"the panel's store is not at {store_path} any more"
-            return OpenedRows(rows, own, [not_run("labels", "labels by stored signals", reason)])
+            missing = [not_run("labels", "labels by stored signals", reason)]
+            return OpenedRows(rows, own, missing, [path])
         with Store(store_path, version=version) as store:
-            return OpenedRows(rows, own, _of_store(store, rows, own))
+            return OpenedRows(rows, own, _of_store(store, rows, own), [store_path, path])
     if is_store(path):
         with Store(path) as store:
             chosen = task_hash or store.task().hash
             rows, own = of_store(store, chosen), profile or _profile_of_store(store, chosen)
-            return OpenedRows(rows, own, _of_store(store, rows, own))
+            return OpenedRows(rows, own, _of_store(store, rows, own), [path])
     raise RunError(
         "is neither a panel nor a store" if path.exists() else "no such panel or store",
         where=str(path),

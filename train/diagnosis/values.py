@@ -1,13 +1,15 @@
 """Do the values of observations lie where the twin's do, and does the lidar look where it should?
 
 Ranges and spreads differ between floors and drivers, so only what no floor explains counts: values
-far beyond any of the twin's, or a sensor that never changes. As the robot drives straight on, what
+far beyond any of the twin's, or a sensor that never changes; and of fewer than five episodes, which
+are one floor and one driver, they are never sure. As the robot drives straight on, what
 lies ahead comes nearer and what lies behind goes away: by this each sector's bearing is told.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -30,6 +32,7 @@ MEASURED = (
     "goal_distance",
 )
 CLEARANCES = "clearances"  # of all sectors in the mean
+_MAY_BE_STILL = ("lateral_speed",)  # a robot that does not slide has none
 _WIDER = 1.0  # of the twin's range, on each side
 _STRAIGHT_RADPS = 0.15
 _DRIVING_MPS = 0.25
@@ -41,8 +44,10 @@ def values(logs: FedRows, twin: FedRows | None, seed: int = 0) -> Iterator[Compa
     if twin is None:
         yield not_run("range", "values against the twin's", "no twin to say where they should be")
     else:
+        few = len(np.unique(logs.episode)) < FEWEST_CLUSTERS
         for name in (*MEASURED, CLEARANCES):
-            yield from _entry(name, logs, twin, np.random.default_rng([seed, 4]))
+            for row in _entry(name, logs, twin, np.random.default_rng([seed, 4])):
+                yield replace(row, status="undecided") if few and row.off else row
     yield _bearing(logs, twin, np.random.default_rng([seed, 3]))
 
 
@@ -74,7 +79,8 @@ def _entry(
     )
     yield judged(
         f"spread: {name}", f"spread of {name} against the twin's", "ratio", spread,
-        logs=most.value - least.value, twin=expected, least=1 / SPREAD, most=SPREAD,
+        logs=most.value - least.value, twin=expected,
+        least=0.0 if name in _MAY_BE_STILL else 1 / SPREAD, most=SPREAD,
         logs_rows=len(logs), twin_rows=len(twin),
     )  # fmt: skip
 

@@ -149,12 +149,14 @@ def _show(diagnosis: Diagnosis, paths: tuple[Path, ...]) -> None:
 
 def _show_rows(diagnosis: RowDiagnosis) -> None:
     from restock.cli.output import print_table, stdout
+    from restock.train.diagnosis.gap_evidence import CHECK
 
     named = {check for one in diagnosis.findings for check in one.evidence}
     chosen = [
         row
         for row in diagnosis.comparisons
-        if row.status in ("off", "undecided") or row.check in named
+        if row.check in named
+        or (row.status in ("off", "undecided") and not row.check.startswith(CHECK))
     ]
     if chosen:
         print_table(
@@ -185,6 +187,12 @@ def _show_rows(diagnosis: RowDiagnosis) -> None:
     for one in diagnosis.findings:
         out.print(f"  {one.cause}: {one.text}", markup=False, soft_wrap=True)
         out.print(f"    {one.remedy}", markup=False, soft_wrap=True)
+    if diagnosis.untrusted:
+        out.print(
+            f"  `restock twin gap` found the twin far from these logs: "
+            f"{', '.join(diagnosis.untrusted)}. Where the two differ, either may be wrong",
+            markup=False, soft_wrap=True,
+        )  # fmt: skip
     by_reason: dict[str, list[str]] = {}
     for row in diagnosis.not_run:
         by_reason.setdefault(row.note, []).append(row.check)
