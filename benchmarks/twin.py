@@ -35,8 +35,9 @@ from restock.ingest.task.signals import STORED_SIGNALS
 from restock.train.twin.env import vector_env
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics import sensing
+from restock.train.twin.physics.robot_model import LIDAR_BEAMS
 from restock.train.twin.physics.sensing import Sensing
-from restock.train.twin.physics.simulation import LIDAR_BEAMS, Simulation
+from restock.train.twin.physics.simulation import Simulation
 
 PEERS = 8  # environments of Gymnasium's own vectors
 COUNTS = (8, 32, 128)

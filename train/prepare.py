@@ -293,6 +293,7 @@ def make_twin(
         seed=config.seed,
         nthread=nthread,
         task=profile.task,
+        robot=profile.robot,
         layouts=layouts or config.env.layouts,
         # Evaluation has its own floors and fixed episodes.
         missions=() if layouts is not None else mission_orders(config),

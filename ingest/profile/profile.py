@@ -2,8 +2,8 @@
 
 A profile is a TOML file: `name`, the shipped `conditions` and `exposures` it uses, `[[condition]]`
 of its own, `[task]`, `[clock]`, `[episodes]`, `[inputs.*]` (which topic fills what), `[frames]`
-(poses from transforms), `[signals.*]` (custom columns), `[tags]` (whose drive it is) and
-`[[zone]]` (named rectangles of the map).
+(poses from transforms), `[signals.*]` (custom columns), `[tags]` (whose drive it is), `[robot]`
+(what the twin builds) and `[[zone]]` (named rectangles of the map).
 `load_profile("warehouse_amr")` reads one that comes with Restock, `load_profile("my_robot.toml")`
 one of yours.
 """
@@ -35,6 +35,7 @@ from restock.ingest.task.conditions import (
     of_kind,
     shipped,
 )
+from restock.ingest.task.robot import Robot, beyond_limits
 from restock.ingest.task.schema import steps_schema
 from restock.ingest.task.task import Task
 from restock.toml import Checked, parse_toml, read_toml, typed
@@ -172,6 +173,7 @@ class Profile(Checked, frozen=True):
     signals: dict[str, CustomSignal] = msgspec.field(default_factory=dict)
     tags: TagRules = TagRules()
     noise: Noise = Noise()
+    robot: Robot | None = None  # None: the twin's own
 
     @property
     def conditions(self) -> list[Condition]:
@@ -203,13 +205,14 @@ class Profile(Checked, frozen=True):
         """12 hex digits of everything in the profile that rows depend on.
 
         That leaves out conditions, which can be changed without the recordings (labels depend on
-        `labels_version`), their [noise], and whose drive it is.
+        `labels_version`), their [noise], whose drive it is, and what only the twin needs of it.
         """
         without = msgspec.structs.replace(
             self, shipped_conditions=[], shipped_exposures=[], own_conditions=[]
         )
         values = msgspec.to_builtins(without)
-        rest = {key: value for key, value in values.items() if key not in ("tags", "noise")}
+        apart = ("tags", "noise", "robot")
+        rest = {key: value for key, value in values.items() if key not in apart}
         return hashlib.blake2b(msgspec.json.encode(rest), digest_size=6).hexdigest()
 
     @property
@@ -334,6 +337,13 @@ def _check(profile: Profile, where: str) -> None:
             where=where,
             remedy="name the topic on which the navigation stack proposes, ahead of whoever"
             " decides, or leave [inputs.nav_command] out",
+        )
+    robot, actions = profile.robot, profile.task.actions
+    if robot is not None and (problem := beyond_limits(robot, actions)):
+        raise ConfigError(
+            f"`task.actions`: {problem}",
+            where=where,
+            remedy="slow the action down, or correct the limit: the robot would not follow it",
         )
     for name in profile.signals:
         if problem := name_problem(name):

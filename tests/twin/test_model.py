@@ -12,19 +12,17 @@ from numpy.typing import NDArray
 from restock.ingest.profile.profile import load_profile
 from restock.train.twin.floors.layout import default_warehouse
 from restock.train.twin.physics.episode import Episode, EpisodeSpec, no_pallets
-from restock.train.twin.physics.model import (
+from restock.train.twin.physics.model import NO_PATCH, PATCHES, build_model, friction_at
+from restock.train.twin.physics.perturbation import Perturbation
+from restock.train.twin.physics.robot_model import (
+    ACCEL_LIMIT,
     CASTER_RADIUS_M,
     MOTOR_KV,
     MOTOR_LIMIT_NM,
-    NO_PATCH,
-    PATCHES,
     TRACK_M,
     WHEEL_RADIUS_M,
-    build_model,
-    friction_at,
+    stand_in,
 )
-from restock.train.twin.physics.perturbation import Perturbation
-from restock.train.twin.physics.robot import ACCEL_LIMIT
 from restock.train.twin.physics.simulation import BLOCK_S, Simulation
 
 TASK = load_profile("warehouse_amr").task
@@ -63,7 +61,7 @@ def drive(sim: Simulation, speed: float, yaw_rate: float, seconds: float) -> Non
 
 def wheel_share() -> float:
     """The share of the robot's weight that the driven wheels carry, standing."""
-    model, _ = build_model(default_warehouse(), TASK.body)
+    model, _ = build_model(default_warehouse(), stand_in(TASK.body))
     data = mujoco.MjData(model)
     data.qpos[:3] = 6.0, 5.0, 0.1
     mujoco.mj_step(model, data, 100)

@@ -222,6 +222,7 @@ def drive_evaluation(
         plan.num_envs,
         nthread=plan.nthread,
         task=task,
+        robot=profile.robot,
         seed=plan.first_seed,
         layouts=plan.layouts,
         conditions={kind: DEFAULT_CONDITIONS[kind] for kind in plan.kinds},

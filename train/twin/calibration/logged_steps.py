@@ -28,6 +28,7 @@ from restock.ingest.task.schema import SIGNAL_COLUMNS
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task
 from restock.replay.store.store import Store, passed_in
+from restock.train.twin.physics.robot_model import RobotModel
 
 Strings = NDArray[np.str_]
 
@@ -55,6 +56,7 @@ class LoggedSteps:
     progress_m: F64  # (N,)
     ending: Ints  # (E,) rows whose successor only ends their episode
     ends: Signals  # the signals of those successors, (E,) each
+    robot: RobotModel | None = None  # that was driven; None: the twin's stand-in
 
     def __len__(self) -> int:
         return len(self.transition_id)
@@ -92,7 +94,10 @@ class LoggedSteps:
 
 
 def logged_steps(
-    store: Store, task_hash: str | None = None, recordings: Sequence[str] = ()
+    store: Store,
+    task_hash: str | None = None,
+    recordings: Sequence[str] = (),
+    robot: RobotModel | None = None,
 ) -> LoggedSteps:
     """The rows of a task of a store, of these recordings (all, if none is named).
 
@@ -140,6 +145,7 @@ def logged_steps(
         progress_m=_numbers(table["progress_m"]),
         ending=ending,
         ends=ends,
+        robot=robot,
     )
 
 

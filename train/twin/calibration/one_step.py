@@ -110,7 +110,7 @@ def one_step(
     pose = np.stack([now[name] for name in POSE], axis=-1)
     start = OpenLoopStart(pose, now, steps.commands(rows, 0, 1), past=steps.commands(rows, PAST, 0))
     driven = drive_open_loop(
-        task, start, list(twins.values()),
+        task, start, list(twins.values()), robot=steps.robot,
         warehouse=warehouse, timestep_s=config.timestep_s, nthread=config.nthread,
     )  # fmt: skip
     results = {}
@@ -167,7 +167,7 @@ def agreement(steps: LoggedSteps, store: Store, rows: Ints, warehouse: Warehouse
     """
     task = steps.task
     observed, _ = observations(store, steps.transition_id[rows], task.observation_size)
-    simulation = Simulation(max(len(rows), 1), task, warehouse, 0.01, 1)
+    simulation = Simulation(max(len(rows), 1), task, warehouse, 0.01, 1, robot=steps.robot)
     poses = np.stack([steps.now[name][rows] for name in POSE], axis=-1)
     for env, pose in enumerate(poses):
         simulation.place_robot(env, *map(float, pose))

@@ -26,8 +26,8 @@ from restock.train.twin.calibration.logged_steps import rows_of
 from restock.train.twin.calibration.segments import POSE, LoggedSegments
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.physics.episode import Episode, EpisodeSpec
-from restock.train.twin.physics.model import TRACK_M, WHEEL_RADIUS_M, body_velocity, wheel_commands
 from restock.train.twin.physics.perturbation import Perturbation
+from restock.train.twin.physics.robot_model import RobotModel
 from restock.train.twin.physics.sensing import Sensing
 from restock.train.twin.physics.simulation import BLOCK_S, Simulation
 
@@ -79,11 +79,14 @@ def drive_open_loop(
     start: OpenLoopStart,
     perturbations: Sequence[Perturbation],
     *,
+    robot: RobotModel | None = None,
     warehouse: Warehouse | None = None,
     timestep_s: float = 0.01,
     nthread: int = 1,
 ) -> OpenLoopResult:
     """Drive every start's commands under every perturbation: P x S robots.
+
+    Without a `robot` they are stand-ins.
 
     The perturbations' own `timestep_s` and sensor noise are not used. The result does not depend
     on `nthread`, nor on which other starts and perturbations are driven.
@@ -105,7 +108,7 @@ def drive_open_loop(
         ids = np.arange(begin, min(begin + ROBOTS, jobs))
         if simulation is None or simulation.num_envs != len(ids):
             floor = warehouse or empty_floor()
-            simulation = Simulation(len(ids), task, floor, timestep_s, nthread)
+            simulation = Simulation(len(ids), task, floor, timestep_s, nthread, robot=robot)
         which, number = np.divmod(ids, shape[1])
         twins, part = [perturbations[index] for index in which], start.take(number)
         offset = _place(simulation, part, twins, endless=warehouse is None)
@@ -116,9 +119,8 @@ def drive_open_loop(
                 diverged[ids] |= simulation.diverged
             pose[ids, step] = simulation.pose()
             pose[ids, step, :2] += offset
-            velocity = simulation.qvel
-            speed, turn = body_velocity(velocity[:, 6], velocity[:, 7])
-            sensed = (speed, turn, velocity[:, 5] + bias, simulation.accel[:, 0])
+            speed, turn = simulation.robot.body_velocity(*simulation.wheel_speeds().T)
+            sensed = (speed, turn, simulation.qvel[:, 5] + bias, simulation.accel[:, 0])
             for name, values in zip(SENSED, sensed, strict=True):
                 signals[name][ids, step] = values
             sliding[ids, step] = _sliding(simulation, pose[ids, step, 2])
@@ -174,7 +176,8 @@ def _place(
     wheels = np.asarray(motion["wheel_speed_mps"])
     localised = np.asarray(motion["localised_speed_mps"])
     slips = np.abs(wheels - localised) > SLIP_MPS
-    forward = np.where(slips, localised, wheels * simulation.body.radius_m / WHEEL_RADIUS_M)
+    rolled = wheels * simulation.body.radius_m / simulation.robot.wheel_radius_m
+    forward = np.where(slips, localised, rolled)
     lateral = np.asarray(motion["localised_lateral_mps"])
     lateral = np.where(np.abs(lateral) > SLIP_MPS, lateral, 0.0)
     cos, sin = np.cos(start.pose[:, 2]), np.sin(start.pose[:, 2])
@@ -183,7 +186,7 @@ def _place(
     bias = np.array([twin.gyro_bias_radps for twin in perturbations])
     simulation.qvel[:, 5] = motion["gyro_yaw_rate_radps"] - bias
     turn = motion["wheel_yaw_rate_radps"]
-    simulation.qvel[:, 6], simulation.qvel[:, 7] = wheel_commands(wheels, turn)
+    simulation.roll(*simulation.robot.wheel_commands(wheels, turn))
     controller = simulation.controller
     if start.past is None:
         command = np.stack([wheels, turn], axis=-1) / controller.gain[:, None]
@@ -205,12 +208,12 @@ def _recentre(simulation: Simulation) -> F64:
 
 
 def _sliding(simulation: Simulation, yaw_rad: F64) -> F64:
-    """How fast a wheel's rim moves over the floor, (N,) m/s, the larger of the two wheels."""
+    """How fast the rims on a side move over the floor, (N,) m/s, the larger of the two sides."""
     velocity = simulation.qvel
     forward = np.cos(yaw_rad) * velocity[:, 0] + np.sin(yaw_rad) * velocity[:, 1]
-    turn = velocity[:, 5] * (TRACK_M / 2)
+    turn = velocity[:, 5] * (simulation.robot.track_m / 2)
     ground = np.stack([forward - turn, forward + turn], axis=-1)
-    rim = velocity[:, 6:8] * simulation.body.radius_m[:, None]
+    rim = simulation.wheel_speeds() * simulation.body.radius_m[:, None]
     faster: F64 = np.abs(rim - ground).max(axis=1)
     return faster
 
@@ -235,8 +238,9 @@ def replay_segments(
     motion["localised_lateral_mps"] = np.zeros(len(segments))  # the warm-up is long enough for it
     start = OpenLoopStart(np.zeros((len(segments), 3)), motion, segments.command)
     driven = drive_open_loop(
-        segments.task, start, perturbations, timestep_s=timestep_s, nthread=nthread
-    )
+        *(segments.task, start, perturbations),
+        robot=segments.robot, timestep_s=timestep_s, nthread=nthread,
+    )  # fmt: skip
     warmup = segments.warmup_steps
     signals = {name: driven.signals[name][..., warmup:] for name in SENSED}
     forward, lateral = _localised(

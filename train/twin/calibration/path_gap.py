@@ -20,8 +20,8 @@ from restock.train.twin.calibration.logged_steps import NOMINAL, LoggedSteps
 from restock.train.twin.calibration.open_loop import lay_onto, replay_segments
 from restock.train.twin.calibration.segments import LoggedSegments, log_segments
 from restock.train.twin.calibration.twin_gap import GapConfig
-from restock.train.twin.physics.model import body_velocity
 from restock.train.twin.physics.perturbation import Perturbation
+from restock.train.twin.physics.robot_model import RobotModel, stand_in
 from restock.train.twin.physics.sensing import DRIFT_TIME_S
 
 SIGNALS = {
@@ -168,7 +168,8 @@ def _gaps(
     gaps[ODOMETRY] = _gap(_dead_reckon(part), {}, part.pose, logged, fresh)
     # Of the last twin, which is the calibrated one if there is one.
     localised = path + _pose_noise(path.shape, noise, part.task.control_period_s, rng)
-    sensed = _sense(signals, localised, path, noise, part.task.control_period_s, rng)
+    robot = part.robot or stand_in(part.task.body)
+    sensed = _sense(signals, localised, path, noise, robot, part.task.control_period_s, rng)
     gaps[FLOOR] = _gap(lay_onto(path, localised[:, 0]), signals, localised, sensed, fresh)
     return {(source, name): gap for source, each in gaps.items() for name, gap in each.items()}
 
@@ -223,13 +224,14 @@ def _sense(
     localised: F64,
     path: F64,
     noise: SensorNoise,
+    robot: RobotModel,
     period_s: float,
     rng: np.random.Generator,
 ) -> dict[str, F64]:
     """The signals that sensors would make of true ones."""
     shape = path.shape[:2]
     wheels = rng.standard_normal((2, *shape)) * noise.encoder_radps
-    speed, rate = body_velocity(wheels[0], wheels[1])
+    speed, rate = robot.body_velocity(wheels[0], wheels[1])
     step = np.diff(localised[..., :2] - path[..., :2], axis=1, prepend=0.0)
     heading = path[..., 2]
     along = (np.cos(heading) * step[..., 0] + np.sin(heading) * step[..., 1]) / period_s

@@ -15,6 +15,7 @@ from restock.errors import ConfigError
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task
 from restock.train.twin.calibration.logged_steps import COMMAND, LoggedSteps, rows_of
+from restock.train.twin.physics.robot_model import RobotModel
 
 WARMUP_S = 1.0  # longer than any latency, and than a stop on friction .2
 STILL_MPS = 0.02  # slower than this a robot stands
@@ -43,6 +44,7 @@ class LoggedSegments:
     """
 
     task: Task
+    robot: RobotModel | None  # whose logs they are; None: the twin's stand-in
     horizon_steps: int  # K
     warmup_steps: int  # W
     row: Ints  # (S,) of the first of the K steps, in the `LoggedSteps`
@@ -130,6 +132,7 @@ def log_segments(
     lead_row = np.maximum(at - warmup, steps.first[at])
     return LoggedSegments(
         task=task,
+        robot=steps.robot,
         horizon_steps=horizon,
         warmup_steps=warmup,
         row=at,

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64
 from restock.errors import ConfigError
-from restock.ingest.task.scan import Body
 from restock.train.twin.env.draw import draw_map
 from restock.train.twin.floors.layout import Rect, Warehouse
 from restock.train.twin.physics.model import (
@@ -28,10 +27,9 @@ from restock.train.twin.physics.model import (
     PARKED_M,
     PEOPLE,
     RACK_HALF_HEIGHT_M,
-    TRACK_M,
-    WHEEL_RADIUS_M,
     building_boxes,
 )
+from restock.train.twin.physics.robot_model import RobotModel
 
 if TYPE_CHECKING:
     from restock.train.twin.env.vector_env import WarehouseVectorEnv
@@ -233,9 +231,9 @@ def _egl_context(width: int, height: int) -> Any:
 
 def _parts(env: WarehouseVectorEnv, index: int, floor: Warehouse) -> Iterator[Part]:
     """Everything on the floor as parts; what is seen through comes last."""
-    sim, body = env.simulation, env.task.body
+    sim = env.simulation
     x, y, yaw = sim.pose()[index]
-    yield from _robot(x, y, yaw, body)
+    yield from _robot(x, y, yaw, sim.robot, sim.lidar_x_m)
     for x, y, yaw in sim.pallets[index]:
         if x > PARKED_M[0] / 2:
             yield from _pallet(x, y, yaw)
@@ -264,17 +262,22 @@ def _frame(x: float, y: float, yaw: float) -> Callable[[float, float, float], Pl
     return lambda ahead, left, up: (x + cos * ahead - sin * left, y + sin * ahead + cos * left, up)
 
 
-def _robot(x: float, y: float, yaw: float, body: Body) -> Iterator[Part]:
-    at, half_x, half_y = _frame(x, y, yaw), body.length_m / 2, body.width_m / 2
-    yield _BOX, at(0, 0, 0.17), (half_x, half_y, 0.11), yaw, BODY
-    yield _BOX, at(0, 0, 0.29), (half_x - 0.07, half_y - 0.07, 0.015), yaw, DARK
-    yield _BOX, at(half_x, 0, 0.2), (0.006, half_y - 0.08, 0.02), yaw, LAMP
+def _robot(x: float, y: float, yaw: float, robot: RobotModel, lidar_x_m: float) -> Iterator[Part]:
+    at, half_x, half_y = _frame(x, y, yaw), robot.length_m / 2, robot.width_m / 2
+    middle, up = -robot.axle_x_m, (robot.chassis_z_m + robot.chassis_height_m / 2) / 0.3
+    edge = min(1.0, half_y / 0.25)  # the parts were drawn for a robot .5 m wide and .3 m high
+    yield _BOX, at(middle, 0, 0.17 * up), (half_x, half_y, 0.11 * up), yaw, BODY
+    deck = (half_x - 0.07 * edge, half_y - 0.07 * edge, 0.015 * up)
+    yield _BOX, at(middle, 0, 0.29 * up), deck, yaw, DARK
+    lamp = (0.006, half_y - 0.08 * edge, 0.02 * up)
+    yield _BOX, at(middle + half_x, 0, 0.2 * up), lamp, yaw, LAMP
     for ahead in (0.16, 0.24):  # an arrow on the deck: which way is forward
-        yield _BOX, at(ahead, 0, 0.306), (0.02, 0.16 - ahead / 2, 0.003), yaw, LAMP
-    for side in (1, -1):
-        wheel = at(0, side * TRACK_M / 2, WHEEL_RADIUS_M)
-        yield _BOX, wheel, (WHEEL_RADIUS_M, 0.03, WHEEL_RADIUS_M), yaw, DARK
-    yield _CYLINDER, at(body.lidar_x_m, 0, 0.34), (0.06, 0.04, 0.0), yaw, DARK
+        size = (0.02 * edge, (0.16 - ahead / 2) * edge, 0.003)
+        yield _BOX, at(middle + ahead * edge, 0, 0.306 * up), size, yaw, LAMP
+    radius = robot.wheel_radius_m
+    for wheel_x, wheel_y in robot.wheels_m.tolist():
+        yield _BOX, at(wheel_x, wheel_y, radius), (radius, 0.03 * edge, radius), yaw, DARK
+    yield _CYLINDER, at(lidar_x_m, 0, 0.34 * up), (0.06 * edge, 0.04 * edge, 0.0), yaw, DARK
 
 
 def _pallet(x: float, y: float, yaw: float) -> Iterator[Part]:

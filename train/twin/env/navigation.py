@@ -103,10 +103,11 @@ class Navigation(Stateful):
             return set()
         ranges = sensing.ranges_m[ids]
         pose = np.stack([signals["pose_x_m"], signals["pose_y_m"], yaw], axis=-1)[ids]
-        bearing = pose[:, 2, None] + sensing.simulation.bearings_rad
+        sim, turned = sensing.simulation, self.task.body.lidar_yaw_rad
+        bearing = pose[:, 2, None] + (sim.bearings_rad + turned)
         valid = (ranges > self.task.range_min_m) & np.isfinite(ranges)
         reach = np.where(valid, ranges, 0.0)
-        ahead = self.task.body.lidar_x_m
+        ahead = sim.lidar_x_m
         hits = np.stack(
             [
                 (pose[:, 0] + ahead * np.cos(pose[:, 2]))[:, None] + reach * np.cos(bearing),

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from restock.arrays import F32, Ints
 from restock.errors import ConfigError, RunError
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.robot import Robot
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task, observe, reward
 from restock.ingest.task.task import terminated as is_terminated
@@ -48,6 +49,7 @@ from restock.train.twin.floors.floors import floors_of
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.physics.episode import EpisodeSpec, draw_episode
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
+from restock.train.twin.physics.robot_trial import robot_model
 from restock.train.twin.physics.sensing import Sensing, add_motion, add_route
 from restock.train.twin.physics.simulation import BodyState, Physics, Simulation
 from restock.train.twin.physics.truth import Truth
@@ -82,6 +84,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         nthread: int = 1,
         render_mode: str | None = None,
         task: Task | None = None,
+        robot: Robot | None = None,
         warehouse: Warehouse | None = None,
         layouts: str | Sequence[Warehouse] = DEFAULT,
         missions: Sequence[MissionOrder] = (),
@@ -98,6 +101,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         A `perturbation` holds for every episode whose spec has none of its own; a schedule draws
         one for each such episode (fixed episodes get its base). `env.specs` tells them.
 
+        `robot` is a profile's, in the task's outline; None: the twin's own.
+
         `layouts` are floors, or what `restock.train.twin.floors.floors.open_floors` reads, such as
         `generated:train`: an episode whose spec names none of them is on one that its seed draws.
         `warehouse` is the one floor, in their place.
@@ -111,8 +116,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
 
         Raises:
             ConfigError: an unknown condition, shares below 0, a floor without room for
-                a condition's episodes, no environments, an unknown action space, or an
-                autoreset mode other than SAME_STEP and DISABLED.
+                a condition's episodes, a robot that cannot be built, no environments, an unknown
+                action space, or an autoreset mode other than SAME_STEP and DISABLED.
         """
         if num_envs < 1:
             raise ConfigError(f"num_envs must be 1 or more, got {num_envs}", where="the twin")
@@ -147,7 +152,9 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
 
         timestep = self.perturbation.timestep_s
         self.simulation = Simulation(
-            num_envs, self.task, self.floors, timestep, nthread, physics=physics
+            *(num_envs, self.task, self.floors, timestep, nthread),
+            physics=physics,
+            robot=robot_model(robot, self.task.body),
         )
         self.sensing = Sensing(self.simulation, self.task)
         self.truth = Truth(self.task, num_envs)

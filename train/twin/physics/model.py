@@ -15,24 +15,15 @@ import mujoco
 import numpy as np
 
 from restock.arrays import F64
-from restock.ingest.task.scan import Body
 from restock.train.twin.floors.layout import Warehouse
+from restock.train.twin.physics.robot_model import RobotModel
 
 FLOOR_FRICTION = 0.8
+FLOOR = [FLOOR_FRICTION, 0.005, 0.0001]  # sliding, torsion (m), rolling (m)
 PATCHES = 4  # at most, an episode: parts of the floor with a friction of their own
 SLIPPERY_BELOW = 0.3  # friction under which a wheel counts as on a patch
-NO_PATCH = (1e6, 1e6, 0.0, 0.0, 1.0)  # x, y, half x, half y, friction
-WHEEL_RADIUS_M = 0.10
-TRACK_M = 0.44  # between the wheels' contact points
-CASTER_RADIUS_M = 0.04
-CASTER_X_M = 0.27
 CASTER_LIFT_M = 0.001  # so that the driven wheels carry most of the load
-CHASSIS_KG = 50.0
-CHASSIS_HEIGHT_M = 0.26
-CHASSIS_Z_M = 0.17  # of the middle of the chassis over the floor
-LIDAR_Z_M = 0.22
-MOTOR_KV = 8.0
-MOTOR_LIMIT_NM = 18.0
+NO_PATCH = (1e6, 1e6, 0.0, 0.0, 1.0)  # x, y, half x, half y, friction
 
 PALLETS = 2
 PALLET_HALF_M = (0.60, 0.40, 0.30)  # long side along the aisle
@@ -54,8 +45,8 @@ class Handles:
     """Where things are in the model's arrays."""
 
     chassis_body: int
-    wheel_bodies: tuple[int, int]  # left, right
-    wheel_geoms: tuple[int, int]
+    wheel_bodies: tuple[int, ...]  # left, right; of a front axle before those of a rear one
+    wheel_geoms: tuple[int, ...]
     building: slice  # the geoms of racks and walls
     pallets: slice  # of the mocap bodies
     people: slice
@@ -65,13 +56,32 @@ class Handles:
 
 
 def build_model(
-    warehouse: Warehouse, body: Body, timestep_s: float = 0.01, rack_slots: int | None = None
+    warehouse: Warehouse, robot: RobotModel, timestep_s: float = 0.01, rack_slots: int | None = None
 ) -> tuple[mujoco.MjModel, Handles]:
-    """The compiled model. State: free joint of the chassis, left and right wheel hinge.
+    """The compiled model. State: free joint of the chassis, left and right wheel hinge(s).
 
     With `rack_slots` there are boxes for so many racks: those that the floor has none for lie
     `PARKED_RACK_M` away, to be placed by `building_boxes`.
     """
+    spec = _spec(timestep_s)
+    _add_building(spec, warehouse, len(warehouse.racks) if rack_slots is None else rack_slots)
+    _add_robot(spec, robot)
+    _add_mocap(spec)
+    model = spec.compile()
+    return model, _handles(model)
+
+
+def build_robot_alone(robot: RobotModel, timestep_s: float = 0.01) -> mujoco.MjModel:
+    """The robot on a floor without an end."""
+    spec = _spec(timestep_s)
+    spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], friction=FLOOR, **_mask(_FLOOR)
+    )
+    _add_robot(spec, robot)
+    return spec.compile()
+
+
+def _spec(timestep_s: float) -> Any:
     spec = mujoco.MjSpec()
     option = spec.option
     option.timestep = timestep_s
@@ -83,11 +93,7 @@ def build_model(
     # One robot among a handful of boxes: both only cost time here (8 % and 3 % of a step).
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
-    _add_building(spec, warehouse, len(warehouse.racks) if rack_slots is None else rack_slots)
-    _add_robot(spec, body)
-    _add_mocap(spec)
-    model = spec.compile()
-    return model, _handles(model)
+    return spec
 
 
 def building_boxes(warehouse: Warehouse, rack_slots: int) -> tuple[F64, F64]:
@@ -119,7 +125,7 @@ def _add_building(spec: Any, warehouse: Warehouse, rack_slots: int) -> None:
         type=mujoco.mjtGeom.mjGEOM_PLANE,
         pos=[warehouse.width_m / 2, warehouse.depth_m / 2, 0],
         size=[warehouse.width_m, warehouse.depth_m, 0.1],
-        friction=[FLOOR_FRICTION, 0.005, 0.0001],
+        friction=FLOOR,
         rgba=[0.82, 0.83, 0.84, 1],
         group=FLOOR_GROUP,
         **_mask(_FLOOR),
@@ -138,58 +144,69 @@ def _add_building(spec: Any, warehouse: Warehouse, rack_slots: int) -> None:
         )
 
 
-def _add_robot(spec: Any, body: Body) -> None:
-    chassis = spec.worldbody.add_body(name="chassis", pos=[1, 1, WHEEL_RADIUS_M])
+def _add_robot(spec: Any, robot: RobotModel) -> None:
+    axle_z = robot.contact_radius_m
+    chassis = spec.worldbody.add_body(name="chassis", pos=[1, 1, axle_z])
     chassis.add_freejoint()
     chassis.add_geom(
         name="chassis",
         type=mujoco.mjtGeom.mjGEOM_BOX,
-        pos=[0, 0, CHASSIS_Z_M - WHEEL_RADIUS_M],
-        size=[body.length_m / 2, body.width_m / 2, CHASSIS_HEIGHT_M / 2],
-        mass=CHASSIS_KG,
+        pos=[0.0 - robot.axle_x_m, 0, robot.chassis_z_m - axle_z],
+        size=[robot.length_m / 2, robot.width_m / 2, robot.chassis_height_m / 2],
+        mass=0 if robot.ballast else robot.chassis_kg,
         rgba=[0.95, 0.55, 0.15, 1],
         group=ROBOT_GROUP,
         **_mask(_CHASSIS),
     )
+    if robot.ballast:
+        chassis.add_geom(
+            name="ballast",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=[-robot.axle_x_m, 0, robot.chassis_z_m - robot.chassis_height_m / 4 - axle_z],
+            size=[robot.length_m / 2, robot.width_m / 2, robot.chassis_height_m / 4],
+            mass=robot.chassis_kg,
+            group=DRAWN_GROUP + 1,
+            **_mask((0, 0)),
+        )
     chassis.add_site(name="imu", pos=[0, 0, 0])
     soft = {"solref": [0.02, 1], "solimp": [0, 0.95, 0.004, 0.5, 2]}
-    for name, x in (("front", CASTER_X_M), ("back", -CASTER_X_M)):
+    for name, (x, y) in zip(_caster_names(len(robot.casters_m)), robot.casters_m, strict=True):
         chassis.add_geom(
             name=f"caster_{name}",
             type=mujoco.mjtGeom.mjGEOM_SPHERE,
-            pos=[x, 0, CASTER_RADIUS_M - WHEEL_RADIUS_M + CASTER_LIFT_M],
-            size=[CASTER_RADIUS_M, 0, 0],
-            mass=0.5,
+            pos=[x, y, robot.caster_radius_m - axle_z + CASTER_LIFT_M],
+            size=[robot.caster_radius_m, 0, 0],
+            mass=robot.caster_kg,
             condim=1,
             priority=3,
             group=ROBOT_GROUP,
             **soft,
             **_mask(_ROLLING),
         )
-    for name, side in (("left", 1), ("right", -1)):
-        wheel = chassis.add_body(name=f"{name}_wheel", pos=[0, side * TRACK_M / 2, 0])
+    for name, (x, y) in zip(_wheel_names(robot), robot.wheels_m.tolist(), strict=True):
+        wheel = chassis.add_body(name=f"{name}_wheel", pos=[x, y, 0])
         wheel.add_joint(
             name=f"{name}_wheel_joint",
             type=mujoco.mjtJoint.mjJNT_HINGE,
             axis=[0, 1, 0],
-            armature=0.02,
-            damping=[0.05, 0, 0],
+            armature=robot.armature,
+            damping=[robot.damping, 0, 0],
         )
         wheel.add_geom(
             name=f"{name}_wheel",
             type=mujoco.mjtGeom.mjGEOM_SPHERE,
-            size=[WHEEL_RADIUS_M, 0, 0],
-            mass=2.0,
+            size=[axle_z, 0, 0],
+            mass=robot.wheel_kg,
             condim=3,
             priority=3,
-            friction=[FLOOR_FRICTION, 0.005, 0.0001],
+            friction=FLOOR,
             group=DRAWN_GROUP + 1,  # hidden by default: the cylinder is what is drawn
             **soft,
             **_mask(_ROLLING),
         )
         wheel.add_geom(
             type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-            size=[WHEEL_RADIUS_M, 0.025, 0],
+            size=[axle_z, 0.25 * axle_z, 0],
             quat=[0.7071068, 0.7071068, 0, 0],
             mass=0,
             contype=0,
@@ -201,10 +218,10 @@ def _add_robot(spec: Any, body: Body) -> None:
             name=f"{name}_motor",
             target=f"{name}_wheel_joint",
             trntype=mujoco.mjtTrn.mjTRN_JOINT,
-            forcerange=[-MOTOR_LIMIT_NM, MOTOR_LIMIT_NM],
+            forcerange=[-robot.motor_limit_nm, robot.motor_limit_nm],
             forcelimited=True,
         )
-        motor.set_to_velocity(kv=MOTOR_KV)
+        motor.set_to_velocity(kv=robot.motor_kv)
     spec.add_sensor(
         name="accelerometer",
         type=mujoco.mjtSensor.mjSENS_ACCELEROMETER,
@@ -218,6 +235,15 @@ def _add_robot(spec: Any, body: Body) -> None:
         objname="chassis",
         intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND), 0, 1],
     )
+
+
+def _caster_names(count: int) -> list[str]:
+    return ["front", "back"] if count == 2 else [str(index) for index in range(count)]
+
+
+def _wheel_names(robot: RobotModel) -> list[str]:
+    axles = ("front_", "rear_") if robot.wheelbase_m else ("",)
+    return [axle + side for axle in axles for side in ("left", "right")]
 
 
 def _add_mocap(spec: Any) -> None:
@@ -244,11 +270,14 @@ def _handles(model: mujoco.MjModel) -> Handles:
         first = int(model.body(f"{kind}_0").mocapid[0])
         return slice(first, first + count)
 
+    wheels = [
+        name for index in range(model.nbody) if (name := model.body(index).name).endswith("_wheel")
+    ]
     accelerometer = int(model.sensor("accelerometer").adr[0])
     return Handles(
         chassis_body=model.body("chassis").id,
-        wheel_bodies=(model.body("left_wheel").id, model.body("right_wheel").id),
-        wheel_geoms=(model.geom("left_wheel").id, model.geom("right_wheel").id),
+        wheel_bodies=tuple(model.body(name).id for name in wheels),
+        wheel_geoms=tuple(model.geom(name).id for name in wheels),
         building=slice(model.geom("floor").id + 1, model.geom("wall_north").id + 1),
         pallets=mocap("pallet", PALLETS),
         people=mocap("person", PEOPLE),
@@ -275,18 +304,6 @@ def pallet_half_m(yaw_rad: F64) -> F64:
     """Half sizes (..., 2) along x and y of pallets by heading (...): across, they are exchanged."""
     across = np.abs(np.sin(yaw_rad))[..., None] > 0.7
     return np.where(across, PALLET_HALF_M[1::-1], PALLET_HALF_M[:2])
-
-
-def wheel_commands(speed_mps: F64, yaw_rate_radps: F64) -> tuple[F64, F64]:
-    """Body velocity to the left and right wheels' speeds in rad/s, at the nominal radius."""
-    turn = yaw_rate_radps * (TRACK_M / 2)
-    return (speed_mps - turn) / WHEEL_RADIUS_M, (speed_mps + turn) / WHEEL_RADIUS_M
-
-
-def body_velocity(left_radps: F64, right_radps: F64) -> tuple[F64, F64]:
-    """Wheel speeds in rad/s to forward speed (m/s) and yaw rate (rad/s): wheel odometry."""
-    speed = (left_radps + right_radps) * (WHEEL_RADIUS_M / 2)
-    return speed, (right_radps - left_radps) * (WHEEL_RADIUS_M / TRACK_M)
 
 
 def yaw_of(quat: F64) -> F64:

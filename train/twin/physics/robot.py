@@ -13,17 +13,11 @@ import numpy as np
 
 from restock.arrays import F64
 from restock.state import Stateful
-from restock.train.twin.physics.model import (
-    CHASSIS_KG,
-    TRACK_M,
-    WHEEL_RADIUS_M,
-    Handles,
-    wheel_commands,
-)
+from restock.train.twin.physics.model import Handles
 from restock.train.twin.physics.perturbation import Perturbation
+from restock.train.twin.physics.robot_model import RobotModel
 
 GRAVITY_MPS2 = 9.81
-ACCEL_LIMIT = np.array([4.0, 10.0])  # m/s2 and rad/s2
 _HISTORY = 5  # commands kept: enough for the longest latency at the shortest period
 
 
@@ -32,7 +26,11 @@ class BaseController(Stateful):
 
     STATE = ("commands", "set_point")
 
-    def __init__(self, num_envs: int, period_s: float, timestep_s: float, substeps: int) -> None:
+    def __init__(
+        self, num_envs: int, robot: RobotModel, period_s: float, timestep_s: float, substeps: int
+    ) -> None:
+        self.robot = robot
+        self._accel_limit, self._speed_limit = map(np.array, (robot.accel_limit, robot.speed_limit))
         self._period_s, self._timestep_s, self._substeps = period_s, timestep_s, substeps
         self.commands = np.zeros((num_envs, _HISTORY, 2))  # speed, yaw rate; newest first
         self.set_point = np.zeros((num_envs, 2))
@@ -45,9 +43,12 @@ class BaseController(Stateful):
         self.commands[env] = self.set_point[env] = 0.0
 
     def command(self, command: F64) -> None:
-        """Give commands (N, 2): forward speed and yaw rate, at the start of a control period."""
+        """Give commands (N, 2): forward speed and yaw rate, at the start of a control period.
+
+        What is beyond the robot's limits is driven as fast as they allow.
+        """
         self.commands[:, 1:] = self.commands[:, :-1]
-        self.commands[:, 0] = command
+        self.commands[:, 0] = _limit(np.asarray(command, np.float64), self._speed_limit)
 
     def wheel_speeds(self, since_s: float) -> F64:
         """Wheel speeds (N, substeps, 2) in rad/s over a block that begins `since_s` into a period.
@@ -64,7 +65,7 @@ class BaseController(Stateful):
         old, new = self.commands[rows, first][:, None], self.commands[rows, last][:, None]
         switch = (age == first[:, None]).sum(axis=1)[:, None, None]  # substeps under `old`
         switch = np.where(first[:, None, None] == last[:, None, None], self._substeps, switch)
-        reach = ACCEL_LIMIT * self._timestep_s
+        reach = self._accel_limit * self._timestep_s
         begin = self.set_point[:, None]
         count = (step + 1)[None, :, None]
         under_old = begin + _limit(old - begin, reach * np.minimum(count, switch))
@@ -72,7 +73,7 @@ class BaseController(Stateful):
         under_new = turned + _limit(new - turned, reach * np.maximum(count - switch, 0))
         ramp = np.where(count <= switch, under_old, under_new)
         self.set_point = ramp[:, -1].copy()
-        left, right = wheel_commands(ramp[..., 0], ramp[..., 1])
+        left, right = self.robot.wheel_commands(ramp[..., 0], ramp[..., 1])
         speeds: F64 = np.stack([left, right], axis=-1) * self.gain[:, None, None]
         speeds[..., 0] *= self.left_gain[:, None]
         return speeds
@@ -89,9 +90,16 @@ class RobotBody:
     the model's.
     """
 
-    def __init__(self, batch: Any, model: mujoco.MjModel, handles: Handles, num_envs: int) -> None:
-        self.batch, self.model, self.handles = batch, model, handles
-        self.radius_m = np.full(num_envs, WHEEL_RADIUS_M)  # (N,) of the wheels
+    def __init__(
+        self,
+        batch: Any,
+        model: mujoco.MjModel,
+        handles: Handles,
+        num_envs: int,
+        robot: RobotModel,
+    ) -> None:
+        self.batch, self.model, self.handles, self.robot = batch, model, handles, robot
+        self.radius_m = np.full(num_envs, robot.wheel_radius_m)  # (N,) that they roll on
         self._masses = self._radii = self._sloped = False
 
     def apply(self, env: int, perturbation: Perturbation) -> None:
@@ -101,21 +109,23 @@ class RobotBody:
             self._masses = True
             body = self.handles.chassis_body
             mass, inertia = self.batch.expand("body_mass"), self.batch.expand("body_inertia")
-            scale = 1.0 + perturbation.payload_kg / CHASSIS_KG
+            scale = 1.0 + perturbation.payload_kg / self.robot.chassis_kg
             mass[env, body] = self.model.body_mass[body] * scale
             inertia[env, body] = self.model.body_inertia[body] * scale
         if (perturbation.wheel_radius_scale, perturbation.track_scale) != (1, 1) or self._radii:
             self._radii = True
-            radius = WHEEL_RADIUS_M * perturbation.wheel_radius_scale
-            self.radius_m[env] = radius
+            nominal = self.robot.contact_radius_m
+            radius = nominal * perturbation.wheel_radius_scale
+            self.radius_m[env] = self.robot.wheel_radius_m * perturbation.wheel_radius_scale
             size, bound = self.batch.expand("geom_size"), self.batch.expand("geom_rbound")
             place = self.batch.expand("body_pos")
             for geom in self.handles.wheel_geoms:
                 size[env, geom, 0] = bound[env, geom] = radius
-            for body, side in zip(self.handles.wheel_bodies, (1, -1), strict=True):
-                place[env, body, 1] = side * TRACK_M / 2 * perturbation.track_scale
+            wheels = zip(self.handles.wheel_bodies, self.robot.wheels_m[:, 1], strict=True)
+            for body, y in wheels:
+                place[env, body, 1] = y * perturbation.track_scale
                 # So that the casters keep their share of the load.
-                place[env, body, 2] = radius - WHEEL_RADIUS_M
+                place[env, body, 2] = radius - nominal
         if self._masses or self._radii:
             self.batch.set_const(np.array([env]))
 

@@ -19,7 +19,6 @@ from restock.ingest.task.signals import Signals, localised_velocity, wrap_angle
 from restock.ingest.task.surroundings import came_nearer, way_to_return
 from restock.ingest.task.task import Task, clearance_ahead
 from restock.state import Stateful
-from restock.train.twin.physics.model import body_velocity
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.simulation import Simulation
 
@@ -102,8 +101,8 @@ class Sensing(Stateful):
             ]
         )
         bias = self._bias[ids]
-        wheels = sim.qvel[ids, 6:8] + scalar[:, 5:7] + bias[:, :1]
-        speed, yaw_rate = body_velocity(wheels[:, 0], wheels[:, 1])
+        wheels = sim.wheel_speeds()[ids] + scalar[:, 5:7] + bias[:, :1]
+        speed, yaw_rate = sim.robot.body_velocity(wheels[:, 0], wheels[:, 1])
         period_ns = round(task.control_period_s * 1e9)
         stamp = FIRST_STAMP_NS + step * period_ns
         fresh = step % self._pose_every[ids] == 0

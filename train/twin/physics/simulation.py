@@ -24,25 +24,23 @@ from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.physics.episode import Episode
 from restock.train.twin.physics.model import (
     FLOOR_FRICTION,
-    LIDAR_Z_M,
     NO_PATCH,
     OBSTACLE_GROUP,
     PATCHES,
     SLIPPERY_BELOW,
-    TRACK_M,
     build_model,
     friction_at,
     yaw_of,
 )
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.robot import BaseController, RobotBody
+from restock.train.twin.physics.robot_model import LIDAR_BEAMS, RobotModel, stand_in
 from restock.train.twin.physics.scenery import Scenery, quaternion
 
 Physics = Literal["mujoco", "warp"]  # warp: see `restock.train.twin.physics.warp_batch`
 
 BLOCK_S = 0.1
-REST_Z_M = 0.09756  # of the chassis frame, standing still
-LIDAR_BEAMS = 72
+SLIP_MPS = 0.15  # a wheel slips that moves so fast over the floor, at 1 m/s; a slower robot's less
 _CONTROLLED = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_MOCAP_POS)
 
 
@@ -92,31 +90,43 @@ class Simulation(Stateful):
         *,
         physics: Physics = "mujoco",
         beams: int = LIDAR_BEAMS,
+        robot: RobotModel | None = None,
     ) -> None:
-        """On several `floors`, `reset` says on which of them each episode is."""
+        """On several `floors`, `reset` says on which of them each episode is.
+
+        Without a `robot` it is the stand-in, with so many `beams`.
+        """
         floors = (floors,) if isinstance(floors, Warehouse) else tuple(floors)
         self.num_envs, self.task = num_envs, task
-        self.beams = beams
+        self.robot = robot = robot or stand_in(task.body, beams)
+        self.beams = len(robot.bearings_rad)
         self.timestep_s = timestep_s
         self.substeps = round(BLOCK_S / timestep_s)
         self.blocks = round(task.control_period_s / BLOCK_S)
         _check_times(task, timestep_s, self.substeps, self.blocks)
         slots = max(len(floor.racks) for floor in floors)
-        self.model, self.handles = build_model(floors[0], task.body, timestep_s, slots)
+        self.model, self.handles = build_model(floors[0], robot, timestep_s, slots)
         _no_log_file()
         self.batch = _batch(physics)(self.model, num_envs, nthread)
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._ctrl = self.batch.bind("ctrl")
         self._friction = self.batch.expand("geom_friction")
-        self._control = np.zeros((num_envs, self.substeps, 2 + 3 * self.model.nmocap))
+        fastest = float(np.abs(np.asarray(task.actions)[:, 0]).max())
+        self._slip_mps = SLIP_MPS * (min(fastest, 1.0) if robot.own else 1.0)
+        self._wheels_m = robot.wheels_m
+        self._wheels = len(self._wheels_m)
+        width = self._wheels + 3 * self.model.nmocap
+        self._control = np.zeros((num_envs, self.substeps, width))
         half_m = task.body.length_m / 2, task.body.width_m / 2
         self.scenery = Scenery(
-            self.batch, self.handles, floors, slots, half_m, self._control[:, :, 2:]
+            self.batch, self.handles, floors, slots, half_m, self._control[:, :, self._wheels :]
         )
         self.traffic, self.pallets = self.scenery.traffic, self.scenery.pallets
-        self.body = RobotBody(self.batch, self.model, self.handles, num_envs)
+        self.body = RobotBody(self.batch, self.model, self.handles, num_envs, robot)
         self.patches = np.tile(NO_PATCH, (num_envs, PATCHES, 1)).astype(np.float64)
-        self.controller = BaseController(num_envs, task.control_period_s, timestep_s, self.substeps)
+        self.controller = BaseController(
+            num_envs, robot, task.control_period_s, timestep_s, self.substeps
+        )
         self.time_s = np.zeros(num_envs)
         self.bumped = np.zeros(num_envs, np.bool_)  # in the last control period
         self.accel = np.zeros((num_envs, 3))  # mean over the last half block
@@ -126,9 +136,9 @@ class Simulation(Stateful):
         self.base_friction = np.full(num_envs, FLOOR_FRICTION)
         self.left_friction = np.ones(num_envs)
 
-        bearings = np.arange(beams) * (2 * np.pi / beams) - np.pi
-        self.bearings_rad = bearings + np.pi / beams
-        self._beam = np.stack([np.cos(self.bearings_rad), np.sin(self.bearings_rad)], axis=-1)
+        self.bearings_rad = np.array(robot.bearings_rad)  # (beams,) in the lidar's own frame
+        ahead = self.bearings_rad + task.body.lidar_yaw_rad
+        self._beam = np.stack([np.cos(ahead), np.sin(ahead)], axis=-1)
         self._groups = np.zeros(6, np.uint8)
         self._groups[OBSTACLE_GROUP] = 1
         self._has_patches = np.zeros(num_envs, np.bool_)
@@ -157,7 +167,7 @@ class Simulation(Stateful):
     def place_robot(self, env: int, x_m: float, y_m: float, yaw_rad: float) -> None:
         """Stand the robot still at a pose."""
         self.qpos[env] = 0.0
-        self.qpos[env, :3] = x_m, y_m, REST_Z_M
+        self.qpos[env, :3] = x_m, y_m, self.robot.rest_z_m
         self.qpos[env, 3:7] = quaternion(np.array([yaw_rad]))[0]
         self.qvel[env] = 0.0
         self._ctrl[env] = 0.0
@@ -174,9 +184,9 @@ class Simulation(Stateful):
     def set_floor_friction(self, env: int, friction: float) -> None:
         """The floor's friction coefficient where no patch lies."""
         self.base_friction[env] = friction
-        left, right = self.handles.wheel_geoms
-        self._friction[env, left, 0] = friction * self.left_friction[env]
-        self._friction[env, right, 0] = friction
+        for wheel, geom in enumerate(self.handles.wheel_geoms):
+            left = self.left_friction[env] if wheel % 2 == 0 else 1.0
+            self._friction[env, geom, 0] = friction * left
 
     # -- motion ---------------------------------------------------------------------------------
 
@@ -204,7 +214,8 @@ class Simulation(Stateful):
     def _run(self, wheels: F64) -> Bools:
         """One block of substeps under wheel speeds (N, S, 2); returns whose bumper was pressed."""
         control = self._control
-        control[:, :, :2] = wheels
+        for axle in range(0, self._wheels, 2):
+            control[:, :, axle : axle + 2] = wheels
         touched = np.zeros(self.num_envs, np.bool_)
         if self.callback is None:
             parts = [(0, self.substeps)]
@@ -240,8 +251,8 @@ class Simulation(Stateful):
             speed_mps=cos * vx + sin * vy,
             lateral_mps=-sin * vx + cos * vy,
             yaw_rate_radps=self.qvel[:, 5].copy(),
-            wheel_angle_rad=self.qpos[:, 7:9].copy(),
-            wheel_speed_radps=self.qvel[:, 6:8].copy(),
+            wheel_angle_rad=self.robot.by_side(self.qpos[:, 7 : 7 + self._wheels]).copy(),
+            wheel_speed_radps=self.wheel_speeds().copy(),
             accel_mps2=accel,
             bumped=pressed,
             set_point=self.controller.set_point.copy(),
@@ -251,16 +262,25 @@ class Simulation(Stateful):
         """True x, y and heading, (N, 3)."""
         return np.column_stack([self.qpos[:, :2], yaw_of(self.qpos[:, 3:7])])
 
+    def wheel_speeds(self) -> F64:
+        """Speeds (N, 2) of the wheels on the left and on the right, rad/s."""
+        return self.robot.by_side(self.qvel[:, 6 : 6 + self._wheels])
+
+    def roll(self, left_radps: F64, right_radps: F64) -> None:
+        """Let the wheels (N,) of both sides turn so fast."""
+        for wheel in range(self._wheels):
+            self.qvel[:, 6 + wheel] = right_radps if wheel % 2 else left_radps
+
     def _yaw(self, ids: Ints) -> F64:
         return yaw_of(self.qpos[ids, 3:7])
 
     def _write_friction(self, ids: Ints, pose: F64) -> Bools:
-        """Friction under the wheels of `ids`; returns (n, 2) which of them stand on a patch."""
+        """Friction under the wheels of `ids`; returns (n, W) which of them stand on a patch."""
         base = self.base_friction[ids]
         friction = friction_at(self._wheel_points(pose), self.patches[ids], base)
-        left, right = self.handles.wheel_geoms
-        self._friction[ids, left, 0] = friction[:, 0] * self.left_friction[ids]
-        self._friction[ids, right, 0] = friction[:, 1]
+        for wheel, geom in enumerate(self.handles.wheel_geoms):
+            left = self.left_friction[ids] if wheel % 2 == 0 else 1.0
+            self._friction[ids, geom, 0] = friction[:, wheel] * left
         return _slippery(friction, base)
 
     def on_patch(self) -> Bools:
@@ -274,21 +294,31 @@ class Simulation(Stateful):
         return stands
 
     def _wheel_points(self, pose: F64) -> F64:
-        across = np.stack([-np.sin(pose[:, 2]), np.cos(pose[:, 2])], axis=-1) * (TRACK_M / 2)
-        return np.stack([pose[:, :2] + across, pose[:, :2] - across], axis=1)
+        """Where the wheels of robots at poses (n, 3) stand, (n, W, 2)."""
+        cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+        ahead, across = np.stack([cos, sin], axis=-1), np.stack([-sin, cos], axis=-1)
+        x, y = self._wheels_m[:, 0, None], self._wheels_m[:, 1, None]
+        points: F64 = pose[:, None, :2] + across[:, None] * y
+        return points if self._wheels == 2 else points + ahead[:, None] * x
 
     def _slipping(self, ids: Ints, slippery: Bools) -> Bools:
-        """Whose wheel (n, 2) is on a patch and moves over the floor by more than .15 m/s."""
+        """Whose wheel (n, W) is on a patch and moves over the floor by more than `_slip_mps`."""
         velocity, heading = self.qvel[ids], yaw_of(self.qpos[ids, 3:7])
         cos, sin = np.cos(heading), np.sin(heading)
         forward = cos * velocity[:, 0] + sin * velocity[:, 1]
         lateral = cos * velocity[:, 1] - sin * velocity[:, 0]
-        turn = velocity[:, 5] * (TRACK_M / 2)
-        ground = np.stack([forward - turn, forward + turn], axis=-1)
-        slip = np.hypot(velocity[:, 6:8] * self.body.radius_m[ids, None] - ground, lateral[:, None])
-        return np.asarray((slippery & (slip > 0.15)).any(axis=1), np.bool_)
+        ground = forward[:, None] - velocity[:, 5, None] * self._wheels_m[:, 1]
+        aside = lateral[:, None] + velocity[:, 5, None] * self._wheels_m[:, 0]
+        rim = velocity[:, 6 : 6 + self._wheels] * self.body.radius_m[ids, None]
+        slip = np.hypot(rim - ground, aside)
+        return np.asarray((slippery & (slip > self._slip_mps)).any(axis=1), np.bool_)
 
     # -- sensing --------------------------------------------------------------------------------
+
+    @property
+    def lidar_x_m(self) -> float:
+        """How far ahead of the pose the lidar is."""
+        return self.task.body.lidar_x_m - self.robot.axle_x_m
 
     def cast(self, ids: Ints) -> F64:
         """True lidar ranges (n, beams) in metres now; inf where nothing is hit."""
@@ -297,8 +327,8 @@ class Simulation(Stateful):
         rays = np.zeros((len(ids), self.beams, 3))
         rays[..., 0] = cos[:, None] * self._beam[:, 0] - sin[:, None] * self._beam[:, 1]
         rays[..., 1] = sin[:, None] * self._beam[:, 0] + cos[:, None] * self._beam[:, 1]
-        origin = np.full((len(ids), 1, 3), LIDAR_Z_M)
-        ahead = self.task.body.lidar_x_m
+        origin = np.full((len(ids), 1, 3), self.robot.lidar_z_m)
+        ahead = self.lidar_x_m
         origin[:, 0, 0] = self.qpos[ids, 0] + cos * ahead
         origin[:, 0, 1] = self.qpos[ids, 1] + sin * ahead
         distance = self.batch.ray(origin, rays, self._groups, ids=ids)[0]
@@ -318,7 +348,7 @@ class Simulation(Stateful):
 
 
 def _slippery(friction: F64, base: F64) -> Bools:
-    """Which wheels (n, 2) stand on a patch, by the friction under them and the floor's (n,)."""
+    """Which wheels (n, W) stand on a patch, by the friction under them and the floor's (n,)."""
     return np.asarray(friction < np.minimum(SLIPPERY_BELOW, base[:, None] - 1e-9), np.bool_)
 
 

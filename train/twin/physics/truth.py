@@ -2,7 +2,8 @@
 
 A step's conditions are what was physically so over [t, t + 1), by the contract's names:
 
-- wheel_slip: a wheel stood on a slippery patch and moved over the floor by more than .15 m/s;
+- wheel_slip: a wheel stood on a slippery patch and moved over the floor by more than .15 m/s (of a
+  profile's own robot that is slower than 1 m/s, by more than .15 of its fastest action);
 - near_collision: at t + 1 something was nearer than .15 m to the body, or the bumper was pressed;
 - recovery: after such an event until .3 m of room or 2 s, known at t;
 - blocked_aisle: at t, pallets lay on the plan within `BLOCK_AHEAD_M` of the robot's middle.

@@ -19,8 +19,8 @@ from restock.ingest.task.signals import Signals
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.physics.episode import EpisodeSpec
-from restock.train.twin.physics.model import CHASSIS_Z_M
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
+from restock.train.twin.physics.robot_model import CHASSIS_Z_M
 from restock.train.twin.physics.simulation import BLOCK_S, BodyState
 from restock.train.twin.recording.drive import Drive, Motion
 from restock.train.twin.recording.drivers import BehaviourPolicies

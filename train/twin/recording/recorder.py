@@ -29,9 +29,8 @@ from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.floors.cells import cells_of
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.floors.planner import Planner
-from restock.train.twin.physics.model import TRACK_M, WHEEL_RADIUS_M
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
-from restock.train.twin.physics.simulation import LIDAR_BEAMS
+from restock.train.twin.physics.robot_model import LIDAR_BEAMS, TRACK_M, WHEEL_RADIUS_M
 from restock.train.twin.recording.bag_writer import Format, recording_sink
 from restock.train.twin.recording.drive import Lidar, Odometer
 from restock.train.twin.recording.drivers import BehaviourPolicies, ExternalPolicy

@@ -1,0 +1,93 @@
+"""The `[robot]` table of a profile: how the robot drives, how large and heavy its parts are.
+
+Its outline, and where its lidar is on it, stand in `[task.body]`, which logs need too; here is what
+only the twin needs. A value that is left out is unknown: the twin takes one from the outline's size
+(`restock.train.twin.physics.robot_model`), and says so. `[robot.origin]` says where each value is
+from.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from restock.toml import Checked
+
+Drive = Literal["differential", "skid_steer", "omnidirectional", "ackermann"]
+# Where a value is from: written by hand, a recording's description, a URDF file, a fit of the twin,
+# what logs show, or the outline's size.
+Origin = Literal["profile", "robot_description", "urdf", "fit", "logs", "default"]
+Metres = Annotated[float, Meta(gt=0, le=10)]
+Limit = Annotated[float, Meta(gt=0, le=100)]
+
+
+class Lidar(Checked, frozen=True):
+    """The `[robot.lidar]` of a profile: its beams, in the lidar's own frame.
+
+    Where it is ahead of the outline's middle, and how it is turned, stand in `[task.body]`.
+    """
+
+    z_m: Annotated[float, Meta(gt=0, le=5)] | None = None  # above the floor
+    beams: Annotated[int, Meta(ge=4, le=720)] | None = None  # evenly, the first at angle_min_rad
+    angle_min_rad: Annotated[float, Meta(ge=-7, le=7)] = -math.pi
+    angle_max_rad: Annotated[float, Meta(ge=-7, le=7)] = math.pi  # all around: a beam short of it
+
+    def check(self) -> None:
+        if not 0 < self.angle_max_rad - self.angle_min_rad <= 2 * math.pi + 1e-3:
+            raise ValueError(
+                "angle_max_rad must be above angle_min_rad, by at most a full turn, got"
+                f" {self.angle_min_rad:g} and {self.angle_max_rad:g}"
+            )
+
+
+class Robot(Checked, frozen=True):
+    """The `[robot]` of a profile. None: unknown."""
+
+    drive: Drive = "differential"
+    wheel_radius_m: Metres | None = None
+    track_m: Metres | None = None  # between the wheels' contact points, left to right
+    wheelbase_m: Metres | None = None  # between the axles, where there are two
+    axle_x_m: Annotated[float, Meta(ge=-10, le=10)] = 0.0  # of the axle (of two: the point halfway)
+    # ahead of the outline's middle: poses are the axle's
+    mass_kg: Annotated[float, Meta(gt=0, le=5000)] | None = None  # of all of it, wheels too
+    height_m: Metres | None = None
+    casters_m: tuple[tuple[float, float], ...] | None = None  # x ahead of the axle, y to the left
+    max_speed_mps: Limit | None = None
+    max_yaw_rate_radps: Limit | None = None
+    max_accel_mps2: Limit | None = None
+    max_yaw_accel_radps2: Limit | None = None
+    # How far the driven wheels are apart for the controller and its odometry, by the track: a skid-
+    # steer robot turns less than its wheels say. None: what the twin's own robot does.
+    track_ratio: Annotated[float, Meta(ge=0.5, le=10)] | None = None
+    lidar: Lidar = Lidar()
+    origin: dict[str, Origin] = msgspec.field(default_factory=dict)
+
+    def check(self) -> None:
+        known = {*self.__struct_fields__, *(f"lidar.{n}" for n in Lidar.__struct_fields__)}
+        for name in self.origin:
+            if name not in known or name in ("origin", "lidar"):
+                raise ValueError(f"origin names no value of the robot: {name!r}")
+        if self.wheelbase_m is None and self.drive == "ackermann":
+            raise ValueError("an ackermann robot needs wheelbase_m")
+
+    def origin_of(self, name: str) -> Origin:
+        """Where a value is from, by its key, such as `mass_kg` or `lidar.beams`."""
+        if name in self.origin:
+            return self.origin[name]
+        value = getattr(self.lidar, name[6:]) if name.startswith("lidar.") else getattr(self, name)
+        return "default" if value is None else "profile"
+
+
+def beyond_limits(robot: Robot, actions: tuple[tuple[float, float], ...]) -> str | None:
+    """What is wrong with the first of the actions (m/s, rad/s) that this robot cannot drive."""
+    for speed, turn in actions:
+        for value, most, name, unit in (
+            (speed, robot.max_speed_mps, "max_speed_mps", "m/s"),
+            (turn, robot.max_yaw_rate_radps, "max_yaw_rate_radps", "rad/s"),
+        ):
+            if most is not None and abs(value) > most * (1 + 1e-3):
+                return f"[{speed:g}, {turn:g}] is beyond robot.{name} = {most:g} {unit}"
+    return None

@@ -1,0 +1,259 @@
+"""The robot that the twin builds: every number of it, by a profile's `[robot]` and outline.
+
+`stand_in` is the twin's own robot, which drives where a profile has no `[robot]`. `design` makes
+one from a profile's: what that leaves out follows from the outline's size, by what is usual among
+wheeled robots, and motors are as strong for their load as the stand-in's. How a designed robot
+stands, rolls and turns is then measured (`restock.train.twin.physics.robot_trial`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from restock.arrays import F64
+from restock.errors import ConfigError
+from restock.ingest.task.robot import Lidar, Robot
+from restock.ingest.task.scan import Body
+
+WHEEL_RADIUS_M = 0.10  # of the stand-in, as all of these
+TRACK_M = 0.44  # between the wheels' contact points
+CASTER_RADIUS_M = 0.04
+CASTER_X_M = 0.27
+CASTER_KG = 0.5
+WHEEL_KG = 2.0
+CHASSIS_KG = 50.0
+CHASSIS_HEIGHT_M = 0.26
+CHASSIS_Z_M = 0.17  # of the middle of the chassis over the floor
+LIDAR_Z_M = 0.22
+LIDAR_BEAMS = 72
+MOTOR_KV = 8.0
+MOTOR_LIMIT_NM = 18.0
+ARMATURE, DAMPING = 0.02, 0.05
+ACCEL_LIMIT = (4.0, 10.0)  # m/s2 and rad/s2
+REST_Z_M = 0.09756  # of the chassis frame, standing still
+
+USUAL_ACCEL = (2.5, 6.0)  # m/s2 and rad/s2, where nothing says
+STIFF = 8.0  # times the motors' gain: whose wheels scrub needs torque where speed is as commanded
+SCRUB = 1.5  # and this times their torque
+
+
+@dataclass(frozen=True)
+class RobotModel:
+    """One robot with two or four driven wheels; x is ahead of the axle, z above the floor."""
+
+    length_m: float
+    width_m: float
+    axle_x_m: float  # of the axle (of two: halfway), ahead of the outline's middle
+    wheel_radius_m: float  # that it rolls on, and that its odometry believes
+    contact_radius_m: float  # of the wheels' spheres, which sink into the floor a little
+    track_m: float  # between the wheels' contact points
+    turn_track_m: float  # by which controller and odometry reckon turns
+    wheelbase_m: float  # between two axles; 0: there is one
+    wheel_kg: float
+    chassis_kg: float
+    chassis_height_m: float
+    chassis_z_m: float  # of the chassis' middle
+    ballast: bool  # the chassis' mass is in its lower half
+    casters_m: tuple[tuple[float, float], ...]
+    caster_radius_m: float
+    caster_kg: float
+    lidar_z_m: float
+    bearings_rad: tuple[float, ...]  # of the beams, in the lidar's own frame
+    motor_kv: float
+    motor_limit_nm: float
+    armature: float
+    damping: float
+    accel_limit: tuple[float, float]  # m/s2 and rad/s2 of the base controller's ramp
+    speed_limit: tuple[float, float]  # m/s and rad/s
+    rest_z_m: float  # of the chassis frame, standing still
+    own: bool = True  # False: the stand-in
+
+    @property
+    def wheels_m(self) -> F64:
+        """x and y of every wheel (W, 2): left before right, front before rear."""
+        axles = (0.0,) if not self.wheelbase_m else (self.wheelbase_m / 2, -self.wheelbase_m / 2)
+        half = self.track_m / 2
+        return np.array([(x, y) for x in axles for y in (half, -half)])
+
+    @property
+    def mass_kg(self) -> float:
+        wheels = len(self.wheels_m) * self.wheel_kg
+        return self.chassis_kg + wheels + len(self.casters_m) * self.caster_kg
+
+    def wheel_commands(self, speed_mps: F64, yaw_rate_radps: F64) -> tuple[F64, F64]:
+        """Body velocity to the left and right wheels' speeds in rad/s, at the nominal radius."""
+        turn = yaw_rate_radps * (self.turn_track_m / 2)
+        return (speed_mps - turn) / self.wheel_radius_m, (speed_mps + turn) / self.wheel_radius_m
+
+    def body_velocity(self, left_radps: F64, right_radps: F64) -> tuple[F64, F64]:
+        """Wheel speeds in rad/s to forward speed (m/s) and yaw rate (rad/s): wheel odometry."""
+        speed = (left_radps + right_radps) * (self.wheel_radius_m / 2)
+        return speed, (right_radps - left_radps) * (self.wheel_radius_m / self.turn_track_m)
+
+    def by_side(self, wheels: F64) -> F64:
+        """Values (N, W) of the wheels as those of the two sides (N, 2), left and right."""
+        return wheels if wheels.shape[1] == 2 else wheels.reshape(-1, 2, 2).mean(axis=1)
+
+
+def stand_in(body: Body, beams: int = LIDAR_BEAMS) -> RobotModel:
+    """The twin's own robot, in this outline."""
+    bearings = np.arange(beams) * (2 * np.pi / beams) - np.pi
+    return RobotModel(
+        length_m=body.length_m,
+        width_m=body.width_m,
+        axle_x_m=0.0,
+        wheel_radius_m=WHEEL_RADIUS_M,
+        contact_radius_m=WHEEL_RADIUS_M,
+        track_m=TRACK_M,
+        turn_track_m=TRACK_M,
+        wheelbase_m=0.0,
+        wheel_kg=WHEEL_KG,
+        chassis_kg=CHASSIS_KG,
+        chassis_height_m=CHASSIS_HEIGHT_M,
+        chassis_z_m=CHASSIS_Z_M,
+        ballast=False,
+        casters_m=((CASTER_X_M, 0.0), (-CASTER_X_M, 0.0)),
+        caster_radius_m=CASTER_RADIUS_M,
+        caster_kg=CASTER_KG,
+        lidar_z_m=LIDAR_Z_M,
+        bearings_rad=tuple((bearings + np.pi / beams).tolist()),
+        motor_kv=MOTOR_KV,
+        motor_limit_nm=MOTOR_LIMIT_NM,
+        armature=ARMATURE,
+        damping=DAMPING,
+        accel_limit=ACCEL_LIMIT,
+        speed_limit=(math.inf, math.inf),
+        rest_z_m=REST_Z_M,
+        own=False,
+    )
+
+
+def design(robot: Robot, body: Body) -> RobotModel:
+    """A profile's robot, before it was tried.
+
+    Raises:
+        ConfigError: a drive that the twin does not have, or parts that do not go together.
+    """
+    _refuse_drive(robot)
+    known = measures(robot, body)
+    radius, track, mass = known.wheel_radius_m, known.track_m, known.mass_kg
+    height, casters = known.height_m, known.casters_m
+    _refuse_misfit(known, body, robot.axle_x_m)
+    scrubs = robot.drive == "skid_steer"
+    wheels = 4 if scrubs else 2
+    wheel_kg, caster_kg = 0.072 / wheels * mass, 0.009 * mass
+    # As the stand-in's motors, by the load that they move: a share of it each.
+    load = mass / (CHASSIS_KG + 2 * WHEEL_KG + 2 * CASTER_KG) * 2 / wheels
+    turning = load * (radius / WHEEL_RADIUS_M) ** 2
+    low = 0.13 * height
+    return RobotModel(
+        length_m=body.length_m,
+        width_m=body.width_m,
+        axle_x_m=robot.axle_x_m,
+        wheel_radius_m=radius,
+        contact_radius_m=radius,
+        track_m=track,
+        turn_track_m=track * (robot.track_ratio or 1.0),
+        wheelbase_m=known.wheelbase_m if scrubs else 0.0,
+        wheel_kg=wheel_kg,
+        chassis_kg=mass - wheels * wheel_kg - len(casters) * caster_kg,
+        chassis_height_m=height - low,
+        chassis_z_m=(height + low) / 2,
+        ballast=True,
+        casters_m=casters,
+        caster_radius_m=0.4 * radius,
+        caster_kg=caster_kg,
+        lidar_z_m=known.lidar_z_m,
+        bearings_rad=_bearings(robot.lidar, known.beams),
+        motor_kv=MOTOR_KV * turning * (STIFF if scrubs else 1.0),
+        motor_limit_nm=MOTOR_LIMIT_NM * load * radius / WHEEL_RADIUS_M * (SCRUB if scrubs else 1.0),
+        armature=ARMATURE * turning,
+        damping=DAMPING * turning,
+        accel_limit=(
+            robot.max_accel_mps2 or USUAL_ACCEL[0],
+            robot.max_yaw_accel_radps2 or USUAL_ACCEL[1],
+        ),
+        speed_limit=(robot.max_speed_mps or math.inf, robot.max_yaw_rate_radps or math.inf),
+        rest_z_m=radius,
+    )
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What a robot measures, by its profile, and by its outline where that leaves something out."""
+
+    wheel_radius_m: float
+    track_m: float
+    wheelbase_m: float  # 0: there is one axle
+    mass_kg: float
+    height_m: float
+    casters_m: tuple[tuple[float, float], ...]
+    lidar_z_m: float
+    beams: int
+
+
+def measures(robot: Robot, body: Body) -> Measures:
+    """A value for all that a profile's robot leaves out, by what is usual for its outline."""
+    size = math.sqrt(body.length_m * body.width_m)
+    height = robot.height_m or max(0.5 * size, 2.2 * (robot.wheel_radius_m or 0.0))
+    four = robot.drive == "skid_steer"
+    casters = robot.casters_m
+    if casters is None:
+        ahead, x = 0.77 * body.length_m / 2, robot.axle_x_m
+        casters = () if four else ((ahead - x, 0.0), (-ahead - x, 0.0))
+    span = robot.lidar.angle_max_rad - robot.lidar.angle_min_rad
+    return Measures(
+        wheel_radius_m=robot.wheel_radius_m or 0.15 * size,
+        track_m=robot.track_m or 0.87 * body.width_m,
+        wheelbase_m=robot.wheelbase_m or (0.55 * body.length_m if four else 0.0),
+        mass_kg=robot.mass_kg or 120.0 * size**3,
+        height_m=height,
+        casters_m=casters,
+        lidar_z_m=robot.lidar.z_m or min(0.73 * height, 0.5),
+        beams=robot.lidar.beams or max(round(LIDAR_BEAMS * span / (2 * math.pi)), 4),
+    )
+
+
+def _bearings(lidar: Lidar, beams: int) -> tuple[float, ...]:
+    """All around, a beam short of a full turn; else from one end to the other."""
+    span = lidar.angle_max_rad - lidar.angle_min_rad
+    around = span > 2 * math.pi * (1 - 0.5 / beams)
+    step = span / beams if around else span / (beams - 1)
+    return tuple((lidar.angle_min_rad + step * np.arange(beams)).tolist())
+
+
+def _refuse_drive(robot: Robot) -> None:
+    why = {
+        "omnidirectional": "an action is a speed ahead and a yaw rate, so it never drives sideways",
+        "ackermann": "it has no steering: wheels on two sides that turn at speeds of their own",
+    }
+    if robot.drive in why:
+        raise ConfigError(
+            f'`robot.drive`: the twin has no robot with "{robot.drive}" drive: {why[robot.drive]}',
+            where="the twin",
+            remedy="its logs can be ingested, audited and learnt from offline; for the twin, say"
+            ' drive = "differential" if it only ever drives as one, or leave [robot] out and the'
+            " twin's own robot stands in",
+        )
+
+
+def _refuse_misfit(robot: Measures, body: Body, axle_x_m: float) -> None:
+    """Parts that cannot be on one robot."""
+    problem = None
+    if 2 * robot.wheel_radius_m > 1.5 * body.length_m:
+        problem = f"wheels of radius {robot.wheel_radius_m:g} m are longer than the outline"
+    elif robot.track_m > 2 * body.width_m:
+        problem = f"a track of {robot.track_m:g} m is more than twice the outline's width"
+    elif abs(axle_x_m) > body.length_m / 2:
+        problem = f"an axle {axle_x_m:g} m ahead of the middle is outside the outline"
+    elif robot.wheelbase_m > body.length_m:
+        problem = f"a wheelbase of {robot.wheelbase_m:g} m is longer than the outline"
+    if problem:
+        raise ConfigError(
+            f"`robot`: {problem} ({body.length_m:g} x {body.width_m:g} m)",
+            where="the twin",
+            remedy="correct [robot], or the outline in [task.body]",
+        )

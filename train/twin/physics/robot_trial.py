@@ -1,0 +1,129 @@
+"""The robot of a profile as the twin drives it: designed, then tried on an empty floor.
+
+Wheels' soft contacts sink a little into the floor, which a small wheel rolls slower for, and a
+robot whose wheels scrub turns slower than they say. Both are measured here once, so that every
+robot drives the speed that it is commanded, and its odometry says what it drives.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from restock.arrays import F64
+from restock.errors import ConfigError
+from restock.ingest.task.robot import Robot
+from restock.ingest.task.scan import Body
+from restock.train.twin.physics.model import build_robot_alone
+from restock.train.twin.physics.robot_model import RobotModel, design, stand_in
+
+TIMESTEP_S = 0.01
+SETTLE_S, DRIVE_S = 1.0, 1.5
+MOST_TILT_RAD = 0.05
+TRY_SPEED, TRY_TURN = 0.5, 1.0  # m/s and rad/s, or as fast as its limits allow
+
+
+def robot_model(robot: Robot | None, body: Body) -> RobotModel:
+    """The model of a profile's `[robot]`; the stand-in where it has none.
+
+    Raises:
+        ConfigError: a drive that the twin does not have, parts that do not go together, or a robot
+            that does not stand or drive.
+    """
+    return stand_in(body) if robot is None else _tried(_Key(robot, body))
+
+
+class _Key:
+    """A robot and its outline, hashed by what they hold."""
+
+    def __init__(self, robot: Robot, body: Body) -> None:
+        self.robot, self.body = robot, body
+        self._text = repr((robot, body))
+
+    def __hash__(self) -> int:
+        return hash(self._text)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Key) and self._text == other._text
+
+
+@functools.lru_cache(maxsize=32)
+def _tried(key: _Key) -> RobotModel:
+    robot = _settled(design(key.robot, key.body))
+    speed = min(TRY_SPEED, robot.speed_limit[0] / 2)
+    ahead, _ = _driven(robot, speed, 0.0)
+    # It rolls on the middle of what its wheels sink in.
+    radius = robot.contact_radius_m * robot.wheel_radius_m / _rolling_m(robot, ahead, speed)
+    robot = _settled(replace(robot, contact_radius_m=radius))
+    if robot.wheelbase_m and key.robot.track_ratio is None:
+        turn = min(TRY_TURN, robot.speed_limit[1] / 2)
+        for _ in range(3):
+            _, turned = _driven(robot, 0.0, turn)
+            if not turned > 0.02 * turn:
+                raise _unfit("its wheels do not turn it on the spot")
+            robot = replace(robot, turn_track_m=robot.turn_track_m * turn / turned)
+    return robot
+
+
+def _rolling_m(robot: RobotModel, ahead_mps: float, speed_mps: float) -> float:
+    """The radius that its wheels roll on, by how fast it drives at a commanded speed."""
+    if not 0.5 * speed_mps < ahead_mps < 2 * speed_mps:
+        raise _unfit(f"it drives {ahead_mps:.2f} m/s where {speed_mps:.2f} m/s is commanded")
+    return robot.wheel_radius_m * ahead_mps / speed_mps
+
+
+def _settled(robot: RobotModel) -> RobotModel:
+    """The robot with the height at which it comes to rest."""
+    model = build_robot_alone(replace(robot, rest_z_m=robot.contact_radius_m), TIMESTEP_S)
+    data = mujoco.MjData(model)
+    _run(model, data, SETTLE_S)
+    _, x, y, _ = data.qpos[3:7]
+    tilt = float(np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1)))
+    if not np.isfinite(data.qpos).all() or tilt > MOST_TILT_RAD:
+        raise _unfit(f"standing still it tips over, by {np.degrees(tilt):.0f} degrees")
+    return replace(robot, rest_z_m=float(data.qpos[2]))
+
+
+def _driven(robot: RobotModel, speed_mps: float, yaw_rate_radps: float) -> tuple[float, float]:
+    """The steady speed (m/s) and yaw rate (rad/s) under a command."""
+    model = build_robot_alone(robot, TIMESTEP_S)
+    data = mujoco.MjData(model)
+    data.qpos[2] = robot.rest_z_m
+    steps = round(1.0 / TIMESTEP_S)
+    for step in range(steps):  # no faster than it accelerates
+        share = np.array((step + 1) / steps)
+        _control(robot, data, speed_mps * share, yaw_rate_radps * share)
+        mujoco.mj_step(model, data)
+    _run(model, data, 0.5)
+    rows = np.array([_motion(model, data) for _ in range(round(DRIVE_S / TIMESTEP_S))])
+    ahead, turned = rows.mean(axis=0)
+    return float(ahead), float(turned)
+
+
+def _control(robot: RobotModel, data: mujoco.MjData, speed: F64, turn: F64) -> None:
+    left, right = robot.wheel_commands(speed, turn)
+    data.ctrl[0::2], data.ctrl[1::2] = left, right
+
+
+def _motion(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[float, float]:
+    """One step further: speed ahead and yaw rate."""
+    mujoco.mj_step(model, data)
+    w, x, y, z = data.qpos[3:7]
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return float(np.cos(yaw) * data.qvel[0] + np.sin(yaw) * data.qvel[1]), float(data.qvel[5])
+
+
+def _run(model: mujoco.MjModel, data: mujoco.MjData, seconds: float) -> None:
+    for _ in range(round(seconds / TIMESTEP_S)):
+        mujoco.mj_step(model, data)
+
+
+def _unfit(problem: str) -> ConfigError:
+    return ConfigError(
+        f"`robot`: {problem}",
+        where="the twin",
+        remedy="check its wheels, casters_m and mass_kg, and the outline in [task.body]",
+    )
