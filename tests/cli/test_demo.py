@@ -8,14 +8,16 @@ from pathlib import Path
 import pytest
 
 from restock import cli
-from restock.cli.demo import MARKER, Stage, prepare, run_demo, stages
+from restock.cli.start.demo import MARKER, plan_of, prepare, run_demo
+from restock.cli.start.stage import Stage
+from restock.cli.start.stages import Settings
 from restock.errors import RestockError
 
 SILENT = lambda message: None  # noqa: E731
 
 
 def plan(tmp_path: Path) -> list[Stage]:
-    return stages(tmp_path / "logs", tmp_path / "out", seconds=5, episodes=1, device="cpu")
+    return plan_of(Settings((str(tmp_path / "logs"),), tmp_path / "out", seconds=5, episodes=1))
 
 
 def test_every_stage_is_a_verb_with_flags_that_exist(tmp_path: Path) -> None:
@@ -57,6 +59,17 @@ def test_a_dry_run_prints_the_commands(tmp_path: Path, capsys: pytest.CaptureFix
     printed = capsys.readouterr().out.splitlines()
     assert printed[-1] == f"restock report {out / 'run'}"
     assert not out.exists()
+
+
+def test_logs_of_another_robot_are_ingested_by_their_profile(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ["--logs", str(tmp_path), "--profile", "mine.toml"]
+    assert cli.main(["demo", "--out", str(tmp_path / "out"), *given, "--dry-run"]) == 0
+    (ingest,) = [
+        line for line in capsys.readouterr().out.splitlines() if line.startswith("restock ingest")
+    ]
+    assert ingest.endswith("--profile mine.toml")
 
 
 @pytest.mark.slow

@@ -36,6 +36,7 @@ VERBS = {
     "trace": "trace a sampled row to its source, down to the messages",
     "diagnose": "buffer failure or target failure?",
     "report": "one HTML page with all of it",
+    "start": "from your robot's recordings to a policy and a report, stage by stage",
     "demo": "all of the above, on sample_logs/",
 }
 # folder -> the verbs whose modules it holds
@@ -46,6 +47,7 @@ FOLDERS = {
     ),
     "learning": ("train", "eval", "study", "compare", "trace", "diagnose", "report"),
     "twin": ("record", "twin"),
+    "start": ("start", "demo"),
 }
 _FOLDER_OF = {verb: f"{folder}." for folder, verbs in FOLDERS.items() for verb in verbs}
 

@@ -6,7 +6,6 @@ a user could type; the demo runs the very same code.
 
 from __future__ import annotations
 
-import shlex
 import shutil
 import sys
 import time
@@ -15,14 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from restock.cli.start import stages
+from restock.cli.start.stage import Stage
+from restock.cli.start.stages import Settings
 from restock.errors import ExitCode, RestockError
 
 MARKER = ".restock-demo"
-
-COVERAGE = (
-    "SELECT condition, rows, share, episodes, success_share, behaviour_policies"
-    " FROM coverage_by_condition"
-)
 
 
 @dataclass
@@ -40,6 +37,9 @@ class DemoCommand:
     """Where store, panel, run and report go. What an earlier demo left there is replaced."""
     logs: Path | None = None
     """Recordings to use; default sample_logs/ of the source tree, else newly recorded ones."""
+    profile: str | None = None
+    """How their topics become signals: a profile that comes with Restock, or a TOML file. Default:
+    that of the simulated robot (`restock start` proposes one for another robot)."""
     seconds: float = 150.0
     """How long to train."""
     episodes: int = 20
@@ -61,10 +61,20 @@ class DemoCommand:
             logs = self.out / "logs"
             record = ["record", "--out", str(logs / "sample.mcap"), "--missions", "60"]
             why = "This installation has no sample recordings: a simulated robot drives some."
-            plan.append(Stage("Record", why, record))
-        plan += stages(logs, self.out, self.seconds, self.episodes, self.device)
+            plan.append(Stage("record", "Record", why, record))
+        plan += plan_of(
+            Settings(
+                logs=(str(logs),),
+                out=self.out,
+                profile=self.profile,
+                seconds=self.seconds,
+                episodes=self.episodes,
+                device=self.device,
+                train=("practice.rule=success",),
+            )
+        )
         if self.dry_run:
-            sys.stdout.writelines(f"restock {shlex.join(stage.command)}\n" for stage in plan)
+            sys.stdout.writelines(f"{stage.line()}\n" for stage in plan)
             return None
         prepare(self.out)
         console = stdout()
@@ -80,78 +90,17 @@ class DemoCommand:
         return None
 
 
-@dataclass(frozen=True)
-class Stage:
-    """One step of the demo."""
-
-    title: str
-    why: str
-    command: list[str]
-    expected: tuple[int, ...] = (0,)  # exit codes that do not stop the demo
-    remark: str = ""  # printed where the exit code is not 0
-
-
-def stages(logs: Path, out: Path, seconds: float, episodes: int, device: str) -> list[Stage]:
-    """The stages, from recordings to a report."""
-    store, panel, run = out / "store", out / "panel", out / "run"
+def plan_of(to: Settings) -> list[Stage]:
+    """The stages of the demo, in order."""
     return [
-        Stage(
-            "What is in these recordings?",
-            "The recordings come first: topics, types, counts, durations.",
-            ["info", str(logs)],
-        ),
-        Stage(
-            "Recordings to labelled transitions",
-            "Topics become steps of the control clock (held causally, never interpolated), steps"
-            " become observation, action and reward, and SQL labels each with its conditions."
-            " These recordings contain the true condition, so the labels are scored.",
-            ["ingest", str(logs), "--store", str(store)],
-            expected=(0, 3),
-            remark="some data was lost or skipped: see the table above",
-        ),
-        Stage(
-            "What is on each shelf?",
-            "Hours of the easy aisle, seconds of the wet floor: the store is plain Parquet, and"
-            " the question is plain SQL.",
-            ["sql", str(store), COVERAGE],
-        ),
-        Stage(
-            "Is the coverage good enough?",
-            "Each audit is a query that returns the offending rows. In a pipeline the exit code"
-            " stops you here.",
-            ["audit", str(store)],
-            expected=(0, 1),
-            remark="an audit failed: a pipeline would stop here, the demo goes on",
-        ),
-        Stage(
-            "A replay panel that keeps the rare conditions in stock",
-            "Each shelf has the whole episodes that met its condition. Natural, wanted, drawn and"
-            " after weights stand side by side, and what is missing is told in rows and hours of"
-            " logging; the result is a pinned panel with an id.",
-            ["mix", str(store), "--mixture", "coverage", "--out", str(panel)],
-        ),
-        Stage(
-            "Train: first on the panel, then online in the twin",
-            f"About {seconds:.0f} s of double DQN. Half of each batch comes from the logs by"
-            " quotas, half is fresh, of missions that go wrong more often. Q chooses among what"
-            " the twin's operator finds plausible. Every row the critic is fed is recorded.",
-            [
-                *("train", "--panel", str(panel), "--out", str(run)),
-                *("--seconds", f"{seconds:g}", "--device", device),
-                *("--set", "practice.rule=success"),
-            ],
-        ),
-        Stage(
-            "Evaluate on the same seeded episodes",
-            "The kept checkpoint, the scripted planner and a random policy, clean and with less"
-            " friction and more latency than in training.",
-            ["eval", str(run), "--episodes", str(episodes)],
-        ),
-        Stage(
-            "One page with all of it",
-            "What it was fed, what it learnt, where it fails.",
-            ["report", str(run)],
-        ),
+        stages.info(to),
+        stages.ingest(to),
+        stages.coverage(to),
+        stages.audit(to),
+        stages.mix(to),
+        stages.train(to),
+        stages.evaluate(to),
+        stages.report(to),
     ]
 
 
@@ -163,7 +112,7 @@ def run_demo(
     for number, stage in enumerate(plan, start=1):
         say(f"\n[bold]{number}/{len(plan)}  {stage.title}[/bold]")
         say(f"[dim]{stage.why}[/dim]")
-        say(f"[cyan]$ restock {shlex.join(stage.command)}[/cyan]\n")
+        say(f"[cyan]$ {stage.line()}[/cyan]\n")
         sys.stdout.flush()
         started = time.monotonic()
         code = dispatch(stage.command)
@@ -180,7 +129,7 @@ def run_demo(
 def find_logs() -> Path | None:
     """`sample_logs/` of the source tree that this code runs from, if it runs from one."""
     here = Path(__file__).resolve()
-    logs = here.parents[3] / "sample_logs"
+    logs = here.parents[4] / "sample_logs"
     return logs if logs.is_dir() and any(logs.iterdir()) else None
 
 

@@ -1,0 +1,210 @@
+"""What came of a stage in a line or two, from the document that its verb prints with --json."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from restock.cli.start.stage import Document
+
+ESTIMATORS = ("logged", "fqe", "pdwis", "wdr")
+
+
+def count(number: int, noun: str) -> str:
+    """A number and its noun."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
+def info(document: Document) -> list[str]:
+    """How much there is."""
+    recordings = document["recordings"]
+    seconds = sum(row["duration_s"] or 0.0 for row in recordings)
+    messages = sum(row["messages"] for row in recordings)
+    return [f"{count(len(recordings), 'recording')}, {_time(seconds)}, {messages:,} messages"]
+
+
+def propose(document: Document) -> list[str]:
+    """What the proposed profile makes of the recording."""
+    lines = [f"{document['transitions']:,} transitions of {count(document['ticks'], 'tick')}"]
+    lines += [f"to consider: `{each['key']}`: {each['text']}" for each in document["advice"]]
+    return lines
+
+
+def check(document: Document) -> list[str]:
+    """What the profile finds, and what stands in for what is not there."""
+    lines = [*document["problems"]]
+    if (outcome := document["outcome"]) is None:
+        return lines
+    lines.append(
+        f"{outcome['transitions']:,} transitions in {count(outcome['episodes'], 'episode')} of"
+        f" {_time(outcome['duration_s'])}"
+    )
+    missing = [f"{item['input']} ({item['instead']})" for item in outcome["stand_ins"]]
+    shown = [line for line in missing if line.split()[0] in _TELLING]
+    if shown:
+        lines.append(f"not in the recording: {'; '.join(shown)}")
+    return lines
+
+
+_TELLING = ("scan", "imu", "bumper", "goal", "plan", "wheels")  # of inputs that may be missing
+
+
+def ingest(document: Document) -> list[str]:
+    """Rows, and what failed."""
+    rows = document["recordings"]
+    good = [row for row in rows if row["status"] != "failed"]
+    transitions = sum(row["transitions"] for row in good)
+    episodes = sum(row["episodes"] for row in good)
+    lines = [
+        f"{count(transitions, 'transition')} in {count(episodes, 'episode')} of"
+        f" {count(len(good), 'recording')}"
+    ]
+    dropped: dict[str, int] = {}
+    for row in good:
+        for drop in row["drops"]:
+            dropped[drop["reason"]] = dropped.get(drop["reason"], 0) + drop["count"]
+    if dropped:
+        worst = sorted(dropped.items(), key=lambda item: -item[1])[:3]
+        lines.append(f"ticks left out: {', '.join(f'{why} {n:,}' for why, n in worst)}")
+    failed = [row["error"].splitlines()[0] for row in rows if row["status"] == "failed"]
+    lines += [f"not ingested: {why}" for why in failed[:3]]
+    if len(failed) > 3:
+        lines.append(f"… and {len(failed) - 3} more")
+    return lines
+
+
+def coverage(document: Document) -> list[str]:
+    """Rows by condition."""
+    rows = document["rows"]
+    held = [f"{row['condition']} {row['rows']:,}" for row in rows if row["rows"]]
+    none = [row["condition"] for row in rows if not row["rows"]]
+    lines = [f"rows: {', '.join(held)}"]
+    return [*lines, f"no row of {', '.join(none)}"] if none else lines
+
+
+def audit(document: Document) -> list[str]:
+    """Which audits failed or warned."""
+    lines = []
+    for status, word in (("fail", "failed"), ("warn", "warned")):
+        names = [item["audit"] for item in document["audits"] if item["status"] == status]
+        if names:
+            lines.append(f"{len(names)} {word}: {', '.join(names)}")
+    return lines or ["all passed"]
+
+
+def mix(document: Document) -> list[str]:
+    """Rows and what is short."""
+    short = [line["stratum"] for line in document["strata"] if line["missing_rows"]]
+    lines = [f"panel {document['id']}: {document['rows']:,} rows"]
+    if short:
+        lines.append(f"too few rows of {', '.join(short)}: the twin or more logs must show them")
+    return lines
+
+
+def fit(document: Document) -> list[str]:
+    """The parameters that the logs tell, and the distance before and after."""
+    (first, *_) = document["fits"]
+    told = [
+        f"{item['name']} {item['value']:.3g} [{item['low']:.3g}, {item['high']:.3g}]"
+        for item in first["estimates"]
+        if item["fitted"]
+    ]
+    untold = [item["name"] for item in first["estimates"] if not item["fitted"]]
+    lines = [f"fitted: {', '.join(told) or 'nothing'}"]
+    if untold:
+        lines.append(f"not told by these logs: {', '.join(untold)}")
+    return lines
+
+
+def gap(document: Document) -> list[str]:
+    """In which conditions the twin may be trusted."""
+    by: dict[str, list[str]] = {}
+    for item in document["verdicts"]:
+        by.setdefault(item["verdict"], []).append(item["condition"])
+    lines = ["; ".join(f"{verdict}: {', '.join(names)}" for verdict, names in by.items())]
+    nominal = of_nominal(document)
+    return lines + [f"nominal: {reason}" for reason in (nominal or {}).get("reasons", [])]
+
+
+def of_nominal(document: Document) -> Mapping[str, Any] | None:
+    """The verdict on nominal driving, with its reasons; None where there is none."""
+    return next((v for v in document.get("verdicts", []) if v["condition"] == "nominal"), None)
+
+
+def train(document: Document) -> list[str]:
+    """How much it learnt from, and what was kept."""
+    lines = [
+        f"{document['gradient_steps']:,} updates, {document['env_steps']:,} steps in the twin,"
+        f" {_time(document['wall_s'])}"
+    ]
+    best = document["best"]
+    if best is not None and best["success"]:
+        cells = ", ".join(f"{name} {value:.2f}" for name, value in best["success"].items())
+        lines.append(f"kept, by success on its own fixed episodes: {cells}")
+    return lines
+
+
+def driven(document: Document) -> list[str]:
+    """Success (or return) of each policy in the twin, clean, with its interval per condition."""
+    clean = [row for row in document["results"] if row["perturbation"] == "none"]
+    lines = []
+    for policy in dict.fromkeys(row["policy"] for row in clean):
+        cells = []
+        for row in clean:
+            if row["policy"] != policy:
+                continue
+            if row["success"] is None:
+                cells.append(f"{row['condition']} return {row['return']:.2f}")
+            else:
+                ends = f"[{row['success_low']:.2f}, {row['success_high']:.2f}]"
+                cells.append(f"{row['condition']} {row['success']:.2f} {ends}")
+        lines.append(f"{policy}: {', '.join(cells)}")
+    return lines
+
+
+def on_logs(document: Document) -> list[str]:
+    """What the policy is worth by held-out logs, beside what the logs' drivers achieved."""
+    rows = [row for row in document["results"] if row["condition"] == "all"]
+    lines = []
+    for measure in dict.fromkeys(row["measure"] for row in rows):
+        own = {row["estimator"]: row for row in rows if row["measure"] == measure}
+        known = [f"{name} {_estimate(own[name])}" for name in ESTIMATORS if name in own]
+        episodes = count(next(iter(own.values()))["episodes"], "held-out episode")
+        lines.append(f"{measure} ({episodes}): {', '.join(known)}")
+        why = next((row["refused"] for row in own.values() if row["refused"]), None)
+        if why:
+            lines.append(f"refused: {why}")
+    return lines + list(document["notes"])
+
+
+def _estimate(row: Mapping[str, Any]) -> str:
+    if row["value"] is None:
+        return "refused"
+    if row["low"] is None:
+        return f"{row['value']:.2f} (no interval)"
+    return f"{row['value']:.2f} [{row['low']:.2f}, {row['high']:.2f}]"
+
+
+def report(document: Document) -> list[str]:
+    """Nothing: the page is the outcome."""
+    return []
+
+
+def errors(text: str) -> list[str]:
+    """The complaints that a verb left on stderr, each with its remedy, without its progress."""
+    found: list[str] = []
+    for line in text.splitlines():
+        if line.startswith(_COMPLAINT):
+            found.append(line.removeprefix(_COMPLAINT).strip())
+        elif found and line.startswith("  "):
+            found[-1] += f"; {line.strip()}"
+    return found
+
+
+_COMPLAINT = "restock: "
+
+
+def _time(seconds: float) -> str:
+    if seconds >= 5400:
+        return f"{seconds / 3600:.1f} h"
+    return f"{seconds / 60:.1f} min" if seconds >= 90 else f"{seconds:.1f} s"

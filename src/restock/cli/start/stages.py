@@ -1,0 +1,247 @@
+"""The stages from recordings to a report: one list of them, for `start` and for `demo`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from restock.cli.start import outcomes
+from restock.cli.start.stage import Stage
+
+COVERAGE = (
+    "SELECT condition, rows, share, episodes, success_share, behaviour_policies"
+    " FROM coverage_by_condition"
+)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the stages share."""
+
+    logs: tuple[str, ...]
+    out: Path
+    profile: Path | str | None = None  # None: the one of the robot that comes with Restock
+    seconds: float = 150.0  # of training
+    episodes: int = 20  # of evaluation, per kind, policy and perturbation
+    device: str = "cpu"
+    mixture: str = "coverage"
+    typestore: str | None = None
+    train: tuple[str, ...] = ()  # further settings, each key=value
+
+    @property
+    def store(self) -> Path:
+        return self.out / "store"
+
+    @property
+    def panel(self) -> Path:
+        return self.out / "panel"
+
+    @property
+    def run(self) -> Path:
+        return self.out / "run"
+
+    @property
+    def fitted(self) -> Path:
+        return self.out / "fitted.toml"
+
+    @property
+    def recordings(self) -> tuple[Path, ...]:
+        """The user's files and folders."""
+        return tuple(Path(path) for path in self.logs)
+
+    @property
+    def with_profile(self) -> list[str]:
+        return [] if self.profile is None else ["--profile", str(self.profile)]
+
+    @property
+    def with_typestore(self) -> list[str]:
+        return [] if self.typestore is None else ["--typestore", self.typestore]
+
+    @property
+    def profile_file(self) -> tuple[Path, ...]:
+        return _file(self.profile)
+
+    @property
+    def mixture_file(self) -> tuple[Path, ...]:
+        return _file(self.mixture)
+
+
+def _file(name: Path | str | None) -> tuple[Path, ...]:
+    """The file of this name, unless it is that of a shipped one."""
+    return () if name is None or not Path(name).is_file() else (Path(name),)
+
+
+def info(to: Settings) -> Stage:
+    return Stage(
+        "info",
+        "What is in these recordings?",
+        "The recordings come first: topics, types, counts, durations.",
+        ["info", *to.logs],
+        reads=to.recordings,
+        outcome=outcomes.info,
+    )
+
+
+def propose(to: Settings, recording: str, flags: list[str]) -> Stage:
+    """A profile, from the recording that has most of what is needed."""
+    assert to.profile is not None
+    return Stage(
+        "propose",
+        "How do its topics become observation, action and reward?",
+        "A first profile is proposed from what is in the recording.",
+        ["profile", "new", recording, "--out", str(to.profile), *flags, *to.with_typestore],
+        reads=to.recordings,
+        writes=(Path(to.profile),),
+        expected=(0, 3),
+        outcome=outcomes.propose,
+    )
+
+
+def check(to: Settings, recording: str) -> Stage:
+    return Stage(
+        "check",
+        "Does the profile fit?",
+        "A dry run of one recording: what is used, what is missing, what would come of it.",
+        ["profile", "check", str(to.profile), recording, *to.with_typestore],
+        reads=to.profile_file,
+        outcome=outcomes.check,
+    )
+
+
+def ingest(to: Settings) -> Stage:
+    return Stage(
+        "ingest",
+        "Recordings to labelled transitions",
+        "Topics become steps of the control clock (held causally, never interpolated), steps"
+        " become observation, action and reward, and SQL labels each with its conditions."
+        " Where recordings contain the true condition, the labels are scored.",
+        ["ingest", *to.logs, "--store", str(to.store), *to.with_profile, *to.with_typestore],
+        reads=(*to.recordings, *to.profile_file),
+        writes=(to.store,),
+        expected=(0, 3),
+        remark="some data was lost or skipped: see the table above",
+        outcome=outcomes.ingest,
+    )
+
+
+def coverage(to: Settings) -> Stage:
+    return Stage(
+        "coverage",
+        "What is on each shelf?",
+        "Hours of the easy aisle, seconds of the wet floor: the store is plain Parquet, and"
+        " the question is plain SQL.",
+        ["sql", str(to.store), COVERAGE],
+        outcome=outcomes.coverage,
+    )
+
+
+def audit(to: Settings) -> Stage:
+    return Stage(
+        "audit",
+        "Is the coverage good enough?",
+        "Each audit is a query that returns the offending rows. In a pipeline the exit code"
+        " stops you here.",
+        ["audit", str(to.store)],
+        expected=(0, 1),
+        remark="an audit failed: a pipeline would stop here, the demo goes on",
+        outcome=outcomes.audit,
+    )
+
+
+def mix(to: Settings) -> Stage:
+    return Stage(
+        "mix",
+        "A replay panel that keeps the rare conditions in stock",
+        "Each shelf has the whole episodes that met its condition. Natural, wanted, drawn and"
+        " after weights stand side by side, and what is missing is told in rows and hours of"
+        " logging; the result is a pinned panel with an id.",
+        ["mix", str(to.store), "--mixture", to.mixture, "--out", str(to.panel)],
+        reads=to.mixture_file,
+        writes=(to.panel,),
+        outcome=outcomes.mix,
+    )
+
+
+def fit(to: Settings, horizon_s: float) -> Stage:
+    """The twin's robot, from the commands and what the robot did. Few segments: minutes matter."""
+    few = ["--search", "32", "--segments", "80", "--horizon-s", f"{horizon_s:g}"]
+    return Stage(
+        "fit",
+        "The twin's robot, fitted to these logs",
+        "The logged commands are driven again in the twin, and its parameters sought under which"
+        " it moves as the robot did.",
+        ["twin", "fit", str(to.store), "--out", str(to.fitted), *few],
+        writes=(to.fitted,),
+        outcome=outcomes.fit,
+    )
+
+
+def gap(to: Settings, horizon_s: float, *, fitted: bool) -> Stage:
+    calibrated = ["--perturbation", str(to.fitted)] if fitted else []
+    horizons = ["--horizons", f"{horizon_s:g}", "--trust-horizon-s", f"{horizon_s:g}"]
+    folder = to.store / "gap"
+    return Stage(
+        "gap",
+        "Is the twin worth trusting?",
+        "How far the twin ends from the log when it is driven by the logged commands.",
+        ["twin", "gap", str(to.store), *calibrated, "--out", str(folder), *horizons, "--most=100"],
+        writes=(folder,),
+        outcome=outcomes.gap,
+    )
+
+
+def train(to: Settings, *, twin: bool = True) -> Stage:
+    """Offline and then in the twin; or on the logs alone."""
+    settings = list(to.train) if twin else ["schedule.env_steps=0"]
+    return Stage(
+        "train",
+        "Train: first on the panel, then online in the twin"
+        if twin
+        else "Train on the logs alone, without a twin",
+        f"About {to.seconds:.0f} s of double DQN. Half of each batch comes from the logs by"
+        " quotas, half is fresh, of missions that go wrong more often. Q chooses among what"
+        " the twin's operator finds plausible. Every row the critic is fed is recorded.",
+        [
+            *("train", "--panel", str(to.panel), "--out", str(to.run)),
+            *("--seconds", f"{to.seconds:g}", "--device", to.device),
+            *(word for setting in settings for word in ("--set", setting)),
+        ],
+        writes=(to.run,),
+        outcome=outcomes.train,
+        shows_progress=True,
+        resume=("train", "--resume", str(to.run)),
+    )
+
+
+def evaluate(to: Settings) -> Stage:
+    return Stage(
+        "eval",
+        "Evaluate on the same seeded episodes",
+        "The kept checkpoint, the scripted planner and a random policy, clean and with less"
+        " friction and more latency than in training.",
+        ["eval", str(to.run), "--episodes", str(to.episodes)],
+        outcome=outcomes.driven,
+        shows_progress=True,
+    )
+
+
+def judge(to: Settings) -> Stage:
+    """Off-policy: what the policy is worth by logs that it did not learn from."""
+    return Stage(
+        "judge",
+        "What is it worth by the logs alone, beside how they were driven?",
+        "Off-policy evaluation on episodes that the panel holds out.",
+        ["eval", str(to.run), "--on-logs", "own"],
+        outcome=outcomes.on_logs,
+        shows_progress=True,
+    )
+
+
+def report(to: Settings) -> Stage:
+    return Stage(
+        "report",
+        "One page with all of it",
+        "What it was fed, what it learnt, where it fails.",
+        ["report", str(to.run)],
+        writes=(to.run / "report.html",),
+    )

@@ -1,0 +1,239 @@
+"""`restock start`: from a stranger's bag to a policy and a report, stage by stage."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from restock.errors import ConfigError, ExitCode, RecordingError
+
+if TYPE_CHECKING:
+    from restock.cli.start.stage import Document, Stop
+    from restock.cli.start.work import Ended, Work
+
+
+@dataclass
+class StartCommand:
+    """From recordings of a robot to a policy for it and a report, in one command.
+
+    Proposes a profile (OUT/profile.toml), checks it, ingests, shows the coverage, mixes a panel,
+    fits the twin, measures whether it may be trusted, trains, evaluates and reports. Each stage
+    prints the command that it is, what came of it, and its file. Where the twin is not to be
+    trusted, a policy is trained on the logs alone, and judged on logs that it did not learn from.
+
+    Run the same command again after an edit of OUT/profile.toml or an interruption: stages that are
+    done and whose inputs are the same are not done again. Where a person must decide it stops, says
+    what to type, and exits with 3.
+
+    Example: `restock start bags/ --out mine`
+    """
+
+    paths: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="BAG")]
+    """Recordings of one kind of robot: files, bag folders, or folders of them."""
+    out: Path
+    """Where everything goes: profile.toml, store, panel, run, and run/report.html."""
+    profile: str | None = None
+    """A profile that is there already, in place of a proposed one."""
+    footprint: Annotated[str | None, tyro.conf.arg(metavar="LxW")] = None
+    """The robot's length and width in metres, as 0.6x0.5, for the proposal."""
+    odometry_as_command: bool = False
+    """Let the proposal take odometry for commands where none was recorded."""
+    typestore: str | None = None
+    """Distribution whose message definitions serve recordings without their own (humble)."""
+    mixture: str = "coverage"
+    """What the learner is fed: a shipped mixture's name, or a TOML file."""
+    minutes: float = 5.0
+    """About how long all of it may take, on two cores, once the logs are ingested: half of it is
+    training."""
+    twin: Literal["auto", "yes", "no"] = "auto"
+    """Whether to train and evaluate in the twin: auto is where its gap to nominal driving is within
+    the limits of `restock twin gap`."""
+    accept: bool = False
+    """Go on with the proposal as it is where it left a choice to a person."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where the network trains."""
+    dry_run: bool = False
+    """Print the commands that would run, and run none."""
+    json: bool = False
+    """Print one JSON document at the end: {"stages": [{"name", "command", "status", "outcome",
+    "files", "seconds", …}], "stopped", "report"}."""
+
+    def run(self) -> int:
+        """The whole way; 3 where a person must decide, 2 where a stage failed."""
+        from restock.cli import main
+        from restock.cli.output import print_json, stderr, stdout
+        from restock.cli.start.work import Work, escape
+
+        if not self.paths:
+            raise RecordingError("no recording given", remedy="restock start BAG --out DIR")
+        if self.minutes <= 0:
+            raise ConfigError(f"must be above 0, got {self.minutes:g}", where="--minutes")
+        console = stderr() if self.json else stdout()
+        say: Callable[[str], None] = lambda line: console.print(line, soft_wrap=True)  # noqa: E731
+        work = Work(self.out, main, say, plan=self.dry_run)
+        stopped = _way(self, work)
+        page = self.out / "run" / "report.html"
+        if self.json:
+            stages = [{k: v for k, v in asdict(e).items() if k != "document"} for e in work.ended]
+            print_json(
+                {
+                    "stages": stages,
+                    "stopped": None if stopped is None else asdict(stopped),
+                    "report": str(page) if page.exists() and stopped is None else None,
+                }
+            )
+        if stopped is None:
+            if not self.dry_run:
+                say(f"\nThe report: [bold]{escape(str(page))}[/bold] (open it in a browser)")
+            return int(ExitCode.OK)
+        say(f"\n[bold yellow]Stopped: {escape(stopped.why)}[/bold yellow]")
+        for remedy in stopped.remedies:
+            say(f"   {escape(remedy)}")
+        sys.stdout.flush()
+        return int(ExitCode.LOSSY)
+
+
+def _way(asked: StartCommand, work: Work) -> Stop | None:
+    """Stage after stage; where a person must decide, why and what to do."""
+    from restock.cli.start import stages
+    from restock.cli.start.stage import Stop
+    from restock.cli.start.stages import Settings
+
+    again = f"then run the same command again: what is done is kept in {asked.out}"
+    own = asked.profile is not None
+    to = Settings(
+        logs=asked.paths,
+        out=asked.out,
+        profile=asked.profile or asked.out / "profile.toml",
+        seconds=30.0 * asked.minutes,
+        episodes=max(round(4 * asked.minutes), 1),
+        device=asked.device,
+        mixture=asked.mixture,
+        typestore=asked.typestore,
+        train=("practice.rule=success",),
+    )
+    found = work.do(stages.info(to))
+    if not found.good:
+        return Stop(
+            "no recording can be read", ("name a file, a bag's folder, or a folder of bags",)
+        )
+    recording = fullest(found.document) or asked.paths[0]
+
+    if not own and not _edited(to.profile, asked.out):
+        flags = [] if asked.footprint is None else ["--footprint", asked.footprint]
+        flags += ["--odometry-as-command"] * asked.odometry_as_command
+        proposed = work.do(stages.propose(to, recording, flags))
+        if not proposed.good:
+            return Stop("no profile can be proposed", (f"write {to.profile}: docs/profile.md",))
+        if problems := proposed.document.get("problems"):
+            return Stop(
+                "; ".join(problems),
+                (f"edit {to.profile}: its first lines say what is missing", again),
+            )
+    checked = work.do(stages.check(to, recording))
+    if not checked.good:
+        return Stop(
+            "the profile does not fit this recording",
+            (f"edit {to.profile}", again),
+        )
+    ingested = work.do(stages.ingest(to))
+    if not ingested.good:
+        return Stop("nothing could be ingested", (f"edit {to.profile}", again))
+    work.do(stages.coverage(to))
+    work.do(stages.audit(to))
+    mixed = work.do(stages.mix(to))
+    if not mixed.good:
+        return Stop(
+            "the mixture does not fit these logs",
+            (
+                "write one for them (docs/mixture.md), and add --mixture FILE to the command",
+                again,
+            ),
+        )
+    twin = asked.twin != "no"
+    horizon_s = horizon(to.profile)
+    if twin:
+        fitted = work.do(stages.fit(to, horizon_s))
+        if fitted.good:
+            to = _with(to, train=(*to.train, f"env.perturbation={to.fitted}"))
+        judged = work.do(stages.gap(to, horizon_s, fitted=fitted.good))
+        if asked.twin == "auto" and not work.plan:
+            why = mistrust(judged)
+            twin = why is None
+            if why is not None:
+                work.say(
+                    f"   [yellow]no training in the twin: {why}; --twin yes overrides[/yellow]"
+                )
+    trained = work.do(stages.train(to, twin=twin))
+    if not trained.good:
+        return Stop("training did not come to its end", (*trained.errors[:2], again))
+    if twin:
+        work.do(stages.evaluate(to))
+    work.do(stages.judge(to))
+    work.do(stages.report(to))
+    return None
+
+
+def _with(to: Any, **changes: Any) -> Any:
+    from dataclasses import replace
+
+    return replace(to, **changes)
+
+
+def fullest(document: Document) -> str | None:
+    """The recording that has most of what a profile needs: a command, a pose, and time."""
+    from restock.ingest.propose.roles import KINDS
+
+    def types(role: str) -> set[str]:
+        return {kind.type for kind in KINDS[role]}
+
+    def rank(row: Any) -> tuple[int, float]:
+        there = {topic["type"] for topic in row["topics"].values() if topic["messages"]}
+        roles = sum(bool(there & types(role)) for role in ("command", "pose", "wheels"))
+        return roles, row["duration_s"] or 0.0
+
+    rows = document.get("recordings", [])
+    return str(max(rows, key=rank)["path"]) if rows else None
+
+
+def _edited(profile: Path | str | None, out: Path) -> bool:
+    """Whether the profile in the folder is a person's: not, byte for byte, what was proposed."""
+    from restock.cli.start.work import FOLDER
+    from restock.files import read_json
+
+    path, proposed = Path(str(profile)), out / FOLDER / "propose.json"
+    if not path.is_file():
+        return False
+    return not proposed.is_file() or read_json(proposed)["toml"] != path.read_text("utf-8")
+
+
+def horizon(profile: Path | str | None) -> float:
+    """Some 3 s in whole control periods: the twin's limits are of that."""
+    from restock.ingest.profile.profile import load_profile
+
+    if profile is None or (isinstance(profile, Path) and not profile.is_file()):
+        return 3.0
+    period_s = load_profile(str(profile)).task.control_period_s
+    return round(max(round(3.0 / period_s), 1) * period_s, 6)
+
+
+def mistrust(judged: Ended) -> str | None:
+    """Why the twin is not to be trusted in nominal driving; None where it is."""
+    from restock.cli.start.outcomes import of_nominal
+
+    if not judged.good:
+        return f"its gap to the logs cannot be measured ({'; '.join(judged.errors)})"
+    verdict = of_nominal(judged.document)
+    if verdict is None:
+        return "these logs show no nominal driving"
+    if verdict["verdict"] == "trusted":
+        return None
+    return f"in nominal driving it is {verdict['verdict']}: {'; '.join(verdict['reasons'])}"
+
+
+__all__ = ["StartCommand", "fullest", "mistrust"]

@@ -1,0 +1,233 @@
+"""Running stages, each once: what is done and whose inputs are the same is not done again.
+
+`OUT/start/NAME.json` is what the stage's verb printed; `OUT/start/stages.json` says of each stage
+which command it ran, from which inputs, and how it ended.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from restock.cli.start.outcomes import errors
+from restock.cli.start.stage import Document, Stage
+from restock.errors import ExitCode, RestockError, visible
+from restock.files import read_json, write_text
+
+FOLDER, RECORD = "start", "stages.json"
+SMALL_BYTES = 1_000_000  # a file up to this is known by its content, a larger one by size and time
+Dispatch = Callable[[list[str]], int]
+
+
+@dataclass
+class Ended:
+    """How a stage ended, now or in an earlier call."""
+
+    name: str
+    command: str
+    status: str  # done | kept (from an earlier call) | failed | planned
+    exit_code: int = 0
+    outcome: list[str] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)
+    files: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+    stamp: str = ""
+    document: Document = field(default_factory=dict)
+
+    @property
+    def good(self) -> bool:
+        """Whether the way can go on from it."""
+        return self.status != "failed"
+
+
+class Work:
+    """Runs stages in a folder of its own, and remembers them.
+
+    `say` prints a line. With `plan` nothing is run: the commands are said.
+    """
+
+    def __init__(
+        self, out: Path, dispatch: Dispatch, say: Callable[[str], None], *, plan: bool = False
+    ) -> None:
+        self.out, self.dispatch, self.say, self.plan = out, dispatch, say, plan
+        self.ended: list[Ended] = []
+        self._stamps: list[str] = []
+        self._known: dict[str, Any] = {}
+        if plan:
+            return
+        record = out / FOLDER / RECORD
+        if record.is_file():
+            self._known = read_json(record)
+        elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise RestockError(
+                "already exists, and not from `restock start`",
+                where=str(out),
+                remedy="give another --out",
+            )
+        (out / FOLDER).mkdir(parents=True, exist_ok=True)
+        self._keep()
+
+    def do(self, stage: Stage) -> Ended:
+        """Run a stage, or take what came of it before; says what it does and what came of it.
+
+        Raises:
+            KeyboardInterrupt: it was interrupted; the same stage then goes on, or begins again.
+        """
+        self.say(f"\n[bold]{len(self.ended) + 1}  {stage.title}[/bold]")
+        if self.plan:
+            self.say(f"[cyan]$ {escape(stage.line())}[/cyan]")
+            return self._note(Ended(stage.name, stage.line(), "planned"))
+        stamp = self._stamp(stage)
+        if (kept := self._before(stage, stamp)) is not None:
+            self._stamps.append(stamp)
+            self.say(f"[cyan]$ {escape(stage.line())}[/cyan]  [dim]done before[/dim]")
+            return self._note(kept)
+        began = self._known.get(stage.name, {})
+        goes_on = bool(stage.resume) and began.get("stamp") == stamp and _resumable(stage)
+        if not goes_on:
+            self._clear(stage)
+        if goes_on:
+            stage = _resumed(stage)
+        self.say(f"[cyan]$ {escape(stage.line())}[/cyan]")
+        # Begun, and not yet ended: where this process ends now, the stage is run again.
+        self._known[stage.name] = {"stamp": stamp, "status": "begun"}
+        self._keep()
+        self._stamps.append(stamp)
+        return self._note(self._run(stage, stamp))
+
+    def _run(self, stage: Stage, stamp: str) -> Ended:
+        printed, complaints = io.StringIO(), io.StringIO()
+        started = time.monotonic()
+        sys.stdout.flush()
+        with redirect_stdout(printed):
+            if stage.shows_progress:
+                code = self.dispatch([*stage.command, "--json"])
+            else:
+                with redirect_stderr(complaints):
+                    code = self.dispatch([*stage.command, "--json"])
+        if code == ExitCode.INTERRUPTED:
+            sys.stderr.write(complaints.getvalue())
+            raise KeyboardInterrupt
+        text = printed.getvalue()
+        document = _parsed(text)
+        good = code in stage.expected and bool(document)
+        ended = Ended(
+            stage.name,
+            stage.line(),
+            "done" if good else "failed",
+            int(code),
+            stage.outcome(document) if good else [],
+            errors(complaints.getvalue()),
+            [str(path) for path in stage.writes if path.exists()],
+            time.monotonic() - started,
+            stamp,
+            document,
+        )
+        if document:
+            write_text(self._document(stage), text)
+        self._known[stage.name] = {k: v for k, v in asdict(ended).items() if k != "document"}
+        self._keep()
+        return ended
+
+    def _note(self, ended: Ended) -> Ended:
+        """Say what came of a stage."""
+        self.ended.append(ended)
+        for line in ended.outcome:
+            self.say(f"   {escape(line)}")
+        if not ended.good:
+            for line in ended.errors:
+                self.say(f"   [yellow]{escape(line)}[/yellow]")
+        if ended.files:
+            self.say(f"   [dim]-> {escape(', '.join(ended.files))}[/dim]")
+        return ended
+
+    def _before(self, stage: Stage, stamp: str) -> Ended | None:
+        """What an earlier call made of just this, where all of it is still there."""
+        known = self._known.get(stage.name, {})
+        if known.get("status") != "done" or known.get("stamp") != stamp:
+            return None
+        if any(ended.status == "done" for ended in self.ended):  # what is before it has changed
+            return None
+        if not all(path.exists() for path in stage.writes) or not self._document(stage).exists():
+            return None
+        document = _parsed(self._document(stage).read_text(encoding="utf-8"))
+        ended = Ended(**known, document=document)
+        ended.status = "kept"
+        return ended
+
+    def _stamp(self, stage: Stage) -> str:
+        """What decides its result: the command, the user's files, and all stages before it."""
+        parts = [stage.line(), *self._stamps[-1:], *(_fingerprint(path) for path in stage.reads)]
+        return hashlib.blake2b("\n".join(parts).encode(), digest_size=12).hexdigest()
+
+    def _clear(self, stage: Stage) -> None:
+        """Remove what an earlier call made of the stage; a run, which took long, is put aside."""
+        for path in stage.writes:
+            if not path.exists() or not path.resolve().is_relative_to(self.out.resolve()):
+                continue
+            if stage.resume:
+                aside = self.out / "earlier"
+                aside.mkdir(exist_ok=True)
+                number = 1 + sum(1 for _ in aside.iterdir())
+                path.rename(aside / f"{path.name}-{number}")
+                self.say(f"   [dim]the earlier one is now {aside / f'{path.name}-{number}'}[/dim]")
+            elif path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+
+    def _document(self, stage: Stage) -> Path:
+        return self.out / FOLDER / f"{stage.name}.json"
+
+    def _keep(self) -> None:
+        write_text(self.out / FOLDER / RECORD, json.dumps(self._known, indent=1) + "\n")
+
+
+def escape(text: str) -> str:
+    """Text as it is, for a console that reads markup."""
+    return visible(text, keep="\n").replace("[", r"\[")
+
+
+def _parsed(text: str) -> Any:
+    try:
+        document = json.loads(text)
+    except json.JSONDecodeError:
+        return {}
+    return {"rows": document} if isinstance(document, list) else document
+
+
+def _resumable(stage: Stage) -> bool:
+    return any((path / "checkpoints").is_dir() for path in stage.writes)
+
+
+def _resumed(stage: Stage) -> Stage:
+    from dataclasses import replace
+
+    return replace(stage, command=list(stage.resume))
+
+
+def _fingerprint(path: Path) -> str:
+    """A user's file or folder as it is now."""
+    files = sorted(path.rglob("*")) if path.is_dir() else [path]
+    parts = []
+    for file in files:
+        if not file.is_file():
+            continue
+        status = file.stat()
+        told = f"{status.st_size} {status.st_mtime_ns}"
+        if status.st_size <= SMALL_BYTES:
+            told = hashlib.blake2b(file.read_bytes(), digest_size=12).hexdigest()
+        parts.append(f"{file} {told}")
+    return "\n".join(parts)
+
+
+__all__ = ["FOLDER", "RECORD", "Ended", "Work", "escape"]

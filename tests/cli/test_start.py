@@ -1,0 +1,173 @@
+"""`restock start`: a stranger's bag, stage by stage; what is done is not done again; it stops where
+a person must decide."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.driven_robot import Drive, write_bag
+
+from restock import cli
+from restock.cli.start.stage import Stage
+from restock.cli.start.work import Work
+from restock.errors import RestockError
+
+SILENT = lambda line: None  # noqa: E731
+
+
+class Verbs:
+    """Stands in for the command line: writes what a stage should, and counts."""
+
+    def __init__(self) -> None:
+        self.ran: list[str] = []
+        self.codes: dict[str, int] = {}
+
+    def __call__(self, command: list[str]) -> int:
+        self.ran.append(command[0])
+        for path in command[1:-1]:
+            Path(path).mkdir(parents=True, exist_ok=True)
+        sys.stdout.write(json.dumps({"made": command[0]}))
+        return self.codes.get(command[0], 0)
+
+
+def way(out: Path, verbs: Verbs, bag: Path, number: int = 1) -> list[str]:
+    """Three stages, one of the user's files, one that can be resumed; each one's status."""
+    work = Work(out, verbs, SILENT)
+    store, run = out / "store", out / "run"
+    stages = [
+        Stage("ingest", "", "", ["ingest", str(store)], reads=(bag,), writes=(store,)),
+        Stage("mix", "", "", ["mix", str(out / f"panel{number}")]),
+        Stage(
+            *("train", "", "", ["train", str(run)]),
+            writes=(run,),
+            resume=("train-on", str(run)),
+        ),
+    ]
+    return [work.do(stage).status for stage in stages]
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    path = tmp_path / "a.bag"
+    path.write_bytes(b"messages")
+    return path
+
+
+def test_what_is_done_is_not_done_again(tmp_path: Path, bag: Path) -> None:
+    verbs, out = Verbs(), tmp_path / "out"
+    assert way(out, verbs, bag) == ["done"] * 3
+    assert way(out, verbs, bag) == ["kept"] * 3
+    assert verbs.ran == ["ingest", "mix", "train"]
+
+
+def test_what_a_changed_input_decides_is_done_again(tmp_path: Path, bag: Path) -> None:
+    verbs, out = Verbs(), tmp_path / "out"
+    way(out, verbs, bag)
+    assert way(out, verbs, bag, number=2) == ["kept", "done", "done"]  # another command
+    (out / "run" / "mine.txt").write_text("a note")
+    bag.write_bytes(b"other messages")
+    assert way(out, verbs, bag, number=2) == ["done"] * 3
+    # Training takes long: what it left before is put aside, and not removed.
+    assert (out / "earlier" / "run-2" / "mine.txt").read_text() == "a note"
+    (out / "store").rmdir()
+    assert way(out, verbs, bag, number=2) == ["done"] * 3
+
+
+def test_a_failed_stage_is_tried_again(tmp_path: Path, bag: Path) -> None:
+    verbs, out = Verbs(), tmp_path / "out"
+    verbs.codes["mix"] = 2
+    assert way(out, verbs, bag) == ["done", "failed", "done"]
+    assert way(out, verbs, bag) == ["kept", "failed", "kept"]
+    verbs.codes.clear()
+    assert way(out, verbs, bag) == ["kept", "done", "done"]
+
+
+def test_interrupted_training_goes_on_from_its_checkpoint(tmp_path: Path, bag: Path) -> None:
+    verbs, out = Verbs(), tmp_path / "out"
+    verbs.codes["train"] = 130
+    with pytest.raises(KeyboardInterrupt):
+        way(out, verbs, bag)
+    (out / "run" / "checkpoints").mkdir()
+    assert way(out, verbs, bag) == ["kept", "kept", "done"]
+    assert verbs.ran[-1] == "train-on"
+    assert not (out / "earlier").exists()
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, bag: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("precious")
+    with pytest.raises(RestockError, match="not from `restock start`"):
+        way(tmp_path, Verbs(), bag)
+
+
+def start(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, Any]:
+    """The exit code, and the document."""
+    code = cli.main(["start", *argv, "--json"])
+    return code, json.loads(capsys.readouterr().out)
+
+
+def test_a_dry_run_prints_commands_and_writes_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert cli.main(["start", "bags", "--out", str(out), "--dry-run"]) == 0
+    printed = capsys.readouterr().out
+    commands = [line for line in printed.splitlines() if line.startswith("$ restock ")]
+    assert commands[0] == "$ restock info bags"
+    assert commands[-1] == f"$ restock report {out / 'run'}"
+    assert not out.exists()
+
+
+def test_no_recording_stops_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "empty").mkdir()
+    code, document = start(capsys, str(tmp_path / "empty"), "--out", str(tmp_path / "out"))
+    assert code == 3
+    assert document["stages"][0]["errors"] == [
+        f"{tmp_path / 'empty'}: no recording in this folder;"
+        " recordings end in .mcap, .db3, .bag or are rosbag2 folders"
+    ]
+
+
+class Parked(Drive):
+    """A bag without commands."""
+
+    def topics(self) -> dict[str, Any]:
+        topics = super().topics()
+        del topics["/cmd_vel"]
+        return topics
+
+
+def test_a_bag_without_commands_stops_at_the_proposal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = write_bag(Parked(), tmp_path / "parked")
+    out = tmp_path / "out"
+    code, document = start(capsys, str(recording), "--out", str(out))
+    assert code == 3
+    assert [stage["name"] for stage in document["stages"]] == ["info", "propose"]
+    assert "no topic for command" in document["stopped"]["why"]
+    assert str(out / "profile.toml") in document["stopped"]["remedies"][0]
+    assert document["report"] is None
+
+
+def test_an_edited_profile_is_taken_and_never_replaced(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = write_bag(Drive(), tmp_path / "drive")
+    out = tmp_path / "out"
+    argv = (str(recording), "--out", str(out), "--mixture", "no_such.toml")
+    code, document = start(capsys, *argv)
+    assert code == 3
+    assert document["stages"][-1]["name"] == "mix"
+    assert all(stage["status"] == "done" for stage in document["stages"][:-1])
+    assert [s["status"] for s in start(capsys, *argv)[1]["stages"][:-1]] == ["kept"] * 6
+    profile = out / "profile.toml"
+    mine = profile.read_text().replace("range_max_m = ", "range_max_m = 1") + "\n# mine\n"
+    profile.write_text(mine)
+    _, document = start(capsys, *argv)
+    assert "propose" not in [stage["name"] for stage in document["stages"]]
+    assert {s["name"]: s["status"] for s in document["stages"]}["ingest"] == "done"
+    assert profile.read_text() == mine
