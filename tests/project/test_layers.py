@@ -72,6 +72,10 @@ MAY_IMPORT = {
     "train/twin/recording": (
         "twin/env twin/floors twin/physics replay/fleet ingest/profile ingest/task"
     ),
+    "train/twin/survey": (
+        "twin/floors replay/store ingest/containers ingest/decoding ingest/profile ingest/propose"
+        " ingest/steps ingest/task"
+    ),
     "train/twin/calibration": (
         "twin/floors twin/physics replay/store ingest/profile ingest/steps ingest/store ingest/task"
     ),
@@ -91,9 +95,9 @@ MAY_IMPORT = {
     ),
     "cli/start": "cli ingest/profile ingest/propose",
     "cli/twin": (
-        "cli report ingest/profile ingest/store ingest/task replay/fleet replay/store"
-        " train/evaluation train/twin/calibration train/twin/env train/twin/floors"
-        " train/twin/physics train/twin/recording"
+        "cli report ingest/profile ingest/propose ingest/store ingest/task replay/fleet"
+        " replay/store train/evaluation train/twin/calibration train/twin/env train/twin/floors"
+        " train/twin/physics train/twin/recording train/twin/survey"
     ),
 }
 

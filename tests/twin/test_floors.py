@@ -37,8 +37,8 @@ from restock.train.twin.floors.floors import (
 from restock.train.twin.floors.layout import OneWay, Warehouse, default_warehouse
 from restock.train.twin.floors.occupancy_map import (
     cells_of,
+    read_image,
     read_map,
-    read_pgm,
     write_map,
     write_pgm,
 )
@@ -152,22 +152,23 @@ def test_a_map_turned_by_its_origin_goes_back_to_the_map(tmp_path: Path) -> None
 
 def test_ascii_and_16_bit_greymaps_with_comments_are_read(tmp_path: Path) -> None:
     (tmp_path / "a.pgm").write_text("P2 # plain\n# a comment\n3 2\n9\n0 9 9\n0 0 # end\n9\n")
-    np.testing.assert_array_equal(read_pgm(tmp_path / "a.pgm"), [[0, 1, 1], [0, 0, 1]])
+    np.testing.assert_array_equal(read_image(tmp_path / "a.pgm")[0], [[0, 1, 1], [0, 0, 1]])
     (tmp_path / "b.pgm").write_bytes(b"P5\n2 1\n65535\n\x00\x00\xff\xff")
-    np.testing.assert_array_equal(read_pgm(tmp_path / "b.pgm"), [[0, 1]])
+    np.testing.assert_array_equal(read_image(tmp_path / "b.pgm")[0], [[0, 1]])
 
 
 @pytest.mark.parametrize(
     ("data", "message"),
     [
         (b"\x89PNG", "is not a PGM"),
-        (b"P5\n4 4\n255\nab", "cut short: 2 of 16"),
-        (b"P5\n99999 99999\n255\n", "99999 x 99999"),
-        (b"P5\n0 4\n255\n", "0 x 4"),
-        (b"P5\nfour 4\n255\n", "no width"),
-        (b"P5", "no width"),
-        (b"P2\n2 1\n255\n1 x", "not a number"),
-        (b"P2\n2 1\n9\n1 10", "outside 0 to 9"),
+        (b"P5\n4 4\n255\nab", "truncated"),
+        (b"P5\n99999 99999\n255\n", "more than 64,000,000 pixels"),
+        (b"P5\n9000 9000\n255\n", "9,000 x 9,000 pixels"),
+        (b"P5\n0 4\n255\n", "is not a PGM"),
+        (b"P5\nfour 4\n255\n", "cannot be read as an image"),
+        (b"P5", "cannot be read as an image"),
+        (b"P2\n2 1\n255\n1 x", "cannot be read as an image"),
+        (b"P2\n2 1\n9\n1 10", "too large"),
         (b"P5\n4 4\n255\n" + bytes(16), "no free place"),
     ],
 )
@@ -183,7 +184,14 @@ def test_a_broken_map_is_refused_with_its_reason(tmp_path: Path, data: bytes, me
     [
         ("resolution: 0.05\norigin: [0, 0, 0]\n", "image"),
         ("image: a.pgm\nresolution: -1\norigin: [0, 0, 0]\n", "resolution"),
+        ("image: a.pgm\nresolution: 0\norigin: [0, 0, 0]\n", "resolution"),
+        ("image: a.pgm\nresolution: .nan\norigin: [0, 0, 0]\n", "resolution"),
         ("image: a.pgm\nresolution: 0.05\norigin: [0, 0]\n", "origin"),
+        ("image: a.pgm\nresolution: 0.05\norigin: [.nan, 0, 0]\n", "origin"),
+        ("image: a.pgm\nresolution: 0.05\norigin: [1.0e+300, 0, 0]\n", "origin"),
+        ("image: ../a.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n", "outside its folder"),
+        ("image: /etc/hostname\nresolution: 0.05\norigin: [0, 0, 0]\n", "outside its folder"),
+        ('image: "a\\0b"\nresolution: 0.05\norigin: [0, 0, 0]\n', "no file's name"),
         ("image: a.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nmode: odd\n", "mode"),
         ("image: gone.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n", "cannot be read"),
         ("image: [\n", "YAML"),

@@ -143,7 +143,7 @@ def find_crossings(
 
 
 def find_goals(
-    free: Cells, cell_m: float, spacing_m: float = 1.0
+    free: Cells, cell_m: float, spacing_m: float = 1.0, room_m: float = GOAL_ROOM_M
 ) -> tuple[tuple[float, float], ...]:
     """Places with room around them, evenly over the free cells; at most GOALS."""
     room = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * cell_m
@@ -153,7 +153,7 @@ def find_goals(
         for j in range(0, free.shape[1], stride):
             window = room[i : i + stride, j : j + stride]
             best = np.unravel_index(int(window.argmax()), window.shape)
-            if window[best] >= GOAL_ROOM_M:
+            if window[best] >= room_m:
                 x, y = (i + best[0] + 0.5) * cell_m, (j + best[1] + 0.5) * cell_m
                 places.append((round(float(x), 6), round(float(y), 6)))
     if len(places) > GOALS:

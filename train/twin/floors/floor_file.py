@@ -14,11 +14,14 @@
     heading = "east" # north, west, south
 
 Aisles (`[[aisle]]` with name, box_m, along = "x" or "y"), goals, crossings and `[[zone]]` may be
-given too; aisles, goals and crossings that are not are found from the racks.
+given too; aisles, goals and crossings that are not are found from the racks. `starts` are places
+where missions begin (else in aisles), `room_m` is how far plans keep a robot's middle off
+obstacles, `way_m` how long a mission's way is.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +32,8 @@ from restock.errors import ConfigError
 from restock.toml import Checked, read_toml, toml_value, typed
 from restock.train.twin.floors.cells import cells_of, find_crossings, find_goals, find_segments
 from restock.train.twin.floors.layout import (
+    ROOM_M,
+    WAY_M,
     AisleSegment,
     Axis,
     Dock,
@@ -68,6 +73,9 @@ class FloorFile(Checked, frozen=True):
     goals: list[tuple[float, float]] | None = None
     crossings: list[Box] | None = None
     map_origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    room_m: float = ROOM_M
+    way_m: tuple[float, float] = WAY_M
+    starts: list[tuple[float, float]] = msgspec.field(default_factory=list)
     aisles: list[_Aisle] | None = msgspec.field(default=None, name="aisle")
     zones: list[_NamedBox] = msgspec.field(default_factory=list, name="zone")
     docks: list[_NamedBox] = msgspec.field(default_factory=list, name="dock")
@@ -93,6 +101,9 @@ def read_floor(path: Path) -> Warehouse:
         one_way=tuple(OneWay(Rect(*rule.box_m), rule.heading) for rule in content.one_way),
         name=content.name or path.name,
         map_origin=content.map_origin,
+        room_m=content.room_m,
+        way_m=content.way_m,
+        starts_m=tuple(content.starts),
     )
     free = cells_of(bare, CELL_M)
     segments = (
@@ -113,19 +124,23 @@ def read_floor(path: Path) -> Warehouse:
     return replace(bare, segments=segments, crossings=crossings, goals_m=goals)
 
 
-def floor_toml(floor: Warehouse) -> str:
-    """A floor as TOML that reads back equal."""
+def floor_toml(floor: Warehouse, remarks: Sequence[str] = ()) -> str:
+    """A floor as TOML that reads back equal, with remarks as comments on top."""
     values = {
         "name": floor.name,
         "width_m": float(floor.width_m),
         "depth_m": float(floor.depth_m),
         "map_origin": [float(value) for value in floor.map_origin],
+        "room_m": float(floor.room_m),
+        "way_m": [float(value) for value in floor.way_m],
     }
-    lines = [f"{key} = {toml_value(value)}" for key, value in values.items()]
+    lines = [f"# {remark}" for remark in remarks]
+    lines += [f"{key} = {toml_value(value)}" for key, value in values.items()]
     for key, rows in (
         ("racks", map(_box, floor.racks)),
         ("crossings", map(_box, floor.crossings)),
         ("goals", ([float(x), float(y)] for x, y in floor.goals_m)),
+        ("starts", ([float(x), float(y)] for x, y in floor.starts_m)),
     ):
         lines += [f"{key} = [", *(f"  {toml_value(row)}," for row in rows), "]"]
     if not floor.segments:
@@ -148,9 +163,9 @@ def _box(area: Rect) -> list[float]:
     return [float(edge) for edge in area.edges]
 
 
-def write_floor(floor: Warehouse, path: Path) -> None:
+def write_floor(floor: Warehouse, path: Path, remarks: Sequence[str] = ()) -> None:
     """Write a floor as TOML. Raises ConfigError where it cannot be written."""
     try:
-        path.write_text(floor_toml(floor), encoding="utf-8")
+        path.write_text(floor_toml(floor, remarks), encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"cannot be written: {error.strerror}", where=str(path)) from error

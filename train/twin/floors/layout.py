@@ -33,6 +33,8 @@ DEFAULT = "default"
 ELSEWHERE = "elsewhere"
 MAX_SIDE_M = 60.0  # a plan of a floor larger than this takes seconds
 MAX_RACKS = 400
+ROOM_M = 0.3  # half the stand-in's width and a margin: its middle comes no nearer to a rack
+WAY_M = (4.0, 11.0)  # of a mission
 BAY_M = 0.6  # between the goals along an aisle
 
 
@@ -126,6 +128,9 @@ class Warehouse:
     name: str = DEFAULT
     wall_m: float = 0.1
     map_origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x, y, yaw of the corner, in the map
+    room_m: float = ROOM_M  # plans keep a robot's middle this far off racks and walls
+    way_m: tuple[float, float] = WAY_M  # how long a mission's way is, from and to
+    starts_m: tuple[tuple[float, float], ...] = ()  # where missions begin, where that is known
 
     def __post_init__(self) -> None:
         """Raises ConfigError where the numbers do not make a floor."""
@@ -158,6 +163,26 @@ class Warehouse:
                     where=where,
                     remedy="give a box as x0, y0, x1, y1 with x0 < x1 and y0 < y1, in metres",
                 )
+        if not 0.05 <= self.room_m <= 3.0:
+            raise ConfigError(
+                f"room_m is {self.room_m:g}",
+                where=where,
+                remedy="half the robot's width and a margin, .05 to 3 m",
+            )
+        if not 0.1 <= self.way_m[0] < self.way_m[1] <= 4 * MAX_SIDE_M:
+            raise ConfigError(
+                f"way_m is {self.way_m[0]:g} to {self.way_m[1]:g} m",
+                where=where,
+                remedy="the shortest and longest way of a mission, in metres",
+            )
+        for x, y in self.goals_m + self.starts_m:
+            if not (0 <= x <= self.width_m and 0 <= y <= self.depth_m):
+                raise ConfigError(
+                    f"the place [{x:g}, {y:g}] is not within 0 to {self.width_m:g} m by 0 to"
+                    f" {self.depth_m:g} m",
+                    where=where,
+                    remedy="give goals and starts in the floor's own frame, in metres",
+                )
         if not len(self.goals):
             raise ConfigError(
                 "has no place that a robot could be sent to", where=where, remedy="give docks"
@@ -171,7 +196,11 @@ class Warehouse:
 
     @cached_property
     def starts(self) -> tuple[AisleSegment, ...]:
-        """Where episodes begin: aisle segments; around the goals where a floor has none."""
+        """Where episodes begin: the places that are known for it, else aisle segments, else around
+        the goals."""
+        if self.starts_m:
+            here = (Rect(x - 0.46, y - 0.46, x + 0.46, y + 0.46) for x, y in self.starts_m)
+            return tuple(AisleSegment("start", 0, area) for area in here)
         around = (Rect(x - 0.5, y - 0.5, x + 0.5, y + 0.5) for x, y in self.goals.tolist())
         return self.segments or tuple(AisleSegment("start", 0, area) for area in around)
 
@@ -211,6 +240,9 @@ class Warehouse:
     def hash(self) -> str:
         """Names everything but the name, 12 hex digits."""
         content = asdict(self) | {"name": ""}
+        for later, usual in (("room_m", ROOM_M), ("way_m", WAY_M), ("starts_m", ())):
+            if content[later] == usual:  # floors from before these were known keep their hash
+                del content[later]
         return hashlib.blake2b(msgspec.json.encode(content), digest_size=6).hexdigest()
 
 

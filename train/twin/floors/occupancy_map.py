@@ -1,50 +1,46 @@
-"""ROS occupancy maps, `map.yaml` and a PGM, as floors of the twin; and floors as such maps.
+"""ROS occupancy maps, `map.yaml` and its image, as floors of the twin; and floors as such maps.
 
 As `nav2_map_server` reads them (https://docs.nav2.org, map_io.cpp): with `p` a pixel's darkness in
 [0, 1], turned around by `negate`,
 
 - `trinary`: occupied above `occupied_thresh`, free below `free_thresh`, else unknown;
-- `scale`: the same, and in between a share of occupancy;
+- `scale`: the same, and in between a share of occupancy; what is transparent is unknown;
 - `raw`: the pixel is the occupancy in percent; above 100, unknown; the thresholds hold on it.
 
-The twin's floor is the largest free part of the map. What is not free, or unknown, is obstacle. The
-image's lower left corner is `origin` (x, y, yaw) in the map's frame; the floor keeps the image's
-axes, and `Warehouse.map_origin` the way back.
+The image's lower left corner is `origin` (x, y, yaw) in the map's frame.
 """
 
 from __future__ import annotations
 
-import re
+import warnings
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
-from scipy import ndimage
 
 from restock.arrays import F64
 from restock.errors import ConfigError
 from restock.toml import Checked, typed
-from restock.train.twin.floors.cells import (
-    Cells,
-    cells_of,
-    cover,
-    find_crossings,
-    find_goals,
-    find_segments,
+from restock.train.twin.floors.cells import cells_of
+from restock.train.twin.floors.layout import Warehouse
+from restock.train.twin.floors.occupancy_grid import (
+    FREE,
+    MAX_CELLS,
+    OCCUPIED,
+    UNKNOWN,
+    OccupancyGrid,
+    floor_of_grid,
 )
-from restock.train.twin.floors.layout import MAX_RACKS, MAX_SIDE_M, Rect, Warehouse, bays
 
 Mode = Literal["trinary", "scale", "raw"]
-FREE, OCCUPIED, UNKNOWN = 0, 100, -1
-ROOM_M = 0.3  # as the planner: a robot's middle comes no nearer to an obstacle
-COARSEST_M = 0.2
-MAX_PIXELS = 64_000_000
-_SPACE = re.compile(rb"(?:\s|#[^\r\n]*[\r\n])*")
-_TOKEN = re.compile(rb"[^\s#]+")
+FURTHEST_M = 1e6  # of an origin: beyond it a coordinate has no millimetres left
+LARGEST_YAML = 1 << 20  # bytes
+_FORMATS = ("PPM", "PNG", "BMP")  # PPM: Pillow's name for PGM and its kin
 
 
 class MapDescription(Checked, frozen=True, forbid_unknown_fields=False):
@@ -64,37 +60,55 @@ class MapDescription(Checked, frozen=True, forbid_unknown_fields=False):
                 "free_thresh and occupied_thresh must rise within 0 to 1, got"
                 f" {self.free_thresh} and {self.occupied_thresh}"
             )
-        if not np.isfinite(self.origin).all():
-            raise ValueError(f"origin must be three finite numbers, got {list(self.origin)}")
+        if not self.image or "\0" in self.image:
+            raise ValueError(f"image is no file's name: {self.image!r}")
+        if not (np.abs(self.origin) <= FURTHEST_M).all():  # False for NaN
+            raise ValueError(
+                f"origin must be three numbers within {FURTHEST_M:g}, got {list(self.origin)}"
+            )
 
 
 def read_map(path: Path) -> Warehouse:
     """The floor of an occupancy map.
 
     Raises:
-        ConfigError: files that cannot be read, a key that is missing or out of range, an image that
-            is not a PGM, or a map without room for the robot.
+        ConfigError: as `read_grid`, or a map without room for the robot.
+    """
+    return floor_of_grid(read_grid(path), name=path.name, where=str(path)).floor
+
+
+def read_grid(path: Path) -> OccupancyGrid:
+    """The occupancy grid of a `map.yaml`.
+
+    Raises:
+        ConfigError: files that cannot be read, a key that is missing or out of range, an image
+            that lies elsewhere, or is none.
     """
     description = _read_yaml(path)
     image = path.parent / description.image
-    occupancy = occupancy_of(read_pgm(image), description)
-    return floor_of_cells(
-        occupancy == FREE,
-        description.resolution,
-        origin=description.origin,
-        name=path.name,
-        where=str(image),
-    )
+    if not image.resolve().is_relative_to(path.parent.resolve()):
+        raise ConfigError(
+            f"its image {description.image!r} lies outside its folder",
+            where=str(path),
+            remedy="copy the image beside it, and write `image:` with the file's name alone",
+        )
+    pixels, seen = read_image(image)
+    occupancy = occupancy_of(pixels, description)
+    if description.mode == "scale":
+        occupancy[~np.ascontiguousarray(seen[::-1].T)] = UNKNOWN
+    return OccupancyGrid(occupancy, description.resolution, description.origin)
 
 
 def _read_yaml(path: Path) -> MapDescription:
     try:
+        if path.stat().st_size > LARGEST_YAML:
+            raise ConfigError("is too large for a map.yaml", where=str(path))
         document: Any = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(
             f"cannot be read: {error.strerror}", where=str(path), remedy="check the path"
         ) from error
-    except (YAMLError, UnicodeDecodeError) as error:
+    except (YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:
         reason = str(error).splitlines()[0]
         raise ConfigError(f"is not YAML: {reason}", where=str(path)) from error
     return typed(
@@ -125,104 +139,6 @@ def occupancy_of(pixels: F64, description: MapDescription) -> NDArray[np.int8]:
     return np.ascontiguousarray(occupancy[::-1].T.astype(np.int8))
 
 
-def floor_of_cells(
-    free: Cells,
-    cell_m: float,
-    *,
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    name: str,
-    where: str,
-) -> Warehouse:
-    """The floor of free cells (X, Y): the largest part that a robot fits in.
-
-    Raises:
-        ConfigError: no such part, one too large, or obstacles too ragged for boxes.
-    """
-    drivable = _reachable(free, cell_m)
-    if not drivable.any():
-        raise ConfigError(
-            f"has no free place that a robot fits in: {int(free.sum()):,} of"
-            f" {free.size:,} cells are free",
-            where=where,
-            remedy="check mode, negate and the thresholds in map.yaml",
-        )
-    # Free cells that belong to it: within the room around its cells.
-    near = ndimage.distance_transform_edt(~drivable) * cell_m <= 1.5 * ROOM_M + cell_m
-    free = free & near
-    columns, rows = np.flatnonzero(free.any(axis=1)), np.flatnonzero(free.any(axis=0))
-    i0, i1, j0, j1 = columns[0], columns[-1] + 1, rows[0], rows[-1] + 1
-    free = free[i0:i1, j0:j1]
-    if max(free.shape) * cell_m > MAX_SIDE_M:
-        raise ConfigError(
-            f"its free part is {free.shape[0] * cell_m:.1f} x {free.shape[1] * cell_m:.1f} m, more"
-            f" than {MAX_SIDE_M:g} m",
-            where=where,
-            remedy="cut the map to the part that the robots drive in",
-        )
-    corner = (float(i0 * cell_m), float(j0 * cell_m))
-    free, cell_m, racks = _racks(free, cell_m, where)
-    shape = (round(free.shape[0] * cell_m, 6), round(free.shape[1] * cell_m, 6))
-    reachable = _reachable(free, cell_m)
-    segments = tuple(
-        segment
-        for segment in find_segments(free, cell_m)
-        if _holds(reachable, cell_m, segment.area.center)
-    )
-    goals = find_goals(free & reachable, cell_m)
-    goals += tuple(bay for bay in bays(segments) if _holds(reachable, cell_m, bay))
-    x0, y0, yaw = origin
-    cos, sin = float(np.cos(yaw)), float(np.sin(yaw))
-    return Warehouse(
-        width_m=shape[0],
-        depth_m=shape[1],
-        racks=racks,
-        segments=segments,
-        goals_m=goals,
-        crossings=find_crossings(segments, free, cell_m),
-        name=name,
-        map_origin=(
-            x0 + cos * corner[0] - sin * corner[1],
-            y0 + sin * corner[0] + cos * corner[1],
-            yaw,
-        ),
-    )
-
-
-def _racks(free: Cells, cell_m: float, where: str) -> tuple[Cells, float, tuple[Rect, ...]]:
-    """The obstacles as boxes; cells are made coarser, and never freer, until few boxes do."""
-    while cell_m <= COARSEST_M:
-        boxes = cover(~free, MAX_RACKS)
-        if boxes is not None:
-            edges = [(a, c, b, d) for a, b, c, d in boxes]
-            racks = tuple(Rect(*(round(e * cell_m, 6) for e in edge)) for edge in edges)
-            return free, cell_m, racks
-        padded = np.pad(free, [(0, size % 2) for size in free.shape])
-        pairs = padded.reshape(padded.shape[0] // 2, 2, padded.shape[1] // 2, 2)
-        free = np.asarray(pairs.all(axis=(1, 3)), np.bool_)
-        cell_m *= 2
-    raise ConfigError(
-        f"its obstacles take more than {MAX_RACKS} boxes, even at {cell_m / 2:g} m a cell",
-        where=where,
-        remedy="cut the map, or clean it of speckles",
-    )
-
-
-def _reachable(free: Cells, cell_m: float) -> Cells:
-    """The largest part that a robot's middle can be in."""
-    room = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * cell_m
-    parts, count = ndimage.label(room >= ROOM_M)
-    if not count:
-        return np.zeros_like(free)
-    sizes = np.bincount(parts.ravel())
-    sizes[0] = 0
-    return np.asarray(parts == int(np.argmax(sizes)), np.bool_)
-
-
-def _holds(cells: Cells, cell_m: float, place: tuple[float, float]) -> bool:
-    i, j = (min(int(at / cell_m), size - 1) for at, size in zip(place, cells.shape, strict=True))
-    return bool(cells[i, j])
-
-
 def write_map(floor: Warehouse, path: Path, cell_m: float = 0.05) -> None:
     """Write a floor as `map.yaml` with a PGM beside it, walls as cells around it.
 
@@ -246,62 +162,51 @@ def write_map(floor: Warehouse, path: Path, cell_m: float = 0.05) -> None:
         raise ConfigError(f"cannot be written: {error.strerror}", where=str(path)) from error
 
 
-def read_pgm(path: Path) -> F64:
-    """Pixels (H, W) in [0, 1], the first row on top.
+def read_image(path: Path) -> tuple[F64, NDArray[np.bool_]]:
+    """Shades (H, W) in [0, 1], the first row on top, and which pixels are opaque (H, W).
 
     Raises:
-        ConfigError: no such file, one that is not a PGM, or one that is cut short or too large.
+        ConfigError: no such file, one that is not a PGM, PNG or BMP, or is cut short or too large.
     """
     try:
-        data = path.read_bytes()
-    except OSError as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            opened = Image.open(path, formats=_FORMATS)
+        with opened as image:
+            width, height = image.size
+            if not 0 < width * height <= MAX_CELLS:
+                raise ConfigError(
+                    f"is {width:,} x {height:,} pixels, and {MAX_CELLS:,} at most can be read",
+                    where=str(path),
+                    remedy="cut the map to the part that the robots drive in",
+                )
+            image.load()
+            seen = np.ones((height, width), np.bool_)
+            if "A" in image.getbands() or "transparency" in image.info:
+                seen = np.asarray(image.convert("RGBA").getchannel("A")) == 255
+            if image.mode.startswith("I"):  # 16 bits: `convert` would clip them
+                return np.asarray(image).astype(np.float64) / 65535, seen
+            return np.asarray(image.convert("L")).astype(np.float64) / 255, seen
+    except UnidentifiedImageError as error:
+        raise ConfigError(
+            "is not a PGM, PNG or BMP",
+            where=str(path),
+            remedy="convert it, such as with `convert map.tif map.png`",
+        ) from error
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+        raise ConfigError(
+            f"has more than {MAX_CELLS:,} pixels",
+            where=str(path),
+            remedy="cut the map to the part that the robots drive in",
+        ) from error
+    except FileNotFoundError as error:
         raise ConfigError(
             f"cannot be read: {error.strerror}",
             where=str(path),
             remedy="image in map.yaml is a path beside it",
         ) from error
-    if data[:2] not in (b"P2", b"P5"):
-        raise ConfigError(
-            f"is not a PGM: it begins with {data[:2]!r}",
-            where=str(path),
-            remedy="convert it, such as with `convert map.png map.pgm`",
-        )
-    place, header = 2, []
-    for name in ("width", "height", "largest value"):
-        number, place = _number(data, place, name, path)
-        header.append(number)
-    width, height, largest = header
-    if not (width > 0 and height > 0 and width * height <= MAX_PIXELS and 0 < largest < 65536):
-        raise ConfigError(
-            f"its header says {width} x {height} pixels of 0 to {largest}",
-            where=str(path),
-            remedy=f"at most {MAX_PIXELS:,} pixels of 0 to 65535",
-        )
-    count = width * height
-    if data[:2] == b"P5":
-        kind = np.dtype(np.uint8 if largest < 256 else ">u2")
-        body = data[place + 1 : place + 1 + count * kind.itemsize]
-        values = np.frombuffer(body[: len(body) // kind.itemsize * kind.itemsize], kind)
-    else:
-        text = re.sub(rb"#[^\r\n]*", b"", data[place:])
-        try:
-            values = np.array(text.split()[:count], np.int64)
-        except ValueError as error:
-            raise ConfigError("has a pixel that is not a number", where=str(path)) from error
-    if len(values) < count:
-        raise ConfigError(f"is cut short: {len(values):,} of {count:,} pixels", where=str(path))
-    if values.max() > largest or values.min() < 0:
-        raise ConfigError(f"has a pixel outside 0 to {largest}", where=str(path))
-    shares: F64 = values.astype(np.float64) / largest
-    return shares.reshape(height, width)
-
-
-def _number(data: bytes, place: int, name: str, path: Path) -> tuple[int, int]:
-    skipped = _SPACE.match(data, place)
-    token = _TOKEN.match(data, skipped.end() if skipped else place)
-    if token is None or not token[0].isdigit() or len(token[0]) > 9:
-        raise ConfigError(f"its header has no {name}", where=str(path))
-    return int(token[0]), token.end()
+    except (OSError, ValueError, SyntaxError, OverflowError) as error:
+        raise ConfigError(f"cannot be read as an image: {error}", where=str(path)) from error
 
 
 def write_pgm(path: Path, pixels: NDArray[np.uint8]) -> None:

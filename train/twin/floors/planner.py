@@ -21,13 +21,12 @@ from scipy.sparse import csgraph
 
 from restock.arrays import F64, Bools, Ints
 from restock.state import Stateful
-from restock.train.twin.floors.layout import HEADINGS, Warehouse
+from restock.train.twin.floors.layout import HEADINGS, ROOM_M, Warehouse
 
 CELL_M = 0.1
 PLAN_POINTS = 48
-ROBOT_RADIUS_M = 0.3  # half the width and a margin: no cell nearer to a rack is used
-WIDE_M = 0.85  # from this clearance on, cells cost no more than their length
-NEAR_COST = 3.0  # how much more a cell at ROBOT_RADIUS_M costs
+WIDE_M = 0.85  # from this clearance on, cells cost the stand-in no more than their length
+NEAR_COST = 3.0  # how much more a cell at the floor's `room_m` costs
 _TREES_KEPT = 2048
 _TREES_KEPT_BYTES = 1 << 29  # of all planners that `planners` makes together
 
@@ -72,7 +71,7 @@ class Planner:
         one-way rules gets one without them.
         """
         cell = self.cell(x_m, y_m)
-        if self._unruled is not None and self._clearance_m.flat[cell] >= ROBOT_RADIUS_M:
+        if self._unruled is not None and self._clearance_m.flat[cell] >= self.warehouse.room_m:
             ruled = self._tree(self.cell(*goal), tuple(sorted(closures)))[0]
             if not np.isfinite(ruled[cell]):
                 return self._unruled.plan(x_m, y_m, goal, closures)
@@ -171,8 +170,10 @@ class Planner:
 
         Edges run against the robot's way: trees grow from the goal.
         """
-        free = clearance_m >= ROBOT_RADIUS_M
-        near = np.clip((WIDE_M - clearance_m) / (WIDE_M - ROBOT_RADIUS_M), 0.0, 1.0)
+        room = self.warehouse.room_m
+        wide = WIDE_M * (room / ROOM_M)
+        free = clearance_m >= room
+        near = np.clip((wide - clearance_m) / (wide - room), 0.0, 1.0)
         cost = 1.0 + NEAR_COST * near**2
         index = np.arange(free.size).reshape(self.shape)
         against = self._against_rules()

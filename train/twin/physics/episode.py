@@ -26,7 +26,6 @@ from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.traffic import AGENTS, Walk, draw_walks
 
 KINDS = ("nominal", "wheel_slip", "blocked_aisle", "near_collision")
-PATH_M = (4.0, 11.0)
 PATCH_FRICTION = (0.02, 0.045)  # oil or wet ice on sealed concrete
 GAP_M = (0.80, 1.00)
 TURN_ROOM_M = 0.45  # that the body needs on both sides to turn on the spot
@@ -92,8 +91,9 @@ def draw_episode(spec: EpisodeSpec, warehouse: Warehouse, planner: Planner) -> E
             walks = draw_walks(rng, warehouse, plan)
             if walks is not None:
                 return Episode(spec, start, goal, plan, walks=walks, noise=noise)
+    low, high = warehouse.way_m
     raise ConfigError(
-        f"no way of {PATH_M[0]} to {PATH_M[1]} m suits a {spec.condition} episode",
+        f"no way of {low:g} to {high:g} m suits a {spec.condition} episode",
         where=f"layout {warehouse.name}",
         remedy="use a larger floor",
     )
@@ -102,6 +102,7 @@ def draw_episode(spec: EpisodeSpec, warehouse: Warehouse, planner: Planner) -> E
 def _draw_way(
     rng: np.random.Generator, warehouse: Warehouse, planner: Planner
 ) -> tuple[tuple[float, float, float], tuple[float, float], F64]:
+    low, high = warehouse.way_m
     for _ in range(200):
         segment = warehouse.starts[rng.integers(len(warehouse.starts))]
         area = segment.lengthwise
@@ -114,16 +115,16 @@ def _draw_way(
         free = rng.random() < 0.25
         if segment.width_m < 2 * TURN_ROOM_M:
             free, turn = False, 0.0
-        if not PATH_M[0] <= planner.distance_m(x, y, goal) <= 1.3 * PATH_M[1]:
+        if not low <= planner.distance_m(x, y, goal) <= 1.3 * high:
             continue
         plan = planner.plan(x, y, goal)
-        if not PATH_M[0] <= length_m(plan) <= PATH_M[1]:
+        if not low <= length_m(plan) <= high:
             continue
         along = point_along(plan, 1.0) - plan[0]
         yaw = anywhere if free else np.arctan2(along[1], along[0]) + turn
         return (float(x), float(y), float(yaw)), (float(goal[0]), float(goal[1])), plan
     raise ConfigError(
-        f"no way of {PATH_M[0]} to {PATH_M[1]} m between aisles and goals",
+        f"no way of {low:g} to {high:g} m between aisles and goals",
         where=f"layout {warehouse.name}",
         remedy="use a larger floor",
     )
@@ -159,7 +160,7 @@ def _sharpest_turn(plan: F64) -> float:
     step = np.diff(plan, axis=0)
     heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
     spacing = length_m(plan) / (len(plan) - 1)
-    reach = max(int(0.6 / spacing), 1)
+    reach = min(max(int(0.6 / spacing), 1), len(heading) // 3)
     bend = np.abs(heading[2 * reach :] - heading[: -2 * reach])
     return float((np.argmax(bend) + reach) * spacing)
 

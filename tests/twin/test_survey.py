@@ -1,0 +1,192 @@
+"""The floor that a recording shows: its map, the way driven, and what is refused."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from restock.cli import main
+from restock.errors import ConfigError, RecordingError
+from restock.ingest.propose.footprint import parse_footprint
+from restock.train.twin.env.policies import PlannerFollower
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.floors.floor_file import read_floor
+from restock.train.twin.floors.occupancy_grid import OccupancyGrid, out_of_frame
+from restock.train.twin.physics.episode import EpisodeSpec
+from restock.train.twin.survey.survey import survey
+
+TYPES = get_typestore(Stores.ROS2_HUMBLE)
+T = TYPES.types
+CELL_M = 0.05
+
+
+def hall() -> np.ndarray:
+    """Occupancy (X, Y) of 9 x 7 m: a ring of corridors 1.5 m wide around one block."""
+    occupancy = np.full((180, 140), 100, np.int8)
+    occupancy[4:176, 4:136] = 0
+    occupancy[34:146, 34:106] = 100
+    return occupancy
+
+
+def lap(origin: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+    """Poses (N, 3) once around the hall, in the middle of its corridors, in the map's frame."""
+    corners = np.array([[0.95, 0.95], [8.05, 0.95], [8.05, 6.05], [0.95, 6.05], [0.95, 0.95]])
+    parts = []
+    for start, end in pairwise(corners):
+        steps = int(np.hypot(*(end - start)) / 0.1)
+        places = start + np.arange(steps)[:, None] / steps * (end - start)
+        yaw = np.arctan2(*(end - start)[::-1])
+        parts.append(np.column_stack([out_of_frame(places, origin), np.full(steps, yaw)]))
+    poses = np.concatenate(parts)
+    poses[:, 2] += origin[2]
+    return poses
+
+
+def header(stamp_ns: int, frame: str) -> Any:
+    stamp = T["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    return T["std_msgs/msg/Header"](stamp=stamp, frame_id=frame)
+
+
+def pose(x: float, y: float, yaw: float) -> Any:
+    return T["geometry_msgs/msg/Pose"](
+        position=T["geometry_msgs/msg/Point"](x=x, y=y, z=0.0),
+        orientation=T["geometry_msgs/msg/Quaternion"](
+            x=0.0, y=0.0, z=float(np.sin(yaw / 2)), w=float(np.cos(yaw / 2))
+        ),
+    )
+
+
+def write_bag(
+    folder: Path,
+    *,
+    poses: np.ndarray | None = None,
+    frame: str = "map",
+    grid: OccupancyGrid | None = None,
+    data: np.ndarray | None = None,
+) -> Path:
+    """A rosbag2 folder with /amcl_pose every .2 s, and /map; `data` in place of the grid's own."""
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+
+        def send(topic: str, kind: str, messages: list[tuple[int, Any]]) -> None:
+            connection = writer.add_connection(topic, kind, typestore=TYPES)
+            for stamp_ns, message in messages:
+                writer.write(connection, stamp_ns, TYPES.serialize_cdr(message, kind))
+
+        if grid is not None:
+            kind = "nav_msgs/msg/OccupancyGrid"
+            info = T["nav_msgs/msg/MapMetaData"](
+                map_load_time=T["builtin_interfaces/msg/Time"](sec=0, nanosec=0),
+                resolution=grid.cell_m,
+                width=grid.occupancy.shape[0],
+                height=grid.occupancy.shape[1],
+                origin=pose(*grid.origin),
+            )
+            cells = np.ascontiguousarray(grid.occupancy.T).ravel() if data is None else data
+            message = T[kind](header=header(10**9, "map"), info=info, data=cells)
+            send("/map", kind, [(10**9, message)])
+        if poses is not None:
+            kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
+            messages = []
+            for index, (x, y, yaw) in enumerate(poses.tolist()):
+                stamp_ns = 10**9 + index * 2 * 10**8
+                with_covariance = T["geometry_msgs/msg/PoseWithCovariance"](
+                    pose=pose(x, y, yaw), covariance=np.zeros(36)
+                )
+                message = T[kind](header=header(stamp_ns, frame), pose=with_covariance)
+                messages.append((stamp_ns, message))
+            send("/amcl_pose", kind, messages)
+    return folder
+
+
+def test_a_map_in_the_bag_becomes_a_floor_that_is_driven_on(tmp_path: Path) -> None:
+    origin = (-3.0, 2.0, 0.0)
+    poses = lap(origin)[:-30]  # not the whole way round
+    bag = write_bag(tmp_path / "bag", poses=poses, grid=OccupancyGrid(hall(), CELL_M, origin))
+    arguments = ["twin", "layout", "--from", str(bag), "--out", str(tmp_path / "floor.toml")]
+    assert main([*arguments, "--footprint", "0.6x0.5", "--png", str(tmp_path / "a.png")]) == 0
+    floor = read_floor(tmp_path / "floor.toml")
+    assert (floor.width_m, floor.depth_m) == pytest.approx((8.6, 6.6))
+    assert floor.map_origin == pytest.approx((-2.8, 2.2, 0.0))
+    assert len(floor.segments) == 4  # the four sides of the ring
+    assert {segment.width_m for segment in floor.segments} == {1.5}
+    # Missions start and end where the robot was.
+    driven = poses[:, :2] - floor.map_origin[:2]
+    for place in floor.goals_m + floor.starts_m:
+        assert np.hypot(*(driven - place).T).min() < 0.1
+    env = WarehouseVectorEnv(2, warehouse=floor, conditions={"nominal": 1.0})
+    env.set_episodes([EpisodeSpec("nominal", seed) for seed in range(2)])
+    _, info = env.reset()
+    driver, done = PlannerFollower(epsilon=0.0), np.zeros(2, np.bool_)
+    success = np.zeros(2, np.bool_)
+    observation = env.observation
+    for _ in range(240):
+        action, _ = driver.act(env, observation)
+        observation, _, terminated, truncated, info = env.step(action)
+        success |= ~done & info["success"]
+        done |= terminated | truncated
+    assert success.all()
+
+
+def test_poses_that_lie_off_the_map_are_refused_with_both_frames(tmp_path: Path) -> None:
+    away = lap((40.0, 0.0, 0.0))
+    bag = write_bag(tmp_path / "bag", poses=away, frame="odom", grid=OccupancyGrid(hall(), CELL_M))
+    with pytest.raises(ConfigError, match=r"100% lie off the map.*'map'.*'odom'"):
+        survey(bag)
+
+
+@pytest.mark.parametrize(
+    ("shape", "resolution", "origin", "data", "message"),
+    [
+        ((0, 0), 0.05, (0.0, 0.0, 0.0), np.zeros(0, np.int8), "an empty map of 0 x 0"),
+        ((4, 4), 0.05, (0.0, 0.0, 0.0), np.zeros(3, np.int8), "3 cells of data for 4 x 4"),
+        ((4, 4), 0.0, (0.0, 0.0, 0.0), None, "a resolution of 0 m"),
+        ((4, 4), 0.05, (float("nan"), 0.0, 0.0), None, "an origin at nan"),
+        ((60000, 60000), 0.05, (0.0, 0.0, 0.0), np.zeros(3, np.int8), "64,000,000 at most"),
+        ((90, 90), 0.05, (0.0, 0.0, 0.0), np.full(8100, -1, np.int8), "8,100 unknown"),
+    ],
+)
+def test_a_map_that_is_none_is_refused_with_its_reason(
+    tmp_path: Path,
+    shape: tuple[int, int],
+    resolution: float,
+    origin: tuple[float, float, float],
+    data: np.ndarray | None,
+    message: str,
+) -> None:
+    cells = np.broadcast_to(np.int8(0), shape)
+    bag = write_bag(tmp_path / "bag", grid=OccupancyGrid(cells, resolution, origin), data=data)
+    with pytest.raises((RecordingError, ConfigError), match=message):
+        survey(bag)
+
+
+def test_a_robot_larger_than_its_aisles_is_refused(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", poses=lap(), grid=OccupancyGrid(hall(), CELL_M))
+    arguments = ["twin", "layout", "--from", str(bag), "--out", str(tmp_path / "floor.toml")]
+    assert main([*arguments, "--footprint", "2.5x1.8"]) == 2
+    assert not (tmp_path / "floor.toml").exists()
+    with pytest.raises(ConfigError, match=r"widest place leaves 0\.90 m .* needs 1\.30 m"):
+        survey(bag, footprint=parse_footprint("3x2.5"))
+
+
+def test_without_a_map_the_floor_is_the_corridor_that_was_driven(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", poses=lap((5.0, -1.0, 0.5)), frame="odom")
+    made = survey(bag)
+    assert made.by == "corridor"
+    # Its axes run along the way, which is turned by half a radian.
+    assert made.floor.map_origin[2] == pytest.approx(0.5, abs=0.01)
+    # 7.1 x 5.1 m from middle to middle, and around them .43 m to turn, .07 and .25 m.
+    assert made.floor.width_m == pytest.approx(7.1 + 2 * 0.75, abs=0.15)
+    assert made.floor.depth_m == pytest.approx(5.1 + 2 * 0.75, abs=0.15)
+    assert len(made.floor.segments) == 4
+
+
+def test_a_bag_that_says_nothing_of_a_place_is_refused(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", poses=np.full((5, 3), np.nan))
+    with pytest.raises(RecordingError, match="neither a map nor anything"):
+        survey(bag)

@@ -1,0 +1,307 @@
+"""An occupancy grid, whatever it came from, and the twin's floor that it gives.
+
+Occupancy is in percent, -1 unknown, as `nav_msgs/OccupancyGrid` has it. The floor is one connected
+part of the free cells: the one that a robot drove in where its poses are known, else the largest.
+What is not free, or unknown, is obstacle, merged into boxes; where that takes too many, cells are
+made coarser and never freer, which is said in the floor's notes. The floor keeps the grid's axes,
+and `Warehouse.map_origin` the way back to the map's frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from restock.arrays import F64, Bools
+from restock.errors import ConfigError
+from restock.train.twin.floors.cells import (
+    GOAL_ROOM_M,
+    Cells,
+    cover,
+    find_crossings,
+    find_goals,
+    find_segments,
+)
+from restock.train.twin.floors.layout import MAX_RACKS, MAX_SIDE_M, ROOM_M, Rect, Warehouse, bays
+from restock.train.twin.floors.places import find_places, missions_way
+
+FREE, OCCUPIED, UNKNOWN = 0, 100, -1
+COARSEST_M = 0.2
+MAX_CELLS = 64_000_000
+_MANY_CELLS = 6_000_000  # more are made coarser first: a floor has at most MAX_SIDE_M
+_AROUND_M = 12.0  # of the places that a robot drove, what is kept of a map that is too large
+
+
+@dataclass(frozen=True)
+class OccupancyGrid:
+    """Cells (X, Y) of a map: column i, row j is i along the grid's x and j along its y."""
+
+    occupancy: NDArray[np.int8]  # (X, Y) percent, -1 unknown
+    cell_m: float
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x, y, yaw of its corner, in the map
+    frame: str = ""
+
+    @property
+    def free(self) -> Cells:
+        """(X, Y) which cells are free."""
+        return np.asarray(self.occupancy == FREE, np.bool_)
+
+    def within(self, places_m: F64) -> F64:
+        """Places (N, 2) of the map's frame along the grid's own axes, from its corner."""
+        return into_frame(places_m, self.origin)
+
+    def at(self, places_m: F64) -> NDArray[np.int8]:
+        """Occupancy (N,) at places (N, 2) of the map's frame; unknown off the map."""
+        cells, inside = self.cells_at(places_m)
+        found = np.full(len(places_m), UNKNOWN, np.int8)
+        found[inside] = self.occupancy[cells[inside, 0], cells[inside, 1]]
+        return found
+
+    def cells_at(self, places_m: F64) -> tuple[NDArray[np.int64], Bools]:
+        """The cells (N, 2) of places (N, 2) of the map's frame, and which are on the map (N,)."""
+        cells = np.floor(self.within(places_m) / self.cell_m).astype(np.int64)
+        inside = ((cells >= 0) & (cells < self.occupancy.shape)).all(axis=1)
+        return cells, np.asarray(inside, np.bool_)
+
+    def cut(self, i0: int, i1: int, j0: int, j1: int) -> OccupancyGrid:
+        """Its columns i0 to i1 and rows j0 to j1 (exclusive)."""
+        corner = out_of_frame(np.array([[i0, j0]]) * self.cell_m, self.origin)[0]
+        origin = (float(corner[0]), float(corner[1]), self.origin[2])
+        return OccupancyGrid(self.occupancy[i0:i1, j0:j1], self.cell_m, origin, self.frame)
+
+    def coarser(self) -> OccupancyGrid:
+        """Four cells as one: free where all are, else occupied where any is, else unknown."""
+        shape = self.occupancy.shape
+        padded = np.pad(self.occupancy, [(0, size % 2) for size in shape], constant_values=UNKNOWN)
+        four = padded.reshape(padded.shape[0] // 2, 2, padded.shape[1] // 2, 2)
+        free = (four == FREE).all(axis=(1, 3))
+        known = np.where((four > FREE).any(axis=(1, 3)), np.int8(OCCUPIED), np.int8(UNKNOWN))
+        merged = np.where(free, np.int8(FREE), known)
+        return OccupancyGrid(merged, 2 * self.cell_m, self.origin, self.frame)
+
+
+@dataclass(frozen=True)
+class GridFloor:
+    """A floor that a grid gave, the grid as it was used, and what was changed on the way."""
+
+    floor: Warehouse
+    grid: OccupancyGrid
+    notes: list[str] = field(default_factory=list)
+
+
+def into_frame(places_m: F64, origin: tuple[float, float, float]) -> F64:
+    """Places (N, 2) of the map along the axes of a frame whose corner is at `origin`."""
+    x, y, yaw = origin
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    moved: F64 = (np.asarray(places_m, np.float64) - (x, y)) @ np.array([[cos, -sin], [sin, cos]])
+    return moved
+
+
+def out_of_frame(places_m: F64, origin: tuple[float, float, float]) -> F64:
+    """Places (N, 2) of such a frame in the map's frame."""
+    x, y, yaw = origin
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    moved: F64 = np.asarray(places_m, np.float64) @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
+    return moved
+
+
+def floor_of_grid(
+    grid: OccupancyGrid,
+    *,
+    name: str,
+    where: str,
+    room_m: float = ROOM_M,
+    turn_m: float = GOAL_ROOM_M,
+    visited_m: F64 | None = None,
+) -> GridFloor:
+    """The floor of a grid: the part that a robot was in, or the largest that it fits in.
+
+    Args:
+        name: of the floor.
+        where: names the grid in errors.
+        room_m: how far a robot's middle keeps off obstacles.
+        turn_m: how far off it needs them to turn on the spot.
+        visited_m: where it drove (N, 2), in the map's frame: missions start and end there.
+
+    Raises:
+        ConfigError: no such part, one too large, or obstacles too ragged for boxes.
+    """
+    notes: list[str] = []
+    grid = _bounded(grid, where, visited_m, notes)
+    drivable = drivable_part(grid.free, grid.cell_m, room_m, _cells_in(grid, visited_m))
+    if not drivable.any():
+        raise ConfigError(_no_room(grid, room_m), where=where, remedy=_NO_ROOM_REMEDY)
+    # Free cells that belong to it: within the room around its cells.
+    near = ndimage.distance_transform_edt(~drivable) * grid.cell_m <= 1.5 * room_m + grid.cell_m
+    free = grid.free & near
+    columns, rows = np.flatnonzero(free.any(axis=1)), np.flatnonzero(free.any(axis=0))
+    window = columns[0], columns[-1] + 1, rows[0], rows[-1] + 1
+    grid, free = grid.cut(*map(int, window)), free[window[0] : window[1], window[2] : window[3]]
+    if max(free.shape) * grid.cell_m > MAX_SIDE_M:
+        raise ConfigError(
+            f"its free part is {free.shape[0] * grid.cell_m:.1f} x"
+            f" {free.shape[1] * grid.cell_m:.1f} m, more than {MAX_SIDE_M:g} m",
+            where=where,
+            remedy="cut the map to the part that the robots drive in",
+        )
+    free, cell_m, racks = _racks(free, grid.cell_m, where, notes)
+    reachable = drivable_part(free, cell_m, room_m, _cells_in(grid, visited_m, cell_m))
+    if not reachable.any():
+        raise ConfigError(_no_room(grid, room_m), where=where, remedy=_NO_ROOM_REMEDY)
+    segments = tuple(
+        segment
+        for segment in find_segments(free, cell_m)
+        if _holds(reachable, cell_m, segment.area.center)
+    )
+    places: tuple[tuple[float, float], ...] = ()
+    if visited_m is not None:
+        found = find_places(free, reachable, cell_m, grid.within(visited_m), room_m, turn_m)
+        places = found.places_m
+        notes += found.notes
+    goals = places
+    if not places:
+        goals = find_goals(free & reachable, cell_m, room_m=turn_m)
+        goals += tuple(bay for bay in bays(segments) if _holds(reachable, cell_m, bay))
+        if not goals:
+            raise ConfigError(
+                f"a robot that needs {turn_m:.2f} m around its middle to turn finds no place"
+                " that it could be sent to",
+                where=where,
+                remedy="check the body in the profile (--footprint LxW), or give a larger map",
+            )
+    floor = Warehouse(
+        width_m=round(free.shape[0] * cell_m, 6),
+        depth_m=round(free.shape[1] * cell_m, 6),
+        racks=racks,
+        segments=segments,
+        goals_m=goals,
+        crossings=find_crossings(segments, free, cell_m),
+        name=name,
+        map_origin=grid.origin,
+        room_m=room_m,
+        starts_m=places,
+    )
+    return GridFloor(missions_way(floor) if places else floor, grid, notes)
+
+
+_NO_ROOM_REMEDY = (
+    "check the robot's size (--footprint LxW), and of a map.yaml mode, negate and the thresholds"
+)
+
+
+def _no_room(grid: OccupancyGrid, room_m: float) -> str:
+    free, size = int(grid.free.sum()), grid.occupancy.size
+    unknown = int((grid.occupancy == UNKNOWN).sum())
+    what = f"has no free place that a robot fits in: {free:,} of {size:,} cells are free"
+    if unknown:
+        what += f", {unknown:,} unknown"
+    if free:
+        room = ndimage.distance_transform_edt(np.pad(grid.free, 1)).max() * grid.cell_m
+        what += (
+            f"; the widest place leaves {room:.2f} m around a robot's middle, which needs"
+            f" {room_m:.2f} m"
+        )
+    return what
+
+
+def _bounded(
+    grid: OccupancyGrid, where: str, visited_m: F64 | None, notes: list[str]
+) -> OccupancyGrid:
+    """Cut to where the robot drove, or made coarser, where it is too large for a floor."""
+    size = grid.occupancy.shape
+    if visited_m is not None and len(visited_m) and max(size) * grid.cell_m > MAX_SIDE_M:
+        cells, inside = grid.cells_at(visited_m)
+        if inside.any():
+            around = round(_AROUND_M / grid.cell_m)
+            low = np.maximum(cells[inside].min(axis=0) - around, 0)
+            high = np.minimum(cells[inside].max(axis=0) + 1 + around, size)
+            before = grid
+            grid = grid.cut(int(low[0]), int(high[0]), int(low[1]), int(high[1]))
+            notes.append(
+                f"cut from {_metres(before)} to {_metres(grid)}: {_AROUND_M:g} m around where the"
+                " robot drove"
+            )
+    fine = grid
+    while grid.occupancy.size > _MANY_CELLS and grid.cell_m <= COARSEST_M / 2:
+        grid = grid.coarser()
+    if grid is not fine:
+        notes.append(f"{fine.occupancy.size:,} cells were made coarser, {grid.cell_m:g} m each")
+    if grid.occupancy.size > _MANY_CELLS:
+        raise ConfigError(
+            f"its {fine.occupancy.size:,} cells are {_metres(fine)}: a floor has a side of at most"
+            f" {MAX_SIDE_M:g} m",
+            where=where,
+            remedy="cut the map to the part that the robots drive in",
+        )
+    return grid
+
+
+def _metres(grid: OccupancyGrid) -> str:
+    sides = (f"{size * grid.cell_m:.0f}" for size in grid.occupancy.shape)
+    return " x ".join(sides) + " m"
+
+
+def _cells_in(
+    grid: OccupancyGrid, visited_m: F64 | None, cell_m: float | None = None
+) -> NDArray[np.int64] | None:
+    """The cells (N, 2) of this size in which the robot was, which may be off the grid."""
+    if visited_m is None:
+        return None
+    return np.floor(grid.within(visited_m) / (cell_m or grid.cell_m)).astype(np.int64)
+
+
+def _racks(
+    free: Cells, cell_m: float, where: str, notes: list[str]
+) -> tuple[Cells, float, tuple[Rect, ...]]:
+    """The obstacles as boxes; cells are made coarser, and never freer, until few boxes do."""
+    fine, fine_m = free, cell_m
+    while cell_m <= COARSEST_M:
+        boxes = cover(~free, MAX_RACKS)
+        if boxes is not None:
+            edges = [(a, c, b, d) for a, b, c, d in boxes]
+            racks = tuple(Rect(*(round(e * cell_m, 6) for e in edge)) for edge in edges)
+            if cell_m > fine_m:
+                lost = fine.sum() * fine_m**2 - free.sum() * cell_m**2
+                notes.append(
+                    f"simplified to {len(racks)} boxes: cells of {cell_m:g} m in place of"
+                    f" {fine_m:g} m, which takes {lost:.1f} of {fine.sum() * fine_m**2:.1f} m2"
+                    " of free floor"
+                )
+            return free, cell_m, racks
+        padded = np.pad(free, [(0, size % 2) for size in free.shape])
+        pairs = padded.reshape(padded.shape[0] // 2, 2, padded.shape[1] // 2, 2)
+        free = np.asarray(pairs.all(axis=(1, 3)), np.bool_)
+        cell_m *= 2
+    raise ConfigError(
+        f"its obstacles take more than {MAX_RACKS} boxes, even at {cell_m / 2:g} m a cell",
+        where=where,
+        remedy="cut the map, or clean it of speckles",
+    )
+
+
+def drivable_part(
+    free: Cells, cell_m: float, room_m: float, visited: NDArray[np.int64] | None = None
+) -> Cells:
+    """The part that a robot's middle can be in: the one with most of the cells `visited` (N, 2),
+    else the largest."""
+    room = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * cell_m
+    parts, count = ndimage.label(room >= room_m)
+    if not count:
+        return np.zeros_like(free)
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
+    if visited is not None and len(visited):
+        inside = ((visited >= 0) & (visited < free.shape)).all(axis=1)
+        held = np.bincount(parts[tuple(visited[inside].T)], minlength=len(sizes))
+        held[0] = 0
+        if held.any():
+            sizes = held
+    return np.asarray(parts == int(np.argmax(sizes)), np.bool_)
+
+
+def _holds(cells: Cells, cell_m: float, place: tuple[float, float]) -> bool:
+    i, j = (min(int(at / cell_m), size - 1) for at, size in zip(place, cells.shape, strict=True))
+    return bool(cells[i, j])

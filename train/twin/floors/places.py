@@ -1,0 +1,82 @@
+"""Where missions start and end on a floor that a robot drove on, and how long their ways are.
+
+A place is one where the robot really was, with room to turn, and connected with the others. Of
+each square of the floor the roomiest such place is kept.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy import ndimage
+
+from restock.arrays import F64, Bools
+from restock.train.twin.floors.layout import WAY_M, Warehouse
+from restock.train.twin.floors.planner import Planner
+
+SPACING_M = 0.5
+PLACES = 100
+LONG_ENOUGH = 0.3  # of the pairs of places: so many are a usual mission apart on a large floor
+NEAREST_M = 0.5  # a way shorter than this is no mission
+
+
+@dataclass(frozen=True)
+class Places:
+    """Places (x, y) in the floor's frame, and what is to be said of them."""
+
+    places_m: tuple[tuple[float, float], ...] = ()
+    notes: list[str] = field(default_factory=list)
+
+
+def find_places(
+    free: Bools, reachable: Bools, cell_m: float, visited_m: F64, room_m: float, turn_m: float
+) -> Places:
+    """The places among those visited (N, 2), in the floor's frame.
+
+    `free` and `reachable` (X, Y) are the floor's cells, `room_m` is what driving needs around a
+    robot's middle, `turn_m` what turning does. Without two places there are none.
+    """
+    room = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * cell_m
+    cells = np.floor(visited_m / cell_m).astype(np.int64)
+    on = ((cells >= 0) & (cells < free.shape)).all(axis=1)
+    cells = cells[on]
+    fits = reachable[tuple(cells.T)]
+    wide = fits & (room[tuple(cells.T)] >= turn_m)
+    notes = []
+    if len(visited_m) and fits.sum() < 0.9 * len(visited_m):
+        notes.append(
+            f"{1 - fits.sum() / len(visited_m):.0%} of the poses are nearer to obstacles than the"
+            f" {room_m:.2f} m that this robot needs, or in another part of the floor: no mission"
+            " goes there"
+        )
+    best: dict[tuple[int, int], tuple[float, tuple[float, float]]] = {}
+    for i, j in np.unique(cells[wide], axis=0).tolist():
+        x, y = (i + 0.5) * cell_m, (j + 0.5) * cell_m
+        square = int(x / SPACING_M), int(y / SPACING_M)
+        if square not in best or room[i, j] > best[square][0]:
+            best[square] = float(room[i, j]), (round(x, 6), round(y, 6))
+    places = [place for _, place in best.values()]
+    if len(places) > PLACES:
+        places = [places[k] for k in np.linspace(0, len(places) - 1, PLACES).astype(int)]
+    if len(places) < 2:
+        notes.append(
+            f"the robot was at {len(places) or 'no'} place{'s'[: not places]} with room to turn:"
+            " missions start and end wherever there is room"
+        )
+        return Places((), notes)
+    return Places(tuple(places), notes)
+
+
+def missions_way(floor: Warehouse) -> Warehouse:
+    """The floor with lengths of missions that its places allow: the usual ones where they do."""
+    planner = Planner(floor, trees_kept=len(floor.goals_m))
+    ways = np.array(
+        [[planner.distance_m(*start, goal) for start in floor.goals_m] for goal in floor.goals_m]
+    )
+    ways = ways[np.isfinite(ways) & (ways > NEAREST_M)]
+    if not len(ways) or (ways >= WAY_M[0]).mean() >= LONG_ENOUGH:
+        return floor
+    longest = float(ways.max())
+    shortest = max(round(float(np.quantile(ways, 1 - LONG_ENOUGH)) / 1.3, 1), NEAREST_M)
+    return replace(floor, way_m=(shortest, max(round(longest + 0.1, 1), shortest + 0.5)))

@@ -1,0 +1,60 @@
+"""A floor where there is neither map nor lidar: the corridor that a robot drove in.
+
+All that is known is that the robot fitted where it was: its outline and a margin around its way are
+free, and whatever is beyond counts as a wall. So there is no way but those that were driven.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from restock.arrays import F64, Ints
+from restock.train.twin.floors.occupancy_grid import (
+    FREE,
+    UNKNOWN,
+    OccupancyGrid,
+    into_frame,
+    out_of_frame,
+)
+from restock.train.twin.survey.directions import main_direction
+from restock.train.twin.survey.poses import Poses
+
+CELL_M = 0.05
+MARGIN_M = 0.25  # around the circle in which the robot turns
+JUMP_M = 1.0  # between two poses: it was carried, or relocalised, and did not drive
+
+
+def driven_corridor(poses: Poses, turn_m: float) -> OccupancyGrid:
+    """The corridor, along the directions that were mostly driven.
+
+    `turn_m` is what the robot needs around its middle to turn.
+    """
+    step = np.diff(poses.places_m, axis=0)
+    length = np.hypot(*step.T)
+    joined = length <= JUMP_M
+    yaw = main_direction(np.arctan2(step[:, 1], step[:, 0]), length * joined)
+    places = into_frame(poses.places_m, (0.0, 0.0, yaw))
+    way = _way(places, joined)
+    reach = turn_m + MARGIN_M
+    low = way.min(axis=0) - reach - 2 * CELL_M
+    cells = np.floor((way - low) / CELL_M).astype(np.int64)
+    shape = cells.max(axis=0) + 2 + int(reach / CELL_M) + 2
+    seen = np.zeros(tuple(shape), np.bool_)
+    seen[tuple(cells.T)] = True
+    free = ndimage.distance_transform_edt(~seen) * CELL_M <= reach
+    corner = out_of_frame(low[None], (0.0, 0.0, yaw))[0]
+    occupancy = np.where(free, np.int8(FREE), np.int8(UNKNOWN))
+    return OccupancyGrid(occupancy, CELL_M, (float(corner[0]), float(corner[1]), yaw), poses.frame)
+
+
+def _way(places_m: F64, joined: Ints | np.ndarray) -> F64:
+    """Places (N, 2) with points in between, no cell apart, where one drove from one to the next."""
+    parts = [places_m]
+    for index in np.flatnonzero(joined):
+        start, end = places_m[index], places_m[index + 1]
+        count = int(np.hypot(*(end - start)) / (CELL_M / 2))
+        if count > 1:
+            share = np.arange(1, count)[:, None] / count
+            parts.append(start + share * (end - start))
+    return np.concatenate(parts)

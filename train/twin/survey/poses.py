@@ -1,0 +1,283 @@
+"""Where a robot was in a recording: from a pose topic, or along its transforms.
+
+Unlike steps, which know nothing of the future, a survey looks at a whole drive: poses are
+interpolated between messages. Times are kept on both clocks of a recording, as a scan is placed on
+the one that both its topic and the pose's carry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from restock.arrays import F64, Bools, Ints
+from restock.ingest.containers.recording import Recording
+from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.profile.profile import Frames, Profile
+from restock.ingest.propose.roles import KINDS, topics_for, transform_frames
+from restock.ingest.steps.clocks import STAMP
+from restock.ingest.steps.frames import (
+    AXES,
+    FIELDS,
+    FRAME_ID,
+    PARENT,
+    TURN,
+    Edges,
+    plain,
+    rotations,
+)
+from restock.ingest.task.signals import yaw_of
+
+MOST_APART_NS = 1_000_000_000  # between two poses that one in between is taken from
+WELL_PLACED = 0.9  # of the poses on free floor
+FURTHEST_M = 1e5  # a pose beyond is a fault
+
+
+@dataclass(frozen=True)
+class Times:
+    """When N messages were measured and received, in ns; measured is 0 where nothing says."""
+
+    stamp_ns: Ints  # (N,)
+    log_ns: Ints  # (N,)
+
+    @classmethod
+    def of(cls, columns: TopicColumns) -> Times:
+        """The clocks of a topic's messages."""
+        stamp = columns.fields.get(STAMP)
+        none = np.zeros(len(columns), np.int64)
+        stamps = np.asarray(stamp).astype(np.int64) if isinstance(stamp, np.ndarray) else none
+        return cls(stamps, columns.log_time_ns)
+
+    @property
+    def stamped(self) -> bool:
+        return bool(len(self.stamp_ns)) and bool((self.stamp_ns != 0).mean() > 0.9)
+
+    def clock(self, *, by_stamp: bool) -> Ints:
+        return self.stamp_ns if by_stamp else self.log_ns
+
+
+def shared_clock(one: Times, other: Times) -> bool:
+    """Whether both carry stamps of one clock: most of `other`'s lie within `one`'s."""
+    if not (one.stamped and other.stamped):
+        return False
+    low, high = one.stamp_ns.min() - MOST_APART_NS, one.stamp_ns.max() + MOST_APART_NS
+    return bool(((other.stamp_ns >= low) & (other.stamp_ns <= high)).mean() > 0.5)
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Poses (N,) of a robot's base in a frame, in the order of their log time."""
+
+    times: Times
+    x_m: F64
+    y_m: F64
+    yaw_rad: F64  # unwrapped; NaN where nothing says
+    frame: str
+    source: str  # in words
+
+    def __len__(self) -> int:
+        return len(self.x_m)
+
+    @property
+    def places_m(self) -> F64:
+        """(N, 2)."""
+        return np.stack([self.x_m, self.y_m], axis=-1)
+
+    @property
+    def driven_m(self) -> float:
+        """The length of its way, each decimetre counted once there."""
+        kept, way = self.places_m[:1], 0.0
+        for place in self.places_m[1:]:
+            step = float(np.hypot(*(place - kept[-1])))
+            if step >= 0.1:
+                way, kept = way + step, place[None]
+        return way
+
+    def at(self, times: Times) -> tuple[F64, Bools]:
+        """Poses (M, 3) at these times, and which of them (M,) lie between two near ones."""
+        by_stamp = shared_clock(self.times, times)
+        values = np.stack([self.x_m, self.y_m, self.yaw_rad], axis=-1)
+        return interpolated(
+            self.times.clock(by_stamp=by_stamp), values, times.clock(by_stamp=by_stamp)
+        )
+
+
+def interpolated(known_ns: Ints, values: F64, asked_ns: Ints) -> tuple[F64, Bools]:
+    """Values (N, K) at other times (M,), and which are between two that are near in time."""
+    if not len(known_ns):
+        return np.zeros((len(asked_ns), values.shape[1])), np.zeros(len(asked_ns), np.bool_)
+    order = np.argsort(known_ns, kind="stable")
+    known, values = known_ns[order], values[order]
+    first = np.flatnonzero(np.diff(known, prepend=known[0] - 1) > 0)
+    known, values = known[first], values[first]
+    after = np.clip(np.searchsorted(known, asked_ns), 0, len(known) - 1)
+    before = np.maximum(after - 1, 0)
+    origin = known[0]
+    found = np.stack(
+        [np.interp(asked_ns - origin, known - origin, column) for column in values.T], axis=-1
+    )
+    near = np.abs(known[after] - asked_ns) <= MOST_APART_NS
+    near &= np.abs(asked_ns - known[before]) <= MOST_APART_NS
+    return found, near & np.isfinite(found).all(axis=1)
+
+
+def candidate_poses(recording: Recording, profile: Profile | None = None) -> list[Poses]:
+    """What may say where the recording's robot was, best first; nothing where nothing does.
+
+    Only what the profile says, where there is one. Else transforms that lead to a map, pose topics,
+    localised ones first, and other transforms.
+    """
+    if profile is not None:
+        return [poses for poses in [_by_profile(recording, profile)] if poses is not None]
+    usable = {n: t for n, t in recording.topics.items() if t.skipped is None and t.expected}
+    guess = transform_frames(recording)
+    along = None
+    if guess is not None:
+        along = along_transforms(recording, Frames(fixed=guess.fixed, base=guess.base))
+    found = _of_topics(
+        recording, {t.name: kind.fields for t, kind in topics_for(usable, KINDS["pose"])}
+    )
+    localised = guess is not None and guess.localised
+    return [p for p in ((along, *found) if localised else (*found, along)) if p is not None]
+
+
+def choose_poses(candidates: Sequence[Poses], on_map: Callable[[F64], Bools]) -> Poses | None:
+    """The first that moves as far as others do and is on free floor, else the one most on it.
+
+    `on_map` says which places (N, 2) are free. A localiser that never ran leaves poses that stand
+    still, or lie in walls.
+    """
+    furthest = max((poses.driven_m for poses in candidates), default=0.0)
+    moving = [p for p in candidates if len(p) > 1 and p.driven_m >= furthest / 2]
+    shares = [float(on_map(poses.places_m).mean()) for poses in moving]
+    for poses, share in zip(moving, shares, strict=True):
+        if share >= WELL_PLACED:
+            return poses
+    return moving[int(np.argmax(shares))] if moving else None
+
+
+def _by_profile(recording: Recording, profile: Profile) -> Poses | None:
+    source = profile.inputs.pose
+    if source is not None and source.topic in recording.topics:
+        found = _of_topics(recording, {source.topic: source.fields})
+        return found[0] if found else None
+    return None if profile.frames is None else along_transforms(recording, profile.frames)
+
+
+def _of_topics(recording: Recording, topics: Mapping[str, Mapping[str, str]]) -> list[Poses]:
+    """The poses that these topics have in these fields; those without such fields are left out."""
+    wanted: dict[str, list[str]] = {}
+    for topic, fields in topics.items():
+        leaves = set(recording.leaves(topic))
+        asked = _paths(fields)
+        if set(asked) <= leaves:
+            wanted[topic] = asked + [path for path in (STAMP, FRAME_ID) if path in leaves]
+    found = []
+    for topic, columns in recording.read(wanted).items():
+        fields = topics[topic]
+        x, y, *turn = (np.asarray(columns.fields[p], np.float64) for p in _paths(fields))
+        yaw = yaw_of(*turn) if len(turn) == 4 else turn[0] if turn else np.full(len(x), np.nan)
+        frames = np.asarray(columns.fields.get(FRAME_ID, [""]), object)
+        if len(columns) and (
+            poses := _poses(
+                Times.of(columns), x, y, yaw, plain(str(frames[-1])), f"poses of {topic}"
+            )
+        ):
+            found.append(poses)
+    return found
+
+
+def _paths(fields: Mapping[str, str]) -> list[str]:
+    turn = [f"{fields['orientation']}.{axis}" for axis in "xyzw"] if "orientation" in fields else []
+    if not turn and "yaw_rad" in fields:
+        turn = [fields["yaw_rad"]]
+    return [fields["x_m"], fields["y_m"], *turn]
+
+
+def _poses(times: Times, x: F64, y: F64, yaw: F64, frame: str, source: str) -> Poses | None:
+    sane = (np.abs(x) < FURTHEST_M) & (np.abs(y) < FURTHEST_M)  # False for NaN
+    if not sane.any():
+        return None
+    kept = Times(times.stamp_ns[sane], times.log_ns[sane])
+    x, y, yaw = x[sane], y[sane], yaw[sane]
+    if np.isfinite(yaw).all():
+        yaw = np.unwrap(yaw)
+    return Poses(kept, x, y, yaw, frame, source)
+
+
+def along_transforms(recording: Recording, frames: Frames) -> Poses | None:
+    """The poses of `frames.base` in `frames.fixed`, at the times of the transform that moves most
+    often; None where no transforms join them."""
+    edges = _edges(recording, frames)
+    chain = chain_between(edges, frames.base, frames.fixed)
+    if not chain:
+        return None
+    moving = [(len(edges.topics[name]), name) for name in chain if name not in edges.static]
+    clock = Times.of(edges.topics[max(moving)[1] if moving else chain[0]])
+    x, y, yaw = (np.zeros(len(clock.log_ns)) for _ in range(3))
+    sane = np.ones(len(x), np.bool_)
+    for name in chain:  # from the base up
+        columns = edges.topics[name]
+        step = np.stack(_planar(columns), axis=-1)
+        if name in edges.static or len(columns) == 1:
+            found = np.repeat(step[-1:], len(x), axis=0)
+        else:
+            by_stamp = shared_clock(clock, Times.of(columns))
+            found, near = interpolated(
+                Times.of(columns).clock(by_stamp=by_stamp), step, clock.clock(by_stamp=by_stamp)
+            )
+            sane &= near
+        cos, sin = np.cos(found[:, 2]), np.sin(found[:, 2])
+        x, y = cos * x - sin * y + found[:, 0], sin * x + cos * y + found[:, 1]
+        yaw = yaw + found[:, 2]
+    kept = Times(clock.stamp_ns[sane], clock.log_ns[sane])
+    way = " -> ".join(name.split(" ", 1)[1] for name in reversed(chain))
+    source = f"transforms {plain(frames.fixed)} -> {way}"
+    return _poses(kept, x[sane], y[sane], yaw[sane], plain(frames.fixed), source)
+
+
+def mount_of(recording: Recording, sensor: str, base: str) -> tuple[F64, F64] | None:
+    """Rotation (3, 3) and place (3,) of a sensor's frame in the base's, or None if unknown."""
+    edges = _edges(recording, Frames(fixed=base, base=sensor)) if sensor else None
+    chain = [] if edges is None else chain_between(edges, sensor, base)
+    if edges is None or (not chain and plain(sensor) != plain(base)):
+        return None
+    turn, place = np.eye(3), np.zeros(3)
+    for name in chain:
+        fields = edges.topics[name].fields
+        step = rotations(*(np.asarray(fields[part], np.float64)[-1:] for part in TURN))[0]
+        place = step @ place + [float(np.asarray(fields[axis])[-1]) for axis in AXES]
+        turn = step @ turn
+    return (turn, place) if np.isfinite(turn).all() and np.isfinite(place).all() else None
+
+
+def _edges(recording: Recording, frames: Frames) -> Edges:
+    wanted = {
+        name: list(FIELDS)
+        for name in (frames.topic, frames.static_topic)
+        if name in recording.topics and set(FIELDS) <= set(recording.leaves(name))
+    }
+    return Edges.of(frames, recording.read(wanted) if wanted else {})
+
+
+def chain_between(edges: Edges, base: str, fixed: str) -> list[str]:
+    """The names of the transforms from a frame up to another, in `edges.topics`; [] for none."""
+    chain, here = list[str](), plain(base)
+    while here != plain(fixed):
+        names = [name for name in edges.topics if name.split(" ", 1)[1] == here]
+        if not names or len(chain) > len(edges.topics):
+            return []
+        # A frame may be sent both as static and as moving: the moving one says where it is.
+        name = min(names, key=lambda name: (name in edges.static, -len(edges.topics[name])))
+        chain.append(name)
+        here = str(np.asarray(edges.topics[name].fields[PARENT], object)[-1])
+    return chain
+
+
+def _planar(columns: TopicColumns) -> tuple[F64, F64, F64]:
+    """x, y and unwrapped yaw of transforms (N,)."""
+    x, y = (np.asarray(columns.fields[axis], np.float64) for axis in AXES[:2])
+    yaw = yaw_of(*(np.asarray(columns.fields[part], np.float64) for part in TURN))
+    return x, y, np.unwrap(yaw)
