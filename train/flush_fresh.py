@@ -137,6 +137,7 @@ def _values(
         policy_version=[version[episode] for episode in number],
         probability=each("probability"),
         perturbation=_perturbed(episodes).columns(number),
+        goal_source="logged" if profile.goal_source else None,  # the twin orders its goals
     )
 
 

@@ -1,9 +1,10 @@
 """Profiles: how one kind of robot's topics fill the signals, and the task that is learnt on them.
 
 A profile is a TOML file: `name`, the shipped `conditions` and `exposures` it uses, `[[condition]]`
-of its own, `[task]`, `[clock]`, `[episodes]`, `[inputs.*]` (which topic fills what), `[frames]`
-(poses from transforms), `[signals.*]` (custom columns), `[tags]` (whose drive it is), `[robot]`
-(what the twin builds) and `[[zone]]` (named rectangles of the map).
+of its own, `[task]`, `[goal]` (logged, or by hindsight), `[clock]`, `[episodes]`, `[inputs.*]`
+(which topic fills what), `[frames]` (poses from transforms), `[signals.*]` (custom columns),
+`[tags]` (whose drive it is), `[robot]` (what the twin builds) and `[[zone]]` (named rectangles
+of the map).
 `load_profile("warehouse_amr")` reads one that comes with Restock, `load_profile("my_robot.toml")`
 one of yours.
 """
@@ -35,6 +36,7 @@ from restock.ingest.task.conditions import (
     of_kind,
     shipped,
 )
+from restock.ingest.task.hindsight import GoalRules, GoalSource
 from restock.ingest.task.robot import Robot, beyond_limits
 from restock.ingest.task.schema import steps_schema
 from restock.ingest.task.task import Task
@@ -76,6 +78,10 @@ MOTION = "nav_msgs/msg/Odometry"  # what was measured: commands are of other typ
 COMMAND_FALLBACK = "the measured motion of {topic} in place of commands"
 POSE_FALLBACK = "from transforms, by [frames]"
 ROUTE_FALLBACK = "none: the task has no goal, progress is forward displacement"
+HINDSIGHT = {
+    "goal": "by hindsight: where the drive stopped, turned back or came by often",
+    "plan": "by hindsight: the way that was driven",
+}
 
 
 class Input(Checked, frozen=True):
@@ -162,6 +168,7 @@ class Profile(Checked, frozen=True):
     task: Task
     inputs: Inputs
     doc: str = ""
+    goal: GoalRules = GoalRules()
     shipped_conditions: list[str] = msgspec.field(default_factory=list, name="conditions")
     shipped_exposures: list[str] = msgspec.field(default_factory=list, name="exposures")
     own_conditions: list[Condition] = msgspec.field(default_factory=list, name="condition")
@@ -211,7 +218,9 @@ class Profile(Checked, frozen=True):
             self, shipped_conditions=[], shipped_exposures=[], own_conditions=[]
         )
         values = msgspec.to_builtins(without)
-        apart = ("tags", "noise", "robot")
+        apart = {"tags", "noise", "robot"}
+        if self.goal == GoalRules():  # rows are as before there was such a table
+            apart |= {"goal"}
         rest = {key: value for key, value in values.items() if key not in apart}
         return hashlib.blake2b(msgspec.json.encode(rest), digest_size=6).hexdigest()
 
@@ -238,7 +247,14 @@ class Profile(Checked, frozen=True):
             fallbacks["pose"] = POSE_FALLBACK
         if self.task.goal == "none":
             fallbacks |= dict.fromkeys(("goal", "plan"), ROUTE_FALLBACK)
+        elif self.goal.source == "hindsight":
+            fallbacks |= HINDSIGHT
         return fallbacks
+
+    @property
+    def goal_source(self) -> GoalSource | None:
+        """Where the goals of its rows come from; None: they have none."""
+        return self.goal.source if self.task.goal == "route" else None
 
     def zone_of(self, x_m: NDArray[Any], y_m: NDArray[Any]) -> list[str]:
         """The name of the first zone that holds each point (N,), or `elsewhere`."""
@@ -322,13 +338,7 @@ def _check(profile: Profile, where: str) -> None:
             where=where,
             remedy="name the topic of the pose, or take it from /tf: [frames] fixed and base",
         )
-    for name in ("goal", "plan"):
-        if profile.task.goal == "route" and getattr(profile.inputs, name) is None:
-            raise ConfigError(
-                f"`inputs.{name}` is missing, and `task.goal` is 'route'",
-                where=where,
-                remedy=f'name the topic of the {name}, or set task.goal = "none"',
-            )
+    _check_goal(profile, where)
     proposed = profile.inputs.nav_command
     if proposed is not None and proposed.topic == profile.inputs.command.topic:
         raise ConfigError(
@@ -349,6 +359,34 @@ def _check(profile: Profile, where: str) -> None:
         if problem := name_problem(name):
             raise ConfigError(f"`signals.{name}`: {problem}", where=where)
     _check_conditions(profile, where)
+
+
+def _check_goal(profile: Profile, where: str) -> None:
+    """That goals and plans come from somewhere, and from one place alone."""
+    if profile.task.goal == "none":
+        if profile.goal.source == "hindsight":
+            raise ConfigError(
+                "`goal.source` is 'hindsight', and `task.goal` is 'none'",
+                where=where,
+                remedy='set task.goal = "route", or leave goal.source out',
+            )
+        return
+    by_hindsight = profile.goal.source == "hindsight"
+    for name in ("goal", "plan"):
+        given = getattr(profile.inputs, name) is not None
+        if by_hindsight and given:
+            raise ConfigError(
+                f"`inputs.{name}` is given, and `goal.source` is 'hindsight': it would not be used",
+                where=where,
+                remedy=f'leave inputs.{name} out, or set goal.source = "logged"',
+            )
+        if not by_hindsight and not given:
+            raise ConfigError(
+                f"`inputs.{name}` is missing, and `task.goal` is 'route'",
+                where=where,
+                remedy=f"name the topic of the {name}; or take goals by hindsight, [goal]"
+                ' source = "hindsight"; or set task.goal = "none"',
+            )
 
 
 def _check_input(name: str, source: Input, where: str, *, framed: bool) -> None:

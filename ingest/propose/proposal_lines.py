@@ -14,6 +14,7 @@ from restock.ingest.profile.profile import FALLBACKS
 from restock.ingest.propose.candidates import Candidate
 from restock.ingest.propose.clock_choice import ClockChoice, Gaps
 from restock.ingest.propose.footprint import Footprint
+from restock.ingest.propose.goal_choice import GoalChoice
 from restock.ingest.propose.roles import KINDS, LATCHED, REQUIRED, FrameGuess, Kind, Roles
 from restock.ingest.propose.trial import Trial
 
@@ -47,6 +48,7 @@ class Evidence:
     driven_s: float
     footprint: Footprint | None
     footprint_notes: list[str]
+    goal: GoalChoice
     signals: list[Candidate]
 
 
@@ -68,6 +70,7 @@ def profile_lines(
         'behaviour_policy = "unknown"  # who drove, where no topic says',
         "",
         *_task_lines(seen, trial),
+        *seen.goal.table_lines(),
         *_clock_lines(seen.clock, trial),
     ]
     for role, fitting in seen.roles.items():
@@ -136,7 +139,7 @@ def _topic_lines(recording: Recording, roles: Roles, seconds: float) -> list[str
 
 def _task_lines(seen: Evidence, trial: Trial) -> list[str]:
     roles, commands = seen.roles, seen.commands
-    routed, (low, high) = bool(roles["goal"]), _lidar_range(seen.recording, roles)
+    low, high = _lidar_range(seen.recording, roles)
     speed, turn = commands.speed_mps, commands.yaw_rate_radps
     actions = [(0.0, 0.0), (speed / 2, 0.0), (speed, 0.0)]
     actions += [(0.8 * speed, 0.6 * turn), (0.8 * speed, -0.6 * turn), (0.0, turn), (0.0, -turn)]
@@ -146,8 +149,7 @@ def _task_lines(seen: Evidence, trial: Trial) -> list[str]:
     return [
         "[task]",
         *_bump_lines(seen.recording, roles),
-        f'goal = "{"route" if routed else "none"}"'
-        + ("" if routed else "  # no goal and plan seen: progress is forward displacement"),
+        *seen.goal.task_lines((seen.footprint or GUESS).length_m),
         f"control_period_s = {seen.clock.period_s:g}",
         f"range_min_m = {low:g}",
         f"range_max_m = {high:g}  # lidar ranges beyond it count as free",
@@ -238,7 +240,7 @@ def _input_lines(
                 f"# [inputs.{role}]",
                 "",
             ]
-        fallback = FALLBACKS.get(role, "progress without a goal")
+        fallback = FALLBACKS.get(role) or seen.goal.fallback(role)
         return [f"# [inputs.{role}]  # no topic seen; instead: {fallback}", ""]
     topic, kind = fitting[0]
     rate = topic.expected / seen.driven_s if seen.driven_s > 0 else 0.0

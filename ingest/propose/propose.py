@@ -18,6 +18,7 @@ from restock.ingest.profile.profile import MOTION, parse_profile
 from restock.ingest.propose.candidates import candidates
 from restock.ingest.propose.clock_choice import Gaps, by_log_time, choose_clock
 from restock.ingest.propose.footprint import Footprint, footprint_of
+from restock.ingest.propose.goal_choice import GoalChoice
 from restock.ingest.propose.proposal_lines import Commands, Evidence, profile_lines
 from restock.ingest.propose.roles import (
     KINDS,
@@ -94,6 +95,10 @@ def propose_profile(
         if trial.problem and LOG_TIME in trial.problem and seen.clock.alignment == STAMP:
             seen = replace(seen, clock=by_log_time(seen.clock, seen.gaps, trial.problem))
             trial = tried(recording, "\n".join(profile_lines(seen, name, problems)))
+        goal = seen.goal.tried(trial.transitions, trial.dropped)
+        if goal != seen.goal:
+            seen = replace(seen, goal=goal)
+            trial = tried(recording, "\n".join(profile_lines(seen, name, problems)))
         if trial.problem:
             problems.append(trial.problem)
         text = "\n".join(profile_lines(seen, name, problems, trial))
@@ -152,6 +157,7 @@ def gather(
         _driven_s(recording, gaps),
         footprint,
         notes,
+        GoalChoice.of(logged=bool(roles["goal"])),
         candidates(
             recording,
             without={topic.name for role, topic, _ in best if role in SPENT},

@@ -53,7 +53,7 @@ class LiveObserver:
 
     Raises:
         ConfigError: the profile takes its pose, goals or plans from transforms, which are not
-            held here.
+            held here, or its goals by hindsight.
     """
 
     def __init__(self, profile: Profile) -> None:
@@ -62,6 +62,13 @@ class LiveObserver:
                 "places messages by transforms ([frames]), which is not done live",
                 where=f"profile {profile.name!r}",
                 remedy="name a topic with the pose in the map frame under [inputs.pose]",
+            )
+        if profile.goal_source == "hindsight":
+            raise ConfigError(
+                "takes its goals by hindsight, and a robot on its way has none",
+                where=f"profile {profile.name!r}",
+                remedy="name the topics of goal and plan under [inputs.goal] and [inputs.plan],"
+                ' with goal.source = "logged"',
             )
         self.profile, self.task = profile, profile.task
         self._inputs: dict[str, list[Input]] = {}

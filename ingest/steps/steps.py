@@ -25,6 +25,7 @@ from restock.ingest.steps.clearance import BEAMS, SECTORS, scan_reduction
 from restock.ingest.steps.clocks import TopicClock, topic_clocks
 from restock.ingest.steps.custom_columns import Custom, custom_signals
 from restock.ingest.steps.routing import LARGEST, Routing, plan_ends, plan_problems, same_goals
+from restock.ingest.task.hindsight import missions
 from restock.ingest.task.perturbation_columns import Perturbed
 from restock.ingest.task.signals import Signals, localised_velocity
 from restock.ingest.task.surroundings import SCANNED, came_nearer
@@ -115,6 +116,7 @@ class Filling:
         self.break_reason = np.full(len(self.tick_ns), "", object)  # why one does not follow
         self.signals: Signals = {"stamp_ns": self.tick_ns}
         self.routing = Routing.none(len(self.tick_ns))
+        self.located = np.zeros(len(self.tick_ns), np.bool_)  # the pose is known
         self.notes: list[str] = []
 
     def fill(self) -> Signals:
@@ -132,7 +134,9 @@ class Filling:
         self._scan()
         self._bumper()
         self._nav_command()
-        if self.task.goal == "route":
+        if self.profile.goal_source == "hindsight":
+            self._hindsight()
+        elif self.task.goal == "route":
             self._route()
         signals, routing = self.signals, self.routing
         signals |= routing.signals(self.task, routing.goal, routing.plan, signals)
@@ -179,8 +183,8 @@ class Filling:
     def _find_breaks(self) -> None:
         reasons = self.break_reason
         reasons[:1] = "start of the recording"
-        x, y = self.signals["pose_x_m"], self.signals["pose_y_m"]
-        jump = np.hypot(np.diff(x), np.diff(y)) > self.profile.episodes.max_pose_jump_m
+        xy_m = np.stack([self.signals["pose_x_m"], self.signals["pose_y_m"]], axis=1)
+        jump = self._too_far(xy_m)
         gap = np.diff(self.tick_ns) > round(self.profile.clock.max_gap_s * NS)
         unusable = (self.problem[1:] != "") | (self.problem[:-1] != "")
         for bad, reason in (
@@ -191,6 +195,11 @@ class Filling:
         ):
             reasons[1:][bad & (reasons[1:] == "")] = reason
 
+    def _too_far(self, xy_m: F64) -> Bools:
+        """Between positions (N, 2), which of the steps (N - 1,) are too long to be driven."""
+        moved_m = np.hypot(*np.diff(xy_m, axis=0).T)
+        return np.asarray(moved_m > self.profile.episodes.max_pose_jump_m, np.bool_)
+
     def _mark_invalid(self, bad: Bools, reason: str, *, route: bool = False) -> None:
         problems = self.route_problem if route else self.problem
         problems[bad & (problems == "")] = reason
@@ -198,7 +207,8 @@ class Filling:
     def _mark_reasons(self, name: str, reasons: NDArray[Any], *, route: bool = False) -> None:
         """Mark the ticks that have a reason (T,), which is "" elsewhere."""
         for reason in sorted(set(reasons) - {""}):
-            self._mark_invalid(reasons == reason, f"{name}: {reason}", route=route)
+            said = f"{name}: {reason}" if name else reason
+            self._mark_invalid(reasons == reason, said, route=route)
 
     def _required(self, name: str, *, route: bool = False) -> LatestMessages:
         latest = self.aligned.latest(name)
@@ -222,7 +232,9 @@ class Filling:
     def _pose(self) -> None:
         if "pose" in self.inputs.by_name:
             self._numbers("pose", x_m="pose_x_m", y_m="pose_y_m", yaw_rad="pose_yaw_rad")
-            self.signals["pose_stamp_ns"] = self.tick_ns - self.aligned.latest("pose").age_ns
+            latest = self.aligned.latest("pose")
+            self.signals["pose_stamp_ns"] = self.tick_ns - latest.age_ns
+            self.located = latest.known & latest.fresh
             return
         tree = self.aligned.tree
         assert tree is not None  # the profile is refused otherwise
@@ -231,6 +243,7 @@ class Filling:
         x, y, _ = at.translation_m.T
         for signal, values in (("x_m", x), ("y_m", y), ("yaw_rad", at.yaw_rad)):
             self._set("pose", f"pose_{signal}", values, at.problem == "")
+        self.located = np.asarray(at.problem == "", np.bool_)
         self.signals["pose_stamp_ns"] = at.stamp_ns
 
     def _scan(self) -> None:
@@ -312,6 +325,20 @@ class Filling:
         usable = self.route_problem == ""
         goal, plan = np.where(usable, goal, -1), np.where(usable, plan, -1)
         self.routing = Routing(goals, plans, goal, plan, latest["goal"].row.astype(np.int64))
+
+    def _hindsight(self) -> None:
+        """Goals and routes from where the robot went: they, and no other signal, see ahead."""
+        xy_m = np.stack([self.signals["pose_x_m"], self.signals["pose_y_m"]], axis=1)
+        at = np.flatnonzero(self.located)
+        carried = np.zeros(len(self.tick_ns), np.bool_)
+        carried[at[1:]] = self._too_far(xy_m[at]) | (np.diff(self.segment[at]) != 0)
+        rules, leg = self.profile.goal, np.cumsum(carried)
+        found = missions(rules, self.task, xy_m, self.tick_ns, self.located, leg)
+        self._mark_reasons("", np.array(found.problem, object), route=True)
+        self.routing = Routing(
+            found.goals_m, found.routes_m, found.mission, found.mission, found.mission
+        )
+        self.notes.append(str(found))
 
 
 def _chunks(before: Ints) -> Iterator[tuple[slice, Ints]]:

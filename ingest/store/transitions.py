@@ -53,6 +53,7 @@ class TransitionValues:
     probability: Sequence[float | None] | NDArray[np.floating]  # (N,) of the action
     perturbation: tuple[pa.Array, pa.Array]  # (N,) its name and its values
     true_exposure: Sequence[str | None] | None = None  # (N,); None: not known of any
+    goal_source: str | None = None  # of all; None: there is no goal
 
 
 def recording_table(
@@ -112,6 +113,7 @@ def transitions(
         probability=[steps.probability[index] for index in tick],
         perturbation=steps.perturbed.columns(tick),
         true_exposure=[_sorted_truth(steps.true_exposure[index]) for index in tick],
+        goal_source=profile.goal_source,
     )
     return transition_table(profile, rows, values, provenance)
 
@@ -164,6 +166,7 @@ def transition_table(
         "action_probability": values.probability,
         "action_residual": values.residual,
         "progress_m": values.progress_m,
+        "goal_source": values.goal_source or pa.nulls(count, pa.string()),
         **signal_columns(rows.signals, begin),
         "ingest_id": provenance.ingest_id,
         "source_file": provenance.source_file,

@@ -94,6 +94,12 @@ COVERAGE: tuple[Column, ...] = (
     Column("action_probability", pa.float32(), "behaviour policy's, of the action", nullable=True),
     Column("action_residual", pa.float32(), "from the command to the discrete action, scaled"),
     Column("progress_m", pa.float32(), "how much shorter the plan became over [t, t + 1)"),
+    Column(
+        "goal_source",
+        pa.string(),
+        "logged: the goal was ordered; hindsight: where the robot got to; null: no goal, or older",
+        nullable=True,
+    ),
 )
 PROVENANCE: tuple[Column, ...] = (
     Column("ingest_id", pa.string(), "the ingest that wrote this row; joins `recordings`"),

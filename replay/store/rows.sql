@@ -53,6 +53,7 @@ FROM (
         NULL::VARCHAR[] AS uncertain,
         NULL::VARCHAR[] AS exposures,
         NULL::VARCHAR AS true_exposure,
+        NULL::VARCHAR AS goal_source,
         NULL::FLOAT AS came_nearer_m,
         NULL::FLOAT AS plan_return_m,
         NULL::VARCHAR AS perturbation,

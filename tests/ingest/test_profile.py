@@ -161,7 +161,7 @@ def test_a_proposal_says_what_no_topic_fills(tmp_path, capsys):
     assert main(["profile", "new", str(bag)]) == 3
     out, err = capsys.readouterr()
     assert "MISSING, and required" in out
-    assert 'goal = "none"' in out
+    assert 'source = "hindsight"' in out
     assert "# [inputs.imu]  # no topic seen; instead: gyro yaw rate taken from the wheels" in out
     assert "no topic of nav_msgs/msg/Odometry." in out
     assert "no topic for wheels" in err

@@ -20,9 +20,9 @@ from restock.replay.store.store import Store
 SAMPLES = ROOT / "sample_logs"
 ROWS = sample_transitions("amr_tuesday")
 ROBOTS = {  # of others -> transitions of the proposal
-    "turtlebot3-sim-humble": 138,
+    "turtlebot3-sim-humble": 133,
     "turtlebot3-sim-sparse-cmd": 9,
-    "ros1/husky_robot_localization.bag": 3951,
+    "ros1/husky_robot_localization.bag": 3903,
 }
 
 

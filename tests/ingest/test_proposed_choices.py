@@ -98,7 +98,7 @@ def test_an_outline_that_the_lidar_contradicts_is_said(tmp_path, capsys):
     assert "inside the robot at 50" in texts[0]
     assert main(["profile", "check", str(file), str(bag)]) == 0
     out = capsys.readouterr().out
-    assert "try: `recovery` holds on 49 of 49 transitions" in out
+    assert "try: `recovery` holds on 48 of 48 transitions" in out
     assert "try: `task.body`: by an outline of 0.6 x 0.5 m" in out
     other = tmp_path / "small"
     other.mkdir()
@@ -116,7 +116,7 @@ def test_periods_are_in_the_robots_own_time(pace, tmp_path, capsys):
     profile = load_profile(file)
     assert profile.clock.alignment == "header.stamp"
     assert profile.task.control_period_s == pytest.approx(0.2)
-    assert said["transitions"] == 149
+    assert said["transitions"] == 147
     assert ("Header stamps run at" in said["toml"]) == (pace != 1.0)
     assert main(["profile", "check", str(file), str(bag), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["outcome"]["transitions"] == said["transitions"]
@@ -150,11 +150,11 @@ def test_log_time_where_stamps_cannot_be_followed(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("bag", "transitions", "options"),
     [
-        ("sim-time-husky", 86, ()),
+        ("sim-time-husky", 73, ()),
         ("sim-time-mobrob", 41, ("--odometry-as-command",)),
-        ("sim-time-robot-kf", 547, ("--odometry-as-command",)),
-        ("robots/turtlebot3-sim/rosbag_test", 125, ()),
-        ("robots/turtlebot3-sim-clock/ros2bag", 17, ()),
+        ("sim-time-robot-kf", 520, ("--odometry-as-command",)),
+        ("robots/turtlebot3-sim/rosbag_test", 113, ()),
+        ("robots/turtlebot3-sim-clock/ros2bag", 14, ()),
     ],
 )
 def test_of_simulations(bag, transitions, options, capsys):
@@ -169,4 +169,4 @@ def test_a_small_robots_rows_are_not_all_recovery(tmp_path, capsys):
     bag = str(SHARED / "turtlebot3-sim-humble")
     assert main(["profile", "new", bag, "--out", str(file)]) == 0
     assert main(["profile", "check", str(file), bag, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["outcome"]["conditions"]["recovery"] == 1  # was 124
+    assert json.loads(capsys.readouterr().out)["outcome"]["conditions"]["recovery"] <= 1  # was 124

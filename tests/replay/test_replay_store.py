@@ -93,6 +93,7 @@ def test_episodes_are_those_of_a_naive_reading(store: Store, transitions: pa.Tab
         assert episode["duration_s"] == pytest.approx(0.2 * (len(steps) - 1))
         assert episode["ended"] == ("terminated" if steps[-1]["terminated"] else "truncated")
         reached = steps[-1]["terminated"] and steps[-1]["reward"] > TASK.rewards.goal / 2
+        assert episode["goal_source"] == "logged"
         assert episode["success"] == reached
         assert episode["conditions"] == sorted({c for s in steps for c in s["conditions"]})
         assert episode["bumped_steps"] == sum(s["bumped"] for s in steps)

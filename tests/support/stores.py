@@ -30,7 +30,13 @@ START_NS = 1_700_000_000 * 10**9
 
 
 def recording_transitions(
-    recording: int, *, episodes: int = 12, seed: int = 0, task: Task = TASK, ingest: str = "a"
+    recording: int,
+    *,
+    episodes: int = 12,
+    seed: int = 0,
+    task: Task = TASK,
+    ingest: str = "a",
+    goal_source: str | None = "logged",
 ) -> pa.Table:
     """Random transitions of one recording, with the columns and meanings of `ingest.schema`."""
     rng = np.random.default_rng([seed, recording])
@@ -68,6 +74,7 @@ def recording_transitions(
         "true_exposure": pa.nulls(rows, pa.string()),
         "perturbation": np.where(np.arange(rows) % 3 > 0, "wet", None),
         "perturbation_values": [[("friction_scale", 0.5)] if r % 3 else None for r in range(rows)],
+        "goal_source": [goal_source if task.goal == "route" else None] * rows,
         "zone": rng.choice(["aisle_1", "aisle_2", "cross"], rows),
         "behaviour_policy": np.where(rng.random(episodes)[episode] < 0.8, "planner", "operator"),
         "behaviour_version": ["1"] * rows,

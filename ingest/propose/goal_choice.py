@@ -1,0 +1,57 @@
+"""Where a proposed profile takes its goals from: topics, hindsight, or nowhere."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from restock.ingest.profile.profile import HINDSIGHT
+from restock.ingest.task.hindsight import NO_MISSION, GoalSource
+
+RADIUS_M = (0.1, 0.4)  # the least and the most of a goal
+
+
+@dataclass(frozen=True)
+class GoalChoice:
+    """The goal of a proposal; `source` None: the task has none."""
+
+    source: GoalSource | None
+    why: str = ""  # there is none
+
+    @classmethod
+    def of(cls, *, logged: bool) -> GoalChoice:
+        """Where goals and plans were not recorded, they come by hindsight."""
+        return cls("logged" if logged else "hindsight")
+
+    def tried(self, transitions: int, dropped: Mapping[str, int]) -> GoalChoice:
+        """The choice after a trial: no goal where hindsight finds none for most of the drive."""
+        without = sum(count for why, count in dropped.items() if why.startswith(NO_MISSION))
+        if self.source != "hindsight" or without <= transitions:
+            return self
+        return GoalChoice(None, f"by hindsight {without:,} ticks have none, {transitions:,} one")
+
+    def task_lines(self, length_m: float) -> list[str]:
+        """What [task] says of it, for a robot of this length."""
+        if self.source is None:
+            why = f"; {self.why}" if self.why else ""
+            progress = "progress is forward displacement"
+            return [f'goal = "none"  # no goal and plan seen{why}: {progress}']
+        lines = ['goal = "route"']
+        if self.source == "hindsight":
+            radius_m = min(max(length_m / 3, RADIUS_M[0]), RADIUS_M[1])
+            lines.append(f"goal_radius_m = {round(radius_m, 2):g}  # a third of the robot's length")
+        return lines
+
+    def fallback(self, role: str) -> str:
+        """What there is instead of `goal` or `plan`."""
+        return HINDSIGHT[role] if self.source == "hindsight" else "progress without a goal"
+
+    def table_lines(self) -> list[str]:
+        """The [goal] of the profile, where it needs one."""
+        if self.source != "hindsight":
+            return []
+        return [
+            "[goal]  # no goal and plan seen",
+            'source = "hindsight"  # where a drive stopped, turned back or came by often',
+            "",
+        ]

@@ -1,0 +1,272 @@
+"""Goals by hindsight: where a drive got to is the goal of what led there (arXiv:1707.01495).
+
+For recordings without a goal topic. A drive is cut into missions, and each one's goal is the place
+where it ended: where the robot stood still, where it turned back, a place that it visited often, or
+as far as an episode may go. The route is the way that was driven, thinned and without its loops.
+
+Goal and route are from the future, by definition; nothing else here is. Every mission arrives, by
+construction: its success says nothing of who drove.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Annotated, Literal
+
+import numpy as np
+from msgspec import Meta
+
+from restock.arrays import F64, Bools, Ints
+from restock.ingest.task.task import Task
+from restock.toml import Checked
+
+NO_MISSION = "goal: none by hindsight"  # what ticks without one are counted as
+STANDING = f"{NO_MISSION}, standing still"
+NOWHERE = f"{NO_MISSION}, nowhere far enough"
+
+_SHORTEST = 3.0  # goal radii from start to goal, at least
+_BACK = 0.6  # of the farthest from its start: nearer again, the robot has turned back
+_OFTEN = 3  # visits
+_LIMIT = 0.9  # of the task's time limit
+
+GoalSource = Literal["logged", "hindsight"]
+
+
+class GoalRules(Checked, frozen=True):
+    """The `[goal]` of a profile: where a route's goals come from."""
+
+    source: GoalSource = "logged"  # from inputs.goal and inputs.plan; or by hindsight
+    still_s: Annotated[float, Meta(gt=0)] = 3.0  # that a robot stands for, to have arrived
+    wait_s: Annotated[float, Meta(ge=0)] = 10.0  # of standing before it sets off: in its mission
+    shortest_m: Annotated[float, Meta(gt=0)] | None = None  # start to goal; None: 3 goal radii
+    longest_m: Annotated[float, Meta(gt=0)] = 10.0  # start to goal
+
+    def at_least_m(self, task: Task) -> float:
+        """How far a goal must be from where its mission starts."""
+        return self.shortest_m or _SHORTEST * task.goal_radius_m
+
+
+@dataclass(frozen=True)
+class Missions:
+    """A recording's missions (M of them), and which one each of T ticks is in."""
+
+    mission: Ints  # (T,) -1: none
+    goals_m: F64  # (M, 2)
+    routes_m: list[F64]  # each (P, 2), from the mission's start to its goal
+    ended_at: list[str]  # (M,) why there
+    standing: Bools  # (T,) and for longer than before or after a mission
+    driven_m: float
+    shortest_m: float
+
+    @property
+    def problem(self) -> list[str]:
+        """(T,) why a tick has no goal, or ""."""
+        without = np.where(self.mission < 0, NOWHERE, "")
+        return [str(text) for text in np.where(self.standing, STANDING, without)]
+
+    def __str__(self) -> str:
+        if not len(self.goals_m):
+            return (
+                f"goals: none by hindsight, as the robot got nowhere {self.shortest_m:g} m from"
+                f" where it set off ({self.driven_m:.1f} m driven)"
+            )
+        ends = Counter(self.ended_at).most_common()
+        places = len(np.unique(self.goals_m, axis=0))
+        return (
+            f"goals: by hindsight, over {self.driven_m:.0f} m driven; missions {len(self.goals_m)}"
+            f" ({', '.join(f'{why} {n}' for why, n in ends)}), places {places}; each mission"
+            " arrives by construction, so no success is counted"
+        )
+
+
+def missions(
+    rules: GoalRules, task: Task, xy_m: F64, stamp_ns: Ints, located: Bools, leg: Ints
+) -> Missions:
+    """The missions of a drive.
+
+    Args:
+        rules: how long, how far.
+        task: whose goal radius and time limit hold.
+        xy_m: (T, 2) positions.
+        stamp_ns: (T,) of the ticks.
+        located: (T,) whether the position is known; where it is not, the drive goes on.
+        leg: (T,) another number where the robot was carried, or the clock was set: no mission
+            goes on beyond that.
+    """
+    at = np.flatnonzero(located)
+    found = _Cutting(rules, task, xy_m[at], stamp_ns[at], leg[at]).missions()
+    # Ticks without a position are as the one before them.
+    before = np.searchsorted(at, np.arange(len(stamp_ns)), "right") - 1
+    mission = np.where(before >= 0, np.append(found.mission, -1)[before], -1)
+    standing = (before >= 0) & np.append(found.standing, False)[before]
+    return replace(found, mission=mission, standing=standing)
+
+
+class _Cutting:
+    """Cuts a drive, leg by leg: a leg is what the robot drove without being carried."""
+
+    def __init__(self, rules: GoalRules, task: Task, xy_m: F64, stamp_ns: Ints, leg: Ints) -> None:
+        self.rules, self.radius_m = rules, task.goal_radius_m
+        self.xy_m = xy_m
+        self.at_s = np.cumsum(np.maximum(np.diff(stamp_ns, prepend=stamp_ns[:1]), 0)) * 1e-9
+        self.leg = leg
+        self.shortest_m = rules.at_least_m(task)
+        self.longest_s = _LIMIT * task.time_limit_steps * task.control_period_s
+        self.arc_m = driven_m(xy_m, leg, self.radius_m / 2)
+        self.standing = self._standing()  # and, after the cutting, in no mission
+        self.visits = self._visits()
+        self.mission = np.full(len(xy_m), -1, np.int64)
+        self.goals: list[F64] = []
+        self.routes: list[F64] = []
+        self.ended_at: list[str] = []
+
+    def missions(self) -> Missions:
+        starts = np.flatnonzero(np.diff(self.leg, prepend=self.leg[:1] - 1))
+        for first, last in zip(starts, [*(starts[1:] - 1), len(self.leg) - 1], strict=True):
+            end = "end of the recording" if last == len(self.leg) - 1 else "carried off"
+            self._cut_leg(int(first), int(last), end)
+        return Missions(
+            self.mission,
+            np.array(self.goals).reshape(-1, 2),
+            self.routes,
+            self.ended_at,
+            self.standing,
+            float(self.arc_m[-1]) if len(self.arc_m) else 0.0,
+            self.shortest_m,
+        )
+
+    def _cut_leg(self, first: int, last: int, end: str) -> None:
+        """Missions between the places where the robot stood still."""
+        changes = np.flatnonzero(np.diff(self.standing[first : last + 1].astype(np.int8)))
+        stood = first
+        bounds = [first, *(changes + first + 1).tolist(), last + 1]
+        for begin, stop in pairwise(bounds):
+            if self.standing[begin]:
+                if self.mission[begin] >= 0:  # the goal that was reached stays in force
+                    self.mission[begin:stop] = self.mission[begin]
+                stood = begin + 1 if self.mission[begin] >= 0 else begin
+                continue
+            arrives = stop <= last
+            # What it did before it set off belongs to the drive: it looked where to go, and turned.
+            since = np.searchsorted(self.at_s, self.at_s[begin] - self.rules.wait_s, "left")
+            start = min(max(stood, int(since)), begin)
+            self._cut_drive(start, stop if arrives else last, "stood still" if arrives else end)
+
+    def _cut_drive(self, start: int, stop: int, end: str) -> None:
+        """Missions of a drive without a stop, from tick `start` to tick `stop`."""
+        while start < stop:
+            late = np.searchsorted(self.at_s, self.at_s[start] + self.longest_s, "right") - 1
+            reach = min(stop, max(int(late), start + 1))
+            away = np.hypot(*(self.xy_m[start : reach + 1] - self.xy_m[start]).T)
+            if (over := np.flatnonzero(away > self.rules.longest_m)).size:
+                away = away[: max(int(over[0]), 2)]
+                reach = start + len(away) - 1
+            farthest = np.maximum.accumulate(away)
+            back = np.flatnonzero((farthest >= self.shortest_m) & (away < _BACK * farthest))
+            if len(back):
+                goal, why = start + int(away[: back[0]].argmax()), "turned back"
+            elif reach == stop:
+                goal, why = stop, end
+            else:
+                goal, why = self._way_point(start, away)
+            if away[goal - start] < self.shortest_m:
+                start = max(goal, start + 1)  # got nowhere
+                continue
+            start = self._add(start, goal, why, last=goal == stop)
+
+    def _way_point(self, start: int, away: F64) -> tuple[int, str]:
+        """Where to end a drive that goes on: the most visited place, or as far as it may go."""
+        visits = self.visits[start : start + len(away)]
+        visits = np.where(away >= max(self.shortest_m, away.max() / 2), visits, 0)
+        most = int(visits.max())
+        if most >= _OFTEN:
+            return start + int(np.flatnonzero(visits == most)[-1]), "visited often"
+        far = away >= self.shortest_m
+        return start + (int(np.flatnonzero(far)[-1]) if far.any() else len(away) - 1), "far enough"
+
+    def _add(self, start: int, end: int, why: str, *, last: bool) -> int:
+        """Add the mission that ends at tick `end`; where the next one starts."""
+        goal = self._place(self.xy_m[end])
+        gap = np.hypot(*(self.xy_m[start : end + 1] - goal).T)
+        arrival = start + int(np.flatnonzero(gap <= self.radius_m)[0])
+        number = len(self.goals)
+        self.goals.append(goal)
+        self.routes.append(route_of(self.xy_m[start : end + 1], goal, self.radius_m / 2))
+        self.ended_at.append(why)
+        # A drive that goes on has its next goal at once, where this one is reached.
+        self.mission[start : (end if last else arrival) + 1] = number
+        self.standing[start:end] = False
+        return end if last else arrival
+
+    def _place(self, goal: F64) -> F64:
+        """The goal, or one of an earlier mission that is the same place."""
+        if self.goals:
+            gap = np.hypot(*(np.array(self.goals) - goal).T)
+            if gap.min() <= self.radius_m / 2:
+                return self.goals[int(gap.argmin())]
+        return goal
+
+    def _standing(self) -> Bools:
+        """Ticks (T,) of the stretches of `still_s` in which the robot keeps to its place.
+
+        By position, so that turning on the spot is standing too.
+        """
+        count = len(self.at_s)
+        until = np.searchsorted(self.at_s, self.at_s + self.rules.still_s, "left")  # (T,)
+        ended = np.minimum(until, count - 1)
+        still = (until < count) & (self.leg[ended] == self.leg)
+        for ahead in range(1, int((ended - np.arange(count)).max(initial=0)) + 1):
+            then = np.minimum(np.arange(count) + ahead, ended)
+            still &= np.hypot(*(self.xy_m[then] - self.xy_m).T) <= self.radius_m / 2
+        edges = np.zeros(count + 1, np.int64)
+        np.add.at(edges, np.flatnonzero(still), 1)
+        np.add.at(edges, ended[still] + 1, -1)
+        return np.cumsum(edges)[:count] > 0
+
+    def _visits(self) -> Ints:
+        """How often (T,) the robot came to the place that it is at, in the whole recording."""
+        cell = np.floor(self.xy_m / (2 * self.radius_m)).astype(np.int64)
+        _, place = np.unique(cell, axis=0, return_inverse=True)
+        order = np.lexsort([np.arange(len(place)), place])
+        # Another visit: it drove a mission's length since it was last here.
+        again = np.diff(self.arc_m[order], prepend=-np.inf) >= self.shortest_m
+        again |= np.diff(place[order], prepend=-1) != 0
+        counts: Ints = np.bincount(place, _weights(again, order))[place].astype(np.int64)
+        return counts
+
+
+def driven_m(xy_m: F64, leg: Ints, band_m: float) -> F64:
+    """How far the robot has driven (N,), in steps of more than `band_m`: noise drives nowhere."""
+    arc, driven, here = 0.0, [], (math.nan, math.nan, -1)
+    for x, y, number in zip(xy_m[:, 0].tolist(), xy_m[:, 1].tolist(), leg.tolist(), strict=True):
+        step = math.hypot(x - here[0], y - here[1])
+        if number != here[2]:
+            here = (x, y, number)
+        elif step > band_m:
+            arc, here = arc + step, (x, y, number)
+        driven.append(arc)
+    return np.array(driven)
+
+
+def _weights(chosen: Bools, order: Ints) -> F64:
+    """`chosen` of the sorted rows, in the rows' own order."""
+    weights = np.zeros(len(order))
+    weights[order] = chosen
+    return weights
+
+
+def route_of(driven_m: F64, goal_m: F64, spacing_m: float) -> F64:
+    """The driven way (N, 2) as a route (P, 2): points about `spacing_m` apart, no loops, the goal.
+
+    Where the way comes back to a point, what lies between is left out.
+    """
+    points, here = [driven_m[0]], 0
+    while here < len(driven_m) - 1:
+        near = np.hypot(*(driven_m[here:] - driven_m[here]).T) <= spacing_m
+        here += int(np.flatnonzero(near)[-1]) + 1
+        if here < len(driven_m):
+            points.append(driven_m[here])
+    return np.array([*points, goal_m])
