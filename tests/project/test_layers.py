@@ -25,7 +25,7 @@ MAY_IMPORT = {
     "ingest/containers": "decoding",
     "ingest/task": "",
     "ingest/profile": "decoding task",
-    "ingest/propose": "containers decoding profile steps",
+    "ingest/propose": "containers decoding profile steps task",
     "ingest/steps": "containers decoding profile task",
     "ingest/store": "containers decoding profile steps task",
     "replay": "panel store ingest/store",
