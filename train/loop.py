@@ -311,8 +311,15 @@ def _choose_start(session: Session) -> None:
 
 
 def _evaluate(session: Session, notify: Notify) -> None:
-    """The fixed episodes, greedily; the policy is kept if it is the best so far."""
+    """The fixed episodes, greedily; the policy is kept if it is the best so far.
+
+    Without a twin nothing drives: what is learnt by now is kept.
+    """
     check_parameters(session)
+    if not session.config.env.twin:
+        session.progress.evaluated_at = session.progress.env_steps
+        session.save_best(Score({}, 0.0, 0.0))
+        return
     config, progress, learner = session.config, session.progress, session.learner
     names = list(config.env.conditions)  # also those with a share of 0: never trained on, yet met
     specs = fixed_episodes(names, config.evaluation.episodes, config.evaluation.seed)

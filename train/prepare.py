@@ -27,6 +27,7 @@ from restock.train.feed.imitation import refuse_nothing_to_learn
 from restock.train.feed.logs import Logs
 from restock.train.feed.teacher import Teacher, open_teacher
 from restock.train.finite import STOPPED
+from restock.train.logs_alone import NoTwin, without_twin
 from restock.train.loop import Notify, TrainResult
 from restock.train.missions import check_missions, mission_orders, reference_success
 from restock.train.ring_capacity import resolve_ring_capacity
@@ -108,9 +109,11 @@ class Prepared:
         if self.panel is not None:
             share = self.document["panel"].get("logs_share", 0.0)
             fed = f"panel {self.panel.id} ({len(self.panel):,} rows), {share:.0%} of each batch"
+        steps = f"up to {schedule.env_steps:,} environment steps"
+        if not config.env.twin:
+            steps = f"{schedule.offline_updates:,} updates on the logs alone, without a twin"
         return (
-            f"run {self.path}: {fed}; target {config.target}; up to"
-            f" {schedule.env_steps:,} environment steps"
+            f"run {self.path}: {fed}; target {config.target}; {steps}"
             + (f" or {schedule.seconds:g} s" if schedule.seconds is not None else "")
             + f"; seed {config.seed}, {config.device}"
             + (
@@ -124,8 +127,12 @@ class Prepared:
                 f" {', '.join(signals)}: its stratum is of logs alone"
                 for name, signals in self.document.get("not_evaluated", {}).items()
             )
-            + "".join(f"\n{line}" for line in sealed(open_floors(config.env.layouts)))
+            + "".join(f"\n{line}" for line in self._sealed())
         )
+
+    def _sealed(self) -> list[str]:
+        """What of the floors was closed, where anything drives on them."""
+        return sealed(open_floors(self.config.env.layouts)) if self.config.env.twin else []
 
 
 def train(
@@ -193,7 +200,8 @@ def prepare_new(
         file, config = config, load_config(config, overrides)
         chosen = "profile" in apply_overrides({} if file is None else read_toml(file), overrides)
     open_device(config.device)
-    for layouts in {config.env.layouts, _evaluation_layouts(config)}:
+    driven = {config.env.layouts, _evaluation_layouts(config)} if config.env.twin else ()
+    for layouts in driven:
         # What is wrong with one is reported before anything is written. Evaluation drives all kinds
         # that are named, whatever their share.
         refuse_unfit(open_floors(layouts), config.env.conditions)
@@ -204,6 +212,8 @@ def prepare_new(
     else:
         profile = load_profile(config.profile)
     panel = open_panel(panel_path, config, profile) if panel_path is not None else None
+    if not config.env.twin:
+        config = without_twin(config, panel)
     check_missions(config, profile, panel)
     config = _resolve_teacher(config, profile)
     refuse_nothing_to_learn(config.teacher, None if panel is None else sorted(_policies(panel)))
@@ -284,6 +294,8 @@ def make_twin(
     layouts: str | None = None,
 ) -> Twin:
     """The warehouse, as training uses it; on other floors where `layouts` names them."""
+    if not config.env.twin:
+        return NoTwin(profile.task)
     from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
     twin: Twin = WarehouseVectorEnv(

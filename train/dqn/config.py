@@ -157,6 +157,7 @@ class OfflineStartConfig(Checked, frozen=True):
 
 
 class EnvConfig(Checked, frozen=True):
+    twin: bool = True  # false: the logs alone; nothing drives, and what was learnt last is kept
     num_envs: Count = 32
     # Shares of true conditions among the episodes of the twin.
     conditions: dict[str, NonNegative] = msgspec.field(

@@ -10,6 +10,7 @@ from typing import Any
 import duckdb
 
 from restock.errors import RestockError, RunError
+from restock.files import read_table
 from restock.replay.panel.panel import Panel
 from restock.replay.panel.strata import Stratum
 from restock.replay.store.store import Store
@@ -74,6 +75,11 @@ class Facts:
         return f"hard, every {rule['every']:,}" if rule.get("rule") == "hard" else "?"
 
     @property
+    def twin(self) -> bool:
+        """Whether the run had a twin to drive in."""
+        return bool(self.config.get("config", {}).get("env", {}).get("twin", True))
+
+    @property
     def no_goal(self) -> bool:
         """Whether the task has no goal: success is not defined."""
         return bool(self.cells) and all(row["success"] is None for row in self.cells)
@@ -112,21 +118,29 @@ def gather(path: Path) -> Facts:
     kept = rows.pop("kept")
     facts = Facts(run=path, config=run.document, kept=kept[0] if kept else None, **rows)  # type: ignore[arg-type]
     facts.evaluation = shown
-    facts.off_policy = [
-        row for row in run.table("off_policy").to_pylist() if row["condition"] == "all"
-    ]
+    facts.off_policy = _off_policy(run, facts.twin)
     facts.offline_start = [
         row for row in run.table("offline_start").to_pylist() if row["condition"] == "all"
     ]
     facts.practice = run.table("practice").to_pylist()
     taught = run.table("teacher").to_pylist()
     facts.teacher = [row for row in taught if _clocks(row) == _clocks(taught[-1])]
-    if not facts.cells:
+    if not facts.cells and facts.twin:
         facts.missing.append("`restock eval` has not been run: success is of training only.")
     _add_panel(facts)
     if facts.visited:
         _add_floor(facts)
     return facts
+
+
+def _off_policy(run: Run, twin: bool) -> Rows:
+    """Estimates on held-out logs: of the policy kept, where nothing drove; else of the one before.
+
+    Of a run in the twin they are of the policy that began to drive there (`off_policy`).
+    """
+    kept = run.path / "eval" / "off_policy.parquet"
+    table = run.table("off_policy") if twin or not kept.is_file() else read_table(kept)
+    return [row for row in table.to_pylist() if row["condition"] == "all"]
 
 
 def _clocks(row: dict[str, Any]) -> tuple[int, int]:
@@ -154,6 +168,8 @@ def _add_panel(facts: Facts) -> None:
 
 def _add_floor(facts: Facts) -> None:
     layouts = facts.config["config"].get("env", {}).get("layouts", DEFAULT)
+    if not facts.twin and layouts == DEFAULT:  # the logs are of another floor
+        return
     try:
         floors = open_floors(layouts)
     except RestockError as error:

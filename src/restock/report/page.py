@@ -5,6 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
+from restock.report import logs_alone
 from restock.report.actions import actions_section
 from restock.report.blocks import span, words
 from restock.report.capacity import capacity_section
@@ -18,7 +19,7 @@ from restock.report.twin_gap import run_section
 def page(facts: Facts) -> dict[str, Any]:
     """Everything the template asks for."""
     sections = [
-        success(facts),
+        success(facts) if facts.twin else logs_alone.judged_section(facts),
         sampled(facts),
         practice_section(facts),
         actions_section(facts),
@@ -43,6 +44,8 @@ def page(facts: Facts) -> dict[str, Any]:
 
 
 def _headline(facts: Facts) -> str:
+    if not facts.twin:
+        return logs_alone.headline(facts)
     cells = facts.clean_cells()
     if not cells:
         return f"Run {facts.run.name}: trained, not yet evaluated"
@@ -59,6 +62,11 @@ def _headline(facts: Facts) -> str:
 
 def _lead(facts: Facts) -> str:
     last = facts.loss[-1]
+    if not facts.twin:
+        return (
+            f"A DQN trained on logs alone, without a twin, for {last['gradient_steps']:,} updates"
+            f" in {span(last['wall_s'])}. Nothing has driven yet."
+        )
     fed = "logs and fresh experience" if facts.panel is not None else "fresh experience alone"
     text = (
         f"A DQN trained on {fed} for {last['env_steps']:,} environment steps and"
@@ -80,6 +88,12 @@ def _cards(facts: Facts) -> list[dict[str, str]]:
     if facts.panel is not None:
         header = facts.panel.header
         cards.append({"value": f"{header.rows:,}", "label": f"logged rows in panel {header.id}"})
+    if not facts.twin:
+        return [
+            *cards,
+            {"value": f"{facts.loss[-1]['gradient_steps']:,}", "label": "updates"},
+            {"value": facts.target_rule, "label": "target rule"},
+        ]
     cards += [
         {
             "value": f"{replay.get('ring_capacity', 0):,}",

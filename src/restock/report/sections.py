@@ -14,12 +14,12 @@ from restock.report.blocks import (
     Section,
     Table,
     count,
-    estimate,
     pretty,
     span,
     words,
 )
 from restock.report.facts import CELL_M, NO_GOAL, Facts, evaluation_bias
+from restock.report.logs_alone import table as off_policy_table
 
 
 def success(facts: Facts) -> Section | None:
@@ -216,28 +216,8 @@ def learning(facts: Facts) -> Section:
             "A low loss alone says little: a frozen target has the lowest loss of all.",
         )
     )
-    tables = [_off_policy(facts.off_policy)] if facts.off_policy else []
+    tables = [off_policy_table(facts.off_policy)] if facts.off_policy and facts.twin else []
     return Section("learning", "How did it learn?", figures=figures, two=True, tables=tables)
-
-
-def _off_policy(rows: Rows) -> Table:
-    """Off-policy estimates, where a run has them."""
-    shown = [
-        {
-            "measure": row["measure"],
-            "estimator": row["estimator"],
-            "value [95 %]": estimate(row),
-            "episodes": row["episodes"],
-        }
-        for row in rows
-    ]
-    return Table(
-        shown,
-        {"episodes"},
-        title="Off-policy evaluation on held-out logs, before it drove",
-        caption="Over all conditions; an estimate is refused where the weights leave too few"
-        " episodes to say.",
-    )
 
 
 def critic(facts: Facts) -> Section | None:

@@ -200,7 +200,8 @@ def _print(
         if result is not None:
             mean = result.success_mean if result.success else "no goal"
             rows.append({"policy": name, **result.success, "mean": mean})
-    print_table(rows, title="success on the fixed episodes, greedy")
+    if rows:  # else nothing drove
+        print_table(rows, title="success on the fixed episodes, greedy")
     if flushed is not None:
         say(
             f"recording {flushed.recording_id}, {flushed.episodes:,} episodes of the twin with"
@@ -208,5 +209,5 @@ def _print(
         )
     say(
         f"{outcome.env_steps:,} environment steps and {outcome.gradient_steps:,} updates in"
-        f" {outcome.wall_s:.0f} s\nnext: restock eval {path}"
+        f" {outcome.wall_s:.0f} s\nnext: restock eval {path}{'' if rows else ' --on-logs own'}"
     )
