@@ -2,9 +2,9 @@
 
 A profile is a TOML file: `name`, the shipped `conditions` and `exposures` it uses, `[[condition]]`
 of its own, `[task]`, `[goal]` (logged, or by hindsight), `[clock]`, `[episodes]`, `[inputs.*]`
-(which topic fills what), `[frames]` (poses from transforms), `[signals.*]` (custom columns),
-`[tags]` (whose drive it is), `[robot]` (what the twin builds) and `[[zone]]` (named rectangles
-of the map).
+(which topic fills what), `[frames]` (poses from transforms), `[motion]` (speeds from poses),
+`[signals.*]` (custom columns), `[tags]` (whose drive it is), `[robot]` (what the twin builds) and
+`[[zone]]` (named rectangles of the map).
 `load_profile("warehouse_amr")` reads one that comes with Restock, `load_profile("my_robot.toml")`
 one of yours.
 """
@@ -77,6 +77,7 @@ FALLBACKS: dict[str, str] = {
 MOTION = "nav_msgs/msg/Odometry"  # what was measured: commands are of other types
 COMMAND_FALLBACK = "the measured motion of {topic} in place of commands"
 POSE_FALLBACK = "from transforms, by [frames]"
+WHEELS_FALLBACK = "speeds from the poses of the last {window_s:g} s: slip cannot be seen"
 ROUTE_FALLBACK = "none: the task has no goal, progress is forward displacement"
 HINDSIGHT = {
     "goal": "by hindsight: where the drive stopped, turned back or came by often",
@@ -98,7 +99,7 @@ class Inputs(Checked, frozen=True):
     """The `[inputs]` of a profile."""
 
     command: Input
-    wheels: Input
+    wheels: Input | None = None  # None: speeds from poses, by [motion]
     pose: Input | None = None
     scan: Input | None = None
     imu: Input | None = None
@@ -149,6 +150,12 @@ class Frames(Checked, frozen=True):
             raise ValueError(f"fixed and base are the same frame: {self.base!r}")
 
 
+class Motion(Checked, frozen=True):
+    """The `[motion]` of a profile: how its speeds are known where there is no odometry."""
+
+    window_s: Annotated[float, Meta(gt=0, le=5)]  # of the poses that a speed is the slope of
+
+
 class Zone(Checked, frozen=True):
     """A named rectangle of the map: `box_m = [x0, y0, x1, y1]`."""
 
@@ -177,6 +184,7 @@ class Profile(Checked, frozen=True):
     episodes: Episodes = Episodes()
     zones: list[Zone] = msgspec.field(default_factory=list, name="zone")
     frames: Frames | None = None
+    motion: Motion | None = None
     signals: dict[str, CustomSignal] = msgspec.field(default_factory=dict)
     tags: TagRules = TagRules()
     noise: Noise = Noise()
@@ -221,6 +229,8 @@ class Profile(Checked, frozen=True):
         apart = {"tags", "noise", "robot"}
         if self.goal == GoalRules():  # rows are as before there was such a table
             apart |= {"goal"}
+        if self.motion is None:
+            apart |= {"motion"}
         rest = {key: value for key, value in values.items() if key not in apart}
         return hashlib.blake2b(msgspec.json.encode(rest), digest_size=6).hexdigest()
 
@@ -245,6 +255,8 @@ class Profile(Checked, frozen=True):
             fallbacks["command"] = COMMAND_FALLBACK.format(topic=self.inputs.command.topic)
         if self.inputs.pose is None:
             fallbacks["pose"] = POSE_FALLBACK
+        if self.motion is not None:
+            fallbacks["wheels"] = WHEELS_FALLBACK.format(window_s=self.motion.window_s)
         if self.task.goal == "none":
             fallbacks |= dict.fromkeys(("goal", "plan"), ROUTE_FALLBACK)
         elif self.goal.source == "hindsight":
@@ -337,6 +349,23 @@ def _check(profile: Profile, where: str) -> None:
             "`inputs.pose` is missing, and there is no `frames`",
             where=where,
             remedy="name the topic of the pose, or take it from /tf: [frames] fixed and base",
+        )
+    if (profile.inputs.wheels is None) == (profile.motion is None):
+        both = profile.motion is not None
+        raise ConfigError(
+            "`inputs.wheels` and `motion` are both given"
+            if both
+            else "`inputs.wheels` is missing, and there is no `motion`",
+            where=where,
+            remedy="keep one: wheels where odometry is recorded, motion for speeds from poses"
+            if both
+            else "name the topic of the odometry, or take speeds from poses: [motion] window_s",
+        )
+    if profile.motion is not None and "wheel_slip" in profile.shipped_conditions:
+        raise ConfigError(
+            "`conditions`: wheel_slip cannot be seen where speeds come from poses ([motion])",
+            where=where,
+            remedy="leave wheel_slip out, or name the odometry under [inputs.wheels]",
         )
     _check_goal(profile, where)
     proposed = profile.inputs.nav_command

@@ -15,6 +15,7 @@ from restock.ingest.propose.candidates import Candidate
 from restock.ingest.propose.clock_choice import ClockChoice, Gaps
 from restock.ingest.propose.footprint import Footprint
 from restock.ingest.propose.goal_choice import GoalChoice
+from restock.ingest.propose.motion_choice import MotionChoice
 from restock.ingest.propose.roles import KINDS, LATCHED, REQUIRED, FrameGuess, Kind, Roles
 from restock.ingest.propose.trial import Trial
 
@@ -42,6 +43,7 @@ class Evidence:
     roles: Roles
     frames: FrameGuess | None
     poses_from_frames: bool
+    motion: MotionChoice | None  # where no topic has the wheels' speeds
     commands: Commands
     clock: ClockChoice
     gaps: Gaps
@@ -66,7 +68,7 @@ def profile_lines(
         "#",
         *_topic_lines(recording, seen.roles, seconds),
         f'name = "{name}"',
-        'conditions = ["recovery", "near_collision", "wheel_slip", "blocked_aisle"]',
+        f"conditions = {json.dumps(_conditions(seen))}",
         'behaviour_policy = "unknown"  # who drove, where no topic says',
         "",
         *_task_lines(seen, trial),
@@ -76,10 +78,14 @@ def profile_lines(
     for role, fitting in seen.roles.items():
         if role == "pose" and seen.poses_from_frames:
             lines += ["# [inputs.pose]  # from transforms, by [frames]", ""]
+        elif role == "wheels" and seen.motion is not None and not seen.motion.problem:
+            lines += ["# [inputs.wheels]  # no odometry seen; instead: [motion]", ""]
         else:
             lines += _input_lines(role, fitting, seen, trial)
     if seen.frames is not None:
         lines += seen.frames.lines(used=seen.poses_from_frames)
+    if seen.motion is not None and not seen.motion.problem:
+        lines += seen.motion.lines()
     if seen.signals:
         lines += [
             "# Custom signals: columns of the table, for conditions and queries. To have one, take",
@@ -90,6 +96,12 @@ def profile_lines(
         lines += ["# " + line for line in signal.toml(_max_age_s(signal.topic, seconds))] + [""]
     # Names are of a stranger: a line break in one starts no key.
     return [visible(line) for line in [*lines, *_ENDING]]
+
+
+def _conditions(seen: Evidence) -> list[str]:
+    """The shipped conditions that this robot's signals can show."""
+    slip = ["wheel_slip"] if seen.motion is None else []
+    return ["recovery", "near_collision", *slip, "blocked_aisle"]
 
 
 _ENDING = [

@@ -19,6 +19,7 @@ from restock.ingest.propose.candidates import candidates
 from restock.ingest.propose.clock_choice import Gaps, by_log_time, choose_clock
 from restock.ingest.propose.footprint import Footprint, footprint_of
 from restock.ingest.propose.goal_choice import GoalChoice
+from restock.ingest.propose.motion_choice import choose_motion
 from restock.ingest.propose.proposal_lines import Commands, Evidence, profile_lines
 from restock.ingest.propose.roles import (
     KINDS,
@@ -39,9 +40,8 @@ LOG_TIME = 'alignment = "log_time"'  # as refusals of header stamps say
 # What a recording lacks -> what to do about it.
 REMEDIES = {
     "command": "record the topic that the robot is driven by (geometry_msgs/msg/Twist)",
-    "wheels": "record the robot's odometry (nav_msgs/msg/Odometry), or name a topic with its"
-    " measured speed and yaw rate as [inputs.wheels]",
-    "pose": "record a localisation, odometry, or the transforms of /tf and /tf_static",
+    "pose": "nothing says where the robot is; record a localisation, odometry, or the transforms"
+    " of /tf and /tf_static",
 }
 INSTEAD_OF_COMMANDS = (
     "; or, where the measured motion may stand in for commands, --odometry-as-command"
@@ -88,9 +88,11 @@ def propose_profile(
         if role == "command" and seen.roles["wheels"]:
             remedy += INSTEAD_OF_COMMANDS
         problems.append(f"no topic for {role}, which every profile needs: {remedy}")
+    if seen.motion is not None and seen.motion.problem:
+        problems.append(seen.motion.problem)
     text = "\n".join(profile_lines(seen, name, problems))
     trial = Trial()
-    if not missing:
+    if not problems:
         trial = tried(recording, text)
         if trial.problem and LOG_TIME in trial.problem and seen.clock.alignment == STAMP:
             seen = replace(seen, clock=by_log_time(seen.clock, seen.gaps, trial.problem))
@@ -136,6 +138,9 @@ def gather(
     drifts = all(topic.type == MOTION for topic, _ in roles["pose"])
     framed = frames is not None and (frames.localised or not roles["pose"]) and drifts
     commands, gaps = _commands(recording, roles)
+    motion = None
+    if not roles["wheels"] and (framed or roles["pose"]):
+        motion = choose_motion(recording, roles, frames, framed=framed)
     best = [(role, *fitting[0]) for role, fitting in roles.items() if fitting]
     notes: list[str] = []
     if footprint is None:
@@ -145,6 +150,7 @@ def gather(
         roles,
         frames,
         framed,
+        motion,
         commands,
         choose_clock(
             recording,

@@ -33,6 +33,12 @@ class Kind:
 _NAVIGATION = ("nav", "move_base", "planner", "autonom", "cmd_vel_raw", "raw_cmd_vel")
 _BY_HAND = ("teleop", "joy", "key", "web", "remote")
 
+# A name of a pose that is not where the robot is.
+_ELSEWHERE = (
+    *("goal", "target", "initial", "waypoint", "click", "marker", "object", "human", "person"),
+    *("people", "dock", "desired", "setpoint", "reference", "camera", "joint", "gripper"),
+)
+
 # Best first.
 KINDS: dict[str, tuple[Kind, ...]] = {
     "command": (
@@ -54,16 +60,34 @@ KINDS: dict[str, tuple[Kind, ...]] = {
             "geometry_msgs/msg/PoseWithCovarianceStamped",
             _under("pose.pose", _POSE),
             ("amcl", "pose", "local"),
-            never=("initial", "goal"),
+            never=_ELSEWHERE,
         ),
         Kind(
             "geometry_msgs/msg/PoseStamped",
             _under("pose", _POSE),
             ("robot_pose", "tracked_pose", "slam", "pose"),
             must=True,
-            never=("goal", "target", "initial", "waypoint"),
+            never=_ELSEWHERE,
         ),
         Kind("nav_msgs/msg/Odometry", _under("pose.pose", _POSE), ("filtered", "map", "odom")),
+        # Of motion capture and the like, whatever their names.
+        Kind("geometry_msgs/msg/PoseStamped", _under("pose", _POSE), never=_ELSEWHERE),
+        Kind(
+            "geometry_msgs/msg/TransformStamped",
+            {
+                "x_m": "transform.translation.x",
+                "y_m": "transform.translation.y",
+                "orientation": "transform.rotation",
+            },
+            never=_ELSEWHERE,
+        ),
+        Kind("geometry_msgs/msg/Pose", _POSE, ("pose",), never=_ELSEWHERE),
+        Kind(
+            "geometry_msgs/msg/Pose2D",
+            {"x_m": "x", "y_m": "y", "yaw_rad": "theta"},
+            ("pose",),
+            never=_ELSEWHERE,
+        ),
     ),
     "wheels": (Kind("nav_msgs/msg/Odometry", _under("twist.twist", _TWIST), ("wheel", "odom")),),
     "imu": (
@@ -129,7 +153,7 @@ KINDS: dict[str, tuple[Kind, ...]] = {
 ODOMETRY_AS_COMMAND = (
     Kind("nav_msgs/msg/Odometry", _under("twist.twist", _TWIST), ("wheel", "odom")),
 )
-REQUIRED = ("command", "wheels", "pose")
+REQUIRED = ("command", "pose")
 FIXED_FRAMES = ("map", "odom", "world")  # best first
 BASE_FRAMES = ("base_link", "base_footprint", "base")
 LATCHED = ("goal", "plan", "behaviour_policy", "perturbation")

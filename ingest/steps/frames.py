@@ -200,6 +200,17 @@ class Tree:
             self._fill(out, rows, transforms, _way(source, parent), _way(fixed, parent))
         return out
 
+    def times(self, frame: str) -> list[Ints]:
+        """When a moving transform between `frame` and the fixed one was given, by segment."""
+        topics = self.edges.only({frame, self.frames.fixed}).topics
+        moving = [name for name in topics if name.split(" ", 1)[0] == self.frames.topic]
+        return [
+            np.unique(
+                np.concatenate([np.zeros(0, np.int64), *(s.topics[n].stamp_ns for n in moving)])
+            )
+            for s in self.segments
+        ]
+
     def way(self, frame: str, time: Sequence[Ints]) -> list[tuple[str, str, int, int]]:
         """The transforms from `frame` to the fixed frame at one time.
 

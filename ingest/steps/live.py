@@ -161,10 +161,13 @@ class LiveObserver:
     def _tick(self, stamp_ns: int) -> None:
         """Let go of what neither this tick holds nor a later one will."""
         self._before_ns, self._ticked = stamp_ns, True
+        motion, pose = self.profile.motion, self.profile.inputs.pose
         for topic, messages in self._buffers.items():
             known = [message.stamp_ns for message in messages if message.stamp_ns <= stamp_ns]
             if known:
                 newest = max(known)
+                if motion is not None and pose is not None and topic == pose.topic:
+                    newest -= round(motion.window_s * NS)  # speeds are of the poses before
                 self._buffers[topic] = [m for m in messages if m.stamp_ns >= newest]
 
     def _commands(self, ticks: Sequence[int]) -> tuple[TopicColumns, Samples]:

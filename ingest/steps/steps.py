@@ -24,6 +24,7 @@ from restock.ingest.steps.aligned_inputs import AlignedInputs, align_inputs
 from restock.ingest.steps.clearance import BEAMS, SECTORS, scan_reduction
 from restock.ingest.steps.clocks import TopicClock, topic_clocks
 from restock.ingest.steps.custom_columns import Custom, custom_signals
+from restock.ingest.steps.motion import motion_at
 from restock.ingest.steps.routing import LARGEST, Routing, plan_ends, plan_problems, same_goals
 from restock.ingest.task.hindsight import missions
 from restock.ingest.task.perturbation_columns import Perturbed
@@ -125,7 +126,7 @@ class Filling:
             "command", speed_mps="command_speed_mps", yaw_rate_radps="command_yaw_rate_radps"
         )
         self._pose()
-        self._numbers("wheels", speed_mps="wheel_speed_mps", yaw_rate_radps="wheel_yaw_rate_radps")
+        lateral_by_poses = self._wheels()
         if "imu" in self.inputs.by_name:
             self._numbers("imu", yaw_rate_radps="gyro_yaw_rate_radps", accel_x_mps2="accel_x_mps2")
         else:
@@ -145,6 +146,9 @@ class Filling:
         forward, lateral = localised_velocity(
             signals, {name: signals[name][before] for name in signals if name.startswith("pose_")}
         )
+        if lateral_by_poses is not None:
+            # Speeds of one and the same poses: no second witness, so never slip.
+            forward, lateral = signals["wheel_speed_mps"].copy(), lateral_by_poses
         signals |= {"localised_speed_mps": forward, "localised_lateral_mps": lateral}
         came = [
             came_nearer(self.task, *({name: signals[name][at] for name in SCANNED} for at in pair))
@@ -228,6 +232,24 @@ class Filling:
         sane = np.abs(values) <= LARGEST  # False for NaN
         self._mark_invalid(~sane, f"{name}: not finite")
         self.signals[signal] = np.where(sane & known, values, 0.0)
+
+    def _wheels(self) -> F64 | None:
+        """The wheels' speeds; where they come from poses, the speed sideways (T,) as well."""
+        motion = self.profile.motion
+        if motion is None:
+            speeds = {"speed_mps": "wheel_speed_mps", "yaw_rate_radps": "wheel_yaw_rate_radps"}
+            self._numbers("wheels", **speeds)
+            return None
+        jump_m = self.profile.episodes.max_pose_jump_m
+        parts = [
+            motion_at(poses, ticks, motion.window_s, jump_m)
+            for poses, ticks in zip(self.aligned.poses(), self.aligned.ticks, strict=True)
+        ]
+        for signal, name in (("speed_mps", "forward_mps"), ("yaw_rate_radps", "yaw_rate_radps")):
+            column = np.concatenate([getattr(part, name) for part in parts])
+            self._set("wheels", f"wheel_{signal}", column, np.ones(len(column), np.bool_))
+        self._mark_reasons("wheels", np.concatenate([part.problem for part in parts]))
+        return np.concatenate([part.lateral_mps for part in parts])
 
     def _pose(self) -> None:
         if "pose" in self.inputs.by_name:

@@ -154,7 +154,7 @@ def test_a_proposal_says_what_no_topic_fills(tmp_path, capsys):
     class Blind(Drive):
         def topics(self):
             topics = super().topics()
-            del topics["/odom"], topics["/plan"], topics["/imu"]
+            del topics["/odom"], topics["/plan"], topics["/imu"], topics["/amcl_pose"]
             return topics
 
     bag = write_bag(Blind(), tmp_path / "bag")
@@ -163,10 +163,10 @@ def test_a_proposal_says_what_no_topic_fills(tmp_path, capsys):
     assert "MISSING, and required" in out
     assert 'source = "hindsight"' in out
     assert "# [inputs.imu]  # no topic seen; instead: gyro yaw rate taken from the wheels" in out
-    assert "no topic of nav_msgs/msg/Odometry." in out
-    assert "no topic for wheels" in err
+    assert "or transforms that join two frames" in out
+    assert "no topic for pose" in err
     assert main(["profile", "new", str(bag), "--json"]) == 3
-    assert json.loads(capsys.readouterr().out)["missing"] == ["wheels"]
+    assert json.loads(capsys.readouterr().out)["missing"] == ["pose"]
 
 
 def test_checking_a_profile_that_does_not_fit(bag, tmp_path, capsys):

@@ -188,6 +188,11 @@ def measured(table: pa.Table, recordings: pa.Table) -> Tables:
     return table, replaced(recordings, "stand_ins", stand_ins)
 
 
+def by_poses(table: pa.Table, recordings: pa.Table) -> Tables:
+    stand_ins = [[{"input": "wheels", "instead": "speeds from poses"}], []]
+    return table, replaced(recordings, "stand_ins", stand_ins)
+
+
 def far_operator(table: pa.Table, recordings: pa.Table) -> Tables:
     operator = rows_where(table, "behaviour_policy", "operator")
     return replaced(table, "action_residual", np.where(operator, 0.4, 0.0)), recordings
@@ -280,6 +285,7 @@ PLANTS: list[tuple[str, Plant, int, dict[str, object]]] = [
     ("unsafe_data", bumping_operator, 1, {"behaviour_policy": "operator"}),
     ("dropped_ticks", many_drops, 1, {"dropped": 2000}),
     ("odometry_as_command", measured, 1, {"instead": "odometry"}),
+    ("speeds_from_poses", by_poses, 1, {"instead": "speeds from poses"}),
     ("far_actions", far_operator, 1, {"behaviour_policy": "operator", "far_share": 1.0}),
     ("repeated_steps", bag_and_a_part_of_it, 1, {"same_as_file": "logs/part.mcap", "rows": 60}),
     ("signal_drift", worn_wheel, 2, {"signal": "odometry_scale", "scope": "alone"}),

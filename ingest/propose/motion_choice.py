@@ -1,0 +1,132 @@
+"""Speeds from poses: over how long a window, by how often the poses come and how they scatter.
+
+How far a pose scatters is found from third differences, which no smooth motion has: of white noise
+of size s they are s times the root of 20. A slope over a window of n poses then scatters by
+s / period x sqrt(12 / (n (n² - 1))); the shortest window in which it is small enough is proposed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from restock.arrays import F64
+from restock.ingest.containers.recording import Recording
+from restock.ingest.profile.profile import Clock, Frames
+from restock.ingest.propose.roles import FrameGuess, Roles
+from restock.ingest.steps.align import align
+from restock.ingest.steps.frames import FIELDS, Edges, Tree
+from restock.ingest.steps.motion import PoseSeries
+from restock.ingest.task.signals import wrap_angle, yaw_of
+
+SMALL_MPS, SMALL_RADPS = 0.04, 0.08  # how far a speed may scatter
+SHORTEST_S, LONGEST_S = 0.2, 2.0
+LEAST_POSES = 3
+LEAST_CHANGES = 20
+
+
+@dataclass(frozen=True)
+class MotionChoice:
+    """The `[motion]` that is proposed, or why there can be none."""
+
+    window_s: float
+    period_s: float  # between two poses, mostly
+    comments: tuple[str, ...] = ()
+    problem: str = ""
+
+    def lines(self) -> list[str]:
+        return [
+            "[motion]  # no odometry: speeds are the slope of the last poses; slip cannot be seen",
+            *(f"# {comment}" for comment in self.comments),
+            f"window_s = {self.window_s:g}",
+            "",
+        ]
+
+
+def choose_motion(
+    recording: Recording, roles: Roles, frames: FrameGuess | None, *, framed: bool
+) -> MotionChoice:
+    """How speeds are to come from the recording's poses."""
+    poses, source = pose_series(recording, roles, frames if framed else None)
+    gaps = np.diff(poses.stamp_ns) * 1e-9
+    period, usual = (float(np.percentile(gaps, p)) if len(gaps) else 0.0 for p in (50, 90))
+    least = (LEAST_POSES - 1) * usual * 1.1
+    if len(poses) < LEAST_POSES or least > LONGEST_S:
+        span = recording.span_ns or (0, 0)
+        problem = (
+            f"no odometry, and {source} has {len(poses)} poses in {(span[1] - span[0]) * 1e-9:.0f}"
+            " s: too few, or too far apart, to tell speeds from;"
+            " record nav_msgs/msg/Odometry, or a pose at least every"
+            f" {LONGEST_S / LEAST_POSES:.1f} s"
+        )
+        return MotionChoice(0.0, period, problem=problem)
+    poses = _changes(poses)  # a transform that is held says nothing of noise
+    period = max(period, float(np.median(np.diff(poses.stamp_ns))) * 1e-9)
+    noise_m = float(np.hypot(_scatter(poses.x_m), _scatter(poses.y_m)) / np.sqrt(2))
+    noise_rad = _scatter(np.concatenate([[0.0], np.cumsum(wrap_angle(np.diff(poses.yaw_rad)))]))
+    window = float(np.ceil(max(SHORTEST_S, least) * 10) / 10)
+    while window < LONGEST_S and not _small(noise_m, noise_rad, period, window):
+        window = round(window + 0.1, 1)
+    speed, turn = (_slope_scatter(noise, period, window) for noise in (noise_m, noise_rad))
+    comments = (
+        f"{source} comes every {period:.3g} s and scatters by {noise_m * 1e3:.1f} mm and"
+        f" {noise_rad * 1e3:.1f} mrad:",
+        f"over {window:g} s that is {speed:.3f} m/s and {turn:.3f} rad/s; speeds are {window / 2:g}"
+        " s late.",
+    )
+    return MotionChoice(window, period, comments)
+
+
+def pose_series(
+    recording: Recording, roles: Roles, frames: FrameGuess | None
+) -> tuple[PoseSeries, str]:
+    """Every pose at its log time, and where it is from in words."""
+    if frames is not None:
+        usual = Frames(fixed=frames.fixed, base=frames.base)
+        topics = [t for t in (usual.topic, usual.static_topic) if t in recording.topics]
+        edges = Edges.of(usual, recording.read({name: list(FIELDS) for name in topics}))
+        edges = edges.only({usual.base, usual.fixed})
+        segments, _ = align(edges.topics, Clock(alignment="log_time"))
+        tree = Tree(usual, edges, segments)
+        times = tree.times(usual.base)
+        at = tree.place(usual.base, times)
+        x, y = (np.where(at.problem == "", column, np.nan) for column in at.translation_m.T[:2])
+        series = PoseSeries.of(np.concatenate(times), x, y, at.yaw_rad)
+        return series, f"{frames.fixed} -> {frames.base} of {usual.topic}"
+    topic, kind = roles["pose"][0]
+    position = [kind.fields["x_m"], kind.fields["y_m"]]
+    turned = kind.fields.get("orientation")
+    turn = [f"{turned}.{axis}" for axis in "xyzw"] if turned else [kind.fields["yaw_rad"]]
+    columns = recording.read({topic.name: [*position, *turn]})[topic.name]
+    x, y, *parts = (np.asarray(columns.fields[p], np.float64) for p in (*position, *turn))
+    yaw = yaw_of(*parts) if turned else parts[0]
+    order = np.argsort(columns.log_time_ns, kind="stable")
+    return PoseSeries.of(columns.log_time_ns[order], x[order], y[order], yaw[order]), topic.name
+
+
+def _changes(poses: PoseSeries) -> PoseSeries:
+    """Those that differ from the one before, if there are enough of them to tell noise by."""
+    columns = (poses.x_m, poses.y_m, poses.yaw_rad)
+    new = np.concatenate([[True], np.any([np.diff(column) != 0 for column in columns], axis=0)])
+    if new.sum() < LEAST_CHANGES:
+        return poses
+    return PoseSeries(poses.stamp_ns[new], *(column[new] for column in columns))
+
+
+def _scatter(values: F64) -> float:
+    """The standard deviation of white noise on a smooth curve, outliers aside."""
+    third = np.diff(values, n=3)
+    return float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20)) if len(third) else 0.0
+
+
+def _slope_scatter(noise: float, period_s: float, window_s: float) -> float:
+    count = max(np.floor(window_s / period_s) + 1, 2)
+    return float(noise / period_s * np.sqrt(12 / (count * (count**2 - 1))))
+
+
+def _small(noise_m: float, noise_rad: float, period_s: float, window_s: float) -> bool:
+    return (
+        _slope_scatter(noise_m, period_s, window_s) <= SMALL_MPS
+        and _slope_scatter(noise_rad, period_s, window_s) <= SMALL_RADPS
+    )

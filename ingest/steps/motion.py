@@ -1,0 +1,99 @@
+"""Speeds from poses, where a robot has no odometry: the slope of the poses just before a tick.
+
+A straight line is fitted to the poses of the last `window_s` up to the latest one at the tick, none
+later. What it says is the motion in the middle of that window, half of it ago: a longer window
+takes off more of the localiser's noise, and says later what happened. A tick whose window holds
+fewer than two poses, or a jump (the localiser found the robot elsewhere), has no speed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.arrays import F64, Bools, Ints
+from restock.ingest.task.signals import wrap_angle
+
+_CHUNK = 4096  # ticks at a time: bounds memory
+
+
+@dataclass(frozen=True)
+class PoseSeries:
+    """The poses of one stretch of a recording, in the order of their stamps."""
+
+    stamp_ns: Ints  # (N,) ascending
+    x_m: F64
+    y_m: F64
+    yaw_rad: F64
+
+    @classmethod
+    def of(cls, stamp_ns: Ints, x_m: F64, y_m: F64, yaw_rad: F64) -> PoseSeries:
+        """Those that are finite; of equal stamps the last."""
+        keep = np.isfinite(x_m) & np.isfinite(y_m) & np.isfinite(yaw_rad)
+        keep[:-1] &= np.diff(stamp_ns) > 0
+        return cls(stamp_ns[keep], x_m[keep], y_m[keep], yaw_rad[keep])
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Speeds at T ticks, in the body frame of the middle of each window."""
+
+    forward_mps: F64
+    lateral_mps: F64
+    yaw_rate_radps: F64
+    problem: NDArray[Any]  # (T,) why there is none, or ""
+
+
+def motion_at(poses: PoseSeries, tick_ns: Ints, window_s: float, max_jump_m: float) -> Motion:
+    """The motion at ticks (T,) by the poses of the `window_s` before each tick's latest one."""
+    count = len(tick_ns)
+    out = Motion(np.zeros(count), np.zeros(count), np.zeros(count), np.full(count, "", object))
+    end = np.searchsorted(poses.stamp_ns, tick_ns, "right")
+    latest = np.maximum(end - 1, 0)
+    if not len(poses):
+        out.problem[:] = "no pose yet"
+        return out
+    begin = np.searchsorted(poses.stamp_ns, poses.stamp_ns[latest] - round(window_s * 1e9))
+    begin = np.where(end > 0, begin, end)
+    few = end - begin < 2
+    out.problem[few] = f"fewer than two poses within {window_s:g} s"
+    jumps = np.hypot(np.diff(poses.x_m), np.diff(poses.y_m)) > max_jump_m
+    before = np.concatenate([[0], np.cumsum(jumps)])  # jumps up to each pose
+    jumped = ~few & (before[latest] > before[np.minimum(begin, len(poses) - 1)])
+    out.problem[jumped] = f"a pose jump within {window_s:g} s"
+    turned = np.concatenate([[0.0], np.cumsum(wrap_angle(np.diff(poses.yaw_rad)))])
+    heading = poses.yaw_rad[:1] + turned  # without the wrap
+    usable = np.flatnonzero(~few & ~jumped)
+    for start in range(0, len(usable), _CHUNK):
+        rows = usable[start : start + _CHUNK]
+        _fill(out, rows, poses, heading, begin[rows], end[rows])
+    return out
+
+
+def _fill(out: Motion, rows: Ints, poses: PoseSeries, heading: F64, begin: Ints, end: Ints) -> None:
+    """The slopes of the poses from `begin` to before `end`, into these rows."""
+    most = int((end - begin).max())
+    at = begin[:, None] + np.arange(most)  # (R, P)
+    inside: Bools = at < end[:, None]
+    at = np.minimum(at, len(poses) - 1)
+    weight = inside / inside.sum(axis=1, keepdims=True)
+    since = (poses.stamp_ns[at] - poses.stamp_ns[end - 1][:, None]) * 1e-9
+    since -= (since * weight).sum(axis=1, keepdims=True)
+    spread = (since**2 * weight).sum(axis=1)
+
+    def slope(values: F64) -> F64:
+        column = values[at] - values[end - 1][:, None]
+        return np.asarray((since * column * weight).sum(axis=1) / spread, np.float64)
+
+    vx, vy = slope(poses.x_m), slope(poses.y_m)
+    ahead = (heading[at] * weight).sum(axis=1)
+    cos, sin = np.cos(ahead), np.sin(ahead)
+    out.forward_mps[rows] = cos * vx + sin * vy
+    out.lateral_mps[rows] = cos * vy - sin * vx
+    out.yaw_rate_radps[rows] = slope(heading)

@@ -1,0 +1,156 @@
+"""Speeds from poses, where a robot has no odometry."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.driven_robot import SPEED_MPS, Drive, write_bag
+from support.paths import SHARED
+
+from restock.cli import main
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.steps.motion import PoseSeries, motion_at
+from restock.ingest.steps.needs import read_topics
+from restock.ingest.steps.steps import steps_of
+
+NS = 10**9
+
+
+def circle(stamps_s: Any, speed: float, turn: float, noise: float = 0.0, seed: int = 0) -> Any:
+    """Poses on a circle through the origin, and white noise on them."""
+    rng, yaw = np.random.default_rng(seed), np.asarray(stamps_s) * turn
+    radius = speed / turn
+    x, y = radius * np.sin(yaw), radius * (1 - np.cos(yaw))
+    stamps = np.rint(np.asarray(stamps_s) * NS).astype(np.int64)
+    x, y, yaw = (column + rng.normal(0, noise, len(stamps)) for column in (x, y, yaw))
+    return PoseSeries.of(stamps, x, y, np.arctan2(np.sin(yaw), np.cos(yaw)))
+
+
+@given(
+    seed=st.integers(0, 1000),
+    speed=st.floats(-1, 1),
+    turn=st.floats(0.2, 2),
+    window=st.sampled_from([0.2, 0.5, 1.0]),
+)
+def test_it_is_the_slope_of_a_line_through_the_last_poses(seed, speed, turn, window):
+    rng = np.random.default_rng(seed)
+    poses = circle(np.cumsum(rng.uniform(0.02, 0.12, 80)), speed, turn, 0.01, seed)
+    ticks = np.arange(0, 5 * NS, NS // 10)
+    found = motion_at(poses, ticks, window, 1.0)
+    for index, tick in enumerate(ticks.tolist()):  # one by one, as one would write it down
+        before = [i for i, stamp in enumerate(poses.stamp_ns.tolist()) if stamp <= tick]
+        used = [i for i in before if poses.stamp_ns[i] >= poses.stamp_ns[before[-1]] - window * NS]
+        assert (found.problem[index] != "") == (len(used) < 2)
+        if len(used) < 2:
+            continue
+        since = (poses.stamp_ns[used] - poses.stamp_ns[used[0]]) / NS
+        yaw = np.unwrap(poses.yaw_rad[used])
+        vx, vy, rate = (np.polyfit(since, c, 1)[0] for c in (poses.x_m[used], poses.y_m[used], yaw))
+        ahead = yaw.mean()
+        forward, left = (
+            vx * np.cos(ahead) + vy * np.sin(ahead),
+            vy * np.cos(ahead) - vx * np.sin(ahead),
+        )
+        assert found.forward_mps[index] == pytest.approx(forward, abs=1e-6)
+        assert found.lateral_mps[index] == pytest.approx(left, abs=1e-6)
+        assert found.yaw_rate_radps[index] == pytest.approx(rate, abs=1e-6)
+
+
+@given(seed=st.integers(0, 1000), known=st.integers(0, 79))
+def test_no_speed_sees_a_later_pose(seed, known):
+    rng = np.random.default_rng(seed)
+    poses = circle(np.cumsum(rng.uniform(0.02, 0.12, 80)), 0.5, 0.7, 0.01, seed)
+    now = poses.stamp_ns[known : known + 1]
+    past = PoseSeries(*(c[: known + 1] for c in vars(poses).values()))
+    for name, column in vars(motion_at(poses, now, 0.4, 1.0)).items():
+        assert column.tolist() == getattr(motion_at(past, now, 0.4, 1.0), name).tolist()
+
+
+def test_a_longer_window_takes_off_more_noise():
+    poses = circle(np.arange(0, 60, 0.05), 0.4, 0.5, 0.01)
+    ticks = np.arange(2 * NS, 59 * NS, NS // 5)
+    short, long = (motion_at(poses, ticks, w, 1.0).forward_mps.std() for w in (0.2, 0.8))
+    assert long < short / 4
+
+
+def test_a_jump_is_no_speed():
+    poses = circle(np.arange(0, 10, 0.05), 0.4, 0.5)
+    moved = PoseSeries.of(
+        poses.stamp_ns, poses.x_m + 3.0 * (poses.stamp_ns > 5 * NS), poses.y_m, poses.yaw_rad
+    )
+    ticks = np.arange(NS, 9 * NS, NS // 10)
+    found = motion_at(moved, ticks, 0.4, 1.0)
+    bad = (ticks > 5.05 * NS) & (ticks < 5.4 * NS)
+    assert set(found.problem[bad]) == {"a pose jump within 0.4 s"}
+    assert set(found.problem[ticks < 5 * NS]) == set(found.problem[ticks > 5.5 * NS]) == {""}
+    assert np.abs(found.forward_mps).max() < 0.5
+
+
+class NoOdometry(Drive):
+    def topics(self) -> dict[str, TopicColumns]:
+        topics = super().topics()
+        del topics["/odom"], topics["/goal_pose"], topics["/plan"]
+        return topics
+
+
+def test_a_robot_without_odometry_is_read_and_said(tmp_path, capsys):
+    bag, file, store = (
+        write_bag(NoOdometry(), tmp_path / "bag"),
+        tmp_path / "p.toml",
+        tmp_path / "s",
+    )
+    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
+    assert "# [inputs.wheels]  # no odometry seen; instead: [motion]" in file.read_text()
+    assert "wheel_slip" not in load_profile(file).shipped_conditions
+    assert main(["ingest", str(bag), "--profile", str(file), "--store", str(store)]) == 0
+    assert "no wheels: speeds from the poses of the last" in capsys.readouterr().out
+    query = "SELECT min(wheel_speed_mps) AS low, max(wheel_speed_mps) AS high FROM transitions"
+    assert main(["sql", str(store), query, "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)
+    assert row["low"] == pytest.approx(SPEED_MPS) == row["high"]
+    main(["audit", str(store), "--json"])
+    said = json.loads(capsys.readouterr().out)["audits"]
+    (found,) = [each for each in said if each["audit"] == "speeds_from_poses"]
+    assert (found["status"], found["rows"]) == ("warn", 1)
+
+
+def test_a_profile_has_wheels_or_motion(tmp_path, capsys):
+    bag, file = write_bag(NoOdometry(), tmp_path / "bag"), tmp_path / "p.toml"
+    main(["profile", "new", str(bag), "--out", str(file)])
+    text = file.read_text()
+    for wrong, what in (
+        (text.replace("[motion]", "# [motion]").replace("window_s", "# window_s"), "no `motion`"),
+        (text.replace('"near_collision"', '"wheel_slip"'), "wheel_slip cannot be seen"),
+        (text.replace("window_s = 0.", "window_s = -0."), "motion.window_s must be in"),
+    ):
+        file.write_text(wrong)
+        capsys.readouterr()
+        assert main(["profile", "check", str(file), str(bag)]) == 2
+        assert what in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
+def test_a_real_robot_in_motion_capture(tmp_path, capsys):
+    rows = []
+    for name in ("test_2026-02-19-10-53-01", "test_2026-02-19-10-53-01.bag"):
+        path, file = SHARED / "jackal-mocap" / name, tmp_path / f"{name}.toml"
+        assert main(["profile", "new", str(path), "--out", str(file)]) == 0
+        rows.append(_speeds(path, file))
+    assert len(rows[0]) == 266
+    assert np.array_equal(rows[0], rows[1])
+
+
+def _speeds(path: Path, profile: Path) -> Any:
+    with open_recording(path) as recording:
+        made = load_profile(profile)
+        steps = steps_of(made, read_topics(recording, made))
+    names = ("wheel_speed_mps", "wheel_yaw_rate_radps", "pose_x_m", "command_speed_mps")
+    return np.stack([steps.signals[name] for name in names], axis=1)
