@@ -78,8 +78,6 @@ def profile_lines(
     for role, fitting in seen.roles.items():
         if role == "pose" and seen.poses_from_frames:
             lines += ["# [inputs.pose]  # from transforms, by [frames]", ""]
-        elif role == "wheels" and seen.motion is not None and not seen.motion.problem:
-            lines += ["# [inputs.wheels]  # no odometry seen; instead: [motion]", ""]
         else:
             lines += _input_lines(role, fitting, seen, trial)
     if seen.frames is not None:
@@ -252,6 +250,8 @@ def _input_lines(
                 f"# [inputs.{role}]",
                 "",
             ]
+        if role == "wheels":
+            return ["# [inputs.wheels]  # no odometry seen; instead: speeds from poses", ""]
         fallback = FALLBACKS.get(role) or seen.goal.fallback(role)
         return [f"# [inputs.{role}]  # no topic seen; instead: {fallback}", ""]
     topic, kind = fitting[0]
