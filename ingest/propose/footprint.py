@@ -8,13 +8,10 @@ a parameter in `/parameter_events`.
 
 from __future__ import annotations
 
-import itertools
 import json
 import re
-import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +19,11 @@ from numpy.typing import NDArray
 from restock.errors import ConfigError
 from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import Ragged
-from restock.ingest.propose.roles import BASE_FRAMES
+from restock.ingest.propose.urdf import Description, Place, extent, read_description
 
 F64 = NDArray[np.float64]
-LARGEST_URDF = 4_000_000  # letters
+OUTLINE = ("fixed", "continuous")  # joints of what is always part of it; no arms
 SIZES_M = (0.02, 30.0)  # of a robot that this can be
-_RIGID = ("fixed", "continuous")  # joints of what is always part of the outline; no arms
 _POLYGONS = ("geometry_msgs/msg/PolygonStamped", "geometry_msgs/msg/Polygon")
 
 
@@ -82,19 +78,24 @@ def footprint_of(recording: Recording, scan_frame: str = "") -> tuple[Footprint 
     return None, notes
 
 
-def _descriptions(recording: Recording, frame: str, notes: list[str]) -> Iterator[Footprint]:
+def descriptions(recording: Recording) -> Iterator[tuple[str, str]]:
+    """The topics of robots' descriptions, and the last text of each."""
     for name, topic in recording.topics.items():
         if topic.skipped or not topic.expected or topic.type != "std_msgs/msg/String":
             continue
         if name.split("/")[-1] != "robot_description":
             continue
         texts = np.asarray(recording.read({name: ["data"]})[name].fields["data"], object)
-        for text in [str(text) for text in texts][-1:]:
-            found = of_urdf(text, frame, source=name)
-            if isinstance(found, str):
-                notes.append(f"{name}: {found}")
-            else:
-                yield found
+        yield from ((name, str(text)) for text in texts[-1:])
+
+
+def _descriptions(recording: Recording, frame: str, notes: list[str]) -> Iterator[Footprint]:
+    for name, text in descriptions(recording):
+        found = of_urdf(text, frame, source=name)
+        if isinstance(found, str):
+            notes.append(f"{name}: {found}")
+        else:
+            yield found
 
 
 def _polygons(recording: Recording) -> Iterator[Footprint]:
@@ -160,105 +161,38 @@ def of_polygon(points_m: F64, source: str) -> Footprint | None:
 
 def of_urdf(text: str, scan_frame: str = "", *, source: str) -> Footprint | str:
     """The outline that a robot's description has, or why there is none."""
-    if len(text) > LARGEST_URDF:
-        return f"{len(text):,} letters are too long for a robot's description"
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        return "a robot's description declares no entities"
-    try:
-        robot = ET.fromstring(text)  # no entities: checked above
-    except (ET.ParseError, ValueError) as error:
-        return f"is no XML ({error})"
-    links = {str(link.get("name")): link for link in robot.findall("link")}
-    base = next(
-        (name for word in BASE_FRAMES for name in links if name.split("/")[-1] == word), None
-    )
-    if base is None:
-        return f"has none of the links {', '.join(BASE_FRAMES)}"
-    places = _places(robot, base)
-    boxes = {name: _box(links[name], place) for name, place in places.items() if name in links}
-    known = {name: box for name, box in boxes.items() if box is not None}
-    body = [name for name in known if places[name].rigid]
-    if not body:
+    description = read_description(text)
+    if isinstance(description, str):
+        return description
+    shapes = outline(description)
+    if shapes is None:
         return "its base has no box, cylinder or sphere (a mesh's size is not in the recording)"
-    low = np.min([box[0] for box in known.values()], axis=0)
-    high = np.max([box[1] for box in known.values()], axis=0)
+    low, high, count = shapes
+    places = description.places(OUTLINE)
     length, width = (float(side) for side in (high - low)[:2])
     x, yaw = _lidar(places, scan_frame)
     return Footprint(
         length,
         width,
-        f"shapes of {len(known)} links in {source}",
+        f"shapes of {count} links in {source}",
         None if x is None else x - float(low[0] + high[0]) / 2,
         yaw,
     )
 
 
-@dataclass(frozen=True)
-class _Place:
-    """Where a link is in the base's frame."""
-
-    rotation: F64  # (3, 3)
-    at_m: F64  # (3,)
-    rigid: bool  # joined by fixed joints alone
-
-    def then(self, origin: ET.Element | None, *, rigid: bool = True) -> _Place:
-        xyz, rpy = (_three(None if origin is None else origin.get(key)) for key in ("xyz", "rpy"))
-        turn = _rotation(rpy)
-        return _Place(self.rotation @ turn, self.rotation @ xyz + self.at_m, self.rigid and rigid)
-
-
-def _places(robot: ET.Element, base: str) -> dict[str, _Place]:
-    """Every link that joints of the outline lead to from the base."""
-    children: dict[str, list[tuple[str, ET.Element]]] = {}
-    for joint in robot.findall("joint"):
-        parent, child = joint.find("parent"), joint.find("child")
-        if parent is not None and child is not None and joint.get("type") in _RIGID:
-            children.setdefault(str(parent.get("link")), []).append((str(child.get("link")), joint))
-    places = {base: _Place(np.eye(3), np.zeros(3), True)}
-    waiting = [base]
-    while waiting:
-        parent_name = waiting.pop()
-        for name, joint in children.get(parent_name, []):
-            if name not in places:
-                fixed = joint.get("type") == "fixed"
-                places[name] = places[parent_name].then(joint.find("origin"), rigid=fixed)
-                waiting.append(name)
-    return places
-
-
-def _box(link: ET.Element, place: _Place) -> tuple[F64, F64] | None:
-    """The lowest and highest corner of a link's collision shapes, else of those one sees."""
-    for kind in ("collision", "visual"):
-        boxes = [
-            box
-            for shape in link.findall(kind)
-            if (box := _extent(shape, place.then(shape.find("origin")))) is not None
-        ]
-        if boxes:
-            return np.min([low for low, _ in boxes], axis=0), np.max([h for _, h in boxes], axis=0)
-    return None
-
-
-def _extent(shape: ET.Element, place: _Place) -> tuple[F64, F64] | None:
-    geometry = shape.find("geometry")
-    if geometry is None:
+def outline(description: Description) -> tuple[F64, F64, int] | None:
+    """The lowest and highest corner of what moves with the base, and of how many links; or None."""
+    links, places = description.links, description.places(OUTLINE)
+    boxes = {name: extent(links[name], place) for name, place in places.items() if name in links}
+    known = {name: box for name, box in boxes.items() if box is not None}
+    if not any(places[name].rigid for name in known):
         return None
-    box, cylinder, sphere = (geometry.find(kind) for kind in ("box", "cylinder", "sphere"))
-    if box is not None:
-        half = np.abs(place.rotation) @ (_three(box.get("size")) / 2)
-    elif cylinder is not None:
-        radius, length = (_number(cylinder.get(key)) for key in ("radius", "length"))
-        axis = place.rotation[:, 2]
-        half = radius * np.sqrt(np.maximum(1 - axis**2, 0)) + length / 2 * np.abs(axis)
-    elif sphere is not None:
-        half = np.full(3, _number(sphere.get("radius")))
-    else:
-        return None
-    low, high = place.at_m - half, place.at_m + half
-    return (low, high) if np.isfinite(low).all() and np.isfinite(high).all() else None
+    low = np.min([box[0] for box in known.values()], axis=0)
+    high = np.max([box[1] for box in known.values()], axis=0)
+    return low, high, len(known)
 
 
-def _lidar(places: dict[str, _Place], frame: str) -> tuple[float | None, float | None]:
+def _lidar(places: dict[str, Place], frame: str) -> tuple[float | None, float | None]:
     """How far ahead of the base, and turned how, the lidar is."""
     frame = frame.strip("/")
     near = [n for n in places if n == frame or n.split("/")[-1] == frame.split("/")[-1]]
@@ -267,24 +201,3 @@ def _lidar(places: dict[str, _Place], frame: str) -> tuple[float | None, float |
     place = places[near[0]]
     x, yaw = float(place.at_m[0]), float(np.arctan2(place.rotation[1, 0], place.rotation[0, 0]))
     return (x, yaw) if np.isfinite([x, yaw]).all() else (None, None)
-
-
-def _rotation(rpy: F64) -> F64:
-    (sr, sp, sy), (cr, cp, cy) = np.sin(rpy), np.cos(rpy)
-    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-    return np.asarray(about_z @ about_y @ about_x, np.float64)
-
-
-def _three(text: str | None) -> F64:
-    numbers = [_number(part) for part in itertools.islice((text or "").split(), 3)]
-    return np.array([*numbers, *[0.0] * (3 - len(numbers))])
-
-
-def _number(text: Any) -> float:
-    """A number of a description; NaN, which no outline survives, for what is none."""
-    try:
-        return float(text) if abs(float(text)) < 1e6 else float("nan")
-    except (TypeError, ValueError):
-        return float("nan")

@@ -16,6 +16,7 @@ from restock.ingest.propose.clock_choice import ClockChoice, Gaps
 from restock.ingest.propose.footprint import Footprint
 from restock.ingest.propose.goal_choice import GoalChoice
 from restock.ingest.propose.motion_choice import MotionChoice
+from restock.ingest.propose.robot_lines import RobotProposal
 from restock.ingest.propose.roles import KINDS, LATCHED, REQUIRED, FrameGuess, Kind, Roles
 from restock.ingest.propose.trial import Trial
 
@@ -52,6 +53,7 @@ class Evidence:
     footprint_notes: list[str]
     goal: GoalChoice
     signals: list[Candidate]
+    robot: RobotProposal
 
 
 def profile_lines(
@@ -73,6 +75,7 @@ def profile_lines(
         "",
         *_task_lines(seen, trial),
         *seen.goal.table_lines(),
+        *_robot_lines(seen),
         *_clock_lines(seen.clock, trial),
     ]
     for role, fitting in seen.roles.items():
@@ -150,10 +153,6 @@ def _topic_lines(recording: Recording, roles: Roles, seconds: float) -> list[str
 def _task_lines(seen: Evidence, trial: Trial) -> list[str]:
     roles, commands = seen.roles, seen.commands
     low, high = _lidar_range(seen.recording, roles)
-    speed, turn = commands.speed_mps, commands.yaw_rate_radps
-    actions = [(0.0, 0.0), (speed / 2, 0.0), (speed, 0.0)]
-    actions += [(0.8 * speed, 0.6 * turn), (0.8 * speed, -0.6 * turn), (0.0, turn), (0.0, -turn)]
-    actions += [(-speed / 2, 0.0)] if commands.backs else []
     kind = "speeds" if commands.measured else "commands"
     origin = f"from {commands.count} {kind} of {commands.topic}" if commands.count else "a guess"
     return [
@@ -164,11 +163,25 @@ def _task_lines(seen: Evidence, trial: Trial) -> list[str]:
         f"range_min_m = {low:g}",
         f"range_max_m = {high:g}  # lidar ranges beyond it count as free",
         f"actions = [  # (m/s, rad/s), {origin}; the first must be stop",
-        *(f"  [{v:.3g}, {w:.3g}]," for v, w in actions),
+        *(f"  [{v:.3g}, {w:.3g}]," for v, w in _actions(commands)),
         "]",
         "",
         *_body_lines(seen, trial),
     ]
+
+
+def _actions(commands: Commands) -> list[tuple[float, float]]:
+    """Speeds (m/s) and yaw rates (rad/s) by the fastest that were commanded; the first is stop."""
+    speed, turn = commands.speed_mps, commands.yaw_rate_radps
+    actions = [(0.0, 0.0), (speed / 2, 0.0), (speed, 0.0)]
+    actions += [(0.8 * speed, 0.6 * turn), (0.8 * speed, -0.6 * turn), (0.0, turn), (0.0, -turn)]
+    actions += [(-speed / 2, 0.0)] if commands.backs else []
+    return actions
+
+
+def _robot_lines(seen: Evidence) -> list[str]:
+    """What the twin builds; the actions are within its limits."""
+    return seen.robot.lines(*np.abs(_actions(seen.commands)).max(axis=0).tolist())
 
 
 def _bump_lines(recording: Recording, roles: Roles) -> list[str]:

@@ -9,6 +9,7 @@ each guess, and with all that might become custom signals, commented out.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from restock.ingest.propose.footprint import Footprint, footprint_of
 from restock.ingest.propose.goal_choice import GoalChoice
 from restock.ingest.propose.motion_choice import choose_motion
 from restock.ingest.propose.proposal_lines import Commands, Evidence, profile_lines
+from restock.ingest.propose.robot_lines import propose_robot, urdf_footprint
 from restock.ingest.propose.roles import (
     KINDS,
     LATCHED,
@@ -66,6 +68,7 @@ def propose_profile(
     name: str,
     *,
     footprint: Footprint | None = None,
+    urdf: Path | None = None,
     odometry_as_command: bool = False,
 ) -> Proposal:
     """A profile for recordings like this one.
@@ -74,9 +77,13 @@ def propose_profile(
         recording: what it is proposed from, and tried on.
         name: of the profile.
         footprint: the robot's outline, where it is known; else what the recording says of it.
+        urdf: a file that describes the robot, in place of the recording's own description.
         odometry_as_command: take the measured motion for commands where none was recorded.
+
+    Raises:
+        ConfigError: the URDF cannot be used; says why.
     """
-    seen = gather(recording, footprint, odometry_as_command=odometry_as_command)
+    seen = gather(recording, footprint, urdf, odometry_as_command=odometry_as_command)
     missing = [
         role
         for role in REQUIRED
@@ -122,7 +129,11 @@ def tried(recording: Recording, toml: str) -> Trial:
 
 
 def gather(
-    recording: Recording, footprint: Footprint | None, *, odometry_as_command: bool
+    recording: Recording,
+    footprint: Footprint | None,
+    urdf: Path | None = None,
+    *,
+    odometry_as_command: bool,
 ) -> Evidence:
     """What a recording says of its robot."""
     topics = {n: t for n, t in recording.topics.items() if t.skipped is None and t.expected}
@@ -143,8 +154,13 @@ def gather(
         motion = choose_motion(recording, roles, frames, framed=framed)
     best = [(role, *fitting[0]) for role, fitting in roles.items() if fitting]
     notes: list[str] = []
+    frame = _scan_frame(recording, roles)
+    scan = roles["scan"][0][0].name if roles["scan"] else None
+    robot = propose_robot(recording, scan, frame, urdf)
+    if footprint is None and urdf is not None:
+        footprint = urdf_footprint(urdf, frame)
     if footprint is None:
-        footprint, notes = footprint_of(recording, _scan_frame(recording, roles))
+        footprint, notes = footprint_of(recording, frame)
     return Evidence(
         recording,
         roles,
@@ -169,6 +185,7 @@ def gather(
             without={topic.name for role, topic, _ in best if role in SPENT},
             used={(topic.name, path) for _, topic, kind in best for path in kind.fields.values()},
         ),
+        robot,
     )
 
 

@@ -44,6 +44,9 @@ class ProfileCommand:
     footprint: Annotated[str | None, tyro.conf.arg(metavar="LxW")] = None
     """The robot's length and width in metres for `new`, as 0.6x0.5; without it from the recording's
     /robot_description or its costmap's footprint, else a guess."""
+    urdf: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """The robot's URDF for `new`: outline, wheels, mass and lidar, in place of the recording's
+    /robot_description. Write xacro out first; meshes are not read. See docs/robot.md."""
     odometry_as_command: bool = False
     """Let `new` take odometry for commands where none was recorded: what the robot did then stands
     for what it was told."""
@@ -81,6 +84,7 @@ class ProfileCommand:
                 recording,
                 re.sub(r"\W+", "_", stem).strip("_") or "robot",
                 footprint=footprint,
+                urdf=self.urdf,
                 odometry_as_command=self.odometry_as_command,
             )
         if self.out is not None:

@@ -1,0 +1,333 @@
+"""The robot that a description (URDF) has: its drive, wheels, mass, casters and lidar.
+
+A wheel is a link on a joint that turns without end about an axis across the robot. What the
+description does not have stays unknown, and what cannot be used is named: meshes (no other file is
+read), arms, steering, wheels that the twin has no drive for.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from restock.errors import ConfigError
+from restock.ingest.propose.urdf import F64, LONGEST, Description, Joint, Place, extent, number
+
+SMALLEST_M = 0.005  # of a wheel's radius
+MOST_ABOVE = 2  # joints that move above a wheel, as a suspension: more are an arm's
+ENDLESS_RAD = 6 * np.pi  # a joint that may turn so far is a wheel's
+AT_FLOOR_M = 0.012  # what is no higher above the floor stands on it
+USUAL_RADPS = (0.5, 60.0)  # a wheel's limit beyond this is a placeholder
+DRIVES = {  # words in the names of links and of simulators' plugins
+    "omnidirectional": ("mecanum", "omni_wheel", "omniwheel", "planar_move", "holonomic"),
+    "ackermann": ("ackermann",),
+    "skid_steer": ("skid_steer", "skidsteer"),
+}
+
+
+@dataclass(frozen=True)
+class DescribedRobot:
+    """Values of `[robot]` by their keys, what could not be used, or why there is no robot."""
+
+    values: dict[str, Any] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    problem: str | None = None
+
+
+@dataclass(frozen=True)
+class _Wheel:
+    joint: Joint
+    place: Place
+    radius_m: float  # NaN: its shape is a mesh, or it has none
+    swivels: bool  # a joint above it turns about the vertical without a limit: a caster
+    steers: bool  # … with one
+
+    @property
+    def x_m(self) -> float:
+        return float(self.place.at_m[0])
+
+    @property
+    def y_m(self) -> float:
+        return float(self.place.at_m[1])
+
+
+def read_urdf(path: Path) -> str:
+    """The text of a URDF file.
+
+    Raises:
+        ConfigError: it cannot be read, is too long, or is no text.
+    """
+    try:
+        with path.open("rb") as file:
+            content = file.read(4 * LONGEST + 1)
+        return content.decode("utf-8")
+    except OSError as error:
+        raise ConfigError(
+            f"cannot be read: {error.strerror}", where=str(path), remedy="check the path of --urdf"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(
+            f"is no URDF: {error}", where=str(path), remedy="give the robot's URDF, as XML in UTF-8"
+        ) from error
+
+
+def described_robot(
+    description: Description, middle_x_m: float, scan_frame: str = ""
+) -> DescribedRobot:
+    """The robot of a description whose outline's middle is `middle_x_m` ahead of its base."""
+    places = description.places()
+    wheels = _wheels(description, places)
+    driven = _driven(wheels)
+    if not driven:
+        return DescribedRobot(problem=_no_wheels(description, places, wheels))
+    notes: list[str] = []
+    radius = float(np.median([wheel.radius_m for wheel in driven]))
+    axles = sorted(_axles(driven, radius), reverse=True)
+    middle = (axles[0] + axles[-1]) / 2
+    drive = _drive(description, wheels, axles)
+    track = 2 * float(np.mean([abs(wheel.y_m) for wheel in driven]))
+    values: dict[str, Any] = {"drive": drive, "wheel_radius_m": radius, "track_m": track}
+    if len(axles) > 1:
+        values["wheelbase_m"] = axles[0] - axles[-1]
+    values["axle_x_m"] = middle - middle_x_m
+    masses = {name: _mass(link) for name, link in description.links.items() if name in places}
+    if (mass := sum(masses.values())) > 0:
+        values["mass_kg"] = mass
+        arms = _arms(description)
+        if arms:
+            notes.append(f"joints that the twin does not move: {', '.join(arms[:6])}")
+    else:
+        notes.append("no link has a mass")
+    floor = float(np.median([wheel.place.at_m[2] for wheel in driven])) - radius
+    boxes = {
+        name: box
+        for name, place in places.items()
+        if name in description.links and (box := extent(description.links[name], place))
+    }
+    if boxes:
+        values["height_m"] = max(float(high[2]) for _, high in boxes.values()) - floor
+    if drive == "differential":
+        rolling = {wheel.joint.child for wheel in driven}
+        casters = _casters(boxes, rolling, floor, middle)
+        if _stands(casters, values["axle_x_m"], values.get("height_m", radius * 4)):
+            values["casters_m"] = casters
+    if speed := _fastest(driven, radius):
+        values["max_speed_mps"] = speed
+    if lidar := _lidar_z(places, scan_frame, floor, notes):
+        values["lidar.z_m"] = lidar
+    meshes = _meshes(description, boxes)
+    if meshes:
+        notes.append(f"{meshes} links have meshes alone, whose size is in other files: left out")
+    rounded = {key: _rounded(value) for key, value in values.items()}
+    return DescribedRobot({k: v for k, v in rounded.items() if v is not None}, notes)
+
+
+def _wheels(description: Description, places: dict[str, Place]) -> list[_Wheel]:
+    above = {joint.child: joint for joint in description.joints}
+    ground = _ground(description, places)
+    found = []
+    for joint in description.joints:
+        place = places.get(joint.child)
+        if not _endless(joint) or place is None or not np.isfinite(place.at_m).all():
+            continue
+        if abs(_axis(joint, place)[1]) < 0.9:
+            continue
+        upward, seen, moving = above.get(joint.parent), {joint.child}, 0
+        swivels = steers = False
+        while upward is not None and upward.child not in seen:
+            seen.add(upward.child)
+            moving += upward.kind != "fixed"
+            turning = places.get(upward.child)
+            if turning is not None and abs(_axis(upward, turning)[2]) > 0.7:
+                swivels |= _endless(upward)
+                steers |= upward.kind == "revolute"
+            upward = above.get(upward.parent)
+        if moving > MOST_ABOVE:
+            continue
+        radius = _radius(description.links.get(joint.child))
+        if not radius > SMALLEST_M and ground is not None:  # a mesh
+            radius = float(place.at_m[2]) - ground
+        found.append(_Wheel(joint, place, radius, swivels, steers))
+    return found
+
+
+def _ground(description: Description, places: dict[str, Place]) -> float | None:
+    """How high the floor is: by name, else what the lowest shape stands on."""
+    for name, place in places.items():
+        if name.split("/")[-1] == "base_footprint":
+            return float(place.at_m[2])
+    links = description.links
+    boxes = [extent(links[name], place) for name, place in places.items() if name in links]
+    return min((float(box[0][2]) for box in boxes if box is not None), default=None)
+
+
+def _endless(joint: Joint) -> bool:
+    """Whether it turns without end, or as good as that."""
+    if joint.kind == "continuous":
+        return True
+    limit = joint.element.find("limit")
+    if joint.kind != "revolute" or limit is None:
+        return False
+    return bool(number(limit.get("upper")) - number(limit.get("lower")) > ENDLESS_RAD)
+
+
+def _axis(joint: Joint, place: Place) -> F64:
+    """The direction (3,) of a joint's axis in the base's frame, or zeros."""
+    axis = joint.element.find("axis")
+    text = "1 0 0" if axis is None else axis.get("xyz", "1 0 0")
+    direction = np.array([number(part) for part in text.split()[:3]])
+    length = float(np.linalg.norm(direction)) if len(direction) == 3 else 0.0
+    if not np.isfinite(length) or length < 1e-9 or joint.kind == "fixed":
+        return np.zeros(3)
+    return np.asarray(place.rotation @ direction / length, np.float64)
+
+
+def _radius(link: ET.Element | None) -> float:
+    for shape in () if link is None else (*link.findall("collision"), *link.findall("visual")):
+        for kind in ("cylinder", "sphere"):
+            if (found := shape.find(f"geometry/{kind}")) is not None:
+                return number(found.get("radius"))
+    return float("nan")
+
+
+def _driven(wheels: list[_Wheel]) -> list[_Wheel]:
+    """Those that drive: large ones that do not swivel, on both sides."""
+    able = [
+        wheel
+        for wheel in wheels
+        if wheel.radius_m > SMALLEST_M
+        and not wheel.swivels
+        and "caster" not in wheel.joint.child.lower()
+        and "castor" not in wheel.joint.child.lower()
+        and abs(wheel.y_m) > SMALLEST_M
+    ]
+    largest = max((wheel.radius_m for wheel in able), default=0.0)
+    able = [wheel for wheel in able if wheel.radius_m > 0.5 * largest]
+    sides = {wheel.y_m > 0 for wheel in able}
+    return able if len(sides) == 2 else []
+
+
+def _axles(driven: list[_Wheel], radius: float) -> list[float]:
+    """How far ahead each axle is."""
+    axles: list[list[float]] = []
+    for x in sorted(wheel.x_m for wheel in driven):
+        if axles and x - axles[-1][-1] < radius / 2:
+            axles[-1].append(x)
+        else:
+            axles.append([x])
+    return [float(np.mean(axle)) for axle in axles]
+
+
+def _drive(description: Description, wheels: list[_Wheel], axles: list[float]) -> str:
+    if len(axles) > 1 and any(wheel.steers for wheel in wheels):
+        return "ackermann"
+    plugins = [
+        f"{e.get('filename')} {e.get('name')} {e.text}" for e in description.root.iter("plugin")
+    ]
+    words = " ".join([*description.links, *plugins]).lower()
+    for drive, known in DRIVES.items():
+        if any(word in words for word in known) and (drive != "skid_steer" or len(axles) > 1):
+            return drive
+    return "skid_steer" if len(axles) > 1 else "differential"
+
+
+def _mass(link: ET.Element) -> float:
+    found = link.find("inertial/mass")
+    mass = number(found.get("value")) if found is not None else 0.0
+    return mass if 0 < mass < 1e5 else 0.0
+
+
+def _arms(description: Description) -> list[str]:
+    return [
+        joint.name
+        for joint in description.joints
+        if joint.kind in ("revolute", "prismatic") and not _endless(joint)
+    ]
+
+
+def _casters(
+    boxes: dict[str, tuple[F64, F64]], rolling: set[str], floor: float, axle_x: float
+) -> list[list[float]]:
+    """x ahead of the axle and y of what else stands on the floor."""
+    found = []
+    for name, (low, high) in boxes.items():
+        small = float(max(high[0] - low[0], high[1] - low[1])) < 0.15
+        if name not in rolling and small and abs(float(low[2]) - floor) < AT_FLOOR_M:
+            x, y = (low[:2] + high[:2]) / 2
+            found.append([float(x) - axle_x, float(y)])
+    return found
+
+
+def _stands(casters: list[list[float]], axle_x_m: float, height_m: float) -> bool:
+    """Whether the middle is between what it stands on, with room for speeding up and braking."""
+    room = 0.02 + 0.1 * height_m
+    ahead = [0.0, *(x for x, _ in casters)]
+    return min(ahead) + room < -axle_x_m < max(ahead) - room
+
+
+def _fastest(driven: list[_Wheel], radius: float) -> float | None:
+    limits = [wheel.joint.element.find("limit") for wheel in driven]
+    speeds = [number(limit.get("velocity")) for limit in limits if limit is not None]
+    low, high = USUAL_RADPS
+    usual = [speed for speed in speeds if low <= speed <= high]
+    return min(usual) * radius if len(usual) == len(driven) else None
+
+
+def _lidar_z(places: dict[str, Place], frame: str, floor: float, notes: list[str]) -> float | None:
+    wanted = frame.strip("/").split("/")[-1]
+    place = next((p for n, p in places.items() if n.split("/")[-1] == wanted), None)
+    if not wanted or place is None or not np.isfinite(place.at_m).all():
+        return None
+    if place.rotation[2, 2] < 0.9:
+        notes.append(f"the lidar ({frame}) does not lie level, as the twin's does")
+    if abs(place.at_m[1]) > 0.02:
+        notes.append(f"the lidar ({frame}) is {place.at_m[1]:.2f} m to the left of the middle")
+    return float(place.at_m[2]) - floor
+
+
+def _meshes(description: Description, boxes: dict[str, tuple[F64, F64]]) -> int:
+    return sum(
+        name not in boxes and link.find(".//mesh") is not None
+        for name, link in description.links.items()
+    )
+
+
+def _no_wheels(description: Description, places: dict[str, Place], wheels: list[_Wheel]) -> str:
+    """One sentence: why it does not roll, and what it looks like."""
+    kinds = Counter(joint.kind for joint in description.joints)
+    has = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common()) or "none"
+    if wheels:
+        return (
+            f"{description.name!r} has {len(wheels)} wheels, but no driven pair on two sides whose"
+            " radius is known (a mesh has none): say wheel_radius_m and track_m in [robot]"
+        )
+    rotors = [
+        joint
+        for joint in description.joints
+        if joint.kind == "continuous"
+        and joint.child in places
+        and abs(_axis(joint, places[joint.child])[2]) > 0.7
+    ]
+    looks = ""
+    if len(rotors) >= 3:
+        looks = ", it looks like a drone"
+    elif kinds["revolute"] >= 4:
+        looks = ", it looks like an arm or a legged robot"
+    return (
+        f"{description.name!r} has no wheels{looks}: none of its joints ({has}) turns without end"
+        " about an axis across the robot"
+    )
+
+
+def _rounded(value: Any) -> Any:
+    """Four digits after the point; None for what is no number that a robot has."""
+    if isinstance(value, list):
+        return [[round(number, 4) for number in pair] for pair in value]
+    if isinstance(value, float):
+        return round(value, 4) + 0.0 if np.isfinite(value) else None
+    return value

@@ -1,0 +1,161 @@
+"""The `[robot]` of a proposed profile: what its description and its scans say of the robot."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from restock.errors import ConfigError
+from restock.ingest.containers.recording import Recording
+from restock.ingest.propose.described_robot import described_robot, read_urdf
+from restock.ingest.propose.footprint import Footprint, descriptions, of_urdf, outline
+from restock.ingest.propose.urdf import read_description
+from restock.ingest.task.robot import Lidar, Robot
+from restock.toml import toml_value
+
+MOST_BEAMS = 361  # in the twin, where each costs time: of a finer lidar every k-th
+
+
+@dataclass(frozen=True)
+class RobotProposal:
+    """Values of `[robot]` by their keys, where each is from, and what is to be said."""
+
+    values: dict[str, Any] = field(default_factory=dict)
+    origin: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    rolls: bool = True  # False: a description says that it has no wheels
+
+    def lines(self, speed_mps: float, yaw_rate_radps: float) -> list[str]:
+        """The TOML; a limit below what was commanded (m/s, rad/s) is none, and said."""
+        if not self.rolls:
+            return [*(f"# [robot]  # {note}" for note in self.notes), ""]
+        values, notes = dict(self.values), list(self.notes)
+        for key, commanded in (
+            ("max_speed_mps", speed_mps),
+            ("max_yaw_rate_radps", yaw_rate_radps),
+        ):
+            if values.get(key, math.inf) < commanded * 0.999:
+                limit = values.pop(key)
+                notes.append(f"{key} = {limit:g} is not its limit: {commanded:g} was commanded")
+        own = {key: value for key, value in values.items() if "." not in key}
+        lidar = {key[6:]: value for key, value in values.items() if key.startswith("lidar.")}
+        drive = own.pop("drive", None)
+        lines = [
+            "[robot]  # what the twin builds; what is left out follows from the outline's size",
+            *(f"# {note}" for note in notes),
+            f'drive = "{drive}"' if drive else 'drive = "differential"  # A GUESS: nothing says',
+            *(f"{key} = {toml_value(value)}" for key, value in own.items()),
+        ]
+        if lidar:
+            lines += ["", "[robot.lidar]", *(f"{k} = {toml_value(v)}" for k, v in lidar.items())]
+        origin = {key: self.origin[key] for key in values if key in self.origin}
+        if origin:
+            lines += ["", "[robot.origin]"]
+            lines += [f'{_key(key)} = "{value}"' for key, value in origin.items()]
+        return [*lines, ""]
+
+
+def urdf_footprint(path: Path, scan_frame: str) -> Footprint | None:
+    """The outline that a URDF file has; None where its shapes are meshes.
+
+    Raises:
+        ConfigError: it cannot be read, or is no URDF.
+    """
+    text = read_urdf(path)
+    description = read_description(text)
+    if isinstance(description, str):
+        raise ConfigError(description, where=str(path), remedy="give the URDF of a wheeled robot")
+    found = of_urdf(text, scan_frame, source=path.name)
+    return found if isinstance(found, Footprint) and found.sane else None
+
+
+def propose_robot(
+    recording: Recording, scan_topic: str | None, scan_frame: str, urdf: Path | None
+) -> RobotProposal:
+    """The robot that a URDF file, else the recording's description, and its scans describe.
+
+    Raises:
+        ConfigError: the file cannot be used: it has no wheels, say.
+    """
+    texts: Iterable[tuple[str, str]] = descriptions(recording)
+    if urdf is not None:
+        texts = [(urdf.name, read_urdf(urdf))]
+    values: dict[str, Any] = {}
+    origin: dict[str, str] = {}
+    notes: list[str] = []
+    for source, text in texts:
+        description = read_description(text)
+        if isinstance(description, str):
+            notes.append(f"{source}: {description}")
+            continue
+        shapes = outline(description)
+        middle = 0.0 if shapes is None else float(shapes[0][0] + shapes[1][0]) / 2
+        found = described_robot(description, middle, scan_frame)
+        if found.problem is not None:
+            if urdf is not None:
+                raise ConfigError(
+                    found.problem, where=str(urdf), remedy="give the URDF of a wheeled robot"
+                )
+            return RobotProposal(notes=[f"{source}: {found.problem}"], rolls=False)
+        kind = "robot_description" if urdf is None else "urdf"
+        values = _sound(found.values, notes)
+        origin = dict.fromkeys(values, kind)
+        notes += [f"{source}: {note}" for note in found.notes]
+        break
+    if scan_topic is not None:
+        seen = _lidar(recording, scan_topic, notes)
+        values |= seen
+        origin |= dict.fromkeys(seen, "logs")
+    return RobotProposal(values, origin, notes)
+
+
+def _sound(values: dict[str, Any], notes: list[str]) -> dict[str, Any]:
+    """Those that a robot can have; the others are noted."""
+    kept = {}
+    for key, value in values.items():
+        try:
+            if key.startswith("lidar."):
+                Lidar(**{key[6:]: value})
+            elif key not in ("drive", "casters_m"):
+                Robot(**{key: value})
+            kept[key] = value
+        except ValueError as error:
+            notes.append(f"{key} = {value} is not used: {error}")
+    return kept
+
+
+def _lidar(recording: Recording, topic: str, notes: list[str]) -> dict[str, Any]:
+    """Beams and field of view of the last scan."""
+    paths = ["angle_min", "angle_max", "angle_increment"]
+    if not set(paths) <= set(recording.leaves(topic)):
+        return {}
+    fields = recording.read({topic: paths})[topic].fields
+    if not len(fields[paths[0]]):
+        return {}
+    first, last, step = (float(np.asarray(fields[path])[-1]) for path in paths)
+    if not (np.isfinite([first, last, step]).all() and step and abs(step) > 1e-4):
+        return {}
+    count = round((last - first) / step) + 1
+    low, high = min(first, last), max(first, last)
+    turn = 2 * math.pi
+    if count < 4 or not 0 < high - low < turn + 0.1 or max(abs(low), abs(high)) > 7:
+        return {}
+    high = min(high, low + turn)
+    every = -(-count // MOST_BEAMS)
+    if every > 1:
+        notes.append(f"the twin has every {every}. of the lidar's {count} beams")
+    beams = -(-count // every)
+    return {
+        "lidar.beams": beams,
+        "lidar.angle_min_rad": round(low, 5),
+        "lidar.angle_max_rad": round(high, 5),
+    }
+
+
+def _key(key: str) -> str:
+    return f'"{key}"' if "." in key else key

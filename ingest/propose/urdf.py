@@ -1,0 +1,159 @@
+"""A robot's description (URDF): its links, where its joints put them, how large its shapes are.
+
+The text may be anyone's: entities, documents that are too long and numbers that are none are
+refused or read as unknown, and no other file is opened, so a mesh has no size.
+"""
+
+from __future__ import annotations
+
+import itertools
+import xml.etree.ElementTree as ET
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.ingest.propose.roles import BASE_FRAMES
+
+F64 = NDArray[np.float64]
+LONGEST = 4_000_000  # letters of a description
+MOST_LINKS = 5_000
+ANY = ("fixed", "continuous", "revolute", "prismatic", "floating", "planar")
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint, from its parent to its child."""
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    element: ET.Element
+
+
+@dataclass(frozen=True)
+class Description:
+    """A description that was read."""
+
+    name: str
+    links: dict[str, ET.Element]
+    joints: list[Joint]
+    base: str  # the link that poses are of
+    root: ET.Element
+
+    def places(self, kinds: Collection[str] = ANY) -> dict[str, Place]:
+        """Where every link is that joints of these kinds lead to from the base, all at zero."""
+        children: dict[str, list[Joint]] = {}
+        for joint in self.joints:
+            if joint.kind in kinds:
+                children.setdefault(joint.parent, []).append(joint)
+        places = {self.base: Place(np.eye(3), np.zeros(3), True)}
+        waiting = [self.base]
+        while waiting:
+            parent = waiting.pop()
+            for joint in children.get(parent, []):
+                if joint.child not in places:
+                    origin = joint.element.find("origin")
+                    places[joint.child] = places[parent].then(origin, rigid=joint.kind == "fixed")
+                    waiting.append(joint.child)
+        return places
+
+
+def read_description(text: str) -> Description | str:
+    """A description, or why it cannot be used."""
+    if len(text) > LONGEST:
+        return f"{len(text):,} letters are too long for a robot's description"
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        return "a robot's description declares no entities"
+    try:
+        robot = ET.fromstring(text)  # no entities: checked above
+    except (ET.ParseError, ValueError) as error:
+        return f"is no XML ({error})"
+    if any("${" in value for e in robot.iter() for value in e.attrib.values()):
+        return "is a xacro file, not a URDF: write it out first (`xacro FILE > robot.urdf`)"
+    if robot.tag != "robot":
+        return f"is no URDF: it begins with <{robot.tag}>, not with <robot>"
+    links = {str(link.get("name")): link for link in robot.findall("link")}
+    if len(links) > MOST_LINKS:
+        return f"{len(links):,} links are too many for a robot"
+    joints = [
+        Joint(str(j.get("name")), str(j.get("type")), str(p.get("link")), str(c.get("link")), j)
+        for j in robot.findall("joint")
+        if (p := j.find("parent")) is not None and (c := j.find("child")) is not None
+    ]
+    named = (n for word in BASE_FRAMES for n in links if n.split("/")[-1] == word)
+    base = next(named, None)
+    if base is None:
+        return f"has none of the links {', '.join(BASE_FRAMES)}"
+    return Description(str(robot.get("name") or "robot"), links, joints, base, robot)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a link is in the base's frame."""
+
+    rotation: F64  # (3, 3)
+    at_m: F64  # (3,)
+    rigid: bool  # joined by fixed joints alone
+
+    def then(self, origin: ET.Element | None, *, rigid: bool = True) -> Place:
+        xyz, rpy = (three(None if origin is None else origin.get(key)) for key in ("xyz", "rpy"))
+        turn = _rotation(rpy)
+        return Place(self.rotation @ turn, self.rotation @ xyz + self.at_m, self.rigid and rigid)
+
+
+def extent(link: ET.Element, place: Place) -> tuple[F64, F64] | None:
+    """The lowest and highest corner of a link's collision shapes, else of those one sees."""
+    for kind in ("collision", "visual"):
+        boxes = [
+            box
+            for shape in link.findall(kind)
+            if (box := _shape_extent(shape, place.then(shape.find("origin")))) is not None
+        ]
+        if boxes:
+            return np.min([low for low, _ in boxes], axis=0), np.max([h for _, h in boxes], axis=0)
+    return None
+
+
+def _shape_extent(shape: ET.Element, place: Place) -> tuple[F64, F64] | None:
+    geometry = shape.find("geometry")
+    if geometry is None:
+        return None
+    box, cylinder, sphere = (geometry.find(kind) for kind in ("box", "cylinder", "sphere"))
+    if box is not None:
+        half = np.abs(place.rotation) @ (three(box.get("size")) / 2)
+    elif cylinder is not None:
+        radius, length = (number(cylinder.get(key)) for key in ("radius", "length"))
+        axis = place.rotation[:, 2]
+        half = radius * np.sqrt(np.maximum(1 - axis**2, 0)) + length / 2 * np.abs(axis)
+    elif sphere is not None:
+        half = np.full(3, number(sphere.get("radius")))
+    else:
+        return None
+    low, high = place.at_m - half, place.at_m + half
+    return (low, high) if np.isfinite(low).all() and np.isfinite(high).all() else None
+
+
+def _rotation(rpy: F64) -> F64:
+    (sr, sp, sy), (cr, cp, cy) = np.sin(rpy), np.cos(rpy)
+    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    return np.asarray(about_z @ about_y @ about_x, np.float64)
+
+
+def three(text: str | None) -> F64:
+    """Three numbers of a description, 0 where it has fewer."""
+    numbers = [number(part) for part in itertools.islice((text or "").split(), 3)]
+    return np.array([*numbers, *[0.0] * (3 - len(numbers))])
+
+
+def number(text: Any) -> float:
+    """A number of a description; NaN, which no outline survives, for what is none."""
+    try:
+        return float(text) if abs(float(text)) < 1e6 else float("nan")
+    except (TypeError, ValueError):
+        return float("nan")

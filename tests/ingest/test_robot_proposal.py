@@ -1,0 +1,195 @@
+"""The robot of a description: what is taken from it, and what is said of the rest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.paths import ROOT
+
+from restock.errors import ConfigError
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.profile.profile import parse_profile
+from restock.ingest.propose.described_robot import DescribedRobot, described_robot, read_urdf
+from restock.ingest.propose.propose import propose_profile
+from restock.ingest.propose.urdf import Description, read_description
+
+RECORDING = ROOT / "sample_logs" / "amr_tuesday"
+
+
+def link(name: str, shape: str = "", mass: float = 0.0) -> str:
+    collision = f"<collision><geometry>{shape}</geometry></collision>" if shape else ""
+    inertial = f"<inertial><mass value='{mass}'/></inertial>" if mass else ""
+    return f"<link name='{name}'>{collision}{inertial}</link>"
+
+
+def joint(
+    child: str, xyz: str, axis: str = "0 1 0", kind: str = "continuous", parent: str = "base_link"
+) -> str:
+    return (
+        f"<joint name='{child}_joint' type='{kind}'><parent link='{parent}'/>"
+        f"<child link='{child}'/><origin xyz='{xyz}'/><axis xyz='{axis}'/></joint>"
+    )
+
+
+WHEEL = "<cylinder radius='0.1' length='0.04'/>"
+BASE = link("base_link", "<box size='0.8 0.5 0.2'/>", mass=20.0)
+
+
+def robot(*parts: str) -> str:
+    return f"<robot name='test'>{BASE}{''.join(parts)}</robot>"
+
+
+def wheels(*places: tuple[float, float], radius: str = WHEEL, **how: str) -> str:
+    return "".join(
+        link(f"wheel_{index}", radius, mass=1.0) + joint(f"wheel_{index}", f"{x} {y} -0.05", **how)
+        for index, (x, y) in enumerate(places)
+    )
+
+
+def of(text: str) -> DescribedRobot:
+    description = read_description(text)
+    assert isinstance(description, Description), description
+    return described_robot(description, 0.0, "laser")
+
+
+def test_one_axle_and_a_caster() -> None:
+    laser = link("laser") + joint("laser", "0.3 0 0.2", kind="fixed")
+    caster = link("caster_wheel", "<sphere radius='0.02'/>")
+    caster += joint("caster_wheel", "-0.3 0 -0.13", kind="fixed")
+    found = of(robot(wheels((0.2, 0.22), (0.2, -0.22)), laser, caster))
+    assert found.values == {
+        "drive": "differential",
+        "wheel_radius_m": 0.1,
+        "track_m": 0.44,
+        "axle_x_m": 0.2,
+        "mass_kg": 22.0,
+        "height_m": 0.25,
+        "casters_m": [[-0.5, 0.0]],
+        "lidar.z_m": 0.35,
+    }
+
+
+def test_two_axles_are_skid_steer_unless_something_steers() -> None:
+    places = ((0.25, 0.2), (0.25, -0.2), (-0.25, 0.2), (-0.25, -0.2))
+    values = of(robot(wheels(*places))).values
+    assert (values["drive"], values["wheelbase_m"]) == ("skid_steer", 0.5)
+    mecanum = robot(wheels(*places)).replace("wheel_", "mecanum_")
+    assert of(mecanum).values["drive"] == "omnidirectional"
+    steering = "".join(
+        link(f"hub_{i}") + joint(f"hub_{i}", f"0.25 {y} -0.05", "0 0 1", "revolute")
+        + link(f"front_{i}", WHEEL) + joint(f"front_{i}", "0 0 0", parent=f"hub_{i}")
+        for i, y in enumerate((0.2, -0.2))
+    )  # fmt: skip
+    assert of(robot(wheels((-0.25, 0.2), (-0.25, -0.2)), steering)).values["drive"] == "ackermann"
+
+
+def test_a_wheel_that_is_a_mesh_stands_on_the_floor() -> None:
+    mesh = "<mesh filename='package://none/wheel.stl'/>"
+    footprint = link("base_footprint") + joint("base_footprint", "0 0 -0.12", kind="fixed")
+    found = of(robot(wheels((0, 0.2), (0, -0.2), radius=mesh), footprint))
+    assert found.values["wheel_radius_m"] == pytest.approx(0.07)
+    assert "meshes alone" in found.notes[-1]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (robot(), "'test' has no wheels: none of its joints (none)"),
+        (
+            robot(
+                *(link(f"a{i}") + joint(f"a{i}", "0 0 1", "0 0 1", "revolute") for i in range(6))
+            ),
+            "looks like an arm",
+        ),
+        (
+            robot(*(link(rotor) + joint(rotor, "1 0 0", "0 0 1") for rotor in "abcd")),
+            "looks like a drone",
+        ),
+        (robot(wheels((0, 0.2), (0.1, 0.2))), "no driven pair on two sides"),
+    ],
+)
+def test_what_does_not_roll_is_named(text: str, message: str) -> None:
+    found = of(text)
+    assert not found.values
+    assert message in (found.problem or "")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("<robot", "is no XML"),
+        ("<!DOCTYPE r [<!ENTITY a 'ha'><!ENTITY b '&a;&a;'>]><robot>&b;</robot>", "no entities"),
+        ("<!DOCTYPE r SYSTEM 'file:///etc/passwd'><robot/>", "no entities"),
+        (robot(wheels((0, 0.2), (0, -0.2))).replace("0.8 0.5", "${length} 0.5"), "xacro file"),
+        ("<sdf version='1.6'/>", "begins with <sdf>"),
+        ("<robot>" + "<link name='a'/>" + " " * 4_000_000 + "</robot>", "too long"),
+        ("<robot>" + "".join(f"<link name='{i}'/>" for i in range(6000)) + "</robot>", "too many"),
+    ],
+)
+def test_a_hostile_description_is_refused(text: str, message: str) -> None:
+    found = read_description(text)
+    assert isinstance(found, str)
+    assert message in found
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["continuous", "revolute", "fixed", "prismatic", "?"]),
+            st.sampled_from(["base_link", "l0", "l1", "l2"]),
+            st.sampled_from(["0 0.3 0", "0 -0.3 0", "nan 1 1", "1e400 0 0", "x", ""]),
+            st.sampled_from(["0 1 0", "0 0 1", "0 0 0", "nan", "1 2"]),
+            st.sampled_from(["<sphere radius='0.1'/>", "<sphere radius='-1'/>", "<box/>", ""]),
+        ),
+        max_size=6,
+    )
+)
+def test_any_tree_of_joints_ends_in_values_or_a_sentence(
+    parts: list[tuple[str, str, str, str, str]],
+) -> None:
+    """Loops, orphans, numbers that are none: nothing raises, and what is taken is finite."""
+    body = "".join(
+        link(f"l{i}", shape) + joint(f"l{i}", xyz, axis, kind, parent)
+        for i, (kind, parent, xyz, axis, shape) in enumerate(parts)
+    )
+    found = of(robot(body))
+    assert (found.problem is None) == bool(found.values)
+    for value in found.values.values():
+        assert value == value  # no NaN
+        assert value != float("inf")
+
+
+def test_a_proposed_profile_has_the_robot_of_the_file(tmp_path: Path) -> None:
+    urdf = tmp_path / "robot.urdf"
+    urdf.write_text(robot(wheels((0.2, 0.22), (0.2, -0.22))))
+    with open_recording(RECORDING) as recording:
+        proposed = propose_profile(recording, "mine", urdf=urdf)
+        plain = propose_profile(recording, "mine")
+    own = parse_profile(proposed.toml, where="proposed")
+    assert own.robot is not None
+    assert (own.robot.track_m, own.robot.origin_of("track_m")) == (0.44, "urdf")
+    assert own.robot.origin_of("lidar.beams") == "logs"
+    assert own.task.body.length_m == pytest.approx(0.8)
+    by_logs = parse_profile(plain.toml, where="proposed").robot
+    assert by_logs is not None
+    assert by_logs.origin_of("track_m") == "default"
+    assert by_logs.lidar.beams == own.robot.lidar.beams
+
+
+def test_a_file_that_is_no_robot_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "arm.urdf"
+    for content, message in (
+        (robot().encode(), "has no wheels"),
+        (b"\xff\xfe<robot/>", "is no URDF"),
+    ):
+        path.write_bytes(content)
+        with (
+            open_recording(RECORDING) as recording,
+            pytest.raises(ConfigError, match=message),
+        ):
+            propose_profile(recording, "mine", urdf=path)
+    with pytest.raises(ConfigError, match="cannot be read"):
+        read_urdf(tmp_path / "none.urdf")
