@@ -101,6 +101,17 @@ def mix(document: Document) -> list[str]:
     return lines
 
 
+def floor(document: Document) -> list[str]:
+    """What it was made from, how large it is, and which episodes fit."""
+    aisles = count(document["aisle_segments"], "aisle segment")
+    lines = [
+        f"made from {document['made_from']}: {document['width_m']:g} x {document['depth_m']:g} m,"
+        f" {count(document['goals'], 'goal')}, {aisles}; room for"
+        f" {', '.join(document['episodes']) or 'no episode'}"
+    ]
+    return [*lines, *document["notes"]]
+
+
 def fit(document: Document) -> list[str]:
     """The parameters that the logs tell, and the distance before and after."""
     (first, *_) = document["fits"]
@@ -133,10 +144,8 @@ def of_nominal(document: Document) -> Mapping[str, Any] | None:
 
 def train(document: Document) -> list[str]:
     """How much it learnt from, and what was kept."""
-    lines = [
-        f"{document['gradient_steps']:,} updates, {document['env_steps']:,} steps in the twin,"
-        f" {_time(document['wall_s'])}"
-    ]
+    twin = f", {document['env_steps']:,} steps in the twin" if document["env_steps"] else ""
+    lines = [f"{document['gradient_steps']:,} updates{twin}, {_time(document['wall_s'])}"]
     best = document["best"]
     if best is not None and best["success"]:
         cells = ", ".join(f"{name} {value:.2f}" for name, value in best["success"].items())

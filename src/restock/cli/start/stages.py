@@ -26,6 +26,7 @@ class Settings:
     device: str = "cpu"
     mixture: str = "coverage"
     typestore: str | None = None
+    map: Path | None = None
     train: tuple[str, ...] = ()  # further settings, each key=value
 
     @property
@@ -43,6 +44,10 @@ class Settings:
     @property
     def fitted(self) -> Path:
         return self.out / "fitted.toml"
+
+    @property
+    def floor(self) -> Path:
+        return self.out / "floor.toml"
 
     @property
     def recordings(self) -> tuple[Path, ...]:
@@ -162,6 +167,24 @@ def mix(to: Settings) -> Stage:
     )
 
 
+def floor(to: Settings) -> Stage:
+    """The user's floor for the twin: their map, else scans, else the way that was driven."""
+    picture = to.out / "floor.png"
+    given = [] if to.map is None else ["--map", str(to.map)]
+    return Stage(
+        "floor",
+        "The floor, as the recordings show it",
+        "The map of the recordings, else their scans, else the way that was driven.",
+        [
+            *("twin", "layout", "--from", str(to.store), *given),
+            *("--out", str(to.floor), "--png", str(picture)),
+        ],
+        reads=() if to.map is None else _file(to.map),
+        writes=(to.floor, picture),
+        outcome=outcomes.floor,
+    )
+
+
 def fit(to: Settings, horizon_s: float) -> Stage:
     """The twin's robot, from the commands and what the robot did. Few segments: minutes matter."""
     few = ["--search", "32", "--segments", "80", "--horizon-s", f"{horizon_s:g}"]
@@ -192,7 +215,6 @@ def gap(to: Settings, horizon_s: float, *, fitted: bool) -> Stage:
 
 def train(to: Settings, *, twin: bool = True) -> Stage:
     """Offline and then in the twin; or on the logs alone."""
-    settings = list(to.train) if twin else ["schedule.env_steps=0"]
     return Stage(
         "train",
         "Train: first on the panel, then online in the twin"
@@ -204,7 +226,7 @@ def train(to: Settings, *, twin: bool = True) -> Stage:
         [
             *("train", "--panel", str(to.panel), "--out", str(to.run)),
             *("--seconds", f"{to.seconds:g}", "--device", to.device),
-            *(word for setting in settings for word in ("--set", setting)),
+            *(word for setting in to.train for word in ("--set", setting)),
         ],
         writes=(to.run,),
         outcome=outcomes.train,

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -14,7 +13,11 @@ from restock.errors import ConfigError, ExitCode, RecordingError
 
 if TYPE_CHECKING:
     from restock.cli.start.stage import Document, Stop
+    from restock.cli.start.stages import Settings
     from restock.cli.start.work import Ended, Work
+
+
+DRIVERS = "behaviour_policies"  # of a row of the coverage
 
 
 @dataclass
@@ -43,6 +46,8 @@ class StartCommand:
     """The robot's length and width in metres, as 0.6x0.5, for the proposal."""
     odometry_as_command: bool = False
     """Let the proposal take odometry for commands where none was recorded."""
+    map: Path | None = None
+    """The map.yaml that the robot localised in, where the recordings do not hold their map."""
     typestore: str | None = None
     """Distribution whose message definitions serve recordings without their own (humble)."""
     mixture: str = "coverage"
@@ -74,7 +79,11 @@ class StartCommand:
         if self.minutes <= 0:
             raise ConfigError(f"must be above 0, got {self.minutes:g}", where="--minutes")
         console = stderr() if self.json else stdout()
-        say: Callable[[str], None] = lambda line: console.print(line, soft_wrap=True)  # noqa: E731
+
+        def say(line: str) -> None:
+            console.print(line, soft_wrap=True)
+            console.file.flush()  # what is on stderr comes after it
+
         work = Work(self.out, main, say, plan=self.dry_run)
         stopped = _way(self, work)
         page = self.out / "run" / "report.html"
@@ -103,6 +112,7 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
     from restock.cli.start import stages
     from restock.cli.start.stage import Stop
     from restock.cli.start.stages import Settings
+    from restock.cli.start.work import escape
 
     again = f"then run the same command again: what is done is kept in {asked.out}"
     own = asked.profile is not None
@@ -115,7 +125,7 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
         device=asked.device,
         mixture=asked.mixture,
         typestore=asked.typestore,
-        train=("practice.rule=success",),
+        map=asked.map,
     )
     found = work.do(stages.info(to))
     if not found.good:
@@ -144,7 +154,7 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
     ingested = work.do(stages.ingest(to))
     if not ingested.good:
         return Stop("nothing could be ingested", (f"edit {to.profile}", again))
-    work.do(stages.coverage(to))
+    covered = work.do(stages.coverage(to))
     work.do(stages.audit(to))
     mixed = work.do(stages.mix(to))
     if not mixed.good:
@@ -156,19 +166,24 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
             ),
         )
     twin = asked.twin != "no"
-    horizon_s = horizon(to.profile)
+    settings = ["practice.rule=success"]
     if twin:
+        floor = work.do(stages.floor(to))
+        if floor.good:
+            settings += floor_settings(to, floor.document)
+        horizon_s = horizon(to.profile)
         fitted = work.do(stages.fit(to, horizon_s))
         if fitted.good:
-            to = _with(to, train=(*to.train, f"env.perturbation={to.fitted}"))
-        judged = work.do(stages.gap(to, horizon_s, fitted=fitted.good))
-        if asked.twin == "auto" and not work.plan:
-            why = mistrust(judged)
-            twin = why is None
-            if why is not None:
-                work.say(
-                    f"   [yellow]no training in the twin: {why}; --twin yes overrides[/yellow]"
-                )
+            settings.append(f"env.perturbation={to.fitted}")
+        gap = work.do(stages.gap(to, horizon_s, fitted=fitted.good))
+        why = None if asked.twin == "yes" or work.plan else mistrust(floor, gap)
+        if why is not None:
+            work.say(f"   [yellow]no training in the twin (--twin yes overrides): {escape(why)}[/]")
+            twin = False
+    if not twin:
+        settings = logs_alone_settings(covered.document)
+    settings += few_rows_settings(mixed.document)
+    to = replace(to, train=tuple(settings))
     trained = work.do(stages.train(to, twin=twin))
     if not trained.good:
         return Stop("training did not come to its end", (*trained.errors[:2], again))
@@ -177,12 +192,6 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
     work.do(stages.judge(to))
     work.do(stages.report(to))
     return None
-
-
-def _with(to: Any, **changes: Any) -> Any:
-    from dataclasses import replace
-
-    return replace(to, **changes)
 
 
 def fullest(document: Document) -> str | None:
@@ -222,18 +231,55 @@ def horizon(profile: Path | str | None) -> float:
     return round(max(round(3.0 / period_s), 1) * period_s, 6)
 
 
-def mistrust(judged: Ended) -> str | None:
+def mistrust(floor: Ended, gap: Ended) -> str | None:
     """Why the twin is not to be trusted in nominal driving; None where it is."""
     from restock.cli.start.outcomes import of_nominal
 
-    if not judged.good:
-        return f"its gap to the logs cannot be measured ({'; '.join(judged.errors)})"
-    verdict = of_nominal(judged.document)
+    if not floor.good:
+        return f"there is no floor to drive on: {'; '.join(floor.errors)}"
+    if "nominal" not in floor.document["episodes"]:
+        return "no mission fits on the floor that the recordings show"
+    if not gap.good:
+        return f"its gap to the logs cannot be measured: {'; '.join(gap.errors)}"
+    verdict = of_nominal(gap.document)
     if verdict is None:
         return "these logs show no nominal driving"
     if verdict["verdict"] == "trusted":
         return None
     return f"in nominal driving it is {verdict['verdict']}: {'; '.join(verdict['reasons'])}"
+
+
+def floor_settings(to: Settings, document: Document) -> list[str]:
+    """Train on that floor, on the kinds of episode that it has room for."""
+    from restock.toml import toml_value
+    from restock.train.twin.env.interface import DEFAULT_CONDITIONS
+
+    settings = [f"env.layouts={to.floor}"]
+    fitting = document.get("episodes", [])
+    kinds = {name: share for name, share in DEFAULT_CONDITIONS.items() if name in fitting}
+    if fitting and len(kinds) < len(DEFAULT_CONDITIONS):
+        settings.append(f"env.conditions={toml_value(kinds)}")
+    return settings
+
+
+def logs_alone_settings(coverage: Document) -> list[str]:
+    """No twin, and no action that the logs' drivers would not plausibly have taken."""
+    from restock.toml import toml_value
+
+    drivers = sorted({name for row in coverage.get("rows", []) for name in row[DRIVERS] or ()})
+    return ["env.twin=false", "teacher.source=logs", f"teacher.policies={toml_value(drivers)}"]
+
+
+def few_rows_settings(mix: Document) -> list[str]:
+    """As many offline updates as the panel's rows allow, where that is fewer than usual."""
+    from restock.train.dqn.config import TrainConfig
+
+    usual = TrainConfig()
+    most = mix.get("max_replays_per_row")
+    if most is None:
+        return []
+    allowed = int(mix["rows"] * most / usual.replay.batch_size)
+    return [f"schedule.offline_updates={allowed}"] * (allowed < usual.schedule.offline_updates)
 
 
 __all__ = ["StartCommand", "fullest", "mistrust"]
