@@ -69,8 +69,15 @@ def write_bag(
     frame: str = "map",
     grid: OccupancyGrid | None = None,
     data: np.ndarray | None = None,
+    scanned: np.ndarray | None = None,
+    scanned_from: np.ndarray | None = None,
+    scans_late_s: float = 0.0,
 ) -> Path:
-    """A rosbag2 folder with /amcl_pose every .2 s, and /map; `data` in place of the grid's own."""
+    """A rosbag2 folder with /amcl_pose every .2 s, and /map; `data` in place of the grid's own.
+
+    `scanned` are cells (X, Y) that a lidar of 120 beams sees from each pose, by ray marching; its
+    stamps may be late.
+    """
     with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
 
         def send(topic: str, kind: str, messages: list[tuple[int, Any]]) -> None:
@@ -101,7 +108,63 @@ def write_bag(
                 message = T[kind](header=header(stamp_ns, frame), pose=with_covariance)
                 messages.append((stamp_ns, message))
             send("/amcl_pose", kind, messages)
+        if scanned is not None and poses is not None:
+            kind = "sensor_msgs/msg/LaserScan"
+            messages = []
+            for index, at in enumerate(poses if scanned_from is None else scanned_from):
+                stamp_ns = 10**9 + index * 2 * 10**8
+                message = T[kind](
+                    header=header(stamp_ns + int(scans_late_s * 1e9), "laser"),
+                    angle_min=-np.pi,
+                    angle_max=np.pi,
+                    angle_increment=2 * np.pi / 120,
+                    time_increment=0.0,
+                    scan_time=0.2,
+                    range_min=0.1,
+                    range_max=12.0,
+                    ranges=seen_from(scanned, at),
+                    intensities=np.zeros(0, np.float32),
+                )
+                messages.append((stamp_ns, message))
+            send("/scan", kind, messages)
     return folder
+
+
+def seen_from(occupancy: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Ranges (120,) to the first occupied cell from a pose; 0, as of a Neato, beyond 6 m."""
+    bearing = at[2] - np.pi + np.arange(120) * 2 * np.pi / 120
+    reach = np.arange(0.0, 6.0, 0.01)
+    x = at[0] + np.cos(bearing)[:, None] * reach
+    y = at[1] + np.sin(bearing)[:, None] * reach
+    cells = np.clip((np.stack([x, y]) / CELL_M).astype(int), 0, [[[179]], [[139]]])
+    hit = occupancy[cells[0], cells[1]] > 0
+    ranges = np.where(hit.any(axis=1), reach[hit.argmax(axis=1)], 0.0)
+    return ranges.astype(np.float32)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 1.5])
+def test_scans_make_the_map_that_was_scanned_by_the_clock_that_fits(
+    tmp_path: Path, late_s: float
+) -> None:
+    known = OccupancyGrid(hall(), CELL_M)
+    bag = write_bag(tmp_path / "bag", poses=lap(), grid=known, scanned=hall(), scans_late_s=late_s)
+    made = survey(bag, by="scans", footprint=parse_footprint("0.4x0.4"))
+    assert f"by {'log time' if late_s else 'header stamps'}" in made.source
+    assert made.agreement is not None
+    assert made.agreement > 0.95
+    assert len(made.floor.segments) == 4
+    assert survey(bag).by == "map"  # which is better known
+
+
+def test_scans_that_do_not_fit_together_leave_the_corridor(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    poses = lap()[::2]
+    bag = write_bag(tmp_path / "bag", poses=poses, scanned=hall())
+    astray = poses + rng.normal(0.0, 0.4, poses.shape)
+    lost = write_bag(tmp_path / "lost", poses=astray, scanned=hall(), scanned_from=poses)
+    assert survey(bag).by == "scans"
+    made = survey(lost)
+    assert made.by == "corridor"
 
 
 def test_a_map_in_the_bag_becomes_a_floor_that_is_driven_on(tmp_path: Path) -> None:

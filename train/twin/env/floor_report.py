@@ -7,7 +7,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csgraph
 
 from restock.errors import ConfigError
 from restock.train.twin.floors.layout import Warehouse
@@ -76,9 +75,8 @@ def sealed(floors: Iterable[Warehouse]) -> list[str]:
 def unreachable_goals(floor: Warehouse) -> int:
     """How many goals a robot cannot reach from the part with the most of them, and come back."""
     planner = Planner(floor)
-    _, part = csgraph.connected_components(planner._graph, connection="strong")
     cells = np.array([planner.cell(x, y) for x, y in floor.goals])
-    return len(cells) - int(np.bincount(part[cells]).max())
+    return len(cells) - int(np.bincount(planner.parts()[cells]).max())
 
 
 @lru_cache(maxsize=1024)

@@ -26,7 +26,7 @@ from restock.train.twin.floors.cells import (
     find_segments,
 )
 from restock.train.twin.floors.layout import MAX_RACKS, MAX_SIDE_M, ROOM_M, Rect, Warehouse, bays
-from restock.train.twin.floors.places import find_places, missions_way
+from restock.train.twin.floors.places import connected, find_places, missions_way, with_missions
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 COARSEST_M = 0.2
@@ -161,30 +161,36 @@ def floor_of_grid(
         found = find_places(free, reachable, cell_m, grid.within(visited_m), room_m, turn_m)
         places = found.places_m
         notes += found.notes
-    goals = places
-    if not places:
-        goals = find_goals(free & reachable, cell_m, room_m=turn_m)
-        goals += tuple(bay for bay in bays(segments) if _holds(reachable, cell_m, bay))
-        if not goals:
-            raise ConfigError(
-                f"a robot that needs {turn_m:.2f} m around its middle to turn finds no place"
-                " that it could be sent to",
-                where=where,
-                remedy="check the body in the profile (--footprint LxW), or give a larger map",
-            )
+    if visited_m is None:
+        elsewhere = find_goals(free & reachable, cell_m, room_m=turn_m)
+    else:
+        there = find_goals(free, cell_m, room_m=turn_m)
+        elsewhere = tuple(place for place in there if _holds(reachable, cell_m, place))
+    elsewhere += tuple(bay for bay in bays(segments) if _holds(reachable, cell_m, bay))
+    if not places and not elsewhere:
+        raise ConfigError(
+            f"a robot that needs {turn_m:.2f} m around its middle to turn finds no place that it"
+            " could be sent to",
+            where=where,
+            remedy="check the body in the profile (--footprint LxW), or give a larger map",
+        )
     floor = Warehouse(
         width_m=round(free.shape[0] * cell_m, 6),
         depth_m=round(free.shape[1] * cell_m, 6),
         racks=racks,
         segments=segments,
-        goals_m=goals,
+        goals_m=places or elsewhere,
         crossings=find_crossings(segments, free, cell_m),
         name=name,
         map_origin=grid.origin,
         room_m=room_m,
         starts_m=places,
     )
-    return GridFloor(missions_way(floor) if places else floor, grid, notes)
+    if places:
+        floor = with_missions(floor, elsewhere, notes)
+    elif visited_m is not None:
+        floor = missions_way(connected(floor))
+    return GridFloor(floor, grid, notes)
 
 
 _NO_ROOM_REMEDY = (

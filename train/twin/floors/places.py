@@ -17,7 +17,10 @@ from restock.train.twin.floors.planner import Planner
 
 SPACING_M = 0.5
 PLACES = 100
-LONG_ENOUGH = 0.3  # of the pairs of places: so many are a usual mission apart on a large floor
+SAMPLE = 12  # starts and goals at most, whose ways are measured
+OFTEN = 0.1  # of the pairs of places: so many are a usual mission apart on a large floor
+SHORTEST = 0.4  # of the longest way on a small one
+NEAR_M = 3.0  # places that are no further apart give short missions alone
 NEAREST_M = 0.5  # a way shorter than this is no mission
 
 
@@ -68,15 +71,56 @@ def find_places(
     return Places(tuple(places), notes)
 
 
+def with_missions(
+    floor: Warehouse, elsewhere: tuple[tuple[float, float], ...], notes: list[str]
+) -> Warehouse:
+    """The floor with the lengths of its missions; where the places that the robot was at are all
+    near to each other, missions go from them to others, too."""
+    made = missions_way(connected(floor))
+    if made.way_m[1] >= NEAR_M or not elsewhere:
+        return made
+    step = max(len(elsewhere) // PLACES, 1)
+    wider = missions_way(connected(replace(floor, goals_m=floor.goals_m + elsewhere[::step])))
+    if wider.way_m[1] < 1.5 * made.way_m[1] or not wider.starts_m:
+        return made
+    notes.append(
+        f"the places that the robot was at are at most {made.way_m[1]:.1f} m apart: missions start"
+        f" there and also go to {len(elsewhere[::step])} places where it could have been"
+    )
+    return wider
+
+
 def missions_way(floor: Warehouse) -> Warehouse:
     """The floor with lengths of missions that its places allow: the usual ones where they do."""
-    planner = Planner(floor, trees_kept=len(floor.goals_m))
-    ways = np.array(
-        [[planner.distance_m(*start, goal) for start in floor.goals_m] for goal in floor.goals_m]
-    )
-    ways = ways[np.isfinite(ways) & (ways > NEAREST_M)]
-    if not len(ways) or (ways >= WAY_M[0]).mean() >= LONG_ENOUGH:
+    planner = Planner(floor, trees_kept=1)
+    starts = [segment.area.center for segment in floor.starts]
+    starts = starts[:: max(len(starts) // SAMPLE, 1)]
+    lengths, costs = [], []
+    for x, y in floor.goals[:: max(len(floor.goals) // SAMPLE, 1)].tolist():
+        for start in starts:
+            away = planner.distance_m(*start, (x, y))
+            if np.isfinite(away) and away > NEAREST_M:
+                way = planner.plan(*start, (x, y))
+                costs.append(away)
+                lengths.append(float(np.hypot(*np.diff(way, axis=0).T).sum()))
+    if not lengths:
         return floor
-    longest = float(ways.max())
-    shortest = max(round(float(np.quantile(ways, 1 - LONG_ENOUGH)) / 1.3, 1), NEAREST_M)
+    length, cost = np.array(lengths), np.array(costs)
+    low, high = WAY_M
+    usual = (length >= low) & (length <= high) & (cost <= 1.3 * high)  # as episodes are drawn
+    if usual.mean() >= OFTEN:
+        return floor
+    longest = float(max(length.max(), cost.max() / 1.3))
+    shortest = max(round(SHORTEST * float(length.max()), 1), NEAREST_M)
     return replace(floor, way_m=(shortest, max(round(longest + 0.1, 1), shortest + 0.5)))
+
+
+def connected(floor: Warehouse) -> Warehouse:
+    """The floor with those goals and starts alone that a robot gets to from most of the others."""
+    planner = Planner(floor, trees_kept=1)
+    part = planner.parts()
+    goals = part[[planner.cell(x, y) for x, y in floor.goals_m]]
+    largest = int(np.bincount(goals).argmax())
+    starts = [place for place in floor.starts_m if part[planner.cell(*place)] == largest]
+    kept = [place for place, of in zip(floor.goals_m, goals, strict=True) if of == largest]
+    return replace(floor, goals_m=tuple(kept), starts_m=tuple(starts))

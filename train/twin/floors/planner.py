@@ -119,6 +119,10 @@ class Planner:
         """Cost-weighted length of the way to the goal on the known map; inf where there is none."""
         return float(self._tree(self.cell(*goal), ())[0][self.cell(x_m, y_m)])
 
+    def parts(self) -> Ints:
+        """Which connected part each cell (size,) is in: by the rules, there and back."""
+        return np.asarray(csgraph.connected_components(self._graph, connection="strong")[1])
+
     def cell(self, x_m: float, y_m: float) -> int:
         """The index of the cell that holds a place; the nearest one for a place off the map."""
         i = min(max(int(x_m / CELL_M), 0), self.shape[0] - 1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from restock.arrays import F64, Ints
+from restock.arrays import F64
 from restock.train.twin.floors.occupancy_grid import (
     FREE,
     UNKNOWN,
@@ -32,10 +32,9 @@ def driven_corridor(poses: Poses, turn_m: float) -> OccupancyGrid:
     """
     step = np.diff(poses.places_m, axis=0)
     length = np.hypot(*step.T)
-    joined = length <= JUMP_M
-    yaw = main_direction(np.arctan2(step[:, 1], step[:, 0]), length * joined)
+    yaw = main_direction(np.arctan2(step[:, 1], step[:, 0]), length * (length <= JUMP_M))
     places = into_frame(poses.places_m, (0.0, 0.0, yaw))
-    way = _way(places, joined)
+    way = way_between(places)
     reach = turn_m + MARGIN_M
     low = way.min(axis=0) - reach - 2 * CELL_M
     cells = np.floor((way - low) / CELL_M).astype(np.int64)
@@ -48,13 +47,13 @@ def driven_corridor(poses: Poses, turn_m: float) -> OccupancyGrid:
     return OccupancyGrid(occupancy, CELL_M, (float(corner[0]), float(corner[1]), yaw), poses.frame)
 
 
-def _way(places_m: F64, joined: Ints | np.ndarray) -> F64:
+def way_between(places_m: F64) -> F64:
     """Places (N, 2) with points in between, no cell apart, where one drove from one to the next."""
     parts = [places_m]
-    for index in np.flatnonzero(joined):
+    length = np.hypot(*np.diff(places_m, axis=0).T)
+    for index in np.flatnonzero((length > CELL_M / 2) & (length <= JUMP_M)):
         start, end = places_m[index], places_m[index + 1]
-        count = int(np.hypot(*(end - start)) / (CELL_M / 2))
-        if count > 1:
-            share = np.arange(1, count)[:, None] / count
-            parts.append(start + share * (end - start))
+        count = int(length[index] / (CELL_M / 2)) + 1
+        share = np.arange(1, count)[:, None] / count
+        parts.append(start + share * (end - start))
     return np.concatenate(parts)

@@ -95,9 +95,8 @@ class Poses:
                 way, kept = way + step, place[None]
         return way
 
-    def at(self, times: Times) -> tuple[F64, Bools]:
+    def at(self, times: Times, *, by_stamp: bool) -> tuple[F64, Bools]:
         """Poses (M, 3) at these times, and which of them (M,) lie between two near ones."""
-        by_stamp = shared_clock(self.times, times)
         values = np.stack([self.x_m, self.y_m, self.yaw_rad], axis=-1)
         return interpolated(
             self.times.clock(by_stamp=by_stamp), values, times.clock(by_stamp=by_stamp)

@@ -1,39 +1,41 @@
-"""A floor of the twin from what a recording or store shows: its map, else scans, else the way
-driven.
+"""A floor of the twin from what a recording or store shows: its map, else its scans, else the way
+that was driven.
 
-surveyed = survey(Path("logs/run.mcap"))
-surveyed.floor, surveyed.source, surveyed.notes
+    surveyed = survey(Path("logs/run.mcap"))
+    surveyed.floor, surveyed.source, surveyed.notes
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
+from scipy import ndimage
 
-from restock.arrays import F64, Bools
 from restock.errors import ConfigError, RecordingError
-from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.profile import Profile
-from restock.ingest.propose.footprint import Footprint, footprint_of
-from restock.replay.store.store import is_store
+from restock.ingest.propose.footprint import Footprint
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.occupancy_grid import FREE, UNKNOWN, OccupancyGrid, floor_of_grid
-from restock.train.twin.floors.occupancy_map import read_grid
 from restock.train.twin.survey.directions import along_walls
 from restock.train.twin.survey.driven_corridor import driven_corridor
-from restock.train.twin.survey.poses import Poses, candidate_poses, choose_poses
-from restock.train.twin.survey.recorded_map import recorded_map
-from restock.train.twin.survey.stored_drive import stored_drive
+from restock.train.twin.survey.evidence import Evidence, gather
+from restock.train.twin.survey.map_agreement import walls_agreement
+from restock.train.twin.survey.poses import Poses
+from restock.train.twin.survey.scan_map import scan_map
+from restock.train.twin.survey.scans import PlacedScans
 
 Source = Literal["map", "scans", "corridor"]
-SOURCES: tuple[Source, ...] = get_args(Source)
 MARGIN_M = 0.05  # beyond half the body, when it drives along a wall
 TURN_MARGIN_M = 0.07  # beyond the circle around its corners, when it turns
 STAND_IN = Footprint(0.7, 0.5, "the stand-in's: nothing says how large this robot is")
+NEAREST_SHARE = 0.05  # of the poses: as near as these it came, to walls that may be blurred
+LEAST_BODY_M = 0.15
+FEWEST_SCANS = 8
+AGREEING, WELL_AGREEING = 0.5, 0.8  # of the ends of scans, on walls that they made together
+CLOCKS_APART = 0.1  # more of them by another clock: that one is right
 MOST_OFF = 0.5  # of the poses: a map that fewer lie on is not theirs
 
 
@@ -42,24 +44,28 @@ class Surveyed:
     """A floor, what it was made from, and what a person should know of it."""
 
     floor: Warehouse
-    grid: OccupancyGrid
-    source: str  # in words
+    grid: OccupancyGrid  # as the floor was made of it
     by: Source
+    source: str  # in words
     footprint: Footprint
     poses: Poses | None = None
+    agreement: float | None = None  # of walls with those of the map that is there too
     notes: list[str] = field(default_factory=list)
 
     def facts(self) -> dict[str, Any]:
         """Plain values, for people and JSON."""
         cells = self.grid.occupancy
         values: dict[str, Any] = {
+            "made_by": self.by,
             "made_from": self.source,
             "frame": self.grid.frame or (self.poses.frame if self.poses else ""),
             "cell_m": round(self.grid.cell_m, 6),
             "unknown_share": round(float((cells == UNKNOWN).mean()), 3),
-            "robot": f"{self.footprint.length_m:g} x {self.footprint.width_m:g} m,"
+            "robot": f"{self.footprint.length_m:.2f} x {self.footprint.width_m:.2f} m,"
             f" {self.footprint.source}",
         }
+        if self.agreement is not None:
+            values["walls_iou_with_map"] = round(self.agreement, 3)
         if self.poses is not None:
             free = self.grid.at(self.poses.places_m) == FREE
             values |= {
@@ -93,106 +99,129 @@ def survey(
     Raises:
         RecordingError: it cannot be read, or holds nothing that a floor can be made from.
         ConfigError: the map is none, or not of these poses; or no floor for this robot.
+        StoreError: the store is empty, or cannot be read.
     """
-    stored = None
-    if is_store(path):
-        stored = stored_drive(path)
-        profile = profile or stored.profile
-    file = path if stored is None else stored.recording
-    if file is None and stored is not None:
-        evidence = _Evidence(stored.poses, None if map_yaml is None else _of_yaml(map_yaml))
-    else:
-        assert file is not None
-        with open_recording(file, typestore=typestore, salvage=True) as recording:
-            evidence = _gather(recording, map_yaml, by, profile)
-    notes = [] if stored is None else list(stored.notes)
-    return _floor_of(evidence, by, footprint or evidence.footprint, path, notes)
-
-
-@dataclass(frozen=True)
-class _Evidence:
-    """What a floor can be made from."""
-
-    poses: Poses | None
-    recorded: tuple[OccupancyGrid, str] | None  # a map, and where it is from
-    footprint: Footprint | None = None
-
-
-def _gather(
-    recording: Recording, map_yaml: Path | None, by: Source | None, profile: Profile | None
-) -> _Evidence:
-    found = None
-    if by in (None, "map"):
-        found = recorded_map(recording) if map_yaml is None else _of_yaml(map_yaml)
-    poses = choose_poses(
-        candidate_poses(recording, profile), _placed(None if found is None else found[0])
+    evidence = gather(
+        path,
+        map_yaml=map_yaml,
+        with_map=by in (None, "map"),
+        with_scans=by in (None, "scans"),
+        profile=profile,
+        typestore=typestore,
     )
-    if profile is not None:
-        body = profile.task.body
-        size = Footprint(body.length_m, body.width_m, f"of the profile {profile.name}")
-        return _Evidence(poses, found, size)
-    return _Evidence(poses, found, footprint_of(recording)[0])
-
-
-def _of_yaml(path: Path) -> tuple[OccupancyGrid, str]:
-    return read_grid(path), str(path)
-
-
-def _floor_of(
-    evidence: _Evidence,
-    by: Source | None,
-    footprint: Footprint | None,
-    path: Path,
-    notes: list[str],
-) -> Surveyed:
-    poses, body = evidence.poses, footprint or STAND_IN
-    turn_m = float(np.hypot(body.length_m, body.width_m)) / 2 + TURN_MARGIN_M
-    if evidence.recorded is not None:
-        grid, source = evidence.recorded
-        _check_frames(grid, poses, source, str(path), notes)
-        grid, turn = along_walls(grid)
-        how: Source = "map"
-        if turn:
-            notes.append(
-                f"turned by {np.rad2deg(turn):.1f} degrees, so that the floor's axes run along its"
-                " walls"
-            )
-    elif by == "map":
-        raise RecordingError(
-            "holds no map: no nav_msgs/OccupancyGrid but costmaps",
-            where=str(path),
-            remedy="give it as --map map.yaml, or leave out --by",
-        )
-    elif poses is None:
-        raise RecordingError(
-            "holds neither a map nor anything that says where the robot was",
-            where=str(path),
-            remedy="record /map, a localisation, odometry, or /tf and /tf_static; or give a"
-            " map.yaml as the floor itself: `restock twin layout map.yaml`",
-        )
-    else:
-        grid, source = driven_corridor(poses, turn_m), f"the way driven, by {poses.source}"
-        how = "corridor"
+    body, notes = footprint or evidence.footprint, list(evidence.notes)
+    poses = evidence.poses
+    how, grid, source = _grid(evidence, by, body, str(path), notes)
+    if body is None:
+        body = _as_near_as_it_came(grid, poses) if how != "corridor" else STAND_IN
+    agreement = None
+    if how == "scans" and evidence.known is not None:
+        agreement = walls_agreement(grid, evidence.known[0])
     made = floor_of_grid(
         grid,
         name=path.stem,
         where=f"{path}, {source}",
         room_m=round(body.width_m / 2 + MARGIN_M, 3),
-        turn_m=turn_m,
+        turn_m=_turn_m(body),
         visited_m=None if poses is None else poses.places_m,
     )
-    return Surveyed(made.floor, made.grid, source, how, body, poses, notes + made.notes)
+    return Surveyed(made.floor, made.grid, how, source, body, poses, agreement, notes + made.notes)
 
 
-def _placed(grid: OccupancyGrid | None) -> Any:
-    """A function that says which places (N, 2) are on free floor; anywhere, without a map."""
+def _grid(
+    evidence: Evidence, by: Source | None, body: Footprint | None, where: str, notes: list[str]
+) -> tuple[Source, OccupancyGrid, str]:
+    """What the floor is made from: how, the grid, and where that is from in words."""
+    poses = evidence.poses
+    if by in (None, "map") and evidence.known is not None:
+        grid, source = evidence.known
+        _check_frames(grid, poses, source, where, notes)
+        grid, turn = along_walls(grid)
+        if turn:
+            notes.append(
+                f"turned by {np.rad2deg(turn):.1f} degrees, so that the floor's axes run along its"
+                " walls"
+            )
+        return "map", grid, source
+    if by == "map":
+        raise RecordingError(
+            "holds no map: no nav_msgs/OccupancyGrid but costmaps",
+            where=where,
+            remedy="give it as --map map.yaml, or leave out --by",
+        )
+    if poses is None:
+        raise RecordingError(
+            "holds neither a map nor anything that says where the robot was",
+            where=where,
+            remedy="record /map, a localisation, odometry, or /tf and /tf_static; or give a"
+            " map.yaml as the floor itself: `restock twin layout map.yaml`",
+        )
+    usable = [scans for scans in evidence.scans if len(scans) >= FEWEST_SCANS]
+    if usable:
+        half_m = LEAST_BODY_M / 2 if body is None else body.width_m / 2
+        made = _scanned(usable, poses, half_m + MARGIN_M)
+        if made.agree >= AGREEING or by == "scans":
+            notes += made.notes
+            return "scans", made.grid, f"{made.source}, by {poses.source}"
+        notes.append(f"{made.notes[-1]}: no map was made of them")
+    elif by == "scans":
+        raise RecordingError(
+            "holds no scans that can be placed: no LaserScan, or no poses at their times",
+            where=where,
+            remedy="leave out --by, or name the topics of pose and scan in a --profile",
+        )
+    elif evidence.scans:
+        notes.append(f"only {len(evidence.scans[0])} scans could be placed, too few for a map")
+    turn_m = _turn_m(body or STAND_IN)
+    return "corridor", driven_corridor(poses, turn_m), f"the way driven, by {poses.source}"
 
-    def on_map(places_m: F64) -> Bools:
-        if grid is None:
-            return np.ones(len(places_m), np.bool_)
-        return np.asarray(grid.at(places_m) == FREE, np.bool_)
 
-    return on_map
+@dataclass(frozen=True)
+class _Scanned:
+    """A map of scans by one clock."""
+
+    grid: OccupancyGrid
+    agree: float
+    source: str
+    notes: list[str]
+
+
+def _scanned(usable: list[PlacedScans], poses: Poses, room_m: float) -> _Scanned:
+    """The map of the scans by header stamps; by log time where they agree better so."""
+    best: _Scanned | None = None
+    for scans in usable:
+        said = list(scans.notes)
+        grid, agree = scan_map(scans, poses.places_m, room_m, poses.frame, said)
+        said.append(
+            f"{len(scans):,} {scans.source} were traced, and {agree:.0%} of their ends lie within a"
+            " cell of a wall that they made together"
+            + ("" if agree >= AGREEING else ": poses or clocks are off, do not trust it")
+        )
+        if best is None or agree > best.agree + CLOCKS_APART:
+            best = _Scanned(grid, agree, scans.source, said)
+        if best.agree >= WELL_AGREEING:
+            break
+    assert best is not None
+    return best
+
+
+def _turn_m(body: Footprint) -> float:
+    return float(np.hypot(body.length_m, body.width_m)) / 2 + TURN_MARGIN_M
+
+
+def _as_near_as_it_came(grid: OccupancyGrid, poses: Poses | None) -> Footprint:
+    """A robot whose size nothing says is no larger than the gaps that it went through."""
+    if poses is None:
+        return STAND_IN
+    cells, inside = grid.cells_at(poses.places_m)
+    room = ndimage.distance_transform_edt(np.pad(grid.free, 1))[1:-1, 1:-1] * grid.cell_m
+    near = float(np.quantile(room[tuple(cells[inside].T)], NEAREST_SHARE)) if inside.any() else 0.0
+    side = max(2 * (near - MARGIN_M), LEAST_BODY_M)
+    if side >= STAND_IN.width_m:
+        return STAND_IN
+    return Footprint(
+        side, side, f"nothing says how large it is, but it came within {near:.2f} m of obstacles"
+    )
 
 
 def _check_frames(

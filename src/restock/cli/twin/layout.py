@@ -65,6 +65,8 @@ class LayoutCommand:
         facts = describe_floor(floor)
         remarks: list[str] = []
         if surveyed is not None:
+            if not facts["episodes"]:
+                surveyed.notes.append("no mission fits on it: the robot moved too little")
             facts = {**surveyed.facts(), **facts, "notes": surveyed.notes}
             remarks = [f"made from {surveyed.source}", *surveyed.notes]
         if self.out is not None:
