@@ -283,15 +283,16 @@ def _close_interval(session: Session, phase: str, notify: Notify) -> None:
 
 
 def _evaluate_off_policy(session: Session) -> None:
-    """The policy as it is now, on held-out logs, into the table `off_policy`; none without logs."""
-    if session.logs is None or session.logs.panel is None:
+    """The policy as it is now, on held-out logs, into the table `off_policy`; none without any."""
+    if session.logs is None or session.logs.panel is None or not session.logs.panel.splits:
         return
     config, learner = session.config, session.learner
+    dataset = load_ope_dataset(session.logs.panel, session.task, seed=config.seed)
     rows = evaluate_off_policy(
         clone(learner.policy).to("cpu"),
-        load_ope_dataset(session.logs.panel, session.task, seed=config.seed),
+        dataset,
         discount=config.loss.discount,
-        measures=measures_of(session.task),
+        measures=measures_of(session.task, dataset),
         config=OpeConfig(seed=config.seed),
     )
     session.run.append("off_policy", [{**session.steps, **row} for row in rows])
@@ -299,7 +300,7 @@ def _evaluate_off_policy(session: Session) -> None:
 
 def _choose_start(session: Session) -> None:
     """Which policy drives first, by held-out logs, into the table `offline_start`."""
-    if session.logs is None or session.logs.panel is None:
+    if session.logs is None or session.logs.panel is None or not session.logs.panel.splits:
         return
     session.start, rows = choose_start(
         session.learner,

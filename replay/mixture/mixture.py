@@ -143,10 +143,16 @@ class PlannedUse(Checked, frozen=True):
 
 
 class EvaluationSplit(Checked, frozen=True):
-    """Episodes kept out of the panel, whole: `share` of the rows, chosen by `by`."""
+    """Episodes kept out of the panel, whole: `share` of the rows, chosen by `by`.
 
-    by: Literal["episode", "recording", "robot", "site", "time", "none"] = "episode"
+    A store of one episode has none to spare: then, as by "within_episode", the end of it.
+    """
+
+    by: Literal["episode", "recording", "robot", "site", "time", "within_episode", "none"] = (
+        "episode"
+    )
     share: Annotated[float, Meta(ge=0, lt=1)] = 0.1
+    gap_s: Annotated[float, Meta(ge=0)] = 2.0  # left out before the end of an episode
     robots: tuple[str, ...] = ()  # these, by their tags, in place of a share of all
 
     def check(self) -> None:

@@ -323,6 +323,8 @@ def _header(
         restock_version=__version__,
         newest_ns=plan.newest_ns,
         as_of_ns=plan.as_of_ns,
+        split_by=plan.split_by,
+        split_note=plan.split_note,
         logs_share=plan.logs_share,
         conditions=[*(c.name for c in by_priority), NOMINAL],
         left_out=plan.left_out,

@@ -21,6 +21,8 @@ from restock.replay.store.query import repeated_rows
 DAY_NS = 86_400 * 10**9
 # What an evaluation split is by, where that is not an episode: column and name.
 _GROUPS = {"recording": ("recording_id", "recording")} | {n: (n, n) for n in ("robot", "site")}
+_GAP_AT_MOST = 0.25  # of an episode, for its end to be held out
+_LEFT_AT_LEAST = 0.2  # of an episode, to learn from
 EPISODE_REPEATS = 3  # rows that an episode shares with the evaluation split, to be left out whole
 
 
@@ -38,7 +40,7 @@ class LeftOut:
         self.gone |= rows
 
 
-def leave_out(table: pa.Table, mixture: Mixture, evaluation_split: Bools, as_of_ns: int) -> LeftOut:
+def leave_out(table: pa.Table, mixture: Mixture, split: EvaluationRows, as_of_ns: int) -> LeftOut:
     """Rows that no stratum gets. `table` is of `read_candidates`, ages are at `as_of_ns`.
 
     Raises:
@@ -68,7 +70,8 @@ def leave_out(table: pa.Table, mixture: Mixture, evaluation_split: Bools, as_of_
     if mixture.max_versions_behind is not None:
         behind = versions_behind(table)
         out.add("of an old version of its policy", behind > mixture.max_versions_behind)
-    out.add("evaluation split", evaluation_split)
+    out.add("evaluation split", split.held)
+    out.add("gap before the evaluation split", split.gap)
     bare = ~bools(table, "labelled") & ~out.gone
     if bare.any() and mixture.unlabelled == "refuse":
         raise MixtureError(
@@ -201,16 +204,70 @@ def versions_behind(table: pa.Table) -> Ints:
     return behind[row_pair]
 
 
-def split_for_evaluation(table: pa.Table, rule: EvaluationSplit, seed: int) -> Bools:
-    """The rows of the evaluation split, (N,): whole episodes, recordings, robots or sites, or the
-    latest episodes.
+@dataclass(frozen=True)
+class EvaluationRows:
+    """What is kept to evaluate on, of N rows."""
+
+    held: Bools  # (N,)
+    gap: Bools  # (N,) before the held end of an episode: neither learnt from nor evaluated on
+    by: str  # as `EvaluationSplit.by`: what was done, where that is not what was asked for
+    note: str = ""  # why not, for people
+
+    @classmethod
+    def none(cls, rows: int, note: str = "") -> EvaluationRows:
+        """Nothing is kept."""
+        return cls(np.zeros(rows, np.bool_), np.zeros(rows, np.bool_), "none", note)
+
+
+def split_for_evaluation(table: pa.Table, mixture: Mixture) -> EvaluationRows:
+    """The evaluation split: whole episodes, recordings, robots or sites, the latest episodes, or
+    the end of each episode, which is also what there is of a single one.
 
     Raises:
         MixtureError: the rule would take everything, there is only one group to split, a robot that
             it names is not there, or rows that the mixture admits are of an unknown robot or site.
     """
+    rule, seed = mixture.evaluation_split, mixture.seed
     if rule.by == "none" or (rule.share == 0 and not rule.robots):
-        return np.zeros(len(table), np.bool_)
+        return EvaluationRows.none(len(table))
+    episodes = len(np.unique(codes(table, "episode_id")))
+    if rule.by == "within_episode" or (rule.by in ("episode", "time") and episodes == 1):
+        return _ends_of_episodes(table, rule, mixture.n_step)
+    held = _whole_groups(table, rule, seed)
+    return EvaluationRows(held, np.zeros(len(table), np.bool_), rule.by)
+
+
+def _ends_of_episodes(table: pa.Table, rule: EvaluationSplit, n_step: int) -> EvaluationRows:
+    """The last `share` of each episode's time, and a gap before it that no n-step return spans."""
+    episode, stamp_ns = codes(table, "episode_id"), table["stamp_ns"].to_numpy()
+    step = table["step_index"].to_numpy()
+    count = int(episode.max()) + 1
+    first_ns, last_ns = np.full(count, np.iinfo(np.int64).max), np.zeros(count, np.int64)
+    np.minimum.at(first_ns, episode, stamp_ns)
+    np.maximum.at(last_ns, episode, stamp_ns)
+    long_s = (last_ns - first_ns) * 1e-9
+    # Of a shorter one little would be left.
+    split = (long_s * _GAP_AT_MOST >= rule.gap_s)[episode]
+    begin_ns = last_ns - (rule.share * (last_ns - first_ns)).astype(np.int64)
+    held = split & (stamp_ns > begin_ns[episode])
+    first_held = np.full(count, np.iinfo(np.int64).max)
+    np.minimum.at(first_held, episode[held], step[held])
+    near = stamp_ns > begin_ns[episode] - round(rule.gap_s * 1e9)
+    near |= step >= first_held[episode] - n_step
+    left = np.bincount(episode[~near], minlength=count) / np.bincount(episode, minlength=count)
+    held, near = (rows & (left > _LEFT_AT_LEAST)[episode] for rows in (held, near))
+    if not held.any():
+        short = f"the one episode lasts {long_s.max():.1f} s"
+        if count > 1:
+            short = f"no episode is longer than {long_s.max():.1f} s"
+        return EvaluationRows.none(len(table), f"nothing: {short}, too short to split")
+    whole = "each episode" if rule.by == "within_episode" else "the one episode there is"
+    note = f"the last {rule.share:.0%} of {whole}, after a gap of {rule.gap_s:g} s"
+    return EvaluationRows(held, split & near & ~held, "within_episode", note)
+
+
+def _whole_groups(table: pa.Table, rule: EvaluationSplit, seed: int) -> Bools:
+    """The rows (N,) of the groups that are kept whole."""
     column, group = _GROUPS.get(rule.by, ("episode_id", "episode"))
     code = codes(table, column)
     untold = (code < 0) & bools(table, "admitted")

@@ -187,7 +187,7 @@ class Packer:
                     pa.array(self.plan.evaluation_split[begin:end])
                 )
                 # For the audit `leakage`.
-                split_by = pa.repeat(self.mixture.evaluation_split.by, len(split))
+                split_by = pa.repeat(self.plan.split_by, len(split))
                 left.write(split.append_column("split_by", split_by))
                 code = self.plan.stratum[begin:end]
                 rows = np.flatnonzero(code != NO_STRATUM)

@@ -69,6 +69,8 @@ class Header(msgspec.Struct, frozen=True):
     profile: str = ""  # the name of the one that read its rows; "" where the source did not say
     profile_toml: str = ""  # its text, for who has not its file; "" where the source did not say
     as_of_ns: int | None = None  # what the mixture's max_age_days counted to, where it has one
+    split_by: str = ""  # what the evaluation split is of; "": as its mixture says
+    split_note: str = ""  # of a split within episodes, or of none for want of time
 
 
 class Panel:
@@ -157,6 +159,11 @@ class Panel:
     @property
     def discount(self) -> float:
         return self.header.discount
+
+    @property
+    def splits(self) -> bool:
+        """Whether anything was kept out of it, to evaluate on."""
+        return (self.header.split_by or self.header.mixture.evaluation_split.by) != "none"
 
     @property
     def n_step(self) -> int:

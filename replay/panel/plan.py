@@ -32,6 +32,7 @@ from restock.replay.panel.candidates import (
     without_measured_actions,
 )
 from restock.replay.panel.exclusions import (
+    EvaluationRows,
     LeftOut,
     leave_out,
     leave_out_of_strata,
@@ -66,6 +67,8 @@ class PanelPlan:
     weight: F32  # (n,) of the panel's rows
     beside: dict[str, NDArray[Any]]  # (n,) each: what new shares need for new weights
     evaluation_split: Bools  # (N,)
+    split_by: str  # what it is of: as `EvaluationSplit.by`, or what was done instead
+    split_note: str  # for people, where that is not whole episodes
     strata: tuple[Stratum, ...]
     logs_share: float  # of a batch, all stores together; the mean over a schedule
     logs_share_wanted: float  # the same, had all strata rows enough
@@ -129,14 +132,14 @@ def plan_panel(
                 member[:, index] |= ~bools(table, "labelled")
                 state[:, index] |= ~bools(table, "labelled")
     stratum, state_code = assign(member, strata), assign(state, strata, only_pre=True)
-    evaluation_split = split_for_evaluation(table, mixture.evaluation_split, mixture.seed)
+    split = split_for_evaluation(table, mixture)
     as_of_ns = (
         time.time_ns() // 10**9 * 10**9  # which `as_of` can say again
         if mixture.as_of is None
         else nanoseconds(mixture.as_of)
     )
-    out = leave_out(table, mixture, evaluation_split, as_of_ns)
-    out.add("same steps as the evaluation split", repeats_of(connection, table, evaluation_split))
+    out = leave_out(table, mixture, split, as_of_ns)
+    out.add("same steps as the evaluation split", repeats_of(connection, table, split.held))
     if measured:
         out.reasons["odometry in place of a command"] = measured
     for other in others:
@@ -157,7 +160,7 @@ def plan_panel(
         strata,
         table,
         task_hash,
-        evaluation_split,
+        split,
         out,
         given,
         worked_out,
@@ -235,7 +238,7 @@ def _joined(
     strata: Sequence[ResolvedStratum],
     table: pa.Table,
     task_hash: str,
-    evaluation_split: Bools,
+    split: EvaluationRows,
     out: LeftOut,
     given: Sequence[SourceRows],
     worked_out: Sequence[SourcePlan],
@@ -288,7 +291,9 @@ def _joined(
         stratum=code,
         weight=weight[chosen],
         beside={"state_code": state[chosen]} | {k: v[chosen] for k, v in outcome.items()},
-        evaluation_split=evaluation_split,
+        evaluation_split=split.held,
+        split_by=split.by,
+        split_note=split.note,
         strata=tuple(lines),
         logs_share=float(filled.sum()),
         logs_share_wanted=sum(source.part for source in given),

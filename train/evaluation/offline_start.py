@@ -75,7 +75,7 @@ def choose_start(
     policy = clone(learner.policy).to("cpu")
     some = candidates(policy, task, config.offline_start, proposed=bool(known))
     ope = OpeConfig(epsilon=_EPSILON, seed=config.seed)
-    measure = measures_of(task)[-1]
+    measure = measures_of(task, dataset)[-1]
     gamma = config.loss.discount if measure == "return" else 1.0
     training = dataset.training.measured(measure)
     evaluation = dataset.evaluation.measured(measure)

@@ -101,7 +101,7 @@ def evaluate_run_off_policy(
         agent.network,
         dataset,
         discount=trained.loss.discount,
-        measures=measures_of(task),
+        measures=measures_of(task, dataset),
         config=config,
         progress=progress,
     )
@@ -113,9 +113,10 @@ def evaluate_run_off_policy(
     return OpeResult(rows, dataset.notes, agent.version)
 
 
-def measures_of(task: Task) -> tuple[Measure, ...]:
-    """What can be measured of a task: without a goal there is no success."""
-    return ("return", "success") if task.goal == "route" else ("return",)
+def measures_of(task: Task, dataset: OpeDataset) -> tuple[Measure, ...]:
+    """What can be measured on logs: without a goal, or with goals by hindsight, no success."""
+    logged = task.goal == "route" and not dataset.hindsight
+    return ("return", "success") if logged else ("return",)
 
 
 def evaluate_off_policy(

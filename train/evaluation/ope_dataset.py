@@ -76,6 +76,7 @@ class OpeDataset:
     training: OpeSteps  # that the policy learnt from: the models are fitted on them
     evaluation: OpeSteps  # of other episodes
     notes: tuple[str, ...]  # what is worth saying
+    hindsight: bool = False  # goals by hindsight: to arrive is no success
 
 
 def load_ope_dataset(
@@ -104,6 +105,10 @@ def load_ope_dataset(
             ids, training_ids = _halves(store, ids)
             training_store = store
             notes.append("the run had no panel: the models are of one half of the episodes")
+        elif logs is None and trained.header.split_by == "within_episode":
+            notes.append(f"held out: {trained.header.split_note}, not whole episodes")
+            training_ids = np.asarray(trained.meta_column("transition_id"), np.int64)
+            training_store = opened.enter_context(_store_of(trained))
         else:
             ids, left_out = _unseen(store, trained, ids)
             if left_out:
@@ -122,6 +127,8 @@ def load_ope_dataset(
             rng = np.random.default_rng([seed, 11])
             training_ids = rng.choice(training_ids, MODEL_ROWS, replace=False)
         evaluation = read_steps(store.connection, ids)
+        if hindsight := _by_hindsight(store.connection, ids):
+            notes.append("goals by hindsight are always reached: success is not estimated")
         training = read_steps(training_store.connection, training_ids)
     for name, steps, asked_for in (
         ("held-out", evaluation, ids),
@@ -131,7 +138,17 @@ def load_ope_dataset(
             notes.append(f"{missing:,} {name} rows are of other stores, and not looked at")
         if not len(steps.rows):
             raise StoreError(f"has none of the {name} rows", where=str(training_store.path))
-    return OpeDataset(training, evaluation, tuple(notes))
+    return OpeDataset(training, evaluation, tuple(notes), hindsight)
+
+
+def _by_hindsight(connection: duckdb.DuckDBPyConnection, ids: Ints) -> bool:
+    """Whether some of these rows' goals are where the robot got to."""
+    with passed_in(connection, wanted=pa.table({"transition_id": ids})):
+        ((found,),) = connection.sql(
+            "SELECT coalesce(bool_or(goal_source = 'hindsight'), false) FROM transitions"
+            " SEMI JOIN wanted USING (transition_id)"
+        ).fetchall()
+    return bool(found)
 
 
 def _open(logs: str | None, trained: Panel | None, task: Task) -> tuple[Store, Ints]:

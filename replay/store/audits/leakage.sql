@@ -1,7 +1,7 @@
 -- severity: error
 -- needs: panel
 -- advice: Make the panel again, after `duplicate_transitions` and `repeated_steps` pass; what is held out must share nothing with what is trained on.
--- doc: What is in the panel and held out at once: an episode; a recording, robot or site, where whole ones are held out; an episode that ends after the first that is held out, where the latest are; or the same step under another id.
+-- doc: What is in the panel and held out at once: an episode; a recording, robot or site, where whole ones are held out; an episode that ends after the first that is held out, where the latest are; steps up to the end of an episode, where that is; or the same step under another id.
 WITH copies AS (
     FROM same_steps()
 ), panel_steps AS (
@@ -18,7 +18,18 @@ WITH copies AS (
 )
 SELECT 'the same episode' AS leak, episode_id, count(*) AS rows
 FROM panel.rows
-SEMI JOIN panel.evaluation_split USING (episode_id)
+SEMI JOIN (FROM panel.evaluation_split WHERE split_by <> 'within_episode') USING (episode_id)
+GROUP BY episode_id
+UNION ALL
+SELECT 'later in an episode whose end is held out', episode_id, count(*)
+FROM panel.rows
+JOIN (
+    SELECT episode_id, min(step_index) AS first_held
+    FROM panel.evaluation_split
+    WHERE split_by = 'within_episode'
+    GROUP BY episode_id
+) USING (episode_id)
+WHERE step_index + horizon >= first_held
 GROUP BY episode_id
 UNION ALL
 SELECT 'a recording that is held out', episode_id, count(*)

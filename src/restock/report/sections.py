@@ -319,6 +319,8 @@ def provenance(facts: Facts) -> Section:
             "task": header.task_hash,
             "labels": header.labels_version,
             "left out of the panel": ", ".join(left_out) or "nothing",
+            "held out to evaluate on": header.split_note
+            or words(header.split_by or header.mixture.evaluation_split.by),
         }
         tables.append(Table([{"pinned": name, "value": value} for name, value in pins.items()]))
     if facts.recordings:

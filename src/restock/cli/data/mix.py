@@ -127,6 +127,11 @@ def describe(plan: PanelPlan) -> dict[str, Any]:
         "strata": [_line(stratum) for stratum in plan.strata],
         "rows": len(plan.panel_rows),
         "left_out": plan.left_out,
+        "evaluation_split": {
+            "by": plan.split_by,
+            "rows": int(plan.evaluation_split.sum()),
+            "note": plan.split_note,
+        },
         "uncertain_rows": plan.uncertain_rows,
         "uncertain": plan.mixture.uncertain,
         "logs_share": plan.logs_share,
@@ -239,6 +244,8 @@ def _summary(document: dict[str, Any]) -> list[str]:
         f" {document['effective_rows']:,.0f} equally weighted rows; largest weight"
         f" {document['largest_weight']:.3g}",
     ]
+    if (held := document["evaluation_split"])["note"]:
+        lines.append(f"held out: {held['note']} ({held['rows']:,} rows)")
     for name, rates in document["represents"].items():
         of = "the main store's" if rates == "archive" else "given"
         lines.append(f"the rows of {name} were chosen: their natural shares are {of}")

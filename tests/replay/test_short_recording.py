@@ -1,0 +1,89 @@
+"""A store of one episode: every shipped mixture packs it, and says what is held out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.stores import TASK, recording_transitions, write_store
+
+from restock import cli
+from restock.replay.mixture.mixture import parse_mixture, shipped_mixtures
+from restock.replay.panel.exclusions import split_for_evaluation
+from restock.replay.panel.panel import Panel
+
+SEED = 3  # of an episode of 58 steps
+
+
+def drive(steps: int) -> pa.Table:
+    """One episode, cut short."""
+    table = recording_transitions(1, episodes=1, seed=SEED)
+    assert len(table) >= steps
+    return table.slice(0, steps)
+
+
+@pytest.mark.parametrize("name", shipped_mixtures())
+def test_every_shipped_mixture_packs_one_episode(name: str, tmp_path: Path, capsys) -> None:
+    store = write_store(tmp_path / "store", [drive(50)], task=TASK)
+    options = ["--mixture", name, "--out", str(tmp_path / "panel")]
+    assert cli.main(["mix", str(store), *options]) == 0
+    said = capsys.readouterr().out
+    assert "held out: the last 10% of the one episode there is, after a gap of 2 s" in said
+    panel = Panel.open(tmp_path / "panel", verify=True)
+    assert panel.header.split_by == "within_episode"
+    assert panel.header.left_out["gap before the evaluation split"] >= 9  # 2 s of .2 s, jitter off
+    learnt = np.asarray(panel.meta_column("step_index"))
+    assert learnt.max() < 50 - 5 - 9
+    assert cli.main(["audit", str(store), "--panel", str(tmp_path / "panel"), "--json"]) in (0, 1)
+    found = {one["audit"]: one for one in json.loads(capsys.readouterr().out)["audits"]}
+    assert found["leakage"]["status"] == "pass"
+
+
+def test_an_episode_too_short_to_split_is_learnt_from_whole(tmp_path: Path, capsys) -> None:
+    store = write_store(tmp_path / "store", [drive(20)], task=TASK)
+    options = ["--mixture", "uniform", "--out", str(tmp_path / "panel"), "--json"]
+    assert cli.main(["mix", str(store), *options]) == 0
+    document = json.loads(capsys.readouterr().out)
+    note = "nothing: the one episode lasts 3.8 s, too short to split"
+    assert document["evaluation_split"] == {"by": "none", "rows": 0, "note": note}
+    assert document["rows"] == 20
+    assert not Panel.open(tmp_path / "panel").splits
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    lengths=st.lists(st.integers(1, 120), min_size=1, max_size=4),
+    share=st.floats(0.05, 0.5),
+    gap_s=st.floats(0, 4),
+    n_step=st.integers(1, 8),
+)
+def test_no_return_of_a_learnt_row_reaches_what_is_held_out(lengths, share, gap_s, n_step) -> None:
+    step = np.concatenate([np.arange(length) for length in lengths])
+    names = [f"e{number}" for number, length in enumerate(lengths) for _ in range(length)]
+    table = pa.table(
+        {
+            "episode_id": pa.array(names).dictionary_encode(),
+            "step_index": step,
+            "stamp_ns": step * 200_000_000,
+        }
+    )
+    split = f'by = "within_episode", share = {share}, gap_s = {gap_s}'
+    text = (
+        f"n_step = {n_step}\nevaluation_split = {{ {split} }}\n[each_condition]\nshare = 'natural'"
+    )
+    rows = split_for_evaluation(table, parse_mixture(text, where="test"))
+    assert not (rows.held & rows.gap).any()
+    learnt = ~rows.held & ~rows.gap
+    for name in set(names):
+        of = np.array(names) == name
+        if (rows.held & of).any():
+            first = step[rows.held & of].min()
+            assert rows.held[of & (step >= first)].all()
+            assert (step[learnt & of] + n_step < first).all()
+            assert (first - step[learnt & of]).min(initial=10**6) * 0.2 >= gap_s - 0.2
+            assert learnt[of].mean() > 0.2
