@@ -156,16 +156,28 @@ class Motion(Checked, frozen=True):
     window_s: Annotated[float, Meta(gt=0, le=5)]  # of the poses that a speed is the slope of
 
 
-class Zone(Checked, frozen=True):
-    """A named rectangle of the map: `box_m = [x0, y0, x1, y1]`."""
+class Zone(Checked, frozen=True, omit_defaults=True):  # a profile's hash has what is given
+    """A named rectangle of the map: `box_m = [x0, y0, x1, y1]`, turned about its middle by
+    `yaw_rad`, counter-clockwise."""
 
     name: str
     box_m: tuple[float, float, float, float]
+    yaw_rad: Annotated[float, Meta(ge=-7, le=7)] = 0.0
 
     def check(self) -> None:
         x0, y0, x1, y1 = self.box_m
         if not (x0 < x1 and y0 < y1):
             raise ValueError(f"box_m must be [x0, y0, x1, y1] with x0 < x1 and y0 < y1: {self}")
+
+    def holds(self, x_m: NDArray[Any], y_m: NDArray[Any]) -> NDArray[np.bool_]:
+        """Which points (N,) lie in it, its edges included."""
+        x0, y0, x1, y1 = self.box_m
+        if self.yaw_rad:
+            middle_x, middle_y = (x0 + x1) / 2, (y0 + y1) / 2
+            cos, sin = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
+            dx, dy = x_m - middle_x, y_m - middle_y
+            x_m, y_m = middle_x + cos * dx + sin * dy, middle_y + cos * dy - sin * dx
+        return np.asarray((x_m >= x0) & (x_m <= x1) & (y_m >= y0) & (y_m <= y1), np.bool_)
 
 
 class Profile(Checked, frozen=True):
@@ -273,8 +285,7 @@ class Profile(Checked, frozen=True):
         x, y = np.asarray(x_m, np.float64), np.asarray(y_m, np.float64)
         index = np.full(x.shape, len(self.zones), np.intp)
         for position in reversed(range(len(self.zones))):
-            x0, y0, x1, y1 = self.zones[position].box_m
-            index[(x >= x0) & (x <= x1) & (y >= y0) & (y <= y1)] = position
+            index[self.zones[position].holds(x, y)] = position
         names = [zone.name for zone in self.zones] + [ELSEWHERE]
         return [names[position] for position in index]
 

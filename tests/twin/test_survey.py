@@ -6,19 +6,24 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
+from PIL import Image
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from restock.cli import main
 from restock.errors import ConfigError, RecordingError
+from restock.ingest.profile.profile import Zone
 from restock.ingest.propose.footprint import parse_footprint
+from restock.toml import Checked, read_toml, typed
 from restock.train.twin.env.policies import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.floor_file import read_floor
 from restock.train.twin.floors.occupancy_grid import OccupancyGrid, out_of_frame
 from restock.train.twin.physics.episode import EpisodeSpec
+from restock.train.twin.survey.picture import LONG_SIDE, MARGIN, PLACE, WAY, write_picture
 from restock.train.twin.survey.survey import survey
 
 TYPES = get_typestore(Stores.ROS2_HUMBLE)
@@ -253,3 +258,48 @@ def test_a_bag_that_says_nothing_of_a_place_is_refused(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", poses=np.full((5, 3), np.nan))
     with pytest.raises(RecordingError, match="neither a map nor anything"):
         survey(bag)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.5])
+def test_zones_of_a_profile_are_those_of_the_floor_in_the_maps_frame(
+    tmp_path: Path, yaw: float
+) -> None:
+    bag = write_bag(tmp_path / "bag", poses=lap((5.0, -1.0, yaw)), frame="odom")
+    arguments = ["twin", "layout", "--from", str(bag), "--zones", str(tmp_path / "zones.toml")]
+    assert main(arguments) == 0
+    floor = survey(bag).floor
+    zones = typed(read_toml(tmp_path / "zones.toml"), _Zones, where="zones").zone
+    assert {zone.name for zone in zones} == set(floor.zones)
+    rng = np.random.default_rng(2)
+    places = rng.uniform((0, 0), (floor.width_m, floor.depth_m), (500, 2))
+    on_map = out_of_frame(places, floor.map_origin)
+    for zone in zones:
+        area = floor.zones[zone.name]
+        sure = [area.contains(x, y, 0.01) for x, y in places.tolist()]
+        outside = [not area.contains(x, y, -0.01) for x, y in places.tolist()]
+        held = zone.holds(on_map[:, 0], on_map[:, 1])
+        assert held[sure].all()
+        assert not held[outside].any()
+    # A profile's hash does not know of a turn that is not given.
+    assert msgspec.to_builtins(Zone("a", (0.0, 0.0, 1.0, 1.0))).keys() == {"name", "box_m"}
+
+
+def test_the_picture_shows_map_way_and_places_to_scale(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", poses=lap(), grid=OccupancyGrid(hall(), CELL_M))
+    made = survey(bag)
+    write_picture(made, tmp_path / "floor.png")
+    pixels = np.asarray(Image.open(tmp_path / "floor.png").convert("RGB")).astype(int)
+    scale = LONG_SIDE / max(made.floor.width_m, made.floor.depth_m)
+
+    def extent(color: tuple[int, ...]) -> tuple[float, float]:
+        """How wide and high what has this colour is, in metres."""
+        rows, columns = np.nonzero(np.abs(pixels - color[:3]).sum(axis=2) < 30)
+        on_floor = columns < MARGIN + made.floor.width_m * scale
+        return np.ptp(columns[on_floor]) / scale, np.ptp(rows[on_floor]) / scale
+
+    assert extent(WAY) == pytest.approx((7.1, 5.1), abs=0.1)
+    assert extent(PLACE) == pytest.approx((7.1, 5.1), abs=0.6)
+
+
+class _Zones(Checked, frozen=True):
+    zone: list[Zone]

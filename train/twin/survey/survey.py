@@ -26,6 +26,7 @@ from restock.train.twin.survey.map_agreement import walls_agreement
 from restock.train.twin.survey.poses import Poses
 from restock.train.twin.survey.scan_map import scan_map
 from restock.train.twin.survey.scans import PlacedScans
+from restock.train.twin.survey.zones import with_zones
 
 Source = Literal["map", "scans", "corridor"]
 MARGIN_M = 0.05  # beyond half the body, when it drives along a wall
@@ -125,7 +126,9 @@ def survey(
         turn_m=_turn_m(body),
         visited_m=None if poses is None else poses.places_m,
     )
-    return Surveyed(made.floor, made.grid, how, source, body, poses, agreement, notes + made.notes)
+    return Surveyed(
+        with_zones(made.floor), made.grid, how, source, body, poses, agreement, notes + made.notes
+    )
 
 
 def _grid(

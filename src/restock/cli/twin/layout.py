@@ -48,16 +48,21 @@ class LayoutCommand:
     """Write it here: FILE.toml, or map.yaml (and map.pgm beside it). Nothing is overwritten."""
     png: Path | None = None
     """Draw it here, from above."""
+    zones: Path | None = None
+    """Write the parts of --from's floor here, as [[zone]] of a profile in the map's frame."""
     json: bool = False
     """Print the description as JSON."""
 
     def run(self) -> int:
         """Print, and write what was asked for."""
         from restock.cli import output
+        from restock.files import write_text
         from restock.train.twin.env.draw import draw_floor, write_png
         from restock.train.twin.env.floor_report import describe_floor
         from restock.train.twin.floors.floor_file import write_floor
         from restock.train.twin.floors.occupancy_map import write_map
+        from restock.train.twin.survey.picture import write_picture
+        from restock.train.twin.survey.zones import profile_zones
 
         maps = self.out is not None and self.out.suffix in (".yaml", ".yml")
         written = self._to_write(maps)
@@ -71,8 +76,12 @@ class LayoutCommand:
             remarks = [f"made from {surveyed.source}", *surveyed.notes]
         if self.out is not None:
             write_map(floor, self.out) if maps else write_floor(floor, self.out, remarks)
-        if self.png is not None:
+        if self.png is not None and surveyed is not None:
+            write_picture(surveyed, self.png)
+        elif self.png is not None:
             write_png(self.png, draw_floor(floor))
+        if self.zones is not None:
+            write_text(self.zones, profile_zones(floor), exclusive=True)
         if self.json:
             output.print_json({**facts, "written": [str(path) for path in written]})
             return 0
@@ -84,7 +93,7 @@ class LayoutCommand:
     def _to_write(self, maps: bool) -> list[Path]:
         if self.out is not None and not maps and self.out.suffix != ".toml":
             raise RestockError(f"{self.out.name!r} ends in neither .toml nor .yaml", where="--out")
-        written = [path for path in (self.out, self.png) if path is not None]
+        written = [path for path in (self.out, self.png, self.zones) if path is not None]
         if maps and self.out is not None:
             written.append(self.out.with_suffix(".pgm"))
         for path in written:
@@ -123,7 +132,7 @@ class LayoutCommand:
         return surveyed.floor, surveyed
 
     def _refuse_without_from(self) -> None:
-        for name in ("map", "by", "profile", "footprint", "typestore"):
+        for name in ("map", "by", "profile", "footprint", "typestore", "zones"):
             if getattr(self, name) is not None:
                 raise ConfigError(
                     f"--{name} is about the recording that --from names",
