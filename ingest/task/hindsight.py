@@ -125,7 +125,8 @@ class _Cutting:
 
     def missions(self) -> Missions:
         starts = np.flatnonzero(np.diff(self.leg, prepend=self.leg[:1] - 1))
-        for first, last in zip(starts, [*(starts[1:] - 1), len(self.leg) - 1], strict=True):
+        stops = np.append(starts, len(self.leg))[1:] - 1
+        for first, last in zip(starts, stops, strict=True):
             end = "end of the recording" if last == len(self.leg) - 1 else "carried off"
             self._cut_leg(int(first), int(last), end)
         return Missions(

@@ -193,6 +193,16 @@ def by_poses(table: pa.Table, recordings: pa.Table) -> Tables:
     return table, replaced(recordings, "stand_ins", stand_ins)
 
 
+def by_hindsight(table: pa.Table, recordings: pa.Table) -> Tables:
+    first = rows_where(table, "recording_id", f"{1:016x}")
+    return replaced(table, "goal_source", np.where(first, "hindsight", None)), recordings
+
+
+def both_kinds_of_goals(table: pa.Table, recordings: pa.Table) -> Tables:
+    first = rows_where(table, "recording_id", f"{1:016x}")
+    return replaced(table, "goal_source", np.where(first, "hindsight", "logged")), recordings
+
+
 def far_operator(table: pa.Table, recordings: pa.Table) -> Tables:
     operator = rows_where(table, "behaviour_policy", "operator")
     return replaced(table, "action_residual", np.where(operator, 0.4, 0.0)), recordings
@@ -285,6 +295,8 @@ PLANTS: list[tuple[str, Plant, int, dict[str, object]]] = [
     ("unsafe_data", bumping_operator, 1, {"behaviour_policy": "operator"}),
     ("dropped_ticks", many_drops, 1, {"dropped": 2000}),
     ("odometry_as_command", measured, 1, {"instead": "odometry"}),
+    ("goals_by_hindsight", by_hindsight, 1, {"recording_id": f"{1:016x}"}),
+    ("mixed_goal_sources", both_kinds_of_goals, 1, {"logged_episodes": 120}),
     ("speeds_from_poses", by_poses, 1, {"instead": "speeds from poses"}),
     ("far_actions", far_operator, 1, {"behaviour_policy": "operator", "far_share": 1.0}),
     ("repeated_steps", bag_and_a_part_of_it, 1, {"same_as_file": "logs/part.mcap", "rows": 60}),

@@ -1,0 +1,221 @@
+"""Goals by hindsight: where a drive got to is the goal of what led there."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.driven_robot import Drive, write_bag
+
+from restock.cli import main
+from restock.errors import ConfigError
+from restock.ingest.profile.profile import load_profile, parse_profile
+from restock.ingest.profile.profile_text import profile_toml
+from restock.ingest.steps.live import LiveObserver
+from restock.ingest.task.hindsight import GoalRules, missions
+from restock.ingest.task.task import Task
+from restock.replay.store.store import Store
+
+PERIOD_S = 0.2
+TASK = Task(body={"length_m": 0.6, "width_m": 0.5}, actions=((0.0, 0.0), (0.4, 0.0)))  # type: ignore[arg-type]
+RADIUS_M = TASK.goal_radius_m
+
+
+class Unguided(Drive):
+    """Without goals and plans: 6 m out, 6 s of standing, 4 m on."""
+
+    def x_at(self, time_s):
+        return 1.0 + 0.5 * (np.minimum(time_s, 12.0) + np.maximum(time_s - 18.0, 0.0))
+
+    def topics(self):
+        topics = super().topics()
+        del topics["/goal_pose"], topics["/plan"], topics["/behaviour_policy"]
+        return topics
+
+
+class Turntable(Unguided):
+    """It never leaves its place."""
+
+    def x_at(self, time_s):
+        return 1.0 + 0.0 * time_s
+
+
+def proposed(drive: Drive, folder: Path, capsys) -> tuple[Path, Path, dict]:
+    """A bag of the drive, the profile that is proposed for it, and what the proposal said."""
+    bag, file = write_bag(drive, folder / "bag"), folder / "robot.toml"
+    assert main(["profile", "new", str(bag), "--out", str(file), "--json"]) == 0
+    return bag, file, json.loads(capsys.readouterr().out)
+
+
+def ingested(bag: Path, profile: Path, store: Path, capsys) -> Store:
+    assert main(["ingest", str(bag), "--profile", str(profile), "--store", str(store)]) == 0
+    capsys.readouterr()
+    return Store(store)
+
+
+def test_a_bag_without_goals_becomes_missions_that_say_so(tmp_path, capsys) -> None:
+    bag, file, _ = proposed(Unguided(26.0), tmp_path, capsys)
+    profile = load_profile(file)
+    assert (profile.goal_source, profile.inputs.goal, profile.task.goal) == (
+        *("hindsight", None),
+        "route",
+    )
+    with ingested(bag, file, tmp_path / "store", capsys) as store:
+        found = store.sql(
+            "SELECT goal_source, success, ended_by FROM episodes ORDER BY episode_index"
+        ).fetchall()
+        assert found == [("hindsight", None, "goal")] * 2
+        ends = store.sql(
+            "SELECT max(pose_x_m), max(goal_distance_m), min(route_remaining_m) >= 0"
+            " FROM transitions GROUP BY episode_index ORDER BY episode_index"
+        ).fetchall()
+        for (x, furthest, sane), goal_x, length in zip(ends, (7.0, 11.0), (6.0, 4.0), strict=True):
+            assert goal_x - profile.task.goal_radius_m - 0.3 <= x <= goal_x
+            assert furthest == pytest.approx(length, abs=0.2)
+            assert sane
+        assert store.sql("SELECT sum(success_share) FROM coverage").fetchall() == [(None,)]
+        stand_in = store.sql(
+            "SELECT one.instead FROM (SELECT unnest(stand_ins) AS one FROM recordings)"
+            " WHERE one.input = 'goal'"
+        ).fetchall()
+        assert stand_in[0][0].startswith("by hindsight")
+    assert main(["audit", str(tmp_path / "store"), "--json"]) in (0, 1)
+    audits = {one["audit"]: one for one in json.loads(capsys.readouterr().out)["audits"]}
+    assert audits["goals_by_hindsight"]["status"] == "info"
+    assert audits["goals_by_hindsight"]["sample"][0]["arrived"] == 2
+    assert audits["mixed_goal_sources"]["status"] == "pass"
+
+
+def test_no_feature_but_goal_and_route_changes_with_what_came_after(tmp_path, capsys) -> None:
+    bag, file, _ = proposed(Unguided(26.0), tmp_path, capsys)
+    bare = tmp_path / "none.toml"
+    text = file.read_text().replace('goal = "route"', 'goal = "none"')
+    bare.write_text(text.replace('source = "hindsight"', 'source = "logged"'))
+    routed = (
+        "waypoint_",
+        "route_",
+        "goal_",
+        "clearance_ahead",
+        "plan_return",
+        "progress",
+        "reward",
+    )
+    with (
+        ingested(bag, file, tmp_path / "a", capsys) as hindsight,
+        ingested(bag, bare, tmp_path / "b", capsys) as none,
+    ):
+        names = [
+            name
+            for name in hindsight.sql("FROM transitions LIMIT 0").columns
+            if name.startswith(
+                ("pose_", "wheel_", "gyro", "accel", "localised_", "clear", "sector")
+            )
+            and not name.startswith(routed)
+        ]
+        assert len(names) > 8
+        query = f"SELECT stamp_ns, action, {', '.join(names)} FROM transitions ORDER BY stamp_ns"
+        every = {row[0]: row for row in none.sql(query).fetchall()}
+        rows = hindsight.sql(query).fetchall()
+        assert rows
+        assert all(repr(row) == repr(every[row[0]]) for row in rows)
+
+
+def test_a_robot_that_gets_nowhere_has_no_goal_and_the_proposal_says_so(tmp_path, capsys) -> None:
+    _, file, said = proposed(Turntable(20.0), tmp_path, capsys)
+    assert load_profile(file).task.goal == "none"
+    assert "by hindsight" in said["toml"]
+    assert said["transitions"] > 90
+
+
+def test_the_key_is_checked_and_leaves_other_profiles_as_they_were(tmp_path) -> None:
+    logged = load_profile("warehouse_amr")
+    text = profile_toml(logged)
+    assert parse_profile(text, where="text").hash == logged.hash
+    hindsight = text.replace('source = "logged"', 'source = "hindsight"')
+    with pytest.raises(ConfigError, match=r"inputs.goal.*would not be used"):
+        parse_profile(hindsight, where="text")
+    with pytest.raises(ConfigError, match=r"`task.goal` is 'none'"):
+        parse_profile(hindsight.replace('goal = "route"', 'goal = "none"'), where="text")
+
+
+def test_a_running_robot_has_no_hindsight(tmp_path, capsys) -> None:
+    _, file, _ = proposed(Unguided(26.0), tmp_path, capsys)
+    with pytest.raises(ConfigError, match="by hindsight, and a robot on its way has none"):
+        LiveObserver(load_profile(file))
+
+
+def found(xy: np.ndarray, leg: np.ndarray | None = None, located: np.ndarray | None = None):
+    stamps = np.arange(len(xy)) * round(PERIOD_S * 1e9)
+    leg = np.zeros(len(xy), np.int64) if leg is None else leg
+    located = np.ones(len(xy), np.bool_) if located is None else located
+    return missions(GoalRules(), TASK, xy, stamps, located, leg)
+
+
+def line(x0: float, x1: float, speed: float = 0.5) -> np.ndarray:
+    x = np.arange(x0, x1, np.sign(x1 - x0) * speed * PERIOD_S)
+    return np.stack([x, np.zeros(len(x))], axis=1)
+
+
+def test_where_a_drive_turns_back_it_has_arrived() -> None:
+    made = found(np.concatenate([line(0, 5), line(5, 0)]))
+    assert made.ended_at == ["turned back", "end of the recording"]
+    assert made.goals_m[:, 0] == pytest.approx([5, 0], abs=0.2)
+
+
+def test_a_long_drive_is_cut_where_it_comes_by_often() -> None:
+    turn = np.linspace(0, 6 * np.pi, 600)
+    circle = 6.0 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    made = found(circle)
+    assert len(made.goals_m) >= 6
+    assert set(made.ended_at) <= {
+        "turned back",
+        "visited often",
+        "far enough",
+        "end of the recording",
+    }
+    assert made.problem.count("") > 0.95 * len(circle)
+
+
+def test_loops_are_no_part_of_a_route() -> None:
+    turn = np.linspace(0, 2 * np.pi, 40)
+    loop = np.stack([3 + 0.4 * np.sin(turn), 0.4 - 0.4 * np.cos(turn)], axis=1)
+    made = found(np.concatenate([line(0, 3), loop, line(3, 6)]))
+    route = np.concatenate(made.routes_m)
+    length = sum(np.hypot(*np.diff(route, axis=0).T).sum() for route in made.routes_m)
+    assert length < 6.5
+    assert np.abs(route[:, 1]).max() < 0.3
+
+
+PATHS = st.lists(
+    st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.integers(1, 40)),
+    min_size=1,
+    max_size=12,
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(PATHS, st.integers(0, 2**31), st.floats(0, 0.05))
+def test_every_mission_arrives_in_time_and_on_its_own_leg(moves, seed, noise) -> None:
+    rng = np.random.default_rng(seed)
+    steps = np.concatenate([np.tile(move[:2], (move[2], 1)) for move in moves])
+    xy = np.cumsum(steps, axis=0) + rng.normal(0, noise, steps.shape)
+    leg = np.cumsum(rng.random(len(xy)) < 0.02)
+    located = rng.random(len(xy)) > 0.05
+    made = found(xy, leg, located)
+    assert len(made.goals_m) == len(made.routes_m) == len(made.ended_at)
+    inside = (made.mission >= 0) & located & ~made.standing
+    for number, goal in enumerate(made.goals_m):
+        ticks = np.flatnonzero((made.mission == number) & inside)
+        assert len(np.unique(leg[ticks])) == 1
+        assert len(ticks) * PERIOD_S <= TASK.time_limit_steps * PERIOD_S
+        after = ticks[-1] + 1 + np.flatnonzero(located[ticks[-1] + 1 :])[:1]  # the tick it ends on
+        near = np.hypot(*(xy[[*ticks, *after]] - goal).T).min()
+        assert near <= RADIUS_M + 1e-9
+        assert np.allclose(made.routes_m[number][-1], goal)
+        away = np.hypot(*(xy[ticks[0]] - goal))
+        assert away >= GoalRules().at_least_m(TASK) - RADIUS_M / 2 - 1e-9
+    assert all((made.mission >= 0) | (np.array(made.problem) != ""))
