@@ -93,6 +93,7 @@ class Input(Checked, frozen=True):
     fields: dict[str, str]
     max_age_s: float | None = None  # None: latched, held until the next message
     optional: bool = False
+    stop_holds: bool = False  # of the command: one to stop holds until the next, however old
 
 
 class Inputs(Checked, frozen=True):
@@ -243,6 +244,9 @@ class Profile(Checked, frozen=True):
             apart |= {"goal"}
         if self.motion is None:
             apart |= {"motion"}
+        for source in filter(None, values["inputs"].values()):
+            if not source["stop_holds"]:
+                del source["stop_holds"]
         rest = {key: value for key, value in values.items() if key not in apart}
         return hashlib.blake2b(msgspec.json.encode(rest), digest_size=6).hexdigest()
 
@@ -449,6 +453,8 @@ def _check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
             where=where,
             remedy=f"{name} takes {', '.join(known)}",
         )
+    if source.stop_holds and name != "command":
+        raise ConfigError(f"`inputs.{name}.stop_holds`: only a command can stop", where=where)
     if source.optional and name not in FALLBACKS and not (name == "pose" and framed):
         raise ConfigError(
             f"`inputs.{name}.optional`: {name} has no fallback, so it cannot be optional",

@@ -21,6 +21,7 @@ from restock.ingest.steps.align import CLOCK_FIELD, CLOCK_TOPIC, ClockReport, al
 from restock.ingest.steps.clocks import STAMP, odd, topic_clock
 
 FASTEST_S, SLOWEST_S = 0.08, 0.5  # control periods that are proposed
+EVENTS_S = 0.2  # the control period where commands are not steady
 STEADY_S = (0.08, 0.5)  # commands this far apart make the ticks themselves
 PAUSE = 5.0  # a gap of more median gaps is a pause in driving
 LONGEST_HOLD_S = 5.0
@@ -35,6 +36,9 @@ class Gaps:
     period_s: float | None = None  # the median gap
     driving_s: float = 0.0  # the longest gap that is no pause
     longest_s: float = 0.0
+    mean_s: float = 0.0
+    hold_s: float | None = None  # how long the robot was seen to go on with a command
+    sensor_s: float = 0.0  # between two messages of what is seldomer, pose or wheels
 
     @classmethod
     def of(cls, columns: TopicColumns) -> Gaps:
@@ -43,7 +47,8 @@ class Gaps:
             return cls(len(columns))
         period = float(np.median(gaps))
         driving = gaps[gaps <= PAUSE * max(period, 0.02)]
-        return cls(len(columns), period, float(driving.max(initial=period)), float(gaps.max()))
+        longest, mean = float(gaps.max()), float(gaps.mean())
+        return cls(len(columns), period, float(driving.max(initial=period)), longest, mean)
 
 
 @dataclass(frozen=True)
@@ -65,17 +70,28 @@ class ClockChoice:
         """What gaps in log time mean on an alignment clock that runs at this pace."""
         middle = None if gaps.period_s is None else gaps.period_s * pace
         steady = middle is not None and STEADY_S[0] <= middle <= STEADY_S[1]
-        period = round(float(np.clip(middle or 0.2, FASTEST_S, SLOWEST_S)), 2)
+        # Commands on every key press, or in bursts, say nothing of how often to decide.
+        streamed = middle is not None and gaps.mean_s * pace <= 2 * middle < 2 * STEADY_S[0]
+        usual = (middle if steady or streamed else EVENTS_S) or EVENTS_S
+        least = FASTEST_S if steady else max(FASTEST_S, gaps.sensor_s * pace)
+        period = round(float(np.clip(max(usual, least), FASTEST_S, SLOWEST_S)), 2)
         driving = gaps.driving_s * pace
         return cls(
             alignment,
             "command" if steady else "rate",
             period,
             max(0.5, _up(max(2.5 * period, 1.2 * driving if steady else 0.0))),
-            float(np.clip(_up(max(2.5 * period, 1.2 * driving)), 0.2, LONGEST_HOLD_S)),
+            max(
+                float(np.clip(_up(max(2.5 * period, 1.2 * driving)), 0.2, LONGEST_HOLD_S)),
+                _up((gaps.hold_s or 0.0) * pace),
+            ),
             pace,
             middle,
         )
+
+    def at_a_rate(self) -> ClockChoice:
+        """A tick every period instead of one a command."""
+        return replace(self, steps="rate", max_gap_s=max(0.5, _up(2.5 * self.period_s)))
 
 
 def _up(seconds: float) -> float:

@@ -13,6 +13,7 @@ from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.profile.profile import FALLBACKS
 from restock.ingest.propose.candidates import Candidate
 from restock.ingest.propose.clock_choice import ClockChoice, Gaps
+from restock.ingest.propose.command_hold import CommandHold
 from restock.ingest.propose.footprint import Footprint
 from restock.ingest.propose.goal_choice import GoalChoice
 from restock.ingest.propose.motion_choice import MotionChoice
@@ -46,6 +47,8 @@ class Evidence:
     poses_from_frames: bool
     motion: MotionChoice | None  # where no topic has the wheels' speeds
     commands: Commands
+    hold: CommandHold
+    paces_s: dict[str, float]  # topic -> between two of its messages, mostly; log time
     clock: ClockChoice
     gaps: Gaps
     driven_s: float
@@ -292,8 +295,13 @@ def _input_lines(
         f"fields = {{ {fields} }}",
     ]
     if role not in LATCHED:
-        age = float(np.clip(round(seen.clock.pace * 4 / rate, 2) if rate else 1.0, 0.2, 1.0))
-        age = max(age, seen.clock.command_age_s) if role == "command" else age
+        pace_s = seen.paces_s.get(topic.name, 0.25)
+        age = float(np.clip(round(seen.clock.pace * 4 * pace_s, 2), 0.2, 1.0))
+        if role == "command":
+            age = max(age, seen.clock.command_age_s)
+            lines += [f"# {comment}" for comment in seen.hold.comments]
+            if seen.hold.stops_hold:
+                lines.append("stop_holds = true  # a command to stop, until the next one")
         lines += [*_said(trial, f"inputs.{role}.max_age_s"), f"max_age_s = {age:g}"]
     if role in FALLBACKS:
         lines.append("optional = true")

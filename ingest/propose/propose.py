@@ -18,9 +18,10 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.profile import MOTION, parse_profile
 from restock.ingest.propose.candidates import candidates
 from restock.ingest.propose.clock_choice import Gaps, by_log_time, choose_clock
+from restock.ingest.propose.command_hold import CommandHold, command_hold
 from restock.ingest.propose.footprint import Footprint, footprint_of
 from restock.ingest.propose.goal_choice import GoalChoice
-from restock.ingest.propose.motion_choice import choose_motion
+from restock.ingest.propose.motion_choice import choose_motion, pose_series
 from restock.ingest.propose.proposal_lines import Commands, Evidence, profile_lines
 from restock.ingest.propose.robot_lines import propose_robot, urdf_footprint
 from restock.ingest.propose.roles import (
@@ -33,8 +34,9 @@ from restock.ingest.propose.roles import (
     topics_for,
     transform_frames,
 )
-from restock.ingest.propose.trial import Advice, Trial, try_profile
+from restock.ingest.propose.trial import GAIN, Advice, Trial, try_profile
 from restock.ingest.steps.clocks import STAMP
+from restock.ingest.steps.motion import PoseSeries
 from restock.ingest.steps.needs import read_topics
 
 LOG_TIME = 'alignment = "log_time"'  # as refusals of header stamps say
@@ -104,6 +106,7 @@ def propose_profile(
         if trial.problem and LOG_TIME in trial.problem and seen.clock.alignment == STAMP:
             seen = replace(seen, clock=by_log_time(seen.clock, seen.gaps, trial.problem))
             trial = tried(recording, "\n".join(profile_lines(seen, name, problems)))
+        seen, trial = _by_rate(recording, seen, name, trial)
         goal = seen.goal.tried(trial.transitions, trial.dropped)
         if goal != seen.goal:
             seen = replace(seen, goal=goal)
@@ -117,6 +120,27 @@ def propose_profile(
     return Proposal(
         text, missing, len(seen.signals), trial.ticks, trial.transitions, problems, advice
     )
+
+
+def _by_rate(
+    recording: Recording, seen: Evidence, name: str, trial: Trial
+) -> tuple[Evidence, Trial]:
+    """A tick every period instead of one a command, where that makes rows of much more time."""
+    clock = seen.clock
+    if clock.steps != "command":
+        return seen, trial
+    goalless = replace(seen, goal=GoalChoice(None))  # pauses may cost the goals of a drive, too
+    rate = replace(seen, clock=clock.at_a_rate())
+    now, other = (
+        tried(recording, "\n".join(profile_lines(one, name, [])))
+        for one in (goalless, replace(goalless, clock=rate.clock))
+    )
+    if other.problem or other.seconds <= GAIN * now.seconds:
+        return seen, trial
+    why = f"a tick a command makes rows of {now.seconds:.0f} s, one a period of {other.seconds:.0f}"
+    comments = (*clock.comments, f"{why} s: commands pause, and hold.")
+    rate = replace(rate, clock=replace(rate.clock, comments=comments))
+    return rate, tried(recording, "\n".join(profile_lines(rate, name, [])))
 
 
 def tried(recording: Recording, toml: str) -> Trial:
@@ -148,7 +172,12 @@ def gather(
     # Odometry drifts: where transforms lead to a map, they are the better pose.
     drifts = all(topic.type == MOTION for topic, _ in roles["pose"])
     framed = frames is not None and (frames.localised or not roles["pose"]) and drifts
-    commands, gaps = _commands(recording, roles)
+    poses = None
+    if framed or roles["pose"]:
+        poses, _ = pose_series(recording, roles, frames if framed else None)
+    commands, gaps, hold = _commands(recording, roles, poses)
+    paces = _paces(recording, roles)
+    gaps = replace(gaps, hold_s=hold.age_s, sensor_s=_seldomest(paces, roles, poses))
     motion = None
     if not roles["wheels"] and (framed or roles["pose"]):
         motion = choose_motion(recording, roles, frames, framed=framed)
@@ -168,6 +197,8 @@ def gather(
         framed,
         motion,
         commands,
+        hold,
+        paces,
         choose_clock(
             recording,
             list(dict.fromkeys(topic.name for _, topic, _ in best)),
@@ -189,15 +220,18 @@ def gather(
     )
 
 
-def _commands(recording: Recording, roles: Roles) -> tuple[Commands, Gaps]:
-    """Read the commands: how fast, which way, how often."""
+def _commands(
+    recording: Recording, roles: Roles, poses: PoseSeries | None
+) -> tuple[Commands, Gaps, CommandHold]:
+    """Read the commands: how fast, which way, how often, and how long each holds."""
     if not roles["command"]:
-        return Commands(), Gaps()
+        return Commands(), Gaps(), CommandHold()
     topic, kind = roles["command"][0]
     paths = list(kind.fields.values())
     columns = recording.read({topic.name: paths})[topic.name]
     speed, turn = (np.asarray(columns.fields[path], np.float64) for path in paths)
     sane = np.isfinite(speed) & np.isfinite(turn)
+    times = columns.log_time_ns[sane]
     speed, turn = speed[sane], turn[sane]
     # The fastest that is commanded now and then; a single outlier is no action.
     fast, sharp = (float(np.percentile(np.abs(c), 98)) if len(c) else 0.0 for c in (speed, turn))
@@ -209,7 +243,36 @@ def _commands(recording: Recording, roles: Roles) -> tuple[Commands, Gaps]:
         topic.name,
         measured=topic.type == MOTION,
     )
-    return commands, Gaps.of(columns)
+    hold = CommandHold()
+    if poses is not None and len(poses) > 1 and not commands.measured:
+        order, zero = np.argsort(times, kind="stable"), poses.stamp_ns[0]
+        seconds = (times[order] - zero) * 1e-9
+        since = PoseSeries(poses.stamp_ns - zero, poses.x_m, poses.y_m, poses.yaw_rad)
+        hold = command_hold(seconds, speed[order], turn[order], since)
+    return commands, Gaps.of(columns), hold
+
+
+def _paces(recording: Recording, roles: Roles) -> dict[str, float]:
+    """Of each topic that fills an input, how far apart its messages mostly are (s, log time)."""
+    names = {fitting[0][0].name for fitting in roles.values() if fitting}
+    found = {}
+    for name, columns in recording.read({name: [] for name in sorted(names)}).items():
+        gaps = np.diff(np.sort(columns.log_time_ns)) * 1e-9
+        if len(gaps) > 1:
+            # The median, or the mean of half of them where messages come in bursts.
+            found[name] = max(float(np.median(gaps)), float(np.percentile(gaps, 90)) / 2)
+    return found
+
+
+def _seldomest(paces: dict[str, float], roles: Roles, poses: PoseSeries | None) -> float:
+    """The time between two messages of pose or wheels, whichever come less often."""
+    names = [
+        fitting[0][0].name for role in ("pose", "wheels") for fitting in [roles[role]] if fitting
+    ]
+    known = [paces[name] for name in names if name in paces]
+    if poses is not None and len(poses) > 1 and not names:
+        known.append(float(np.median(np.diff(poses.stamp_ns))) * 1e-9)
+    return max(known, default=0.0)
 
 
 def _stamped(recording: Recording, roles: Roles, commands: Commands) -> bool:

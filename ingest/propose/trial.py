@@ -45,6 +45,7 @@ class Trial:
 
     ticks: int = 0
     transitions: int = 0
+    seconds: float = 0.0  # that the transitions span
     dropped: dict[str, int] = field(default_factory=dict)  # ticks in no episode, by reason
     endings: dict[str, int] = field(default_factory=dict)  # episodes by what ended them
     advice: list[Advice] = field(default_factory=list)
@@ -66,8 +67,15 @@ def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
     worst = sorted(episodes.dropped.items(), key=lambda item: -item[1])
     why = "; ".join(f"{reason}: {count} of {len(steps)} ticks" for reason, count in worst)
     problem = "" if episodes.transitions else f"no transition: {why}"
+    stamps = steps.signals["stamp_ns"]
     return Trial(
-        len(steps), episodes.transitions, dict(worst), dict(endings.most_common()), advice, problem
+        len(steps),
+        episodes.transitions,
+        sum(int(stamps[one.last] - stamps[one.first]) for one in episodes.episodes) / NS,
+        dict(worst),
+        dict(endings.most_common()),
+        advice,
+        problem,
     )
 
 

@@ -142,7 +142,12 @@ class AlignedInputs:
         """
         source, lead_ns = self.inputs.by_name[name], round(self._lead_s(name) * NS)
         latest = self.latest_of(source.topic, source.max_age_s, lead_ns=lead_ns)
-        return replace(latest, age_ns=latest.age_ns - np.where(latest.known, lead_ns, 0))
+        fresh = latest.fresh
+        if source.stop_holds and len(self.inputs.topics[source.topic]):
+            stops = np.all([self.inputs.numbers(name, key) == 0 for key in source.fields], axis=0)
+            fresh = fresh | (latest.known & stops[latest.row])
+        age_ns = latest.age_ns - np.where(latest.known, lead_ns, 0)
+        return replace(latest, age_ns=age_ns, fresh=fresh)
 
     def latest_of(
         self,

@@ -21,7 +21,7 @@ SAMPLES = ROOT / "sample_logs"
 ROWS = sample_transitions("amr_tuesday")
 ROBOTS = {  # of others -> transitions of the proposal
     "turtlebot3-sim-humble": 133,
-    "turtlebot3-sim-sparse-cmd": 9,
+    "turtlebot3-sim-sparse-cmd": 208,
     "ros1/husky_robot_localization.bag": 3903,
 }
 

@@ -15,7 +15,9 @@ from support.paths import SHARED
 from restock.cli import main
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.propose.command_hold import CommandHold, command_hold
 from restock.ingest.steps.align import NS
+from restock.ingest.steps.motion import PoseSeries
 
 PACES = [0.5, 0.9, 0.97, 1.0, 1.1]
 
@@ -70,13 +72,14 @@ def test_commands_twice_a_second_make_no_gaps(tmp_path, capsys):
     ]
 
 
-def test_a_hold_that_drops_most_ticks_says_what_another_one_gives(tmp_path, capsys):
+def test_a_hold_is_read_from_how_long_the_robot_drives_on(tmp_path, capsys):
     times = (*np.arange(0, 1, 0.1), 6.0, 17.0)
     bag, said, file = propose(Commanded(20.0, times_s=tuple(times)), tmp_path, capsys)
-    (advice,) = [each for each in said["advice"] if each["key"] == "clock.steps"]
-    assert "if the robot drives on with its last command" in advice["text"]
-    assert advice["text"] in said["toml"]
-    strict = file.read_text().replace('steps = "command"', 'steps = "rate"')
+    profile = load_profile(file)
+    assert (profile.clock.steps, profile.inputs.command.max_age_s) == ("rate", pytest.approx(11))
+    assert "drove on to the end of 3 of 3 gaps" in said["toml"]
+    assert said["transitions"] > 90  # 20 s, five a second
+    strict = file.read_text().replace("max_age_s = 11", "max_age_s = 1", 1)
     file.write_text(strict)
     assert main(["profile", "check", str(file), str(bag), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
@@ -90,6 +93,27 @@ def test_a_hold_that_drops_most_ticks_says_what_another_one_gives(tmp_path, caps
     assert main(["profile", "check", str(file), str(bag), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["outcome"]["transitions"] == promised > 3 * before
+
+
+def driven(until_s: float, told: list[tuple[float, float]]) -> CommandHold:
+    """What is read of commands (time, speed) to a robot that goes .5 m/s until then, and stands."""
+    at = np.arange(0, 30, 0.05)
+    x = 0.5 * np.minimum(at, until_s)
+    poses = PoseSeries((at * NS).astype(np.int64), x, np.zeros(len(at)), np.zeros(len(at)))
+    times, speeds = (np.array(column) for column in zip(*told, strict=True))
+    return command_hold(times, speeds, np.zeros(len(times)), poses)
+
+
+def test_a_driver_that_times_out_is_seen():
+    hold = driven(10.6, [(0.1 * i, 0.5) for i in range(101)])
+    assert hold.age_s == pytest.approx(0.6, abs=0.5)
+    assert "it stood in 1 of them" in hold.comments[0]
+
+
+def test_a_command_to_stop_holds_if_the_robot_stands():
+    told = [(0.1 * i, 0.5) for i in range(101)] + [(10.1, 0.0)]
+    assert driven(10.2, told).stops_hold
+    assert not driven(25.0, told).stops_hold  # somebody else drives it
 
 
 def test_an_outline_that_the_lidar_contradicts_is_said(tmp_path, capsys):
@@ -150,7 +174,7 @@ def test_log_time_where_stamps_cannot_be_followed(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("bag", "transitions", "options"),
     [
-        ("sim-time-husky", 73, ()),
+        ("sim-time-husky", 77, ()),
         ("sim-time-mobrob", 41, ("--odometry-as-command",)),
         ("sim-time-robot-kf", 520, ("--odometry-as-command",)),
         ("robots/turtlebot3-sim/rosbag_test", 113, ()),

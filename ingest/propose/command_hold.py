@@ -1,0 +1,107 @@
+"""How long a command holds, read from what the robot did where the next one was late.
+
+Some drivers stop a robot that hears nothing for half a second; others drive on until they are told
+otherwise. Where commands come seldom that decides the row count, so it is read from the poses: of
+every gap after a command to move, whether the robot still moved when the gap ended, or since when
+it stood. A command to stop holds until the next one whatever the driver does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from restock.arrays import F64
+from restock.ingest.steps.motion import PoseSeries
+from restock.ingest.task.signals import wrap_angle
+
+LEAST_GAP_S = 0.4  # shorter ones say little
+WITHIN_S = 0.5  # that a robot has moved in, at the end of a gap
+MOVES = 0.25  # of what was commanded: less is standing
+STANDS_M, STANDS_RAD = 0.05, 0.2  # within a gap after a command to stop
+LONGEST_S = 60.0
+
+
+@dataclass(frozen=True)
+class CommandHold:
+    """What a recording shows of how long its robot goes on with a command; in log time."""
+
+    age_s: float | None = None  # None: nothing is known
+    stops_hold: bool = False  # a command to stop holds until the next
+    comments: tuple[str, ...] = ()
+
+
+def command_hold(
+    time_s: F64, speed_mps: F64, yaw_rate_radps: F64, poses: PoseSeries
+) -> CommandHold:
+    """What the gaps between commands (N,) show; `poses` are on the same clock, from the same 0."""
+    at = poses.stamp_ns * 1e-9
+    if not len(time_s) or len(at) < 2:
+        return CommandHold()
+    turned = np.concatenate([[0.0], np.cumsum(wrap_angle(np.diff(poses.yaw_rad)))])
+    # The way, summed up: a robot that comes back to where it was has moved.
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(poses.x_m), np.diff(poses.y_m)))])
+    within = max(WITHIN_S, 3 * float(np.median(np.diff(at))))
+    ends = np.append(time_s[1:], at[-1])
+    on, stopped, stood, went = [], [], 0, 0
+    for begin, end, speed, turn in zip(time_s, ends, speed_mps, yaw_rate_radps, strict=True):
+        if end - begin < LEAST_GAP_S or at[0] > begin or at[-1] < end - within:
+            continue
+        if speed == 0 and turn == 0:
+            settled = min(begin + 1.0, end)  # it brakes first
+            moved = [float(np.ptp(np.interp([settled, end], at, c))) for c in (way, turned)]
+            still = moved[0] <= STANDS_M and moved[1] <= STANDS_RAD
+            stood, went = stood + still, went + (not still)
+            continue
+        moving = _last_moving(at, way, turned, begin, end, speed, turn, within)
+        if moving is None:
+            continue  # it never began to: held up, or not this robot's command
+        if moving >= end - within / 2:
+            on.append(end - begin)
+        else:
+            stopped.append(moving - begin)
+    return _judge(on, stopped, stood, went)
+
+
+def _last_moving(
+    at: F64,
+    way: F64,
+    turned: F64,
+    begin: float,
+    end: float,
+    speed: float,
+    turn: float,
+    within: float,
+) -> float | None:
+    """When in a gap the robot last did a good part of what the command says; None: never."""
+    checked = np.arange(min(begin + within, end), end + 1e-9, within / 4)
+    checked = np.append(checked, end)
+    since = np.maximum(checked - within, begin)
+    span = np.maximum(checked - since, 1e-3)
+    gone = (np.interp(checked, at, way) - np.interp(since, at, way)) / span
+    spun = (np.interp(checked, at, turned) - np.interp(since, at, turned)) / span
+    drives = gone >= MOVES * abs(speed) if speed else spun * np.sign(turn) >= MOVES * abs(turn)
+    # Poses that stay away for longer say nothing.
+    seen = np.searchsorted(at, checked, "right") > np.searchsorted(at, since, "left")
+    moving = np.flatnonzero(drives & seen)
+    return float(checked[moving[-1]]) if len(moving) else None
+
+
+def _judge(on: list[float], stopped: list[float], stood: int, went: int) -> CommandHold:
+    comments = []
+    age = None
+    if on:
+        age = min(max(on), LONGEST_S)
+        comments.append(
+            f"the robot drove on to the end of {len(on)} of {len(on) + len(stopped)} gaps of"
+            f" {LEAST_GAP_S:g} s and more between commands, the longest of {max(on):.1f} s"
+        )
+    if stopped:
+        middle = float(np.median(stopped))
+        age = middle if age is None else age
+        comments.append(f"it stood in {len(stopped)} of them from {middle:.1f} s on (median)")
+    holds = went <= stood
+    if stood:
+        comments.append(f"it stood through {stood} of {stood + went} gaps after a command to stop")
+    return CommandHold(age, holds, tuple(comments))
