@@ -16,10 +16,11 @@ from typing import Any, Literal
 import numpy as np
 import pyarrow as pa
 
-from restock.errors import RecordingError
+from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.profile import Profile
+from restock.ingest.profile.profile_text import profile_toml, read_profile_toml
 from restock.ingest.profile.tag_rules import Told, resolve_tags
 from restock.ingest.steps.episodes import Split, split
 from restock.ingest.steps.needs import read_topics
@@ -88,7 +89,8 @@ def ingest(
     put it there is left alone, unless `force`. One whose rows are largely those of another
     recording in the store (a part of it, a copy) is kept and said, or refused, by `repeated`.
     `tags` say whose drive it is, before what the recording says itself; "" takes a tag off. Where
-    only tags are new, the rows that are there are written with them: the status is "tagged".
+    only tags or the profile's [robot] are new, the rows that are there are written with them: the
+    status is "tagged".
 
     Raises:
         RecordingError: no recording, damaged (unless `salvage`), not of this profile, it gives
@@ -101,10 +103,13 @@ def ingest(
         tagged = (before or {}).get("tags") or {}
         told = resolve_tags(profile.tags, Path(path), recording.metadata, tags or {}, tagged)
         if store is not None and before is not None and not force and _unchanged(before, profile):
-            if told.tags == (before["tags"] or {}):
+            new = {"tags": told.tags}
+            if _other_robot(before, profile):
+                new["profile_toml"] = profile_toml(profile)
+            elif told.tags == (before["tags"] or {}):
                 return IngestResult(str(path), "unchanged", before)
-            version = _tag(store, before, told.tags)
-            manifest = before | {"tags": told.tags}
+            version = _tag(store, before, new)
+            manifest = before | new
             return IngestResult(str(path), "tagged", manifest, notes=told.notes, version=version)
         try:
             return _Ingest(str(path), recording, profile, told, repeated, before).run(store)
@@ -128,10 +133,20 @@ def _unchanged(before: Mapping[str, Any], profile: Profile) -> bool:
     return all(by_rules[name] == value for name, value in definitions(profile).items())
 
 
-def _tag(store: StoreWriter, before: Mapping[str, Any], tags: Mapping[str, str]) -> int:
-    """Write a recording's rows again with other tags; returns the store's version with them."""
+def _other_robot(before: Mapping[str, Any], profile: Profile) -> bool:
+    """Whether the profile that a recording was ingested with says something else in [robot]."""
+    if not (text := before.get("profile_toml")):
+        return False
+    try:
+        return read_profile_toml(text, where="profile_toml").robot != profile.robot
+    except ConfigError:  # as another version wrote it
+        return False
+
+
+def _tag(store: StoreWriter, before: Mapping[str, Any], new: Mapping[str, Any]) -> int:
+    """Write a recording's rows again with what is `new` in its manifest; returns the version."""
     ingest_id = uuid.uuid4().hex[:16]
-    manifest = {**before, "ingest_id": ingest_id, "tags": tags}
+    manifest = {**before, "ingest_id": ingest_id, **new}
     rows = store.rows(before["recording_id"], before["ingest_id"])
     rows = replaced(rows, {"ingest_id": ingest_id})
     return store.write_all(

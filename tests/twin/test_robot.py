@@ -142,6 +142,25 @@ def test_a_slippery_floor_and_traffic_apply_to_it(name: str) -> None:
     assert sum("wheel_slip" in text for text in truths) > 5
 
 
+@pytest.mark.parametrize("period_s", [0.05, 0.08, 0.12])
+def test_a_control_period_of_some_hundredths_of_a_second(period_s: float) -> None:
+    robot, body, speed, _ = ROBOTS["burger"]
+    task = Task(body=body, actions=((0.0, 0.0), (speed, 0.0)), control_period_s=period_s)
+    sim = Simulation(1, task, empty_floor(), 0.01, 1, robot=robot_model(robot, body))
+    place = Episode(EpisodeSpec("nominal", 0), (30, 30, 0), (1, 1), np.zeros((2, 2)))
+    sim.reset(0, place, Perturbation())
+    for _ in range(50):
+        sim.drive(np.array([[speed, 0.0]]))
+    assert sim.time_s[0] == pytest.approx(50 * period_s)
+    assert sim.qpos[0, 0] - 30 == pytest.approx(speed * (50 * period_s - 0.1), rel=0.05)
+
+
+def test_a_control_period_that_no_timestep_divides_is_refused() -> None:
+    task = Task(body=Body(0.5, 0.4), actions=((0.0, 0.0),), control_period_s=0.133)
+    with pytest.raises(ConfigError, match=r"control_period_s = 0\.133 is not some physics"):
+        Simulation(1, task, empty_floor(), 0.01, 1)
+
+
 @pytest.mark.parametrize(
     ("robot", "message"),
     [

@@ -198,7 +198,10 @@ def _drive(
 ) -> tuple[FedRows | None, str]:
     conditions: list[Condition] = conditions_in_twin(profile.conditions, profile.signals)[0]
     try:
-        return drive_twin(profile.task, conditions, perturbation=perturbation, seed=seed), ""
+        driven = drive_twin(
+            profile.task, conditions, robot=profile.robot, perturbation=perturbation, seed=seed
+        )
+        return driven, ""
     except RestockError as error:  # no such robot in the twin: the other checks still say much
         return None, f"the twin cannot be driven with this profile: {error.what}"
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import Ints
 from restock.ingest.task.conditions import Condition, label, primary
+from restock.ingest.task.robot import Robot
 from restock.ingest.task.signals import STORED_SIGNALS
 from restock.ingest.task.task import Task
 from restock.train.diagnosis.fed_rows import FedRows
@@ -34,6 +35,7 @@ def drive_twin(
     task: Task,
     conditions: Sequence[Condition],
     *,
+    robot: Robot | None = None,
     perturbation: Perturbation | None = None,
     seed: int = 0,
     robots: int = ROBOTS,
@@ -48,7 +50,7 @@ def drive_twin(
     """
     env = WarehouseVectorEnv(
         robots, conditions=dict.fromkeys(KINDS, 1.0), perturbation=perturbation, seed=seed,
-        nthread=0, task=task,
+        nthread=0, task=task, robot=robot,
     )  # fmt: skip
     table = np.asarray(task.actions, np.float64)
     driver = Handover(

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from restock.errors import ConfigError
+from restock.ingest.task.robot import Robot
 from restock.ingest.task.task import Task
 from restock.train.evaluation.evaluate import EpisodeResult, fixed_episodes, run_episodes
 from restock.train.twin.env.interface import Policy
@@ -43,6 +44,7 @@ def drive_references(
     task: Task,
     names: Sequence[str] = ("planner", "operator"),
     *,
+    robot: Robot | None = None,
     kinds: Sequence[str] = KINDS,
     episodes: int = 20,
     first_seed: int = FIRST_SEED,
@@ -54,6 +56,7 @@ def drive_references(
     """How each reference ends the same episodes, `episodes` of every kind: those of `restock eval`.
 
     Args:
+        robot: whose task it is; None: the twin's own.
         discount: of one step, for `discounted_return`.
 
     Raises:
@@ -67,6 +70,7 @@ def drive_references(
         min(32, len(specs)),
         nthread=nthread,
         task=task,
+        robot=robot,
         seed=first_seed,
         layouts=layouts,
         conditions=dict.fromkeys(kinds, 1.0),

@@ -20,6 +20,7 @@ from msgspec import Meta
 
 from restock.arrays import F64
 from restock.errors import ConfigError, StoreError
+from restock.ingest.task.robot import Robot
 from restock.replay.store.store import Store
 from restock.stats import bootstrap, median
 from restock.toml import Checked
@@ -49,6 +50,7 @@ from restock.train.twin.calibration.fit_uncertainty import (
     unidentified,
 )
 from restock.train.twin.calibration.fitted_twin import FittedTwin, HeldOutGap, ParameterEstimate
+from restock.train.twin.calibration.logged_robot import robot_of_store
 from restock.train.twin.calibration.logged_steps import LoggedSteps, logged_steps
 from restock.train.twin.calibration.open_loop import replay_segments
 from restock.train.twin.calibration.segments import (
@@ -57,6 +59,7 @@ from restock.train.twin.calibration.segments import (
     log_segments,
     ordinary_driving,
     split_at,
+    whole_periods_s,
 )
 from restock.train.twin.physics.perturbation import Perturbation
 
@@ -77,6 +80,7 @@ class FitConfig(Checked, frozen=True):
     base: Perturbation = Perturbation()
     recordings: tuple[str, ...] = ()  # of the store; none: all
     task_hash: str | None = None  # whose rows, where the store has several tasks
+    robot: Robot | None = None  # whose logs they are; None: that of the store's own profile
     timestep_s: Annotated[float, Meta(gt=0)] | None = None  # None: the base's
     horizon_s: Annotated[float, Meta(gt=0)] = 3.0  # of the segments that are fitted
     held_out: Annotated[float, Meta(ge=0, lt=1)] = 0.25  # share of the log, to measure the gap on
@@ -124,7 +128,8 @@ def fit(
     config, report = config or FitConfig(), on_progress or (lambda text: None)
     rng = np.random.Generator(np.random.PCG64(config.seed))
     task = store.task(config.task_hash)
-    scope = fit_scope(store, task, config.parameters, config.recordings)
+    robot = config.robot or robot_of_store(store, task.hash)
+    scope = fit_scope(store, task, config.parameters, config.recordings, robot)
     data = _fit_data(store, config, rng)
     few = data.segments.take(rng.permutation(len(data.segments))[:COARSE_SEGMENTS])
     coarse, fine = (
@@ -168,8 +173,8 @@ def fit(
 
 def _fit_data(store: Store, config: FitConfig, rng: np.random.Generator) -> _FitData:
     """Segments of ordinary driving to fit, at most `max_segments`, and what is held out."""
-    steps = logged_steps(store, config.task_hash, config.recordings)
-    segments = log_segments(steps, config.horizon_s)
+    steps = logged_steps(store, config.task_hash, config.recordings, config.robot)
+    segments = log_segments(steps, whole_periods_s(steps.task, config.horizon_s))
     if not len(segments):
         raise StoreError(
             f"no stretch of {config.horizon_s:g} s: {segments.left_out}", where=str(store.path),

@@ -11,6 +11,7 @@ import numpy as np
 from restock.arrays import F64
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.robot import Robot
 from restock.ingest.task.task import Task
 from restock.replay.store.store import Store
 from restock.train.twin.physics.perturbation import RANGES, Perturbation
@@ -61,6 +62,7 @@ PARAMETERS: dict[str, Parameter] = {
         Parameter("gyro_bias_radps", "rad/s", 0.001, 0.01),  # what the gyroscope says at rest
     )
 }
+MEASURED = ("wheel_radius_m", "track_m", "mass_kg", "max_accel_mps2", "max_yaw_accel_radps2")
 DEFAULT = tuple(item.name for item in PARAMETERS.values() if item.default)
 
 
@@ -136,9 +138,15 @@ class FitScope:
 
 
 def fit_scope(
-    store: Store, task: Task, names: Sequence[str], recordings: Sequence[str]
+    store: Store,
+    task: Task,
+    names: Sequence[str],
+    recordings: Sequence[str],
+    robot: Robot | None = None,
 ) -> FitScope:
     """What of `names` the recordings (all, if none is named) can identify at all.
+
+    `robot` is the profile's own; None: the twin's stand-in stands for the log's.
 
     Raises:
         ConfigError: nothing.
@@ -147,7 +155,24 @@ def fit_scope(
     notes: list[str] = []
     channels = list(CHANNELS)
     twin = load_profile("warehouse_amr").task.body
-    if (task.body.length_m, task.body.width_m) != (twin.length_m, twin.width_m):
+    if robot is not None:
+        guessed = [name for name in MEASURED if robot.origin_of(name) == "default"]
+        if "payload_kg" in names:
+            refused["payload_kg"] = (
+                "how strong the motors of the profile's robot are is not known, so wheels that lag"
+                " do not tell how heavy it is"
+            )
+        if guessed:
+            notes.append(
+                f"nothing says {', '.join(guessed)} of the robot: what is fitted is relative to"
+                " a guess by its outline"
+            )
+        if "wheel_radius_m" not in guessed or "track_m" not in guessed:
+            notes.append(
+                "wheel_radius_scale and track_scale are relative to the profile's robot; its"
+                " odometry keeps believing those values, as the log's does"
+            )
+    elif (task.body.length_m, task.body.width_m) != (twin.length_m, twin.width_m):
         body = f"{task.body.length_m:g} x {task.body.width_m:g} m"
         why = f"the log's robot ({body}) is not the twin's: its mass and its contacts differ"
         refused |= {name: why for name in names if PARAMETERS[name].own_body}

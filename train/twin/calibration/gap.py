@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 
 from restock.arrays import Bools, Ints
 from restock.errors import StoreError
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.robot import Robot
 from restock.replay.store.store import Store
 from restock.stats import NOT_KNOWN, ConfidenceInterval, clustered_quantiles, clustered_ratio
 from restock.train.twin.calibration.logged_steps import NOMINAL, LoggedSteps, logged_steps
@@ -56,14 +58,15 @@ def measure_gap(
     *,
     warehouse: Warehouse | None = None,
     task_hash: str | None = None,
+    robot: Robot | None = None,
     notes: tuple[str, ...] = (),
     on_progress: Callable[[str], None] | None = None,
 ) -> TwinGap:
     """Measure the gap of the nominal twin, and of a calibrated one beside it.
 
     `warehouse` is the floor that the log may have been driven on (default: the twin's own); what
-    the lidar sees is compared only where the two agree. `notes` are listed beside what was not
-    done.
+    the lidar sees is compared only where the two agree. `robot` is whose logs they are (default:
+    that of the store's own profile). `notes` are listed beside what was not done.
 
     Raises:
         ConfigError: a horizon that is not some control periods, or a control period that the twin
@@ -75,7 +78,7 @@ def measure_gap(
     report = on_progress or (lambda text: None)
     twins = {BEFORE: Perturbation()} | ({AFTER: calibrated} if calibrated is not None else {})
     judged = list(twins)[-1]
-    steps = logged_steps(store, task_hash)
+    steps = logged_steps(store, task_hash, robot=robot)
     if not steps.followed.any():
         raise StoreError("no step is followed by another", where=str(store.path))
     noise = measured_noise(steps, twins[judged])
@@ -103,6 +106,7 @@ def measure_gap(
         "twins": {name: msgspec.to_builtins(twin) for name, twin in twins.items()},
         "noise": asdict(noise),
         "limits": msgspec.structs.asdict(config.limits),
+        "robot": "the twin's stand-in" if steps.robot is None else "the profile's own",
         "floor": warehouse.name,
         "floor_difference": difference,
         "left_out": {f"{path.horizon_s:g} s": path.left_out for path in paths},
@@ -288,6 +292,11 @@ def _not_done(
             f" twin's (their clearances differ by {difference:.2f} in the median, {AGREES:g} is the"
             " most). Steps were driven on an empty floor: clearances in their rewards are the log's"
             " own, and nothing is bumped into."
+        )
+    if steps.robot is None and steps.task.body != load_profile("warehouse_amr").task.body:
+        yield (
+            "The robot driven is the twin's stand-in in the log's outline: the profile has none"
+            " (docs/robot.md)."
         )
     if steps.task.goal != "route":
         yield (

@@ -24,11 +24,14 @@ from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import ConfigError, StoreError
 from restock.ingest.store.episode_rows import episode_ends
 from restock.ingest.store.writer import TRANSITIONS
+from restock.ingest.task.robot import Robot
 from restock.ingest.task.schema import SIGNAL_COLUMNS
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task
 from restock.replay.store.store import Store, passed_in
+from restock.train.twin.calibration.logged_robot import robot_of_store
 from restock.train.twin.physics.robot_model import RobotModel
+from restock.train.twin.physics.robot_trial import robot_model
 
 Strings = NDArray[np.str_]
 
@@ -97,15 +100,18 @@ def logged_steps(
     store: Store,
     task_hash: str | None = None,
     recordings: Sequence[str] = (),
-    robot: RobotModel | None = None,
+    robot: Robot | None = None,
 ) -> LoggedSteps:
     """The rows of a task of a store, of these recordings (all, if none is named).
 
+    `robot` is whose they are; None: that of the profile that the store keeps.
+
     Raises:
-        ConfigError: no such recording.
+        ConfigError: no such recording, or a robot that the twin cannot build.
         StoreError: no rows, rows of several tasks and no `task_hash`, or columns are missing.
     """
     task = store.task(task_hash)
+    robot = robot or robot_of_store(store, task_hash or task.hash)
     recordings_of(store, recordings, task_hash)
     sql = (files("restock.train.twin.calibration") / "logged_steps.sql").read_text(encoding="utf-8")
     parameters = {"task_hash": task_hash or task.hash, "recordings": list(recordings)}
@@ -145,7 +151,7 @@ def logged_steps(
         progress_m=_numbers(table["progress_m"]),
         ending=ending,
         ends=ends,
-        robot=robot,
+        robot=None if robot is None else robot_model(robot, task.body),
     )
 
 

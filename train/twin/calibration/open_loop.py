@@ -29,7 +29,7 @@ from restock.train.twin.physics.episode import Episode, EpisodeSpec
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.robot_model import RobotModel
 from restock.train.twin.physics.sensing import Sensing
-from restock.train.twin.physics.simulation import BLOCK_S, Simulation
+from restock.train.twin.physics.simulation import Simulation
 
 ROBOTS = 512  # simulated at a time
 SLIP_MPS = 0.2  # wheels and localisation this far apart: ground speed is the localised one
@@ -93,7 +93,7 @@ def drive_open_loop(
 
     Raises:
         ConfigError: a timestep that does not divide .1 s, or a control period that the twin
-            cannot keep (no multiple of .1 s).
+            cannot keep (no whole number of timesteps).
     """
     shape = (len(perturbations), len(start.pose))
     jobs, periods = shape[0] * shape[1], start.command.shape[1]
@@ -195,7 +195,7 @@ def _place(
     for step in range(start.past.shape[1]):  # its ramp and its late commands, as they are now
         controller.command(start.past[:, step])
         for block in range(simulation.blocks):
-            controller.wheel_speeds(block * BLOCK_S)
+            controller.wheel_speeds(block * simulation.block_s)
     return offset
 
 

@@ -18,7 +18,11 @@ from restock.arrays import F64, Bools
 from restock.ingest.task.signals import wrap_angle
 from restock.train.twin.calibration.logged_steps import NOMINAL, LoggedSteps
 from restock.train.twin.calibration.open_loop import lay_onto, replay_segments
-from restock.train.twin.calibration.segments import LoggedSegments, log_segments
+from restock.train.twin.calibration.segments import (
+    LoggedSegments,
+    log_segments,
+    whole_periods_s,
+)
 from restock.train.twin.calibration.twin_gap import GapConfig
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.robot_model import RobotModel, stand_in
@@ -76,7 +80,7 @@ def path_gap(
     """
     period = steps.task.control_period_s
     stride_s = max(round(horizon_s / 2 / period), 1) * period
-    cut = log_segments(steps, horizon_s, stride_s=stride_s)
+    cut = log_segments(steps, whole_periods_s(steps.task, horizon_s), stride_s=stride_s)
     rng = np.random.default_rng([config.seed, cut.horizon_steps])
     chosen = _choose(steps, cut, config.max_segments, rng)
     used = np.flatnonzero(np.any(list(chosen.values()), axis=0))

@@ -213,6 +213,14 @@ def _fresh(steps: LoggedSteps, period_ns: int) -> NDArray[np.bool_]:
     return fresh
 
 
+def whole_periods_s(task: Task, seconds: float) -> float:
+    """The nearest length that is some control periods; `seconds` itself where that is more than
+    a twentieth away."""
+    period_s = task.control_period_s
+    whole = round(max(round(seconds / period_s), 1) * period_s, 6)
+    return whole if abs(whole - seconds) <= 0.05 * seconds else seconds
+
+
 def _periods(task: Task, seconds: float, name: str) -> int:
     count = round(seconds / task.control_period_s)
     if count < 1 or abs(count * task.control_period_s - seconds) > 1e-6:

@@ -1,12 +1,14 @@
 """The physics of N warehouses at once: one `mujoco.batch.Batch`, and what is written into it.
 
-A control period is driven in blocks of .1 s. Before each block, friction is looked up under every
-wheel and traffic moves; within it the base controller's ramp and the actuators' latency act at
-every substep. Results do not depend on the number of threads.
+A control period is driven in blocks of .1 s, or where it is no multiple of that in equal parts.
+Before each block, friction is looked up under every wheel and traffic moves; within it the base
+controller's ramp and the actuators' latency act at every substep. Results do not depend on the
+number of threads.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -101,9 +103,9 @@ class Simulation(Stateful):
         self.robot = robot = robot or stand_in(task.body, beams)
         self.beams = len(robot.bearings_rad)
         self.timestep_s = timestep_s
-        self.substeps = round(BLOCK_S / timestep_s)
-        self.blocks = round(task.control_period_s / BLOCK_S)
-        _check_times(task, timestep_s, self.substeps, self.blocks)
+        self.blocks = max(math.ceil(task.control_period_s / BLOCK_S - 1e-9), 1)
+        self.block_s = _block_s(task, timestep_s, self.blocks)
+        self.substeps = round(self.block_s / timestep_s)
         slots = max(len(floor.racks) for floor in floors)
         self.model, self.handles = build_model(floors[0], robot, timestep_s, slots)
         _no_log_file()
@@ -199,10 +201,10 @@ class Simulation(Stateful):
         start = self.qpos[:, :2].copy()
         for block in range(self.blocks):
             pose = self.pose()
-            self.scenery.walk(self.traffic.advance(pose, self.qvel[:, :2], touched, BLOCK_S))
+            self.scenery.walk(self.traffic.advance(pose, self.qvel[:, :2], touched, self.block_s))
             icy = np.flatnonzero(self._has_patches)
             slippery = self._write_friction(icy, pose[icy])
-            touched = self._run(self.controller.wheel_speeds(block * BLOCK_S))
+            touched = self._run(self.controller.wheel_speeds(block * self.block_s))
             self.bumped |= touched
             if slippery.any():
                 self.slipped[icy] |= self._slipping(icy, slippery)
@@ -362,19 +364,30 @@ def _batch(physics: Physics) -> Any:
     raise ConfigError(f"unknown physics {physics!r}", where="the twin", remedy="use mujoco or warp")
 
 
-def _check_times(task: Task, timestep_s: float, substeps: int, blocks: int) -> None:
-    if abs(substeps * timestep_s - BLOCK_S) > 1e-9:
+def _block_s(task: Task, timestep_s: float, blocks: int) -> float:
+    """The length of a block: `BLOCK_S` where periods are some of these, else a part of a period.
+
+    Raises:
+        ConfigError: it is not some timesteps.
+    """
+    period_s = task.control_period_s
+    whole = abs(blocks * BLOCK_S - period_s) < 1e-9
+    block_s = BLOCK_S if whole else period_s / blocks
+    if abs(round(block_s / timestep_s) * timestep_s - block_s) < 1e-9:
+        return block_s
+    if whole:
         raise ConfigError(
             f"timestep_s = {timestep_s} does not divide {BLOCK_S} s",
             where="perturbation",
             remedy="use .01, .005, .002 or .001",
         )
-    if abs(blocks * BLOCK_S - task.control_period_s) > 1e-9 or blocks < 1:
-        raise ConfigError(
-            f"control_period_s = {task.control_period_s} is not a multiple of {BLOCK_S} s",
-            where="task",
-            remedy="the twin drives in blocks of .1 s",
-        )
+    raise ConfigError(
+        f"control_period_s = {period_s} is not some physics timesteps of {timestep_s} s"
+        + (f", in {blocks} equal parts" if blocks > 1 else ""),
+        where="task",
+        remedy="use a control period of some hundredths of a second, even above .1 s, as .05, .08"
+        " or .12, or a smaller timestep_s",
+    )
 
 
 def _no_log_file() -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 if TYPE_CHECKING:
+    from restock.ingest.task.robot import Robot
     from restock.train.twin.calibration.fitted_twin import FittedTwin
 
 
@@ -57,6 +58,8 @@ class FitCommand:
     """The store as it was: a version's number, or a time (2026-11-01T08:00Z); the newest."""
     task: str | None = None
     """Hash of the task whose rows are fitted, where the store has several."""
+    profile: str | None = None
+    """The profile whose [robot] is driven (default: the one that the store's rows carry)."""
     dry_run: bool = False
     """Fit and print, and write nothing."""
     json: bool = False
@@ -91,6 +94,8 @@ class FitCommand:
         return ExitCode.OK
 
     def _fit(self, store: Any, recordings: tuple[str, ...]) -> FittedTwin:
+        import msgspec
+
         from restock.cli import output
         from restock.toml import typed
         from restock.train.twin.calibration.fit import FitConfig, fit
@@ -115,7 +120,29 @@ class FitCommand:
         if self.base is not None:
             values["base"] = load_perturbation(self.base)
         config = typed(values, FitConfig, where="restock twin fit")
+        config = msgspec.structs.replace(config, robot=robot_given(self.profile))
         return fit(store, config, on_progress=output.say)
+
+
+def robot_given(profile: str | None) -> Robot | None:
+    """The robot of a profile that was named; None where none was.
+
+    Raises:
+        ConfigError: no such profile, or it has no [robot].
+    """
+    from restock.errors import ConfigError
+    from restock.ingest.profile.profile import load_profile
+
+    if profile is None:
+        return None
+    robot = load_profile(profile).robot
+    if robot is None:
+        raise ConfigError(
+            "has no [robot]",
+            where=profile,
+            remedy="add one (docs/robot.md), or leave --profile out",
+        )
+    return robot
 
 
 def _show(fit: FittedTwin) -> None:

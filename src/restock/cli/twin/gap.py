@@ -67,6 +67,8 @@ class GapCommand:
     """The store as it was: a version's number, or a time (2026-11-01T08:00Z); the newest."""
     task: str | None = None
     """Hash of the task whose rows are compared, where the store has several."""
+    profile: str | None = None
+    """The profile whose [robot] is driven (default: the one that the store's rows carry)."""
     check: bool = False
     """Exit 1 where a condition is untrusted."""
     json: bool = False
@@ -76,6 +78,7 @@ class GapCommand:
     def run(self) -> int:
         """Measure, print, write."""
         from restock.cli import output
+        from restock.cli.twin.fit import robot_given
         from restock.errors import ConfigError, ExitCode
         from restock.ingest.store.version import given_version
         from restock.replay.store.store import Store
@@ -88,6 +91,7 @@ class GapCommand:
         if self.fit and self.perturbation is not None:
             raise ConfigError("give --fit or --perturbation, one of them", where="restock twin gap")
         calibrated = None if self.perturbation is None else load_perturbation(self.perturbation)
+        robot = robot_given(self.profile)
         limits = {
             "horizon_s": self.trust_horizon_s,
             "position_m": self.trust_position_m,
@@ -113,6 +117,7 @@ class GapCommand:
 
                 fit_config = FitConfig(
                     task_hash=self.task,
+                    robot=robot,
                     timestep_s=self.timestep_s,
                     seed=self.seed,
                     nthread=self.threads,
@@ -120,7 +125,11 @@ class GapCommand:
                 fitted = fit(store, fit_config, on_progress=output.say)
                 calibrated, notes = fitted.perturbation, (_IN_SAMPLE, *fitted.warnings)
             gap = measure_gap(
-                store, calibrated, config, task_hash=self.task, notes=notes, on_progress=output.say
+                *(store, calibrated, config),
+                task_hash=self.task,
+                robot=robot,
+                notes=notes,
+                on_progress=output.say,
             )
         if self.out is not None:
             write_gap(gap, self.out)
