@@ -166,6 +166,20 @@ def test_missions_come_at_their_shares_and_rare_ones_come_early() -> None:
     assert len({mission.spec.seed for mission in missions}) == len(missions)
 
 
+def test_what_is_rarer_than_a_block_comes_at_its_share_too() -> None:
+    shares = {
+        "nominal": 0.988,
+        "wheel_slip": 0.004,
+        "blocked_aisle": 0.004,
+        "near_collision": 0.004,
+    }
+    missions = islice(schedule(9, shares, "operator", HARDWARE), 1000)
+    kinds = Counter(mission.spec.condition for mission in missions)
+    assert {k: kinds[k] for k in shares} == {
+        k: pytest.approx(1000 * shares[k], abs=1) for k in shares
+    }
+
+
 def test_flags_from_python() -> None:
     assert parse_shares("nominal=.5, wheel_slip=.5") == {"nominal": 0.5, "wheel_slip": 0.5}
     assert parse_rates("odom=20,scan=5").odom == 20

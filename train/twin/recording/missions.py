@@ -149,10 +149,11 @@ def _deal(shares: Mapping[str, float], rng: np.random.Generator) -> Iterator[str
     owed = np.zeros(len(names))
     while True:
         owed += share / share.sum() * BLOCK
-        count = np.floor(owed).astype(int)
-        for index in np.argsort(count - owed, kind="stable")[: BLOCK - count.sum()]:
+        count = np.zeros(len(names), int)
+        for _ in range(BLOCK):  # to whom most is owed; what came early is owed less than nothing
+            index = int(owed.argmax())
             count[index] += 1
-        owed -= count
+            owed[index] -= 1
         yield from (
             names[index] for index in rng.permutation(np.repeat(np.arange(len(names)), count))
         )
