@@ -8,10 +8,13 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import pyarrow as pa
 import pytest
+from deltalake import DeltaTable
 from PIL import Image
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
+from support.stores import recording_transitions, write_store
 
 from restock.cli import main
 from restock.errors import ConfigError, RecordingError
@@ -299,6 +302,34 @@ def test_the_picture_shows_map_way_and_places_to_scale(tmp_path: Path) -> None:
 
     assert extent(WAY) == pytest.approx((7.1, 5.1), abs=0.1)
     assert extent(PLACE) == pytest.approx((7.1, 5.1), abs=0.6)
+
+
+def test_a_store_gives_the_floor_of_its_recording_and_without_it_the_corridor(
+    tmp_path: Path,
+) -> None:
+    bag = write_bag(tmp_path / "bag", poses=lap()[:60], grid=OccupancyGrid(hall(), CELL_M))
+    recordings = []
+    for recording, part in ((1, slice(0, 60)), (2, slice(60, 200))):
+        poses = lap()[part]
+        rows = recording_transitions(recording, episodes=8)
+        at = np.minimum(np.arange(len(rows)) // 2, len(poses) - 1)
+        for name, values in zip(("pose_x_m", "pose_y_m", "pose_yaw_rad"), poses.T, strict=True):
+            column = rows.column_names.index(name)
+            kind = rows.schema.field(name)
+            rows = rows.set_column(column, kind, pa.array(values[at], kind.type))
+        recordings.append(rows)
+    there = str(bag)
+    store = write_store(tmp_path / "store", recordings)
+    gone = survey(store)
+    assert gone.by == "corridor"
+    assert "not there any more" in gone.notes[0]
+    manifests = DeltaTable(str(store / "recordings"))
+    manifests.update(updates={"source_file": f"'{there}'"})
+    made = survey(store)
+    assert made.by == "map"
+    # Missions go where any of the drives on this map was.
+    assert made.poses is not None
+    assert "2 recordings" in made.poses.source
 
 
 class _Zones(Checked, frozen=True):

@@ -18,11 +18,10 @@ from restock.train.twin.floors.occupancy_grid import (
     out_of_frame,
 )
 from restock.train.twin.survey.directions import main_direction
-from restock.train.twin.survey.poses import Poses
+from restock.train.twin.survey.poses import JUMP_M, Poses
 
 CELL_M = 0.05
 MARGIN_M = 0.25  # around the circle in which the robot turns
-JUMP_M = 1.0  # between two poses: it was carried, or relocalised, and did not drive
 
 
 def driven_corridor(poses: Poses, turn_m: float) -> OccupancyGrid:

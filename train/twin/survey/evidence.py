@@ -17,7 +17,12 @@ from restock.ingest.propose.footprint import Footprint, footprint_of
 from restock.replay.store.store import is_store
 from restock.train.twin.floors.occupancy_grid import FREE, OccupancyGrid
 from restock.train.twin.floors.occupancy_map import read_grid
-from restock.train.twin.survey.poses import Poses, candidate_poses, choose_poses
+from restock.train.twin.survey.poses import (
+    WELL_PLACED,
+    Poses,
+    candidate_poses,
+    choose_poses,
+)
 from restock.train.twin.survey.recorded_map import recorded_map
 from restock.train.twin.survey.scans import PlacedScans, placed_scans
 from restock.train.twin.survey.stored_drive import stored_drive
@@ -54,7 +59,7 @@ def gather(
         StoreError: the store is empty, or cannot be read.
     """
     notes: list[str] = []
-    file = path
+    file, stored = path, None
     if is_store(path):
         stored = stored_drive(path)
         profile, notes = profile or stored.profile, stored.notes
@@ -64,12 +69,19 @@ def gather(
         file = stored.recording
     with open_recording(file, typestore=typestore, salvage=True) as recording:
         known = _map(recording, map_yaml, notes, needed=with_map)
-        poses = choose_poses(candidate_poses(recording, profile), _free_on(known))
+        free_on = _free_on(known)
+        poses = choose_poses(candidate_poses(recording, profile), free_on)
+        if with_map and known and stored is not None and _lies_on(stored.everywhere, free_on):
+            poses = stored.everywhere  # drives on one map are in one frame
         size = _of_profile(profile) or footprint_of(recording)[0]
         scans: list[PlacedScans] = []
         if with_scans and poses is not None and not (with_map and known):
             scans = placed_scans(recording, poses, profile, size)
     return Evidence(poses, known, size, scans, notes)
+
+
+def _lies_on(poses: Poses, free_on: Callable[[F64], Bools]) -> bool:
+    return len(poses) > 0 and float(free_on(poses.places_m).mean()) >= WELL_PLACED
 
 
 def _map(

@@ -12,6 +12,7 @@ from restock.arrays import F64
 from restock.errors import ConfigError
 from restock.train.twin.floors.layout import Rect, Warehouse
 from restock.train.twin.floors.occupancy_grid import FREE, OCCUPIED, OccupancyGrid, into_frame
+from restock.train.twin.survey.poses import JUMP_M
 from restock.train.twin.survey.survey import Surveyed
 
 Color = tuple[int, int, int, int]
@@ -115,7 +116,7 @@ class _Picture:
         if poses is None:
             return
         places: F64 = into_frame(poses.places_m, self.floor.map_origin)
-        cuts = np.flatnonzero(np.hypot(*np.diff(places, axis=0).T) > 1.0) + 1
+        cuts = np.flatnonzero(np.hypot(*np.diff(places, axis=0).T) > JUMP_M) + 1
         for part in np.split(places, cuts):
             points = [self._at(x, y) for x, y in part.tolist()]
             if len(points) > 1:

@@ -31,6 +31,7 @@ from restock.ingest.steps.frames import (
 from restock.ingest.task.signals import yaw_of
 
 MOST_APART_NS = 1_000_000_000  # between two poses that one in between is taken from
+JUMP_M = 1.0  # between two poses: it was carried, or relocalised, and did not drive
 WELL_PLACED = 0.9  # of the poses on free floor
 FURTHEST_M = 1e5  # a pose beyond is a fault
 
@@ -87,12 +88,12 @@ class Poses:
 
     @property
     def driven_m(self) -> float:
-        """The length of its way, each decimetre counted once there."""
+        """The length of its way in steps of a decimetre; where it jumped it did not drive."""
         kept, way = self.places_m[:1], 0.0
         for place in self.places_m[1:]:
             step = float(np.hypot(*(place - kept[-1])))
             if step >= 0.1:
-                way, kept = way + step, place[None]
+                way, kept = way + step * (step <= JUMP_M), place[None]
         return way
 
     def at(self, times: Times, *, by_stamp: bool) -> tuple[F64, Bools]:

@@ -19,7 +19,7 @@ from restock.train.twin.survey.poses import Poses, Times
 
 _POSES = (
     "SELECT stamp_ns, logged_ns, pose_x_m, pose_y_m, pose_yaw_rad FROM transitions"
-    " WHERE recording_id = ? ORDER BY logged_ns"
+    " WHERE list_contains(?, recording_id) ORDER BY recording_id, logged_ns"
 )
 
 
@@ -28,6 +28,9 @@ class StoredDrive:
     """The drive of a store with the most rows, and whose poses they are."""
 
     poses: Poses
+    everywhere: (
+        Poses  # of all recordings by the same profile: places of one map, where there is one
+    )
     recording: Path | None  # where it lies; None where it is no longer there
     profile: Profile | None  # that its rows were made by
     notes: list[str] = field(default_factory=list)
@@ -46,20 +49,25 @@ def stored_drive(path: Path) -> StoredDrive:
             raise StoreError("no transitions", where=str(path), remedy="ingest recordings into it")
         there = [row for row in rows if row[1] and Path(row[1]).exists()]
         identity, source, toml, _ = (there or rows)[0]
-        columns = store.connection.execute(_POSES, [identity]).fetchnumpy()
-    stamp, log, *numbers = columns.values()
-    x, y, yaw = (np.asarray(number, np.float64) for number in numbers)
-    poses = Poses(
-        Times(np.asarray(stamp, np.int64), np.asarray(log, np.int64)),
-        *(x, y, np.unwrap(yaw), ""),
-        f"poses of the rows of {source}",
-    )
+        alike = [row[0] for row in rows if row[2] == toml]
+        poses = _poses(store, [identity], f"poses of the rows of {source}")
+        everywhere = _poses(store, alike, f"poses of the rows of {len(alike)} recordings")
     notes = []
     if not there:
         notes.append(f"{source} is not there any more: neither its map nor its scans can be read")
     if len(rows) > 1:
         notes.append(f"by {source}, of {len(rows)} recordings in the store")
-    return StoredDrive(poses, Path(source) if there else None, _profile(toml, source), notes)
+    return StoredDrive(
+        poses, everywhere, Path(source) if there else None, _profile(toml, source), notes
+    )
+
+
+def _poses(store: Store, recordings: list[str], source: str) -> Poses:
+    columns = store.connection.execute(_POSES, [recordings]).fetchnumpy()
+    stamp, log, *numbers = columns.values()
+    x, y, yaw = (np.asarray(number, np.float64) for number in numbers)
+    times = Times(np.asarray(stamp, np.int64), np.asarray(log, np.int64))
+    return Poses(times, x, y, np.unwrap(yaw), "", source)
 
 
 def _profile(toml: str | None, source: str) -> Profile | None:
