@@ -171,3 +171,37 @@ def test_an_edited_profile_is_taken_and_never_replaced(
     assert "propose" not in [stage["name"] for stage in document["stages"]]
     assert {s["name"]: s["status"] for s in document["stages"]}["ingest"] == "done"
     assert profile.read_text() == mine
+
+
+def test_where_nothing_says_that_the_twin_is_right_a_policy_comes_from_the_logs_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = write_bag(Drive(12.0), tmp_path / "drive")
+    out = tmp_path / "out"
+    argv = (str(recording), "--out", str(out), "--minutes", "0.1")
+    code, document = start(capsys, *argv)
+    assert code == 0
+    stages = {stage["name"]: stage for stage in document["stages"]}
+    assert "env.twin=false" in stages["train"]["command"]
+    assert "eval" not in stages
+    assert document["report"] == str(out / "run" / "report.html")
+    page = (out / "run" / "report.html").read_text("utf-8")
+    assert "logs alone" in page.split("<h1>")[1].split("</h1>")[0]
+    assert "Does it reach the goal?" not in page
+    again = start(capsys, *argv)[1]["stages"]
+    failed = {name for name, stage in stages.items() if stage["status"] == "failed"}
+    assert {stage["name"] for stage in again if stage["status"] != "kept"} == failed
+
+
+def test_several_topics_of_commands_are_for_a_person_to_choose_from(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = write_bag(Drive(proposals="/base/cmd_vel"), tmp_path / "drive")
+    out = tmp_path / "out"
+    argv = (str(recording), "--out", str(out), "--mixture", "no_such.toml")
+    code, document = start(capsys, *argv)
+    assert code == 3
+    assert document["stages"][-1]["name"] == "propose"
+    assert "/base/cmd_vel, /cmd_vel" in document["stopped"]["why"]
+    _, document = start(capsys, *argv, "--accept")
+    assert document["stages"][-1]["name"] == "mix"

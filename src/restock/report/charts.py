@@ -29,6 +29,8 @@ SPARE_COLOURS = ("#009e73", "#56b4e9", "#8b5cf6", "#84643a", "#111827")
 POLICY_COLOURS = {"agent": "#0f766e", "planner": "#b45309", "random": "#9ca3af"}
 SOURCE_COLOURS = {"logs": "#334155", "fresh": "#14b8a6"}
 
+FEW_POINTS = 10  # of a line, with which each is drawn
+
 _CONFIG = {
     "background": "transparent",
     "font": "Inter, Helvetica Neue, Helvetica, Arial, sans-serif",
@@ -112,6 +114,8 @@ def lines(
 ) -> str:
     """Lines over training; `marker` is a vertical line (the step of the kept checkpoint)."""
     names = ordered(rows, series, colours)
+    # A line of a single point would not be seen.
+    points = points or len({row[x] for row in rows}) < FEW_POINTS
     axis = alt.Axis(format="%") if percent else alt.Axis(format="~g")
     y_scale = alt.Scale(domain=[0, 1]) if percent else alt.Scale(type="log" if log else "linear")
     line = (

@@ -16,6 +16,8 @@ NOTHING_DROVE = (
 def headline(facts: Facts) -> str:
     """The most that can honestly be said."""
     rows = {(row["measure"], row["estimator"]): row for row in facts.off_policy}
+    if not rows and not holds_out(facts):
+        return "Trained on the logs alone, which are too short to judge it by"
     if not rows:
         return "Trained on the logs alone, not yet judged"
     measure = "success" if any(name == "success" for name, _ in rows) else "return"
@@ -29,6 +31,12 @@ def headline(facts: Facts) -> str:
     )
 
 
+def holds_out(facts: Facts) -> bool:
+    """Whether the panel left some rows for evaluation."""
+    left_out = {} if facts.panel is None else facts.panel.header.left_out
+    return any("evaluation split" in why for why, rows in left_out.items() if rows)
+
+
 def known(row: dict[str, object] | None) -> bool:
     """Whether an estimate was not refused."""
     return row is not None and row["value"] is not None
@@ -36,6 +44,13 @@ def known(row: dict[str, object] | None) -> bool:
 
 def judged_section(facts: Facts) -> Section:
     """The estimates, or how to get them."""
+    if not facts.off_policy and not holds_out(facts):
+        return Section(
+            "judged",
+            "What is it worth?",
+            intro=f"{NOTHING_DROVE} And the logs are too short to hold any of them out: it learnt"
+            " from all, so they cannot judge it. More recordings can.",
+        )
     if not facts.off_policy:
         return Section(
             "judged",

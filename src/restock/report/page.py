@@ -24,7 +24,7 @@ def page(facts: Facts) -> dict[str, Any]:
         practice_section(facts),
         actions_section(facts),
         labels_section(facts),
-        capacity_section(facts),
+        capacity_section(facts) if facts.twin else None,
         learning(facts),
         critic(facts),
         floor_section(facts),

@@ -87,7 +87,7 @@ def info(to: Settings) -> Stage:
     )
 
 
-def propose(to: Settings, recording: str, flags: list[str]) -> Stage:
+def propose(to: Settings, recording: str, flags: list[str], urdf: Path | None = None) -> Stage:
     """A profile, from the recording that has most of what is needed."""
     assert to.profile is not None
     return Stage(
@@ -95,7 +95,7 @@ def propose(to: Settings, recording: str, flags: list[str]) -> Stage:
         "How do its topics become observation, action and reward?",
         "A first profile is proposed from what is in the recording.",
         ["profile", "new", recording, "--out", str(to.profile), *flags, *to.with_typestore],
-        reads=to.recordings,
+        reads=(*to.recordings, *_file(urdf)),
         writes=(Path(to.profile),),
         expected=(0, 3),
         outcome=outcomes.propose,
@@ -225,7 +225,8 @@ def train(to: Settings, *, twin: bool = True) -> Stage:
         " the twin's operator finds plausible. Every row the critic is fed is recorded.",
         [
             *("train", "--panel", str(to.panel), "--out", str(to.run)),
-            *("--seconds", f"{to.seconds:g}", "--device", to.device),
+            *(("--seconds", f"{to.seconds:g}") if twin else ()),
+            *("--device", to.device),
             *(word for setting in to.train for word in ("--set", setting)),
         ],
         writes=(to.run,),

@@ -17,6 +17,11 @@ if TYPE_CHECKING:
     from restock.cli.start.work import Ended, Work
 
 
+HELD_OUT = "evaluation split"  # of a panel's rows left out: those that judge
+ODOMETRY = "--odometry-as-command"
+UPDATES_A_MINUTE = 400  # on logs alone: 2,000 in five minutes, with the rest of the way
+INTERVALS = 20  # at least so many points of every curve
+MUCH = 0.1  # of the messages of the topic that was taken: another one with as many may be it
 DRIVERS = "behaviour_policies"  # of a row of the coverage
 
 
@@ -44,6 +49,8 @@ class StartCommand:
     """A profile that is there already, in place of a proposed one."""
     footprint: Annotated[str | None, tyro.conf.arg(metavar="LxW")] = None
     """The robot's length and width in metres, as 0.6x0.5, for the proposal."""
+    urdf: Path | None = None
+    """The robot's URDF, for the proposal, in place of the recording's /robot_description."""
     odometry_as_command: bool = False
     """Let the proposal take odometry for commands where none was recorded."""
     map: Path | None = None
@@ -136,14 +143,26 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
 
     if not own and not _edited(to.profile, asked.out):
         flags = [] if asked.footprint is None else ["--footprint", asked.footprint]
+        flags += [] if asked.urdf is None else ["--urdf", str(asked.urdf)]
         flags += ["--odometry-as-command"] * asked.odometry_as_command
-        proposed = work.do(stages.propose(to, recording, flags))
+        proposed = work.do(stages.propose(to, recording, flags, asked.urdf))
         if not proposed.good:
             return Stop("no profile can be proposed", (f"write {to.profile}: docs/profile.md",))
         if problems := proposed.document.get("problems"):
+            told = (f"edit {to.profile}: its first lines say what is missing", again)
+            if any(ODOMETRY in problem for problem in problems):
+                told = (f"add {ODOMETRY} to this command, or {told[0]}", again)
+            return Stop("; ".join(problems), told)
+        ask = not (asked.accept or work.plan)
+        if others := other_commands(recording, asked.typestore) if ask else []:
             return Stop(
-                "; ".join(problems),
-                (f"edit {to.profile}: its first lines say what is missing", again),
+                f"several topics may be what drives the robot: {', '.join(others)}; the first of"
+                " them was taken",
+                (
+                    f"edit `topic` of [inputs.command] in {to.profile}, and run the same command"
+                    " again",
+                    "or add --accept to it, where the first one is right",
+                ),
             )
     checked = work.do(stages.check(to, recording))
     if not checked.good:
@@ -151,6 +170,8 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
             "the profile does not fit this recording",
             (f"edit {to.profile}", again),
         )
+    if not work.plan:
+        work.say(f"   the robot in the twin: {escape(robot_line(to.profile))}")
     ingested = work.do(stages.ingest(to))
     if not ingested.good:
         return Stop("nothing could be ingested", (f"edit {to.profile}", again))
@@ -182,16 +203,27 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
             twin = False
     if not twin:
         settings = logs_alone_settings(covered.document)
-    settings += few_rows_settings(mixed.document)
+    settings += updates_settings(mixed.document, asked.minutes, twin=twin)
     to = replace(to, train=tuple(settings))
     trained = work.do(stages.train(to, twin=twin))
     if not trained.good:
         return Stop("training did not come to its end", (*trained.errors[:2], again))
     if twin:
         work.do(stages.evaluate(to))
-    work.do(stages.judge(to))
-    work.do(stages.report(to))
-    return None
+    if work.plan or any(HELD_OUT in why for why in mixed.document["left_out"]):
+        judged = work.do(stages.judge(to))
+        if judged.status in ("done", "kept") and by_hindsight(to.profile):
+            work.say(
+                "   goals are by hindsight, where the drives went: `logged` success is 1 by"
+                " construction where nothing was met. Compare returns"
+            )
+    else:
+        work.say(
+            "\n[yellow]These logs are too short to hold any of them out: nothing says what the"
+            " policy is worth. Ingest more.[/]"
+        )
+    reported = work.do(stages.report(to))
+    return None if reported.good else Stop("there is no report", (again,))
 
 
 def fullest(document: Document) -> str | None:
@@ -270,16 +302,65 @@ def logs_alone_settings(coverage: Document) -> list[str]:
     return ["env.twin=false", "teacher.source=logs", f"teacher.policies={toml_value(drivers)}"]
 
 
-def few_rows_settings(mix: Document) -> list[str]:
-    """As many offline updates as the panel's rows allow, where that is fewer than usual."""
+def updates_settings(mix: Document, minutes: float, *, twin: bool) -> list[str]:
+    """As many offline updates as the panel's rows and the budget allow; each curve has points."""
     from restock.train.dqn.config import TrainConfig
 
     usual = TrainConfig()
-    most = mix.get("max_replays_per_row")
-    if most is None:
-        return []
-    allowed = int(mix["rows"] * most / usual.replay.batch_size)
-    return [f"schedule.offline_updates={allowed}"] * (allowed < usual.schedule.offline_updates)
+    updates = usual.schedule.offline_updates
+    if not twin:
+        updates = max(round(UPDATES_A_MINUTE * minutes), INTERVALS)
+    if (most := mix.get("max_replays_per_row")) is not None:
+        updates = min(updates, int(mix["rows"] * most / usual.replay.batch_size))
+    settings = []
+    if updates != usual.schedule.offline_updates:
+        settings.append(f"schedule.offline_updates={updates}")
+    if not twin and updates < INTERVALS * usual.record.every_updates:
+        settings.append(f"record.every_updates={max(updates // INTERVALS, 1)}")
+    return settings
+
+
+def robot_line(profile: Path | str | None) -> str:
+    """What the twin builds, and where that is from."""
+    from restock.ingest.profile.profile import load_profile
+
+    robot = None if profile is None else load_profile(str(profile)).robot
+    if robot is None:
+        return "the stand-in's wheels and mass, as nothing says this one's; --urdf FILE would"
+    values = {
+        "wheels of": (robot.wheel_radius_m, "m radius"),
+        "track": (robot.track_m, "m"),
+        "mass": (robot.mass_kg, "kg"),
+    }
+    told = [f"{name} {value:g} {unit}" for name, (value, unit) in values.items() if value]
+    origins = sorted(set(robot.origin.values()))
+    return f"{robot.drive}, {', '.join(told)} (from {', '.join(origins) or 'the profile'})"
+
+
+def by_hindsight(profile: Path | str | None) -> bool:
+    """Whether goals were not logged."""
+    from restock.ingest.profile.profile import load_profile
+
+    return profile is not None and load_profile(str(profile)).goal_source == "hindsight"
+
+
+def other_commands(path: str, typestore: str | None) -> list[str]:
+    """All topics that may be what drives the robot, best first, where there are several."""
+    from restock.ingest.containers.open_recording import open_recording
+    from restock.ingest.propose.roles import KINDS, topics_for
+
+    with open_recording(path, typestore=typestore) as recording:
+        topics = {n: t for n, t in recording.topics.items() if t.skipped is None and t.expected}
+    fitting = topics_for(topics, KINDS["command"])
+    proposed = {topic.name for topic, _ in topics_for(topics, KINDS["nav_command"])}
+    named = [
+        topic.name
+        for topic, kind in fitting
+        if topic.name not in proposed
+        and topic.expected >= MUCH * fitting[0][0].expected
+        and not any(word in topic.name.lower() for word in kind.rather)
+    ]
+    return named if len(named) > 1 else []
 
 
 __all__ = ["StartCommand", "fullest", "mistrust"]
