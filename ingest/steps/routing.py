@@ -10,7 +10,7 @@ import numpy as np
 from restock.arrays import F64, Ints
 from restock.ingest.task.route import RouteView, pad_plans, view_route
 from restock.ingest.task.signals import Signals
-from restock.ingest.task.surroundings import way_to_return
+from restock.ingest.task.surroundings import PLAN_PARTS, plan_distances_m, returns_on_plan
 from restock.ingest.task.task import Task, clearance_ahead
 
 # A number beyond this, in any unit that a signal has, is a fault and counts as not finite.
@@ -39,10 +39,10 @@ class Routing:
         return cls(np.zeros((0, 2)), [], nowhere, nowhere, nowhere)
 
     def view(self, task: Task, plan: Ints, pose: Signals) -> RouteView:
-        """Along plan `plan[i]` from pose i, for N poses."""
-        count = len(plan)
-        ahead = np.zeros((count, 2, 2))
-        ahead[:, :, 0] = task.near_m, task.far_m
+        """Along plan `plan[i]` from pose i to `plan_distances_m`, for N poses."""
+        count, at_m = len(plan), plan_distances_m(task)
+        ahead = np.zeros((count, len(at_m), 2))
+        ahead[:, :, 0] = at_m
         remaining, offset = np.zeros(count), np.zeros(count)
         planned = np.flatnonzero(plan >= 0)
         for start in range(0, len(planned), _CHUNK):
@@ -50,7 +50,7 @@ class Routing:
             used, inverse = np.unique(plan[rows], return_inverse=True)
             padded = pad_plans([self.plans_m[index] for index in used])[inverse]
             x, y, yaw = (pose[name][rows] for name in ("pose_x_m", "pose_y_m", "pose_yaw_rad"))
-            seen = view_route(padded, x, y, yaw, (task.near_m, task.far_m))
+            seen = view_route(padded, x, y, yaw, at_m)
             ahead[rows], offset[rows] = seen.look_ahead_m, seen.offset_m
             remaining[rows] = seen.remaining_m
         return RouteView(ahead, remaining, offset)
@@ -62,7 +62,8 @@ class Routing:
         aimed = np.flatnonzero(goal >= 0)
         position = np.stack([now["pose_x_m"], now["pose_y_m"]], axis=-1)
         distance[aimed] = np.linalg.norm(self.goals_m[goal[aimed]] - position[aimed], axis=-1)
-        near, far = seen.look_ahead_m[:, 0], seen.look_ahead_m[:, 1]
+        near, far = seen.look_ahead_m[:, PLAN_PARTS], seen.look_ahead_m[:, 2 * PLAN_PARTS]
+        way_m, gap_m = returns_on_plan(task, now["sector_clearance_m"], seen.look_ahead_m)
         return {
             "waypoint_near_x_m": near[:, 0],
             "waypoint_near_y_m": near[:, 1],
@@ -73,7 +74,8 @@ class Routing:
             "clearance_ahead_m": clearance_ahead(
                 task, now["sector_clearance_m"], near[:, 0], near[:, 1]
             ),
-            "plan_return_m": way_to_return(task, now["sector_clearance_m"], near, far),
+            "plan_return_m": way_m,
+            "plan_gap_m": gap_m,
         }
 
     def progress_m(self, task: Task, plan: Ints, now: Signals, after: Signals) -> F64:

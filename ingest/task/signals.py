@@ -64,7 +64,13 @@ SIGNALS: tuple[Signal, ...] = (
     ),
     Signal(
         "plan_return_m",
-        "way along the look-ahead points to the first lidar return on it; range_max_m: none",
+        "way along the plan in view to the first lidar return within half the body's width of it;"
+        " range_max_m: none",
+    ),
+    Signal(
+        "plan_gap_m",
+        "from the plan just ahead (1.4 of near_m) to the lidar return nearest to it; range_max_m:"
+        " none",
     ),
     Signal("bumped", "the bumper was pressed since the step before", "bool"),
     Signal("command_speed_mps", "commanded forward speed in force until the next step"),

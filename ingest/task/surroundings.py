@@ -7,6 +7,7 @@ sectors it is within .17 m of where it is at 2 m. For logs and twin alike.
 from __future__ import annotations
 
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 
@@ -17,6 +18,8 @@ from restock.ingest.task.task import Task
 
 NEAR_M = 2.0  # of clearance, for who comes nearer
 LARGEST_M = 1.0  # in one step: more is a return that was hidden before
+PLAN_PARTS = 3  # between two look-ahead points, and to the first
+GAP_WITHIN = 1.4  # of `near_m`: the plan just ahead
 # The signals that it takes.
 SCANNED = (
     *("stamp_ns", "gyro_yaw_rate_radps", "sector_clearance_m"),
@@ -56,36 +59,51 @@ def came_nearer(task: Task, now: Signals, before: Signals) -> F64:
     return np.asarray(np.where(told, gain, 0.0).max(axis=1), np.float64)
 
 
-def way_to_return(task: Task, clearance_m: F64, near_m: F64, far_m: F64) -> F64:
-    """Way (m) along the plan in view to the first lidar return on it, (N,); else `range_max_m`.
+def plan_distances_m(task: Task) -> tuple[float, ...]:
+    """Where along the plan it is looked at for returns, from the point nearest to the robot on."""
+    parts = [part / PLAN_PARTS for part in range(1, PLAN_PARTS)]
+    near = (task.near_m * part for part in parts)
+    beyond = (task.near_m + (task.far_m - task.near_m) * part for part in parts)
+    return (0.0, *near, task.near_m, *beyond, task.far_m)
 
-    The plan in view is the line over the look-ahead points `near_m` (N, 2) and `far_m` (N, 2) of
-    the body frame. A return within half the body's width of it is on it. A task without a goal has
-    no plan, and nothing is on it.
+
+def returns_on_plan(task: Task, clearance_m: F64, plan_m: F64) -> tuple[F64, F64]:
+    """What lies on the plan and how far off its middle, of points of it `plan_m` (N, L, 2).
+
+    The points are those at `plan_distances_m`, in the body frame, and the plan the line over them.
+
+    Returns:
+        way_m: along the plan to the first lidar return within half the body's width of it, (N,).
+        gap_m: from the plan just ahead (`GAP_WITHIN` of `near_m`) to the return nearest to it,
+            (N,).
+        Both are `range_max_m` where there is none. A task without a goal has no plan, and nothing
+        is on it.
     """
+    none = np.full(len(clearance_m), float(task.range_max_m))
     if task.goal == "none":
-        return np.full(len(clearance_m), float(task.range_max_m))
+        return none, none.copy()
     bearing, reach = _sectors(task.sectors, task.body)
     distance = clearance_m + reach
-    points = np.stack(
-        [distance * np.cos(bearing) + task.body.lidar_x_m, distance * np.sin(bearing)], axis=-1
-    )  # (N, K, 2)
+    x, y = distance * np.cos(bearing) + task.body.lidar_x_m, distance * np.sin(bearing)  # (N, K)
+    off2 = np.full(clearance_m.shape, np.inf)  # of each return from the plan, squared
+    along_m = np.zeros(clearance_m.shape)  # the plan, to where it is nearest
+    passed = np.zeros((len(none), 1))
+    for begin, end in pairwise(np.moveaxis(plan_m, 1, 0)):
+        line_x, line_y = (end - begin)[:, :1], (end - begin)[:, 1:]
+        length2 = np.maximum(line_x**2 + line_y**2, 1e-12)
+        off_x, off_y = x - begin[:, :1], y - begin[:, 1:]
+        part = np.clip((off_x * line_x + off_y * line_y) / length2, 0.0, 1.0)
+        aside2 = (off_x - part * line_x) ** 2 + (off_y - part * line_y) ** 2
+        nearer = aside2 < off2
+        off2 = np.where(nearer, aside2, off2)
+        along_m = np.where(nearer, passed + part * np.sqrt(length2), along_m)
+        passed = passed + np.sqrt(length2)
     seen = clearance_m < task.range_max_m
-    way = np.full(clearance_m.shape, float(task.range_max_m))
-    first = np.hypot(near_m[:, 0], near_m[:, 1])
-    for begin, end, passed in (
-        (np.zeros_like(near_m), near_m, np.zeros(len(near_m))),
-        (near_m, far_m, first),
-    ):
-        line = end - begin
-        length2 = np.maximum((line**2).sum(axis=-1), 1e-12)[:, None]
-        offset = points - begin[:, None]
-        along = np.clip((offset * line[:, None]).sum(axis=-1) / length2, 0.0, 1.0)
-        aside = offset - along[..., None] * line[:, None]
-        on_it = seen & (np.hypot(aside[..., 0], aside[..., 1]) <= task.body.width_m / 2)
-        here = passed[:, None] + along * np.sqrt(length2)
-        way = np.minimum(way, np.where(on_it, here, task.range_max_m))
-    return np.asarray(way.min(axis=1), np.float64)
+    on_it = seen & (off2 <= (task.body.width_m / 2) ** 2)
+    ahead = seen & (along_m <= GAP_WITHIN * task.near_m)
+    way_m = np.where(on_it, along_m, task.range_max_m).min(axis=1)
+    gap_m = np.sqrt(np.where(ahead, off2, task.range_max_m**2).min(axis=1))
+    return way_m, np.minimum(gap_m, task.range_max_m)
 
 
 @lru_cache(maxsize=64)

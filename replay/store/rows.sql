@@ -56,6 +56,7 @@ FROM (
         NULL::VARCHAR AS goal_source,
         NULL::FLOAT AS came_nearer_m,
         NULL::FLOAT AS plan_return_m,
+        NULL::FLOAT AS plan_gap_m,
         NULL::VARCHAR AS perturbation,
         NULL::MAP(VARCHAR, DOUBLE) AS perturbation_values
     WHERE false

@@ -88,6 +88,7 @@ _LATER = {
         "true_exposure": "CAST(NULL AS STRING) AS true_exposure",
         "came_nearer_m": "CAST(NULL AS FLOAT) AS came_nearer_m",
         "plan_return_m": "CAST(NULL AS FLOAT) AS plan_return_m",
+        "plan_gap_m": "CAST(NULL AS FLOAT) AS plan_gap_m",
         "perturbation": "CAST(NULL AS STRING) AS perturbation",
         "perturbation_values": "CAST(NULL AS MAP<STRING, DOUBLE>) AS perturbation_values",
     },

@@ -34,6 +34,7 @@ def steps(count: int, episodes: list[int] | None = None, **signals: object) -> p
         "clearance_m": np.full(count, 2.0),
         "clearance_ahead_m": np.full(count, 2.0),
         "plan_return_m": np.full(count, 4.0),
+        "plan_gap_m": np.full(count, 4.0),
         "bumped": np.zeros(count, np.bool_),
         "command_speed_mps": np.full(count, 0.5),
         "waypoint_near_x_m": np.ones(count),
@@ -82,7 +83,7 @@ def test_a_bump_makes_the_step_before_it_a_near_collision():
     assert given_to(steps(20, bumped=bumped), "near_collision") == [8]
 
 
-def in_the_way(drive: dict[str, np.ndarray], ahead: np.ndarray) -> pa.Table:
+def in_the_way(drive: dict[str, np.ndarray], ahead: np.ndarray, aside_m: float = 0.0) -> pa.Table:
     """Steps of a robot that sees something this far ahead of its middle, and who came nearer."""
     seen = np.where(ahead < 2.2, ahead, 4.0)
     driven = np.concatenate([[0.0], drive["wheel_speed_mps"][:-1] * 0.2])
@@ -91,6 +92,7 @@ def in_the_way(drive: dict[str, np.ndarray], ahead: np.ndarray) -> pa.Table:
         len(ahead),
         **drive,
         plan_return_m=seen,
+        plan_gap_m=np.where(ahead < 1.4, aside_m, 4.0),
         came_nearer_m=np.where(ahead < 2.2, np.clip(came, 0.0, 1.0), 0.0),
         clearance_ahead_m=np.maximum(ahead - 0.35, 0.0),
         clearance_m=np.minimum(ahead, 0.5),
@@ -111,6 +113,8 @@ def test_an_obstacle_in_the_way_is_a_blocked_aisle_only_when_it_stays(planned):
     found = given_to(in_the_way(drive, 4.5 - x), "blocked_aisle")
     assert {22, 30, 50, 59} <= set(found)
     assert found[0] >= 14  # 1.9 m before it
+    corner = in_the_way(drive, 4.5 - x, aside_m=0.22)  # of a rack, which the plan passes
+    assert given_to(corner, "blocked_aisle") == []
     # Somebody walks up to the robot as fast as it drives, stands there, and is away after a while.
     ahead = np.concatenate([np.linspace(4, 0.6, 10), np.full(15, 0.6), np.full(35, 4.0)])
     assert given_to(in_the_way(drive, ahead), "blocked_aisle") == []
@@ -141,6 +145,7 @@ def tables(draw: st.DrawFn) -> pa.Table:
         clearance_m=rng.choice([0.05, 0.2, 0.5, 2.0], count),
         clearance_ahead_m=rng.choice([0.3, 0.9, 1.4, 3.0], count),
         plan_return_m=rng.choice([0.4, 0.9, 1.3, 4.0], count),
+        plan_gap_m=rng.choice([0.0, 0.1, 0.2, 4.0], count),
         came_nearer_m=rng.choice([0.0, 0.0, 0.02, 0.3], count),
         bumped=rng.random(count) < 0.2,
         goal_distance_m=rng.uniform(0, 9, count),

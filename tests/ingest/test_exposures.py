@@ -185,7 +185,8 @@ def test_a_store_from_before_exposures_opens_and_says_null(store, profile, capsy
 
 def _before_exposures(store: Path, out: Path) -> Path:
     """The same store as it was written before exposures and the signals that they are told by."""
-    gone = {"exposures", "true_exposure", "came_nearer_m", "plan_return_m", "exposures_json"}
+    signals = {"came_nearer_m", "plan_return_m", "plan_gap_m"}
+    gone = signals | {"exposures", "true_exposure", "exposures_json"}
 
     def older(table: pa.Table) -> pa.Table:
         return table.drop_columns([name for name in table.column_names if name in gone])

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from restock.ingest.task.scan import Body, SectorMap
-from restock.ingest.task.surroundings import came_nearer, way_to_return
+from restock.ingest.task.surroundings import came_nearer, plan_distances_m, returns_on_plan
 from restock.ingest.task.task import Task
 
 TASK = Task(body=Body(length_m=0.7, width_m=0.5), actions=((0.0, 0.0), (1.0, 0.0)))
@@ -96,10 +96,17 @@ def test_the_same_scan_again_tells_nothing():
 
 
 def test_a_return_on_the_plan_is_found_along_it_and_beside_it_not():
-    near, far = np.array([[1.0, 0.0]]), np.array([[1.8, 0.9]])  # a plan that bends left
+    near, far = np.array([1.0, 0.0]), np.array([1.8, 0.9])  # a plan that bends left
+    at_m = np.array(plan_distances_m(TASK))[:, None]
+    beyond = (at_m - TASK.near_m) / (TASK.far_m - TASK.near_m)
+    plan = np.where(at_m <= TASK.near_m, at_m * near, near + beyond * (far - near))[None]
+
+    def seen(discs: list[Disc]) -> tuple[float, float]:
+        way_m, gap_m = returns_on_plan(TASK, scan((0.0, 0.0, 0.0), discs), plan)
+        return float(way_m[0]), float(gap_m[0])
 
     def way(discs: list[Disc]) -> float:
-        return float(way_to_return(TASK, scan((0.0, 0.0, 0.0), discs), near, far)[0])
+        return seen(discs)[0]
 
     assert way([]) == TASK.range_max_m
     assert way([(1.0, 0.0, 0.2)]) == pytest.approx(0.8, abs=0.05)
@@ -108,4 +115,17 @@ def test_a_return_on_the_plan_is_found_along_it_and_beside_it_not():
     assert way([(0.5, 0.7, 0.2)]) == TASK.range_max_m  # beside it
     free = msgspec.structs.replace(TASK, goal="none")
     ahead = scan((0.0, 0.0, 0.0), [(1.0, 0.0, 0.2)])
-    assert way_to_return(free, ahead, near, far)[0] == TASK.range_max_m
+    assert [one[0] for one in returns_on_plan(free, ahead, plan)] == [TASK.range_max_m] * 2
+
+
+def test_the_gap_is_from_the_plan_to_what_is_nearest_beside_the_way_just_ahead():
+    plan = np.stack([np.array(plan_distances_m(TASK)), np.zeros(7)], axis=-1)[None]
+
+    def gap(discs: list[Disc]) -> float:
+        return float(returns_on_plan(TASK, scan((0.0, 0.0, 0.0), discs), plan)[1][0])
+
+    assert gap([]) == TASK.range_max_m
+    assert gap([(0.9, 0.0, 0.2)]) == pytest.approx(0.0, abs=0.1)
+    assert gap([(0.9, 0.8, 0.3)]) == pytest.approx(0.5, abs=0.1)
+    assert gap([(0.9, -0.8, 0.3), (0.9, 0.6, 0.2)]) == pytest.approx(0.4, abs=0.1)
+    assert gap([(2.0, 0.0, 0.2)]) == TASK.range_max_m  # farther on

@@ -1,7 +1,9 @@
 -- Something stands on the plan just ahead, and stays where it is: what has been driven of the plan and
--- what is free of it add up to the same place along it, now and 1.6 s before, and nobody came nearer
--- within 8 s. Where the plan bends the lidar sees less of what stands on it, and before its end more
--- is near. It takes clear evidence within 2 s, and holds on through gaps.
+-- what is free of it add up to the same place along it, now and 1.6 s before; nobody came nearer within
+-- 8 s; and a return lies within .1 m of the plan's middle, which the corner of a rack that the plan
+-- passes does not. Where the robot has turned away from the plan it sees less of what stands on it. In
+-- the first 1.6 s of an episode nothing says that it stays. It takes clear evidence within 1 s, and
+-- holds on through gaps.
 -- Weights: a logistic regression; `python benchmarks/labels.py --cache FOLDER --fit blocked_aisle`.
 -- timing: pre
 -- priority: 40
@@ -16,29 +18,26 @@ END
 driven_m + ahead_m
 -- let came_m:
 sum(greatest(came_nearer_m - 2 * lidar_noise_m, 0)) OVER (episode ROWS BETWEEN 3 PRECEDING AND CURRENT ROW)
--- let near_m:
-greatest(least(1.45 - ahead_m, 0.5), 0)
 -- let moved_m:
 least(abs(at_m - coalesce(lag(at_m, 8) OVER episode, first_value(at_m) OVER episode)), 0.6)
--- let fan_m:
-greatest(least(1.4 - clearance_ahead_m, 1.2), 0)
 -- let bend_rad:
 least(abs(atan2(waypoint_near_y_m, waypoint_near_x_m)), 1.5)
 -- let someone_m:
 least(max(came_m) OVER (episode ROWS BETWEEN 40 PRECEDING AND CURRENT ROW), 1)
--- let short_m:
-1 - least(sqrt(pow(waypoint_near_x_m, 2) + pow(waypoint_near_y_m, 2)), 1)
+-- let aside_m:
+greatest(least(plan_gap_m, 0.25) - 0.1, 0)
+-- let early:
+greatest(1 - step_index / 8, 0)
 -- let odds:
-CASE WHEN near_m > 0 THEN
-    + 0.25
-    + 4.01 * near_m
-    - 6.16 * moved_m
-    + 1.92 * fan_m
-    + 4.88 * bend_rad
-    - 12.20 * someone_m
-    - 8.45 * short_m
+CASE WHEN ahead_m < 1.45 THEN
+    + 3.86
+    - 7.46 * moved_m
+    + 2.92 * bend_rad
+    - 10.24 * someone_m
+    - 35.69 * aside_m
+    - 3.82 * early
 ELSE -9 END
 -- label:
-odds > -2.2 AND max(odds) OVER (episode ROWS BETWEEN 10 PRECEDING AND CURRENT ROW) > 2.0
+odds > -2.9 AND max(odds) OVER (episode ROWS BETWEEN 5 PRECEDING AND CURRENT ROW) > 2.2
 -- probability:
 1 / (1 + exp(-greatest(least(odds, 30), -30)))

@@ -16,7 +16,12 @@ from restock.arrays import F64, Ints
 from restock.ingest.task.route import view_route
 from restock.ingest.task.scan import SectorMap
 from restock.ingest.task.signals import Signals, localised_velocity, wrap_angle
-from restock.ingest.task.surroundings import came_nearer, way_to_return
+from restock.ingest.task.surroundings import (
+    PLAN_PARTS,
+    came_nearer,
+    plan_distances_m,
+    returns_on_plan,
+)
 from restock.ingest.task.task import Task, clearance_ahead
 from restock.state import Stateful
 from restock.train.twin.physics.perturbation import Perturbation
@@ -139,8 +144,8 @@ def add_motion(task: Task, signals: Signals, before: Signals | None) -> None:
 def add_route(task: Task, signals: Signals, plans_m: F64, goals_m: F64) -> F64:
     """What robots see of plans (n, P, 2) and goals (n, 2); returns how far off plan they are."""
     x, y, yaw = signals["pose_x_m"], signals["pose_y_m"], signals["pose_yaw_rad"]
-    view = view_route(plans_m, x, y, yaw, (task.near_m, task.far_m))
-    near, far = view.look_ahead_m[:, 0], view.look_ahead_m[:, 1]
+    view = view_route(plans_m, x, y, yaw, plan_distances_m(task))
+    near, far = view.look_ahead_m[:, PLAN_PARTS], view.look_ahead_m[:, 2 * PLAN_PARTS]
     signals["waypoint_near_x_m"], signals["waypoint_near_y_m"] = near[:, 0], near[:, 1]
     signals["waypoint_far_x_m"], signals["waypoint_far_y_m"] = far[:, 0], far[:, 1]
     signals["route_remaining_m"] = view.remaining_m
@@ -148,5 +153,7 @@ def add_route(task: Task, signals: Signals, plans_m: F64, goals_m: F64) -> F64:
     signals["clearance_ahead_m"] = clearance_ahead(
         task, signals["sector_clearance_m"], near[:, 0], near[:, 1]
     )
-    signals["plan_return_m"] = way_to_return(task, signals["sector_clearance_m"], near, far)
+    signals["plan_return_m"], signals["plan_gap_m"] = returns_on_plan(
+        task, signals["sector_clearance_m"], view.look_ahead_m
+    )
     return view.offset_m
