@@ -153,6 +153,7 @@ CHECKS: dict[str, Callable[[Block, Path], None]] = {
     "docs/study.md": check_study,
     "docs/layouts.md": check_floor,
     "docs/profile.md": check_profile,
+    "docs/robot.md": check_profile,
     "docs/ingest.md": check_profile,
 }
 

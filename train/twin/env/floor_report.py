@@ -9,9 +9,12 @@ from typing import Any
 import numpy as np
 
 from restock.errors import ConfigError
+from restock.ingest.task.scan import Body
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.planner import Planner
 from restock.train.twin.physics.episode import KINDS, EpisodeSpec, draw_episode
+
+AISLE_ROOM_M = 0.1  # beside a robot in an aisle: a cell of the planner's
 
 
 def describe_floor(floor: Warehouse) -> dict[str, Any]:
@@ -50,6 +53,20 @@ def refuse_unfit(floors: Iterable[Warehouse], kinds: Iterable[str]) -> None:
                 where="layouts",
                 remedy="train and record without these conditions, or give it more aisles or room;"
                 " `restock twin layout` says what fits on a floor",
+            )
+
+
+def refuse_too_large(floors: Iterable[Warehouse], body: Body) -> None:
+    """Raises ConfigError where a robot is wider than an aisle, with `AISLE_ROOM_M` to spare."""
+    for floor in floors:
+        narrowest = min(floor.segments, key=lambda segment: segment.width_m, default=None)
+        if narrowest is not None and body.width_m + AISLE_ROOM_M > narrowest.width_m:
+            raise ConfigError(
+                f"the robot is {body.width_m:g} m wide, and {narrowest.name} of {floor.name}"
+                f" {narrowest.width_m:.2f} m: it does not fit",
+                where="the twin",
+                remedy="choose a floor with wider aisles (env.layouts, `restock twin layout`), or"
+                " correct the outline in [task.body]",
             )
 
 

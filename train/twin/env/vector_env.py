@@ -39,7 +39,7 @@ from restock.state import Stateful
 from restock.train.twin.env.action_space import ActionKind, action_space
 from restock.train.twin.env.camera import Renderer, View
 from restock.train.twin.env.episode_queue import EpisodeQueue
-from restock.train.twin.env.floor_report import refuse_unfit
+from restock.train.twin.env.floor_report import refuse_too_large, refuse_unfit
 from restock.train.twin.env.info import info_after, info_now
 from restock.train.twin.env.interface import DEFAULT_CONDITIONS, Info, Step
 from restock.train.twin.env.mission_arms import MissionArm, MissionArms
@@ -116,8 +116,9 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
 
         Raises:
             ConfigError: an unknown condition, shares below 0, a floor without room for
-                a condition's episodes, a robot that cannot be built, no environments, an unknown
-                action space, or an autoreset mode other than SAME_STEP and DISABLED.
+                a condition's episodes, a robot that cannot be built or is wider than an aisle, no
+                environments, an unknown action space, or an autoreset mode other than SAME_STEP
+                and DISABLED.
         """
         if num_envs < 1:
             raise ConfigError(f"num_envs must be 1 or more, got {num_envs}", where="the twin")
@@ -143,6 +144,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         )
         refuse_unfit(self.floors, [kind for kind, share in self.queue.conditions.items() if share])
 
+        if robot is not None:
+            refuse_too_large(self.floors, self.task.body)
         limit = np.full(self.task.observation_size, OBSERVATION_LIMIT, np.float32)
         self.single_observation_space = gymnasium.spaces.Box(-limit, limit, dtype=np.float32)
         self._actions = action_space(action, self.task, num_envs)
