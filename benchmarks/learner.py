@@ -77,6 +77,8 @@ def _asked(options: argparse.Namespace) -> Study:
     wanted |= {pair.baseline.name for pair in study.pairs if pair.arm.name in names}
     if unknown := wanted - {arm.name for arm in study.arms}:
         raise SystemExit(f"--arms: {', '.join(sorted(unknown))} not in {options.study}")
+    if len(wanted) < 2:
+        raise SystemExit(f"--arms: name one besides {study.base.name}, which is always there")
     panels = options.out.resolve() / "panels"
     arms = tuple(
         msgspec.structs.replace(arm, mixture=None, panel=str(panels / str(arm.mixture)))
