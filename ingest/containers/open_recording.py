@@ -35,7 +35,8 @@ def open_recording(
     Args:
         path: the file or folder.
         typestore: the distribution ("humble", "jazzy", …) whose message definitions are used
-            where a recording carries none, as older sqlite3 bags do.
+            where a recording carries none, as older sqlite3 bags do; `humble+/a/folder` has those
+            of the folder's .msg and .idl files on top.
         salvage: read what can still be read of a file that is cut short or damaged, instead of
             refusing it; what is missing is in the recording's `lost_messages`.
 
@@ -47,6 +48,11 @@ def open_recording(
     distro = typestore or DEFAULT_DISTRO
     refuse_unknown(distro)  # before anything is opened
     return _Opening(path, distro, salvage).open()
+
+
+def with_definitions(typestore: str | None, folder: Path | None) -> str | None:
+    """The name of a type store with a folder's .msg and .idl files on top: `humble+/the/folder`."""
+    return typestore if folder is None else f"{typestore or DEFAULT_DISTRO}+{folder.absolute()}"
 
 
 class _Opening:

@@ -21,6 +21,7 @@ from rosbags.typesys.store import Typestore
 
 from restock.errors import RecordingError
 from restock.ingest.decoding.field_paths import DTYPES, CannotDecode, FieldType, Many, MessageType
+from restock.ingest.decoding.hand_definitions import ackermann_types, folder_types
 from restock.ingest.decoding.messages import Channel
 
 # The IDL parser's time is exponential in how deep these nest; rosidl writes none of either.
@@ -72,20 +73,25 @@ def _field(name: str, description: Any) -> FieldType:
 
 
 def distro_types(distro: str) -> Typesdict:
-    """A distribution's message definitions.
+    """A distribution's message definitions; of `humble+DIR`, those of a folder on top.
 
     Raises:
-        RecordingError: no distribution of that name.
+        RecordingError: no distribution of that name, or no definitions in that folder.
     """
-    return dict(_distro_store(distro).fielddefs)
+    name, _, folder = distro.partition("+")
+    hand = folder_types(folder) if folder else {}
+    return {**ackermann_types(), **_distro_store(name).fielddefs, **hand}
 
 
 def refuse_unknown(distro: str) -> None:
-    """Check a distribution's name, without loading its definitions.
+    """Check a distribution's name, without loading its definitions; and the folder after a `+`.
 
     Raises:
-        RecordingError: no distribution of that name.
+        RecordingError: no distribution of that name, or no definitions in that folder.
     """
+    distro, _, folder = distro.partition("+")
+    if folder:
+        folder_types(folder)
     if distro not in _STORES:
         raise RecordingError(
             f"no type store named {distro!r}",
@@ -121,7 +127,7 @@ def message_type(channel: Channel, distro: str) -> RosType:
     if name not in types:
         raise CannotDecode(
             f"unknown type {channel.type or '(unnamed)'}: not defined in the recording"
-            f" nor in {distro!r}"
+            f" nor in {distro!r} (--definitions DIR reads .msg and .idl files)"
         )
     return _from_distro(name, distro)
 

@@ -48,7 +48,7 @@ ELSEWHERE = "elsewhere"
 # What each input must and may say of a message: signal-side name -> whether it is required.
 # `orientation` is a quaternion's path and becomes a yaw.
 INPUT_FIELDS: dict[str, dict[str, bool]] = {
-    "command": {"speed_mps": True, "yaw_rate_radps": True},
+    "command": {"speed_mps": True, "yaw_rate_radps": False, "steering_rad": False},
     "pose": {"x_m": True, "y_m": True, "orientation": False, "yaw_rad": False},
     "wheels": {"speed_mps": True, "yaw_rate_radps": True},
     "imu": {"yaw_rate_radps": True, "accel_x_mps2": True},
@@ -56,7 +56,7 @@ INPUT_FIELDS: dict[str, dict[str, bool]] = {
     "goal": {"x_m": True, "y_m": True},
     "plan": {"x_m": True, "y_m": True},
     "bumper": {"pressed": True},
-    "nav_command": {"speed_mps": True, "yaw_rate_radps": True},
+    "nav_command": {"speed_mps": True, "yaw_rate_radps": False, "steering_rad": False},
     "behaviour_policy": {"text": True},
     "true_condition": {"text": True},
     "true_exposure": {"text": True},
@@ -75,6 +75,7 @@ FALLBACKS: dict[str, str] = {
     "perturbation": "unknown: null, as of hardware",
 }
 MOTION = "nav_msgs/msg/Odometry"  # what was measured: commands are of other types
+STEERED = "speed x tan(steering angle) / {wheelbase_m:g} m of {topic}"
 COMMAND_FALLBACK = "the measured motion of {topic} in place of commands"
 POSE_FALLBACK = "from transforms, by [frames]"
 WHEELS_FALLBACK = "speeds from the poses of the last {window_s:g} s: slip cannot be seen"
@@ -93,6 +94,7 @@ class Input(Checked, frozen=True):
     fields: dict[str, str]
     max_age_s: float | None = None  # None: latched, held until the next message
     optional: bool = False
+    wheelbase_m: Annotated[float, Meta(gt=0)] | None = None  # of a command that steers
     stop_holds: bool = False  # of the command: one to stop holds until the next, however old
 
 
@@ -245,8 +247,9 @@ class Profile(Checked, frozen=True):
         if self.motion is None:
             apart |= {"motion"}
         for source in filter(None, values["inputs"].values()):
-            if not source["stop_holds"]:
-                del source["stop_holds"]
+            for key in ("stop_holds", "wheelbase_m"):
+                if not source[key]:
+                    del source[key]
         rest = {key: value for key, value in values.items() if key not in apart}
         return hashlib.blake2b(msgspec.json.encode(rest), digest_size=6).hexdigest()
 
@@ -269,6 +272,10 @@ class Profile(Checked, frozen=True):
         fallbacks = {name: how for name, how in FALLBACKS.items() if name not in given}
         if self.inputs.command.type == MOTION:
             fallbacks["command"] = COMMAND_FALLBACK.format(topic=self.inputs.command.topic)
+        for name, source in given.items():
+            if source.wheelbase_m is not None:
+                how = STEERED.format(wheelbase_m=source.wheelbase_m, topic=source.topic)
+                fallbacks[f"{name}.yaw_rate_radps"] = how
         if self.inputs.pose is None:
             fallbacks["pose"] = POSE_FALLBACK
         if self.motion is not None:
@@ -446,6 +453,18 @@ def _check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
     )
     if name == "pose" and not source.fields.keys() & {"orientation", "yaw_rad"}:
         missing.append("orientation")
+    steered = "steering_rad" in source.fields
+    if name in ("command", "nav_command"):
+        if steered and "yaw_rate_radps" in source.fields:
+            unknown.append("steering_rad beside yaw_rate_radps")
+        elif not steered and "yaw_rate_radps" not in source.fields:
+            missing.append("yaw_rate_radps")
+    if steered != (source.wheelbase_m is not None):
+        raise ConfigError(
+            f"`inputs.{name}`: steering_rad and wheelbase_m belong together",
+            where=where,
+            remedy="wheelbase_m is the way between the axles, in metres",
+        )
     if unknown or missing:
         problems = [f"unknown {key!r}" for key in unknown] + [f"missing {key!r}" for key in missing]
         raise ConfigError(

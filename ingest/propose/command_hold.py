@@ -36,7 +36,7 @@ def command_hold(
     time_s: F64, speed_mps: F64, yaw_rate_radps: F64, poses: PoseSeries
 ) -> CommandHold:
     """What the gaps between commands (N,) show; `poses` are on the same clock, from the same 0."""
-    at = poses.stamp_ns * 1e-9
+    at = np.asarray(poses.stamp_ns * 1e-9, np.float64)
     if not len(time_s) or len(at) < 2:
         return CommandHold()
     turned = np.concatenate([[0.0], np.cumsum(wrap_angle(np.diff(poses.yaw_rad)))])

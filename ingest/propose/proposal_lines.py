@@ -35,6 +35,9 @@ class Commands:
     count: int = 0
     topic: str = ""
     measured: bool = False  # they are odometry, in place of commands
+    steered: bool = False  # by the angle of the front wheels, as a car
+    wheelbase_m: float = 0.3
+    wheelbase_known: bool = False
 
 
 @dataclass(frozen=True)
@@ -294,6 +297,18 @@ def _input_lines(
         f'type = "{topic.type}"',
         f"fields = {{ {fields} }}",
     ]
+    drives = seen.robot.values.get("drive")
+    if role == "command" and drives == "ackermann" and "steering_rad" not in kind.fields:
+        lines += [
+            "# The robot steers as a car: right where the command's turn is a yaw rate. Where it",
+            "# is the steering angle: steering_rad for yaw_rate_radps, and wheelbase_m.",
+        ]
+    if "steering_rad" in kind.fields:
+        origin = "of [robot]" if seen.commands.wheelbase_known else "A GUESS: MEASURE IT"
+        lines += [
+            "# Its yaw rate is speed x tan(steering_rad) / wheelbase_m.",
+            f"wheelbase_m = {round(seen.commands.wheelbase_m, 4):g}  # {origin}",
+        ]
     if role not in LATCHED:
         pace_s = seen.paces_s.get(topic.name, 0.25)
         age = float(np.clip(round(seen.clock.pace * 4 * pace_s, 2), 0.2, 1.0))

@@ -175,7 +175,11 @@ def gather(
     poses = None
     if framed or roles["pose"]:
         poses, _ = pose_series(recording, roles, frames if framed else None)
-    commands, gaps, hold = _commands(recording, roles, poses)
+    frame = _scan_frame(recording, roles)
+    scan = roles["scan"][0][0].name if roles["scan"] else None
+    robot = propose_robot(recording, scan, frame, urdf)
+    wheelbase_m = robot.values.get("wheelbase_m")
+    commands, gaps, hold = _commands(recording, roles, poses, wheelbase_m)
     paces = _paces(recording, roles)
     gaps = replace(gaps, hold_s=hold.age_s, sensor_s=_seldomest(paces, roles, poses))
     motion = None
@@ -183,9 +187,6 @@ def gather(
         motion = choose_motion(recording, roles, frames, framed=framed)
     best = [(role, *fitting[0]) for role, fitting in roles.items() if fitting]
     notes: list[str] = []
-    frame = _scan_frame(recording, roles)
-    scan = roles["scan"][0][0].name if roles["scan"] else None
-    robot = propose_robot(recording, scan, frame, urdf)
     if footprint is None and urdf is not None:
         footprint = urdf_footprint(urdf, frame)
     if footprint is None:
@@ -221,7 +222,7 @@ def gather(
 
 
 def _commands(
-    recording: Recording, roles: Roles, poses: PoseSeries | None
+    recording: Recording, roles: Roles, poses: PoseSeries | None, wheelbase_m: float | None
 ) -> tuple[Commands, Gaps, CommandHold]:
     """Read the commands: how fast, which way, how often, and how long each holds."""
     if not roles["command"]:
@@ -230,6 +231,8 @@ def _commands(
     paths = list(kind.fields.values())
     columns = recording.read({topic.name: paths})[topic.name]
     speed, turn = (np.asarray(columns.fields[path], np.float64) for path in paths)
+    if steered := "steering_rad" in kind.fields:
+        turn = speed * np.tan(turn) / (wheelbase_m or Commands.wheelbase_m)
     sane = np.isfinite(speed) & np.isfinite(turn)
     times = columns.log_time_ns[sane]
     speed, turn = speed[sane], turn[sane]
@@ -242,6 +245,9 @@ def _commands(
         len(columns),
         topic.name,
         measured=topic.type == MOTION,
+        steered=steered,
+        wheelbase_m=wheelbase_m or Commands.wheelbase_m,
+        wheelbase_known=wheelbase_m is not None,
     )
     hold = CommandHold()
     if poses is not None and len(poses) > 1 and not commands.measured:

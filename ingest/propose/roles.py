@@ -31,6 +31,9 @@ class Kind:
 
 # A name of what may drive but is only proposed: to a multiplexer, a smoother, a person's remote.
 _NAVIGATION = ("nav", "move_base", "planner", "autonom", "cmd_vel_raw", "raw_cmd_vel")
+# Of several, what is nearest to the motor is driven: a multiplexer's output before its inputs.
+_DRIVEN = ("cmd_vel_out", "mux/out", "mux/cmd_vel", "cmd_vel")
+_ACKERMANN = ("low_level", "output", "ackermann_cmd", "drive")
 _BY_HAND = ("teleop", "joy", "key", "web", "remote")
 
 # A name of a pose that is not where the robot is.
@@ -45,14 +48,26 @@ KINDS: dict[str, tuple[Kind, ...]] = {
         Kind(
             "geometry_msgs/msg/Twist",
             _TWIST,
-            ("cmd_vel",),
-            rather=(*_NAVIGATION, *_BY_HAND),
+            _DRIVEN,
+            rather=(*_NAVIGATION, *_BY_HAND, "input"),
         ),
         Kind(
             "geometry_msgs/msg/TwistStamped",
             _under("twist", _TWIST),
-            ("cmd_vel",),
-            rather=(*_NAVIGATION, *_BY_HAND),
+            _DRIVEN,
+            rather=(*_NAVIGATION, *_BY_HAND, "input"),
+        ),
+        Kind(
+            "ackermann_msgs/msg/AckermannDriveStamped",
+            {"speed_mps": "drive.speed", "steering_rad": "drive.steering_angle"},
+            _ACKERMANN,
+            rather=(*_NAVIGATION, *_BY_HAND, "input", "safety"),
+        ),
+        Kind(
+            "ackermann_msgs/msg/AckermannDrive",
+            {"speed_mps": "speed", "steering_rad": "steering_angle"},
+            _ACKERMANN,
+            rather=(*_NAVIGATION, *_BY_HAND, "input", "safety"),
         ),
     ),
     "pose": (

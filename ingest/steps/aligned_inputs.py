@@ -54,6 +54,9 @@ class InputColumns:
         """A field of an input, one number a message (N,)."""
         if key == "yaw_rad" and "orientation" in self.by_name[name].fields:
             return self._yaw(name)
+        if key == "yaw_rate_radps" and self.by_name[name].wheelbase_m is not None:
+            turn = np.tan(self.numbers(name, "steering_rad")) / self.by_name[name].wheelbase_m
+            return self.numbers(name, "speed_mps") * turn
         column = self.column(name, key)
         if isinstance(column, Ragged) or column.ndim != 1 or column.dtype.kind not in "biuf":
             source = self.by_name[name]
@@ -144,7 +147,8 @@ class AlignedInputs:
         latest = self.latest_of(source.topic, source.max_age_s, lead_ns=lead_ns)
         fresh = latest.fresh
         if source.stop_holds and len(self.inputs.topics[source.topic]):
-            stops = np.all([self.inputs.numbers(name, key) == 0 for key in source.fields], axis=0)
+            keys = ("speed_mps", "yaw_rate_radps")
+            stops = np.all([self.inputs.numbers(name, key) == 0 for key in keys], axis=0)
             fresh = fresh | (latest.known & stops[latest.row])
         age_ns = latest.age_ns - np.where(latest.known, lead_ns, 0)
         return replace(latest, age_ns=age_ns, fresh=fresh)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
@@ -28,6 +29,9 @@ class InfoCommand:
     """Recordings, folders of recordings, or globs."""
     typestore: str | None = None
     """Distribution whose message definitions serve recordings without their own (humble)."""
+    definitions: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """A folder of .msg and .idl files (PACKAGE/msg/NAME.msg): definitions of a robot's own types,
+    for recordings that carry none."""
     salvage: bool = False
     """Read truncated files, too (exit code 3)."""
     clocks: bool = False
@@ -35,6 +39,12 @@ class InfoCommand:
     often they jump, go back, repeat or are zero."""
     json: bool = False
     """Print one JSON document: {"recordings": [{"path", "format", "messages", "topics", …}]}."""
+
+    @property
+    def _typestore(self) -> str | None:
+        from restock.ingest.containers.open_recording import with_definitions
+
+        return with_definitions(self.typestore, self.definitions)
 
     def run(self) -> int:
         """Describe each recording; the exit code of the worst of them."""
@@ -56,7 +66,7 @@ class InfoCommand:
             for path in paths:
                 try:
                     entry = describe_recording(
-                        path, typestore=self.typestore, salvage=self.salvage, clocks=self.clocks
+                        path, typestore=self._typestore, salvage=self.salvage, clocks=self.clocks
                     )
                 except RecordingError as error:
                     sys.stderr.write(f"restock: {error}\n")

@@ -52,6 +52,9 @@ class IngestCommand:
     over what a recording or its path says; KEY= takes a tag off. May be given several times."""
     typestore: str | None = None
     """Distribution whose message definitions serve recordings without their own (humble)."""
+    definitions: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """A folder of .msg and .idl files (PACKAGE/msg/NAME.msg): definitions of a robot's own types,
+    for recordings that carry none."""
     workers: int = 1
     """Processes that read recordings at the same time."""
     engine: Literal["processes", "ray"] = "processes"
@@ -59,6 +62,12 @@ class IngestCommand:
     (without one, of a Ray that is started here). Ray is an extra: pip install 'restock[ray]'."""
     json: bool = False
     """Print one JSON document: {"recordings": [{"path", "status", "transitions", …}]}."""
+
+    @property
+    def _typestore(self) -> str | None:
+        from restock.ingest.containers.open_recording import with_definitions
+
+        return with_definitions(self.typestore, self.definitions)
 
     def run(self) -> int:
         """Ingest each recording; the exit code for them all."""
@@ -84,7 +93,7 @@ class IngestCommand:
         if store is not None:
             StoreWriter(store).reach()  # or say now why not, and not once a recording
         job = IngestJob(
-            *(profile, store, self.force, self.salvage, self.typestore, self.repeated, tags)
+            *(profile, store, self.force, self.salvage, self._typestore, self.repeated, tags)
         )
         paths, failures = self._recordings()
         outcomes: list[dict[str, Any]] = []

@@ -54,9 +54,18 @@ class ProfileCommand:
     """Where `new` writes the profile. Nothing is overwritten."""
     typestore: str | None = None
     """Distribution whose message definitions serve recordings without their own (humble)."""
+    definitions: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """A folder of .msg and .idl files (PACKAGE/msg/NAME.msg): definitions of a robot's own types,
+    for recordings that carry none."""
     json: bool = False
     """Print one JSON document: `new`: {"toml", "missing", "signals", "ticks", "transitions",
     "problems", "advice"}; `check`: {"inputs", "problems", "advice", "outcome", …}."""
+
+    @property
+    def _typestore(self) -> str | None:
+        from restock.ingest.containers.open_recording import with_definitions
+
+        return with_definitions(self.typestore, self.definitions)
 
     def run(self) -> int:
         """Do one of the two."""
@@ -79,7 +88,7 @@ class ProfileCommand:
             raise ConfigError("already exists", where=str(self.out), remedy="name another --out")
         footprint = None if self.footprint is None else parse_footprint(self.footprint)
         stem = (self.out or Path(self.paths[0])).stem
-        with open_recording(self.paths[0], typestore=self.typestore) as recording:
+        with open_recording(self.paths[0], typestore=self._typestore) as recording:
             proposal = propose_profile(
                 recording,
                 re.sub(r"\W+", "_", stem).strip("_") or "robot",
@@ -118,7 +127,7 @@ class ProfileCommand:
         from restock.ingest.steps.needs import input_problems
 
         profile = load_profile(self.paths[0])
-        with open_recording(self.paths[1], typestore=self.typestore) as recording:
+        with open_recording(self.paths[1], typestore=self._typestore) as recording:
             topics = {n: t for n, t in recording.topics.items() if t.skipped is None}
             leaves = {name: recording.fields(name) for name in profile.topics if name in topics}
             problems = input_problems(profile, topics, leaves)
@@ -130,7 +139,7 @@ class ProfileCommand:
         advice: list[str] = []
         if not problems:
             try:
-                outcome = ingest(self.paths[1], profile, store=None, typestore=self.typestore)
+                outcome = ingest(self.paths[1], profile, store=None, typestore=self._typestore)
             except RecordingError as error:
                 problems = [error.what]
             advice = self._advice(profile, outcome)
@@ -155,7 +164,7 @@ class ProfileCommand:
         from restock.ingest.steps.needs import read_topics
         from restock.ingest.task.conditions import NOMINAL
 
-        with open_recording(self.paths[1], typestore=self.typestore) as recording:
+        with open_recording(self.paths[1], typestore=self._typestore) as recording:
             trial = try_profile(profile, read_topics(recording, profile))
         lines = [str(each) for each in trial.advice]
         rows = outcome.manifest["transitions"] if outcome else 0

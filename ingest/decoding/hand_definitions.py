@@ -1,0 +1,80 @@
+"""Message definitions that no recording and no distribution holds: a folder's, and Ackermann's.
+
+Bags of sqlite3 before 2023 carry no definitions. `--definitions DIR` reads those of a robot's own
+packages from their sources: `DIR/**/PACKAGE/msg/NAME.msg` (or `PACKAGE/NAME.msg`) and `.idl`.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+from rosbags.interfaces.typing import Typesdict
+from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
+
+from restock.errors import RecordingError
+
+LARGEST = 512 << 10  # bytes of one file
+MOST_FILES = 5000
+# Part of no distribution's core, and what every robot that steers is driven by (ackermann_msgs).
+ACKERMANN = {
+    "ackermann_msgs/msg/AckermannDrive": (
+        "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\n"
+        "float32 acceleration\nfloat32 jerk\n"
+    ),
+    "ackermann_msgs/msg/AckermannDriveStamped": (
+        "std_msgs/Header header\nackermann_msgs/AckermannDrive drive\n"
+    ),
+}
+
+
+@cache
+def ackermann_types() -> Typesdict:
+    """The types of ackermann_msgs."""
+    types: Typesdict = {}
+    for name, text in ACKERMANN.items():
+        types.update(get_types_from_msg(text, name))
+    return types
+
+
+@cache
+def folder_types(folder: str) -> Typesdict:
+    """Every type that the `.msg` and `.idl` files of a folder define.
+
+    Raises:
+        RecordingError: no such folder, no definition in it, or one that cannot be read; names it.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise RecordingError(
+            "no such folder of definitions",
+            where=folder,
+            remedy="--definitions names a folder with PACKAGE/msg/NAME.msg (or .idl) in it",
+        )
+    files = sorted([*root.rglob("*.msg"), *root.rglob("*.idl")])[:MOST_FILES]
+    types: Typesdict = {}
+    for file in files:
+        parts = [part for part in file.relative_to(root).parts[:-1] if part != "msg"]
+        package = parts[-1] if parts else root.name if root.name != "msg" else root.parent.name
+        try:
+            if file.stat().st_size > LARGEST:
+                raise ValueError("too long for a definition")
+            text = file.read_text("utf-8")
+            if file.suffix == ".idl":
+                types.update(get_types_from_idl(text))
+            else:
+                types.update(get_types_from_msg(text, f"{package}/msg/{file.stem}"))
+        except (TypesysError, ValueError, RecursionError, IndexError, OSError) as error:
+            what = (str(error).splitlines() or [type(error).__name__])[0]
+            raise RecordingError(
+                f"a definition that cannot be read: {what}",
+                where=str(file),
+                remedy="mend it, or take it out of the folder",
+            ) from error
+    if not types:
+        raise RecordingError(
+            "no .msg and no .idl file in it",
+            where=folder,
+            remedy="--definitions names a folder with PACKAGE/msg/NAME.msg (or .idl) in it",
+        )
+    return types

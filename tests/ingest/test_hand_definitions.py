@@ -1,0 +1,83 @@
+"""Definitions by hand, and robots that are steered."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.paths import SHARED
+
+from restock.cli import main
+from restock.errors import RecordingError
+from restock.ingest.containers.open_recording import open_recording, with_definitions
+from restock.ingest.decoding.hand_definitions import folder_types
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.steps.needs import read_topics
+from restock.ingest.steps.steps import steps_of
+
+NEATO = SHARED / "fleet-neato" / "2025-redhot" / "drive_square"
+RACECAR = SHARED / "robots" / "racecar-ackermann" / "BIGPATH.bag"
+BUMP = "\n".join(f"bool {side}" for side in ("left_front", "left_side", "right_front"))
+IDL = "module a_msgs { module msg { struct Level { double value; }; }; };"
+
+
+def package(folder: Path) -> Path:
+    (folder / "src" / "neato2_interfaces" / "msg").mkdir(parents=True)
+    (folder / "src" / "neato2_interfaces" / "msg" / "Bump.msg").write_text(BUMP)
+    (folder / "a_msgs").mkdir()
+    (folder / "a_msgs" / "Level.idl").write_text(IDL)
+    return folder
+
+
+def test_messages_are_named_by_their_package(tmp_path):
+    types = folder_types(str(package(tmp_path)))
+    assert {"neato2_interfaces/msg/Bump", "a_msgs/msg/Level"} <= types.keys()
+
+
+@pytest.mark.parametrize(
+    ("text", "what"), [(None, "no .msg and no .idl file"), ("float64 = = ;;", "cannot be read")]
+)
+def test_a_folder_of_no_use_is_refused(text, what, tmp_path):
+    if text is not None:
+        (tmp_path / "Bad.msg").write_text(text)
+    with pytest.raises(RecordingError, match=what):
+        folder_types(str(tmp_path))
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
+def test_a_type_that_nobody_knows_is_read_by_its_definition(tmp_path, capsys):
+    with open_recording(NEATO) as recording:
+        assert "--definitions" in str(recording.topics["/bump"].skipped)
+    with open_recording(NEATO, typestore=with_definitions(None, package(tmp_path))) as recording:
+        bump = recording.topics["/bump"]
+        assert (bump.skipped, bump.expected) == (None, 142)
+    assert main(["info", str(NEATO), "--definitions", str(tmp_path / "none")]) != 0
+    assert "no such folder of definitions" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
+def test_a_car_is_read_by_its_steering_angle(tmp_path, capsys):
+    file = tmp_path / "p.toml"
+    assert main(["profile", "new", str(RACECAR), "--out", str(file)]) == 0
+    profile = load_profile(file)
+    command = profile.inputs.command
+    assert command.topic == "/vesc/low_level/ackermann_cmd"  # of seven, nearest to the motor
+    assert command.wheelbase_m is not None
+    # One with more than zeros in it, tick by tick as one would write it down.
+    text = file.read_text().replace(command.topic + '"', '/vesc/high_level/ackermann_cmd"')
+    file.write_text(text)
+    profile = load_profile(file)
+    with open_recording(RACECAR) as recording:
+        topics = read_topics(recording, profile)
+        raw = recording.read(
+            {"/vesc/high_level/ackermann_cmd": ["drive.speed", "drive.steering_angle"]}
+        )["/vesc/high_level/ackermann_cmd"]
+    steps = steps_of(profile, topics)
+    told = zip(raw.fields["drive.speed"], raw.fields["drive.steering_angle"], strict=True)
+    rates = {round(float(v) * math.tan(d) / command.wheelbase_m, 4) for v, d in told}
+    found = set(np.round(steps.signals["command_yaw_rate_radps"], 4).tolist())
+    assert found <= rates | {0.0}
+    assert len(found) > 2
+    assert "command.yaw_rate_radps" in profile.fallbacks
