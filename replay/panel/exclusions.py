@@ -260,7 +260,7 @@ def _ends_of_episodes(table: pa.Table, rule: EvaluationSplit, n_step: int) -> Ev
         short = f"the one episode lasts {long_s.max():.1f} s"
         if count > 1:
             short = f"no episode is longer than {long_s.max():.1f} s"
-        return EvaluationRows.none(len(table), f"nothing: {short}, too short to split")
+        return EvaluationRows.none(len(table), f"nothing, as {short}: too short to split")
     whole = "each episode" if rule.by == "within_episode" else "the one episode there is"
     note = f"the last {rule.share:.0%} of {whole}, after a gap of {rule.gap_s:g} s"
     return EvaluationRows(held, split & near & ~held, "within_episode", note)

@@ -49,7 +49,7 @@ def test_an_episode_too_short_to_split_is_learnt_from_whole(tmp_path: Path, caps
     options = ["--mixture", "uniform", "--out", str(tmp_path / "panel"), "--json"]
     assert cli.main(["mix", str(store), *options]) == 0
     document = json.loads(capsys.readouterr().out)
-    note = "nothing: the one episode lasts 3.8 s, too short to split"
+    note = "nothing, as the one episode lasts 3.8 s: too short to split"
     assert document["evaluation_split"] == {"by": "none", "rows": 0, "note": note}
     assert document["rows"] == 20
     assert not Panel.open(tmp_path / "panel").splits

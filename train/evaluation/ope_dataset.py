@@ -117,7 +117,8 @@ def load_ope_dataset(
             training_store = store if logs is None else opened.enter_context(_store_of(trained))
         if not len(ids) or not len(training_ids):
             raise RunError(
-                "holds no episode that the run did not learn from",
+                "holds no episode that the run did not learn from"
+                + (f" (held out: {trained.header.split_note})" if _unsplit(trained) else ""),
                 where=logs or (str(trained.path) if trained is not None else None),
                 remedy="mix with [evaluation_split] share above 0, or name other logs with"
                 " --on-logs",
@@ -139,6 +140,11 @@ def load_ope_dataset(
         if not len(steps.rows):
             raise StoreError(f"has none of the {name} rows", where=str(training_store.path))
     return OpeDataset(training, evaluation, tuple(notes), hindsight)
+
+
+def _unsplit(trained: Panel | None) -> bool:
+    """Whether a panel's logs had nothing to spare."""
+    return trained is not None and not trained.splits and bool(trained.header.split_note)
 
 
 def _by_hindsight(connection: duckdb.DuckDBPyConnection, ids: Ints) -> bool:

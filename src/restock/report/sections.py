@@ -290,7 +290,13 @@ def floor_section(facts: Facts) -> Section | None:
                 floor_map.visited(plan, facts.visited, CELL_M),
                 "Where the logs have been",
                 f"{steps:,} logged steps in cells of {CELL_M} m, darker where there are more"
-                f" (logarithmic). Drawn on the floor that the run drives on, {layout.name}.",
+                f" (logarithmic). Drawn on the floor that the run drives on, {layout.name}."
+                + (
+                    f" Its missions start at {len(layout.starts_m)} places that the robot was at"
+                    f" in the logs, and go to {len(layout.goals)}."
+                    if layout.starts_m
+                    else ""
+                ),
             ),
             Figure(
                 floor_map.events(plan, facts.rare, failures),

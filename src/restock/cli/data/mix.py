@@ -245,7 +245,8 @@ def _summary(document: dict[str, Any]) -> list[str]:
         f" {document['largest_weight']:.3g}",
     ]
     if (held := document["evaluation_split"])["note"]:
-        lines.append(f"held out: {held['note']} ({held['rows']:,} rows)")
+        rows = f" ({held['rows']:,} rows)" if held["rows"] else ""
+        lines.append(f"held out: {held['note']}{rows}")
     for name, rates in document["represents"].items():
         of = "the main store's" if rates == "archive" else "given"
         lines.append(f"the rows of {name} were chosen: their natural shares are {of}")
