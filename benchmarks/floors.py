@@ -1,0 +1,92 @@
+"""The floors that recordings show: what they are made from, and do planned missions arrive on them?
+
+    python benchmarks/floors.py RECORDING... [--missions N] [--json] [--check]
+
+Each recording's floor is made by `survey`, as `restock twin layout --from` does. On it, N nominal
+episodes of the seeds from 0 are driven by `PlannerFollower` without exploration: the stand-in's
+drive under a body of the recording's robot. Where the recording has a map and scans, a map is also
+made of the scans, and their occupied cells compared within one cell. `--check` exits 1 where fewer
+than half of all missions arrive.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from harness import finish, markdown, option_parser
+
+from restock.errors import RestockError
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.scan import Body
+from restock.train.twin.survey.survey import Surveyed, survey
+from restock.twin import EpisodeSpec, PlannerFollower, WarehouseVectorEnv
+
+LEAST_ARRIVING = 0.5
+
+
+def drive(made: Surveyed, missions: int) -> Counter[str]:
+    """How the missions end: success, bump, or time limit."""
+    size = made.footprint
+    body = Body(length_m=size.length_m, width_m=size.width_m)
+    task = msgspec.structs.replace(load_profile("warehouse_amr").task, body=body)
+    env = WarehouseVectorEnv(missions, warehouse=made.floor, task=task, conditions={"nominal": 1.0})
+    env.set_episodes([EpisodeSpec("nominal", seed) for seed in range(missions)])
+    observation, _ = env.reset()
+    driver, done, ends = PlannerFollower(epsilon=0.0), np.zeros(missions, np.bool_), Counter[str]()
+    while not done.all():
+        action, _ = driver.act(env, observation)
+        observation, _, terminated, truncated, info = env.step(action)
+        for index in np.flatnonzero((terminated | truncated) & ~done).tolist():
+            bumped = "bump" if info["bumps"][index] else "time limit"
+            ends["success" if info["success"][index] else bumped] += 1
+        done |= terminated | truncated
+    return ends
+
+
+def measure(path: Path, missions: int) -> dict[str, Any]:
+    """One recording's floor: plain values."""
+    try:
+        made = survey(path)
+        ends = drive(made, missions)
+    except RestockError as error:
+        return {"recording": path.stem, "made from": f"refused: {error.what}"}
+    agreement = made.agreement
+    if made.by == "map":
+        try:
+            agreement = survey(path, by="scans").agreement
+        except RestockError:
+            agreement = None  # no scans, or none that can be placed
+    low, high = made.floor.way_m
+    return {
+        "recording": path.stem,
+        "made from": made.by,
+        "boxes": len(made.floor.racks),
+        "walls, IoU": "" if agreement is None else round(agreement, 3),
+        "missions": f"{low:g} to {high:g} m",
+        "at the goal": ends["success"],
+        "bump": ends["bump"],
+        "time limit": ends["time limit"],
+    }
+
+
+def main() -> int:
+    parser = option_parser(__doc__)
+    parser.add_argument("recordings", nargs="+", type=Path)
+    parser.add_argument("--missions", type=int, default=20)
+    options = parser.parse_args()
+    rows = [measure(path, options.missions) for path in options.recordings]
+    driven = [row for row in rows if "at the goal" in row]
+    arriving = sum(row["at the goal"] for row in driven) / max(len(driven) * options.missions, 1)
+    missed = [] if arriving >= LEAST_ARRIVING else [f"{arriving:.0%} of the missions arrive"]
+    header = list(max(rows, key=lambda row: len(row)))
+    table = markdown(header, ([row.get(key, "") for key in header] for row in rows))
+    return finish(options, {"floors": rows, "arriving": arriving}, missed, [table])
+
+
+if __name__ == "__main__":
+    sys.exit(main())
