@@ -137,7 +137,11 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
     found = work.do(stages.info(to))
     if not found.good:
         return Stop(
-            "no recording can be read", ("name a file, a bag's folder, or a folder of bags",)
+            "no recording can be read",
+            (
+                "name a file, a bag's folder, or a folder of bags; `restock ingest FILE --salvage"
+                " --store STORE` reads what is intact of a damaged one",
+            ),
         )
     recording = fullest(found.document) or asked.paths[0]
 
@@ -211,12 +215,7 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
     if twin:
         work.do(stages.evaluate(to))
     if work.plan or any(HELD_OUT in why for why in mixed.document["left_out"]):
-        judged = work.do(stages.judge(to))
-        if judged.status in ("done", "kept") and by_hindsight(to.profile):
-            work.say(
-                "   goals are by hindsight, where the drives went: `logged` success is 1 by"
-                " construction where nothing was met. Compare returns"
-            )
+        work.do(stages.judge(to))
     else:
         work.say(
             "\n[yellow]These logs are too short to hold any of them out: nothing says what the"
@@ -337,13 +336,6 @@ def robot_line(profile: Path | str | None) -> str:
     return f"{robot.drive}, {', '.join(told)} (from {', '.join(origins) or 'the profile'})"
 
 
-def by_hindsight(profile: Path | str | None) -> bool:
-    """Whether goals were not logged."""
-    from restock.ingest.profile.profile import load_profile
-
-    return profile is not None and load_profile(str(profile)).goal_source == "hindsight"
-
-
 def other_commands(path: str, typestore: str | None) -> list[str]:
     """All topics that may be what drives the robot, best first, where there are several."""
     from restock.ingest.containers.open_recording import open_recording
@@ -357,6 +349,7 @@ def other_commands(path: str, typestore: str | None) -> list[str]:
         topic.name
         for topic, kind in fitting
         if topic.name not in proposed
+        and any(word in topic.name.lower() for word in kind.words)
         and topic.expected >= MUCH * fitting[0][0].expected
         and not any(word in topic.name.lower() for word in kind.rather)
     ]
