@@ -83,7 +83,7 @@ def main() -> int:
     driven = [row for row in rows if "at the goal" in row]
     arriving = sum(row["at the goal"] for row in driven) / max(len(driven) * options.missions, 1)
     missed = [] if arriving >= LEAST_ARRIVING else [f"{arriving:.0%} of the missions arrive"]
-    header = list(max(rows, key=lambda row: len(row)))
+    header = list(driven[0] if driven else rows[0])
     table = markdown(header, ([row.get(key, "") for key in header] for row in rows))
     return finish(options, {"floors": rows, "arriving": arriving}, missed, [table])
 
