@@ -77,6 +77,7 @@ def profile_lines(
         *_topic_lines(recording, seen.roles, seconds),
         f'name = "{name}"',
         f"conditions = {json.dumps(_conditions(seen))}",
+        f"exposures = {json.dumps(_exposures(seen))}  # situations, whatever came of them",
         'behaviour_policy = "unknown"  # who drove, where no topic says',
         "",
         *_task_lines(seen, trial),
@@ -109,6 +110,12 @@ def _conditions(seen: Evidence) -> list[str]:
     """The shipped conditions that this robot's signals can show."""
     slip = ["wheel_slip"] if seen.motion is None else []
     return ["recovery", "near_collision", *slip, "blocked_aisle"]
+
+
+def _exposures(seen: Evidence) -> list[str]:
+    """The shipped exposures that this robot's signals can show."""
+    slip = ["slippery_floor"] if seen.motion is None else []
+    return slip + (["closing_traffic", "plan_blocked"] if seen.roles["scan"] else [])
 
 
 _ENDING = [
