@@ -103,7 +103,7 @@ def ingest(
         tagged = (before or {}).get("tags") or {}
         told = resolve_tags(profile.tags, Path(path), recording.metadata, tags or {}, tagged)
         if store is not None and before is not None and not force and _unchanged(before, profile):
-            new = {"tags": told.tags}
+            new: dict[str, Any] = {"tags": told.tags}
             if _other_robot(before, profile):
                 new["profile_toml"] = profile_toml(profile)
             elif told.tags == (before["tags"] or {}):

@@ -354,7 +354,7 @@ class Filling:
         at = np.flatnonzero(self.located)
         carried = np.zeros(len(self.tick_ns), np.bool_)
         carried[at[1:]] = self._too_far(xy_m[at]) | (np.diff(self.segment[at]) != 0)
-        rules, leg = self.profile.goal, np.cumsum(carried)
+        rules, leg = self.profile.goal, np.cumsum(carried, dtype=np.int64)
         found = missions(rules, self.task, xy_m, self.tick_ns, self.located, leg)
         self._mark_reasons("", np.array(found.problem, object), route=True)
         self.routing = Routing(

@@ -118,7 +118,11 @@ def load_ope_dataset(
         if not len(ids) or not len(training_ids):
             raise RunError(
                 "holds no episode that the run did not learn from"
-                + (f" (held out: {trained.header.split_note})" if _unsplit(trained) else ""),
+                + (
+                    f" (held out: {trained.header.split_note})"
+                    if trained is not None and _unsplit(trained)
+                    else ""
+                ),
                 where=logs or (str(trained.path) if trained is not None else None),
                 remedy="mix with [evaluation_split] share above 0, or name other logs with"
                 " --on-logs",
