@@ -74,7 +74,7 @@ def _last_moving(
     turn: float,
     within: float,
 ) -> float | None:
-    """When in a gap the robot last did a good part of what the command says; None: never."""
+    """Until when in a gap the robot did a good part of what the command says; None: never."""
     checked = np.arange(min(begin + within, end), end + 1e-9, within / 4)
     checked = np.append(checked, end)
     since = np.maximum(checked - within, begin)
@@ -85,7 +85,11 @@ def _last_moving(
     # Poses that stay away for longer say nothing.
     seen = np.searchsorted(at, checked, "right") > np.searchsorted(at, since, "left")
     moving = np.flatnonzero(drives & seen)
-    return float(checked[moving[-1]]) if len(moving) else None
+    if not len(moving):
+        return None
+    # Up to the first break: what it does after that is not this command's (a hand, another driver).
+    broken = np.flatnonzero(~drives & seen & (checked > checked[moving[0]]))
+    return float(checked[broken[0] - 1] if len(broken) else checked[moving[-1]])
 
 
 def _judge(on: list[float], stopped: list[float], stood: int, went: int) -> CommandHold:

@@ -110,6 +110,16 @@ def test_a_driver_that_times_out_is_seen():
     assert "it stood in 1 of them" in hold.comments[0]
 
 
+def test_a_robot_that_is_moved_later_by_hand_did_not_drive_on():
+    at = np.arange(0, 30, 0.05)
+    x = 0.5 * np.minimum(at, 10.6) + np.maximum(at - 27, 0)
+    poses = PoseSeries((at * NS).astype(np.int64), x, np.zeros(len(at)), np.zeros(len(at)))
+    times = np.arange(0, 10.05, 0.1)
+    hold = command_hold(times, np.full(len(times), 0.5), np.zeros(len(times)), poses)
+    assert hold.age_s is not None
+    assert hold.age_s < 1.2
+
+
 def test_a_command_to_stop_holds_if_the_robot_stands():
     told = [(0.1 * i, 0.5) for i in range(101)] + [(10.1, 0.0)]
     assert driven(10.2, told).stops_hold
