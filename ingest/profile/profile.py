@@ -159,7 +159,7 @@ class Motion(Checked, frozen=True):
     window_s: Annotated[float, Meta(gt=0, le=5)]  # of the poses that a speed is the slope of
 
 
-class Zone(Checked, frozen=True, omit_defaults=True):  # a profile's hash has what is given
+class Zone(Checked, frozen=True):
     """A named rectangle of the map: `box_m = [x0, y0, x1, y1]`, turned about its middle by
     `yaw_rad`, counter-clockwise."""
 
@@ -250,6 +250,9 @@ class Profile(Checked, frozen=True):
             for key in ("stop_holds", "wheelbase_m"):
                 if not source[key]:
                     del source[key]
+        for zone in values["zone"]:
+            if not zone["yaw_rad"]:
+                del zone["yaw_rad"]
         rest = {key: value for key, value in values.items() if key not in apart}
         return hashlib.blake2b(msgspec.json.encode(rest), digest_size=6).hexdigest()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from support.profile_texts import WAREHOUSE as TEXT
 from restock.cli import main
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile, parse_profile, shipped_profiles
+from restock.ingest.profile.profile_text import profile_toml
 
 
 def test_the_shipped_profiles_load():
@@ -29,6 +31,13 @@ def test_the_hash_names_all_that_a_profile_says_but_its_conditions():
     fewer = parse_profile(TEXT.replace('"recovery", ', ""), where="a")
     assert fewer.hash == load_profile("warehouse_amr").hash
     assert fewer.labels_version != load_profile("warehouse_amr").labels_version
+
+
+def test_the_hash_is_the_same_in_another_process():
+    profile = load_profile("warehouse_amr")
+    assert pickle.loads(pickle.dumps(profile)).hash == profile.hash
+    written = parse_profile(profile_toml(profile), where="written")  # has every default
+    assert written.hash == profile.hash
 
 
 def test_zones_are_looked_up_in_order():
