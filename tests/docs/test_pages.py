@@ -98,7 +98,7 @@ def test_blocks_that_are_not_run_are_few_and_say_why() -> None:
     left_out = {block.place: block.marks["not run"] for block in told if "not run" in block.marks}
     print("\n".join(f"{place}: {reason}" for place, reason in left_out.items()))  # noqa: T201
     assert all(len(reason.split()) >= 2 for reason in left_out.values()), left_out
-    assert len(left_out) <= 29
+    assert len(left_out) <= 30
     assert len(told) > 5 * len(left_out)
 
 

@@ -333,7 +333,8 @@ def robot_line(profile: Path | str | None) -> str:
     }
     told = [f"{name} {value:g} {unit}" for name, (value, unit) in values.items() if value]
     origins = sorted(set(robot.origin.values()))
-    return f"{robot.drive}, {', '.join(told)} (from {', '.join(origins) or 'the profile'})"
+    own = ", ".join(told) or "the stand-in's wheels and mass"
+    return f"{robot.drive}, {own} (from {', '.join(origins) or 'the profile'})"
 
 
 def other_commands(path: str, typestore: str | None) -> list[str]:
