@@ -159,13 +159,13 @@ class Motion(Checked, frozen=True):
     window_s: Annotated[float, Meta(gt=0, le=5)]  # of the poses that a speed is the slope of
 
 
-class Zone(Checked, frozen=True):
+class Zone(Checked, frozen=True, omit_defaults=True):  # a profile's hash has what is given
     """A named rectangle of the map: `box_m = [x0, y0, x1, y1]`, turned about its middle by
     `yaw_rad`, counter-clockwise."""
 
     name: str
     box_m: tuple[float, float, float, float]
-    yaw_rad: Annotated[float, Meta(ge=-7, le=7)] = 0.0
+    yaw_rad: Annotated[float, Meta(ge=-7, le=7)] | None = None  # defaults are known by identity
 
     def check(self) -> None:
         x0, y0, x1, y1 = self.box_m
@@ -250,9 +250,6 @@ class Profile(Checked, frozen=True):
             for key in ("stop_holds", "wheelbase_m"):
                 if not source[key]:
                     del source[key]
-        for zone in values["zone"]:
-            if not zone["yaw_rad"]:
-                del zone["yaw_rad"]
         rest = {key: value for key, value in values.items() if key not in apart}
         return hashlib.blake2b(msgspec.json.encode(rest), digest_size=6).hexdigest()
 
