@@ -42,16 +42,15 @@ def folder_types(folder: str) -> Typesdict:
     """Every type that the `.msg` and `.idl` files of a folder define.
 
     Raises:
-        RecordingError: no such folder, no definition in it, or one that cannot be read; names it.
+        RecordingError: no such folder, no definition in it or too many, or one that cannot be read;
+            names it.
     """
     root = Path(folder)
     if not root.is_dir():
-        raise RecordingError(
-            "no such folder of definitions",
-            where=folder,
-            remedy="--definitions names a folder with PACKAGE/msg/NAME.msg (or .idl) in it",
-        )
-    files = sorted([*root.rglob("*.msg"), *root.rglob("*.idl")])[:MOST_FILES]
+        raise _refused(folder, "no such folder of definitions")
+    files = sorted([*root.rglob("*.msg"), *root.rglob("*.idl")])
+    if len(files) > MOST_FILES:
+        raise _refused(folder, f"{len(files):,} definitions in it, and {MOST_FILES:,} at most")
     types: Typesdict = {}
     for file in files:
         parts = [part for part in file.relative_to(root).parts[:-1] if part != "msg"]
@@ -72,9 +71,10 @@ def folder_types(folder: str) -> Typesdict:
                 remedy="mend it, or take it out of the folder",
             ) from error
     if not types:
-        raise RecordingError(
-            "no .msg and no .idl file in it",
-            where=folder,
-            remedy="--definitions names a folder with PACKAGE/msg/NAME.msg (or .idl) in it",
-        )
+        raise _refused(folder, "no .msg and no .idl file in it")
     return types
+
+
+def _refused(folder: str, why: str) -> RecordingError:
+    remedy = "--definitions names a folder with PACKAGE/msg/NAME.msg (or .idl) in it"
+    return RecordingError(why, where=folder, remedy=remedy)

@@ -46,6 +46,12 @@ def test_a_folder_of_no_use_is_refused(text, what, tmp_path):
         folder_types(str(tmp_path))
 
 
+def test_more_definitions_than_are_read_are_refused_and_not_cut(tmp_path, monkeypatch):
+    monkeypatch.setattr("restock.ingest.decoding.hand_definitions.MOST_FILES", 1)
+    with pytest.raises(RecordingError, match="2 definitions in it, and 1 at most"):
+        folder_types(str(package(tmp_path)))
+
+
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
 def test_a_type_that_nobody_knows_is_read_by_its_definition(tmp_path, capsys):
     with open_recording(NEATO) as recording:

@@ -40,20 +40,15 @@ class InfoCommand:
     json: bool = False
     """Print one JSON document: {"recordings": [{"path", "format", "messages", "topics", …}]}."""
 
-    @property
-    def _typestore(self) -> str | None:
-        from restock.ingest.containers.open_recording import with_definitions
-
-        return with_definitions(self.typestore, self.definitions)
-
     def run(self) -> int:
         """Describe each recording; the exit code of the worst of them."""
         from restock.cli import output
-        from restock.ingest.containers.open_recording import recordings_in
+        from restock.ingest.containers.open_recording import recordings_in, with_definitions
         from restock.ingest.describe import describe_recording
 
         if not self.paths:
             raise RecordingError("no path given", remedy="restock info PATH [PATH …]")
+        typestore = with_definitions(self.typestore, self.definitions)
         entries: list[dict[str, Any]] = []
         code = ExitCode.OK
         for name in self.paths:
@@ -66,7 +61,7 @@ class InfoCommand:
             for path in paths:
                 try:
                     entry = describe_recording(
-                        path, typestore=self._typestore, salvage=self.salvage, clocks=self.clocks
+                        path, typestore=typestore, salvage=self.salvage, clocks=self.clocks
                     )
                 except RecordingError as error:
                     sys.stderr.write(f"restock: {error}\n")

@@ -63,12 +63,6 @@ class IngestCommand:
     json: bool = False
     """Print one JSON document: {"recordings": [{"path", "status", "transitions", …}]}."""
 
-    @property
-    def _typestore(self) -> str | None:
-        from restock.ingest.containers.open_recording import with_definitions
-
-        return with_definitions(self.typestore, self.definitions)
-
     def run(self) -> int:
         """Ingest each recording; the exit code for them all."""
         from restock.ingest.batch import warm_up
@@ -77,6 +71,7 @@ class IngestCommand:
             warm_up()
         from restock.cli import output
         from restock.ingest.batch import IngestJob, ingest_all
+        from restock.ingest.containers.open_recording import with_definitions
         from restock.ingest.profile.profile import load_profile
         from restock.ingest.store.writer import StoreWriter
         from restock.ingest.task.tags import parse_tags
@@ -92,9 +87,8 @@ class IngestCommand:
         store = None if self.dry_run else self.store
         if store is not None:
             StoreWriter(store).reach()  # or say now why not, and not once a recording
-        job = IngestJob(
-            *(profile, store, self.force, self.salvage, self._typestore, self.repeated, tags)
-        )
+        typestore = with_definitions(self.typestore, self.definitions)
+        job = IngestJob(*(profile, store, self.force, self.salvage, typestore, self.repeated, tags))
         paths, failures = self._recordings()
         outcomes: list[dict[str, Any]] = []
         lossy = False
