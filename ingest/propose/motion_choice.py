@@ -17,7 +17,7 @@ from restock.ingest.profile.profile import Clock, Frames
 from restock.ingest.propose.roles import FrameGuess, Roles
 from restock.ingest.steps.align import align
 from restock.ingest.steps.frames import FIELDS, Edges, Tree
-from restock.ingest.steps.motion import PoseSeries
+from restock.ingest.steps.motion import PoseSeries, poses_along
 from restock.ingest.task.signals import wrap_angle, yaw_of
 
 SMALL_MPS, SMALL_RADPS = 0.04, 0.08  # how far a speed may scatter
@@ -89,10 +89,7 @@ def pose_series(
         edges = edges.only({usual.base, usual.fixed})
         segments, _ = align(edges.topics, Clock(alignment="log_time"))
         tree = Tree(usual, edges, segments)
-        times = tree.times(usual.base)
-        at = tree.place(usual.base, times)
-        x, y = (np.where(at.problem == "", column, np.nan) for column in at.translation_m.T[:2])
-        series = PoseSeries.of(np.concatenate(times), x, y, at.yaw_rad)
+        series = PoseSeries.joined(poses_along(tree))
         return series, f"{frames.fixed} -> {frames.base} of {usual.topic}"
     topic, kind = roles["pose"][0]
     position = [kind.fields["x_m"], kind.fields["y_m"]]

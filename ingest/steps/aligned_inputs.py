@@ -25,7 +25,7 @@ from restock.ingest.steps.align import (
     ticks_of,
 )
 from restock.ingest.steps.frames import FRAME_ID, Edges, Placement, Tree, plain
-from restock.ingest.steps.motion import PoseSeries
+from restock.ingest.steps.motion import PoseSeries, poses_along
 from restock.ingest.task.signals import yaw_of
 
 # A handover is announced on the tick it takes force; its message may arrive a moment later. Used
@@ -182,13 +182,7 @@ class AlignedInputs:
                 for one in samples
             ]
         assert self.tree is not None  # the profile is refused otherwise
-        times = self.tree.times(self.tree.frames.base)
-        at = self.tree.place(self.tree.frames.base, times)
-        known = at.problem == ""
-        x, y = (np.where(known, column, np.nan) for column in at.translation_m.T[:2])
-        ends = np.cumsum([len(stamps) for stamps in times])[:-1]
-        parts = zip(times, *(np.split(c, ends) for c in (x, y, at.yaw_rad)), strict=True)
-        return [PoseSeries.of(*part) for part in parts]
+        return poses_along(self.tree)
 
     def _lead_s(self, name: str) -> float:
         """How much after a tick an input's message may be measured."""

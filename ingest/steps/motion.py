@@ -8,6 +8,7 @@ fewer than two poses, or a jump (the localiser found the robot elsewhere), has n
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
+from restock.ingest.steps.frames import Tree
 from restock.ingest.task.signals import wrap_angle
 
 _CHUNK = 4096  # ticks at a time: bounds memory
@@ -36,8 +38,28 @@ class PoseSeries:
         keep[:-1] &= np.diff(stamp_ns) > 0
         return cls(stamp_ns[keep], x_m[keep], y_m[keep], yaw_rad[keep])
 
+    @classmethod
+    def joined(cls, parts: Sequence[PoseSeries]) -> PoseSeries:
+        """Stretches that follow one another, as one."""
+        return cls.of(
+            *(np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS)
+        )
+
     def __len__(self) -> int:
         return len(self.stamp_ns)
+
+
+_COLUMNS = ("stamp_ns", "x_m", "y_m", "yaw_rad")
+
+
+def poses_along(tree: Tree) -> list[PoseSeries]:
+    """Every pose of a tree's base in its fixed frame, by segment."""
+    times = tree.times(tree.frames.base)
+    at = tree.place(tree.frames.base, times)
+    x, y = (np.where(at.problem == "", column, np.nan) for column in at.translation_m.T[:2])
+    ends = np.cumsum([len(stamps) for stamps in times])[:-1]
+    parts = zip(times, *(np.split(column, ends) for column in (x, y, at.yaw_rad)), strict=True)
+    return [PoseSeries.of(*part) for part in parts]
 
 
 @dataclass(frozen=True)
