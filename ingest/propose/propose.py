@@ -31,8 +31,10 @@ from restock.ingest.propose.roles import (
     REQUIRED,
     SPENT,
     Roles,
+    several_commands,
     topics_for,
     transform_frames,
+    usable_topics,
 )
 from restock.ingest.propose.trial import GAIN, Advice, Trial, try_profile
 from restock.ingest.steps.clocks import STAMP
@@ -63,6 +65,7 @@ class Proposal:
     transitions: int = 0
     problems: list[str] = field(default_factory=list)  # why it cannot be used as it is
     advice: list[Advice] = field(default_factory=list)  # what choices cost, and what to try
+    commands: list[str] = field(default_factory=list)  # topics, where several may drive the robot
 
 
 def propose_profile(
@@ -118,7 +121,8 @@ def propose_profile(
     if seen.footprint is None and seen.roles["scan"]:
         advice.append(Advice("task.body", "a guess, as nothing in the recording says: --footprint"))
     return Proposal(
-        text, missing, len(seen.signals), trial.ticks, trial.transitions, problems, advice
+        *(text, missing, len(seen.signals), trial.ticks, trial.transitions, problems, advice),
+        several_commands(usable_topics(recording)),
     )
 
 
@@ -160,7 +164,7 @@ def gather(
     odometry_as_command: bool,
 ) -> Evidence:
     """What a recording says of its robot."""
-    topics = {n: t for n, t in recording.topics.items() if t.skipped is None and t.expected}
+    topics = usable_topics(recording)
     roles = {role: topics_for(topics, kinds) for role, kinds in KINDS.items()}
     if not roles["command"] and odometry_as_command:
         roles["command"] = topics_for(topics, ODOMETRY_AS_COMMAND)

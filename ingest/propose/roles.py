@@ -42,6 +42,8 @@ _ELSEWHERE = (
     *("people", "dock", "desired", "setpoint", "reference", "camera", "joint", "gripper"),
 )
 
+MUCH = 0.1  # of the messages of the topic that is taken: another one with as many may be it
+
 # Best first.
 KINDS: dict[str, tuple[Kind, ...]] = {
     "command": (
@@ -177,6 +179,11 @@ SPENT = (*LATCHED, "true_condition", "true_exposure")  # nothing else is in thei
 Roles = dict[str, list[tuple[TopicInfo, Kind]]]  # input -> …, best first
 
 
+def usable_topics(recording: Recording) -> dict[str, TopicInfo]:
+    """The topics that can be decoded and have messages."""
+    return {n: t for n, t in recording.topics.items() if t.skipped is None and t.expected}
+
+
 def topics_for(
     topics: dict[str, TopicInfo], kinds: tuple[Kind, ...]
 ) -> list[tuple[TopicInfo, Kind]]:
@@ -192,6 +199,21 @@ def topics_for(
                 place = min(named, default=len(kind.words))
                 fitting.append(((later, rank, place, -topic.expected, topic.name), topic, kind))
     return [(topic, kind) for _, topic, kind in sorted(fitting, key=lambda item: item[0])]
+
+
+def several_commands(topics: dict[str, TopicInfo]) -> list[str]:
+    """All topics that may be what drives the robot, best first, where there are several."""
+    fitting = topics_for(topics, KINDS["command"])
+    proposed = {topic.name for topic, _ in topics_for(topics, KINDS["nav_command"])}
+    named = [
+        topic.name
+        for topic, kind in fitting
+        if topic.name not in proposed
+        and any(word in topic.name.lower() for word in kind.words)
+        and topic.expected >= MUCH * fitting[0][0].expected
+        and not any(word in topic.name.lower() for word in kind.rather)
+    ]
+    return named if len(named) > 1 else []
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,7 @@ MAY_IMPORT = {
         " train/diagnosis train/evaluation train/run train/study train/twin/calibration"
         " train/twin/physics"
     ),
-    "cli/start": "cli ingest/containers ingest/profile ingest/propose train/dqn train/twin/env",
+    "cli/start": "cli ingest/profile ingest/propose train/dqn train/twin/env",
     "cli/twin": (
         "cli report ingest/profile ingest/propose ingest/store ingest/task replay/fleet"
         " replay/store train/evaluation train/twin/calibration train/twin/env train/twin/floors"

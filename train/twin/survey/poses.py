@@ -16,7 +16,7 @@ from restock.arrays import F64, Bools, Ints
 from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Frames, Profile
-from restock.ingest.propose.roles import KINDS, topics_for, transform_frames
+from restock.ingest.propose.roles import KINDS, topics_for, transform_frames, usable_topics
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.frames import (
     AXES,
@@ -131,7 +131,7 @@ def candidate_poses(recording: Recording, profile: Profile | None = None) -> lis
     """
     if profile is not None:
         return [poses for poses in [_by_profile(recording, profile)] if poses is not None]
-    usable = {n: t for n, t in recording.topics.items() if t.skipped is None and t.expected}
+    usable = usable_topics(recording)
     guess = transform_frames(recording)
     along = None
     if guess is not None:

@@ -17,7 +17,7 @@ from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, offsets_of
 from restock.ingest.profile.profile import Profile
 from restock.ingest.propose.footprint import Footprint
-from restock.ingest.propose.roles import BASE_FRAMES, KINDS, topics_for
+from restock.ingest.propose.roles import BASE_FRAMES, KINDS, topics_for, usable_topics
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.frames import FRAME_ID
 from restock.train.twin.survey.poses import Poses, Times, mount_of, shared_clock
@@ -118,7 +118,7 @@ def _topic(recording: Recording, profile: Profile | None) -> str | None:
         scan = profile.inputs.scan
         named = None if scan is None else recording.topics.get(scan.topic)
         return named.name if named is not None and named.expected and not named.skipped else None
-    usable = {n: t for n, t in recording.topics.items() if t.skipped is None and t.expected}
+    usable = usable_topics(recording)
     found = [topic.name for topic, _ in topics_for(usable, KINDS["scan"])]
     return min(found, key=lambda name: "fake" in name or "sim" in name, default=None)
 

@@ -59,7 +59,7 @@ class ProfileCommand:
     for recordings that carry none."""
     json: bool = False
     """Print one JSON document: `new`: {"toml", "missing", "signals", "ticks", "transitions",
-    "problems", "advice"}; `check`: {"inputs", "problems", "advice", "outcome", …}."""
+    "problems", "advice", "commands"}; `check`: {"inputs", "problems", "advice", "outcome", …}."""
 
     @property
     def _typestore(self) -> str | None:
@@ -108,6 +108,7 @@ class ProfileCommand:
                     "transitions": proposal.transitions,
                     "problems": proposal.problems,
                     "advice": [{"key": each.key, "text": each.text} for each in proposal.advice],
+                    "commands": proposal.commands,
                 }
             )
         elif self.out is None:

@@ -21,7 +21,6 @@ HELD_OUT = "evaluation split"  # of a panel's rows left out: those that judge
 ODOMETRY = "--odometry-as-command"
 UPDATES_A_MINUTE = 400  # on logs alone: 2,000 in five minutes, with the rest of the way
 INTERVALS = 20  # at least so many points of every curve
-MUCH = 0.1  # of the messages of the topic that was taken: another one with as many may be it
 DRIVERS = "behaviour_policies"  # of a row of the coverage
 
 
@@ -30,9 +29,10 @@ class StartCommand:
     """From recordings of a robot to a policy for it and a report, in one command.
 
     Proposes a profile (OUT/profile.toml), checks it, ingests, shows the coverage, mixes a panel,
-    fits the twin, measures whether it may be trusted, trains, evaluates and reports. Each stage
-    prints the command that it is, what came of it, and its file. Where the twin is not to be
-    trusted, a policy is trained on the logs alone, and judged on logs that it did not learn from.
+    makes the floor, fits the twin, measures whether it may be trusted, trains, evaluates and
+    reports. Each stage prints the command that it is, what came of it, and its file. Where the twin
+    is not to be trusted, a policy is trained on the logs alone, and judged on logs that it did not
+    learn from.
 
     Run the same command again after an edit of OUT/profile.toml or an interruption: stages that are
     done and whose inputs are the same are not done again. Where a person must decide it stops, says
@@ -157,10 +157,10 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
             if any(ODOMETRY in problem for problem in problems):
                 told = (f"add {ODOMETRY} to this command, or {told[0]}", again)
             return Stop("; ".join(problems), told)
-        ask = not (asked.accept or work.plan)
-        if others := other_commands(recording, asked.typestore) if ask else []:
+        several = proposed.document.get("commands", [])
+        if several and not asked.accept:
             return Stop(
-                f"several topics may be what drives the robot: {', '.join(others)}; the first of"
+                f"several topics may be what drives the robot: {', '.join(several)}; the first of"
                 " them was taken",
                 (
                     f"edit `topic` of [inputs.command] in {to.profile}, and run the same command"
@@ -335,26 +335,6 @@ def robot_line(profile: Path | str | None) -> str:
     origins = sorted(set(robot.origin.values()))
     own = ", ".join(told) or "the stand-in's wheels and mass"
     return f"{robot.drive}, {own} (from {', '.join(origins) or 'the profile'})"
-
-
-def other_commands(path: str, typestore: str | None) -> list[str]:
-    """All topics that may be what drives the robot, best first, where there are several."""
-    from restock.ingest.containers.open_recording import open_recording
-    from restock.ingest.propose.roles import KINDS, topics_for
-
-    with open_recording(path, typestore=typestore) as recording:
-        topics = {n: t for n, t in recording.topics.items() if t.skipped is None and t.expected}
-    fitting = topics_for(topics, KINDS["command"])
-    proposed = {topic.name for topic, _ in topics_for(topics, KINDS["nav_command"])}
-    named = [
-        topic.name
-        for topic, kind in fitting
-        if topic.name not in proposed
-        and any(word in topic.name.lower() for word in kind.words)
-        and topic.expected >= MUCH * fitting[0][0].expected
-        and not any(word in topic.name.lower() for word in kind.rather)
-    ]
-    return named if len(named) > 1 else []
 
 
 __all__ = ["StartCommand", "fullest", "mistrust"]

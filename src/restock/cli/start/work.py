@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -210,8 +210,6 @@ def _resumable(stage: Stage) -> bool:
 
 
 def _resumed(stage: Stage) -> Stage:
-    from dataclasses import replace
-
     return replace(stage, command=list(stage.resume))
 
 
