@@ -34,6 +34,11 @@ class ConfidenceInterval:
 NOT_KNOWN = ConfidenceInterval(float("nan"), float("nan"), float("nan"))
 
 
+def interval_text(value: float, low: float | None, high: float | None, form: str = ".2f") -> str:
+    """A value with the ends of its interval where there is one: `.52 [.41, .63]`."""
+    return f"{value:{form}}" + ("" if low is None else f" [{low:{form}}, {high:{form}}]")
+
+
 def wilson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
     """The Wilson score interval of a proportion; (0, 1) without trials.
 

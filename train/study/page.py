@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from restock.stats import interval_text
 from restock.train.comparison.compare import LEAST_EPISODES, LEAST_RUNS
 from restock.train.study.findings import SAFETY
 
@@ -96,11 +97,8 @@ def _arms(arms: list[dict[str, Any]]) -> list[str]:
 
 
 def _over_seeds(value: list[float | None] | None, form: str) -> str:
-    if value is None or value[0] is None:
-        return ""
-    mean, low, high = value
-    text = format(mean, form)
-    return text if low is None else f"{text} [{low:{form}}, {high:{form}}]"
+    mean, low, high = value or (None, None, None)
+    return "" if mean is None else interval_text(mean, low, high, form)
 
 
 def _comparison(comparison: dict[str, Any]) -> list[str]:

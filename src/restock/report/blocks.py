@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from restock.stats import interval_text
+
 Rows = list[dict[str, Any]]
 
 
@@ -58,9 +60,7 @@ def estimate(row: dict[str, Any]) -> str:
     """A value with its interval, or why there is none."""
     if row["value"] is None:
         return f"refused: {row['refused']}"
-    if row["low"] is None:
-        return f"{row['value']:.2f}"
-    return f"{row['value']:.2f} [{row['low']:.2f}, {row['high']:.2f}]"
+    return interval_text(row["value"], row["low"], row["high"])
 
 
 def percent(value: float | None) -> str:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from restock.stats import interval_text
+
 if TYPE_CHECKING:
     from restock.train.evaluation.ope import OpeConfig, OpeResult
 
@@ -47,9 +49,7 @@ def _measures_row(row: dict[str, Any]) -> dict[str, Any]:
 
 def _with_interval(row: dict[str, Any], name: str, form: str) -> str:
     value, low, high = (row[name + end] for end in ("", "_low", "_high"))
-    if value is None:
-        return ""
-    return format(value, form) + (f" [{low:{form}}, {high:{form}}]" if low is not None else "")
+    return "" if value is None else interval_text(value, low, high, form)
 
 
 def show_off_policy(path: Path, result: OpeResult, config: OpeConfig, *, as_json: bool) -> None:
@@ -101,9 +101,7 @@ def show_off_policy(path: Path, result: OpeResult, config: OpeConfig, *, as_json
 def _value(row: dict[str, Any]) -> str:
     if row["value"] is None:
         return "refused"
-    if row["low"] is None:
-        return f"{row['value']:.2f}"
-    return f"{row['value']:.2f} [{row['low']:.2f}, {row['high']:.2f}]"
+    return interval_text(row["value"], row["low"], row["high"])
 
 
 def show_regression(rows: list[dict[str, Any]], baseline: str, margin: float) -> None:

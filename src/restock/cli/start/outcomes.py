@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from restock.cli.start.stage import Document
+from restock.stats import interval_text
 
 ESTIMATORS = ("logged", "fqe", "pdwis", "wdr")
 
@@ -116,7 +117,7 @@ def fit(document: Document) -> list[str]:
     """The parameters that the logs tell, and the distance before and after."""
     (first, *_) = document["fits"]
     told = [
-        f"{item['name']} {item['value']:.3g} [{item['low']:.3g}, {item['high']:.3g}]"
+        f"{item['name']} {interval_text(item['value'], item['low'], item['high'], '.3g')}"
         for item in first["estimates"]
         if item["fitted"]
     ]
@@ -165,8 +166,8 @@ def driven(document: Document) -> list[str]:
             if row["success"] is None:
                 cells.append(f"{row['condition']} return {row['return']:.2f}")
             else:
-                ends = f"[{row['success_low']:.2f}, {row['success_high']:.2f}]"
-                cells.append(f"{row['condition']} {row['success']:.2f} {ends}")
+                ends = row["success_low"], row["success_high"]
+                cells.append(f"{row['condition']} {interval_text(row['success'], *ends)}")
         lines.append(f"{policy}: {', '.join(cells)}")
     return lines
 
@@ -189,9 +190,8 @@ def on_logs(document: Document) -> list[str]:
 def _estimate(row: Mapping[str, Any]) -> str:
     if row["value"] is None:
         return "refused"
-    if row["low"] is None:
-        return f"{row['value']:.2f} (no interval)"
-    return f"{row['value']:.2f} [{row['low']:.2f}, {row['high']:.2f}]"
+    text = interval_text(row["value"], row["low"], row["high"])
+    return text if row["low"] is not None else f"{text} (no interval)"
 
 
 def report(document: Document) -> list[str]:
