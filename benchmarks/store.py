@@ -1,0 +1,187 @@
+"""A fleet's store: what it costs to open it, to ask it, to audit it and to mix from it.
+
+    python benchmarks/store.py [--quick] [--json] [--check] [--size NAME] [--keep FOLDER]
+
+Synthetic fleets are written by the project's own writer, some recordings a commit: few rows in
+many files, and as many rows as a fleet has. Each question is asked in a process of its own; wall
+and CPU seconds are of the question alone, what imports cost is paid before. `--keep` keeps the
+stores, and takes those that are there.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from harness import finish, markdown, option_parser
+from store_fleet import disk_bytes, write_fleet
+
+LIMIT_S = 300  # a question that takes longer is not waited for
+BATCH = 100  # recordings a commit
+
+
+@dataclass(frozen=True)
+class Size:
+    """A fleet, and the seconds and bytes that questions to it may take."""
+
+    files: int
+    rows: int  # of each
+    targets_s: Mapping[str, float]
+    audit_bytes: float | None = None
+    only: tuple[str, ...] = ()  # questions; none named: all
+
+
+_OPEN = {"count": 0.5, "coverage": 1.0, "coverage_by_condition": 1.0, "episodes": 1.0}
+SIZES = {
+    "quick": Size(60, 200, {}),
+    "1,000 small files": Size(1_000, 20, _OPEN),
+    "10,000 small files": Size(10_000, 20, _OPEN, only=("open", *_OPEN)),
+    "1 M rows": Size(140, 7_200, _OPEN),
+    "10 M rows": Size(1_400, 7_200, {**_OPEN, "audit": 30.0}, audit_bytes=2e9),
+}
+QUESTIONS = {
+    "open": "",
+    "count": "SELECT count(*) FROM transitions",
+    "coverage": "FROM coverage",
+    "coverage_by_condition": "FROM coverage_by_condition",
+    "episodes": "SELECT ended, count(*), avg(success::INTEGER) FROM episodes GROUP BY ALL",
+    "one_column": "SELECT condition, avg(reward) FROM transitions GROUP BY ALL",
+    "audit": "",
+    "mix": "",
+}
+
+
+def ask(store: Path, question: str) -> dict[str, float]:
+    """Ask it here; wall and CPU seconds, and the peak of this process' memory in bytes."""
+    import contextlib
+    import resource
+
+    import restock.replay.panel.build
+    from restock.cli import main as restock
+    from restock.replay.store.store import Store
+
+    with tempfile.TemporaryDirectory(dir=store.parent) as folder:
+        began, cpu = time.perf_counter(), time.process_time()
+        with contextlib.redirect_stdout(sys.stderr):
+            if question == "audit":
+                code = restock(["audit", str(store)])
+            elif question == "mix":
+                code = restock(["mix", str(store), "--out", f"{folder}/panel"])
+            else:
+                with Store(store) as opened:
+                    if text := QUESTIONS[question]:
+                        opened.sql(text).fetchall()
+                code = 0
+        wall, cpu = time.perf_counter() - began, time.process_time() - cpu
+    if code not in (0, 1):
+        raise SystemExit(f"{question}: exit code {code}")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    return {"wall_s": wall, "cpu_s": cpu, "peak_bytes": peak}
+
+
+def asked(store: Path, question: str) -> dict[str, float]:
+    """The same in a process of its own; empty where it is not done after LIMIT_S."""
+    command = [sys.executable, __file__, "--ask", question, str(store)]
+    print(f"  {question} …", file=sys.stderr)
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False)
+    except subprocess.TimeoutExpired:
+        return {}
+    if done.returncode:
+        raise SystemExit(done.stderr)
+    answer: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    return answer
+
+
+def measure(name: str, folder: Path, *, rounds: int) -> dict[str, Any]:
+    """One fleet: written, then every question to it; the median of some rounds."""
+    size, store = SIZES[name], folder / name.replace(" ", "_").replace(",", "")
+    figures: dict[str, Any] = {"files": size.files, "rows": size.files * size.rows}
+    print(f"{name}: {size.files:,} files of {size.rows:,} rows", file=sys.stderr)
+    if not store.exists():
+        began, cpu = time.perf_counter(), time.process_time()
+        write_fleet(store, size.files, size.rows, batch=BATCH)
+        figures["write_wall_s"] = time.perf_counter() - began
+        figures["write_cpu_s"] = time.process_time() - cpu
+    figures["disk_bytes"] = disk_bytes(store)
+    figures["as written"] = _answers(store, size, rounds)
+    return figures
+
+
+def _answers(store: Path, size: Size, rounds: int) -> dict[str, dict[str, float]]:
+    answers = {}
+    for question in size.only or QUESTIONS:
+        times = rounds if question not in ("audit", "mix") else 1
+        several = [asked(store, question) for _ in range(times)]
+        done = sorted((one for one in several if one), key=lambda one: one["wall_s"])
+        answers[question] = done[len(done) // 2] if done else {}
+    return answers
+
+
+def missed(figures: Mapping[str, Any]) -> list[str]:
+    """The targets that these figures miss."""
+    misses = []
+    for name, one in figures.items():
+        for question, most in SIZES[name].targets_s.items():
+            answer = one["as written"].get(question, {})
+            if answer.get("wall_s", float("inf")) > most:
+                took = f"{answer['wall_s']:.2f} s" if answer else f"not done after {LIMIT_S} s"
+                misses.append(f"{name}, {question}: {took}, at most {most:g} s")
+        most_bytes = SIZES[name].audit_bytes
+        peak = one["as written"].get("audit", {}).get("peak_bytes", 0)
+        if most_bytes is not None and peak > most_bytes:
+            misses.append(f"{name}, audit: {peak / 1e9:.1f} GB, at most {most_bytes / 1e9:g} GB")
+    return misses
+
+
+def lines(figures: Mapping[str, Any]) -> Iterator[str]:
+    """The figures as tables."""
+    for name, one in figures.items():
+        size = f"{one['files']:,} files, {one['rows']:,} rows, {one['disk_bytes'] / 1e6:,.0f} MB"
+        yield f"{name}: {size}"
+        if "write_cpu_s" in one:
+            yield f"written in {one['write_wall_s']:.1f} s, {one['write_cpu_s']:.1f} s of CPU"
+        rows = [[question, *_cells(answer)] for question, answer in one["as written"].items()]
+        yield markdown(["question", "s", "CPU s", "peak MB"], rows)
+
+
+def _cells(answer: Mapping[str, float]) -> list[str]:
+    if not answer:
+        return [f"not done after {LIMIT_S}", "", ""]
+    return [
+        f"{answer['wall_s']:.2f}",
+        f"{answer['cpu_s']:.2f}",
+        f"{answer['peak_bytes'] / 1e6:,.0f}",
+    ]
+
+
+def main() -> int:
+    parser = option_parser(__doc__, quick="one small fleet")
+    parser.add_argument("--size", choices=SIZES, action="append", help="may be repeated")
+    parser.add_argument("--keep", type=Path, help="folder of the stores, which stay there")
+    parser.add_argument("--ask", nargs=2, metavar=("QUESTION", "STORE"), help="ask it here")
+    options = parser.parse_args()
+    if options.ask:
+        print(json.dumps(ask(Path(options.ask[1]), options.ask[0])))
+        return 0
+    names = options.size or (["quick"] if options.quick else [n for n in SIZES if n != "quick"])
+    folder = options.keep or Path(tempfile.mkdtemp(prefix="restock-store-"))
+    try:
+        rounds = 1 if options.quick else 3
+        figures = {name: measure(name, folder, rounds=rounds) for name in names}
+    finally:
+        if options.keep is None:
+            shutil.rmtree(folder, ignore_errors=True)
+    return finish(options, figures, missed(figures), lines(figures))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
