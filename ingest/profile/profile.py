@@ -2,7 +2,8 @@
 
 A profile is a TOML file: `name`, the shipped `conditions` and `exposures` it uses, `[[condition]]`
 of its own, `[task]`, `[goal]` (logged, or by hindsight), `[clock]`, `[episodes]`, `[inputs.*]`
-(which topic fills what), `[frames]` (poses from transforms), `[motion]` (speeds from poses),
+(which topic fills what), `[command_sources.*]` (whose command it may be), `[frames]` (poses from
+transforms), `[motion]` (speeds from poses),
 `[signals.*]` (custom columns), `[tags]` (whose drive it is), `[robot]` (what the twin builds) and
 `[[zone]]` (named rectangles of the map).
 `load_profile("warehouse_amr")` reads one that comes with Restock, `load_profile("my_robot.toml")`
@@ -43,6 +44,8 @@ from restock.ingest.task.task import Task
 from restock.toml import Checked, parse_toml, read_toml, typed
 
 ELSEWHERE = "elsewhere"
+COMMAND_SOURCES = "command_sources"
+MOST_NAME = 64  # characters of a behaviour policy
 
 
 # What each input must and may say of a message: signal-side name -> whether it is required.
@@ -62,6 +65,8 @@ INPUT_FIELDS: dict[str, dict[str, bool]] = {
     "true_exposure": {"text": True},
     "perturbation": {"text": True},
 }
+# Of a source of commands: the commands that it gives, or what is pressed while it drives.
+COMMAND_SOURCE_FIELDS = {**INPUT_FIELDS["nav_command"], "speed_mps": False, "pressed": False}
 
 # What is used instead of an input that is left out, or is optional and the recording lacks.
 FALLBACKS: dict[str, str] = {
@@ -77,6 +82,7 @@ FALLBACKS: dict[str, str] = {
 MOTION = "nav_msgs/msg/Odometry"  # what was measured: commands are of other types
 STEERED = "speed x tan(steering angle) / {wheelbase_m:g} m of {topic}"
 COMMAND_FALLBACK = "the measured motion of {topic} in place of commands"
+POLICY_FALLBACK = "whose command it equals: {names}; else the profile's behaviour_policy"
 POSE_FALLBACK = "from transforms, by [frames]"
 WHEELS_FALLBACK = "speeds from the poses of the last {window_s:g} s: slip cannot be seen"
 ROUTE_FALLBACK = "none: the task has no goal, progress is forward displacement"
@@ -195,6 +201,8 @@ class Profile(Checked, frozen=True):
     shipped_exposures: list[str] = msgspec.field(default_factory=list, name="exposures")
     own_conditions: list[Condition] = msgspec.field(default_factory=list, name="condition")
     behaviour_policy: str = "unknown"  # who drove, where no topic says
+    # Behaviour policy -> its commands (of a person, of navigation) before one is chosen to drive.
+    command_sources: dict[str, Input] = msgspec.field(default_factory=dict)
     clock: Clock = Clock()
     episodes: Episodes = Episodes()
     zones: list[Zone] = msgspec.field(default_factory=list, name="zone")
@@ -246,6 +254,8 @@ class Profile(Checked, frozen=True):
             apart |= {"goal"}
         if self.motion is None:
             apart |= {"motion"}
+        if not self.command_sources:
+            apart |= {"command_sources"}
         for source in filter(None, values["inputs"].values()):
             for key in ("stop_holds", "wheelbase_m"):
                 if not source[key]:
@@ -259,9 +269,18 @@ class Profile(Checked, frozen=True):
         return (self.frames.topic, self.frames.static_topic) if self.frames else ()
 
     @property
+    def sources(self) -> dict[str, Input]:
+        """The inputs, and as `command_sources.NAME` those of commands, none of which is needed."""
+        optional = {
+            f"{COMMAND_SOURCES}.{name}": msgspec.structs.replace(source, optional=True)
+            for name, source in self.command_sources.items()
+        }
+        return dict(self.inputs.items()) | optional
+
+    @property
     def topics(self) -> list[str]:
         """Every topic that the profile names."""
-        named = [source.topic for _, source in self.inputs.items()]
+        named = [source.topic for source in self.sources.values()]
         named += [signal.topic for signal in self.signals.values()]
         return list(dict.fromkeys([*named, *self.transform_topics]))
 
@@ -276,6 +295,9 @@ class Profile(Checked, frozen=True):
             if source.wheelbase_m is not None:
                 how = STEERED.format(wheelbase_m=source.wheelbase_m, topic=source.topic)
                 fallbacks[f"{name}.yaw_rate_radps"] = how
+        if self.command_sources and "behaviour_policy" in fallbacks:
+            names = ", ".join(self.command_sources)
+            fallbacks["behaviour_policy"] = POLICY_FALLBACK.format(names=names)
         if self.inputs.pose is None:
             fallbacks["pose"] = POSE_FALLBACK
         if self.motion is not None:
@@ -366,6 +388,8 @@ def _check(profile: Profile, where: str) -> None:
         raise ConfigError(f"`conditions`: {', '.join(doubled)} given twice", where=where)
     for name, source in profile.inputs.items():
         _check_input(name, source, where, framed=profile.frames is not None)
+    for name, source in profile.command_sources.items():
+        _check_command_source(name, source, profile.inputs.command, where)
     if profile.inputs.pose is None and profile.frames is None:
         raise ConfigError(
             "`inputs.pose` is missing, and there is no `frames`",
@@ -459,12 +483,7 @@ def _check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
             unknown.append("steering_rad beside yaw_rate_radps")
         elif not steered and "yaw_rate_radps" not in source.fields:
             missing.append("yaw_rate_radps")
-    if steered != (source.wheelbase_m is not None):
-        raise ConfigError(
-            f"`inputs.{name}`: steering_rad and wheelbase_m belong together",
-            where=where,
-            remedy="wheelbase_m is the way between the axles, in metres",
-        )
+    _check_wheelbase(f"inputs.{name}", source, where)
     if unknown or missing:
         problems = [f"unknown {key!r}" for key in unknown] + [f"missing {key!r}" for key in missing]
         raise ConfigError(
@@ -480,6 +499,57 @@ def _check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
             where=where,
             remedy=f"optional may be {', '.join(FALLBACKS)}, and pose where there is [frames]",
         )
+
+
+def _check_wheelbase(key: str, source: Input, where: str) -> None:
+    if ("steering_rad" in source.fields) != (source.wheelbase_m is not None):
+        raise ConfigError(
+            f"`{key}`: steering_rad and wheelbase_m belong together",
+            where=where,
+            remedy="wheelbase_m is the way between the axles, in metres",
+        )
+
+
+def _check_command_source(name: str, source: Input, command: Input, where: str) -> None:
+    """That it says what it commands as the command does, or what is pressed while it drives.
+
+    Raises:
+        ConfigError: it does not; names the key.
+    """
+    key = f"{COMMAND_SOURCES}.{name}"
+    commanding = source.fields.keys() - {"pressed"}
+    if not name or len(name) > MOST_NAME or not name.isprintable():
+        raise ConfigError(
+            f"`{key}`: the name of a behaviour policy has 1 to {MOST_NAME} printable characters",
+            where=where,
+            remedy='name who drives by it: "teleop", "navigation"',
+        )
+    if unknown := sorted(source.fields.keys() - COMMAND_SOURCE_FIELDS.keys()):
+        raise ConfigError(
+            f"`{key}.fields`: unknown {', '.join(map(repr, unknown))}",
+            where=where,
+            remedy=f"a source of commands takes {', '.join(COMMAND_SOURCE_FIELDS)}",
+        )
+    complete = "speed_mps" in commanding and len(commanding) == 2
+    if not (commanding == set() if "pressed" in source.fields else complete):
+        raise ConfigError(
+            f"`{key}.fields`: {', '.join(source.fields) or 'nothing'} does not say when it drives",
+            where=where,
+            remedy="give speed_mps with yaw_rate_radps (or steering_rad), or pressed alone",
+        )
+    if source.topic == command.topic and "pressed" not in source.fields:
+        raise ConfigError(
+            f"`{key}.topic` is the command's own, {command.topic}: it would always be in force",
+            where=where,
+            remedy="name the topic of its commands before one of several is chosen",
+        )
+    if source.stop_holds or source.optional:
+        raise ConfigError(
+            f"`{key}` takes neither stop_holds nor optional",
+            where=where,
+            remedy="leave both out: a recording may lack a source of commands",
+        )
+    _check_wheelbase(key, source, where)
 
 
 def _check_conditions(profile: Profile, where: str) -> None:

@@ -31,10 +31,17 @@ if TYPE_CHECKING:
 Rows = NDArray[np.intp]
 NAMES = "name"  # the sibling that names elements, as in sensor_msgs/JointState
 _STEP = re.compile(r"([A-Za-z_]\w*)((?:\[[^\]]*\])?)(?:\.|$)")
+_ELEMENT = re.compile(r"(.+)\[(\d{1,6})\]")
 
 
 class PathProblem(Exception):
     """A path that cannot be read, or that a message type does not have; says what there is."""
+
+
+def element_of(path: str) -> tuple[str, int | None]:
+    """The list of which a path takes one element, and its place; None: it takes the whole field."""
+    match = _ELEMENT.fullmatch(path)
+    return (match[1], int(match[2])) if match else (path, None)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,14 @@ import numpy as np
 from restock.arrays import F64, Bools, Ints
 from restock.errors import RecordingError
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns
-from restock.ingest.profile.profile import FALLBACKS, POSE_FALLBACK, Input, Profile
+from restock.ingest.profile.profile import (
+    COMMAND_SOURCES,
+    FALLBACKS,
+    POSE_FALLBACK,
+    Input,
+    Profile,
+)
+from restock.ingest.profile.signal_paths import element_of
 from restock.ingest.steps.align import (
     NS,
     ClockReport,
@@ -31,6 +38,7 @@ from restock.ingest.task.signals import yaw_of
 # A handover is announced on the tick it takes force; its message may arrive a moment later. Used
 # for provenance alone, never for what the robot knew.
 PROVENANCE_LEAD_S = 0.1
+SAME_COMMAND = 1e-6  # m/s or rad/s: what only passes a command on does not change it
 
 
 class InputColumns:
@@ -41,14 +49,16 @@ class InputColumns:
         self.placed: dict[str, Placement] = {}  # of each message of an input in another frame
         self.by_name: dict[str, Input] = {  # those whose topic the recording has
             name: source
-            for name, source in profile.inputs.items()
+            for name, source in profile.sources.items()
             if source.topic in topics and not (source.optional and not len(topics[source.topic]))
         }
 
     def column(self, name: str, key: str) -> FieldColumn:
         """A field of an input as it was read."""
         source = self.by_name[name]
-        return self.topics[source.topic].fields[source.fields[key]]
+        path, place = element_of(source.fields[key])
+        column = self.topics[source.topic].fields[path]
+        return column if place is None else _element(column, place)
 
     def numbers(self, name: str, key: str) -> F64:
         """A field of an input, one number a message (N,)."""
@@ -171,6 +181,38 @@ class AlignedInputs:
             parts.append(samples.hold(stamps + lead_ns, max_age_s))
         return LatestMessages.join(parts)
 
+    def commanded_by(self) -> list[str | None]:
+        """At each tick the source whose command is the one in force, or None.
+
+        It is looked for at the command itself, among what had come up to then: of the sources
+        whose last command is the same the one that said so last, else one that is pressed.
+        """
+        topics, keys = self.inputs.topics, ("speed_mps", "yaw_rate_radps")
+        topic = self.profile.inputs.command.topic
+        by = np.full(len(topics[topic]), None, object)
+        command = np.stack([self.inputs.numbers("command", key) for key in keys])
+        sources = [
+            (name.removeprefix(f"{COMMAND_SOURCES}."), name, source)
+            for name, source in self.inputs.by_name.items()
+            if name.startswith(f"{COMMAND_SOURCES}.") and len(topics[source.topic])
+        ]
+        for segment in self.segments:
+            given = segment.topics[topic]
+            said_ns = np.full(len(given.row), np.iinfo(np.int64).min)
+            for policy, name, source in sources:
+                last = segment.topics[source.topic].hold(given.stamp_ns, source.max_age_s)
+                if "pressed" in source.fields:
+                    pressed = self.inputs.numbers(name, "pressed")[last.row] > 0
+                    drives = last.fresh & pressed & np.equal(by[given.row], None)
+                else:
+                    its = np.stack([self.inputs.numbers(name, key)[last.row] for key in keys])
+                    same = (np.abs(its - command[:, given.row]) <= SAME_COMMAND).all(axis=0)
+                    at_ns = given.stamp_ns - last.age_ns
+                    drives = last.fresh & same & (at_ns > said_ns)
+                    said_ns[drives] = at_ns[drives]
+                by[given.row[drives]] = policy
+        return [by[row] for row in self.latest("command").row]
+
     def poses(self) -> list[PoseSeries]:
         """Every pose of each segment, in the fixed frame."""
         if "pose" in self.inputs.by_name:
@@ -197,6 +239,16 @@ class AlignedInputs:
             "perturbation": PROVENANCE_LEAD_S,
         }
         return leads.get(name, 0.0)
+
+
+def _element(column: FieldColumn, place: int) -> F64:
+    """One element of each row's list (N,); NaN where a list is shorter."""
+    if not isinstance(column, Ragged):
+        return np.asarray(column[:, place], np.float64)
+    values = np.full(len(column), np.nan)
+    has = column.lengths > place
+    values[has] = np.asarray(column.values)[column.offsets[:-1][has] + place]
+    return values
 
 
 def align_inputs(profile: Profile, topics: Mapping[str, TopicColumns]) -> AlignedInputs:

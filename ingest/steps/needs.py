@@ -13,7 +13,7 @@ from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, TopicColumns
 from restock.ingest.profile.custom_signal import CustomSignal
 from restock.ingest.profile.profile import Input, Profile
-from restock.ingest.profile.signal_paths import offer
+from restock.ingest.profile.signal_paths import element_of, offer
 from restock.ingest.steps.align import CLOCK_FIELD, CLOCK_TOPIC, clock_drifts
 from restock.ingest.steps.clearance import scan_reduction
 from restock.ingest.steps.clocks import STAMP
@@ -71,7 +71,7 @@ def wanted_fields(
             remedy=f"its topics are {have}; choose another --profile or see `restock info`",
         )
     wanted: dict[str, list[str]] = {}
-    for name, source in profile.inputs.items():
+    for name, source in profile.sources.items():
         if source.topic not in available:
             continue
         paths = wanted.setdefault(source.topic, [])
@@ -123,6 +123,7 @@ def field_paths(source: Input) -> list[str]:
     """The field paths that an input reads."""
     paths: list[str] = []
     for key, field in source.fields.items():
+        field, _ = element_of(field)
         paths += [f"{field}.{axis}" for axis in "xyzw"] if key == "orientation" else [field]
     return paths
 
@@ -136,7 +137,7 @@ def input_problems(
     needed: dict[str, list[str]] = {}
     wrong: dict[str, list[str]] = {}
     fields: list[str] = []
-    sources: dict[str, Input | CustomSignal] = dict(profile.inputs.items())
+    sources: dict[str, Input | CustomSignal] = {**profile.sources}
     sources |= {f"signals.{name}": signal for name, signal in profile.signals.items()}
     for name, source in sources.items():
         topic = available.get(source.topic)
@@ -169,8 +170,9 @@ def _field_problems(name: str, source: Input | CustomSignal, leaves: Sequence[Le
         problem = source.problem(leaves)
         return [f"`{name}.path`: {source.topic}: {problem}"] if problem else []
     has = {leaf.path.removesuffix("[]") for leaf in leaves}
+    key = name if "." in name else f"inputs.{name}"
     return [
-        f"`inputs.{name}.fields`: {source.topic}: {offer(path, sorted(has))}"
+        f"`{key}.fields`: {source.topic}: {offer(path, sorted(has))}"
         for path in field_paths(source)
         if path.removesuffix("[]") not in has
     ]

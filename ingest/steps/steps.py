@@ -164,9 +164,11 @@ class Filling:
 
     def behaviour(self) -> list[tuple[str, str | None, float | None]]:
         """Who acted at each tick: policy, version, probability of the action."""
-        default = (self.profile.behaviour_policy, None, None)
-        texts = self.texts("behaviour_policy")
-        return [default if text is None else parse_policy(text) for text in texts]
+        default, by = self.profile.behaviour_policy, self.aligned.commanded_by()
+        return [
+            (source or default, None, None) if text is None else parse_policy(text)
+            for text, source in zip(self.texts("behaviour_policy"), by, strict=True)
+        ]
 
     def texts(self, name: str) -> list[str | None]:
         """The latest text of an input at each tick, or None."""

@@ -3,6 +3,7 @@ whose right answers can be worked out by hand."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -145,10 +146,6 @@ def without(topic: TopicColumns, keep: NDArray[np.bool_]) -> TopicColumns:
 
 def write_bag(drive: Drive, folder: Path, *, storage: str = "sqlite3") -> Path:
     """The drive as a rosbag2 folder, `sqlite3` or `mcap`, written by rosbags."""
-    from rosbags.rosbag2 import StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    types = get_typestore(Stores.ROS2_HUMBLE)
     names = {
         "/cmd_vel": "geometry_msgs/msg/Twist",
         "/amcl_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
@@ -162,18 +159,30 @@ def write_bag(drive: Drive, folder: Path, *, storage: str = "sqlite3") -> Path:
         "/ground_truth/condition": "std_msgs/msg/String",
         "/battery": "sensor_msgs/msg/BatteryState",
     }
-    plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     if drive.proposals is not None:
         names[drive.proposals] = names["/cmd_vel"]
+    topics = {name: (names[name], columns) for name, columns in drive.topics().items()}
+    return write_topics(topics, folder, storage=storage)
+
+
+def write_topics(
+    topics: Mapping[str, tuple[str, TopicColumns]], folder: Path, *, storage: str = "sqlite3"
+) -> Path:
+    """Topics as (message type, columns), as a rosbag2 folder; other fields are zero or empty."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     with Writer(folder, version=9, storage_plugin=plugin) as writer:
         lines = []
-        for topic, messages in drive.topics().items():
-            connection = writer.add_connection(topic, names[topic], typestore=types)
+        for topic, (name, messages) in topics.items():
+            connection = writer.add_connection(topic, name, typestore=types)
             for row in range(len(messages)):
-                message = _blank(types, names[topic])
+                message = _blank(types, name)
                 for path, column in messages.fields.items():
                     _set(types, message, path, column[row])
-                data = types.serialize_cdr(message, names[topic])
+                data = types.serialize_cdr(message, name)
                 lines.append((int(messages.log_time_ns[row]), connection, data))
         for log_time_ns, connection, data in sorted(lines, key=lambda line: line[0]):
             writer.write(connection, log_time_ns, data)

@@ -196,7 +196,7 @@ def _inputs(profile: Any, topics: Any) -> list[dict[str, Any]]:
 
     rows = [
         row(name, source.topic, source.type, source.max_age_s, source.optional)
-        for name, source in profile.inputs.items()
+        for name, source in profile.sources.items()
     ]
     for topic in profile.transform_topics:
         moving = topic == profile.frames.topic

@@ -1,0 +1,175 @@
+"""Who drove, by whose command was in force: a multiplexer's inputs, a joystick's button."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.driven_robot import START_NS, Drive, columns, write_topics
+
+from restock.cli import main
+from restock.errors import ConfigError
+from restock.ingest.decoding.columns import Ragged, TopicColumns, offsets_of
+from restock.ingest.profile.profile import load_profile, parse_profile
+from restock.replay.store.store import Store
+
+TWIST = "geometry_msgs/msg/Twist"
+NAV, TELEOP, OUT, JOY = "/cmd_vel_nav", "/teleop_cmd_vel", "/cmd_vel", "/joy"
+TAKEN_OVER_S = (4.0, 7.0)
+SOURCES = """
+[command_sources.navigation]
+topic = "/cmd_vel_nav"
+type = "geometry_msgs/msg/Twist"
+fields = { speed_mps = "linear.x", yaw_rate_radps = "angular.z" }
+max_age_s = 0.5
+
+[command_sources.teleop]
+topic = "/teleop_cmd_vel"
+type = "geometry_msgs/msg/Twist"
+fields = { speed_mps = "linear.x", yaw_rate_radps = "angular.z" }
+max_age_s = 0.5
+"""
+PRESSED = """
+[command_sources.teleop]
+topic = "/joy"
+type = "sensor_msgs/msg/Joy"
+fields = { pressed = "buttons[4]" }
+"""
+
+
+def twists(time_s: Any, speed_mps: Any, turn_radps: Any) -> TopicColumns:
+    fields = {"linear.x": np.asarray(speed_mps), "angular.z": np.asarray(turn_radps)}
+    return columns(time_s, fields, stamped=False)
+
+
+def taken_over(duration_s: float = 12.0) -> dict[str, tuple[str, TopicColumns]]:
+    """Navigation drives; between 4 and 7 s a person does; a multiplexer passes on who counts."""
+    drive = Drive(duration_s)
+    names = {"/amcl_pose": "geometry_msgs/msg/PoseWithCovarianceStamped"}
+    topics = drive.topics()
+    found = {name: (kind, topics[name]) for name, kind in names.items()}
+    found["/odom"] = ("nav_msgs/msg/Odometry", topics["/odom"])
+    nav_s = np.arange(0, duration_s, 0.1)
+    hand_s = np.arange(*TAKEN_OVER_S, 0.1) + 0.03
+    nav = twists(nav_s, 0.4 + 0.01 * np.sin(nav_s), 0.1 * np.cos(nav_s))
+    hand = twists(hand_s, np.full(len(hand_s), 0.2), np.linspace(-0.3, 0.3, len(hand_s)))
+    start, end = TAKEN_OVER_S
+    drives = (nav_s < start) | (nav_s > end)
+    out_s = np.concatenate([nav_s[drives], hand_s]) + 0.002
+    order = np.argsort(out_s)
+    out = [
+        np.concatenate([nav.fields[path][drives], hand.fields[path]])[order]
+        for path in ("linear.x", "angular.z")
+    ]
+    joy_s = np.arange(0, duration_s, 0.05)
+    held = (joy_s >= start) & (joy_s <= end)
+    buttons = np.zeros((len(joy_s), 8), np.int32)
+    buttons[:, 4] = held
+    each = offsets_of(np.full(len(joy_s), 8))
+    found |= {
+        NAV: (TWIST, nav),
+        TELEOP: (TWIST, hand),
+        OUT: (TWIST, twists(out_s[order], *out)),
+        JOY: (
+            "sensor_msgs/msg/Joy",
+            columns(joy_s, {"buttons": Ragged(buttons.reshape(-1), each)}),
+        ),
+    }
+    return found
+
+
+def profile_of(bag: Path, folder: Path, sources: str) -> Path:
+    """A proposal with these sources of commands and no others."""
+    file = folder / "p.toml"
+    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
+    kept, skip = [], False
+    for line in file.read_text().splitlines():
+        skip = line.startswith("[command_sources") or (skip and not line.startswith("["))
+        kept += [] if skip else [line]
+    file.write_text("\n".join(kept) + "\n" + sources)
+    return file
+
+
+def policies(bag: Path, profile: Path, store: Path) -> list[tuple[float, str]]:
+    """Seconds from the start and who drove, of each row."""
+    assert main(["ingest", str(bag), "--profile", str(profile), "--store", str(store)]) == 0
+    with Store(store) as opened:
+        rows = opened.sql("SELECT stamp_ns, behaviour_policy FROM transitions ORDER BY 1")
+        return [((stamp - START_NS) * 1e-9, policy) for stamp, policy in rows.fetchall()]
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+def test_the_source_whose_command_is_in_force_is_who_drove(storage, tmp_path, capsys):
+    bag = write_topics(taken_over(), tmp_path / "bag", storage=storage)
+    rows = policies(bag, profile_of(bag, tmp_path, SOURCES), tmp_path / "s")
+    assert len(rows) > 50
+    by_hand = [s for s, policy in rows if policy == "teleop"]
+    assert min(by_hand) == pytest.approx(TAKEN_OVER_S[0], abs=0.2)
+    assert max(by_hand) == pytest.approx(TAKEN_OVER_S[1], abs=0.2)
+    assert {policy for s, policy in rows if 4.2 < s < 6.8} == {"teleop"}
+    assert {policy for s, policy in rows if s < 3.8 or s > 7.2} == {"navigation"}
+    assert "whose command it equals: navigation, teleop" in capsys.readouterr().out
+
+
+def test_a_button_says_it_where_no_source_has_the_command(tmp_path, capsys):
+    topics = taken_over()
+    del topics[TELEOP], topics[NAV]
+    bag = write_topics(topics, tmp_path / "bag")
+    rows = policies(bag, profile_of(bag, tmp_path, PRESSED), tmp_path / "s")
+    assert {policy for s, policy in rows if 4.2 < s < 6.8} == {"teleop"}
+    assert {policy for s, policy in rows if s < 3.8 or s > 7.2} == {"unknown"}
+
+
+def test_no_later_command_says_who_drives_now(tmp_path):
+    """What sources say after a moment changes nobody before it."""
+    topics, late = taken_over(), START_NS + 5 * 10**9
+    bag = write_topics(topics, tmp_path / "bag")
+    profile = profile_of(bag, tmp_path, SOURCES)
+    before = policies(bag, profile, tmp_path / "s")
+    for name in (NAV, TELEOP):
+        columns_ = topics[name][1]
+        columns_.fields["linear.x"][columns_.log_time_ns > late] = 0.9
+    other = policies(write_topics(topics, tmp_path / "other"), profile, tmp_path / "t")
+    assert [p for s, p in before if s < 4.9] == [p for s, p in other if s < 4.9]
+    assert {p for s, p in other if s > 5.2} == {"unknown"}
+
+
+def test_a_recording_without_them_is_of_unknown_drivers_and_keeps_its_hash(tmp_path, capsys):
+    topics = taken_over()
+    bag = write_topics(topics, tmp_path / "bag")
+    profile = profile_of(bag, tmp_path, SOURCES)
+    plain = profile.read_text().replace(SOURCES, "")
+    with_sources, without = load_profile(profile), parse_profile(plain, where="p")
+    assert with_sources.hash != without.hash
+    del topics[NAV], topics[TELEOP], topics[JOY]
+    lone = write_topics(topics, tmp_path / "lone")
+    assert {policy for _, policy in policies(lone, profile, tmp_path / "s")} == {"unknown"}
+    capsys.readouterr()
+    assert main(["profile", "check", str(profile), str(bag), "--json"]) == 0
+    inputs = {one["input"]: one for one in json.loads(capsys.readouterr().out)["inputs"]}
+    assert inputs["command_sources.teleop"]["messages"] == 30
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('"buttons[4]"', '"button[4]"', None),
+        ('pressed = "buttons[4]"', 'speed_mps = "axes[1]"', "does not say when it drives"),
+        ('pressed = "buttons[4]"', 'presed = "buttons[4]"', "unknown 'presed'"),
+        ("[command_sources.teleop]", '[command_sources.""]', "1 to 64 printable"),
+        ("fields =", "optional = true\nfields =", "neither stop_holds nor optional"),
+    ],
+)
+def test_what_is_no_source_is_refused_with_its_key(old, new, said, tmp_path, capsys):
+    bag = write_topics(taken_over(2.0), tmp_path / "bag")
+    profile = profile_of(bag, tmp_path, PRESSED.replace(old, new))
+    if said is not None:
+        with pytest.raises(ConfigError, match=said):
+            load_profile(profile)
+        return
+    capsys.readouterr()
+    assert main(["profile", "check", str(profile), str(bag)]) == 2
+    assert "`command_sources.teleop.fields`: /joy: no field 'button'" in capsys.readouterr().err
