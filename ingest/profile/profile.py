@@ -3,9 +3,9 @@
 A profile is a TOML file: `name`, the shipped `conditions` and `exposures` it uses, `[[condition]]`
 of its own, `[task]`, `[goal]` (logged, or by hindsight), `[clock]`, `[episodes]`, `[inputs.*]`
 (which topic fills what), `[command_sources.*]` (whose command it may be), `[frames]` (poses from
-transforms), `[motion]` (speeds from poses),
-`[signals.*]` (custom columns), `[tags]` (whose drive it is), `[robot]` (what the twin builds) and
-`[[zone]]` (named rectangles of the map).
+transforms), `[motion]` (speeds from poses), `[signals.*]` (custom columns), `[tags]` (whose drive
+it is), `[robot]` (what the twin builds), `[limiter]` (of a policy's commands) and `[[zone]]` (named
+rectangles of the map).
 `load_profile("warehouse_amr")` reads one that comes with Restock, `load_profile("my_robot.toml")`
 one of yours.
 """
@@ -38,6 +38,7 @@ from restock.ingest.task.conditions import (
     shipped,
 )
 from restock.ingest.task.hindsight import GoalRules, GoalSource
+from restock.ingest.task.limiter import Limiter
 from restock.ingest.task.robot import Robot, beyond_limits
 from restock.ingest.task.schema import steps_schema
 from restock.ingest.task.task import Task
@@ -212,6 +213,7 @@ class Profile(Checked, frozen=True):
     tags: TagRules = TagRules()
     noise: Noise = Noise()
     robot: Robot | None = None  # None: the twin's own
+    limiter: Limiter | None = None  # in front of a policy; None: by outline and actions
 
     @property
     def conditions(self) -> list[Condition]:
@@ -249,7 +251,7 @@ class Profile(Checked, frozen=True):
             self, shipped_conditions=[], shipped_exposures=[], own_conditions=[]
         )
         values = msgspec.to_builtins(without)
-        apart = {"tags", "noise", "robot"}
+        apart = {"tags", "noise", "robot", "limiter"}
         if self.goal == GoalRules():  # rows are as before there was such a table
             apart |= {"goal"}
         if self.motion is None:

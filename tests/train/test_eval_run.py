@@ -165,3 +165,29 @@ def test_episodes_that_chose_the_policy_flatter_it(tmp_path: Path) -> None:
     assert plan_evaluation(run, first_seed=90_000, policies=["planner"]).warnings == []
     (said,) = plan_evaluation(run, first_seed=89_991, episodes=10).warnings
     assert "among those that chose the run's policy (90000 to 90009)" in said
+
+
+def test_a_limiter_in_front_is_driven_beside_and_its_interventions_are_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, limits = kept_run(tmp_path / "a"), tmp_path / "limits.toml"
+    limits.write_text("[limiter]\nmax_speed_mps = 0.5\n", encoding="utf-8")
+    line = ["eval", str(run), "--policies", "planner", "--perturbations", "none", "--json"]
+    line += ["--episodes", "nominal=2", "--limiter"]
+    assert main([*line, str(limits)]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["limiter"]["fastest"] == [0.5, 1.2]
+    free, limited = said["results"]
+    assert (free["policy"], free["limited_share"]) == ("planner", None)
+    assert limited["policy"] == "limited:planner"
+    assert 0 < limited["limited_share"] <= 1
+    assert limited["time_s"] > free["time_s"] * 1.2
+    # Other limits are another driver: the newest is what is shown.
+    assert main([*line, "profile"]) == 0
+    shown = shown_evaluation(run)[0].to_pylist()
+    assert sorted(row["policy"] for row in shown) == ["limited:planner"] * 2 + ["planner"] * 2
+    assert all((row["limited_s"] is None) == (row["policy"] == "planner") for row in shown)
+    bad = tmp_path / "bad.toml"
+    bad.write_text("[limiter]\nstop_m = -1\n", encoding="utf-8")
+    assert main([*line, str(bad)]) == 2
+    assert "limiter.stop_m" in capsys.readouterr().err

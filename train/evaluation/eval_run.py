@@ -16,11 +16,13 @@ import msgspec
 import pyarrow as pa
 
 from restock.errors import ConfigError
+from restock.ingest.task.limiter import Limiter, Limits
+from restock.toml import read_toml, typed
 from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.evaluation.evaluate import EpisodeResult, run_episodes
 from restock.train.evaluation.policies import load_agent, load_policy
 from restock.train.evaluation.references import FIRST_SEED, REFERENCES, reference
-from restock.train.run.kept_evaluations import add_evaluation
+from restock.train.run.kept_evaluations import LIMITED, add_evaluation
 from restock.train.run.measures import summary_rows
 from restock.train.run.run import Run
 from restock.train.run.run_profile import profile_of_run
@@ -55,6 +57,7 @@ class EvaluationPlan:
     num_envs: int = 32
     nthread: int = 0  # all cores
     layouts: str = "default"
+    limits: Limits | None = None  # every policy once more, with this limiter in front
     left_out: dict[str, list[str]] = field(default_factory=dict)  # kinds -> floors without room
 
     @property
@@ -80,7 +83,8 @@ class EvaluationPlan:
     def total(self) -> int:
         """Episodes to drive."""
         episodes = sum(self.episodes[kind] for kind in self.kinds)
-        return len(self.policies) * len(self.perturbations) * episodes
+        drivers = len(self.policies) * (1 if self.limits is None else 2)
+        return drivers * len(self.perturbations) * episodes
 
 
 def plan_evaluation(
@@ -91,8 +95,11 @@ def plan_evaluation(
     episodes: int | str | Mapping[str, int] = 20,
     first_seed: int = FIRST_SEED,
     layouts: str | None = None,
+    limiter: str | None = None,
 ) -> EvaluationPlan:
     """Check a request. `layouts` None: the run's, with training floors' test split.
+
+    `limiter` is "profile", by the `[limiter]` of the run's profile, or a TOML file with one.
 
     Raises:
         RunError: no such run, or it kept no policy yet.
@@ -125,6 +132,7 @@ def plan_evaluation(
         of_kind,
         first_seed,
         layouts=layouts,
+        limits=None if limiter is None else _limits(run, limiter),
         left_out=unfit_kinds(floors),
     )
     if not plan.kinds:
@@ -180,6 +188,7 @@ def evaluate(
     episodes: int | str | Mapping[str, int] = 20,
     first_seed: int = FIRST_SEED,
     layouts: str | None = None,
+    limiter: str | None = None,
 ) -> list[dict[str, Any]]:
     """Drive a run's kept policy and its references through the same episodes, as `restock eval`.
 
@@ -193,6 +202,8 @@ def evaluate(
         perturbations: none, friction, latency, payload, wheels, sensors, or a TOML file.
         episodes: of each kind, or by kind: `{"nominal": 1000, "wheel_slip": 300}`.
         layouts: floors to drive on; None: the run's own, of training floors the test split.
+        limiter: "profile", or a TOML file with a `[limiter]`: every policy drives once more with
+            it in front, as `limited:NAME`.
 
     Raises:
         RunError: no such run, or it kept no policy yet.
@@ -205,6 +216,7 @@ def evaluate(
         episodes=episodes,
         first_seed=first_seed,
         layouts=layouts,
+        limiter=limiter,
     )
     return summary_rows(drive_evaluation(plan))
 
@@ -238,9 +250,13 @@ def drive_evaluation(
     ]
     results: Results = {}
     versions: dict[str, str] = {}
-    for policy in plan.policies:
-        driver = make_policy(policy, plan)
+    limited = [] if plan.limits is None else [LIMITED + name for name in plan.policies]
+    for policy in (*plan.policies, *limited):
+        driver = make_policy(policy.removeprefix(LIMITED), plan)
+        env.limits = plan.limits if policy in limited else None
         versions[policy] = driver.version
+        if env.limits is not None:
+            versions[policy] += f" limits {env.limits.hash}"
         driven = run_episodes(
             env,
             driver,
@@ -256,6 +272,22 @@ def drive_evaluation(
     table = episodes_table(results, plan, versions)
     added: list[dict[str, Any]] = add_evaluation(plan.run.path, table).to_pylist()
     return added
+
+
+def _limits(run: Run, named: str) -> Limits:
+    """The limits of a run's robot, by its profile or by a TOML file.
+
+    Raises:
+        ConfigError: no such file, or its `[limiter]` cannot be used.
+    """
+    profile = profile_of_run(run)
+    given = profile.limiter
+    if named != "profile":
+        document = read_toml(Path(named), remedy='give "profile", or a TOML file with a [limiter]')
+        if "limiter" not in document:
+            raise ConfigError("has no [limiter]", where=named)
+        given = typed(document["limiter"], Limiter, where=named, prefix="limiter")
+    return Limits.of(profile.task, profile.robot, given)
 
 
 def _perturb(name: str) -> Perturbation | None:
@@ -322,6 +354,7 @@ def settings(plan: EvaluationPlan) -> dict[str, Any]:
         "episodes_per_kind": dict(plan.episodes),
         "first_seed": plan.first_seed,
         "layouts": plan.layouts,
+        "limiter": None if plan.limits is None else msgspec.to_builtins(plan.limits),
         "kinds": list(plan.kinds),
         "left_out": plan.left_out,
     }

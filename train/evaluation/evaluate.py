@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from restock.arrays import F32, F64, Ints
+from restock.ingest.task.limiter import NONE, STOP
 from restock.ingest.task.signals import Signals
 from restock.train.feed.fresh_log import values_entries
 from restock.train.twin.env.interface import Policy, Step, Twin
@@ -43,6 +44,8 @@ class EpisodeResult:
     distance_m: float | None = None  # driven, over ground
     closest_person_m: float | None = None  # body edge to edge; None: nobody was about
     discounted_return: float | None = None  # None: no discount was named
+    limited_s: float | None = None  # that a limiter held a command back; None: there was none
+    stopped_s: float | None = None  # of that, to a stop
 
     @property
     def row(self) -> dict[str, Any]:
@@ -61,6 +64,8 @@ class EpisodeResult:
             "discounted_return": self.discounted_return,
             "distance_m": self.distance_m,
             "closest_person_m": self.closest_person_m,
+            "limited_s": self.limited_s,
+            "stopped_s": self.stopped_s,
         }
 
 
@@ -100,6 +105,7 @@ def run_episodes(
     touching = np.zeros(env.num_envs, np.bool_)
     total, discounted = np.zeros(env.num_envs), np.zeros(env.num_envs)
     distance = np.zeros(env.num_envs)
+    limited = np.zeros((2, env.num_envs), np.int64)  # steps held back, and to a stop
     track = np.zeros((env.num_envs, time_limit_steps + 1, 2))
     track[:, 0] = _position(env.signals)
     left = len(specs)
@@ -113,6 +119,9 @@ def run_episodes(
         steps += 1
         total += reward
         distance += info["travelled_m"]
+        rule = info.get("limiter")
+        if rule is not None:
+            limited += rule != NONE, rule >= STOP
         bumped = np.asarray(after["bumped"], np.bool_)
         bumps += bumped & ~touching
         touching = bumped.copy()
@@ -152,11 +161,14 @@ def run_episodes(
                     distance_m=float(distance[place]),
                     closest_person_m=float(closest) if np.isfinite(closest) else None,
                     discounted_return=None if discount is None else float(discounted[place]),
+                    limited_s=None if rule is None else float(limited[0, place]) * control_period_s,
+                    stopped_s=None if rule is None else float(limited[1, place]) * control_period_s,
                 )
                 left -= 1
                 if progress is not None:
                     progress(1)
         steps[ended], bumps[ended], touching[ended] = 0, 0, False
+        limited[:, ended] = 0
         total[ended], discounted[ended], distance[ended] = 0.0, 0.0, 0.0
         track[ended, 0] = _position(env.signals)[ended]
     return [result for result in results if result is not None]

@@ -2,7 +2,7 @@
 
 An episode is named by who drove it, where, under what and from which seed. One that is driven again
 replaces itself; any other stands beside those that were there. What is shown of them is the newest
-floors, and of the run's own policy its newest version.
+floors, and of the run's own policy its newest version, as of a limited one its newest limits.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from restock.train.run.run_tables import EVAL_EPISODES
 
 Mission = tuple[str | None, str, int, str]
 FILE = Path("eval") / "episodes.parquet"  # in a run
+LIMITED = "limited:"  # a policy with the limiter in front of it
 _NAME = ("policy", "version", "layouts", "perturbation", "perturbation_values", "condition")
 
 
@@ -86,19 +87,25 @@ def shown_evaluation(run: Path) -> tuple[pa.Table, str]:
     if not table.num_rows:
         return table, ""
     last = table.slice(table.num_rows - 1).to_pylist()[0]
-    agents = table.filter(pc.equal(table["policy"], "agent"))
-    version = agents["version"][-1].as_py() if agents.num_rows else None
+    policies, versions, layouts = (
+        table[name].to_pylist() for name in ("policy", "version", "layouts")
+    )
+    newest = dict(zip(policies, versions, strict=True))
+    version = newest.get("agent")
     mask = [
-        layouts == last["layouts"] and (policy != "agent" or of == version)
-        for policy, of, layouts in zip(
-            *(table[name].to_pylist() for name in ("policy", "version", "layouts")), strict=True
-        )
+        on == last["layouts"] and (not _changes(policy) or of == newest[policy])
+        for policy, of, on in zip(policies, versions, layouts, strict=True)
     ]
     shown = table.filter(pa.array(mask, pa.bool_()))
     seeds = shown["episode_seed"]
     text = f"{shown.num_rows:,} of {table.num_rows:,} episodes that `restock eval` drove: "
     text += f"floors {last['layouts'] or 'not named'}, policy {version or 'not named'}, "
     return shown, text + f"seeds {pc.min(seeds).as_py()} to {pc.max(seeds).as_py()}."
+
+
+def _changes(policy: str) -> bool:
+    """Whether a policy of this name is another as the run goes on, or by the limiter's settings."""
+    return policy == "agent" or policy.startswith(LIMITED)
 
 
 def _names(table: pa.Table) -> list[tuple[str, ...]]:
@@ -108,6 +115,7 @@ def _names(table: pa.Table) -> list[tuple[str, ...]]:
 
 __all__ = [
     "FILE",
+    "LIMITED",
     "Mission",
     "add_evaluation",
     "mission_of",

@@ -67,8 +67,19 @@ def measures(episodes: Sequence[Row]) -> dict[str, Any]:
         "closest_person_least_m": min(near, default=None),
         **_mean("closest_person_m", near),
         "time_s": float(np.mean(arrived)) if arrived else None,
+        **_limited(episodes),
         "time_lost_episodes": len(lost),
         **_mean("time_lost_s", lost),
+    }
+
+
+def _limited(episodes: Sequence[Row]) -> dict[str, float | None]:
+    """The share of the driven time that a limiter held commands back, and of that to a stop."""
+    behind = [row for row in episodes if row.get("limited_s") is not None]
+    time_s = sum(row["time_s"] for row in behind)
+    return {
+        f"{name}_share": sum(row[f"{name}_s"] for row in behind) / time_s if time_s else None
+        for name in ("limited", "stopped")
     }
 
 

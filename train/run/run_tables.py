@@ -355,6 +355,8 @@ EVAL_EPISODES = _schema(
     ("failure", _S, "null | stuck | timeout | bump | cut"),
     ("version", _S, "of the policy; null from an earlier Restock"),
     ("layouts", _S, "floors that were asked for; null from an earlier Restock"),
+    ("limited_s", _F, "that the limiter held a command back; null: it was not in front"),
+    ("stopped_s", _F, "of that, to a stop"),
 )
 
 

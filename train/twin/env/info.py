@@ -16,7 +16,9 @@
   inf where nobody is on the floor, and in others, where it is not measured;
 - `invalid`: the physics diverged: the episode is truncated and the step must not enter replay;
 - `final_obs`, with the mask `_final_obs`;
-- in the continuous action space `action`, the nearest of the task's, and `action_residual`.
+- in the continuous action space, and behind a limiter (`env.limits`), `action`, the nearest of the
+  task's, and `action_residual`;
+- behind a limiter `limiter`, the rule that held: `restock.ingest.task.limiter.RULES`.
 """
 
 from __future__ import annotations

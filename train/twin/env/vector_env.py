@@ -30,9 +30,10 @@ from numpy.typing import NDArray
 from restock.arrays import F32, Ints
 from restock.errors import ConfigError, RunError
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.limiter import Limits, limit
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.signals import Signals
-from restock.ingest.task.task import Task, observe, reward
+from restock.ingest.task.task import Task, nearest_action, observe, reward
 from restock.ingest.task.task import terminated as is_terminated
 from restock.replay.fleet.missions_file import MissionOrder
 from restock.state import Stateful
@@ -167,6 +168,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
             orders = MissionOrders(missions, self.floors, planners, where="env.missions")
             self.queue.follow(orders, missions_share)
         self._arms: MissionArms | None = None
+        self.limits: Limits | None = None  # a limiter in front of whoever drives; None: none
         self.specs: list[EpisodeSpec] = [EpisodeSpec("nominal", 0)] * num_envs
         self.diverged = 0  # episodes that ended in a NaN or beyond MuJoCo's limits
         self.signals: Signals = {}
@@ -301,6 +303,14 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         """One control period everywhere. `actions` (N,) index the task's actions, or are (N, 2)."""
         action, command, chosen = self._actions.read(actions)
         now, sim, task = self.signals, self.simulation, self.task
+        if self.limits is not None:
+            before = np.stack([now["command_speed_mps"], now["command_yaw_rate_radps"]], axis=-1)
+            limited = limit(self.limits, command, now["sector_clearance_m"], before)
+            held, command = limited.intervened, limited.command
+            nearest, residual = nearest_action(task, *command.T)
+            action = np.where(held, nearest, action)  # as a log of the command would have it
+            residual = np.where(held, residual, chosen.get("action_residual", 0.0))
+            chosen = {"action": action, "action_residual": residual, "limiter": limited.rule}
         everyone = np.arange(self.num_envs)
         self.truth.note_situation(sim, self.navigation.plans_m)
         sim.drive(command)

@@ -58,6 +58,9 @@ class EvalCommand:
     layouts: str | None = None
     """Floors to drive on, e.g. generated:test (default: the run's own; where it trained on
     generated:train, the test floors)."""
+    limiter: Annotated[str | None, tyro.conf.arg(metavar="profile|FILE.toml")] = None
+    """Drive each policy once more with the limiter in front of it, as limited:NAME: by the
+    profile's [limiter], or a file's (docs/deploy.md)."""
     dry_run: bool = False
     """Check everything and print what would be driven; write nothing."""
     json: bool = False
@@ -91,6 +94,7 @@ class EvalCommand:
             episodes=self.episodes,
             first_seed=self.seed,
             layouts=self.layouts,
+            limiter=self.limiter,
         )
         if self.dry_run:
             print_json({**settings(plan), "episodes": plan.total})

@@ -20,8 +20,12 @@ def show_measures(rows: list[dict[str, Any]]) -> None:
         own = [row for row in rows if row["perturbation"] == perturbation]
         cells = list(dict.fromkeys(row["condition"] for row in own))
         own.sort(key=lambda row: cells.index(row["condition"]))
+        shown = [_measures_row(row) for row in own]
+        if not any(row["held back"] for row in shown):
+            for row in shown:
+                del row["held back"]
         print_table(
-            [_measures_row(row) for row in own],
+            shown,
             title=f"perturbation {perturbation} [95 % over episodes]; time of the successful ones",
         )
     if not any(row["policy"] == "planner" for row in rows) and not any(
@@ -44,6 +48,9 @@ def _measures_row(row: dict[str, Any]) -> dict[str, Any]:
         else f"{nearest:.2f} ({row['closest_person_m']:.2f})",
         "time s": "" if row["time_s"] is None else f"{row['time_s']:.1f}",
         "lost s": _with_interval(row, "time_lost_s", "+.1f"),
+        "held back": ""
+        if row["limited_share"] is None
+        else f"{row['limited_share']:.0%} ({row['stopped_share']:.0%} to a stop)",
     }
 
 
