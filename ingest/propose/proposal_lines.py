@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from restock.arrays import F64
 from restock.errors import visible
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
@@ -38,6 +39,18 @@ class Commands:
     steered: bool = False  # by the angle of the front wheels, as a car
     wheelbase_m: float = 0.3
     wheelbase_known: bool = False
+
+    def fastest(self, speed_mps: F64, yaw_rate_radps: F64) -> Commands:
+        """The fastest of these (N,) that is commanded now and then; an outlier is no action."""
+        if not len(speed_mps):
+            return self
+        fast, sharp = (float(np.percentile(np.abs(c), 98)) for c in (speed_mps, yaw_rate_radps))
+        return replace(
+            self,
+            speed_mps=fast or Commands.speed_mps,
+            yaw_rate_radps=sharp or Commands.yaw_rate_radps,
+            backs=bool((speed_mps < -0.05 * fast).any()),
+        )
 
 
 @dataclass(frozen=True)

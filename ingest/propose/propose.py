@@ -13,8 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
+from restock.arrays import F64, Ints
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.recording import Recording
+from restock.ingest.containers.topic_reading import TopicInfo
+from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import MOTION, parse_profile
 from restock.ingest.propose.candidates import candidates
 from restock.ingest.propose.clock_choice import Gaps, by_log_time, choose_clock
@@ -30,6 +33,7 @@ from restock.ingest.propose.roles import (
     ODOMETRY_AS_COMMAND,
     REQUIRED,
     SPENT,
+    Kind,
     Roles,
     several_commands,
     topics_for,
@@ -88,7 +92,17 @@ def propose_profile(
     Raises:
         ConfigError: the URDF cannot be used; says why.
     """
-    seen = gather(recording, footprint, urdf, odometry_as_command=odometry_as_command)
+    return propose_from(
+        gather(recording, footprint, urdf, odometry_as_command=odometry_as_command), name
+    )
+
+
+def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Proposal:
+    """A profile from what was gathered, tried on the recording that it was gathered from.
+
+    With `goal_decided` its goal is not left out where this recording alone has few by hindsight.
+    """
+    recording = seen.recording
     missing = [
         role
         for role in REQUIRED
@@ -111,7 +125,7 @@ def propose_profile(
             trial = tried(recording, "\n".join(profile_lines(seen, name, problems)))
         seen, trial = _by_rate(recording, seen, name, trial)
         goal = seen.goal.tried(trial.transitions, trial.dropped)
-        if goal != seen.goal:
+        if goal != seen.goal and not goal_decided:
             seen = replace(seen, goal=goal)
             trial = tried(recording, "\n".join(profile_lines(seen, name, problems)))
         if trial.problem:
@@ -232,24 +246,13 @@ def _commands(
     if not roles["command"]:
         return Commands(), Gaps(), CommandHold()
     topic, kind = roles["command"][0]
-    paths = list(kind.fields.values())
-    columns = recording.read({topic.name: paths})[topic.name]
-    speed, turn = (np.asarray(columns.fields[path], np.float64) for path in paths)
-    if steered := "steering_rad" in kind.fields:
-        turn = speed * np.tan(turn) / (wheelbase_m or Commands.wheelbase_m)
-    sane = np.isfinite(speed) & np.isfinite(turn)
-    times = columns.log_time_ns[sane]
-    speed, turn = speed[sane], turn[sane]
-    # The fastest that is commanded now and then; a single outlier is no action.
-    fast, sharp = (float(np.percentile(np.abs(c), 98)) if len(c) else 0.0 for c in (speed, turn))
-    commands = Commands(
-        fast or Commands.speed_mps,
-        sharp or Commands.yaw_rate_radps,
-        bool((speed < -0.05 * fast).any()),
-        len(columns),
-        topic.name,
+    columns, times, speed, turn = commanded(recording, (topic, kind), wheelbase_m)
+    commands = replace(
+        Commands().fastest(speed, turn),
+        count=len(columns),
+        topic=topic.name,
         measured=topic.type == MOTION,
-        steered=steered,
+        steered="steering_rad" in kind.fields,
         wheelbase_m=wheelbase_m or Commands.wheelbase_m,
         wheelbase_known=wheelbase_m is not None,
     )
@@ -260,6 +263,20 @@ def _commands(
         since = PoseSeries(poses.stamp_ns - zero, poses.x_m, poses.y_m, poses.yaw_rad)
         hold = command_hold(seconds, speed[order], turn[order], since)
     return commands, Gaps.of(columns), hold
+
+
+def commanded(
+    recording: Recording, fit: tuple[TopicInfo, Kind], wheelbase_m: float | None
+) -> tuple[TopicColumns, Ints, F64, F64]:
+    """The commands of a topic; of those that are numbers log time (N,), m/s (N,), rad/s (N,)."""
+    topic, kind = fit
+    paths = list(kind.fields.values())
+    columns = recording.read({topic.name: paths})[topic.name]
+    speed, turn = (np.asarray(columns.fields[path], np.float64) for path in paths)
+    if "steering_rad" in kind.fields:
+        turn = speed * np.tan(turn) / (wheelbase_m or Commands.wheelbase_m)
+    sane = np.isfinite(speed) & np.isfinite(turn)
+    return columns, columns.log_time_ns[sane], speed[sane], turn[sane]
 
 
 def _paces(recording: Recording, roles: Roles) -> dict[str, float]:

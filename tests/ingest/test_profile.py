@@ -191,7 +191,7 @@ def test_checking_a_profile_that_does_not_fit(bag, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("args", "said"),
     [
-        (["new"], "takes 1 path, got 0"),
+        (["new"], "takes at least 1 path, got 0"),
         (["check", "warehouse_amr"], "takes 2 paths, got 1"),
         (["new", "nowhere.mcap"], "nowhere.mcap"),
         (["check", "warehouse", "nowhere.mcap"], "did you mean 'warehouse_amr'"),

@@ -158,6 +158,7 @@ def write_bag(drive: Drive, folder: Path, *, storage: str = "sqlite3") -> Path:
         "/behaviour_policy": "std_msgs/msg/String",
         "/ground_truth/condition": "std_msgs/msg/String",
         "/battery": "sensor_msgs/msg/BatteryState",
+        "/robot_description": "std_msgs/msg/String",
     }
     if drive.proposals is not None:
         names[drive.proposals] = names["/cmd_vel"]

@@ -27,7 +27,8 @@ class ProfileCommand:
     `restock profile new RECORDING` proposes one from what is in the file: topics by type and name,
     rates, clocks, frames, the speeds that were commanded, with a comment at each guess; and,
     commented out with a #, every field that might become a custom column. It is printed, or
-    written to --out.
+    written to --out. Of several recordings, or a folder of them, it proposes one profile for all
+    that are of one kind of robot, and names the others.
 
     `restock profile check PROFILE RECORDING` shows what would be used, what is missing (and what
     the recording has instead), how many transitions there would be and what each condition would
@@ -38,9 +39,10 @@ class ProfileCommand:
     """
 
     action: Annotated[Literal["new", "check"], tyro.conf.Positional]
-    """new RECORDING, or check PROFILE RECORDING."""
+    """new RECORDING…, or check PROFILE RECORDING."""
     paths: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
-    """The recording; for `check`, the profile (a file or a shipped name) first."""
+    """The recording, or several drives of one kind of robot; for `check`, the profile (a file or a
+    shipped name) first."""
     footprint: Annotated[str | None, tyro.conf.arg(metavar="LxW")] = None
     """The robot's length and width in metres for `new`, as 0.6x0.5; without it from the recording's
     /robot_description or its costmap's footprint, else a guess."""
@@ -69,32 +71,44 @@ class ProfileCommand:
 
     def run(self) -> int:
         """Do one of the two."""
-        wanted = 1 if self.action == "new" else 2
-        if len(self.paths) != wanted:
+        wrong = not self.paths if self.action == "new" else len(self.paths) != 2
+        if wrong:
+            wanted = "at least 1 path" if self.action == "new" else "2 paths"
             raise ConfigError(
-                f"`profile {self.action}` takes {wanted} path{'s' * (wanted > 1)}, "
-                f"got {len(self.paths)}",
-                remedy="restock profile new RECORDING; restock profile check PROFILE RECORDING",
+                f"`profile {self.action}` takes {wanted}, got {len(self.paths)}",
+                remedy="restock profile new RECORDING…; restock profile check PROFILE RECORDING",
             )
         return self._new() if self.action == "new" else self._check()
 
     def _new(self) -> int:
+        from contextlib import ExitStack
+
         from restock.cli import output
+        from restock.ingest.containers.discover import recordings_in
         from restock.ingest.containers.open_recording import open_recording
+        from restock.ingest.propose.drives import drives_to_read, propose_for_drives
         from restock.ingest.propose.footprint import parse_footprint
-        from restock.ingest.propose.propose import propose_profile
 
         if self.out is not None and self.out.exists():
             raise ConfigError("already exists", where=str(self.out), remedy="name another --out")
         footprint = None if self.footprint is None else parse_footprint(self.footprint)
         stem = (self.out or Path(self.paths[0])).stem
-        with open_recording(self.paths[0], typestore=self._typestore) as recording:
-            proposal = propose_profile(
-                recording,
+        chosen, left_out = drives_to_read([r for path in self.paths for r in recordings_in(path)])
+        with ExitStack() as opened:
+            recordings = [
+                opened.enter_context(open_recording(path, typestore=self._typestore))
+                for path in chosen
+            ]
+            proposal = propose_for_drives(
+                recordings,
                 re.sub(r"\W+", "_", stem).strip("_") or "robot",
                 footprint=footprint,
                 urdf=self.urdf,
                 odometry_as_command=self.odometry_as_command,
+            )
+        if left_out:
+            output.say(
+                f"of {len(chosen) + left_out:,} recordings the {len(chosen)} largest are read"
             )
         if self.out is not None:
             write_text(self.out, proposal.toml)
@@ -116,7 +130,7 @@ class ProfileCommand:
         for each in proposal.advice:
             output.say(str(each))
         for problem in proposal.problems:
-            sys.stderr.write(f"restock: {self.paths[0]}: cannot be used yet: {problem}\n")
+            sys.stderr.write(f"restock: {', '.join(self.paths)}: cannot be used yet: {problem}\n")
         return ExitCode.LOSSY if proposal.problems else ExitCode.OK
 
     def _check(self) -> int:

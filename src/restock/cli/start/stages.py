@@ -87,14 +87,16 @@ def info(to: Settings) -> Stage:
     )
 
 
-def propose(to: Settings, recording: str, flags: list[str], urdf: Path | None = None) -> Stage:
-    """A profile, from the recording that has most of what is needed."""
+def propose(
+    to: Settings, recordings: tuple[str, ...], flags: list[str], urdf: Path | None = None
+) -> Stage:
+    """One profile, from these recordings."""
     assert to.profile is not None
     return Stage(
         "propose",
         "How do its topics become observation, action and reward?",
-        "A first profile is proposed from what is in the recording.",
-        ["profile", "new", recording, "--out", str(to.profile), *flags, *to.with_typestore],
+        "A first profile is proposed from what is in the recordings.",
+        ["profile", "new", *recordings, "--out", str(to.profile), *flags, *to.with_typestore],
         reads=(*to.recordings, *_file(urdf)),
         writes=(Path(to.profile),),
         expected=(0, 3),

@@ -149,7 +149,9 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
         flags = [] if asked.footprint is None else ["--footprint", asked.footprint]
         flags += [] if asked.urdf is None else ["--urdf", str(asked.urdf)]
         flags += ["--odometry-as-command"] * asked.odometry_as_command
-        proposed = work.do(stages.propose(to, recording, flags, asked.urdf))
+        several = len(found.document.get("recordings", ())) > 1
+        sources = asked.paths if several else (recording,)
+        proposed = work.do(stages.propose(to, sources, flags, asked.urdf))
         if not proposed.good:
             return Stop("no profile can be proposed", (f"write {to.profile}: docs/profile.md",))
         if problems := proposed.document.get("problems"):
@@ -157,10 +159,10 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
             if any(ODOMETRY in problem for problem in problems):
                 told = (f"add {ODOMETRY} to this command, or {told[0]}", again)
             return Stop("; ".join(problems), told)
-        several = proposed.document.get("commands", [])
-        if several and not asked.accept:
+        driving = proposed.document.get("commands", [])
+        if driving and not asked.accept:
             return Stop(
-                f"several topics may be what drives the robot: {', '.join(several)}; the first of"
+                f"several topics may be what drives the robot: {', '.join(driving)}; the first of"
                 " them was taken",
                 (
                     f"edit `topic` of [inputs.command] in {to.profile}, and run the same command"

@@ -1,0 +1,166 @@
+"""Which recordings are of one kind of robot, by what they say themselves: never by file or folder.
+
+Two recordings that both have a lidar, or both a robot's description, or both odometry, are of one
+kind only if these agree. And something must tell one robot from the next: lidar or description.
+Recordings with neither are of one kind if they have the same command, pose and odometry, and at
+least half of their topics in common. What fits two kinds that differ is of neither.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from restock.ingest.containers.recording import Recording
+from restock.ingest.decoding.columns import Ragged
+from restock.ingest.profile.profile import MOTION
+from restock.ingest.propose.footprint import descriptions
+from restock.ingest.propose.roles import KINDS, topics_for, usable_topics
+from restock.ingest.propose.urdf import read_description
+from restock.ingest.steps.clocks import STAMP
+
+SCANS = 40  # of a recording that are looked at
+BEAMS = 0.1  # of the beams, by which scans of one lidar may differ: some turn at their own pace
+RANGE = 0.01
+SIMULATED_NS = 10**8 * 10**9  # stamps before 1973 are of a simulation, which begins at 0
+SHARED = 0.5  # of all topics
+
+
+@dataclass(frozen=True)
+class Lidar:
+    """What scans say of the lidar that made them."""
+
+    frame: str
+    beams: int
+    range_max_m: float
+    simulated: bool  # by their stamps
+
+    def agrees(self, other: Lidar) -> bool:
+        most = max(self.beams, other.beams, 1)
+        longest = max(self.range_max_m, other.range_max_m)
+        return (
+            self.frame == other.frame
+            and abs(self.beams - other.beams) <= BEAMS * most
+            and (
+                self.range_max_m == other.range_max_m
+                or abs(self.range_max_m - other.range_max_m) <= RANGE * longest
+            )
+            and self.simulated == other.simulated
+        )
+
+    def __str__(self) -> str:
+        clock = ", simulated clock" if self.simulated else ""
+        return f"lidar {self.frame}, {self.beams} beams, {self.range_max_m:g} m{clock}"
+
+
+@dataclass(frozen=True)
+class RobotTraits:
+    """What one recording says of its robot; None and "" where it says nothing."""
+
+    command: str  # type of the topic that drives it
+    frames: str  # of its odometry: "odom -> base_link"
+    lidar: Lidar | None
+    description: str  # a digest of it
+    named: str  # the robot's name in it
+    inputs: frozenset[tuple[str, str]]  # topics, with their types, that command and locate it
+    topics: frozenset[tuple[str, str]]  # all of them
+
+    def fits(self, other: RobotTraits) -> bool:
+        """Whether both may be one kind of robot, and something tells that they are."""
+        for mine, its in (
+            (self.command, other.command),
+            (self.frames, other.frames),
+            (self.description, other.description),
+        ):
+            if mine and its and mine != its:
+                return False
+        if self.lidar and other.lidar and not self.lidar.agrees(other.lidar):
+            return False
+        if (self.lidar and other.lidar) or (self.description and other.description):
+            return True
+        if self.lidar or other.lidar or self.description or other.description:
+            return False
+        shared = len(self.topics & other.topics)
+        return self.inputs == other.inputs and shared >= SHARED * len(self.topics | other.topics)
+
+    def __str__(self) -> str:
+        told = [
+            self.named and f"described as {self.named}",
+            str(self.lidar or ""),
+            self.frames,
+            self.command.split("/")[-1],
+        ]
+        topics = ", ".join(sorted(name for name, _ in self.inputs))
+        return "; ".join(filter(None, told)) or topics or "nothing that tells of a robot"
+
+
+def robot_traits(recording: Recording) -> RobotTraits:
+    """What a recording says of its robot; reads a few scans and poses of it."""
+    topics = usable_topics(recording)
+    roles = {role: topics_for(topics, KINDS[role]) for role in ("command", "pose", "wheels")}
+    command = roles["command"][0][0].type if roles["command"] else ""
+    odometry = next((t for fits in roles.values() for t, _ in fits if t.type == MOTION), None)
+    frames = ""
+    if odometry is not None:
+        paths = ["header.frame_id", "child_frame_id"]
+        ends = recording.read({odometry.name: paths})[odometry.name].fields
+        first = [str(np.asarray(ends[path], object)[0]).strip("/") for path in paths]
+        frames = " -> ".join(first)
+    texts = [text for _, text in descriptions(recording)]
+    described = read_description(texts[0]) if texts else ""
+    return RobotTraits(
+        command,
+        frames,
+        _lidar(recording, [t.name for t, _ in topics_for(topics, KINDS["scan"])]),
+        hashlib.blake2b(texts[0].encode(), digest_size=8).hexdigest() if texts else "",
+        "" if isinstance(described, str) else described.name,
+        frozenset((t.name, t.type) for fits in roles.values() for t, _ in fits),
+        frozenset((name, topic.type) for name, topic in recording.topics.items() if topic.expected),
+    )
+
+
+def robot_kinds(traits: Sequence[RobotTraits]) -> list[list[int]]:
+    """The recordings of each kind, by their place in `traits`; every one is in exactly one kind.
+
+    Kinds are in the order of their first recording.
+    """
+    rich_first = sorted(range(len(traits)), key=lambda one: (-_known(traits[one]), one))
+    kinds: list[list[int]] = []
+    for index in rich_first:
+        fitting = [k for k in kinds if all(traits[index].fits(traits[other]) for other in k)]
+        if len(fitting) == 1:
+            fitting[0].append(index)
+        else:
+            kinds.append([index])
+    return sorted(sorted(kind) for kind in kinds)
+
+
+def _known(traits: RobotTraits) -> int:
+    told = (traits.description, traits.lidar, traits.frames, traits.command)
+    return sum(bool(each) for each in told)
+
+
+def _lidar(recording: Recording, names: list[str]) -> Lidar | None:
+    if not names:
+        return None
+    paths = ["header.frame_id", "range_max", "angle_min", "angle_increment", "ranges", STAMP]
+    wanted = [path for path in paths if path == "ranges" or path in recording.leaves(names[0])]
+    columns = recording.read({names[0]: wanted})[names[0]]
+    if not len(columns):
+        return None
+    fields, some = columns.fields, slice(SCANS)
+    ranges = fields["ranges"]
+    assert isinstance(ranges, Ragged)
+    stamps = np.asarray(fields[STAMP], np.int64)[some] if STAMP in fields else np.zeros(0)
+    return Lidar(
+        str(np.asarray(fields["header.frame_id"], object)[0]).strip("/"),
+        int(np.median(ranges.lengths[some])),
+        round(float(np.median(np.asarray(fields["range_max"], np.float64)[some])), 3),
+        bool(len(stamps)) and 0 < int(np.median(stamps)) < SIMULATED_NS,
+    )
+
+
+__all__ = ["RobotTraits", "robot_kinds", "robot_traits"]

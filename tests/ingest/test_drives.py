@@ -1,0 +1,141 @@
+"""Several drives of one kind of robot: which are of a kind, and one profile for all of them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.driven_robot import FREE_M, PERIOD_S, Drive, columns, scans, write_bag
+
+from restock.cli import main
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.propose.kinds import Lidar, RobotTraits, robot_kinds, robot_traits
+
+TWIST = "geometry_msgs/msg/Twist"
+WHEELS = "".join(
+    f'<link name="{side}"><collision><geometry><cylinder radius="0.05" length="0.02"/></geometry>'
+    f'</collision></link><joint name="{side}_joint" type="continuous"><parent link="base"/>'
+    f'<child link="{side}"/><origin xyz="0 {y} 0" rpy="1.5708 0 0"/><axis xyz="0 0 1"/></joint>'
+    for side, y in (("left", 0.2), ("right", -0.2))
+)
+DESCRIBED = (
+    '<robot name="trolley"><link name="base"><collision><geometry><box size="0.7 0.45 0.2"/>'
+    f"</geometry></collision></link>{WHEELS}</robot>"
+)
+
+
+@dataclass
+class Told(Drive):
+    """A drive without goals, told to drive at a speed, seen by a lidar of so many beams."""
+
+    speed_mps: float = 0.4
+    every_s: float = PERIOD_S
+    beams: int = 72
+    description: str | None = None
+
+    def topics(self):
+        found = super().topics()
+        ticks = np.arange(0, self.duration_s, self.every_s)
+        turned = np.zeros(len(ticks))
+        told = {"linear.x": np.full(len(ticks), self.speed_mps), "angular.z": turned}
+        found["/cmd_vel"] = columns(ticks + 0.005, told, stamped=False)
+        tenth = np.arange(0, self.duration_s, 0.1)
+        found["/scan"] = columns(tenth, scans(np.full((len(tenth), self.beams), FREE_M)))
+        for topic in ("/goal_pose", "/plan", "/bumper"):
+            del found[topic]
+        if self.description is not None:
+            text = {"data": np.array([self.description], object)}
+            found["/robot_description"] = columns(np.array([0.01]), text, stamped=False)
+        return found
+
+
+def test_one_profile_has_what_only_some_of_the_drives_show(tmp_path, capsys):
+    drives = {
+        "slow": Told(duration_s=12.0, speed_mps=0.2),
+        "fast": Told(duration_s=9.0, speed_mps=0.8, every_s=0.1),
+        "described": Told(duration_s=8.0, description=DESCRIBED),
+        "another": Told(duration_s=30.0, speed_mps=2.0, beams=360),
+    }
+    for name, drive in drives.items():
+        write_bag(drive, tmp_path / "bags" / name)
+    file = tmp_path / "trolley.toml"
+    assert main(["profile", "new", str(tmp_path / "bags"), "--out", str(file), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    profile = load_profile(str(file))
+    # The fastest command is of one drive, the outline and the wheels of another.
+    assert max(speed for speed, _ in profile.task.actions) == pytest.approx(0.8)
+    assert (profile.task.body.length_m, profile.task.body.width_m) == (0.7, 0.45)
+    assert profile.robot is not None
+    assert profile.robot.wheel_radius_m == 0.05
+    # Drives whose commands are of another pace share a tick every period.
+    assert profile.clock.steps == "rate"
+    assert any("bags/another" in each["text"] for each in said["advice"])
+    assert "NOT OF THAT KIND: bags/another: lidar" in file.read_text()
+    # And it makes rows of all three.
+    store = tmp_path / "store"
+    bags = [str(tmp_path / "bags" / name) for name in ("slow", "fast", "described")]
+    assert main(["ingest", *bags, "--profile", str(file), "--store", str(store), "--json"]) in (
+        0,
+        3,
+    )
+    rows = [one["transitions"] for one in json.loads(capsys.readouterr().out)["recordings"]]
+    assert all(rows)
+    assert sum(rows) == said["transitions"]
+
+
+def test_one_recording_is_proposed_as_before(tmp_path, capsys):
+    bag = write_bag(Told(), tmp_path / "bags" / "one")
+    texts = []
+    for path in (bag, tmp_path / "bags"):
+        assert main(["profile", "new", str(path), "--json"]) == 0
+        texts.append(json.loads(capsys.readouterr().out)["toml"].split("\n\n", 1)[1])
+    assert texts[0].replace('name = "one"', 'name = "bags"') == texts[1]
+
+
+def traits(**told) -> RobotTraits:
+    empty = RobotTraits("", "", None, "", "", frozenset(), frozenset())
+    return replace(empty, **told)
+
+
+LIDAR = Lidar("laser", 360, 12.0, simulated=False)
+
+
+def test_what_disagrees_is_another_kind():
+    robots = [
+        traits(command=TWIST, frames="odom -> base_link", lidar=LIDAR),
+        traits(command=TWIST, lidar=replace(LIDAR, beams=351)),  # it turns at its own pace
+        traits(command=TWIST, lidar=replace(LIDAR, beams=720)),
+        traits(command=TWIST, lidar=replace(LIDAR, simulated=True)),
+        traits(command="ackermann_msgs/msg/AckermannDrive", lidar=LIDAR),
+        traits(command=TWIST, frames="odom -> base_footprint", lidar=LIDAR),
+    ]
+    assert robot_kinds(robots) == [[0], [1], [2], [3], [4], [5]]
+    # Without the one of other frames nothing contradicts: the two of the same lidar are of a kind.
+    assert robot_kinds(robots[:5]) == [[0, 1], [2], [3], [4]]
+
+
+def test_the_usual_names_alone_tell_of_no_kind():
+    usual = {"command": TWIST, "frames": "odom -> base_link"}
+    inputs = frozenset({("/cmd_vel", TWIST)})
+    topics = inputs | {("/status", "mine/msg/Status")}
+    robots = [
+        traits(**usual, lidar=LIDAR, inputs=inputs),
+        traits(**usual, inputs=inputs, topics=inputs),
+        traits(**usual, inputs=inputs, topics=topics | {("/a", "A"), ("/b", "B")}),
+        traits(**usual, inputs=inputs, topics=topics | {("/a", "A")}),
+    ]
+    assert robot_kinds(robots) == [[0], [1], [2, 3]]
+
+
+def test_what_a_recording_says_of_its_robot(tmp_path: Path):
+    bag = write_bag(Told(beams=90, description=DESCRIBED), tmp_path / "bag")
+    with open_recording(bag) as recording:
+        found = robot_traits(recording)
+    assert (found.command, found.named) == (TWIST, "trolley")
+    assert found.lidar is not None
+    assert (found.lidar.beams, found.lidar.simulated) == (90, False)
+    assert "described as trolley" in str(found)
