@@ -19,9 +19,16 @@ from restock.errors import ConfigError
 from restock.ingest.task.limiter import Limiter, Limits
 from restock.toml import read_toml, typed
 from restock.train.dqn.config import TrainConfig, parse_config
+from restock.train.evaluation.cloned import (
+    CLONED,
+    cloned_panel,
+    is_cloned,
+    load_cloned,
+)
 from restock.train.evaluation.evaluate import EpisodeResult, run_episodes
 from restock.train.evaluation.policies import load_agent, load_policy
 from restock.train.evaluation.references import FIRST_SEED, REFERENCES, reference
+from restock.train.run.clone_quality import CloneQuality, read_clones
 from restock.train.run.kept_evaluations import LIMITED, add_evaluation
 from restock.train.run.measures import summary_rows
 from restock.train.run.run import Run
@@ -40,6 +47,7 @@ from restock.train.twin.physics.perturbation import (
 
 CLEAN = "none"
 POLICIES = ("agent", "planner", "random")
+_PATHS = ", cloned:DRIVER, onnx:FILE, run:DIRECTORY"
 
 Results = dict[tuple[str, str], list[EpisodeResult]]  # (policy, perturbation) -> episodes
 
@@ -110,7 +118,7 @@ def plan_evaluation(
     config = parse_config(run.document["config"], where=str(path / "config.json"))
     known = [CLEAN, *(name for name in PERTURBATIONS if name != "nominal")]
     for flag, names, choices in (
-        ("--policies", policies, ["agent", *REFERENCES]),
+        ("--policies", policies, ["agent", *REFERENCES, CLONED]),
         ("--perturbations", perturbations, known),
     ):
         unknown = [name for name in names if name not in choices and not _is_path(flag, name)]
@@ -119,7 +127,7 @@ def plan_evaluation(
                 f"there is no {', '.join(map(repr, unknown))}" if unknown else "names nothing",
                 where=flag,
                 remedy=f"choose from {', '.join(choices)}"
-                + (", onnx:FILE, run:DIRECTORY" if flag == "--policies" else ", FILE.toml"),
+                + (_PATHS if flag == "--policies" else ", FILE.toml"),
             )
     of_kind = episodes_of_kind(episodes)
     layouts = layouts or layouts_of_split(config.env.layouts, "test")
@@ -138,7 +146,9 @@ def plan_evaluation(
     if not plan.kinds:
         refuse_unfit(floors, list(of_kind))
     for name in plan.policies:
-        if name == "agent" or _is_path("--policies", name):
+        if is_cloned(name):
+            cloned_panel(run, name)
+        elif name == "agent" or _is_path("--policies", name):
             make_policy(name, plan)  # refused before anything is driven
     return plan
 
@@ -176,7 +186,7 @@ def episodes_of_kind(asked: int | str | Mapping[str, int]) -> dict[str, int]:
 def _is_path(flag: str, name: str) -> bool:
     if flag == "--policies":
         kind, _, path = name.partition(":")
-        return kind in ("onnx", "run") and bool(path)
+        return kind in ("onnx", "run", CLONED) and bool(path)
     return name.endswith(".toml")
 
 
@@ -197,8 +207,8 @@ def evaluate(
     The episodes are kept in the run's `eval/episodes.parquet`.
 
     Args:
-        policies: agent (the run's best), planner, operator, random, `onnx:FILE` or
-            `run:DIRECTORY`.
+        policies: agent (the run's best), planner, operator, random, cloned (the way the logs were
+            driven), `cloned:DRIVER`, `onnx:FILE` or `run:DIRECTORY`.
         perturbations: none, friction, latency, payload, wheels, sensors, or a TOML file.
         episodes: of each kind, or by kind: `{"nominal": 1000, "wheel_slip": 300}`.
         layouts: floors to drive on; None: the run's own, of training floors the test split.
@@ -319,8 +329,15 @@ def make_policy(name: str, plan: EvaluationPlan) -> Policy:
     """The run's kept policy, a scripted one, or one that is named."""
     if name == "agent":
         return load_agent(plan.run)
+    if is_cloned(name):
+        return load_cloned(plan.run, name, seed=plan.first_seed)
     named = load_policy(name, profile_of_run(plan.run).task)
     return reference(name, plan.first_seed) if named is None else named
+
+
+def clones_driven(plan: EvaluationPlan) -> list[CloneQuality]:
+    """How good the clones among the policies are; empty before they were driven."""
+    return [one for one in read_clones(plan.run.path) if one.policy in plan.policies]
 
 
 def episodes_table(results: Results, plan: EvaluationPlan, versions: Mapping[str, str]) -> pa.Table:

@@ -190,6 +190,25 @@ def _open(logs: str | None, trained: Panel | None, task: Task) -> tuple[Store, I
     return store, np.asarray(ids, np.int64)
 
 
+def held_out_rows(panel: Panel, driver: str | None = None) -> Transitions:
+    """What a panel holds out of its first store; of one behaviour policy where it is named.
+
+    Raises:
+        StoreError, PanelError: the store or the list of rows is no longer there.
+    """
+    store, ids = _open(None, panel, panel.task)
+    with store:
+        if driver is not None:
+            with passed_in(store.connection, wanted=pa.table({"transition_id": ids})):
+                own = store.connection.execute(
+                    "SELECT transition_id FROM transitions SEMI JOIN wanted USING (transition_id)"
+                    " WHERE behaviour_policy = ?",
+                    [driver],
+                ).fetchnumpy()
+            ids = np.asarray(own["transition_id"], np.int64)
+        return read_steps(store.connection, ids).rows
+
+
 def read_steps(connection: duckdb.DuckDBPyConnection, ids: Ints) -> OpeSteps:
     """The rows of these ids, by recording, episode and step."""
     query = (
@@ -285,4 +304,11 @@ def run_panel(document: dict[str, Any]) -> Panel | None:
     return None if panel is None else Panel.open(Path(panel["path"]))
 
 
-__all__ = ["Measure", "OpeDataset", "OpeSteps", "load_ope_dataset", "run_panel"]
+__all__ = [
+    "Measure",
+    "OpeDataset",
+    "OpeSteps",
+    "held_out_rows",
+    "load_ope_dataset",
+    "run_panel",
+]

@@ -26,6 +26,7 @@ from restock.train.run.measures import cell_name
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES
 
+AGENT = "agent"
 FOLDER = Path("baselines")  # where names are looked up, in the working directory
 EVERY = "all"
 Verdict = Literal["better", "worse", "no difference shown", "inconclusive", "refused"]
@@ -45,14 +46,15 @@ class Evaluated:
     cells: dict[tuple[str, str], _Episodes]  # by perturbation and condition (with its block)
 
 
-def of_run(path: Path) -> Evaluated:
-    """What `restock eval` wrote of a run's own policy.
+def of_run(path: Path, policy: str = AGENT) -> Evaluated:
+    """What `restock eval` wrote of a run's own policy, or of another that it drove beside it.
 
     Raises:
         RunError: no run, or it was not evaluated.
     """
     run = Run.open(path)
-    return Evaluated(str(path), str(run.document.get("task_hash")), _cells(_agent(run)))
+    name = str(path) if policy == AGENT else policy
+    return Evaluated(name, str(run.document.get("task_hash")), _cells(_driven(run, policy)))
 
 
 def of_baseline(name: str) -> Evaluated:
@@ -89,7 +91,7 @@ def save_baseline(path: Path, name: str) -> Path:
     """
     run = Run.open(path)
     about = {"run": path.name, "task_hash": str(run.document.get("task_hash"))}
-    table = _agent(run).replace_schema_metadata({_KEY: json.dumps(about).encode()})
+    table = _driven(run, AGENT).replace_schema_metadata({_KEY: json.dumps(about).encode()})
     file = baseline_file(name)
     write_table(table, file)
     return file
@@ -221,20 +223,20 @@ def _refused(cell: tuple[str, str], before: _Episodes, after: _Episodes) -> dict
     }
 
 
-def agent_episodes(run: Run) -> pa.Table | None:
-    """What `restock eval` wrote of the run's own policy; None where it did not drive."""
+def agent_episodes(run: Run, policy: str = AGENT) -> pa.Table | None:
+    """What `restock eval` wrote of the run's own policy, or of another; None: none drove."""
     table, _ = shown_evaluation(run.path)
-    agent = table.filter(pa.compute.equal(table["policy"], "agent"))
-    return agent if len(agent) else None
+    driven = table.filter(pa.compute.equal(table["policy"], policy))
+    return driven if len(driven) else None
 
 
-def _agent(run: Run) -> pa.Table:
-    if (episodes := agent_episodes(run)) is not None:
+def _driven(run: Run, policy: str) -> pa.Table:
+    if (episodes := agent_episodes(run, policy)) is not None:
         return episodes
     raise RunError(
-        "has no evaluation of its own policy",
+        f"has no evaluation of {'its own policy' if policy == AGENT else policy}",
         where=str(run.path),
-        remedy=f"run `restock eval {run.path} --policies agent`",
+        remedy=f"run `restock eval {run.path} --policies {policy}`",
     )
 
 

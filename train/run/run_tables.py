@@ -359,11 +359,30 @@ EVAL_EPISODES = _schema(
     ("stopped_s", _F, "of that, to a stop"),
 )
 
+# Of RUN/eval/clones.parquet, beside it.
+EVAL_CLONES = _schema(
+    "a clone of the logs' drivers that an evaluation drove: how good a clone it is",
+    ("policy", _S, "cloned | cloned:DRIVER"),
+    ("drivers", pa.list_(_S), "behaviour policies of the rows that it is of"),
+    ("rows", _I, "of the run's panel, that it learnt from"),
+    ("episodes", _I, "of those rows"),
+    ("updates", _I, "gradient steps, chosen by the likelihood of episodes set aside"),
+    ("training_log_likelihood", _F, "mean log probability of its rows' actions, nats"),
+    ("held_out_rows", _I, "of the same drivers, that the panel holds out"),
+    ("log_likelihood", _F, "the same of the held-out rows' actions; null: there are none"),
+    ("frequencies_log_likelihood", _F, "by how often each action was taken alone"),
+    ("agreement", _F, "share of held-out rows whose action it finds likeliest"),
+    ("repeating", _F, "share in which repeating the last action would agree"),
+    ("changed_agreement", _F, "agreement where the driver changed the action"),
+    ("note", _S, "why held-out rows could not be read, or null"),
+)
+
 
 def markdown() -> str:
     """The tables of docs/run.md: every column of every table."""
     parts = []
-    for name, schema in {**TABLES, "eval/episodes": EVAL_EPISODES}.items():
+    evaluated = {"eval/episodes": EVAL_EPISODES, "eval/clones": EVAL_CLONES}
+    for name, schema in {**TABLES, **evaluated}.items():
         parts.append(f"## {name}.parquet\n\nA row is {schema.metadata[b'doc'].decode()}.\n")
         parts.append("| column | type | meaning |\n| --- | --- | --- |")
         for field in schema:

@@ -26,7 +26,12 @@ CONDITION_COLOURS = {
     "recovery": "#cc79a7",
 }
 SPARE_COLOURS = ("#009e73", "#56b4e9", "#8b5cf6", "#84643a", "#111827")
-POLICY_COLOURS = {"agent": "#0f766e", "planner": "#b45309", "random": "#9ca3af"}
+POLICY_COLOURS = {
+    "agent": "#0f766e",
+    "cloned": "#7c3aed",
+    "planner": "#b45309",
+    "random": "#9ca3af",
+}
 SOURCE_COLOURS = {"logs": "#334155", "fresh": "#14b8a6"}
 
 FEW_POINTS = 10  # of a line, with which each is drawn

@@ -15,6 +15,7 @@ from restock.replay.panel.panel import Panel
 from restock.replay.panel.strata import Stratum
 from restock.replay.store.store import Store
 from restock.report.blocks import Rows, words
+from restock.train.run.clone_quality import CloneQuality, read_clones
 from restock.train.run.kept_evaluations import shown_evaluation
 from restock.train.run.measures import measures
 from restock.train.run.run import Run
@@ -58,6 +59,7 @@ class Facts:
     reliability: Rows = field(default_factory=list)  # of their probabilities
     off_policy: Rows = field(default_factory=list)  # off-policy estimates, over all conditions
     offline_start: Rows = field(default_factory=list)  # what might have driven first, over all
+    clones: list[CloneQuality] = field(default_factory=list)  # of who drove in the logs
     practice: Rows = field(default_factory=list)  # an interval x arm of missions
     teacher: Rows = field(default_factory=list)  # what its filter did at last
     missing: list[str] = field(default_factory=list)  # what could not be read, and why
@@ -118,6 +120,7 @@ def gather(path: Path) -> Facts:
     kept = rows.pop("kept")
     facts = Facts(run=path, config=run.document, kept=kept[0] if kept else None, **rows)  # type: ignore[arg-type]
     facts.evaluation = shown
+    facts.clones = read_clones(path)
     facts.off_policy = _off_policy(run, facts.twin)
     facts.offline_start = [
         row for row in run.table("offline_start").to_pylist() if row["condition"] == "all"

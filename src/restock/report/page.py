@@ -15,6 +15,12 @@ from restock.report.practice import practice_section
 from restock.report.sections import critic, floor_section, learning, provenance, sampled, success
 from restock.report.twin_gap import run_section
 
+REFERENCES = {
+    "cloned": "a clone of whoever drove in the logs",
+    "planner": "the scripted planner",
+    "random": "a random policy",
+}
+
 
 def page(facts: Facts) -> dict[str, Any]:
     """Everything the template asks for."""
@@ -72,12 +78,13 @@ def _lead(facts: Facts) -> str:
         f"A DQN trained on {fed} for {last['env_steps']:,} environment steps and"
         f" {last['gradient_steps']:,} updates in {span(last['wall_s'])}."
     )
-    planner, random = facts.clean_cells("planner"), facts.clean_cells("random")
-    if planner and random and not facts.no_goal:
-        text += (
-            f" On the same episodes the scripted planner reaches {mean_success(planner):.0%}"
-            f" and a random policy {mean_success(random):.0%}."
-        )
+    others = [
+        f"{who} {mean_success(cells):.0%}"
+        for name, who in REFERENCES.items()
+        if (cells := facts.clean_cells(name)) and not facts.no_goal
+    ]
+    if others:
+        text += f" Success on the same episodes: {', '.join(others)}."
     return text
 
 

@@ -60,7 +60,8 @@ def success(facts: Facts) -> Section | None:
         intro=NO_GOAL
         if facts.no_goal
         else "Success per kind of episode, on the same seeded episodes for every policy, clean and"
-        f" under each perturbation. Lines are 95 % Wilson intervals. {facts.evaluation}",
+        f" under each perturbation. Lines are 95 % Wilson intervals. {facts.evaluation}"
+        + "".join(f" {one.text}." for one in facts.clones),
         callout="" if facts.no_goal else "; ".join(_regressions(facts)),
         figures=[] if facts.no_goal else [Figure(charts.success(shown))],
         tables=[
@@ -102,18 +103,22 @@ def _told(row: dict[str, Any], name: str, form: str, unit: str = "") -> str:
     return f"{row[name]:{form}}{unit}{ends}"
 
 
+_REFERENCES = {"planner": "the planner", "cloned": "the logs' drivers, cloned,"}
+
+
 def _regressions(facts: Facts) -> list[str]:
-    """Where the agent is clearly worse than the planner: the intervals do not overlap."""
-    planner = {
-        (row["perturbation"], row["cell"]): row for row in facts.cells if row["policy"] == "planner"
+    """Where the agent is clearly worse than planner or clone: the intervals do not overlap."""
+    agent = {
+        (row["perturbation"], row["cell"]): row for row in facts.cells if row["policy"] == "agent"
     }
     lines = []
-    for row in facts.cells:
-        other = planner.get((row["perturbation"], row["cell"]))
-        if row["policy"] == "agent" and other is not None and row["high"] < other["low"]:
+    for other in facts.cells:
+        row = agent.get((other["perturbation"], other["cell"]))
+        who = _REFERENCES.get(other["policy"])
+        if who is not None and row is not None and row["high"] < other["low"]:
             where = "" if row["perturbation"] == "none" else f" under {row['perturbation']}"
             lines.append(
-                f"Worse than the planner in {words(row['cell'])}{where}: {row['success']:.0%}"
+                f"Worse than {who} in {words(row['cell'])}{where}: {row['success']:.0%}"
                 f" against {other['success']:.0%}"
             )
     return lines

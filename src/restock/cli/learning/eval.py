@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -34,12 +34,13 @@ class EvalCommand:
     """Comma-separated: none, friction, latency, payload, wheels, sensors, or FILE.toml (as
     `restock twin fit` writes it)."""
     policies: str = "agent,planner,random"
-    """Comma-separated: agent (the run's best), planner, operator, random, onnx:FILE,
-    run:DIRECTORY."""
+    """Comma-separated: agent (the run's best), planner, operator, random, cloned (the way the logs
+    were driven, by behaviour cloning), cloned:DRIVER, onnx:FILE, run:DIRECTORY."""
     seed: int = 10_000
     """Seed of the first episode; the same seeds for every policy."""
     baseline: str | None = None
-    """Compare with this run, or a saved baseline, on the same episodes, per condition."""
+    """Compare with this run, a saved baseline, or another of the --policies (cloned, planner), on
+    the same episodes, per condition."""
     margin: float = 0.05
     """With --baseline: a success lower by more than this, with the interval below 0, is worse."""
     check: bool = False
@@ -74,7 +75,12 @@ class EvalCommand:
     def _drive(self) -> int:
         from restock.cli.output import print_json, progress, say
         from restock.errors import ConfigError, ExitCode
-        from restock.train.evaluation.eval_run import drive_evaluation, plan_evaluation, settings
+        from restock.train.evaluation.eval_run import (
+            clones_driven,
+            drive_evaluation,
+            plan_evaluation,
+            settings,
+        )
         from restock.train.evaluation.regression import of_baseline, of_run, regressed, regression
         from restock.train.evaluation.regression import save_baseline as save
         from restock.train.run.measures import summary_rows
@@ -85,8 +91,10 @@ class EvalCommand:
                 where="--check",
                 remedy="name the run or the saved baseline to compare with",
             )
-        baseline = of_baseline(self.baseline) if self.baseline is not None else None
-
+        beside = self.baseline if self.baseline in _names(self.policies) else None
+        baseline = None
+        if self.baseline is not None and beside is None:
+            baseline = of_baseline(self.baseline)
         plan = plan_evaluation(
             self.run_path,
             policies=_names(self.policies),
@@ -107,8 +115,11 @@ class EvalCommand:
                 say(f"left out: {kind}, no room for it on {', '.join(floors)}")
             with progress("driving", plan.total) as advance:
                 rows = summary_rows(drive_evaluation(plan, advance))
-            document = {**settings(plan), "results": rows}
+            clones = [{**asdict(one), "text": one.text} for one in clones_driven(plan)]
+            document = {**settings(plan), "results": rows, "clones": clones}
         compared = None
+        if beside is not None:
+            baseline = of_run(self.run_path, beside)
         if baseline is not None:
             compared = regression(baseline, of_run(self.run_path), margin=self.margin)
             document |= {"baseline": baseline.name, "margin": self.margin, "regression": compared}
@@ -127,6 +138,8 @@ class EvalCommand:
 
         if (rows := document.get("results")) is not None:
             show_measures(rows)
+            for clone in document["clones"]:
+                say(clone["text"])
             say(f"added to {self.run_path / 'eval' / 'episodes.parquet'}")
         if "regression" in document:
             show_regression(document["regression"], document["baseline"], self.margin)

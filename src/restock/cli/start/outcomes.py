@@ -169,7 +169,20 @@ def driven(document: Document) -> list[str]:
                 ends = row["success_low"], row["success_high"]
                 cells.append(f"{row['condition']} {interval_text(row['success'], *ends)}")
         lines.append(f"{policy}: {', '.join(cells)}")
+    lines += [clone["text"] for clone in document.get("clones", [])]
+    compared = [
+        f"{row['condition']} {_difference(row)}"
+        for row in document.get("regression", [])
+        if row["perturbation"] == "none" and row["difference"] is not None
+    ]
+    if compared:
+        lines.append(f"agent against {document['baseline']}, by episode: {', '.join(compared)}")
     return lines
+
+
+def _difference(row: Mapping[str, Any]) -> str:
+    ends = row["difference_low"], row["difference_high"]
+    return f"{interval_text(row['difference'], *ends, '+.2f')} ({row['verdict']})"
 
 
 def on_logs(document: Document) -> list[str]:

@@ -238,13 +238,18 @@ def train(to: Settings, *, twin: bool = True) -> Stage:
     )
 
 
-def evaluate(to: Settings) -> Stage:
+def evaluate(to: Settings, *, goal: bool | None = None) -> Stage:
+    """Driven in the twin; with `goal` known, also against the way the logs were driven."""
+    cloned = ["--policies", "agent,cloned,planner,random"] if goal is not None else []
     return Stage(
         "eval",
         "Evaluate on the same seeded episodes",
         "The kept checkpoint, the scripted planner and a random policy, clean and with less"
         " friction and more latency than in training.",
-        ["eval", str(to.run), "--episodes", str(to.episodes)],
+        [
+            *("eval", str(to.run), "--episodes", str(to.episodes), *cloned),
+            *(("--baseline", "cloned") if goal else ()),
+        ],
         outcome=outcomes.driven,
         shows_progress=True,
     )

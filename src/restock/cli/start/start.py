@@ -215,7 +215,7 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
     if not trained.good:
         return Stop("training did not come to its end", (*trained.errors[:2], again))
     if twin:
-        work.do(stages.evaluate(to))
+        work.do(stages.evaluate(to, goal=has_goal(to.profile)))
     if work.plan or any(HELD_OUT in why for why in mixed.document["left_out"]):
         work.do(stages.judge(to))
     else:
@@ -262,6 +262,15 @@ def horizon(profile: Path | str | None) -> float:
         return 3.0
     period_s = load_profile(str(profile)).task.control_period_s
     return round(max(round(3.0 / period_s), 1) * period_s, 6)
+
+
+def has_goal(profile: Path | str | None) -> bool:
+    """Whether the task has one: without, there is no success to compare."""
+    from restock.ingest.profile.profile import load_profile
+
+    if profile is None or (isinstance(profile, Path) and not profile.is_file()):
+        return True
+    return load_profile(str(profile)).task.goal != "none"
 
 
 def mistrust(floor: Ended, gap: Ended) -> str | None:

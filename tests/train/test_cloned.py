@@ -1,0 +1,159 @@
+"""The way the logs were driven, as a policy: how good a clone it is, and what it is refused for."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from support.kept_run import TASK, kept_run
+from support.panels import panel_of
+from support.stores import recording_transitions, write_store
+
+from restock.cli import main
+from restock.replay.panel.panel import Panel
+from restock.train.dqn.fitted_q import cloned_probabilities
+from restock.train.evaluation import cloned
+from restock.train.evaluation.cloned import load_cloned
+from restock.train.run.clone_quality import read_clones
+from restock.train.run.run import Run
+
+MIXTURE = "[each_condition]\nshare = 'natural'\n[evaluation_split]\nshare = 0.3\n"
+ACTIONS = len(TASK.actions)
+
+
+@pytest.fixture(autouse=True)
+def few_updates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is learnt here is easy."""
+    monkeypatch.setattr(cloned, "UPDATES", (50, 100))
+
+
+def driven_by_a_rule(recording: int, who: str) -> pa.Table:
+    """Rows whose driver turns by the side on which the near waypoint is."""
+    table = recording_transitions(recording, task=TASK)
+    rng = np.random.default_rng(recording)
+    observation = np.zeros((len(table), TASK.observation_size), np.float32)
+    observation[:, 0] = rng.normal(size=len(table))
+    last = rng.integers(ACTIONS, size=len(table))
+    observation[:, 12 : 12 + ACTIONS] = np.eye(ACTIONS, dtype=np.float32)[last]
+    action = np.where(observation[:, 0] > 0, 1, 2).astype(np.int16)
+    columns = {
+        "observation": pa.FixedSizeListArray.from_arrays(
+            pa.array(observation.ravel()), TASK.observation_size
+        ),
+        "action": pa.array(action),
+        "behaviour_policy": pa.array([who] * len(table)),
+    }
+    for name, column in columns.items():
+        place = table.schema.get_field_index(name)
+        field = table.schema.field(place)
+        table = table.set_column(place, field, column.cast(field.type))
+    return table
+
+
+@pytest.fixture(scope="module")
+def panel(tmp_path_factory: pytest.TempPathFactory) -> Panel:
+    folder = tmp_path_factory.mktemp("cloned")
+    tables = [driven_by_a_rule(1, "planner"), driven_by_a_rule(2, "teleop")]
+    return panel_of(write_store(folder / "store", tables, task=TASK), MIXTURE, folder / "panel")
+
+
+def test_a_clone_acts_as_the_drivers_did_and_says_how_well(panel: Panel, tmp_path: Path) -> None:
+    run = Run.open(kept_run(tmp_path / "run", panel=panel))
+    policy = load_cloned(run, "cloned", seed=3)
+    told = policy.quality
+    assert told.drivers == ["planner", "teleop"]
+    assert told.rows == len(panel)
+    assert told.held_out_rows > 20
+    assert told.agreement is not None
+    assert told.agreement > 0.8
+    assert told.repeating is not None
+    assert told.repeating < 0.3
+    assert told.poor is None
+    assert "held-out rows it finds" in told.text
+    observation = np.array(panel.rows[:200, : panel.observation_size])
+    action, probability = policy.act(None, observation)
+    of_each = cloned_probabilities(policy.network, observation)
+    assert (action == np.where(observation[:, 0] > 0, 1, 2)).mean() > 0.8
+    assert np.allclose(probability, of_each[np.arange(200), action])
+    # Draws are seeded, and by probability: the likeliest is not always taken.
+    again = load_cloned(run, "cloned", seed=3).act(None, observation)[0]
+    other = load_cloned(run, "cloned", seed=4).act(None, observation)[0]
+    assert (again == action).all()
+    assert (other != action).any()
+
+
+def test_a_clone_is_kept_and_not_trained_again(
+    panel: Panel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Run.open(kept_run(tmp_path / "run", panel=panel))
+    first = load_cloned(run, "cloned:teleop")
+    assert first.quality.drivers == ["teleop"]
+    assert first.quality.rows < len(panel)
+    load_cloned(run, "cloned:planner")
+    assert [one.policy for one in read_clones(run.path)] == ["cloned:teleop", "cloned:planner"]
+    monkeypatch.setattr(cloned, "clone_of", None)  # calling it would fail
+    again = load_cloned(run, "cloned:teleop")
+    assert again.quality == first.quality
+    weights, before = again.network.state_dict(), first.network.state_dict()
+    assert all((weights[name] == before[name]).all() for name in before)
+
+
+def test_a_clone_that_learnt_nothing_is_called_poor(tmp_path: Path) -> None:
+    tables = []
+    for recording in (1, 2):
+        table = driven_by_a_rule(recording, "teleop")
+        place = table.schema.get_field_index("action")
+        chance = np.random.default_rng(recording).integers(ACTIONS, size=len(table))
+        field = table.schema.field(place)
+        tables.append(table.set_column(place, field, pa.array(chance.astype(np.int16))))
+    store = write_store(tmp_path / "store", tables, task=TASK)
+    panel = panel_of(store, MIXTURE, tmp_path / "panel")
+    told = load_cloned(Run.open(kept_run(tmp_path / "run", panel=panel)), "cloned").quality
+    assert told.poor is not None
+    assert "a poor clone" in told.text
+    everything = panel_of(store, MIXTURE.replace("0.3", "0.0"), tmp_path / "all")
+    told = load_cloned(Run.open(kept_run(tmp_path / "b", panel=everything)), "cloned").quality
+    assert told.held_out_rows == 0
+    assert told.agreement is None
+    assert "nothing says how good a clone it is" in told.text
+
+
+def test_eval_drives_the_clone_beside_the_agent_and_compares_with_it(
+    panel: Panel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = kept_run(tmp_path / "run", panel=panel)
+    line = ["eval", str(run), "--episodes", "nominal=2", "--perturbations", "none", "--json"]
+    assert main([*line, "--policies", "agent,cloned", "--baseline", "cloned"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert {row["policy"] for row in document["results"]} == {"agent", "cloned"}
+    (clone,) = document["clones"]
+    assert clone["policy"] == "cloned"
+    assert clone["text"].startswith("cloned is behaviour cloning")
+    assert document["baseline"] == "cloned"
+    (row,) = document["regression"]
+    assert row["episodes"] == 2
+    assert row["verdict"] == "inconclusive"
+    query = "SELECT rows, agreement > .8 AS good FROM eval_clones"
+    assert main(["sql", str(run), query, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == [{"rows": len(panel), "good": True}]
+
+
+@pytest.mark.parametrize(
+    ("policy", "said"),
+    [
+        ("cloned:nobody", "nobody of the name 'nobody' drove in its logs"),
+        ("cloned:", "there is no 'cloned:'"),
+    ],
+)
+def test_a_clone_of_nobody_is_refused(
+    panel: Panel, tmp_path: Path, capsys: pytest.CaptureFixture[str], policy: str, said: str
+) -> None:
+    run = kept_run(tmp_path / "run", panel=panel)
+    assert main(["eval", str(run), "--policies", policy, "--dry-run"]) == 2
+    assert said in capsys.readouterr().err
+    none = kept_run(tmp_path / "none")
+    assert main(["eval", str(none), "--policies", "cloned", "--dry-run"]) == 2
+    assert "learnt from no logs" in capsys.readouterr().err
