@@ -28,8 +28,9 @@ $(VENV)/.dev: pyproject.toml $(VENV)/.runtime
 demo: $(VENV)/.runtime
 	$(BIN)/restock demo --out build/demo
 
+# A process a core, each with whole files: fixtures of a module are made once.
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
 test-docs: $(VENV)/.dev
 	$(BIN)/python -m pytest -m 'docs and not slow'

@@ -31,8 +31,6 @@ import duckdb
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from scipy.optimize import minimize
-from scipy.special import log_softmax, softmax
 
 from restock.arrays import F32, F64, Ints
 from restock.replay.mixture.mixture import CorrectionRule
@@ -241,6 +239,9 @@ class OutcomeModel:
     def __init__(
         self, features: NDArray[Any], outcome: Ints, outcomes: int, weight: F64 | None = None
     ) -> None:
+        from scipy.optimize import minimize  # here: no query needs it, and it is slow to import
+        from scipy.special import log_softmax
+
         given = np.asarray(features, np.float64)
         weight = np.ones(len(given)) if weight is None else weight / weight.mean()
         self.mean = np.average(given, axis=0, weights=weight)
@@ -270,6 +271,8 @@ class OutcomeModel:
 
     def probability(self, features: NDArray[Any]) -> F64:
         """P(outcome) of each row, (n, outcomes)."""
+        from scipy.special import softmax
+
         return np.asarray(softmax(self._design(features) @ self.theta, axis=1), np.float64)
 
     def _design(self, features: NDArray[Any]) -> F64:
