@@ -39,7 +39,7 @@ from restock.ingest.task.conditions import (
 )
 from restock.ingest.task.hindsight import GoalRules, GoalSource
 from restock.ingest.task.limiter import Limiter
-from restock.ingest.task.robot import Robot, beyond_limits
+from restock.ingest.task.robot import Robot, beyond_limits, refuse_beyond_steering
 from restock.ingest.task.schema import steps_schema
 from restock.ingest.task.task import Task
 from restock.toml import Checked, parse_toml, read_toml, typed
@@ -350,7 +350,10 @@ def load_profile(name_or_path: str | Path) -> Profile:
             where=where,
             remedy=f"did you mean {near[0]!r}?" if near else f"shipped are: {', '.join(names)}",
         )
-    return _typed(read_toml(path), where=where, folder=path.parent)
+    profile = _typed(read_toml(path), where=where, folder=path.parent)
+    # Of stores too it would shut out those that an older Restock wrote: here, and in the twin.
+    refuse_beyond_steering(profile.robot, profile.task.actions, where=where)
+    return profile
 
 
 def parse_profile(text: str, *, where: str, folder: Path | None = None) -> Profile:

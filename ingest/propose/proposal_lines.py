@@ -21,6 +21,7 @@ from restock.ingest.propose.motion_choice import MotionChoice
 from restock.ingest.propose.robot_lines import RobotProposal
 from restock.ingest.propose.roles import KINDS, LATCHED, REQUIRED, FrameGuess, Kind, Roles
 from restock.ingest.propose.trial import Trial
+from restock.ingest.task.robot import Robot
 
 MOSTLY_FREE = 0.1  # of its messages, at most, in which a bumper is pressed
 GUESS = Footprint(0.6, 0.5, "A GUESS, as nothing in the recording says: MEASURE IT")
@@ -189,25 +190,42 @@ def _task_lines(seen: Evidence, trial: Trial) -> list[str]:
         f"range_min_m = {low:g}",
         f"range_max_m = {high:g}  # lidar ranges beyond it count as free",
         f"actions = [  # (m/s, rad/s), {origin}; the first must be stop",
-        *(f"  [{v:.3g}, {w:.3g}]," for v, w in _actions(commands)),
+        *(f"  [{v:.3g}, {w:.3g}]," for v, w in _actions(commands, seen.robot)),
         "]",
         "",
         *_body_lines(seen, trial),
     ]
 
 
-def _actions(commands: Commands) -> list[tuple[float, float]]:
+def _actions(commands: Commands, robot: RobotProposal) -> list[tuple[float, float]]:
     """Speeds (m/s) and yaw rates (rad/s) by the fastest that were commanded; the first is stop."""
     speed, turn = commands.speed_mps, commands.yaw_rate_radps
+    if robot.values.get("drive") == "ackermann":
+        return _steered_actions(commands, robot)
     actions = [(0.0, 0.0), (speed / 2, 0.0), (speed, 0.0)]
     actions += [(0.8 * speed, 0.6 * turn), (0.8 * speed, -0.6 * turn), (0.0, turn), (0.0, -turn)]
     actions += [(-speed / 2, 0.0)] if commands.backs else []
     return actions
 
 
+def _steered_actions(commands: Commands, robot: RobotProposal) -> list[tuple[float, float]]:
+    """Of a robot that steers: no turn on the spot, nor one tighter than its steering allows."""
+    speed, turn = commands.speed_mps, commands.yaw_rate_radps
+    known = {key: robot.values[key] for key in ("max_steering_rad",) if key in robot.values}
+    least_m = Robot(
+        drive="ackermann", wheelbase_m=commands.wheelbase_m, **known
+    ).min_turning_radius_m
+    slow = 0.4 * speed
+    wide, tight = min(0.6 * turn, 0.8 * speed / least_m), min(turn, slow / least_m)
+    curves = [(0.8 * speed, wide), (slow, tight), *([(-slow, tight)] if commands.backs else [])]
+    actions = [(0.0, 0.0), (speed / 2, 0.0), (speed, 0.0)]
+    actions += [(v, side * 0.99 * w) for v, w in curves for side in (1, -1)]
+    return actions + ([(-slow, 0.0)] if commands.backs else [])
+
+
 def _robot_lines(seen: Evidence) -> list[str]:
     """What the twin builds; the actions are within its limits."""
-    return seen.robot.lines(*np.abs(_actions(seen.commands)).max(axis=0).tolist())
+    return seen.robot.lines(*np.abs(_actions(seen.commands, seen.robot)).max(axis=0).tolist())
 
 
 def _bump_lines(recording: Recording, roles: Roles) -> list[str]:

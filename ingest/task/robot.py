@@ -14,6 +14,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from restock.errors import ConfigError
 from restock.toml import Checked
 
 Drive = Literal["differential", "skid_steer", "omnidirectional", "ackermann"]
@@ -22,6 +23,7 @@ Drive = Literal["differential", "skid_steer", "omnidirectional", "ackermann"]
 Origin = Literal["profile", "robot_description", "urdf", "fit", "logs", "default"]
 Metres = Annotated[float, Meta(gt=0, le=10)]
 Limit = Annotated[float, Meta(gt=0, le=100)]
+USUAL_STEERING_RAD = 0.6  # of a robot that steers, where nothing says
 
 
 class Lidar(Checked, frozen=True):
@@ -59,6 +61,10 @@ class Robot(Checked, frozen=True):
     max_yaw_rate_radps: Limit | None = None
     max_accel_mps2: Limit | None = None
     max_yaw_accel_radps2: Limit | None = None
+    # Of a robot that steers (ackermann): the angle of the wheel that would stand in the middle of
+    # its front axle, to either side, and how fast it changes.
+    max_steering_rad: Annotated[float, Meta(gt=0.01, le=1.4)] | None = None
+    max_steering_rate_radps: Limit | None = None
     # How far the driven wheels are apart for the controller and its odometry, by the track: a skid-
     # steer robot turns less than its wheels say. None: what the twin's own robot does.
     track_ratio: Annotated[float, Meta(ge=0.5, le=10)] | None = None
@@ -72,6 +78,15 @@ class Robot(Checked, frozen=True):
                 raise ValueError(f"origin names no value of the robot: {name!r}")
         if self.wheelbase_m is None and self.drive == "ackermann":
             raise ValueError("an ackermann robot needs wheelbase_m")
+        if self.drive != "ackermann" and (self.max_steering_rad or self.max_steering_rate_radps):
+            raise ValueError(f"a robot of {self.drive} drive does not steer: no max_steering_*")
+
+    @property
+    def min_turning_radius_m(self) -> float:
+        """Of the circle that the pose describes at full steering; 0: it turns on the spot."""
+        if self.drive != "ackermann" or self.wheelbase_m is None:
+            return 0.0
+        return self.wheelbase_m / math.tan(self.max_steering_rad or USUAL_STEERING_RAD)
 
     def origin_of(self, name: str) -> Origin:
         """Where a value is from, by its key, such as `mass_kg` or `lidar.beams`."""
@@ -90,4 +105,33 @@ def beyond_limits(robot: Robot, actions: tuple[tuple[float, float], ...]) -> str
         ):
             if most is not None and abs(value) > most * (1 + 1e-3):
                 return f"[{speed:g}, {turn:g}] is beyond robot.{name} = {most:g} {unit}"
+    return None
+
+
+def refuse_beyond_steering(
+    robot: Robot | None, actions: tuple[tuple[float, float], ...], *, where: str
+) -> None:
+    """Raises ConfigError for an action (m/s, rad/s) whose turn a robot that steers cannot drive."""
+    if robot is not None and (problem := _beyond_steering(robot, actions)):
+        raise ConfigError(
+            f"`task.actions`: {problem}",
+            where=where,
+            remedy="give the action more speed or less turn; where the steering allows more, say"
+            " so in [robot]",
+        )
+
+
+def _beyond_steering(robot: Robot, actions: tuple[tuple[float, float], ...]) -> str | None:
+    least = robot.min_turning_radius_m
+    for speed, turn in actions if least else ():
+        if turn and not speed:
+            return (
+                f"[{speed:g}, {turn:g}] turns on the spot, which a robot that steers"
+                ' (robot.drive = "ackermann") cannot'
+            )
+        if abs(turn) * least > abs(speed) * (1 + 1e-2):
+            return (
+                f"[{speed:g}, {turn:g}] turns on a circle of {abs(speed / turn):.3g} m, and the"
+                f" robot's tightest has {least:.3g} m (wheelbase_m, max_steering_rad)"
+            )
     return None

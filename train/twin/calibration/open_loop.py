@@ -186,16 +186,17 @@ def _place(
     bias = np.array([twin.gyro_bias_radps for twin in perturbations])
     simulation.qvel[:, 5] = motion["gyro_yaw_rate_radps"] - bias
     turn = motion["wheel_yaw_rate_radps"]
-    simulation.roll(*simulation.robot.wheel_commands(wheels, turn))
+    simulation.roll(wheels, turn)
     controller = simulation.controller
     if start.past is None:
-        command = np.stack([wheels, turn], axis=-1) / controller.gain[:, None]
-        controller.commands[:], controller.set_point[:] = command[:, None], command
+        controller.begin(np.stack([wheels, turn], axis=-1))
+        simulation.steer()
         return offset
     for step in range(start.past.shape[1]):  # its ramp and its late commands, as they are now
         controller.command(start.past[:, step])
         for block in range(simulation.blocks):
-            controller.wheel_speeds(block * simulation.block_s)
+            controller.controls(block * simulation.block_s)
+    simulation.steer()
     return offset
 
 

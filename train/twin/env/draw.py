@@ -73,7 +73,7 @@ def draw_map(env: WarehouseVectorEnv, index: int) -> NDArray[np.uint8]:
         else:
             yaw = sim.traffic.heading_rad[index, agent]
             canvas.box(x, y, *FORKLIFT_HALF_M[:2], yaw, FORKLIFT)
-    x, y, yaw = sim.pose()[index]
+    x, y, yaw = sim.middle(sim.pose())[index]
     body = env.task.body
     canvas.box(x, y, body.length_m / 2, body.width_m / 2, yaw, ROBOT)
     nose = body.length_m / 2 - 0.1

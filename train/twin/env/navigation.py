@@ -143,10 +143,14 @@ class PathFollower:
         self.table = np.asarray(task.actions, np.float64)  # (A, 2)
         half = max(round(task.sectors * 30 / 360), 1)
         self._ahead = slice(task.sectors // 2 - half, task.sectors // 2 + half)
+        self._behind = np.r_[0:half, task.sectors - half : task.sectors]
         # Rows: fast, slow; columns: straight on, to the left, to the right.
         bends = [((1.0, 0.0), (0.8, 0.7), (0.8, -0.7)), ((0.4, 0.0), (0.35, 0.6), (0.35, -0.6))]
         self._drive = np.array([[self._index(*one) for one in row] for row in bends])
         self._pivot = np.array([0, self._index(0.0, 1.2), self._index(0.0, -1.2)])
+        # A robot that steers has no action that turns on the spot: it turns in several moves.
+        self._steers = not (self.table[:, 1] != 0)[self.table[:, 0] == 0].any()
+        self._back = np.array([0, self._index(-0.4, 0.6), self._index(-0.4, -0.6)])
 
     def choose(self, signals: Signals) -> Ints:
         """The action (N,) whose velocity is nearest to what the plan asks for."""
@@ -158,8 +162,23 @@ class PathFollower:
         careful = (slow | (bend > 0.45)) & (bend > 0.12)
         action = self._drive[(slow | careful).astype(np.intp), np.where(bend > 0.12, side, 0)]
         action[front < self.stop_m] = 0
+        if self._steers:
+            return self._turned_in_moves(signals, action, front, bend, side)
         pivot = (bend > 0.9) & (signals["clearance_m"] > self.pivot_m)
         return np.where(pivot, self._pivot[side], action)
+
+    def _turned_in_moves(
+        self, signals: Signals, action: Ints, front: F64, bend: F64, side: Ints
+    ) -> Ints:
+        """The actions (N,) of robots that steer: forward and back in turns, toward the plan, where
+        it leads elsewhere than they drive."""
+        backs = signals["wheel_speed_mps"] < -0.05  # what it began it goes on with
+        behind = signals["sector_clearance_m"][:, self._behind].min(axis=1)
+        turns = (bend > 0.9) | ((bend > 0.3) & (backs | (front < self.stop_m)))
+        room = np.where(backs, self.slow_m, self.stop_m)  # ahead, to drive on forward
+        back = (front < room) & (behind > self.stop_m / 2)
+        forward = np.where(front < self.stop_m / 2, 0, self._drive[1, side])
+        return np.where(turns, np.where(back, self._back[side], forward), action)
 
     def front(self, signals: Signals) -> F64:
         """The smallest clearance (N,) within 30 degrees of straight ahead."""

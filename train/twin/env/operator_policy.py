@@ -175,6 +175,7 @@ class Operator(SoftPolicy, Stateful):
     def _room(self, env: WarehouseVectorEnv, ends: F64) -> tuple[F64, F64]:
         """Clearance (N, A, T) to racks, walls and pallets, and to people where they will be."""
         outline = _outline(env.task.body.length_m / 2, env.task.body.width_m / 2)
+        outline[:, 0] -= env.simulation.robot.axle_x_m  # of the pose, ahead of the middle
         cos, sin = np.cos(ends[..., 2, None]), np.sin(ends[..., 2, None])
         x = ends[..., 0, None] + cos * outline[:, 0] - sin * outline[:, 1]  # (N, A, T, K)
         y = ends[..., 1, None] + sin * outline[:, 0] + cos * outline[:, 1]

@@ -31,7 +31,7 @@ from restock.arrays import F32, Ints
 from restock.errors import ConfigError, RunError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.limiter import Limits, limit
-from restock.ingest.task.robot import Robot
+from restock.ingest.task.robot import Robot, refuse_beyond_steering
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task, nearest_action, observe, reward
 from restock.ingest.task.task import terminated as is_terminated
@@ -147,6 +147,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
 
         if robot is not None:
             refuse_too_large(self.floors, self.task.body)
+            refuse_beyond_steering(robot, self.task.actions, where="the twin")
         limit = np.full(self.task.observation_size, OBSERVATION_LIMIT, np.float32)
         self.single_observation_space = gymnasium.spaces.Box(-limit, limit, dtype=np.float32)
         self._actions = action_space(action, self.task, num_envs)

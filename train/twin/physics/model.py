@@ -23,6 +23,7 @@ FLOOR = [FLOOR_FRICTION, 0.005, 0.0001]  # sliding, torsion (m), rolling (m)
 PATCHES = 4  # at most, an episode: parts of the floor with a friction of their own
 SLIPPERY_BELOW = 0.3  # friction under which a wheel counts as on a patch
 CASTER_LIFT_M = 0.001  # so that the driven wheels carry most of the load
+STEERING_RADPS = 50.0  # the natural frequency of a steering motor with its wheel
 NO_PATCH = (1e6, 1e6, 0.0, 0.0, 1.0)  # x, y, half x, half y, friction
 
 PALLETS = 2
@@ -47,6 +48,9 @@ class Handles:
     chassis_body: int
     wheel_bodies: tuple[int, ...]  # left, right; of a front axle before those of a rear one
     wheel_geoms: tuple[int, ...]
+    wheel_qpos: tuple[int, ...]  # the angle of each in qpos, and its speed in qvel
+    wheel_qvel: tuple[int, ...]
+    steering_qpos: tuple[int, ...]  # of the front wheels that steer, left and right
     building: slice  # the geoms of racks and walls
     pallets: slice  # of the mocap bodies
     people: slice
@@ -185,6 +189,9 @@ def _add_robot(spec: Any, robot: RobotModel) -> None:
         )
     for name, (x, y) in zip(_wheel_names(robot), robot.wheels_m.tolist(), strict=True):
         wheel = chassis.add_body(name=f"{name}_wheel", pos=[x, y, 0])
+        rolls_free = robot.steers and name.startswith("front")
+        if rolls_free:
+            _add_steering(spec, wheel, name, robot)
         wheel.add_joint(
             name=f"{name}_wheel_joint",
             type=mujoco.mjtJoint.mjJNT_HINGE,
@@ -214,6 +221,8 @@ def _add_robot(spec: Any, robot: RobotModel) -> None:
             rgba=[0.1, 0.1, 0.1, 1],
             group=ROBOT_GROUP,
         )
+        if rolls_free:
+            continue
         motor = spec.add_actuator(
             name=f"{name}_motor",
             target=f"{name}_wheel_joint",
@@ -222,6 +231,8 @@ def _add_robot(spec: Any, robot: RobotModel) -> None:
             forcelimited=True,
         )
         motor.set_to_velocity(kv=robot.motor_kv)
+    if robot.steers:
+        _add_steering_motors(spec, robot)
     spec.add_sensor(
         name="accelerometer",
         type=mujoco.mjtSensor.mjSENS_ACCELEROMETER,
@@ -235,6 +246,29 @@ def _add_robot(spec: Any, robot: RobotModel) -> None:
         objname="chassis",
         intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND), 0, 1],
     )
+
+
+def _add_steering(spec: Any, wheel: Any, name: str, robot: RobotModel) -> None:
+    wheel.add_joint(
+        name=f"{name}_steering",
+        type=mujoco.mjtJoint.mjJNT_HINGE,
+        axis=[0, 0, 1],
+        armature=robot.armature,
+    )
+
+
+def _add_steering_motors(spec: Any, robot: RobotModel) -> None:
+    """Critically damped, and much faster than wheels are steered."""
+    inertia = robot.armature + 0.4 * robot.wheel_kg * robot.contact_radius_m**2
+    for side in ("left", "right"):
+        motor = spec.add_actuator(
+            name=f"{side}_steering_motor",
+            target=f"front_{side}_steering",
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            forcerange=[-2 * robot.motor_limit_nm, 2 * robot.motor_limit_nm],
+            forcelimited=True,
+        )
+        motor.set_to_position(kp=inertia * STEERING_RADPS**2, kv=2 * inertia * STEERING_RADPS)
 
 
 def _caster_names(count: int) -> list[str]:
@@ -274,10 +308,19 @@ def _handles(model: mujoco.MjModel) -> Handles:
         name for index in range(model.nbody) if (name := model.body(index).name).endswith("_wheel")
     ]
     accelerometer = int(model.sensor("accelerometer").adr[0])
+    joints = [model.joint(f"{name}_joint") for name in wheels]
+    steering = [
+        joint
+        for index in range(model.njnt)
+        if (joint := model.joint(index)).name.endswith("_steering")
+    ]
     return Handles(
         chassis_body=model.body("chassis").id,
         wheel_bodies=tuple(model.body(name).id for name in wheels),
         wheel_geoms=tuple(model.geom(name).id for name in wheels),
+        wheel_qpos=tuple(int(joint.qposadr[0]) for joint in joints),
+        wheel_qvel=tuple(int(joint.dofadr[0]) for joint in joints),
+        steering_qpos=tuple(int(joint.qposadr[0]) for joint in steering),
         building=slice(model.geom("floor").id + 1, model.geom("wall_north").id + 1),
         pallets=mocap("pallet", PALLETS),
         people=mocap("person", PEOPLE),

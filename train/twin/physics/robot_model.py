@@ -15,7 +15,7 @@ import numpy as np
 
 from restock.arrays import F64
 from restock.errors import ConfigError
-from restock.ingest.task.robot import Lidar, Robot
+from restock.ingest.task.robot import USUAL_STEERING_RAD, Drive, Lidar, Robot
 from restock.ingest.task.scan import Body
 
 WHEEL_RADIUS_M = 0.10  # of the stand-in, as all of these
@@ -38,15 +38,20 @@ REST_Z_M = 0.09756  # of the chassis frame, standing still
 USUAL_ACCEL = (2.5, 6.0)  # m/s2 and rad/s2, where nothing says
 STIFF = 8.0  # times the motors' gain: whose wheels scrub needs torque where speed is as commanded
 SCRUB = 1.5  # and this times their torque
+USUAL_STEERING_RADPS = 2.0  # how fast wheels steer, where nothing says
 
 
 @dataclass(frozen=True)
 class RobotModel:
-    """One robot with two or four driven wheels; x is ahead of the axle, z above the floor."""
+    """One robot with two or four wheels; x is ahead of the axle, z above the floor.
+
+    Of a robot that steers (ackermann) the axle is the rear one, whose wheels are driven; of the
+    others with two it is the point halfway.
+    """
 
     length_m: float
     width_m: float
-    axle_x_m: float  # of the axle (of two: halfway), ahead of the outline's middle
+    axle_x_m: float  # of the axle, ahead of the outline's middle
     wheel_radius_m: float  # that it rolls on, and that its odometry believes
     contact_radius_m: float  # of the wheels' spheres, which sink into the floor a little
     track_m: float  # between the wheels' contact points
@@ -70,13 +75,28 @@ class RobotModel:
     speed_limit: tuple[float, float]  # m/s and rad/s
     rest_z_m: float  # of the chassis frame, standing still
     own: bool = True  # False: the stand-in
+    drive: Drive = "differential"
+    max_steering_rad: float = 0.0
+    steering_rate_radps: float = 0.0
 
     @property
     def wheels_m(self) -> F64:
         """x and y of every wheel (W, 2): left before right, front before rear."""
         axles = (0.0,) if not self.wheelbase_m else (self.wheelbase_m / 2, -self.wheelbase_m / 2)
+        if self.steers:
+            axles = (self.wheelbase_m, 0.0)
         half = self.track_m / 2
         return np.array([(x, y) for x in axles for y in (half, -half)])
+
+    @property
+    def steers(self) -> bool:
+        """Whether its front wheels steer, and only the rear ones are driven."""
+        return self.drive == "ackermann"
+
+    @property
+    def min_turning_radius_m(self) -> float:
+        """Of its tightest circle; 0: it turns on the spot."""
+        return self.wheelbase_m / math.tan(self.max_steering_rad) if self.steers else 0.0
 
     @property
     def mass_kg(self) -> float:
@@ -95,7 +115,37 @@ class RobotModel:
 
     def by_side(self, wheels: F64) -> F64:
         """Values (N, W) of the wheels as those of the two sides (N, 2), left and right."""
+        if self.steers:
+            return wheels[:, 2:]
         return wheels if wheels.shape[1] == 2 else wheels.reshape(-1, 2, 2).mean(axis=1)
+
+    # -- steering -------------------------------------------------------------------------------
+
+    def steering_for(self, motion: F64, held_rad: F64) -> F64:
+        """Steering angles (...) for speeds and yaw rates (..., 2); `held_rad` where it is to stand.
+
+        Turned on the spot, which it cannot, it steers as far as it can.
+        """
+        speed, turn = motion[..., 0], motion[..., 1]
+        rolls = np.abs(speed) > 1e-6
+        angle = np.arctan(self.wheelbase_m * turn / np.where(rolls, speed, 1.0))
+        angle = np.where(rolls, angle, np.where(turn != 0, np.sign(turn) * np.pi, held_rad))
+        return np.clip(angle, -self.max_steering_rad, self.max_steering_rad)
+
+    def yaw_rate(self, speed_mps: F64, steering_rad: F64) -> F64:
+        """Yaw rates in rad/s by the kinematic bicycle."""
+        return np.asarray(speed_mps * np.tan(steering_rad) / self.wheelbase_m)
+
+    def front_angles(self, steering_rad: F64) -> F64:
+        """Angles (..., 2) of the left and the right front wheel: both on one circle's middle."""
+        tangent, half = np.tan(steering_rad) / self.wheelbase_m, self.track_m / 2
+        return np.stack(
+            [
+                np.arctan(self.wheelbase_m * tangent / (1 - tangent * half)),
+                np.arctan(self.wheelbase_m * tangent / (1 + tangent * half)),
+            ],
+            axis=-1,
+        )
 
 
 def stand_in(body: Body, beams: int = LIDAR_BEAMS) -> RobotModel:
@@ -142,28 +192,31 @@ def design(robot: Robot, body: Body) -> RobotModel:
     radius, track, mass = known.wheel_radius_m, known.track_m, known.mass_kg
     height, casters = known.height_m, known.casters_m
     _refuse_misfit(known, body, robot.axle_x_m)
-    scrubs = robot.drive == "skid_steer"
-    wheels = 4 if scrubs else 2
+    scrubs, steers = robot.drive == "skid_steer", robot.drive == "ackermann"
+    wheels = 4 if known.wheelbase_m else 2
+    driven = 4 if scrubs else 2
     wheel_kg, caster_kg = 0.072 / wheels * mass, 0.009 * mass
+    # The pose of a robot that steers is its rear axle's.
+    behind = known.wheelbase_m / 2 if steers else 0.0
     # As the stand-in's motors, by the load that they move: a share of it each.
-    load = mass / (CHASSIS_KG + 2 * WHEEL_KG + 2 * CASTER_KG) * 2 / wheels
+    load = mass / (CHASSIS_KG + 2 * WHEEL_KG + 2 * CASTER_KG) * 2 / driven
     turning = load * (radius / WHEEL_RADIUS_M) ** 2
     low = 0.13 * height
     return RobotModel(
         length_m=body.length_m,
         width_m=body.width_m,
-        axle_x_m=robot.axle_x_m,
+        axle_x_m=robot.axle_x_m - behind,
         wheel_radius_m=radius,
         contact_radius_m=radius,
         track_m=track,
         turn_track_m=track * (robot.track_ratio or 1.0),
-        wheelbase_m=known.wheelbase_m if scrubs else 0.0,
+        wheelbase_m=known.wheelbase_m,
         wheel_kg=wheel_kg,
         chassis_kg=mass - wheels * wheel_kg - len(casters) * caster_kg,
         chassis_height_m=height - low,
         chassis_z_m=(height + low) / 2,
         ballast=True,
-        casters_m=casters,
+        casters_m=tuple((x + behind, y) for x, y in casters),
         caster_radius_m=0.4 * radius,
         caster_kg=caster_kg,
         lidar_z_m=known.lidar_z_m,
@@ -178,6 +231,9 @@ def design(robot: Robot, body: Body) -> RobotModel:
         ),
         speed_limit=(robot.max_speed_mps or math.inf, robot.max_yaw_rate_radps or math.inf),
         rest_z_m=radius,
+        drive=robot.drive,
+        max_steering_rad=(robot.max_steering_rad or USUAL_STEERING_RAD) if steers else 0.0,
+        steering_rate_radps=robot.max_steering_rate_radps or USUAL_STEERING_RADPS,
     )
 
 
@@ -199,7 +255,7 @@ def measures(robot: Robot, body: Body) -> Measures:
     """A value for all that a profile's robot leaves out, by what is usual for its outline."""
     size = math.sqrt(body.length_m * body.width_m)
     height = robot.height_m or max(0.5 * size, 2.2 * (robot.wheel_radius_m or 0.0))
-    four = robot.drive == "skid_steer"
+    four = robot.drive != "differential"
     casters = robot.casters_m
     if casters is None:
         ahead, x = 0.77 * body.length_m / 2, robot.axle_x_m
@@ -208,7 +264,7 @@ def measures(robot: Robot, body: Body) -> Measures:
     return Measures(
         wheel_radius_m=robot.wheel_radius_m or 0.15 * size,
         track_m=robot.track_m or 0.87 * body.width_m,
-        wheelbase_m=robot.wheelbase_m or (0.55 * body.length_m if four else 0.0),
+        wheelbase_m=(robot.wheelbase_m or 0.55 * body.length_m) if four else 0.0,
         mass_kg=robot.mass_kg or 120.0 * size**3,
         height_m=height,
         casters_m=casters,
@@ -228,7 +284,6 @@ def _bearings(lidar: Lidar, beams: int) -> tuple[float, ...]:
 def _refuse_drive(robot: Robot) -> None:
     why = {
         "omnidirectional": "an action is a speed ahead and a yaw rate, so it never drives sideways",
-        "ackermann": "it has no steering: wheels on two sides that turn at speeds of their own",
     }
     if robot.drive in why:
         raise ConfigError(

@@ -58,7 +58,7 @@ def _tried(key: _Key) -> RobotModel:
     # It rolls on the middle of what its wheels sink in.
     radius = robot.contact_radius_m * robot.wheel_radius_m / _rolling_m(robot, ahead, speed)
     robot = _settled(replace(robot, contact_radius_m=radius))
-    if robot.wheelbase_m and key.robot.track_ratio is None:
+    if robot.drive == "skid_steer" and key.robot.track_ratio is None:
         turn = min(TRY_TURN, robot.speed_limit[1] / 2)
         for _ in range(3):
             _, turned = _driven(robot, 0.0, turn)
@@ -104,8 +104,13 @@ def _driven(robot: RobotModel, speed_mps: float, yaw_rate_radps: float) -> tuple
 
 
 def _control(robot: RobotModel, data: mujoco.MjData, speed: F64, turn: F64) -> None:
-    left, right = robot.wheel_commands(speed, turn)
-    data.ctrl[0::2], data.ctrl[1::2] = left, right
+    motion = np.array([[[speed, turn]]])  # (1, 1, 2)
+    sides = np.stack(robot.wheel_commands(motion[..., 0], motion[..., 1]), axis=-1)
+    if robot.steers:
+        steering = robot.steering_for(motion, np.zeros((1, 1)))
+        data.ctrl[:] = [*sides[0, 0], *robot.front_angles(steering)[0, 0]]
+    else:
+        data.ctrl[0::2], data.ctrl[1::2] = sides[0, 0]
 
 
 def _motion(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[float, float]:

@@ -35,7 +35,7 @@ from restock.train.twin.physics.model import (
     yaw_of,
 )
 from restock.train.twin.physics.perturbation import Perturbation
-from restock.train.twin.physics.robot import BaseController, RobotBody
+from restock.train.twin.physics.robot import RobotBody, SteeringController, base_controller
 from restock.train.twin.physics.robot_model import LIDAR_BEAMS, RobotModel, stand_in
 from restock.train.twin.physics.scenery import Scenery, quaternion
 
@@ -117,16 +117,20 @@ class Simulation(Stateful):
         self._slip_mps = SLIP_MPS * (min(fastest, 1.0) if robot.own else 1.0)
         self._wheels_m = robot.wheels_m
         self._wheels = len(self._wheels_m)
-        width = self._wheels + 3 * self.model.nmocap
+        self._wheel_qpos = np.array(self.handles.wheel_qpos)
+        self._wheel_qvel = np.array(self.handles.wheel_qvel)
+        self._steering_qpos = np.array(self.handles.steering_qpos, np.int64)
+        self._actuators = self.model.nu
+        width = self._actuators + 3 * self.model.nmocap
         self._control = np.zeros((num_envs, self.substeps, width))
         half_m = task.body.length_m / 2, task.body.width_m / 2
         self.scenery = Scenery(
-            self.batch, self.handles, floors, slots, half_m, self._control[:, :, self._wheels :]
+            self.batch, self.handles, floors, slots, half_m, self._control[:, :, self._actuators :]
         )
         self.traffic, self.pallets = self.scenery.traffic, self.scenery.pallets
         self.body = RobotBody(self.batch, self.model, self.handles, num_envs, robot)
         self.patches = np.tile(NO_PATCH, (num_envs, PATCHES, 1)).astype(np.float64)
-        self.controller = BaseController(
+        self.controller = base_controller(
             num_envs, robot, task.control_period_s, timestep_s, self.substeps
         )
         self.time_s = np.zeros(num_envs)
@@ -201,23 +205,25 @@ class Simulation(Stateful):
         start = self.qpos[:, :2].copy()
         for block in range(self.blocks):
             pose = self.pose()
-            self.scenery.walk(self.traffic.advance(pose, self.qvel[:, :2], touched, self.block_s))
+            middle = self.middle(pose)
+            self.scenery.walk(self.traffic.advance(middle, self.qvel[:, :2], touched, self.block_s))
             icy = np.flatnonzero(self._has_patches)
             slippery = self._write_friction(icy, pose[icy])
-            touched = self._run(self.controller.wheel_speeds(block * self.block_s))
+            touched = self._run(self.controller.controls(block * self.block_s))
             self.bumped |= touched
             if slippery.any():
                 self.slipped[icy] |= self._slipping(icy, slippery)
-            self.traffic.note_closest(self.qpos[:, :2], self._yaw)
+            middles = self.middle(self.pose()) if self.robot.axle_x_m else self.qpos
+            self.traffic.note_closest(middles[:, :2], self._yaw)
         self.travelled_m = np.hypot(*(self.qpos[:, :2] - start).T)
         warnings = np.asarray(self.batch.warning).reshape(self.num_envs, -1)
         self.diverged = np.asarray((warnings > 0).any(axis=1), np.bool_)
 
-    def _run(self, wheels: F64) -> Bools:
-        """One block of substeps under wheel speeds (N, S, 2); returns whose bumper was pressed."""
+    def _run(self, actuators: F64) -> Bools:
+        """One block of substeps under controls (N, S, actuators); returns whose bumper was
+        pressed."""
         control = self._control
-        for axle in range(0, self._wheels, 2):
-            control[:, :, axle : axle + 2] = wheels
+        control[:, :, : self._actuators] = actuators
         touched = np.zeros(self.num_envs, np.bool_)
         if self.callback is None:
             parts = [(0, self.substeps)]
@@ -253,7 +259,7 @@ class Simulation(Stateful):
             speed_mps=cos * vx + sin * vy,
             lateral_mps=-sin * vx + cos * vy,
             yaw_rate_radps=self.qvel[:, 5].copy(),
-            wheel_angle_rad=self.robot.by_side(self.qpos[:, 7 : 7 + self._wheels]).copy(),
+            wheel_angle_rad=self.robot.by_side(self.qpos[:, self._wheel_qpos]).copy(),
             wheel_speed_radps=self.wheel_speeds().copy(),
             accel_mps2=accel,
             bumped=pressed,
@@ -264,14 +270,29 @@ class Simulation(Stateful):
         """True x, y and heading, (N, 3)."""
         return np.column_stack([self.qpos[:, :2], yaw_of(self.qpos[:, 3:7])])
 
+    def middle(self, pose: F64) -> F64:
+        """The middles and headings (..., 3) of outlines at poses (..., 3), which are axles'."""
+        if not self.robot.axle_x_m:
+            return pose
+        back = self.robot.axle_x_m
+        x, y = np.cos(pose[..., 2]) * back, np.sin(pose[..., 2]) * back
+        return np.stack([pose[..., 0] - x, pose[..., 1] - y, pose[..., 2]], axis=-1)
+
     def wheel_speeds(self) -> F64:
         """Speeds (N, 2) of the wheels on the left and on the right, rad/s."""
-        return self.robot.by_side(self.qvel[:, 6 : 6 + self._wheels])
+        return self.robot.by_side(self.qvel[:, self._wheel_qvel])
 
-    def roll(self, left_radps: F64, right_radps: F64) -> None:
-        """Let the wheels (N,) of both sides turn so fast."""
-        for wheel in range(self._wheels):
-            self.qvel[:, 6 + wheel] = right_radps if wheel % 2 else left_radps
+    def roll(self, speed_mps: F64, yaw_rate_radps: F64) -> None:
+        """Let the wheels turn as at speeds (N,) and yaw rates (N,) of their own."""
+        left, right = self.robot.wheel_commands(speed_mps, yaw_rate_radps)
+        for wheel, dof in enumerate(self.handles.wheel_qvel):
+            self.qvel[:, dof] = right if wheel % 2 else left
+
+    def steer(self) -> None:
+        """Let the front wheels of robots that steer stand as their controllers have them."""
+        if isinstance(self.controller, SteeringController):
+            angles = self.robot.front_angles(self.controller.steering_rad)
+            self.qpos[:, self._steering_qpos] = angles
 
     def _yaw(self, ids: Ints) -> F64:
         return yaw_of(self.qpos[ids, 3:7])
@@ -311,7 +332,11 @@ class Simulation(Stateful):
         lateral = cos * velocity[:, 1] - sin * velocity[:, 0]
         ground = forward[:, None] - velocity[:, 5, None] * self._wheels_m[:, 1]
         aside = lateral[:, None] + velocity[:, 5, None] * self._wheels_m[:, 0]
-        rim = velocity[:, 6 : 6 + self._wheels] * self.body.radius_m[ids, None]
+        rim = velocity[:, self._wheel_qvel] * self.body.radius_m[ids, None]
+        if self.robot.steers:
+            steering = self.qpos[np.ix_(ids, self._steering_qpos)]
+            ground[:, :2] -= rim[:, :2] * (np.cos(steering) - 1)
+            aside[:, :2] -= rim[:, :2] * np.sin(steering)
         slip = np.hypot(rim - ground, aside)
         return np.asarray((slippery & (slip > self._slip_mps)).any(axis=1), np.bool_)
 

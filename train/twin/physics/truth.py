@@ -80,7 +80,7 @@ class Truth(Stateful):
                 pose[with_pallets], plans_m[with_pallets], pallets[with_pallets]
             )
         self.blocked[:] = ahead[:, :BLOCK_AHEAD].any(axis=1)
-        gaps_m = simulation.traffic.gaps_m(pose)
+        gaps_m = simulation.traffic.gaps_m(simulation.middle(pose))
         with np.errstate(invalid="ignore"):  # who was not there, or is not, is at infinity
             came_m = self.traffic_gap_m - gaps_m
         came = np.isfinite(came_m) & (came_m > CLOSING_MPS * self._period_s)

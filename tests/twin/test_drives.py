@@ -1,0 +1,144 @@
+"""Robots that steer: what they drive, what they cannot, and what their controllers do for it."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+from twin.test_robot import AMR, amr_with, driven
+
+from restock.errors import ConfigError
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.profile.profile_text import profile_toml
+from restock.ingest.task.robot import Robot
+from restock.ingest.task.scan import Body
+from restock.ingest.task.task import Task
+from restock.train.twin.calibration.open_loop import OpenLoopStart, drive_open_loop
+from restock.train.twin.env.policies import PlannerFollower
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.physics.perturbation import Perturbation
+from restock.train.twin.physics.robot_trial import robot_model
+
+CAR = Robot(
+    drive="ackermann", wheel_radius_m=0.1, track_m=0.4, wheelbase_m=0.5, mass_kg=40.0,
+    max_steering_rad=0.6,
+)  # fmt: skip
+OUTLINE = Body(0.8, 0.5)
+TIGHTEST_M = 0.5 / math.tan(0.6)
+CAR_ACTIONS = (
+    *((0.0, 0.0), (0.4, 0.0), (1.0, 0.0), (0.8, 0.6), (0.8, -0.6), (0.4, 0.5), (0.4, -0.5)),
+    *((-0.4, 0.0), (-0.4, 0.5), (-0.4, -0.5)),
+)
+
+
+@pytest.mark.parametrize("friction", [1.0, 0.25])
+def test_a_robot_that_steers_drives_the_circles_that_it_is_commanded(friction: float) -> None:
+    commands = [(1.0, 0.0), (-0.5, 0.0), (0.8, 0.7), (0.4, -0.4), (-0.4, 0.3)]
+    sim, steady = driven(CAR, OUTLINE, commands, friction)
+    np.testing.assert_allclose(steady, commands, atol=0.01)
+    wheels = np.stack(sim.robot.body_velocity(*sim.wheel_speeds().T), axis=-1)
+    np.testing.assert_allclose(wheels, commands, atol=0.02)  # the rear axle's odometry
+    assert not sim.diverged.any()
+
+
+def test_what_its_steering_does_not_allow_it_drives_as_tightly_as_it_can() -> None:
+    assert CAR.min_turning_radius_m == pytest.approx(TIGHTEST_M)
+    _, steady = driven(CAR, OUTLINE, [(0.3, 2.0), (0.0, 1.0)])
+    assert steady[0] == pytest.approx([0.3, 0.3 / TIGHTEST_M], rel=0.02)
+    assert steady[1] == pytest.approx([0.0, 0.0], abs=1e-3)  # it stands, its wheels turned
+
+
+def test_its_wheels_turn_no_faster_than_they_steer_and_stay_under_a_stop() -> None:
+    robot = msgspec.structs.replace(CAR, max_steering_rate_radps=1.0)
+    task = Task(body=OUTLINE, actions=((0.0, 0.0), (0.4, 0.5)))
+    commands = np.array([[(0.4, 0.5)] * 3 + [(0.0, 0.0)] * 5])  # .6 s, then a stop
+    still = {
+        name: np.zeros(1)
+        for name in (
+            *("wheel_speed_mps", "wheel_yaw_rate_radps", "gyro_yaw_rate_radps"),
+            *("localised_speed_mps", "localised_lateral_mps"),
+        )
+    }
+    start = OpenLoopStart(np.zeros((1, 3)), still, commands)
+    result = drive_open_loop(
+        task, start, [Perturbation(latency_s=0.0)], robot=robot_model(robot, OUTLINE)
+    )
+    turn = result.signals["gyro_yaw_rate_radps"][0, 0]
+    # .2 and .4 s after the command its wheels have steered so far, and not yet .56 rad.
+    assert 0.05 < turn[1] < 0.4 * math.tan(0.2) / 0.5 + 0.01  # its speed ramps too
+    assert 0.25 < turn[2] < 0.4 * math.tan(0.4) / 0.5 + 0.01
+    assert turn[-1] == pytest.approx(0.0, abs=0.01)
+
+
+def test_a_logged_turn_is_gone_on_with() -> None:
+    """Put into the middle of a turn, it steers as that takes."""
+    task = Task(body=OUTLINE, actions=((0.0, 0.0), (0.8, 0.6)))
+    motion = {
+        "wheel_speed_mps": np.full(1, 0.8),
+        "wheel_yaw_rate_radps": np.full(1, 0.6),
+        "gyro_yaw_rate_radps": np.full(1, 0.6),
+        "localised_speed_mps": np.full(1, 0.8),
+        "localised_lateral_mps": np.zeros(1),
+    }
+    start = OpenLoopStart(np.zeros((1, 3)), motion, np.full((1, 5, 2), (0.8, 0.6)))
+    result = drive_open_loop(task, start, [Perturbation()], robot=robot_model(CAR, OUTLINE))
+    x, y, yaw = result.pose[0, 0, -1]
+    assert yaw == pytest.approx(0.6, abs=0.02)
+    circle = 0.8 / 0.6
+    expected = [circle * math.sin(0.6), circle * (1 - math.cos(0.6))]
+    assert [x, y] == pytest.approx(expected, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        ((0.0, 1.2), r"\[0, 1.2\] turns on the spot, which a robot that steers"),
+        ((0.4, 0.8), r"a circle of 0.5 m, and the robot's tightest has 0.731 m"),
+    ],
+)
+def test_an_action_that_it_cannot_steer_is_refused(
+    action: tuple[float, float], message: str
+) -> None:
+    task = msgspec.structs.replace(AMR.task, body=OUTLINE, actions=((0.0, 0.0), action))
+    with pytest.raises(ConfigError, match=message):
+        WarehouseVectorEnv(1, task=task, robot=CAR)
+
+
+def test_a_profile_file_is_refused_and_one_in_a_store_is_read(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    """Older stores hold such profiles: their rows can be learnt from, without a twin."""
+    text = profile_toml(amr_with('\n[robot]\ndrive = "ackermann"\nwheelbase_m = 0.4\n'))
+    (tmp_path / "car.toml").write_text(text)
+    with pytest.raises(ConfigError, match="turns on the spot"):
+        load_profile(tmp_path / "car.toml")
+
+
+def test_the_planner_drives_it_to_its_goals() -> None:
+    task = msgspec.structs.replace(AMR.task, body=OUTLINE, actions=CAR_ACTIONS)
+    env = WarehouseVectorEnv(12, task=task, robot=CAR, seed=7, conditions={"nominal": 1.0})
+    observation, _ = env.reset(seed=7)
+    policy, ended = PlannerFollower(epsilon=0.0), []
+    while len(ended) < 12:
+        action, _ = policy.act(env, observation)
+        observation, _, terminated, truncated, info = env.step(action)
+        done = terminated | truncated
+        ended += info["success"][done].tolist()
+    assert np.mean(ended) > 0.8
+    assert env.diverged == 0
+
+
+def test_its_state_is_kept_with_the_steering() -> None:
+    task = msgspec.structs.replace(AMR.task, body=OUTLINE, actions=CAR_ACTIONS)
+    made = [
+        WarehouseVectorEnv(3, task=task, robot=CAR, seed=1, conditions={"nominal": 1.0})
+        for _ in range(2)
+    ]
+    made[0].reset(seed=1)
+    for _ in range(7):
+        made[0].step(np.array([3, 5, 9]))
+    made[1].reset(seed=2)
+    made[1].load_state_dict(made[0].state_dict())
+    for _ in range(3):
+        states = [env.step(np.array([0, 1, 4]))[0] for env in made]
+    np.testing.assert_array_equal(states[0], states[1])
