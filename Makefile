@@ -3,12 +3,13 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-.PHONY: demo test test-docs test-slow neighbours lint sample-logs clean
+.PHONY: demo site test test-docs test-slow neighbours lint sample-logs clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo         recordings in, a fine-tuned policy and a report out (build/demo/report.html)"
 	@echo "make test         the tests (make test-slow: the slow ones and the documentation's too)"
+	@echo "make site         the documentation as a site, build/site/index.html; a broken link fails"
 	@echo "make test-docs    run every block of the documentation as it is printed"
 	@echo "make neighbours   a Python with d3rlpy and lerobot, for the tests that read exports with them"
 	@echo "make lint         ruff and mypy"
@@ -34,6 +35,9 @@ test: $(VENV)/.dev
 
 test-docs: $(VENV)/.dev
 	$(BIN)/python -m pytest -m 'docs and not slow'
+
+site: $(VENV)/.dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
 test-slow: $(VENV)/.dev
 	$(BIN)/python -m pytest -m ''
