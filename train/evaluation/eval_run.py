@@ -349,6 +349,8 @@ def episodes_table(results: Results, plan: EvaluationPlan, versions: Mapping[str
             "perturbation": perturbation,
             "end_x_m": result.end_x_m,
             "end_y_m": result.end_y_m,
+            "limited_s": result.limited_s,
+            "stopped_s": result.stopped_s,
             "failure": result.failure,
             "version": versions[policy],
             "layouts": plan.layouts,

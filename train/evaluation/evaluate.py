@@ -64,8 +64,6 @@ class EpisodeResult:
             "discounted_return": self.discounted_return,
             "distance_m": self.distance_m,
             "closest_person_m": self.closest_person_m,
-            "limited_s": self.limited_s,
-            "stopped_s": self.stopped_s,
         }
 
 
