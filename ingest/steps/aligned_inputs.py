@@ -39,6 +39,7 @@ from restock.ingest.task.signals import yaw_of
 # for provenance alone, never for what the robot knew.
 PROVENANCE_LEAD_S = 0.1
 SAME_COMMAND = 1e-6  # m/s or rad/s: what only passes a command on does not change it
+SIDEWAYS_MPS = 1e-3  # slower is none
 
 
 class InputColumns:
@@ -135,7 +136,7 @@ class AlignedInputs:
     tree: Tree | None = None  # of the frames, where the profile has any
     clock: ClockReport = field(default_factory=lambda: ClockReport(""))
     commands_between: int = 0  # commands that got no tick of their own
-    notes: Sequence[str] = ()  # what is odd about the frames
+    notes: Sequence[str] = ()  # what is odd about the frames, and left out of commands
 
     def at(self, tick: int, stamp_ns: int) -> AlignedInputs | None:
         """The same inputs at one tick alone, or None where that tick is at another time."""
@@ -281,7 +282,9 @@ def align_inputs(profile: Profile, topics: Mapping[str, TopicColumns]) -> Aligne
     tree = Tree(profile.frames, edges, segments) if profile.frames else None
     if tree is not None:
         place_messages(inputs, tree, segments)
+    command = profile.inputs.command
     notes = frame_notes(profile, inputs, edges)
+    notes += sideways_notes(command, inputs.topics[command.topic].fields)
     return AlignedInputs(profile, inputs, segments, ticks, tree, report, between, notes)
 
 
@@ -352,3 +355,21 @@ def frame_notes(profile: Profile, inputs: InputColumns, edges: Edges) -> list[st
                 " one: the profile has no [frames]"
             )
     return notes
+
+
+def sideways_path(source: Input) -> str:
+    """Where a command's speed to the left stands, beside that ahead; "": it has none."""
+    path = source.fields.get("speed_mps", "")
+    return path[:-1] + "y" if path.split(".")[-2:] == ["linear", "x"] else ""
+
+
+def sideways_notes(source: Input, fields: Mapping[str, FieldColumn]) -> list[str]:
+    """How many commands also ask for a speed sideways, which no action has."""
+    aside = np.asarray(fields.get(sideways_path(source), np.zeros(0)), np.float64)
+    count = int((np.abs(aside) > SIDEWAYS_MPS).sum())
+    if not count:
+        return []
+    return [
+        f"command: {count:,} of {len(aside):,} messages of {source.topic} ask for a speed sideways,"
+        f" up to {np.nanmax(np.abs(aside)):.2g} m/s: an action has none, and it is left out"
+    ]

@@ -15,6 +15,7 @@ from restock.ingest.profile.custom_signal import CustomSignal
 from restock.ingest.profile.profile import Input, Profile
 from restock.ingest.profile.signal_paths import element_of, offer
 from restock.ingest.steps.align import CLOCK_FIELD, CLOCK_TOPIC, clock_drifts
+from restock.ingest.steps.aligned_inputs import sideways_path
 from restock.ingest.steps.clearance import scan_reduction
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.custom_columns import custom_reduction
@@ -71,6 +72,7 @@ def wanted_fields(
             remedy=f"its topics are {have}; choose another --profile or see `restock info`",
         )
     wanted: dict[str, list[str]] = {}
+    optional = {FRAME_ID}
     for name, source in profile.sources.items():
         if source.topic not in available:
             continue
@@ -79,6 +81,8 @@ def wanted_fields(
             paths += field_paths(source)
         if name in ("goal", "plan"):
             paths += [FRAME_ID]
+        optional.add(aside := sideways_path(source) if name == "command" else "")
+        paths += [aside] if aside else []
     for topic in profile.transform_topics:
         if topic in available:
             wanted.setdefault(topic, []).extend(FIELDS)
@@ -87,7 +91,7 @@ def wanted_fields(
             wanted.setdefault(signal.topic, [])
     for topic, paths in wanted.items():
         has = {leaf.path for leaf in leaves[topic]}
-        kept = [path for path in paths if path != FRAME_ID or path in has]
+        kept = [path for path in paths if path not in optional or path in has]
         wanted[topic] = list(dict.fromkeys(kept + ([STAMP] if STAMP in has else [])))
     return wanted
 

@@ -164,7 +164,6 @@ def test_a_control_period_that_no_timestep_divides_is_refused() -> None:
 @pytest.mark.parametrize(
     ("robot", "message"),
     [
-        (Robot(drive="omnidirectional"), "never drives sideways"),
         (Robot(drive="ackermann", wheelbase_m=0.6), "longer than the outline"),
         (Robot(wheel_radius_m=0.5), "longer than the outline"),
         (Robot(track_m=2.0), "more than twice the outline's width"),

@@ -3,7 +3,9 @@
 The contact parameters are measured, not guessed: stiff wheel contacts chatter when they slide and
 then do not converge with the timestep; these soft ones do (see docs/twin.md). Wheels collide as
 spheres, because a sphere's one contact point costs less than a cylinder's, and are drawn as
-cylinders. Pallets and traffic are mocap bodies, so that a layout is only a set of positions.
+cylinders. A mecanum wheel is a sphere that is driven about one diagonal and rolls freely about the
+other, as its rollers do. Pallets and traffic are mocap bodies, so that a layout is only a set of
+positions.
 """
 
 from __future__ import annotations
@@ -187,14 +189,16 @@ def _add_robot(spec: Any, robot: RobotModel) -> None:
             **soft,
             **_mask(_ROLLING),
         )
-    for name, (x, y) in zip(_wheel_names(robot), robot.wheels_m.tolist(), strict=True):
+    places = zip(_wheel_names(robot), robot.wheels_m.tolist(), strict=True)
+    for number, (name, (x, y)) in enumerate(places):
         wheel = chassis.add_body(name=f"{name}_wheel", pos=[x, y, 0])
         rolls_free = robot.steers and name.startswith("front")
         if rolls_free:
             _add_steering(spec, wheel, name, robot)
+        rollers = robot.roller_axes
         wheel.add_joint(
             name=f"{name}_wheel_joint",
-            type=mujoco.mjtJoint.mjJNT_HINGE,
+            type=mujoco.mjtJoint.mjJNT_HINGE if rollers is None else mujoco.mjtJoint.mjJNT_BALL,
             axis=[0, 1, 0],
             armature=robot.armature,
             damping=[robot.damping, 0, 0],
@@ -230,6 +234,9 @@ def _add_robot(spec: Any, robot: RobotModel) -> None:
             forcerange=[-robot.motor_limit_nm, robot.motor_limit_nm],
             forcelimited=True,
         )
+        if rollers is not None:
+            motor.trntype = mujoco.mjtTrn.mjTRN_JOINTINPARENT
+            motor.gear = [*rollers[number], 0, 0, 0]
         motor.set_to_velocity(kv=robot.motor_kv)
     if robot.steers:
         _add_steering_motors(spec, robot)

@@ -94,6 +94,16 @@ class RobotModel:
         return self.drive == "ackermann"
 
     @property
+    def roller_axes(self) -> F64 | None:
+        """Of mecanum wheels (W, 3): the axis in the robot's frame about which each drives, the
+        rollers' free direction along its contact being the other diagonal; a unit of its speed is
+        one of the wheel's. None: wheels without rollers.
+        """
+        if self.drive != "omnidirectional":
+            return None
+        return np.array([[1.0, 1, 0], [-1, 1, 0], [-1, 1, 0], [1, 1, 0]])
+
+    @property
     def min_turning_radius_m(self) -> float:
         """Of its tightest circle; 0: it turns on the spot."""
         return self.wheelbase_m / math.tan(self.max_steering_rad) if self.steers else 0.0
@@ -185,16 +195,15 @@ def design(robot: Robot, body: Body) -> RobotModel:
     """A profile's robot, before it was tried.
 
     Raises:
-        ConfigError: a drive that the twin does not have, or parts that do not go together.
+        ConfigError: parts that do not go together.
     """
-    _refuse_drive(robot)
     known = measures(robot, body)
     radius, track, mass = known.wheel_radius_m, known.track_m, known.mass_kg
     height, casters = known.height_m, known.casters_m
     _refuse_misfit(known, body, robot.axle_x_m)
     scrubs, steers = robot.drive == "skid_steer", robot.drive == "ackermann"
     wheels = 4 if known.wheelbase_m else 2
-    driven = 4 if scrubs else 2
+    driven = 2 if steers else wheels
     wheel_kg, caster_kg = 0.072 / wheels * mass, 0.009 * mass
     # The pose of a robot that steers is its rear axle's.
     behind = known.wheelbase_m / 2 if steers else 0.0
@@ -209,7 +218,8 @@ def design(robot: Robot, body: Body) -> RobotModel:
         wheel_radius_m=radius,
         contact_radius_m=radius,
         track_m=track,
-        turn_track_m=track * (robot.track_ratio or 1.0),
+        turn_track_m=(track + (known.wheelbase_m if robot.drive == "omnidirectional" else 0.0))
+        * (robot.track_ratio or 1.0),
         wheelbase_m=known.wheelbase_m,
         wheel_kg=wheel_kg,
         chassis_kg=mass - wheels * wheel_kg - len(casters) * caster_kg,
@@ -279,20 +289,6 @@ def _bearings(lidar: Lidar, beams: int) -> tuple[float, ...]:
     around = span > 2 * math.pi * (1 - 0.5 / beams)
     step = span / beams if around else span / (beams - 1)
     return tuple((lidar.angle_min_rad + step * np.arange(beams)).tolist())
-
-
-def _refuse_drive(robot: Robot) -> None:
-    why = {
-        "omnidirectional": "an action is a speed ahead and a yaw rate, so it never drives sideways",
-    }
-    if robot.drive in why:
-        raise ConfigError(
-            f'`robot.drive`: the twin has no robot with "{robot.drive}" drive: {why[robot.drive]}',
-            where="the twin",
-            remedy="its logs can be ingested, audited and learnt from offline; for the twin, say"
-            ' drive = "differential" if it only ever drives as one, or leave [robot] out and the'
-            " twin's own robot stands in",
-        )
 
 
 def _refuse_misfit(robot: Measures, body: Body, axle_x_m: float) -> None:

@@ -115,3 +115,11 @@ def quaternion(yaw_rad: F64) -> F64:
     half = yaw_rad / 2
     zero = np.zeros_like(half)
     return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)
+
+
+def rotated(quat: F64, vector: F64) -> F64:
+    """Vectors (..., 3) turned by unit quaternions (..., 4), w first."""
+    axis = quat[..., 1:]
+    across = 2 * np.cross(axis, vector)
+    turned: F64 = vector + quat[..., :1] * across + np.cross(axis, across)
+    return turned

@@ -37,7 +37,7 @@ from restock.train.twin.physics.model import (
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.robot import RobotBody, SteeringController, base_controller
 from restock.train.twin.physics.robot_model import LIDAR_BEAMS, RobotModel, stand_in
-from restock.train.twin.physics.scenery import Scenery, quaternion
+from restock.train.twin.physics.scenery import Scenery, quaternion, rotated
 
 Physics = Literal["mujoco", "warp"]  # warp: see `restock.train.twin.physics.warp_batch`
 
@@ -119,6 +119,11 @@ class Simulation(Stateful):
         self._wheels = len(self._wheels_m)
         self._wheel_qpos = np.array(self.handles.wheel_qpos)
         self._wheel_qvel = np.array(self.handles.wheel_qvel)
+        self._rollers = robot.roller_axes
+        if self._rollers is not None:  # ball joints: quaternions, and three speeds
+            self._wheel_qpos = (self._wheel_qpos[:, None] + np.arange(4)).ravel()
+            self._wheel_qvel = (self._wheel_qvel[:, None] + np.arange(3)).ravel()
+        self._rolled = np.zeros((num_envs, len(robot.wheels_m)))
         self._steering_qpos = np.array(self.handles.steering_qpos, np.int64)
         self._actuators = self.model.nu
         width = self._actuators + 3 * self.model.nmocap
@@ -172,7 +177,7 @@ class Simulation(Stateful):
 
     def place_robot(self, env: int, x_m: float, y_m: float, yaw_rad: float) -> None:
         """Stand the robot still at a pose."""
-        self.qpos[env] = 0.0
+        self.qpos[env] = self.model.qpos0
         self.qpos[env, :3] = x_m, y_m, self.robot.rest_z_m
         self.qpos[env, 3:7] = quaternion(np.array([yaw_rad]))[0]
         self.qvel[env] = 0.0
@@ -239,6 +244,10 @@ class Simulation(Stateful):
             pressed = (sensed[:, :, self.handles.bumper] > 0).any(axis=1)
             touched |= pressed
             self.time_s += (stop - start) * self.timestep_s
+            if self._rollers is not None and self.callback is not None:
+                self._rolled += self._turning(np.arange(self.num_envs)) * (
+                    (stop - start) * self.timestep_s
+                )
             records.append(sensed[:, :, self.handles.accelerometer])
             if self.callback is not None:
                 self.callback(self.body_state(records[-1].mean(axis=1), pressed))
@@ -259,7 +268,7 @@ class Simulation(Stateful):
             speed_mps=cos * vx + sin * vy,
             lateral_mps=-sin * vx + cos * vy,
             yaw_rate_radps=self.qvel[:, 5].copy(),
-            wheel_angle_rad=self.robot.by_side(self.qpos[:, self._wheel_qpos]).copy(),
+            wheel_angle_rad=self.robot.by_side(self._wheel_angles()).copy(),
             wheel_speed_radps=self.wheel_speeds().copy(),
             accel_mps2=accel,
             bumped=pressed,
@@ -280,13 +289,26 @@ class Simulation(Stateful):
 
     def wheel_speeds(self) -> F64:
         """Speeds (N, 2) of the wheels on the left and on the right, rad/s."""
-        return self.robot.by_side(self.qvel[:, self._wheel_qvel])
+        return self.robot.by_side(self._turning(np.arange(self.num_envs)))
+
+    def _turning(self, ids: Ints) -> F64:
+        """Speeds (n, W) of the wheels, rad/s."""
+        if self._rollers is None:
+            return np.asarray(self.qvel[np.ix_(ids, self._wheel_qvel)])
+        spin = self.qvel[np.ix_(ids, self._wheel_qvel)].reshape(len(ids), -1, 3)
+        about = rotated(self.qpos[np.ix_(ids, self._wheel_qpos)].reshape(len(ids), -1, 4), spin)
+        return np.asarray((about * self._rollers).sum(axis=-1))
+
+    def _wheel_angles(self) -> F64:
+        """How far the wheels (N, W) have turned, rad."""
+        return self._rolled if self._rollers is not None else self.qpos[:, self._wheel_qpos]
 
     def roll(self, speed_mps: F64, yaw_rate_radps: F64) -> None:
         """Let the wheels turn as at speeds (N,) and yaw rates (N,) of their own."""
         left, right = self.robot.wheel_commands(speed_mps, yaw_rate_radps)
         for wheel, dof in enumerate(self.handles.wheel_qvel):
-            self.qvel[:, dof] = right if wheel % 2 else left
+            # A mecanum wheel that has not turned yet turns about y.
+            self.qvel[:, dof + (self._rollers is not None)] = right if wheel % 2 else left
 
     def steer(self) -> None:
         """Let the front wheels of robots that steer stand as their controllers have them."""
@@ -332,7 +354,10 @@ class Simulation(Stateful):
         lateral = cos * velocity[:, 1] - sin * velocity[:, 0]
         ground = forward[:, None] - velocity[:, 5, None] * self._wheels_m[:, 1]
         aside = lateral[:, None] + velocity[:, 5, None] * self._wheels_m[:, 0]
-        rim = velocity[:, self._wheel_qvel] * self.body.radius_m[ids, None]
+        rim = self._turning(ids) * self.body.radius_m[ids, None]
+        if self._rollers is not None:  # across its free direction alone
+            slip = np.abs(ground - self._rollers[:, 0] * aside - rim) / np.sqrt(2)
+            return np.asarray((slippery & (slip > self._slip_mps)).any(axis=1), np.bool_)
         if self.robot.steers:
             steering = self.qpos[np.ix_(ids, self._steering_qpos)]
             ground[:, :2] -= rim[:, :2] * (np.cos(steering) - 1)

@@ -1,23 +1,26 @@
-"""Robots that steer: what they drive, what they cannot, and what their controllers do for it."""
+"""Robots that steer, and with mecanum wheels: what they drive, what they cannot, and how."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import msgspec
+import mujoco
 import numpy as np
 import pytest
 from twin.test_robot import AMR, amr_with, driven
 
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.profile.profile_text import profile_toml
+from restock.ingest.profile.profile_text import profile_toml, read_profile_toml
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.scan import Body
 from restock.ingest.task.task import Task
 from restock.train.twin.calibration.open_loop import OpenLoopStart, drive_open_loop
 from restock.train.twin.env.policies import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.physics.model import build_robot_alone
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.robot_trial import robot_model
 
@@ -106,12 +109,13 @@ def test_an_action_that_it_cannot_steer_is_refused(
         WarehouseVectorEnv(1, task=task, robot=CAR)
 
 
-def test_a_profile_file_is_refused_and_one_in_a_store_is_read(tmp_path) -> None:  # type: ignore[no-untyped-def]
+def test_a_profile_file_is_refused_and_one_in_a_store_is_read(tmp_path: Path) -> None:
     """Older stores hold such profiles: their rows can be learnt from, without a twin."""
     text = profile_toml(amr_with('\n[robot]\ndrive = "ackermann"\nwheelbase_m = 0.4\n'))
     (tmp_path / "car.toml").write_text(text)
     with pytest.raises(ConfigError, match="turns on the spot"):
         load_profile(tmp_path / "car.toml")
+    assert read_profile_toml(text, where="a store").robot is not None
 
 
 def test_the_planner_drives_it_to_its_goals() -> None:
@@ -142,3 +146,78 @@ def test_its_state_is_kept_with_the_steering() -> None:
     for _ in range(3):
         states = [env.step(np.array([0, 1, 4]))[0] for env in made]
     np.testing.assert_array_equal(states[0], states[1])
+
+
+MECANUM = Robot(
+    drive="omnidirectional", wheel_radius_m=0.075, track_m=0.4, wheelbase_m=0.4, mass_kg=30.0
+)
+
+
+@pytest.mark.parametrize("friction", [1.0, 0.25])
+def test_mecanum_wheels_drive_what_they_are_commanded(friction: float) -> None:
+    """Without scrub: their rollers give way, where a skid-steer robot's wheels slide."""
+    commands = [(1.0, 0.0), (-0.5, 0.0), (0.8, 0.7), (0.0, 1.0)]
+    sim, steady = driven(MECANUM, Body(0.6, 0.5), commands, friction)
+    np.testing.assert_allclose(steady, commands, atol=0.01)
+    wheels = np.stack(sim.robot.body_velocity(*sim.wheel_speeds().T), axis=-1)
+    np.testing.assert_allclose(wheels, commands, atol=0.02)
+    assert not sim.diverged.any()
+
+
+def test_rollers_carry_it_sideways_when_the_wheels_turn_against_each_other() -> None:
+    """Wheel speeds of a drive to the left, straight into the motors: the model is holonomic."""
+    robot = robot_model(MECANUM, Body(0.6, 0.5))
+    model = build_robot_alone(robot, 0.01)
+    data = mujoco.MjData(model)
+    data.qpos[2] = robot.rest_z_m
+    for step in range(200):
+        spin = min(step / 50, 1.0) * 0.4 / robot.wheel_radius_m
+        data.ctrl[:] = -spin, spin, spin, -spin  # front left and right, rear left and right
+        mujoco.mj_step(model, data)
+    ahead, left, turn = data.qvel[0], data.qvel[1], data.qvel[5]
+    assert [ahead, left, turn] == pytest.approx([0.0, 0.4, 0.0], abs=0.015)
+
+
+def test_mecanum_wheels_slip_on_ice_by_the_truth() -> None:
+    body = Body(0.6, 0.5)
+    actions = ((0.0, 0.0), (1.0, 0.0), (0.5, 0.9), (-0.5, -0.9))
+    task = msgspec.structs.replace(AMR.task, body=body, actions=actions)
+    kinds = {"wheel_slip": 1.0}
+    env = WarehouseVectorEnv(8, task=task, robot=MECANUM, seed=3, conditions=kinds)
+    env.reset(seed=3)
+    slipped = 0
+    for step in range(20):
+        *_, info = env.step(np.full(8, 1 + step % 3))
+        slipped += sum("wheel_slip" in text for text in info["true_condition"])
+    assert slipped > 5
+    assert env.diverged == 0
+
+
+def test_perturbations_apply_to_every_drive() -> None:
+    """A gain, a worn wheel and a longer way to the wheels: each drive shows them as it must."""
+    seen = {}
+    for robot, body in ((CAR, OUTLINE), (MECANUM, Body(0.6, 0.5))):
+        task = Task(body=body, actions=((0.0, 0.0), (0.8, 0.0)))
+        motion = dict.fromkeys(
+            (
+                *("wheel_speed_mps", "wheel_yaw_rate_radps", "gyro_yaw_rate_radps"),
+                *("localised_speed_mps", "localised_lateral_mps"),
+            ),
+            np.zeros(1),
+        )
+        start = OpenLoopStart(np.zeros((1, 3)), motion, np.full((1, 12, 2), (0.8, 0.0)))
+        twins = [
+            Perturbation(),
+            Perturbation(gain=0.9),
+            Perturbation(wheel_radius_scale=0.95),
+            Perturbation(left_gain=0.9),
+            Perturbation(payload_kg=20.0),
+        ]
+        result = drive_open_loop(task, start, twins, robot=robot_model(robot, body))
+        assert not result.diverged.any()
+        way = result.pose[:, 0, -1, 0] / result.pose[0, 0, -1, 0]
+        assert way[1:3] == pytest.approx([0.9, 0.95], abs=0.015)
+        assert way[4] == pytest.approx(1.0, abs=0.02)
+        seen[robot.drive] = result.pose[3, 0, -1, 2]
+    assert seen["omnidirectional"] > 0.1  # its left wheels lag, and it turns to the left
+    assert abs(seen["ackermann"]) < 0.02  # its front wheels hold it straight

@@ -1,0 +1,30 @@
+"""Commands that ask for a speed sideways, which no action has: used without it, and counted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from restock.ingest.profile.profile import Input
+from restock.ingest.steps.aligned_inputs import sideways_notes, sideways_path
+
+
+def command(field: str) -> Input:
+    return Input(topic="/cmd_vel", type="a type", fields={"speed_mps": field}, max_age_s=1.0)
+
+
+@pytest.mark.parametrize(
+    ("field", "aside"),
+    [("twist.linear.x", "twist.linear.y"), ("linear.x", "linear.y"), ("drive.speed", "")],
+)
+def test_a_speed_sideways_stands_beside_the_one_ahead(field: str, aside: str) -> None:
+    assert sideways_path(command(field)) == aside
+
+
+def test_commands_with_a_speed_sideways_are_counted() -> None:
+    asked = {"linear.y": np.array([0.0, 0.3, -0.45, 0.0])}
+    notes = sideways_notes(command("linear.x"), asked)
+    assert len(notes) == 1
+    assert "2 of 4 messages of /cmd_vel ask for a speed sideways, up to 0.45 m/s" in notes[0]
+    assert sideways_notes(command("linear.x"), {"linear.y": np.zeros(4)}) == []
+    assert sideways_notes(command("drive.speed"), {}) == []
