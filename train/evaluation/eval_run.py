@@ -26,6 +26,13 @@ from restock.train.evaluation.cloned import (
     load_cloned,
 )
 from restock.train.evaluation.evaluate import EpisodeResult, run_episodes
+from restock.train.evaluation.logged_ways import (
+    EVERY,
+    HELD_OUT,
+    LoggedMissions,
+    logged_missions,
+)
+from restock.train.evaluation.ope_dataset import run_panel
 from restock.train.evaluation.policies import load_agent, load_policy
 from restock.train.evaluation.references import FIRST_SEED, REFERENCES, reference
 from restock.train.run.clone_quality import CloneQuality, read_clones
@@ -37,6 +44,7 @@ from restock.train.run.run_tables import EVAL_EPISODES
 from restock.train.twin.env.floor_report import refuse_unfit, unfit_kinds
 from restock.train.twin.env.interface import Policy
 from restock.train.twin.floors.floors import layouts_of_split, open_floors
+from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.physics.episode import KINDS, EpisodeSpec
 from restock.train.twin.physics.perturbation import (
     PERTURBATIONS,
@@ -46,6 +54,7 @@ from restock.train.twin.physics.perturbation import (
 )
 
 CLEAN = "none"
+DRAWN = "drawn"  # missions by the seeds, on the floor
 POLICIES = ("agent", "planner", "random")
 _PATHS = ", cloned:DRIVER, onnx:FILE, run:DIRECTORY"
 
@@ -67,17 +76,40 @@ class EvaluationPlan:
     layouts: str = "default"
     limits: Limits | None = None  # every policy once more, with this limiter in front
     left_out: dict[str, list[str]] = field(default_factory=dict)  # kinds -> floors without room
+    missions: LoggedMissions | None = None  # None: drawn on the floor, by their seeds
 
     @property
     def kinds(self) -> tuple[str, ...]:
         """The kinds of episodes that were asked for and every floor has room for."""
-        return tuple(kind for kind in KINDS if kind in self.episodes and kind not in self.left_out)
+        fit = [kind for kind in KINDS if kind in self.episodes and kind not in self.left_out]
+        if self.missions is not None:
+            fit = [kind for kind in fit if kind in self.missions.specs]
+        return tuple(fit)
+
+    @property
+    def specs(self) -> list[EpisodeSpec]:
+        """The episodes of each perturbation, kind beside kind; of logged ways each at most once."""
+        of = {
+            kind: range(self.first_seed, self.first_seed + n) for kind, n in self.episodes.items()
+        }
+        drawn = {kind: [EpisodeSpec(kind, seed) for seed in of[kind]] for kind in self.kinds}
+        if self.missions is not None:
+            drawn = {k: list(self.missions.specs[k][: self.episodes[k]]) for k in self.kinds}
+        most = max(map(len, drawn.values()))
+        return [drawn[k][at] for at in range(most) for k in self.kinds if at < len(drawn[k])]
+
+    @property
+    def floors(self) -> str:
+        """The floors by name, for the record: logged ways there are other missions."""
+        return self.layouts if self.missions is None else f"{self.layouts}, ways of the logs"
 
     @property
     def warnings(self) -> list[str]:
         """Episodes among those that chose the policy that is kept: they flatter it."""
         chosen = self.config.evaluation
         last = self.first_seed + max(self.episodes.values())
+        if self.missions is not None:
+            return [self.missions.text]
         if "agent" not in self.policies or not (
             chosen.seed < last and self.first_seed < chosen.seed + chosen.episodes
         ):
@@ -90,7 +122,7 @@ class EvaluationPlan:
     @property
     def total(self) -> int:
         """Episodes to drive."""
-        episodes = sum(self.episodes[kind] for kind in self.kinds)
+        episodes = len(self.specs)
         drivers = len(self.policies) * (1 if self.limits is None else 2)
         return drivers * len(self.perturbations) * episodes
 
@@ -104,10 +136,13 @@ def plan_evaluation(
     first_seed: int = FIRST_SEED,
     layouts: str | None = None,
     limiter: str | None = None,
+    missions: str = DRAWN,
 ) -> EvaluationPlan:
     """Check a request. `layouts` None: the run's, with training floors' test split.
 
-    `limiter` is "profile", by the `[limiter]` of the run's profile, or a TOML file with one.
+    `missions` is "drawn", or "logged" (or "logged:all"): the ways of logged episodes that the run's
+    panel holds out (or of all of them). `limiter` is "profile", by the `[limiter]` of the run's
+    profile, or a TOML file with one.
 
     Raises:
         RunError: no such run, or it kept no policy yet.
@@ -141,7 +176,8 @@ def plan_evaluation(
         first_seed,
         layouts=layouts,
         limits=None if limiter is None else _limits(run, limiter),
-        left_out=unfit_kinds(floors),
+        left_out=unfit_kinds(floors) if missions == DRAWN else {},
+        missions=_missions(run, missions, floors, tuple(of_kind)),
     )
     if not plan.kinds:
         refuse_unfit(floors, list(of_kind))
@@ -252,11 +288,9 @@ def drive_evaluation(
     )
     # One queue a policy, over all perturbations: few environments then wait for the last episodes.
     episodes = [
-        (name, EpisodeSpec(kind, plan.first_seed + index, perturbation))
+        (name, msgspec.structs.replace(spec, perturbation=perturbation))
         for name, perturbation in plan.perturbations.items()
-        for index in range(max(plan.episodes[kind] for kind in plan.kinds))
-        for kind in plan.kinds
-        if index < plan.episodes[kind]
+        for spec in plan.specs
     ]
     results: Results = {}
     versions: dict[str, str] = {}
@@ -282,6 +316,33 @@ def drive_evaluation(
     table = episodes_table(results, plan, versions)
     added: list[dict[str, Any]] = add_evaluation(plan.run.path, table).to_pylist()
     return added
+
+
+def _missions(
+    run: Run, named: str, floors: Sequence[Warehouse], kinds: Sequence[str]
+) -> LoggedMissions | None:
+    """Those of the logs where they are asked for.
+
+    Raises:
+        ConfigError: no such missions, no logs, several floors, or none of them can be driven.
+    """
+    if named == DRAWN:
+        return None
+    where = f"--missions {named}"
+    if named not in (HELD_OUT, EVERY):
+        remedy = f"choose from {DRAWN}, {HELD_OUT}, {EVERY}"
+        raise ConfigError("there are no such missions", where=where, remedy=remedy)
+    if (panel := run_panel(run.document)) is None:
+        raise ConfigError("the run learnt from no logs", where=where, remedy="leave it out")
+    if panel.task.goal == "none":
+        raise ConfigError("the task has no goal", where=where, remedy="leave it out")
+    if len(floors) > 1:
+        raise ConfigError(
+            f"is about the floor of the logs, these are {len(floors)}",
+            where=where,
+            remedy="name one with --layouts",
+        )
+    return logged_missions(panel, floors[0], kinds, every=named == EVERY)
 
 
 def _limits(run: Run, named: str) -> Limits:
@@ -353,7 +414,7 @@ def episodes_table(results: Results, plan: EvaluationPlan, versions: Mapping[str
             "stopped_s": result.stopped_s,
             "failure": result.failure,
             "version": versions[policy],
-            "layouts": plan.layouts,
+            "layouts": plan.floors,
         }
         for (policy, perturbation), episodes in results.items()
         for result in episodes
@@ -373,6 +434,7 @@ def settings(plan: EvaluationPlan) -> dict[str, Any]:
         "episodes_per_kind": dict(plan.episodes),
         "first_seed": plan.first_seed,
         "layouts": plan.layouts,
+        "missions": DRAWN if plan.missions is None else plan.missions.text,
         "limiter": None if plan.limits is None else msgspec.to_builtins(plan.limits),
         "kinds": list(plan.kinds),
         "left_out": plan.left_out,

@@ -108,13 +108,13 @@ def load_ope_dataset(
         elif logs is None and trained.header.split_by == "within_episode":
             notes.append(f"held out: {trained.header.split_note}, not whole episodes")
             training_ids = np.asarray(trained.meta_column("transition_id"), np.int64)
-            training_store = opened.enter_context(_store_of(trained))
+            training_store = opened.enter_context(panel_store(trained))
         else:
             ids, left_out = _unseen(store, trained, ids)
             if left_out:
                 notes.append(f"{left_out:,} episodes left aside: rows of them were trained on")
             training_ids = np.asarray(trained.meta_column("transition_id"), np.int64)
-            training_store = store if logs is None else opened.enter_context(_store_of(trained))
+            training_store = store if logs is None else opened.enter_context(panel_store(trained))
         if not len(ids) or not len(training_ids):
             raise RunError(
                 "holds no episode that the run did not learn from"
@@ -169,10 +169,8 @@ def _open(logs: str | None, trained: Panel | None, task: Task) -> tuple[Store, I
         folder = location.folder
         panel = Panel.open(folder) if folder is not None and (folder / HEADER).is_file() else None
     if panel is not None:
-        split = panel.path / EVALUATION_SPLIT
-        panel.header.files[EVALUATION_SPLIT].check(split, verify=True)
-        ids = read_table(split, columns=["transition_id"], error=PanelError)["transition_id"]
-        store, tasks = _store_of(panel), {panel.task_hash}
+        ids = held_out_of(panel)
+        store, tasks = panel_store(panel), {panel.task_hash}
     else:
         store = Store(location)
         columns = store.connection.sql(
@@ -190,14 +188,22 @@ def _open(logs: str | None, trained: Panel | None, task: Task) -> tuple[Store, I
     return store, np.asarray(ids, np.int64)
 
 
+def held_out_of(panel: Panel) -> Ints:
+    """The ids (n,) of the rows that a panel holds out. Raises PanelError where they are damaged."""
+    split = panel.path / EVALUATION_SPLIT
+    panel.header.files[EVALUATION_SPLIT].check(split, verify=True)
+    table = read_table(split, columns=["transition_id"], error=PanelError)
+    return np.asarray(table["transition_id"], np.int64)
+
+
 def held_out_rows(panel: Panel, driver: str | None = None) -> Transitions:
     """What a panel holds out of its first store; of one behaviour policy where it is named.
 
     Raises:
         StoreError, PanelError: the store or the list of rows is no longer there.
     """
-    store, ids = _open(None, panel, panel.task)
-    with store:
+    ids = held_out_of(panel)
+    with panel_store(panel) as store:
         if driver is not None:
             with passed_in(store.connection, wanted=pa.table({"transition_id": ids})):
                 own = store.connection.execute(
@@ -247,7 +253,8 @@ def _matrix(column: pa.ChunkedArray) -> F32:
     return flat.reshape(len(lists), -1) if len(lists) else np.zeros((0, 0), np.float32)
 
 
-def _store_of(panel: Panel) -> Store:
+def panel_store(panel: Panel) -> Store:
+    """The store of a panel, at its version. Raises StoreError where it was kept nowhere."""
     if panel.store_version < 0:
         raise StoreError(
             "was mixed from a table in memory: its held-out rows are kept nowhere",
@@ -308,7 +315,9 @@ __all__ = [
     "Measure",
     "OpeDataset",
     "OpeSteps",
+    "held_out_of",
     "held_out_rows",
     "load_ope_dataset",
+    "panel_store",
     "run_panel",
 ]

@@ -31,17 +31,21 @@ GAP_M = (0.80, 1.00)
 TURN_ROOM_M = 0.45  # that the body needs on both sides to turn on the spot
 
 
+Way = tuple[float, float, float, float, float]  # start x, y, yaw, goal x, y: on the floor
+
+
 class EpisodeSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What determines an episode. `perturbation` None: the environment's.
 
     `layout` is the name of a floor; None: the environment's, or the one of its floors that the seed
-    draws.
+    draws. `way` is where it starts and goes, instead of what the seed draws.
     """
 
     condition: str
     seed: int
     perturbation: Perturbation | None = None
     layout: str | None = None
+    way: Way | None = None
 
     def __post_init__(self) -> None:
         if self.condition not in KINDS:
@@ -76,7 +80,11 @@ def draw_episode(spec: EpisodeSpec, warehouse: Warehouse, planner: Planner) -> E
     layout, noise = np.random.SeedSequence(entropy).spawn(2)
     rng = np.random.Generator(np.random.PCG64(layout))
     for _ in range(200):
-        start, goal, plan = _draw_way(rng, warehouse, planner)
+        if spec.way is None:
+            start, goal, plan = _draw_way(rng, warehouse, planner)
+        else:
+            start, goal = spec.way[:3], spec.way[3:]
+            plan = planner.plan(start[0], start[1], goal)
         if spec.condition == "nominal":
             return Episode(spec, start, goal, plan, noise=noise)
         if spec.condition == "wheel_slip":

@@ -62,6 +62,9 @@ class EvalCommand:
     limiter: Annotated[str | None, tyro.conf.arg(metavar="profile|FILE.toml")] = None
     """Drive each policy once more with the limiter in front of it, as limited:NAME: by the
     profile's [limiter], or a file's (docs/deploy.md)."""
+    missions: str = "drawn"
+    """drawn: by their seeds, on the floor. logged: start and goal of the logged episodes that the
+    run's panel holds out, on the floor of the logs; logged:all: of those trained on too."""
     dry_run: bool = False
     """Check everything and print what would be driven; write nothing."""
     json: bool = False
@@ -102,6 +105,7 @@ class EvalCommand:
             episodes=self.episodes,
             first_seed=self.seed,
             layouts=self.layouts,
+            missions=self.missions,
             limiter=self.limiter,
         )
         if self.dry_run:

@@ -180,6 +180,12 @@ def driven(document: Document) -> list[str]:
     return lines
 
 
+def driven_on_ways(document: Document) -> list[str]:
+    """Which ways these are, and the success of each policy there."""
+    bare = {**document, "clones": []}  # the next evaluation says how good the clone is
+    return [str(document["missions"]), *driven(bare)]
+
+
 def _difference(row: Mapping[str, Any]) -> str:
     ends = row["difference_low"], row["difference_high"]
     return f"{interval_text(row['difference'], *ends, '+.2f')} ({row['verdict']})"

@@ -255,6 +255,21 @@ def evaluate(to: Settings, *, goal: bool | None = None) -> Stage:
     )
 
 
+def evaluate_on_ways(to: Settings) -> Stage:
+    """Driven on the ways that robots really drove, where the floor is that of the logs."""
+    return Stage(
+        "ways",
+        "Evaluate on the ways of the logs",
+        "Start and goal of the logged episodes that the panel holds out.",
+        [
+            *("eval", str(to.run), "--episodes", str(to.episodes), "--missions", "logged"),
+            *("--policies", "agent,cloned,planner", "--perturbations", "none"),
+        ],
+        outcome=outcomes.driven_on_ways,
+        shows_progress=True,
+    )
+
+
 def judge(to: Settings) -> Stage:
     """Off-policy: what the policy is worth by logs that it did not learn from."""
     return Stage(

@@ -215,7 +215,10 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
     if not trained.good:
         return Stop("training did not come to its end", (*trained.errors[:2], again))
     if twin:
-        work.do(stages.evaluate(to, goal=has_goal(to.profile)))
+        goal = has_goal(to.profile)
+        if goal and floor.good:
+            work.do(stages.evaluate_on_ways(to))
+        work.do(stages.evaluate(to, goal=goal))
     if work.plan or any(HELD_OUT in why for why in mixed.document["left_out"]):
         work.do(stages.judge(to))
     else:

@@ -1,0 +1,208 @@
+"""Missions of the twin from those that robots really drove: start and goal of logged episodes.
+
+A store keeps no goal, but in each row how far it was and, once within reach of the far look-ahead
+point, where. Where the robot never came that near, the distances from along its way tell it,
+unless it hardly moved aside. What is not told, and what the floor has no way for, is counted.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.resources import files
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+
+from restock.arrays import F64, Ints
+from restock.errors import ConfigError
+from restock.ingest.task.task import Task
+from restock.replay.panel.panel import Panel
+from restock.replay.store.store import passed_in
+from restock.train.evaluation.ope_dataset import held_out_of, panel_store
+from restock.train.twin.floors.layout import Warehouse
+from restock.train.twin.floors.occupancy_grid import into_frame
+from restock.train.twin.floors.planner import Planner
+from restock.train.twin.physics.episode import EpisodeSpec, Way, draw_episode
+
+HELD_OUT, EVERY = "logged", "logged:all"
+AGREE_M = 0.3  # a goal by the waypoint must be as far as the row says
+RESIDUAL_M = 0.1  # of a goal by distances
+ASIDE_M = 0.3  # that the way must leave a straight line by, for distances to tell a goal
+NO_GOAL = "the rows do not tell the goal's place"
+NO_WAY = "the floor has no way there: inside a wall, outside, or shut off"
+AT_GOAL = "it starts at its goal"
+
+
+@dataclass(frozen=True)
+class LoggedMissions:
+    """Episodes of each kind, one a logged way that has room for it, and what came of the others."""
+
+    specs: Mapping[str, Sequence[EpisodeSpec]]  # by kind
+    ways: int  # that can be driven
+    logged: int  # episodes that were looked at
+    source: str  # which these were
+    left_out: Mapping[str, int] = field(default_factory=dict)  # episodes, by reason
+    no_room: Mapping[str, int] = field(default_factory=dict)  # ways without room, by kind
+
+    @property
+    def text(self) -> str:
+        """What they are, in a sentence."""
+        parts = [f"missions of the logs: {self.ways} of {self.logged} {self.source} can be driven"]
+        parts += [f"{count} not: {why}" for why, count in self.left_out.items()]
+        parts += [
+            f"{count} have no room for {kind}" for kind, count in self.no_room.items() if count
+        ]
+        return "; ".join(parts)
+
+
+def logged_missions(
+    panel: Panel, floor: Warehouse, kinds: Sequence[str], *, every: bool = False
+) -> LoggedMissions:
+    """The ways of the episodes that a panel holds out, as missions on a floor of the same frame.
+
+    Args:
+        every: those that were trained on too; also where nothing is held out.
+
+    Raises:
+        ConfigError: none of them can be driven on this floor.
+        StoreError, PanelError: the logs are no longer there.
+    """
+    with panel_store(panel) as store:
+        ids = np.asarray(held_out_of(panel), np.int64)
+        held_out = len(ids) > 0 and not every
+        if not held_out:
+            ids = np.union1d(ids, np.asarray(panel.meta_column("transition_id"), np.int64))
+        ways, count = logged_ways(store.connection, ids, panel.task)
+    source = (
+        "episodes that the panel holds out"
+        if held_out
+        else "logged episodes, most of which were trained on"
+    )
+    planner, left_out = Planner(floor), Counter({NO_GOAL: count - len(ways)})
+    drivable = []
+    for way in _in_frame(ways, floor):
+        why = _undrivable(way, floor, planner, panel.task.goal_radius_m)
+        if why is None:
+            drivable.append(way)
+        else:
+            left_out[why] += 1
+    specs: dict[str, list[EpisodeSpec]] = {
+        kind: [
+            spec
+            for spec in (EpisodeSpec(kind, _seed(way), way=way) for way in drivable)
+            if _has_room(spec, floor, planner)
+        ]
+        for kind in kinds
+    }
+    made = LoggedMissions(
+        {kind: some for kind, some in specs.items() if some},
+        len(drivable),
+        count,
+        source,
+        {why: number for why, number in left_out.items() if number},
+        {
+            kind: len(drivable) - len(some)
+            for kind, some in specs.items()
+            if len(some) < len(drivable)
+        },
+    )
+    if not made.specs:
+        raise ConfigError(
+            made.text,
+            where=f"--missions, {floor.name}",
+            remedy=f"give --missions {EVERY}, a floor of the logs' own frame (`restock twin layout"
+            " --from STORE`), or leave --missions out",
+        )
+    return made
+
+
+def logged_ways(
+    connection: duckdb.DuckDBPyConnection, ids: Ints, task: Task
+) -> tuple[list[Way], int]:
+    """Start pose and goal of each episode with some of these rows, in the logs' frame, where the
+    rows tell it; and how many episodes there are."""
+    query = (files("restock.train.evaluation") / "logged_ways.sql").read_text(encoding="utf-8")
+    with passed_in(connection, wanted=pa.table({"transition_id": ids})):
+        columns = connection.sql(query).fetchnumpy()
+    names = np.asarray(columns.pop("episode_id"), str)
+    first = np.flatnonzero(names[1:] != names[:-1]) + 1
+    rows = np.stack([np.asarray(column, np.float64) for column in columns.values()], axis=-1)
+    ways = []
+    episodes = np.split(rows, first) if len(rows) else []
+    for of_episode in episodes:
+        goal = goal_of(of_episode, task.far_m)
+        if goal is not None and np.isfinite(of_episode[0, :3]).all():
+            x, y, yaw = of_episode[0, :3].tolist()
+            ways.append((x, y, yaw, float(goal[0]), float(goal[1])))
+    return ways, len(episodes)
+
+
+def goal_of(rows: F64, far_m: float) -> F64 | None:
+    """Where an episode was sent, (2,), by its rows (N, 7); None where they do not tell.
+
+    Columns: pose x, y, yaw; far waypoint forward, left; route left; distance to the goal.
+    """
+    place, yaw, far = rows[:, :2], rows[:, 2], rows[:, 3:5]
+    left, distance = rows[:, 5], rows[:, 6]
+    in_reach = np.flatnonzero(left <= far_m)
+    if len(in_reach):
+        at = int(in_reach[-1])
+        turn = np.array([[np.cos(yaw[at]), -np.sin(yaw[at])], [np.sin(yaw[at]), np.cos(yaw[at])]])
+        goal: F64 = place[at] + turn @ far[at]
+        if abs(float(np.hypot(*(goal - place[at]))) - distance[at]) <= AGREE_M:
+            return goal
+    known = np.isfinite(rows[:, [0, 1, 6]]).all(axis=1)
+    place, distance = place[known], distance[known]
+    if len(place) < 3:
+        return None
+    # |p - g|^2 = d^2 less its mean over rows is linear in g: 2 (p - mean) . g = ...
+    centred = place - place.mean(axis=0)
+    _, spread, _ = np.linalg.svd(centred, full_matrices=False)
+    if spread[-1] / np.sqrt(len(place)) < ASIDE_M / 2:
+        return None
+    square = (place**2).sum(axis=1) - distance**2
+    goal, *_ = np.linalg.lstsq(2 * centred, square - square.mean(), rcond=None)
+    residual = np.abs(np.hypot(*(place - goal).T) - distance)
+    return np.asarray(goal) if float(residual.max()) <= RESIDUAL_M else None
+
+
+def _in_frame(ways: Sequence[Way], floor: Warehouse) -> list[Way]:
+    if not ways:
+        return []
+    of = np.asarray(ways, np.float64)
+    start, goal = (into_frame(of[:, part], floor.map_origin) for part in (slice(2), slice(3, 5)))
+    yaw = of[:, 2] - floor.map_origin[2]
+    moved = np.column_stack([start, yaw, goal]).round(3).tolist()
+    return [(row[0], row[1], row[2], row[3], row[4]) for row in moved]
+
+
+def _undrivable(way: Way, floor: Warehouse, planner: Planner, radius_m: float) -> str | None:
+    """Why a way cannot be driven on a floor, None where it can."""
+    x, y, _, goal_x, goal_y = way
+    inside = all(
+        0 <= px <= floor.width_m and 0 <= py <= floor.depth_m
+        for px, py in ((x, y), (goal_x, goal_y))
+    )
+    if not inside or not np.isfinite(planner.distance_m(x, y, (goal_x, goal_y))):
+        return NO_WAY
+    return AT_GOAL if np.hypot(goal_x - x, goal_y - y) <= radius_m else None
+
+
+def _has_room(spec: EpisodeSpec, floor: Warehouse, planner: Planner) -> bool:
+    try:
+        draw_episode(spec, floor, planner)
+    except ConfigError:
+        return False
+    return True
+
+
+def _seed(way: Way) -> int:
+    """The way names its mission: the same seed in every run, another for another way."""
+    return zlib.crc32(np.asarray(way, np.float64).tobytes()) >> 1
+
+
+__all__ = ["EVERY", "HELD_OUT", "LoggedMissions", "goal_of", "logged_missions", "logged_ways"]
