@@ -27,6 +27,9 @@ SIZES_M = (0.02, 30.0)  # of a robot that this can be
 _POLYGONS = ("geometry_msgs/msg/PolygonStamped", "geometry_msgs/msg/Polygon")
 
 
+DESCRIBED = "as described"  # where a lidar's place is from
+
+
 @dataclass(frozen=True)
 class Footprint:
     """A robot's outline, and where its lidar is."""
@@ -36,11 +39,16 @@ class Footprint:
     source: str  # where that is from, in words
     lidar_x_m: float | None = None  # ahead of the middle; None: nothing says
     lidar_yaw_rad: float | None = None
+    lidar_source: str = DESCRIBED
+    measured: bool = True  # False: a guess, though with a reason
 
     @property
     def sane(self) -> bool:
         low, high = SIZES_M
         return low <= self.length_m <= high and low <= self.width_m <= high
+
+
+GUESS = Footprint(0.6, 0.5, "A GUESS, as nothing in the recording says: MEASURE IT", measured=False)
 
 
 def parse_footprint(text: str) -> Footprint:

@@ -20,11 +20,12 @@ from restock.ingest.propose.goal_choice import GoalChoice
 from restock.ingest.propose.motion_choice import MotionChoice
 from restock.ingest.propose.robot_lines import RobotProposal
 from restock.ingest.propose.roles import KINDS, LATCHED, REQUIRED, FrameGuess, Kind, Roles
+from restock.ingest.propose.scanned_outline import OWN_SPREAD_M, ScannedOutline
 from restock.ingest.propose.trial import Trial
 from restock.ingest.task.robot import Robot
 
+LEAST_RANGE_M = 0.01
 MOSTLY_FREE = 0.1  # of its messages, at most, in which a bumper is pressed
-GUESS = Footprint(0.6, 0.5, "A GUESS, as nothing in the recording says: MEASURE IT")
 
 
 @dataclass(frozen=True)
@@ -69,8 +70,9 @@ class Evidence:
     clock: ClockChoice
     gaps: Gaps
     driven_s: float
-    footprint: Footprint | None
+    footprint: Footprint
     footprint_notes: list[str]
+    outline: ScannedOutline | None  # where its scans say something of it
     goal: GoalChoice
     signals: list[Candidate]
     robot: RobotProposal
@@ -179,15 +181,15 @@ def _topic_lines(recording: Recording, roles: Roles, seconds: float) -> list[str
 
 def _task_lines(seen: Evidence, trial: Trial) -> list[str]:
     roles, commands = seen.roles, seen.commands
-    low, high = _lidar_range(seen.recording, roles)
+    low, high, why = _lidar_range(seen)
     kind = "speeds" if commands.measured else "commands"
     origin = f"from {commands.count} {kind} of {commands.topic}" if commands.count else "a guess"
     return [
         "[task]",
         *_bump_lines(seen.recording, roles),
-        *seen.goal.task_lines((seen.footprint or GUESS).length_m),
+        *seen.goal.task_lines(seen.footprint.length_m),
         f"control_period_s = {seen.clock.period_s:g}",
-        f"range_min_m = {low:g}",
+        f"range_min_m = {low:g}{why}",
         f"range_max_m = {high:g}  # lidar ranges beyond it count as free",
         f"actions = [  # (m/s, rad/s), {origin}; the first must be stop",
         *(f"  [{v:.3g}, {w:.3g}]," for v, w in _actions(commands, seen.robot)),
@@ -244,31 +246,44 @@ def _bump_lines(recording: Recording, roles: Roles) -> list[str]:
 
 
 def _body_lines(seen: Evidence, trial: Trial) -> list[str]:
-    footprint = seen.footprint or GUESS
+    footprint = seen.footprint
     x, yaw = footprint.lidar_x_m, footprint.lidar_yaw_rad
     return [
         "[task.body]  # it decides what is near",
-        f"# {footprint.source}" + ("" if seen.footprint else ", or say --footprint LENGTHxWIDTH"),
+        f"# {footprint.source}"
+        + ("" if footprint.measured else ", or say --footprint LENGTHxWIDTH"),
         *(f"# {note}" for note in seen.footprint_notes),
         *_said(trial, "task.body"),
         f"length_m = {round(footprint.length_m, 4):g}",
         f"width_m = {round(footprint.width_m, 4):g}",
         f"lidar_x_m = {round(x or 0.0, 3):g}  # of the lidar, ahead of the middle"
-        + ("; a guess" if x is None else ""),
+        + ("; a guess" if x is None else f"; {footprint.lidar_source}"),
         *([f"lidar_yaw_rad = {round(yaw, 4):g}"] if yaw and abs(yaw) > 1e-3 else []),
         "",
     ]
 
 
-def _lidar_range(recording: Recording, roles: Roles) -> tuple[float, float]:
-    """The nearest and the farthest that the lidar says it sees; at most 4 m, where it matters."""
-    if not roles["scan"]:
-        return 0.05, 4.0
-    topic = roles["scan"][0][0].name
-    columns = recording.read({topic: ["range_min", "range_max"]})[topic].fields
+def _lidar_range(seen: Evidence) -> tuple[float, float, str]:
+    """The nearest and the farthest range of use, at most 4 m, and why where the lidar says less.
+
+    Of a lidar that gives 0 where nothing comes back, 0 is no range; nor is one of its own parts.
+    """
+    if not seen.roles["scan"]:
+        return 0.05, 4.0, ""
+    topic = seen.roles["scan"][0][0].name
+    columns = seen.recording.read({topic: ["range_min", "range_max"]})[topic].fields
     low, high = (float(np.median(np.asarray(columns[f"range_{end}"]))) for end in ("min", "max"))
-    sane = 0 <= low < high < np.inf
-    return (round(low, 3), min(round(high, 3), 4.0)) if sane else (0.05, 4.0)
+    if not 0 <= low < high < np.inf:
+        return 0.05, 4.0, ""
+    own_m = (
+        seen.outline.own_range_m + OWN_SPREAD_M if seen.outline and len(seen.outline.own_m) else 0
+    )
+    why = ""
+    if low < LEAST_RANGE_M:
+        low, why = LEAST_RANGE_M, "  # the lidar says less; 0 is where nothing came back"
+    if own_m > low:
+        low, why = own_m, "  # beyond the robot's own parts, which the lidar sees"
+    return round(low, 3), min(round(high, 3), 4.0), why
 
 
 def _clock_lines(clock: ClockChoice, trial: Trial) -> list[str]:

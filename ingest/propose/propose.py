@@ -22,7 +22,7 @@ from restock.ingest.profile.profile import MOTION, parse_profile
 from restock.ingest.propose.candidates import candidates
 from restock.ingest.propose.clock_choice import Gaps, by_log_time, choose_clock
 from restock.ingest.propose.command_hold import CommandHold, command_hold
-from restock.ingest.propose.footprint import Footprint, footprint_of
+from restock.ingest.propose.footprint import GUESS, Footprint, footprint_of
 from restock.ingest.propose.goal_choice import GoalChoice
 from restock.ingest.propose.motion_choice import choose_motion, pose_series
 from restock.ingest.propose.proposal_lines import Commands, Evidence, profile_lines
@@ -40,6 +40,7 @@ from restock.ingest.propose.roles import (
     transform_frames,
     usable_topics,
 )
+from restock.ingest.propose.scanned_outline import lidar_place, scanned_outline, with_lidar
 from restock.ingest.propose.trial import GAIN, Advice, Trial, try_profile
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.motion import PoseSeries
@@ -132,8 +133,9 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
             problems.append(trial.problem)
         text = "\n".join(profile_lines(seen, name, problems, trial))
     advice = [*trial.advice]
-    if seen.footprint is None and seen.roles["scan"]:
-        advice.append(Advice("task.body", "a guess, as nothing in the recording says: --footprint"))
+    if not seen.footprint.measured and seen.roles["scan"]:
+        said = seen.footprint.source.replace("A GUESS", "a guess").replace("MEASURE IT", "")
+        advice.append(Advice("task.body", f"{said}--footprint"))
     return Proposal(
         *(text, missing, len(seen.signals), trial.ticks, trial.transitions, problems, advice),
         several_commands(usable_topics(recording)),
@@ -209,6 +211,11 @@ def gather(
         footprint = urdf_footprint(urdf, frame)
     if footprint is None:
         footprint, notes = footprint_of(recording, frame)
+    outline = scanned_outline(recording, scan, poses) if scan is not None else None
+    if footprint is None:
+        footprint = (outline.footprint(GUESS) if outline else None) or GUESS
+    if footprint.lidar_x_m is None and scan is not None:
+        footprint = with_lidar(footprint, lidar_place(recording, frame))
     return Evidence(
         recording,
         roles,
@@ -229,6 +236,7 @@ def gather(
         _driven_s(recording, gaps),
         footprint,
         notes,
+        outline,
         GoalChoice.of(logged=bool(roles["goal"])),
         candidates(
             recording,

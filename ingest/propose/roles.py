@@ -238,27 +238,30 @@ class FrameGuess:
         ]
 
 
-def transform_frames(recording: Recording) -> FrameGuess | None:
-    """The map's and the robot's frame, or None where no transforms join any such two."""
+def transform_edges(recording: Recording) -> Edges:
+    """The transforms of /tf and /tf_static; none where it has no such topics."""
     usual = Frames()
     wanted = {
         name: list(FIELDS)
         for name in (usual.topic, usual.static_topic)
         if name in recording.topics and set(FIELDS) <= set(recording.leaves(name))
     }
-    if not wanted:
-        return None
-    edges = Edges.of(usual, recording.read(wanted))
+    return Edges.of(usual, recording.read(wanted) if wanted else {})
+
+
+def transform_frames(recording: Recording) -> FrameGuess | None:
+    """The map's and the robot's frame, or None where no transforms join any such two."""
+    edges = transform_edges(recording)
     frames = {frame for child, up in edges.parents.items() for frame in (child, *up)}
-    for fixed in _named(FIXED_FRAMES, frames):
-        for base in _named(BASE_FRAMES, frames):
+    for fixed in named_frames(FIXED_FRAMES, frames):
+        for base in named_frames(BASE_FRAMES, frames):
             if fixed in upward(base, edges.parents):
                 chain = " -> ".join(_chain(base, fixed, edges))
                 return FrameGuess(fixed, base, chain, fixed.split("/")[-1] == "map")
     return None
 
 
-def _named(words: tuple[str, ...], frames: set[str]) -> list[str]:
+def named_frames(words: tuple[str, ...], frames: set[str]) -> list[str]:
     """The frames of these names, a robot's prefix before them or not; best first."""
     return [name for word in words for name in sorted(frames) if name.split("/")[-1] == word]
 

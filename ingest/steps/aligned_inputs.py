@@ -204,7 +204,8 @@ class AlignedInputs:
                 last = segment.topics[source.topic].hold(given.stamp_ns, source.max_age_s)
                 if "pressed" in source.fields:
                     pressed = self.inputs.numbers(name, "pressed")[last.row] > 0
-                    drives = last.fresh & pressed & np.equal(by[given.row], None)
+                    unclaimed = np.array([by[row] is None for row in given.row], np.bool_)
+                    drives = last.fresh & pressed & unclaimed
                 else:
                     its = np.stack([self.inputs.numbers(name, key)[last.row] for key in keys])
                     same = (np.abs(its - command[:, given.row]) <= SAME_COMMAND).all(axis=0)

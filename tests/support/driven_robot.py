@@ -20,6 +20,11 @@ LATENCY_NS = 2_000_000  # from header stamp to log time, of every topic
 BEAMS = 72
 FREE_M = 3.0
 GOAL = (11.0, 1.0)
+ITEMS = {  # of lists: what they hold
+    "poses": "geometry_msgs/msg/PoseStamped",
+    "polygon.points": "geometry_msgs/msg/Point32",
+    "transforms": "geometry_msgs/msg/TransformStamped",
+}
 
 
 @dataclass
@@ -213,11 +218,14 @@ def _set(types: Any, message: Any, path: str, value: Any) -> None:
         stamp = types.types["builtin_interfaces/msg/Time"](*divmod(int(value), 10**9))
         message.header.stamp = stamp
         return
-    if path.startswith("poses[]"):
-        while len(message.poses) < len(value):
-            message.poses.append(_blank(types, "geometry_msgs/msg/PoseStamped"))
-        for item, part in zip(message.poses, value, strict=True):
-            _set(types, item, path.removeprefix("poses[]."), float(part))
+    head, repeated, rest = path.partition("[].")
+    if repeated:
+        for name in head.split("."):
+            message = getattr(message, name)
+        while len(message) < len(value):
+            message.append(_blank(types, ITEMS[head]))
+        for item, part in zip(message, value, strict=True):
+            _set(types, item, rest, part)
         return
     *parents, last = path.split(".")
     for parent in parents:

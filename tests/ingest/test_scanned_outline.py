@@ -1,0 +1,142 @@
+"""The outline by what the lidar never saw inside, its own parts, and where transforms put it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from support.driven_robot import BEAMS, Drive, columns, pose, scans, write_topics
+from support.paths import SHARED
+
+from restock.cli import main
+from restock.ingest.decoding.columns import Ragged, TopicColumns, offsets_of
+from restock.ingest.profile.profile import Profile, parse_profile
+
+TYPES = {
+    "/cmd_vel": "geometry_msgs/msg/Twist",
+    "/amcl_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "/odom": "nav_msgs/msg/Odometry",
+    "/scan": "sensor_msgs/msg/LaserScan",
+    "/tf_static": "tf2_msgs/msg/TFMessage",
+    "/local_costmap/published_footprint": "geometry_msgs/msg/PolygonStamped",
+}
+
+
+@dataclass
+class Turning(Drive):
+    """Drives on while it turns; a wall stands at `nearest_m` on one side of the room."""
+
+    nearest_m: float = 0.25
+    near_scans: int = 8
+    post_m: float | None = None  # of itself, straight behind: what its lidar always sees
+
+    def topics(self) -> dict[str, TopicColumns]:
+        found = {name: c for name, c in super().topics().items() if name in TYPES}
+        stamps = (found["/amcl_pose"].fields["header.stamp"] - 1_700_000_000 * 10**9) * 1e-9
+        yaw = stamps  # rad
+        turned = pose("pose.pose", self.x_at(stamps), 1.0)
+        turned["pose.pose.orientation.z"] = np.sin(yaw / 2)
+        turned["pose.pose.orientation.w"] = np.cos(yaw / 2)
+        found["/amcl_pose"] = columns(stamps, turned)
+        count = len(found["/scan"])
+        ranges = np.full((count, BEAMS), 2.0) + np.linspace(0, 0.5, count)[:, None]
+        ranges[10 : 10 + self.near_scans, 20] = self.nearest_m
+        ranges[3, 40] = 0.05  # a speck of dust
+        if self.post_m is not None:
+            ranges[:, 0] = self.post_m
+        found["/scan"].fields.update(scans(ranges))
+        found["/scan"].fields["range_min"] = np.full(count, 0.02)
+        found["/scan"].fields["range_max"] = np.full(count, 5.0)
+        return found
+
+
+def proposed(tmp_path: Any, capsys: Any, drive: Drive, **more: TopicColumns) -> tuple[Profile, str]:
+    topics = {name: (TYPES[name], c) for name, c in drive.topics().items()}
+    topics |= {name: (TYPES[name], c) for name, c in more.items()}
+    bag = write_topics(topics, tmp_path / "bag", storage="mcap")
+    assert main(["profile", "new", str(bag), "--json"]) in (0, 3)
+    text = json.loads(capsys.readouterr().out)["toml"]
+    return parse_profile(text, where="p"), text
+
+
+def test_no_outline_reaches_to_what_the_lidar_saw(tmp_path, capsys):
+    profile, text = proposed(tmp_path, capsys, Turning(12.0))
+    body = profile.task.body
+    assert (body.length_m, body.width_m) == (pytest.approx(0.4), pytest.approx(0.4))
+    assert "by the lidar, which saw nothing nearer than 0.25 m: MEASURE IT" in text
+
+
+def test_a_robot_that_kept_away_is_as_large_as_guessed(tmp_path, capsys):
+    profile, text = proposed(tmp_path, capsys, Turning(12.0, nearest_m=0.9))
+    assert (profile.task.body.length_m, profile.task.body.width_m) == (0.6, 0.5)
+    assert "A GUESS, as nothing in the recording says" in text
+
+
+def test_one_odd_return_makes_no_robot_smaller(tmp_path, capsys):
+    profile, _ = proposed(tmp_path, capsys, Turning(12.0, near_scans=1))
+    assert profile.task.body.length_m == 0.6
+
+
+def test_nothing_makes_it_smaller_than_robots_are(tmp_path, capsys):
+    profile, _ = proposed(tmp_path, capsys, Turning(12.0, nearest_m=0.08))
+    assert profile.task.body.length_m == pytest.approx(0.2)
+
+
+def test_its_own_parts_are_its_body_and_no_obstacles(tmp_path, capsys):
+    """A post of its own .21 m behind; a wall at .3 m once."""
+    profile, text = proposed(tmp_path, capsys, Turning(12.0, nearest_m=0.3, post_m=0.21))
+    body = profile.task.body
+    assert body.length_m == pytest.approx(0.5)  # the post does not bound it
+    assert body.length_m / 2 > 0.2
+    assert profile.task.range_min_m == pytest.approx(0.225)
+    assert "range_min_m = 0.225  # beyond the robot's own parts" in text
+
+
+def test_what_stands_still_beside_a_robot_that_does_not_turn_is_not_its_own(tmp_path, capsys):
+    drive = Turning(12.0, post_m=0.21)
+    topics = drive.topics()
+    straight = Drive(12.0).topics()["/amcl_pose"]
+    topics["/amcl_pose"] = straight
+    bag = write_topics({n: (TYPES[n], c) for n, c in topics.items()}, tmp_path / "bag")
+    main(["profile", "new", str(bag), "--json"])
+    profile = parse_profile(json.loads(capsys.readouterr().out)["toml"], where="p")
+    assert profile.task.range_min_m == pytest.approx(0.02)
+    assert profile.task.body.length_m == pytest.approx(0.32)
+
+
+def test_a_costmaps_footprint_comes_first(tmp_path, capsys):
+    """A square of .3 m, as it is published: in the map, turned."""
+    turned = np.deg2rad(30) + np.pi / 4 + np.arange(4) * np.pi / 2
+    points = np.stack([4 + np.cos(turned) * 0.15 * 2**0.5, 1 + np.sin(turned) * 0.15 * 2**0.5])
+    each = offsets_of(np.full(3, 4))
+    fields = {
+        f"polygon.points[].{axis}": Ragged(np.tile(row.astype(np.float32), 3), each)
+        for axis, row in zip("xy", points, strict=True)
+    }
+    name = "/local_costmap/published_footprint"
+    more = {name: columns(np.array([0.5, 1.0, 1.5]), fields)}
+    profile, text = proposed(tmp_path, capsys, Turning(12.0), **more)
+    assert profile.task.body.length_m == pytest.approx(0.3, abs=1e-3)
+    assert f"the polygon of {name}" in text
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
+@pytest.mark.parametrize(
+    ("name", "size_m", "lidar"),
+    [
+        ("fleet-neato/2024-danpark/drive_square", (0.33, 0.33), (-0.084, np.pi)),
+        ("robots/neato-map-ros1/ac109_3_demo.bag", (0.322, 0.322), (-0.102, np.pi)),
+        ("fleet-turtlebot3/dwa-goal/rosbag2_2025_12_16-15_31_16", (0.208, 0.208), (0, 0)),
+    ],
+)
+def test_real_robots(name, size_m, lidar, capsys):
+    """A Neato is .33 m long, with its lidar behind the middle and turned about; a Burger .14 m."""
+    main(["profile", "new", str(SHARED / name), "--json"])
+    profile = parse_profile(json.loads(capsys.readouterr().out)["toml"], where="p")
+    body = profile.task.body
+    assert (body.length_m, body.width_m) == pytest.approx(size_m, abs=0.005)
+    assert body.lidar_x_m == pytest.approx(lidar[0], abs=0.005)
+    assert abs(body.lidar_yaw_rad) == pytest.approx(lidar[1], abs=0.02)
