@@ -117,7 +117,10 @@ def pooled(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
     driven = [one for one in drives if one.commands.topic == base.commands.topic]
     described = max(drives, key=lambda one: len(one.robot.values))
     clocks = [one.clock for one in driven]
-    outlined = next((one for one in (base, *drives) if one.footprint is not None), base)
+    # A measured outline before a guess, of guesses the smallest: it had the nearest return.
+    outlined = min(
+        (base, *drives), key=lambda one: (not one.footprint.measured, one.footprint.length_m)
+    )
     return replace(
         base,
         commands=_commands(base.commands, driven),
@@ -133,6 +136,7 @@ def pooled(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
         },
         footprint=outlined.footprint,
         footprint_notes=outlined.footprint_notes,
+        outline=outlined.outline,
         robot=described.robot
         if len(base.robot.values) < len(described.robot.values)
         else base.robot,

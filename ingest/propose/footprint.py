@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from restock.errors import ConfigError
 from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import Ragged
-from restock.ingest.propose.urdf import Description, Place, extent, read_description
+from restock.ingest.urdf.description import Description, Place, extent, read_description
 
 F64 = NDArray[np.float64]
 OUTLINE = ("fixed", "continuous")  # joints of what is always part of it; no arms

@@ -39,7 +39,7 @@ class GoalChoice:
         lines = ['goal = "route"']
         if self.source == "hindsight":
             radius_m = min(max(length_m / 3, RADIUS_M[0]), RADIUS_M[1])
-            lines.append(f"goal_radius_m = {round(radius_m, 2):g}  # a third of the robot's length")
+            lines.append(f"goal_radius_m = {round(radius_m, 2):g}  # a third of a robot's length")
         return lines
 
     def fallback(self, role: str) -> str:

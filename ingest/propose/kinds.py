@@ -19,8 +19,8 @@ from restock.ingest.decoding.columns import Ragged
 from restock.ingest.profile.profile import MOTION
 from restock.ingest.propose.footprint import descriptions
 from restock.ingest.propose.roles import KINDS, topics_for, usable_topics
-from restock.ingest.propose.urdf import read_description
 from restock.ingest.steps.clocks import STAMP
+from restock.ingest.urdf.description import read_description
 
 SCANS = 40  # of a recording that are looked at
 BEAMS = 0.1  # of the beams, by which scans of one lidar may differ: some turn at their own pace

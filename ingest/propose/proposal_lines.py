@@ -15,7 +15,7 @@ from restock.ingest.profile.profile import FALLBACKS
 from restock.ingest.propose.candidates import Candidate
 from restock.ingest.propose.clock_choice import ClockChoice, Gaps
 from restock.ingest.propose.command_hold import CommandHold
-from restock.ingest.propose.footprint import Footprint
+from restock.ingest.propose.footprint import GUESS, Footprint
 from restock.ingest.propose.goal_choice import GoalChoice
 from restock.ingest.propose.motion_choice import MotionChoice
 from restock.ingest.propose.robot_lines import RobotProposal
@@ -187,7 +187,7 @@ def _task_lines(seen: Evidence, trial: Trial) -> list[str]:
     return [
         "[task]",
         *_bump_lines(seen.recording, roles),
-        *seen.goal.task_lines(seen.footprint.length_m),
+        *seen.goal.task_lines((seen.footprint if seen.footprint.measured else GUESS).length_m),
         f"control_period_s = {seen.clock.period_s:g}",
         f"range_min_m = {low:g}{why}",
         f"range_max_m = {high:g}  # lidar ranges beyond it count as free",

@@ -12,10 +12,10 @@ import numpy as np
 
 from restock.errors import ConfigError
 from restock.ingest.containers.recording import Recording
-from restock.ingest.propose.described_robot import described_robot, read_urdf
 from restock.ingest.propose.footprint import Footprint, descriptions, of_urdf, outline
-from restock.ingest.propose.urdf import read_description
 from restock.ingest.task.robot import Lidar, Robot
+from restock.ingest.urdf.described_robot import described_robot, read_urdf
+from restock.ingest.urdf.description import read_description
 from restock.toml import toml_value
 
 MOST_BEAMS = 361  # in the twin, where each costs time: of a finer lidar every k-th

@@ -8,6 +8,7 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.profile.profile import Frames
 from restock.ingest.steps.frames import FIELDS, Edges, upward
+from restock.ingest.urdf.description import BASE_FRAMES
 
 _TWIST = {"speed_mps": "linear.x", "yaw_rate_radps": "angular.z"}
 _POSE = {"x_m": "position.x", "y_m": "position.y", "orientation": "orientation"}
@@ -172,7 +173,6 @@ ODOMETRY_AS_COMMAND = (
 )
 REQUIRED = ("command", "pose")
 FIXED_FRAMES = ("map", "odom", "world")  # best first
-BASE_FRAMES = ("base_link", "base_footprint", "base")
 LATCHED = ("goal", "plan", "behaviour_policy", "perturbation")
 SPENT = (*LATCHED, "true_condition", "true_exposure")  # nothing else is in their topics
 

@@ -19,10 +19,11 @@ from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged
 from restock.ingest.profile.profile import Clock, Frames
 from restock.ingest.propose.footprint import Footprint
-from restock.ingest.propose.roles import BASE_FRAMES, named_frames, transform_edges
+from restock.ingest.propose.roles import named_frames, transform_edges
 from restock.ingest.steps.align import align
 from restock.ingest.steps.frames import Tree, plain, upward
 from restock.ingest.steps.motion import PoseSeries
+from restock.ingest.urdf.description import BASE_FRAMES
 
 BINS = 60  # of the full circle
 NEAREST = "nearest return by bearing"  # (N, BINS) float32, m; no field's name holds a space

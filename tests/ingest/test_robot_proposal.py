@@ -12,9 +12,9 @@ from support.paths import ROOT
 from restock.errors import ConfigError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.profile.profile import parse_profile
-from restock.ingest.propose.described_robot import DescribedRobot, described_robot, read_urdf
 from restock.ingest.propose.propose import propose_profile
-from restock.ingest.propose.urdf import Description, read_description
+from restock.ingest.urdf.described_robot import DescribedRobot, described_robot, read_urdf
+from restock.ingest.urdf.description import Description, read_description
 
 RECORDING = ROOT / "sample_logs" / "amr_tuesday"
 

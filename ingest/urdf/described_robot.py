@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from restock.errors import ConfigError
-from restock.ingest.propose.urdf import F64, LONGEST, Description, Joint, Place, extent, number
+from restock.ingest.urdf.description import F64, LONGEST, Description, Joint, Place, extent, number
 
 SMALLEST_M = 0.005  # of a wheel's radius
 MOST_ABOVE = 2  # joints that move above a wheel, as a suspension: more are an arm's

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.ingest.propose.roles import BASE_FRAMES
-
+BASE_FRAMES = ("base_link", "base_footprint", "base")  # best first
 F64 = NDArray[np.float64]
 LONGEST = 4_000_000  # letters of a description
 MOST_LINKS = 5_000

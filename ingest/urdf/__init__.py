@@ -1,0 +1,1 @@
+"""What a robot's description (URDF) says of it: links, joints, shapes; drive, wheels, mass."""
