@@ -119,7 +119,7 @@ def recordings_of(bags: Path) -> list[tuple[Path, bool]]:
     """The recordings, and whether each has a command and a pose by `fleets.json`."""
     listed = bags / "fleets.json"
     if not listed.is_file():
-        return [(path, True) for path in recordings_in([bags])]
+        return [(path, True) for path in recordings_in(bags)]
     return [
         (bags / one["file"], one["has"]["command"] and one["has"]["pose"])
         for one in json.loads(listed.read_text())

@@ -13,7 +13,8 @@ from support.driven_robot import Drive, write_bag
 
 from restock import cli
 from restock.cli.start.stage import Stage
-from restock.cli.start.work import Work
+from restock.cli.start.start import no_room
+from restock.cli.start.work import Ended, Work
 from restock.errors import RestockError
 
 SILENT = lambda line: None  # noqa: E731
@@ -205,3 +206,13 @@ def test_several_topics_of_commands_are_for_a_person_to_choose_from(
     assert "/base/cmd_vel, /cmd_vel" in document["stopped"]["why"]
     _, document = start(capsys, *argv, "--accept")
     assert document["stages"][-1]["name"] == "mix"
+
+
+def test_where_no_mission_fits_there_is_no_training_in_the_twin_whatever_was_asked() -> None:
+    def floor(**document: Any) -> Ended:
+        return Ended("floor", "", "done", document=document)
+
+    assert no_room(floor(episodes=["nominal"])) is None
+    assert "no mission fits" in str(no_room(floor(episodes=[])))
+    # Without any floor the twin has its own, where that is asked for.
+    assert no_room(Ended("floor", "", "failed")) is None

@@ -203,9 +203,11 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
         if fitted.good:
             settings.append(f"env.perturbation={to.fitted}")
         gap = work.do(stages.gap(to, horizon_s, fitted=fitted.good))
-        why = None if asked.twin == "yes" or work.plan else mistrust(floor, gap)
-        if why is not None:
-            work.say(f"   [yellow]no training in the twin (--twin yes overrides): {escape(why)}[/]")
+        why, remedy = no_room(floor), ""
+        if why is None and asked.twin != "yes":
+            why, remedy = mistrust(floor, gap), " (--twin yes overrides)"
+        if why is not None and not work.plan:
+            work.say(f"   [yellow]no training in the twin{remedy}: {escape(why)}[/]")
             twin = False
     if not twin:
         settings = logs_alone_settings(covered.document)
@@ -274,6 +276,13 @@ def has_goal(profile: Path | str | None) -> bool:
     if profile is None or (isinstance(profile, Path) and not profile.is_file()):
         return True
     return load_profile(str(profile)).task.goal != "none"
+
+
+def no_room(floor: Ended) -> str | None:
+    """Why nothing can be driven on the floor that there is; None where something can."""
+    if floor.good and floor.document.get("episodes") == []:
+        return "no mission fits on the floor that the recordings show"
+    return None
 
 
 def mistrust(floor: Ended, gap: Ended) -> str | None:
