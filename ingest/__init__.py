@@ -16,12 +16,12 @@ if TYPE_CHECKING:
     from restock.ingest.correct import correct_store as correct_store
     from restock.ingest.correct import remove_corrections as remove_corrections
     from restock.ingest.describe import describe_recording as describe_recording
+    from restock.ingest.live.observer import LiveObserver as LiveObserver
     from restock.ingest.pipeline import ingest as ingest
     from restock.ingest.profile.profile import Profile as Profile
     from restock.ingest.profile.profile import load_profile as load_profile
     from restock.ingest.propose.propose import propose_profile as propose_profile
     from restock.ingest.relabel import relabel_store as relabel_store
-    from restock.ingest.steps.live import LiveObserver as LiveObserver
     from restock.ingest.store.writer import StoreWriter as StoreWriter
 else:
     __getattr__, __dir__, __all__ = lazy(
@@ -41,7 +41,7 @@ else:
             "restock.ingest.profile.profile": ["Profile", "load_profile"],
             "restock.ingest.propose.propose": ["propose_profile"],
             "restock.ingest.relabel": ["relabel_store"],
-            "restock.ingest.steps.live": ["LiveObserver"],
+            "restock.ingest.live.observer": ["LiveObserver"],
             "restock.ingest.store.writer": ["StoreWriter"],
         },
     )

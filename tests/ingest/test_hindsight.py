@@ -13,9 +13,9 @@ from support.driven_robot import Drive, write_bag
 
 from restock.cli import main
 from restock.errors import ConfigError
+from restock.ingest.live.observer import LiveObserver
 from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.profile.profile_text import profile_toml
-from restock.ingest.steps.live import LiveObserver
 from restock.ingest.task.hindsight import GoalRules, missions
 from restock.ingest.task.task import Task
 from restock.replay.store.store import Store

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
-import subprocess
+import json
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,16 +14,19 @@ import pytest
 from support.kept_run import kept_network, kept_run
 from support.paths import ROOT
 
+from restock.cli import main
 from restock.errors import ConfigError
+from restock.ingest.live.observer import LiveObserver
+from restock.ingest.live.pilot import Pilot
+from restock.ingest.live.played import play
+from restock.ingest.live.policy_file import PolicyFile
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import Frames, load_profile
-from restock.ingest.steps.live import LiveObserver
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 from restock.train.evaluation.policies import GreedyPolicy
 
 BAG = ROOT / "sample_logs" / "amr_tuesday"
-EXAMPLE = ROOT / "docs" / "examples" / "ros2_policy.py"
 PROFILE = load_profile("warehouse_amr")
 TASK = PROFILE.task
 
@@ -42,23 +44,11 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def example() -> Any:
-    spec = importlib.util.spec_from_file_location("ros2_policy", EXAMPLE)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_the_node_sees_what_ingest_stores_and_acts_as_torch_does(
+def test_what_it_sees_is_what_ingest_stores_and_it_acts_as_torch_does(
     policy: Path, tmp_path: Path
 ) -> None:
-    module = example()
-    bag = module.BagNode(BAG)
-    node = module.PolicyNode(bag, policy, module.twist_class)
-    decisions: dict[int, tuple[Any, int]] = {}
-    bag.play(lambda log_time_ns, _: decisions.__setitem__(log_time_ns, node.last))
+    pilot = Pilot(PolicyFile(policy), None)
+    decisions = {one.log_time_ns: one for one in play(pilot, BAG)}
     assert "rclpy" not in sys.modules
 
     ingest(BAG, PROFILE, store=StoreWriter(tmp_path / "store"))
@@ -73,27 +63,36 @@ def test_the_node_sees_what_ingest_stores_and_acts_as_torch_does(
     assert len(times) > 700
     assert stored[:, TASK.observation_names.index("nav_known")].all()
     assert set(times) <= decisions.keys()  # a decision for every step
-    live = np.stack([decisions[at][0].observation for at in times])
-    assert not any(decisions[at][0].problem for at in times)
+    live = np.stack([decisions[at].decision.observed.observation for at in times])
+    assert not any(decisions[at].decision.reason for at in times)
     np.testing.assert_allclose(live, stored, rtol=1e-6, atol=1e-6)
     greedy, _ = GreedyPolicy(kept_network()).act(None, stored)
-    assert [decisions[at][1] for at in times] == greedy.tolist()
+    assert [decisions[at].decision.action for at in times] == greedy.tolist()
     assert len(set(greedy.tolist())) > 1
-    # What it published is the action table's.
-    speeds = {command.linear.x for command in bag.published}
-    assert speeds <= {speed for speed, _ in TASK.actions}
+    assert [decisions[at].drove for at in times] == rows["action"].to_pylist()
+    # Without a limiter the command is the action table's.
+    at = decisions[times[0]].decision
+    assert at.command == at.proposal == TASK.actions[at.action]
 
 
-def test_the_example_reports_its_latency(policy: Path) -> None:
-    found = subprocess.run(
-        [sys.executable, str(EXAMPLE), str(policy), str(BAG)],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    said = msgspec.json.decode(found.stdout)
+def test_a_recording_is_played_at_the_shell(
+    policy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["node", str(policy), "--on", str(BAG)]) == 0
+    said = json.loads(capsys.readouterr().out)
     assert said["decisions"] > 700
     assert 0 < said["latency_ms"]["p50"] <= said["latency_ms"]["p99"]
+    assert 0 < said["agreement"] < 1
+    assert said["limited"]
+    assert not said["unreadable"]
+    # Refused in words: no recording, no policy, no ROS.
+    assert main(["node", str(policy), "--on", str(tmp_path / "none")]) == 2
+    assert main(["node", str(tmp_path / "none.onnx"), "--on", str(BAG)]) == 2
+    assert main(["node", str(policy)]) == 2
+    said = capsys.readouterr().err
+    assert "cannot be played" in said
+    assert "no such file" in said
+    assert "needs ROS 2" in said
 
 
 def stamped(stamp_ns: int, **fields: Any) -> SimpleNamespace:

@@ -11,9 +11,9 @@ from support.paths import SHARED
 
 from restock.arrays import Ints
 from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.live.clock import LiveClock
 from restock.ingest.profile.profile import Clock
 from restock.ingest.steps.align import NS, STAMP, align
-from restock.ingest.steps.live_clock import LiveClock
 
 HUSKY, ODOMETRY = SHARED / "sim-time-husky", "/husky_velocity_controller/odom"
 WARM_UP_NS = 3 * NS

@@ -27,6 +27,7 @@ MAY_IMPORT = {
     "ingest/urdf": "",
     "ingest/profile": "decoding task",
     "ingest/propose": "containers decoding profile steps task urdf",
+    "ingest/live": "decoding profile steps task",
     "ingest/steps": "containers decoding profile task",
     "ingest/store": "containers decoding profile steps task",
     "replay": "panel store ingest/store",
@@ -52,7 +53,7 @@ MAY_IMPORT = {
     ),
     "train/evaluation": (
         "dqn feed run twin/env twin/floors twin/physics replay/panel replay/ring replay/store"
-        " ingest/store ingest/task"
+        " ingest/live ingest/profile ingest/store ingest/task"
     ),
     "train/comparison": (
         "train diagnosis dqn evaluation run twin/physics replay/fleet replay/panel"
@@ -94,6 +95,7 @@ MAY_IMPORT = {
         " train/diagnosis train/evaluation train/run train/study train/twin/calibration"
         " train/twin/physics"
     ),
+    "cli/robot": "cli ingest/live ingest/profile ingest/task",
     "cli/start": "cli ingest/profile ingest/propose train/dqn train/twin/env",
     "cli/twin": (
         "cli report ingest/profile ingest/propose ingest/store ingest/task replay/fleet"

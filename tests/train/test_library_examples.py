@@ -47,8 +47,7 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_example_is_run_and_explained() -> None:
-    # ros2_policy is no trainer: tests/test_live.py runs it.
-    assert {path.stem for path in EXAMPLES.glob("*.py")} == {*NEEDS, "ros2_policy"}
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == set(NEEDS)
     page = (EXAMPLES.parent / "libraries.md").read_text(encoding="utf-8")
     assert all(f"examples/{name}.py" in page for name in NEEDS)
 

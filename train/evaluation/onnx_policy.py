@@ -20,6 +20,8 @@ from restock import __version__
 from restock.arrays import F32, Ints
 from restock.errors import ConfigError, RunError
 from restock.files import write_bytes
+from restock.ingest.live.policy_file import FORMAT, open_session
+from restock.ingest.profile.profile_text import profile_toml
 from restock.ingest.task.task import Task
 from restock.train.dqn.behaviour import FilteredNetwork, PolicyNetwork, ProposedNetwork
 from restock.train.dqn.network import QNetwork
@@ -27,7 +29,6 @@ from restock.train.evaluation.policies import load_agent
 from restock.train.run.run import Run
 from restock.train.run.run_profile import profile_of_run
 
-FORMAT = "restock-policy/1"
 _OPSET = 18
 
 
@@ -54,6 +55,7 @@ def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
         "observation": msgspec.json.encode(profile.task.observation_names).decode(),
         "actions": msgspec.json.encode(profile.task.actions).decode(),
         "profile": profile.name,
+        "profile_toml": profile_toml(profile),
         "run": run.path.resolve().name,
         "version": agent.version,
         "restock_version": __version__,
@@ -197,22 +199,7 @@ class OnnxPolicy:
     """
 
     def __init__(self, path: Path, task: Task) -> None:
-        runtime = _library("onnxruntime")
-        if not path.is_file():
-            raise ConfigError(
-                "no such file", where=str(path), remedy="restock export RUN --to onnx"
-            )
-        options = runtime.SessionOptions()
-        options.intra_op_num_threads = 1
-        options.log_severity_level = 4
-        try:
-            self._session = runtime.InferenceSession(
-                str(path), options, providers=["CPUExecutionProvider"]
-            )
-        except Exception as error:
-            raise ConfigError(
-                f"is not an ONNX model: {str(error).splitlines()[0]}", where=str(path)
-            ) from error
+        self._session = open_session(path)
         metadata = self._session.get_modelmeta().custom_metadata_map
         if metadata.get("format") == FORMAT and metadata.get("task_hash") != task.hash:
             raise ConfigError(

@@ -36,6 +36,7 @@ VERBS = {
     "trace": "trace a sampled row to its source, down to the messages",
     "diagnose": "buffer failure or target failure?",
     "report": "one HTML page with all of it",
+    "node": "an exported policy on a robot: a ROS 2 node, in shadow or driving",
     "start": "from your robot's recordings to a policy and a report, stage by stage",
     "demo": "all of the above, on sample_logs/",
 }
@@ -47,6 +48,7 @@ FOLDERS = {
     ),
     "learning": ("train", "eval", "study", "compare", "trace", "diagnose", "report"),
     "twin": ("record", "twin"),
+    "robot": ("node",),
     "start": ("start", "demo"),
 }
 _FOLDER_OF = {verb: f"{folder}." for folder, verbs in FOLDERS.items() for verb in verbs}
@@ -112,7 +114,7 @@ def _dispatch(args: list[str]) -> int:
         parsed = tyro.cli(
             command,
             prog=f"restock {verb}",
-            args=args[1:],
+            args=_without_ros(args[1:]) if verb == "node" else args[1:],
             use_underscores=False,
             config=(tyro.conf.FlagCreatePairsOff,),  # --json, without a --no-json beside it
         )
@@ -120,6 +122,11 @@ def _dispatch(args: list[str]) -> int:
         return int(stop.code or 0) if isinstance(stop.code, int | None) else int(ExitCode.USAGE)
     code: int | None = parsed.run()
     return int(code or ExitCode.OK)
+
+
+def _without_ros(args: list[str]) -> list[str]:
+    """The flags before `--ros-args`; rclpy reads the rest from the command line itself."""
+    return args[: args.index("--ros-args")] if "--ros-args" in args else args
 
 
 def _complain(message: str) -> None:

@@ -16,16 +16,19 @@ from numpy.typing import NDArray
 
 from restock.errors import ConfigError
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, join
+from restock.ingest.live.clock import LiveClock
 from restock.ingest.profile.profile import Input, Profile
+from restock.ingest.profile.signal_paths import element_of
 from restock.ingest.steps.align import NS, ClockSegment, Samples
 from restock.ingest.steps.aligned_inputs import AlignedInputs, InputColumns
-from restock.ingest.steps.live_clock import LiveClock
 from restock.ingest.steps.needs import field_paths
 from restock.ingest.steps.steps import Filling
+from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import nearest_action, observe
 
 # No robot acts by these.
 PROVENANCE = ("behaviour_policy", "true_condition", "true_exposure", "perturbation")
+_MOST = 2000  # messages of a topic between two ticks
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,7 @@ class Observed:
     stamp_ns: int  # of the tick on the alignment clock
     previous_action: int  # in force since the tick before; 0, stop, where there was none
     problem: str  # why it must not be acted on, or ""
+    signals: Signals  # at the tick, one row each; none where nothing could be observed
 
 
 @dataclass(frozen=True)
@@ -99,19 +103,25 @@ class LiveObserver:
         return self._clock.offset_ns(self._newest_ns)
 
     def receive(self, topic: str, message: Any, log_time_ns: int) -> None:
-        """Take a message of one of `topics`, received at `log_time_ns`."""
+        """Take a message of one of `topics`, received at `log_time_ns`.
+
+        Raises:
+            AttributeError, TypeError: it has not the fields of its type; nothing of it is kept.
+        """
         sources = self._inputs[topic]
         paths = dict.fromkeys(path for source in sources for path in field_paths(source))
         latched = all(source.max_age_s is None for source in sources)
+        fields = {path: _column(message, path) for path in paths}
         self._newest_ns = log_time_ns
         stamp_ns = self._stamp(topic, message, log_time_ns, latched)
         if stamp_ns is None:
             self.left_out[topic] = self.left_out.get(topic, 0) + 1
             return
-        fields = {path: _column(message, path) for path in paths}
         taken = _Message(log_time_ns, stamp_ns, fields)
         if topic != self.profile.inputs.command.topic:
             self._buffers[topic].append(taken)
+            if len(self._buffers[topic]) > _MOST:  # nobody observes
+                del self._buffers[topic][: _MOST // 2]
         elif self._ticked:
             self._command, self._ticked = taken, False
 
@@ -152,11 +162,12 @@ class LiveObserver:
         problem = str(filling.problem[last] or filling.route_problem[last])
         observation = observe(self.task, now, then, np.array([previous]))[0]
         self._tick(stamp_ns)
-        return Observed(observation, stamp_ns, previous, problem)
+        return Observed(observation, stamp_ns, previous, problem, now)
 
     def _unknown(self, stamp_ns: int, problem: str) -> Observed:
         self._tick(stamp_ns)
-        return Observed(np.zeros(self.task.observation_size, np.float32), stamp_ns, 0, problem)
+        nothing = np.zeros(self.task.observation_size, np.float32)
+        return Observed(nothing, stamp_ns, 0, problem, {})
 
     def _tick(self, stamp_ns: int) -> None:
         """Let go of what neither this tick holds nor a later one will."""
@@ -196,6 +207,18 @@ class LiveObserver:
 
     def _optional(self, topic: str) -> bool:
         return all(source.optional for source in self._inputs[topic])
+
+
+def value_of(message: Any, path: str) -> Any:
+    """A message's value at a path without lists, such as `twist.linear.x`, `data` or `buttons[4]`.
+
+    Raises:
+        AttributeError: the message has no such field.
+        IndexError: its list is shorter.
+    """
+    head, place = element_of(path)
+    value = _member(message, head)
+    return value if place is None else value[place]
 
 
 def _columns(messages: Sequence[_Message]) -> TopicColumns:

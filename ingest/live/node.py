@@ -1,0 +1,380 @@
+"""The ROS 2 node: a lifecycle node that drives by an exported policy, or says what it would drive.
+
+Unconfigured it knows nothing. Configured (inactive) it listens, decides and reports on
+/diagnostics, and commands nothing. Active it publishes commands; in shadow mode only what they
+would have been. It publishes a stop where an input cannot be relied on, where its timer stalls (a
+steady clock watches it), when it is deactivated and when it is shut down; while a person drives,
+nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from restock.errors import ConfigError
+from restock.ingest.live.node_topics import (
+    ACTION,
+    BEHAVIOUR,
+    LIMITER,
+    PROPOSAL,
+    SHADOW,
+    STRING,
+    TAKEOVER,
+    CommandForm,
+)
+from restock.ingest.live.pilot import Decision, Pilot
+from restock.ingest.live.policy_file import PolicyFile
+from restock.ingest.live.ros import Ros
+from restock.ingest.task.limiter import Limiter, Limits
+
+DIAGNOSTICS_S = 1.0
+NAME = "restock_policy"
+
+
+class PolicyNode:
+    """What a lifecycle node does in its transitions; `node` is an rclpy LifecycleNode."""
+
+    def __init__(self, ros: Ros, node: Any, policy: Path, *, drive: bool = False) -> None:
+        self.ros, self.node = ros, node
+        self.pilot: Pilot | None = None
+        self.active = False
+        self._lock_group = ros.MutuallyExclusiveCallbackGroup()
+        self._decided_s = math.inf  # by the steady clock
+        self._said = ""  # who drives, as last published
+        self._classes: dict[str, Any] = {}
+        self._published: dict[str, Any] = {}
+        self._reports: Any = None
+        self._subscriptions: list[Any] = []
+        self._timers: list[Any] = []
+        self._parameter("policy", str(policy))
+        self._parameter("profile", "")
+        self._parameter("shadow", not drive)
+        self._parameter("limiter", True)
+        self._parameter("takeover_topic", TAKEOVER)
+
+    # -- transitions ----------------------------------------------------------------------------
+
+    def configure(self) -> None:
+        """Read the policy, and make publishers, subscriptions and timers.
+
+        Raises:
+            RestockError: the policy or a parameter cannot be used.
+        """
+        policy = PolicyFile(Path(self._value("policy")), self._value("profile") or None)
+        profile, task = policy.profile, policy.profile.task
+        form = CommandForm.of(profile)
+        self._parameter("cmd_vel_topic", form.topic)
+        self._parameter("cmd_vel_type", form.type)
+        self._parameter("watchdog_s", 2.5 * task.control_period_s)
+        self.watchdog_s = float(self._value("watchdog_s"))
+        if not 0 < self.watchdog_s <= 60:
+            raise ConfigError(
+                f"must be within 0 and 60 s, got {self.watchdog_s:g}", where="watchdog_s"
+            )
+        limits = self._limits(policy)
+        self.form = CommandForm.of(
+            profile, self._value("cmd_vel_topic"), self._value("cmd_vel_type")
+        )
+        self.shadow = bool(self._value("shadow"))
+        pilot = Pilot(policy, limits, self._value("takeover_topic"))
+        told = profile.inputs.behaviour_policy
+        kinds = {
+            "proposal": (PROPOSAL, self.form.type),
+            "action": (ACTION, "std_msgs/msg/Int16"),
+            "limiter": (LIMITER, "std_msgs/msg/UInt8"),
+            "shadow": (SHADOW, self.form.type),
+        }
+        if not self.shadow:
+            kinds["command"] = (self.form.topic, self.form.type)
+            kinds["behaviour"] = (BEHAVIOUR if told is None else told.topic, STRING)
+        self._said = ""
+        self._classes = {name: self._class(kind) for name, (_, kind) in kinds.items()}
+        heard = {topic: self._class(kind) for topic, kind in pilot.topics.items()}
+        self._published = {
+            name: self.node.create_lifecycle_publisher(
+                self._classes[name],
+                topic,
+                self.ros.latched_qos() if name == "behaviour" else self.ros.command_qos(),
+            )
+            for name, (topic, _) in kinds.items()
+        }
+        status = self._classes["diagnostics"] = self._class("diagnostic_msgs/msg/DiagnosticArray")
+        self._reports = self.node.create_publisher(status, "/diagnostics", 10)
+        self._subscriptions = [
+            self.node.create_subscription(kind, topic, partial(self._receive, topic), qos)
+            for topic, kind in heard.items()
+            for qos in self._subscribed(topic, pilot)
+        ]
+        # Control ticks by the node's clock, which use_sim_time sets; the rest by a steady one.
+        steady = self.ros.Clock(clock_type=self.ros.ClockType.STEADY_TIME)
+        self._timers = [
+            self.node.create_timer(task.control_period_s, self._tick),
+            self.node.create_timer(
+                self.watchdog_s / 2, self._watch, callback_group=self._lock_group, clock=steady
+            ),
+            self.node.create_timer(DIAGNOSTICS_S, self._report, clock=steady),
+        ]
+        self.pilot = pilot
+        mode = "shadow: it commands nothing" if self.shadow else f"it drives {self.form.topic}"
+        self._log(f"{policy.path}: profile {profile.name}, task {task.hash}, {mode}")
+
+    def activate(self) -> None:
+        """From now on it publishes; the lifecycle publishers must be enabled."""
+        self._decided_s, self.active = time.monotonic(), True
+        self._say(self._own())
+
+    def deactivate(self) -> None:
+        """Stop, and publish nothing from here on; the lifecycle publishers are still enabled."""
+        if self.active and self._drives():
+            self._command(0.0, 0.0)
+            assert self.pilot is not None
+            self._say(self.pilot.profile.behaviour_policy)
+        self.active = False
+
+    def cleanup(self) -> None:
+        """Take down what `configure` made."""
+        self.deactivate()
+        self.pilot = None
+        for timer in self._timers:
+            self.node.destroy_timer(timer)
+        for subscription in self._subscriptions:
+            self.node.destroy_subscription(subscription)
+        for publisher in self._published.values():
+            self.node.destroy_lifecycle_publisher(publisher)
+        if self._reports is not None:
+            self.node.destroy_publisher(self._reports)
+        self._timers, self._subscriptions, self._published = [], [], {}
+        self._reports = None
+
+    # -- messages and ticks ---------------------------------------------------------------------
+
+    def _subscribed(self, topic: str, pilot: Pilot) -> list[Any]:
+        """A request for latched messages matches no publisher that does not latch: so both."""
+        latched = [self.ros.latched_qos()] if topic in pilot.latched else []
+        return [self.ros.sensor_qos(), *latched]
+
+    def _receive(self, topic: str, message: Any) -> None:
+        if self.pilot is not None:
+            self.pilot.receive(topic, message, self._now_ns())
+
+    def _tick(self) -> None:
+        if self.pilot is None:
+            return
+        began_s = time.monotonic()
+        decision = self.pilot.decide(self._now_ns())
+        self._decided_s = time.monotonic()
+        late = self._decided_s - began_s > self.watchdog_s  # the watchdog has stopped it meanwhile
+        if not self.active:
+            return
+        self._publish_shadow(decision)
+        if self.shadow:
+            return
+        if decision.taken_over:
+            self._say("operator")
+            return
+        self._say(self._own())
+        self._command(*((0.0, 0.0) if late else decision.command))
+
+    def _publish_shadow(self, decision: Decision) -> None:
+        """What it would do, and why: for the log, whoever drives."""
+        rule = self._classes["limiter"]()
+        rule.data = decision.rule
+        self._published["limiter"].publish(rule)
+        self._published["shadow"].publish(self._filled("shadow", *decision.command))
+        if decision.action is not None:
+            action = self._classes["action"]()
+            action.data = decision.action
+            self._published["action"].publish(action)
+            self._published["proposal"].publish(self._filled("proposal", *decision.proposal))
+
+    def _watch(self) -> None:
+        """A stop where control ticks no longer come: a hanging decision, or a stopped clock."""
+        if not self.active or self.pilot is None:
+            return
+        if time.monotonic() - self._decided_s > self.watchdog_s:
+            self.pilot.counts["stop: watchdog"] += 1
+            if self._drives():
+                self._command(0.0, 0.0)
+
+    def _drives(self) -> bool:
+        """Whether its commands are the robot's."""
+        return (
+            not self.shadow and self.pilot is not None and not self.pilot.taken_over(self._now_ns())
+        )
+
+    def _command(self, speed_mps: float, yaw_rate_radps: float) -> None:
+        self._published["command"].publish(self._filled("command", speed_mps, yaw_rate_radps))
+
+    def _filled(self, name: str, speed_mps: float, yaw_rate_radps: float) -> Any:
+        message = self._classes[name]()
+        if hasattr(message, "header"):
+            message.header.stamp = self.node.get_clock().now().to_msg()
+        return self.form.fill(message, speed_mps, yaw_rate_radps)
+
+    def _say(self, who: str) -> None:
+        """Who drives, once, for those who come later too."""
+        if not self.shadow and who != self._said:
+            message = self._classes["behaviour"]()
+            message.data = self._said = who
+            self._published["behaviour"].publish(message)
+
+    def _own(self) -> str:
+        assert self.pilot is not None
+        return json.dumps({"policy": "restock", "version": self.pilot.policy.version})
+
+    def _report(self) -> None:
+        """Counts of decisions, stops and why, interventions, to /diagnostics."""
+        if self.pilot is None:
+            return
+        pilot, message = self.pilot, self._classes["diagnostics"]()
+        kind = self._class("diagnostic_msgs/msg/DiagnosticStatus")
+        pair = self._class("diagnostic_msgs/msg/KeyValue")
+        stalled = self.active and time.monotonic() - self._decided_s > self.watchdog_s
+        status = kind()
+        status.name, status.hardware_id = f"{NAME}: policy", pilot.policy.version
+        status.level = kind.ERROR if stalled else kind.WARN if pilot.reason else kind.OK
+        mode = "shadow" if self.shadow else "drives"
+        status.message = (
+            "stalled" if stalled else pilot.reason or (mode if self.active else "ready")
+        )
+        counts = {**pilot.counts, **{f"unreadable: {k}": n for k, n in pilot.unreadable.items()}}
+        counts |= {f"off the clock: {k}": n for k, n in pilot.observer.left_out.items()}
+        for name, count in counts.items():
+            entry = pair()
+            entry.key, entry.value = name, str(int(count))
+            status.values.append(entry)
+        message.header.stamp = self.node.get_clock().now().to_msg()
+        message.status.append(status)
+        self._reports.publish(message)
+
+    # -- parameters -----------------------------------------------------------------------------
+
+    def _class(self, kind: str) -> Any:
+        """The class of a message type.
+
+        Raises:
+            ConfigError: it is not installed.
+        """
+        try:
+            return self.ros.get_message(kind)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise ConfigError(
+                f"message type {kind} cannot be imported: {error}",
+                where="the node",
+                remedy="install and source the package that defines it",
+            ) from error
+
+    def _parameter(self, name: str, default: Any) -> None:
+        if not self.node.has_parameter(name):
+            self.node.declare_parameter(name, default)
+
+    def _value(self, name: str) -> Any:
+        return self.node.get_parameter(name).value
+
+    def _limits(self, policy: PolicyFile) -> Limits | None:
+        """The limiter by the profile and the parameters `limiter_…`; below 0: not given."""
+        profile = policy.profile
+        given = {}
+        for name in Limiter.__struct_fields__:
+            value = None if profile.limiter is None else getattr(profile.limiter, name)
+            self._parameter(f"limiter_{name}", -1.0 if value is None else float(value))
+            asked = float(self._value(f"limiter_{name}"))
+            if asked > 0 or (asked == 0 and name == "stop_m"):
+                given[name] = asked
+        if not self._value("limiter"):
+            return None
+        try:
+            return Limits.of(profile.task, profile.robot, msgspec.convert(given, Limiter))
+        except (ValueError, msgspec.ValidationError) as error:
+            raise ConfigError(str(error), where="limiter_…") from error
+
+    def _now_ns(self) -> int:
+        return int(self.node.get_clock().now().nanoseconds)
+
+    def _log(self, text: str) -> None:
+        self.node.get_logger().info(text)
+
+
+def lifecycle_node(ros: Ros, policy: Path, *, drive: bool = False) -> Any:
+    """The node, unconfigured. Its transitions return SUCCESS, or FAILURE where it cannot be
+    configured, which leaves it unconfigured and says why."""
+    returned = ros.TransitionCallbackReturn
+
+    class Node(ros.LifecycleNode):  # type: ignore[misc, name-defined]
+        def __init__(self) -> None:
+            super().__init__(NAME)
+            self.policy = PolicyNode(ros, self, policy, drive=drive)
+
+        def on_configure(self, state: Any) -> Any:
+            try:
+                self.policy.configure()
+            except Exception as error:  # noqa: BLE001  (rclpy would say nothing of it)
+                self.get_logger().error(f"cannot be configured: {error}")
+                self.policy.cleanup()
+                return returned.FAILURE
+            return super().on_configure(state)
+
+        def on_activate(self, state: Any) -> Any:
+            enabled = super().on_activate(state)  # the publishers first
+            if enabled == returned.SUCCESS:
+                self.policy.activate()
+            return enabled
+
+        def on_deactivate(self, state: Any) -> Any:
+            self.policy.deactivate()  # a stop, while the publishers still publish
+            return super().on_deactivate(state)
+
+        def on_cleanup(self, state: Any) -> Any:
+            return self._end(super().on_cleanup, state)
+
+        def on_shutdown(self, state: Any) -> Any:
+            return self._end(super().on_shutdown, state)
+
+        def on_error(self, state: Any) -> Any:
+            return self._end(super().on_error, state)
+
+        def _end(self, call: Callable[[Any], Any], state: Any) -> Any:
+            self.policy.deactivate()
+            ended = call(state)
+            self.policy.cleanup()
+            return ended
+
+    return Node()
+
+
+def run_node(ros: Ros, policy: Path, *, drive: bool = False, activate: bool = False) -> int:
+    """Spin the node until it is interrupted; it stops the robot before it goes. Returns 0."""
+    import signal
+
+    # rclpy's own handlers would end the context before a last stop could be published.
+    ros.rclpy.init(signal_handler_options=ros.SignalHandlerOptions.NO)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    node = lifecycle_node(ros, policy, drive=drive)
+    executor = ros.MultiThreadedExecutor(num_threads=2)  # the watchdog has its own
+    executor.add_node(node)
+    try:
+        if activate:
+            done = node.trigger_configure()
+            if done != ros.TransitionCallbackReturn.SUCCESS:
+                raise ConfigError("could not be configured: see its log", where=str(policy))
+            node.trigger_activate()
+        executor.spin()
+    except KeyboardInterrupt:
+        node.get_logger().info("interrupted: stopping")
+    finally:
+        node.trigger_shutdown()
+        executor.shutdown()
+        node.destroy_node()
+        ros.rclpy.try_shutdown()
+    return 0
+
+
+__all__ = ["PolicyNode", "lifecycle_node", "run_node"]

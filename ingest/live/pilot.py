@@ -1,0 +1,180 @@
+"""What a policy would drive, message by message: observation, proposal, limiter, and who has taken
+over. It knows no ROS: the node, a played recording and the tests all drive by it.
+
+What cannot be acted on is a stop, with its reason: an input that is silent, stale or unreadable, a
+clock that went back, a scan in which no beam says anything.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from restock.errors import ConfigError, RestockError
+from restock.ingest.live.observer import LiveObserver, Observed, value_of
+from restock.ingest.live.policy_file import PolicyFile
+from restock.ingest.profile.profile import Input
+from restock.ingest.steps.align import NS
+from restock.ingest.task.limiter import NONE, RULES, UNKNOWN, Limits, limit
+
+OPERATORS = ("operator", "teleop", "joystick")  # sources of commands that are people
+BOOL = "std_msgs/msg/Bool"
+ACTIVE_S = 0.5  # after the last message of a person's commands
+_WRONG = (AttributeError, IndexError, TypeError, ValueError)  # of a message of another type
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What the policy would do at a tick."""
+
+    observed: Observed
+    action: int | None  # that it proposes; None: nothing could be decided
+    proposal: tuple[float, float]  # speed m/s, yaw rate rad/s; stop where there is none
+    command: tuple[float, float]  # what of it may be driven
+    rule: int  # of `restock.ingest.task.limiter.RULES`
+    reason: str  # why it is a stop, or ""
+    taken_over: bool  # a person drives: it is not to be published
+
+
+class Pilot:
+    """Takes messages as they are received, and decides when it is asked.
+
+    Args:
+        policy: with its profile.
+        limits: of the limiter; None: no limiter, but what is not known is still a stop.
+        takeover_topic: a Bool that is true while a person drives; "": none. The profile's
+            `command_sources` of OPERATORS count as well: a button that is pressed, or commands of
+            the last ACTIVE_S.
+
+    Raises:
+        ConfigError: the profile cannot be observed live.
+    """
+
+    def __init__(self, policy: PolicyFile, limits: Limits | None, takeover_topic: str = "") -> None:
+        self.policy, self.limits, self.profile = policy, limits, policy.profile
+        self.observer = LiveObserver(self.profile)
+        self._people = [
+            source for name, source in self.profile.command_sources.items() if name in OPERATORS
+        ]
+        if takeover_topic:
+            if takeover_topic in self.observer.topics:
+                raise ConfigError(
+                    f"{takeover_topic} is an input of profile {self.profile.name!r}",
+                    where="takeover_topic",
+                    remedy="name the topic of a std_msgs/Bool, or none",
+                )
+            self._people.append(Input(takeover_topic, BOOL, {"pressed": "data"}))
+        self._active_ns: dict[str, int | None] = {}  # a person's topic -> when it last said so
+        self._now_ns: int | None = None
+        self._blind = False
+        self.counts: Counter[str] = Counter()  # decisions, and each kind of stop and intervention
+        self.unreadable: Counter[str] = Counter()  # messages of another type, by topic
+        self._was_taken = False
+        self.reason = "nothing decided yet"  # why the last decision was a stop, or ""
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """What to subscribe to: topic -> message type."""
+        return {source.topic: source.type for source in self._people} | self.observer.topics
+
+    @property
+    def latched(self) -> set[str]:
+        """Those whose last message counts however old it is, such as goals, plans and maps."""
+        inputs = [source for _, source in self.profile.inputs.items()]
+        aging = {source.topic for source in inputs if source.max_age_s is not None}
+        return {source.topic for source in inputs} & self.observer.topics.keys() - aging
+
+    def receive(self, topic: str, message: Any, now_ns: int) -> None:
+        """Take a message of one of `topics`; one of another type is counted and left out."""
+        try:
+            for source in self._people:
+                if source.topic == topic:
+                    self._hear(source, message, now_ns)
+            if topic in self.observer.topics:
+                self.observer.receive(topic, message, now_ns)
+                self._look(topic, message)
+        except _WRONG:
+            self.unreadable[topic] += 1
+
+    def _hear(self, source: Input, message: Any, now_ns: int) -> None:
+        path = source.fields.get("pressed")
+        drives = path is None or bool(value_of(message, path))
+        self._active_ns[source.topic] = now_ns if drives else None
+
+    def _look(self, topic: str, message: Any) -> None:
+        """A scan that says nothing at all is no free floor, whatever a log makes of it."""
+        scan = self.profile.inputs.scan
+        if scan is not None and topic == scan.topic:
+            ranges = np.asarray(value_of(message, scan.fields["ranges_m"]), np.float64)
+            self._blind = not (ranges >= self.profile.task.range_min_m).any()  # False for NaN
+
+    def taken_over(self, now_ns: int) -> bool:
+        """Whether a person drives."""
+        for source in self._people:
+            at_ns = self._active_ns.get(source.topic)
+            held = source.max_age_s
+            if held is None and "pressed" not in source.fields:
+                held = ACTIVE_S
+            if at_ns is not None and (held is None or now_ns - at_ns <= held * NS):
+                return True
+        return False
+
+    def decide(self, now_ns: int) -> Decision:
+        """What to do at a tick, by the clock that messages were received by."""
+        observed, reason = self._observe(now_ns)
+        action, proposal = None, (0.0, 0.0)
+        if not reason:
+            action = self.policy.act(observed.observation)
+            speed, turn = self.profile.task.actions[action]
+            proposal = float(speed), float(turn)
+        command, rule = self._limit(observed, proposal, unknown=bool(reason))
+        taken = self.taken_over(now_ns)
+        self.counts["decisions"] += 1
+        self.counts["taken over"] += taken
+        self.counts["takeovers"] += taken and not self._was_taken
+        if reason:
+            self.counts[f"stop: {reason}"] += 1
+        elif rule != NONE:
+            self.counts[f"limited: {RULES[rule]}"] += 1
+        self._was_taken, self.reason = taken, reason
+        return Decision(observed, action, proposal, command, rule, reason, taken)
+
+    def _observe(self, now_ns: int) -> tuple[Observed, str]:
+        before, self._now_ns = self._now_ns, now_ns
+        if before is not None and now_ns < before:
+            self.observer.reset()
+            self._active_ns.clear()
+            return self.observer.observe(now_ns), "clock: went back"
+        try:
+            observed = self.observer.observe(now_ns)
+        except (RestockError, *_WRONG) as error:
+            self.observer.reset()
+            unreadable = f"unreadable: {str(error).splitlines()[0]}"
+            return self.observer.observe(now_ns), unreadable
+        if not observed.problem and self._blind:
+            return observed, "scan: no beam says anything"
+        return observed, observed.problem
+
+    def _limit(
+        self, observed: Observed, proposal: tuple[float, float], *, unknown: bool
+    ) -> tuple[tuple[float, float], int]:
+        if unknown:
+            return (0.0, 0.0), UNKNOWN
+        if self.limits is None:
+            return proposal, NONE
+        signals = observed.signals
+        before = [signals["command_speed_mps"], signals["command_yaw_rate_radps"]]
+        limited = limit(
+            self.limits,
+            np.array([proposal]),
+            signals["sector_clearance_m"],
+            np.stack(before, axis=-1),
+        )
+        speed, turn = limited.command[0].tolist()
+        return (speed, turn), int(limited.rule[0])
+
+
+__all__ = ["OPERATORS", "Decision", "Pilot"]

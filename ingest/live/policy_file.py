@@ -1,0 +1,113 @@
+"""An exported policy as a robot uses it: the network, and all that its metadata says of the task.
+
+`restock export RUN --to onnx` writes it. What the robot needs stands in it: the profile as TOML,
+which says what to subscribe to and what observation, actions and limits are. No PyTorch is needed.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from restock.arrays import F32
+from restock.errors import ConfigError
+from restock.ingest.profile.profile import Profile, load_profile
+from restock.ingest.profile.profile_text import read_profile_toml
+
+FORMAT = "restock-policy/1"
+
+
+class PolicyFile:
+    """A policy and its profile.
+
+    Raises:
+        ConfigError: no such file, not a policy of Restock, one whose profile cannot be read, is not
+            at hand or is of another task; or the extra `onnx` is not installed.
+    """
+
+    def __init__(self, path: Path, profile: Path | str | None = None) -> None:
+        """`profile` is a file or a name in place of the profile that the policy carries."""
+        self.path = path
+        self._session = open_session(path)
+        metadata = self._session.get_modelmeta().custom_metadata_map
+        if metadata.get("format") != FORMAT:
+            raise ConfigError(
+                "is an ONNX model, but says nothing of a task: it was not exported by Restock",
+                where=str(path),
+                remedy="restock export RUN --to onnx --out policy.onnx",
+            )
+        self.version = f"{metadata.get('run', '')} {metadata.get('version', '')}".strip()
+        self.profile = _profile(metadata, path, profile)
+        task, (taken, *more) = self.profile.task, self._session.get_inputs()
+        if task.hash != metadata.get("task_hash"):
+            raise ConfigError(
+                f"was made for task {metadata.get('task_hash')}, profile {self.profile.name!r}"
+                f" defines {task.hash}",
+                where=str(path),
+                remedy="export it again from a run of this task, with this Restock",
+            )
+        if more or taken.shape[-1] != task.observation_size:
+            raise ConfigError(
+                f"takes {[each.shape for each in (taken, *more)]}, the observation is"
+                f" (N, {task.observation_size})",
+                where=str(path),
+            )
+        self._input = taken.name
+
+    def act(self, observation: F32) -> int:
+        """The best action for one observation (D,).
+
+        Raises:
+            ConfigError: the network's output is none of the task's actions.
+        """
+        (output,) = self._session.run(["action"], {self._input: observation[None]})
+        action = int(np.asarray(output).reshape(-1)[0])
+        if not 0 <= action < len(self.profile.task.actions):
+            raise ConfigError(f"chose action {action}, which there is not", where=str(self.path))
+        return action
+
+
+def open_session(path: Path) -> Any:
+    """The ONNX runtime's session of a file, on one thread.
+
+    Raises:
+        ConfigError: no such file, no ONNX model, or the runtime is not installed.
+    """
+    try:
+        runtime = import_module("onnxruntime")
+    except ImportError as error:
+        raise ConfigError(
+            "needs onnxruntime, which is not installed", remedy="pip install 'restock[onnx]'"
+        ) from error
+    if not path.is_file():
+        raise ConfigError("no such file", where=str(path), remedy="restock export RUN --to onnx")
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = 1  # a small network: handing it out costs more
+    options.log_severity_level = 4
+    try:
+        return runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:
+        raise ConfigError(
+            f"is not an ONNX model: {str(error).splitlines()[0]}", where=str(path)
+        ) from error
+
+
+def _profile(metadata: dict[str, str], path: Path, given: Path | str | None) -> Profile:
+    if given is not None:
+        return load_profile(given)
+    if text := metadata.get("profile_toml"):
+        return read_profile_toml(text, where=f"{path}: profile_toml")
+    try:
+        return load_profile(metadata.get("profile", ""))
+    except ConfigError as error:
+        raise ConfigError(
+            f"carries no profile, and none named {metadata.get('profile', '')!r} is at hand",
+            where=str(path),
+            remedy="export it again with this Restock, or give its profile's file",
+        ) from error
+
+
+__all__ = ["FORMAT", "PolicyFile", "open_session"]

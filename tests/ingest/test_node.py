@@ -1,0 +1,289 @@
+"""The ROS 2 node on a stub of rclpy (`support.ros_graph`): it drives the twin to its goal, stops
+for what it cannot rely on, keeps silent in shadow and while a person drives, and what it publishes
+ingests.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.ros_graph import Graph, Returned, message_class
+from support.twin_robot import TwinRobot, follower_onnx
+
+from restock.cli import main
+from restock.ingest.live.node import lifecycle_node
+from restock.ingest.live.node_topics import ACTION, LIMITER, SHADOW, TAKEOVER, with_node_topics
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.profile.profile_text import profile_toml
+from restock.replay.store.store import Store
+from restock.train.twin.physics.episode import EpisodeSpec
+
+PROFILE = load_profile("warehouse_amr")
+SPEC = EpisodeSpec("nominal", 20_003)
+COMMAND = "/cmd_vel"
+
+pytest.importorskip("onnxruntime")
+pytest.importorskip("onnx")
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return follower_onnx(tmp_path_factory.mktemp("policy") / "p.onnx", PROFILE)
+
+
+def started(policy: Path, *, drive: bool = True, **parameters: Any) -> tuple[Graph, Any]:
+    graph = Graph(parameters=parameters)
+    node = lifecycle_node(graph.ros(), policy, drive=drive)
+    assert node.trigger_configure() is Returned.SUCCESS, graph.logged
+    return graph, node
+
+
+def driven(robot: TwinRobot, each: Callable[[int], None] | None = None, steps: int = 240) -> int:
+    """Steps until the episode ended; `each` is called before each decision."""
+    for step in range(steps):
+        robot.sense()
+        if each is not None:
+            each(step)
+        robot.graph.fire()
+        if robot.drive():
+            return step + 1
+    return steps
+
+
+def speeds(graph: Graph, topic: str = COMMAND) -> list[tuple[float, float]]:
+    return [(message.linear.x, message.angular.z) for message in graph.of(topic)]
+
+
+def test_it_drives_the_twin_to_its_goal_and_sees_what_the_twin_does(policy: Path) -> None:
+    graph, node = started(policy)
+    assert node.trigger_activate() is Returned.SUCCESS
+    robot, seen = TwinRobot(graph, SPEC), []
+
+    def look(_: int) -> None:
+        seen.append(robot.env.observation[0])
+
+    pilot, live = node.policy.pilot, []
+    decide = pilot.decide
+    pilot.decide = lambda now_ns: live.append(decide(now_ns)) or live[-1]
+    steps = driven(robot, look)
+    assert bool(robot.info["success"][0])
+    assert len(live) == steps == len(graph.of(COMMAND))
+    assert not [one.reason for one in live if one.reason]
+    observed = np.stack([one.observed.observation for one in live])
+    np.testing.assert_allclose(observed, np.stack(seen), atol=2e-4)
+    assert speeds(graph) == [one.command for one in live]
+    who = json.loads(graph.of("/behaviour_policy")[0].data)
+    assert who == {"policy": "restock", "version": "follower 1"}
+    graph.fire(steady=True)
+    said = graph.of("/diagnostics")[-1].status[0]
+    assert {entry.key: entry.value for entry in said.values}["decisions"] == str(steps)
+
+
+def test_its_transitions_command_only_when_active_and_stop_when_they_end(policy: Path) -> None:
+    graph, node = started(policy)
+    robot = TwinRobot(graph, SPEC)
+    driven(robot, steps=3)
+    assert not graph.of(COMMAND)  # inactive
+    node.trigger_activate()
+    driven(robot, steps=8)
+    assert speeds(graph)[-1][0] > 0
+    assert node.trigger_deactivate() is Returned.SUCCESS
+    assert speeds(graph)[-1] == (0.0, 0.0)
+    assert graph.of("/behaviour_policy")[-1].data == PROFILE.behaviour_policy
+    count = len(graph.of(COMMAND))
+    driven(robot, steps=2)
+    graph.fire(steady=True)
+    assert len(graph.of(COMMAND)) == count
+    # Once more, and from active straight to the end.
+    node.trigger_activate()
+    driven(robot, steps=4)
+    assert node.trigger_shutdown() is Returned.SUCCESS
+    assert speeds(graph)[-1] == (0.0, 0.0)
+    assert not graph.timers
+    assert not any(topic != COMMAND and heard for topic, heard in graph.heard.items())
+
+
+def test_it_can_be_configured_again_after_a_cleanup(policy: Path) -> None:
+    graph, node = started(policy)
+    assert node.trigger_cleanup() is Returned.SUCCESS
+    assert not graph.timers
+    assert node.trigger_configure() is Returned.SUCCESS
+    assert node.trigger_activate() is Returned.SUCCESS
+    assert len(graph.timers) == 3
+
+
+def test_silence_stale_inputs_and_a_stalled_timer_are_stops(
+    policy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    graph, node = started(policy)
+    node.trigger_activate()
+    graph.fire()
+    assert speeds(graph) == [(0.0, 0.0)]
+    assert "nothing received yet" in node.policy.pilot.reason
+    robot = TwinRobot(graph, SPEC)
+    driven(robot, steps=8)
+    assert speeds(graph)[-1][0] > 0
+    graph.now_ns += 2 * 10**9  # nothing comes any more
+    graph.fire()
+    assert speeds(graph)[-1] == (0.0, 0.0)
+    assert "stale" in node.policy.pilot.reason
+    driven(robot, steps=3)
+    count, later = len(graph.of(COMMAND)), time.monotonic() + 10
+    monkeypatch.setattr(time, "monotonic", lambda: later)
+    graph.fire(steady=True)
+    assert len(graph.of(COMMAND)) == count + 1
+    assert speeds(graph)[-1] == (0.0, 0.0)
+    assert node.policy.pilot.counts["stop: watchdog"] == 1
+    assert graph.of("/diagnostics")[-1].status[0].message == "stalled"
+
+
+def test_what_is_hostile_is_a_stop_and_counted(policy: Path) -> None:
+    graph, node = started(policy)
+    node.trigger_activate()
+    robot = TwinRobot(graph, SPEC)
+    driven(robot, steps=8)
+    pilot, beams = node.policy.pilot, len(robot.env.simulation.bearings_rad)
+    for nothing in (np.nan, 0.0):
+        robot.sense(ranges=np.full(beams, nothing, np.float32))
+        graph.fire()
+        assert speeds(graph)[-1] == (0.0, 0.0)
+        assert pilot.reason == "scan: no beam says anything"
+        robot.drive()
+    # Another type on a topic: left out.
+    graph.send("/odom", message_class("std_msgs/msg/Bool")())
+    assert pilot.unreadable == {"/odom": 1}
+    # The clock is set back: nothing of before counts.
+    graph.now_ns -= 10**12
+    graph.fire()
+    assert pilot.reason == "clock: went back"
+    graph.fire()
+    assert "nothing received yet" in pilot.reason
+    assert speeds(graph)[-1] == (0.0, 0.0)
+    assert all(np.isfinite(pair).all() for pair in speeds(graph))
+
+
+def test_a_policy_that_does_not_fit_leaves_it_unconfigured_and_says_why(
+    policy: Path, tmp_path: Path
+) -> None:
+    other = tmp_path / "turtlebot3.toml"
+    other.write_text(profile_toml(load_profile("turtlebot3")), encoding="utf-8")
+    for parameters, why in (
+        ({"profile": str(other)}, "was made for task"),
+        ({"policy": str(tmp_path / "none.onnx")}, "no such file"),
+        ({"cmd_vel_type": "std_msgs/msg/Bool"}, "neither the profile's command nor a twist"),
+        ({"watchdog_s": 0.0}, "must be within 0 and 60 s"),
+        ({"takeover_topic": "/scan"}, "is an input of profile"),
+        ({"limiter_stop_m": 99.0}, "stop_m"),
+        ({"limiter_stop_m": 1}, "not <class 'float'>"),
+    ):
+        graph = Graph(parameters=parameters)
+        node = lifecycle_node(graph.ros(), policy)
+        assert node.trigger_configure() is Returned.FAILURE
+        assert node.state == "unconfigured"
+        assert why in graph.logged[-1]
+        assert not graph.timers
+
+
+def test_parameters_choose_the_command_and_its_limits(policy: Path) -> None:
+    graph, node = started(
+        policy,
+        cmd_vel_topic="/cmd_vel_policy",
+        cmd_vel_type="geometry_msgs/msg/TwistStamped",
+        limiter_max_speed_mps=0.3,
+    )
+    node.trigger_activate()
+    robot = TwinRobot(graph, SPEC)
+    driven(robot, steps=6)  # what drives is not on /cmd_vel: the robot stands
+    sent = graph.of("/cmd_vel_policy")
+    assert max(message.twist.linear.x for message in sent) == pytest.approx(0.3)
+    assert sent[-1].header.stamp.sec > 0
+    assert {message.data for message in graph.of(LIMITER)} & {1}
+
+
+def test_in_shadow_it_commands_nothing_and_its_log_is_compared_in_sql(
+    policy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    graph, node = started(policy, drive=False)
+    node.trigger_activate()
+    robot, twist = TwinRobot(graph, SPEC), message_class("geometry_msgs/msg/Twist")
+
+    def planner_drives(step: int) -> None:
+        """As navigation proposes, but for a stop now and then."""
+        command = twist()
+        proposed = graph.of("/cmd_vel_nav")[-1]
+        if step % 5:
+            command.linear.x, command.angular.z = proposed.linear.x, proposed.angular.z
+        drives.append(command)
+
+    drives: list[Any] = []
+    steps = 0
+    while steps < 40:
+        robot.sense()
+        planner_drives(steps)
+        graph.fire()
+        graph.send(COMMAND, drives[-1])
+        robot.drive()
+        steps += 1
+    assert len(graph.of(COMMAND)) == steps  # all of them the planner's
+    assert len(graph.of(SHADOW)) == len(graph.of(ACTION)) == steps
+    assert not graph.of("/behaviour_policy")
+    profile = tmp_path / "with_node.toml"
+    assert main(["node", str(policy), "--write-profile", str(profile)]) == 0
+    bag = graph.write(tmp_path / "bag")
+    line = ["ingest", str(bag), "--profile", str(profile), "--store", str(tmp_path / "store")]
+    assert main(line) == 0
+    with Store(tmp_path / "store") as store:
+        rows, agreement, limited, policies = store.sql(
+            "SELECT count(*), avg((shadow_action = action)::INT),"
+            " count(*) FILTER (list_contains(exposures, 'limited') != (limiter_rule > 0)),"
+            " list(DISTINCT behaviour_policy) FROM transitions WHERE shadow_action IS NOT NULL"
+        ).fetchall()[0]
+    assert rows > 30
+    assert agreement == pytest.approx(0.8, abs=0.06)
+    assert limited == 0
+    assert policies == [PROFILE.behaviour_policy]
+
+
+def test_a_takeover_silences_it_and_its_rows_are_the_operators(
+    policy: Path, tmp_path: Path
+) -> None:
+    graph, node = started(policy)
+    node.trigger_activate()
+    robot = TwinRobot(graph, SPEC)
+    button, twist = message_class("std_msgs/msg/Bool"), message_class("geometry_msgs/msg/Twist")
+    by_hand = range(10, 20)
+    for step in range(30):
+        robot.sense()
+        pressed = button()
+        pressed.data = step in by_hand
+        graph.send(TAKEOVER, pressed)
+        before = len(graph.of(COMMAND))
+        graph.fire()
+        assert len(graph.of(COMMAND)) == before + (step not in by_hand)
+        if step in by_hand:
+            command = twist()
+            command.linear.x = -0.4 if step < 15 else 0.4
+            graph.send(COMMAND, command)
+        robot.drive()
+    counts = node.policy.pilot.counts
+    assert (counts["takeovers"], counts["taken over"]) == (1, len(by_hand))
+    assert [message.data for message in graph.of("/behaviour_policy")][1] == "operator"
+    profile = tmp_path / "with_node.toml"
+    profile.write_text(profile_toml(with_node_topics(PROFILE)), encoding="utf-8")
+    rows = {}
+    for name, left_out in (("told", ()), ("by the button", ("/behaviour_policy",))):
+        some = Graph(sent=[one for one in graph.sent if one[1] not in left_out])
+        bag, at = some.write(tmp_path / name), tmp_path / f"{name} store"
+        assert main(["ingest", str(bag), "--profile", str(profile), "--store", str(at)]) == 0
+        with Store(at) as store:
+            rows[name] = store.sql(
+                "SELECT behaviour_policy, count(*) FROM transitions GROUP BY 1 ORDER BY 1"
+            ).fetchall()
+    assert rows["told"] == [("operator", 10), ("restock", 19)]
+    assert dict(rows["by the button"])["operator"] == 10
