@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from restock.errors import ConfigError
 from restock.ingest.profile.custom_signal import CustomSignal, name_problem
+from restock.ingest.profile.robot_file import with_robot_file
 from restock.ingest.profile.tag_rules import TagRules
 from restock.ingest.task.condition_files import with_files
 from restock.ingest.task.conditions import (
@@ -362,7 +363,7 @@ def parse_profile(text: str, *, where: str, folder: Path | None = None) -> Profi
 
 
 def _typed(document: dict[str, Any], *, where: str, folder: Path | None) -> Profile:
-    document = with_files(document, folder, where)
+    document = with_robot_file(with_files(document, folder, where), folder, where)
     signals = document.get("signals")
     # Each by itself first: msgspec's paths leave out the keys of a table of tables.
     for name, table in signals.items() if isinstance(signals, dict) else ():

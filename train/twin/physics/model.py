@@ -18,6 +18,13 @@ import numpy as np
 
 from restock.arrays import F64
 from restock.train.twin.floors.layout import Warehouse
+from restock.train.twin.physics.own_model import (
+    actuators,
+    attach_own,
+    steering_joints,
+    wheel_geom,
+    wheel_joints,
+)
 from restock.train.twin.physics.robot_model import RobotModel
 
 FLOOR_FRICTION = 0.8
@@ -53,6 +60,7 @@ class Handles:
     wheel_qpos: tuple[int, ...]  # the angle of each in qpos, and its speed in qvel
     wheel_qvel: tuple[int, ...]
     steering_qpos: tuple[int, ...]  # of the front wheels that steer, left and right
+    actuators: tuple[int, ...]  # in ctrl, of the wheels that are driven, and what steers
     building: slice  # the geoms of racks and walls
     pallets: slice  # of the mocap bodies
     people: slice
@@ -74,7 +82,9 @@ def build_model(
     _add_robot(spec, robot)
     _add_mocap(spec)
     model = spec.compile()
-    return model, _handles(model)
+    if robot.mjcf is not None:
+        _grip(model, robot)
+    return model, _handles(model, robot)
 
 
 def build_robot_alone(robot: RobotModel, timestep_s: float = 0.01) -> mujoco.MjModel:
@@ -84,7 +94,10 @@ def build_robot_alone(robot: RobotModel, timestep_s: float = 0.01) -> mujoco.MjM
         type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], friction=FLOOR, **_mask(_FLOOR)
     )
     _add_robot(spec, robot)
-    return spec.compile()
+    model = spec.compile()
+    if robot.mjcf is not None:
+        _grip(model, robot)
+    return model
 
 
 def _spec(timestep_s: float) -> Any:
@@ -150,7 +163,53 @@ def _add_building(spec: Any, warehouse: Warehouse, rack_slots: int) -> None:
         )
 
 
+def _add_own(spec: Any, robot: RobotModel) -> None:
+    """A model of its own, with the outline, the sensors and the grip that every robot has."""
+    base = attach_own(spec, robot)
+    base.add_geom(
+        name="chassis",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=[-robot.axle_x_m, 0, robot.chassis_z_m - base.pos[2]],
+        size=[robot.length_m / 2, robot.width_m / 2, robot.chassis_height_m / 2],
+        mass=0,
+        group=DRAWN_GROUP + 1,
+        **_mask(_CHASSIS),
+    )
+    base.add_site(name="imu", pos=[0, 0, 0])
+    _add_sensors(spec)
+
+
+def _grip(model: mujoco.MjModel, robot: RobotModel) -> None:
+    """The floor's friction under the wheels, which is theirs to say, as of built ones."""
+    for geom in _own_wheels(model, robot)[1]:
+        model.geom_priority[geom] = 3
+        model.geom_friction[geom] = FLOOR
+
+
+def _own_wheels(model: mujoco.MjModel, robot: RobotModel) -> tuple[list[int], list[int], list[int]]:
+    """Bodies, geoms and joints of the wheels of a model of its own."""
+    joints = wheel_joints(model, robot)
+    bodies = [int(model.jnt_bodyid[joint]) for joint in joints]
+    geoms = [geom for body in bodies if (geom := wheel_geom(model, body)) is not None]
+    return bodies, geoms, joints
+
+
+def wheel_geoms(model: mujoco.MjModel, robot: RobotModel) -> list[int]:
+    """The geoms of the wheels that touch the floor."""
+    if robot.mjcf is not None:
+        return _own_wheels(model, robot)[1]
+    return [model.geom(f"{name}_wheel").id for name in _wheel_names(robot)]
+
+
+def actuator_places(model: mujoco.MjModel, robot: RobotModel) -> tuple[int, ...]:
+    """Where in ctrl what drives and steers is."""
+    return tuple(range(model.nu)) if robot.mjcf is None else tuple(actuators(model, robot))
+
+
 def _add_robot(spec: Any, robot: RobotModel) -> None:
+    if robot.mjcf is not None:
+        _add_own(spec, robot)
+        return
     axle_z = robot.contact_radius_m
     chassis = spec.worldbody.add_body(name="chassis", pos=[1, 1, axle_z])
     chassis.add_freejoint()
@@ -240,6 +299,10 @@ def _add_robot(spec: Any, robot: RobotModel) -> None:
         motor.set_to_velocity(kv=robot.motor_kv)
     if robot.steers:
         _add_steering_motors(spec, robot)
+    _add_sensors(spec)
+
+
+def _add_sensors(spec: Any) -> None:
     spec.add_sensor(
         name="accelerometer",
         type=mujoco.mjtSensor.mjSENS_ACCELEROMETER,
@@ -306,28 +369,30 @@ def _mask(bits: tuple[int, int]) -> dict[str, int]:
     return {"contype": bits[0], "conaffinity": bits[1]}
 
 
-def _handles(model: mujoco.MjModel) -> Handles:
+def _handles(model: mujoco.MjModel, robot: RobotModel) -> Handles:
     def mocap(kind: str, count: int) -> slice:
         first = int(model.body(f"{kind}_0").mocapid[0])
         return slice(first, first + count)
 
-    wheels = [
-        name for index in range(model.nbody) if (name := model.body(index).name).endswith("_wheel")
-    ]
+    if robot.mjcf is None:
+        wheels = [f"{name}_wheel" for name in _wheel_names(robot)]
+        bodies = [model.body(name).id for name in wheels]
+        geoms = wheel_geoms(model, robot)
+        joints = [model.joint(f"{name}_joint").id for name in wheels]
+        sides = ("left", "right") if robot.steers else ()
+        steering = [model.joint(f"front_{side}_steering").id for side in sides]
+    else:
+        bodies, geoms, joints = _own_wheels(model, robot)
+        steering = steering_joints(model) if robot.steers else []
     accelerometer = int(model.sensor("accelerometer").adr[0])
-    joints = [model.joint(f"{name}_joint") for name in wheels]
-    steering = [
-        joint
-        for index in range(model.njnt)
-        if (joint := model.joint(index)).name.endswith("_steering")
-    ]
     return Handles(
-        chassis_body=model.body("chassis").id,
-        wheel_bodies=tuple(model.body(name).id for name in wheels),
-        wheel_geoms=tuple(model.geom(name).id for name in wheels),
-        wheel_qpos=tuple(int(joint.qposadr[0]) for joint in joints),
-        wheel_qvel=tuple(int(joint.dofadr[0]) for joint in joints),
-        steering_qpos=tuple(int(joint.qposadr[0]) for joint in steering),
+        chassis_body=int(model.geom_bodyid[model.geom("chassis").id]),
+        wheel_bodies=tuple(bodies),
+        wheel_geoms=tuple(geoms),
+        wheel_qpos=tuple(int(model.jnt_qposadr[joint]) for joint in joints),
+        wheel_qvel=tuple(int(model.jnt_dofadr[joint]) for joint in joints),
+        steering_qpos=tuple(int(model.jnt_qposadr[joint]) for joint in steering),
+        actuators=actuator_places(model, robot),
         building=slice(model.geom("floor").id + 1, model.geom("wall_north").id + 1),
         pallets=mocap("pallet", PALLETS),
         people=mocap("person", PEOPLE),

@@ -200,7 +200,7 @@ class RobotBody:
             for body, y in wheels:
                 place[env, body, 1] = y * perturbation.track_scale
                 # So that the casters keep their share of the load.
-                place[env, body, 2] = radius - nominal
+                place[env, body, 2] = self.model.body_pos[body, 2] + radius - nominal
         if self._masses or self._radii:
             self.batch.set_const(np.array([env]))
 

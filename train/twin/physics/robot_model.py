@@ -78,6 +78,7 @@ class RobotModel:
     drive: Drive = "differential"
     max_steering_rad: float = 0.0
     steering_rate_radps: float = 0.0
+    mjcf: str | None = None  # a model of its own, in the place of the built one
 
     @property
     def wheels_m(self) -> F64:

@@ -8,7 +8,9 @@ robot drives the speed that it is commanded, and its odometry says what it drive
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -17,7 +19,13 @@ from restock.arrays import F64
 from restock.errors import ConfigError
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.scan import Body
-from restock.train.twin.physics.model import build_robot_alone
+from restock.train.twin.physics.model import (
+    FLOOR_FRICTION,
+    actuator_places,
+    build_robot_alone,
+    wheel_geoms,
+)
+from restock.train.twin.physics.own_model import own_model
 from restock.train.twin.physics.robot_model import RobotModel, design, stand_in
 
 TIMESTEP_S = 0.01
@@ -52,12 +60,15 @@ class _Key:
 
 @functools.lru_cache(maxsize=32)
 def _tried(key: _Key) -> RobotModel:
-    robot = _settled(design(key.robot, key.body))
+    built = design(key.robot, key.body)
+    own = key.robot.mjcf is not None
+    robot = _settled(own_model(key.robot, key.body, built) if own else built)
     speed = min(TRY_SPEED, robot.speed_limit[0] / 2)
     ahead, _ = _driven(robot, speed, 0.0)
     # It rolls on the middle of what its wheels sink in.
     radius = robot.contact_radius_m * robot.wheel_radius_m / _rolling_m(robot, ahead, speed)
-    robot = _settled(replace(robot, contact_radius_m=radius))
+    if not own:  # whose wheels are what its file says
+        robot = _settled(replace(robot, contact_radius_m=radius))
     if robot.drive == "skid_steer" and key.robot.track_ratio is None:
         turn = min(TRY_TURN, robot.speed_limit[1] / 2)
         for _ in range(3):
@@ -87,15 +98,78 @@ def _settled(robot: RobotModel) -> RobotModel:
     return replace(robot, rest_z_m=float(data.qpos[2]))
 
 
-def _driven(robot: RobotModel, speed_mps: float, yaw_rate_radps: float) -> tuple[float, float]:
+def driven_actions(
+    robot: RobotModel, actions: Sequence[tuple[float, float]], friction: float
+) -> list[dict[str, float]]:
+    """What a robot drives steadily of each action (m/s, rad/s), on a floor of this friction."""
+    rows = []
+    for speed, turn in actions:
+        ahead, turned = _driven(robot, speed, turn, friction)
+        rows.append(
+            {
+                "speed_mps": speed,
+                "yaw_rate_radps": turn,
+                "driven_mps": round(ahead, 3) + 0.0,
+                "driven_radps": round(turned, 3) + 0.0,
+            }
+        )
+    return rows
+
+
+def measured(model: RobotModel, robot: Robot | None) -> list[tuple[str, Any, str]]:
+    """The values of a robot in the twin: name, value, and where it is from."""
+    own = robot is not None and robot.mjcf is not None
+    of_file = ("wheel_radius_m", "track_m", "wheelbase_m", "mass_kg", "lidar.z_m")
+    values: dict[str, Any] = {
+        "drive": model.drive,
+        "own_model": own,
+        "wheel_radius_m": model.wheel_radius_m,
+        "track_m": model.track_m,
+        "wheelbase_m": model.wheelbase_m or None,
+        "mass_kg": model.mass_kg,
+        "min_turning_radius_m": model.min_turning_radius_m,
+        "max_steering_rad": model.max_steering_rad or None,
+        "track_ratio": model.turn_track_m / model.track_m,
+        "lidar.z_m": model.lidar_z_m,
+        "lidar.beams": len(model.bearings_rad),
+        "max_speed_mps": _known(model.speed_limit[0]),
+        "max_yaw_rate_radps": _known(model.speed_limit[1]),
+        "max_accel_mps2": model.accel_limit[0],
+        "max_yaw_accel_radps2": None if model.steers else model.accel_limit[1],
+        "max_steering_rate_radps": model.steering_rate_radps if model.steers else None,
+    }
+    rows = []
+    for name, value in values.items():
+        if value is None:
+            continue
+        origin = "the twin's own" if robot is None else "measured"
+        if own and name in of_file:
+            origin = "mjcf"
+        elif robot is not None and (name.startswith("lidar.") or hasattr(robot, name)):
+            origin = robot.origin_of(name)
+        if robot is not None and name in ("track_ratio", "own_model", "min_turning_radius_m"):
+            origin = "measured" if name == "track_ratio" and not robot.track_ratio else "profile"
+        rows.append((name, round(value, 4) if isinstance(value, float) else value, origin))
+    return rows
+
+
+def _known(limit: float) -> float | None:
+    return limit if np.isfinite(limit) else None
+
+
+def _driven(
+    robot: RobotModel, speed_mps: float, yaw_rate_radps: float, friction: float = FLOOR_FRICTION
+) -> tuple[float, float]:
     """The steady speed (m/s) and yaw rate (rad/s) under a command."""
     model = build_robot_alone(robot, TIMESTEP_S)
+    for geom in wheel_geoms(model, robot):
+        model.geom_friction[geom, 0] = friction
     data = mujoco.MjData(model)
     data.qpos[2] = robot.rest_z_m
     steps = round(1.0 / TIMESTEP_S)
     for step in range(steps):  # no faster than it accelerates
         share = np.array((step + 1) / steps)
-        _control(robot, data, speed_mps * share, yaw_rate_radps * share)
+        _control(robot, model, data, speed_mps * share, yaw_rate_radps * share)
         mujoco.mj_step(model, data)
     _run(model, data, 0.5)
     rows = np.array([_motion(model, data) for _ in range(round(DRIVE_S / TIMESTEP_S))])
@@ -103,14 +177,17 @@ def _driven(robot: RobotModel, speed_mps: float, yaw_rate_radps: float) -> tuple
     return float(ahead), float(turned)
 
 
-def _control(robot: RobotModel, data: mujoco.MjData, speed: F64, turn: F64) -> None:
+def _control(
+    robot: RobotModel, model: mujoco.MjModel, data: mujoco.MjData, speed: F64, turn: F64
+) -> None:
     motion = np.array([[[speed, turn]]])  # (1, 1, 2)
     sides = np.stack(robot.wheel_commands(motion[..., 0], motion[..., 1]), axis=-1)
     if robot.steers:
         steering = robot.steering_for(motion, np.zeros((1, 1)))
-        data.ctrl[:] = [*sides[0, 0], *robot.front_angles(steering)[0, 0]]
+        values = [*sides[0, 0], *robot.front_angles(steering)[0, 0]]
     else:
-        data.ctrl[0::2], data.ctrl[1::2] = sides[0, 0]
+        values = [*np.tile(sides[0, 0], len(robot.wheels_m) // 2)]
+    data.ctrl[list(actuator_places(model, robot))] = values
 
 
 def _motion(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[float, float]:

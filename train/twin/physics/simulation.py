@@ -228,7 +228,7 @@ class Simulation(Stateful):
         """One block of substeps under controls (N, S, actuators); returns whose bumper was
         pressed."""
         control = self._control
-        control[:, :, : self._actuators] = actuators
+        control[:, :, self.handles.actuators] = actuators
         touched = np.zeros(self.num_envs, np.bool_)
         if self.callback is None:
             parts = [(0, self.substeps)]

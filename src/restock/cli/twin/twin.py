@@ -10,20 +10,23 @@ import tyro
 from restock.cli.twin.fit import FitCommand
 from restock.cli.twin.gap import GapCommand
 from restock.cli.twin.layout import LayoutCommand
+from restock.cli.twin.robot import RobotCommand
 
 
 @dataclass
 class TwinCommand:
-    """Fit the twin's robot to logs, measure its gap to them, and describe the floors it drives
-    on.
+    """Fit the twin's robot to logs, measure its gap to them, try the robot, and describe the floors
+    it drives on.
 
-    See docs/calibration.md and docs/layouts.md. `restock twin JOB --help` explains one job.
+    See docs/calibration.md, docs/robot.md and docs/layouts.md. `restock twin JOB --help` explains
+    one job.
     """
 
     job: tyro.conf.OmitArgPrefixes[
         Annotated[FitCommand, tyro.conf.subcommand("fit", prefix_name=False)]
         | Annotated[GapCommand, tyro.conf.subcommand("gap", prefix_name=False)]
         | Annotated[LayoutCommand, tyro.conf.subcommand("layout", prefix_name=False)]
+        | Annotated[RobotCommand, tyro.conf.subcommand("robot", prefix_name=False)]
     ]
 
     def run(self) -> int:

@@ -1,0 +1,59 @@
+"""`restock twin robot`: the robot that the twin builds of a profile, and whether it drives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+
+
+@dataclass
+class RobotCommand:
+    """Build the robot of a profile's [robot], and try it: what the twin takes it to be, and what it
+    drives of each action.
+
+    Its own MuJoCo model too (`mjcf`): what that lacks is said by name, and the exit code is 2. See
+    docs/robot.md.
+
+    Example: `restock twin robot my_robot.toml`
+    """
+
+    profile: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PROFILE")]
+    """A profile: a TOML file, or the name of one that comes with Restock."""
+    friction: float = 0.8
+    """The floor's coefficient of friction, from .04 to 1.6."""
+    json: bool = False
+    """Print JSON: {"robot": {drive, own_model, wheel_radius_m, …}, "driven": [{action, friction,
+    speed_mps, yaw_rate_radps, driven_mps, driven_radps}]}."""
+
+    def run(self) -> int:
+        """Build it and drive every action."""
+        from restock.cli import output
+        from restock.errors import ConfigError
+        from restock.ingest.profile.profile import load_profile
+        from restock.ingest.task.robot import refuse_beyond_steering
+        from restock.train.twin.physics.robot_trial import driven_actions, measured, robot_model
+
+        if not 0.04 <= self.friction <= 1.6:
+            raise ConfigError(f"must be from .04 to 1.6, got {self.friction:g}", where="--friction")
+        profile = load_profile(self.profile)
+        refuse_beyond_steering(profile.robot, profile.task.actions, where=self.profile)
+        model = robot_model(profile.robot, profile.task.body)
+        facts = measured(model, profile.robot)
+        driven = [
+            {"action": name, "friction": self.friction, **row}
+            for name, row in zip(
+                profile.task.action_names,
+                driven_actions(model, profile.task.actions, self.friction),
+                strict=True,
+            )
+        ]
+        if self.json:
+            values = {name: value for name, value, _ in facts}
+            output.print_json({"robot": values, "driven": driven})
+            return 0
+        rows = [{"": n, "value": value, "from": origin} for n, value, origin in facts]
+        output.print_table(rows, title=f"{self.profile}: the robot in the twin")
+        output.print_table(driven, title="What it drives, steadily")
+        return 0

@@ -1,0 +1,133 @@
+"""A robot's own MuJoCo model in the built one's place: it drives, or what it lacks is said."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from support.paths import ROOT
+from twin.test_robot import AMR, amr_with, driven
+
+from restock.cli.twin.robot import RobotCommand
+from restock.errors import ConfigError
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.profile.profile_text import profile_toml, read_profile_toml
+from restock.ingest.profile.robot_file import LARGEST_BYTES, mjcf_problem
+from restock.ingest.task.robot import Robot
+from restock.ingest.task.scan import Body
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.physics.perturbation import Perturbation
+from restock.train.twin.physics.robot_trial import robot_model
+
+PAGE = (ROOT / "docs" / "robot.md").read_text()
+MODEL = re.findall(r"```xml\n(.*?)```", PAGE, re.DOTALL)[0]
+OUTLINE = Body(0.7, 0.5, lidar_x_m=0.1)
+
+
+def test_the_model_of_the_page_drives_what_it_is_commanded() -> None:
+    robot = Robot(mjcf=MODEL)
+    commands = [(1.0, 0.0), (-0.5, 0.0), (0.8, 0.7), (0.0, 1.0)]
+    sim, steady = driven(robot, OUTLINE, commands)
+    np.testing.assert_allclose(steady, commands, rtol=0.03, atol=0.01)
+    odometry = np.stack(sim.robot.body_velocity(*sim.wheel_speeds().T), axis=-1)
+    np.testing.assert_allclose(odometry, commands, rtol=0.03, atol=0.01)
+    assert sim.robot.mass_kg == pytest.approx(24.0)
+    assert (sim.robot.wheel_radius_m, sim.robot.track_m) == (0.1, 0.4)
+
+
+def test_conditions_and_perturbations_apply_to_it() -> None:
+    task = msgspec.structs.replace(AMR.task, body=OUTLINE)
+    env = WarehouseVectorEnv(
+        8, task=task, robot=Robot(mjcf=MODEL), seed=3, conditions={"wheel_slip": 1.0},
+        perturbation=Perturbation(
+            payload_kg=20.0, wheel_radius_scale=0.95, left_friction_scale=0.5
+        ),
+    )  # fmt: skip
+    env.reset(seed=3)
+    slipped = bumped = 0
+    for step in range(60):
+        *_, info = env.step(np.full(8, 2 + step % 3))
+        slipped += sum("wheel_slip" in text for text in info["true_condition"])
+        bumped += int(info["bumps"].sum())
+    assert env.diverged == 0
+    assert slipped > 5
+    assert bumped > 0  # its outline touches racks
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('name="lidar"', 'name="laser"', "no site named lidar"),
+        ('<velocity name="left"', '<velocity name="l"', "no actuator named left"),
+        ("<freejoint/>", "", "0 free joints, and must have one body, the base"),
+        ('pos="0 0.2 0"', 'pos="0.1 0.2 0"', "wheels are 0.05 m ahead of the base"),
+        ('pos="0.1 0 0.2"', 'pos="0.2 0 0.2"', "site lidar is 0.20 m ahead"),
+        ('<geom type="sphere" size="0.1" mass="1.5"', '<geom size=".1" contype="0" conaffinity="0" '
+         'mass="1.5"', "wheel left wheel needs one geom that touches"),
+        ('joint="left hinge" kv="8"', 'joint="left hinge" gear="2" kv="8"', "with gear 1"),
+        ('joint="left hinge"', 'joint="nowhere"', "MuJoCo says:"),
+        ('kv="8"', 'kv="0.001"', r"it drives .* where 0.50 m/s is commanded"),
+    ],
+)  # fmt: skip
+def test_what_a_model_lacks_is_said_by_name(old: str, new: str, message: str) -> None:
+    assert old in MODEL
+    with pytest.raises(ConfigError, match=message):
+        robot_model(Robot(mjcf=MODEL.replace(old, new)), OUTLINE)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('<mujoco><include file="/etc/passwd"/></mujoco>', "has a <include>"),
+        ('<!DOCTYPE a [<!ENTITY b "c">]><mujoco/>', "has a DOCTYPE"),
+        ("a robot", "is no XML"),
+        ('<mujoco><asset><mesh file="a.stl"/></asset></mujoco>', "has a <mesh>"),
+        ('<mujoco><worldbody><replicate count="1000000"/></worldbody></mujoco>', "<replicate>"),
+        ('<mujoco><extension><plugin plugin="x"/></extension></mujoco>', "has a <extension>"),
+        ('<mujoco><option timestep="10"/></mujoco>', "option timestep='10', not from 0.0001"),
+        ('<mujoco><option timestep="nan"/></mujoco>', "no finite number"),
+        ("<mujoco>" + "<body>" * 101 + "</body>" * 101 + "</mujoco>", "101 of <body>"),
+        ("<robot/>", "is no MJCF: its root is <robot>"),
+        ("<mujoco>", "is no XML"),
+        ("<mujoco>" + " " * LARGEST_BYTES + "</mujoco>", "is longer than"),
+    ],
+)  # fmt: skip
+def test_a_hostile_file_is_refused_by_name(text: str, message: str) -> None:
+    problem = mjcf_problem(text)
+    assert problem is not None
+    assert message in problem
+
+
+def test_it_travels_in_the_profile_without_its_file(tmp_path: Path) -> None:
+    (tmp_path / "my_robot.xml").write_text(MODEL)
+    text = profile_toml(AMR) + '\n[robot]\nmjcf = "my_robot.xml"\n'
+    (tmp_path / "mine.toml").write_text(text)
+    profile = load_profile(tmp_path / "mine.toml")
+    (tmp_path / "my_robot.xml").unlink()
+    carried = read_profile_toml(profile_toml(profile), where="a store")
+    assert carried.robot is not None
+    assert carried.robot.mjcf == MODEL
+    assert carried.hash == AMR.hash  # rows do not depend on it
+    with pytest.raises(ConfigError, match=r"my_robot\.xml: .*No such file"):
+        load_profile(tmp_path / "mine.toml")
+    with pytest.raises(ConfigError, match="beside that"):
+        read_profile_toml(text, where="a store")
+    (tmp_path / "mine.toml").write_text(text.replace("my_robot", "../my_robot"))
+    with pytest.raises(ConfigError, match="leads out of the profile's folder"):
+        load_profile(tmp_path / "mine.toml")
+
+
+def test_the_verb_says_what_is_built_and_driven(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "my_robot.xml").write_text(MODEL)
+    profile = profile_toml(amr_with("")).replace("lidar_x_m = 0.0", "lidar_x_m = 0.1")
+    (tmp_path / "mine.toml").write_text(profile + '\n[robot]\nmjcf = "my_robot.xml"\n')
+    assert RobotCommand(str(tmp_path / "mine.toml"), json=True).run() == 0
+    printed = msgspec.json.decode(capsys.readouterr().out)
+    assert printed["robot"]["mass_kg"] == pytest.approx(24.0)
+    fast = next(row for row in printed["driven"] if row["speed_mps"] == 1.0)
+    assert fast["driven_mps"] == pytest.approx(1.0, abs=0.03)
