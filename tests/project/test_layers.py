@@ -84,7 +84,7 @@ MAY_IMPORT = {
     "report": (
         "replay/fleet replay/panel replay/store train/run train/twin/calibration train/twin/floors"
     ),
-    "cli": "ingest/steps",
+    "cli": "ingest/steps replay/store",
     "cli/data": (
         "cli ingest ingest/containers ingest/profile ingest/propose ingest/steps ingest/store"
         " ingest/task replay replay/export replay/fleet replay/mixture replay/panel replay/review"

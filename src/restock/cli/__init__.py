@@ -39,6 +39,7 @@ VERBS = {
     "node": "an exported policy on a robot: a ROS 2 node, in shadow or driving",
     "start": "from your robot's recordings to a policy and a report, stage by stage",
     "demo": "all of the above, on sample_logs/",
+    "doctor": "what is installed here, what works, and is a store well?",
 }
 # folder -> the verbs whose modules it holds
 FOLDERS = {

@@ -1,0 +1,166 @@
+"""`restock doctor`: what is installed here, what works, and whether a store is well."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import tyro
+
+from restock.errors import ExitCode, RestockError
+
+EXTRA = re.compile(r"extra == ['\"](\w+)['\"]")
+FOR_DEVELOPERS = {"dev", "test", "site", "fuzz", "bench"}
+# Drawn elsewhere: a driver that is broken ends its process.
+DRAWS = """
+import os
+os.environ.setdefault("MUJOCO_GL", "egl")
+import mujoco
+model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+with mujoco.Renderer(model, 48, 64) as renderer:
+    renderer.update_scene(data)
+    renderer.render()
+"""
+DRAWS_S = 60
+
+
+class Finding(NamedTuple):
+    """One line: what was looked at, how it is, and what to do where it is not well."""
+
+    part: str
+    name: str
+    state: str  # ok | missing (an extra) | wrong
+    what: str
+    remedy: str = ""
+
+
+@dataclass
+class DoctorCommand:
+    """What is installed here, what works, and whether a store is well: for a bug report.
+
+    Exit code 2 where something that every command needs is missing or a store cannot be read; an
+    extra that is not installed is no fault.
+    """
+
+    store: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")] = None
+    """A store to look at, too: a folder or an s3:// address."""
+    json: bool = False
+    """Print {"findings": [{"part", "name", "state", "what", "remedy"}]}."""
+
+    def run(self) -> int:
+        """Print what was found; 2 where something is wrong."""
+        from restock.cli import output
+
+        findings = [*_machine(), *_packages(), _torch(), _drawing(), _disk(Path.cwd())]
+        if self.store is not None:
+            findings += _store(self.store)
+        if self.json:
+            output.print_json({"findings": [one._asdict() for one in findings]})
+        else:
+            columns = ["part", "name", "state", "what", "remedy"]
+            shown = columns if any(one.remedy for one in findings) else columns[:-1]
+            output.print_table([one._asdict() for one in findings], shown)
+        return int(ExitCode.USAGE if any(one.state == "wrong" for one in findings) else ExitCode.OK)
+
+
+def _machine() -> list[Finding]:
+    from restock import __version__
+
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return [
+        Finding("restock", "version", "ok", __version__),
+        Finding("machine", "python", "ok", platform.python_version()),
+        Finding("machine", "system", "ok", f"{platform.platform()}, {cores} cores"),
+    ]
+
+
+def _packages() -> list[Finding]:
+    """What Restock needs, and its extras: the version, or how to install one that serves."""
+    from packaging.requirements import Requirement
+
+    found = []
+    for requirement in map(Requirement, requires("restock") or []):
+        extra = EXTRA.search(str(requirement.marker or ""))
+        if requirement.name == "restock" or (extra and extra[1] in FOR_DEVELOPERS):
+            continue
+        name, wanted = requirement.name, requirement.specifier
+        part = f"extra {extra[1]}" if extra else "needed"
+        try:
+            installed, state = version(name), "ok"
+        except PackageNotFoundError:
+            installed, state = "not installed", "missing" if extra else "wrong"
+        if state == "ok" and not wanted.contains(installed, prereleases=True):
+            installed, state = f"{installed}, and {wanted} is needed", "wrong"
+        package = f"restock[{extra[1]}]" if extra else "restock"
+        remedy = "" if state == "ok" else f"pip install '{package}'"
+        found.append(Finding(part, name, state, installed, remedy))
+    return found
+
+
+def _torch() -> Finding:
+    try:
+        import torch
+    except (ImportError, OSError) as error:
+        return Finding(
+            "works", "torch", "wrong", f"cannot be imported: {error}", "install it again"
+        )
+    threads = f"{torch.get_num_threads()} threads"
+    if torch.cuda.is_available():
+        return Finding("works", "torch", "ok", f"{torch.cuda.get_device_name()}, {threads}")
+    return Finding("works", "torch", "ok", f"no CUDA device, {threads}")
+
+
+def _drawing() -> Finding:
+    """Whether MuJoCo can draw off screen; only pictures and films need it."""
+    command = [sys.executable, "-c", DRAWS]
+    try:
+        ended = subprocess.run(command, capture_output=True, text=True, timeout=DRAWS_S)
+    except subprocess.TimeoutExpired:
+        return Finding("works", "pictures", "missing", f"not drawn within {DRAWS_S} s")
+    if ended.returncode == 0:
+        backend = os.environ.get("MUJOCO_GL", "egl")
+        return Finding("works", "pictures", "ok", f"MuJoCo draws off screen ({backend})")
+    why = (ended.stderr.strip().splitlines() or [f"exit code {ended.returncode}"])[-1]
+    remedy = "install libegl1 (or MUJOCO_GL=osmesa with libosmesa6); only films need it"
+    return Finding("works", "pictures", "missing", why, remedy)
+
+
+def _disk(folder: Path) -> Finding:
+    free = shutil.disk_usage(folder).free
+    return Finding("machine", "disk here", "ok", f"{free / 1e9:.1f} GB free")
+
+
+def _store(path: str) -> list[Finding]:
+    """What a store holds, how long opening it takes, and whether it can be read."""
+    from restock.replay.store.store import Store
+
+    began = time.monotonic()
+    try:
+        with Store(path) as store:
+            opened = time.monotonic() - began
+            counts: dict[str, Any] = dict(
+                store.sql(
+                    "SELECT 'recordings' AS name, count(*) AS n FROM recordings"
+                    " UNION ALL SELECT 'transitions', count(*) FROM transitions"
+                ).fetchall()
+            )
+            files = len(store.files["stored_transitions"])
+            holds = f"{counts['transitions']:,} transitions of {counts['recordings']:,} recordings"
+            files_are = f"{files:,} Parquet files"
+            return [
+                Finding("store", "version", "ok", f"{store.version}, opened in {opened:.2f} s"),
+                Finding("store", "rows", "ok", f"{holds} in {files_are}"),
+            ]
+    except RestockError as error:
+        return [Finding("store", "rows", "wrong", error.what, error.remedy or "")]

@@ -1,0 +1,60 @@
+"""`restock doctor`: what it says of this machine, of a package that is not there, of a store."""
+
+from __future__ import annotations
+
+import json
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from restock.cli import doctor, main
+
+
+def told(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any]]:
+    code = main(["doctor", *arguments, "--json"])
+    found = json.loads(capsys.readouterr().out)["findings"]
+    return code, {one["name"]: one for one in found}
+
+
+def test_a_machine_on_which_the_tests_run_is_well(
+    store_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, found = told(capsys, str(store_path))
+    assert code == 0
+    assert found["duckdb"]["what"] == metadata.version("duckdb")
+    assert found["torch"]["state"] == "ok"
+    assert " transitions of 3 recordings in 3 Parquet files" in found["rows"]["what"]
+    assert not {"ruff", "mypy", "pytest"} & set(found)  # what developers need is no extra
+
+
+def test_what_is_missing_or_too_old_is_named_with_its_remedy(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wanted = ["duckdb>=99", "no-such-package>=1", "no-such-extra>=1; extra == 'onnx'"]
+    monkeypatch.setattr(doctor, "requires", lambda _: wanted)
+    code, found = told(capsys)
+    assert code == 2
+    assert found["duckdb"]["state"] == "wrong"
+    assert ">=99 is needed" in found["duckdb"]["what"]
+    assert found["no-such-package"]["state"] == "wrong"
+    extra = found["no-such-extra"]
+    assert (extra["state"], extra["remedy"]) == ("missing", "pip install 'restock[onnx]'")
+
+
+def test_a_store_that_is_not_there_is_wrong(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, found = told(capsys, str(tmp_path / "none"))
+    assert code == 2
+    assert "restock ingest" in found["rows"]["remedy"]
+
+
+def test_a_machine_that_cannot_draw_still_does_the_rest(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(doctor, "DRAWS", "raise SystemExit('no EGL here')")
+    code, found = told(capsys)
+    assert code == 0
+    assert (found["pictures"]["state"], found["pictures"]["what"]) == ("missing", "no EGL here")
