@@ -14,6 +14,7 @@ from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.profile.profile import FALLBACKS
 from restock.ingest.propose.candidates import Candidate
 from restock.ingest.propose.clock_choice import ClockChoice, Gaps
+from restock.ingest.propose.command_choice import CommandChoice
 from restock.ingest.propose.command_hold import CommandHold
 from restock.ingest.propose.footprint import GUESS, Footprint
 from restock.ingest.propose.goal_choice import GoalChoice
@@ -65,6 +66,7 @@ class Evidence:
     poses_from_frames: bool
     motion: MotionChoice | None  # where no topic has the wheels' speeds
     commands: Commands
+    chosen: CommandChoice
     hold: CommandHold
     paces_s: dict[str, float]  # topic -> between two of its messages, mostly; log time
     clock: ClockChoice
@@ -94,7 +96,7 @@ def profile_lines(
         f'name = "{name}"',
         f"conditions = {json.dumps(_conditions(seen))}",
         f"exposures = {json.dumps(_exposures(seen))}  # situations, whatever came of them",
-        'behaviour_policy = "unknown"  # who drove, where no topic says',
+        f'behaviour_policy = "{seen.chosen.policy}"  # {seen.chosen.why}',
         "",
         *_task_lines(seen, trial),
         *seen.goal.table_lines(),
@@ -106,6 +108,7 @@ def profile_lines(
             lines += ["# [inputs.pose]  # from transforms, by [frames]", ""]
         else:
             lines += _input_lines(role, fitting, seen, trial)
+    lines += seen.chosen.toml(seen.commands.wheelbase_m)
     if seen.frames is not None:
         lines += seen.frames.lines(used=seen.poses_from_frames)
     if seen.motion is not None and not seen.motion.problem:

@@ -21,6 +21,7 @@ from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import MOTION, parse_profile
 from restock.ingest.propose.candidates import candidates
 from restock.ingest.propose.clock_choice import Gaps, by_log_time, choose_clock
+from restock.ingest.propose.command_choice import CommandChoice, choose_command
 from restock.ingest.propose.command_hold import CommandHold, command_hold
 from restock.ingest.propose.footprint import GUESS, Footprint, footprint_of
 from restock.ingest.propose.goal_choice import GoalChoice
@@ -182,8 +183,11 @@ def gather(
     """What a recording says of its robot."""
     topics = usable_topics(recording)
     roles = {role: topics_for(topics, kinds) for role, kinds in KINDS.items()}
+    chosen = CommandChoice()
     if not roles["command"] and odometry_as_command:
         roles["command"] = topics_for(topics, ODOMETRY_AS_COMMAND)
+    else:
+        roles["command"], chosen = choose_command(recording, topics, roles["command"])
     driven = {topic.name for topic, _ in roles["command"][:1]}
     roles["nav_command"] = [fit for fit in roles["nav_command"] if fit[0].name not in driven]
     if not (roles["goal"] and roles["plan"]):
@@ -223,6 +227,7 @@ def gather(
         framed,
         motion,
         commands,
+        chosen,
         hold,
         paces,
         choose_clock(

@@ -31,11 +31,11 @@ class Kind:
 
 
 # A name of what may drive but is only proposed: to a multiplexer, a smoother, a person's remote.
-_NAVIGATION = ("nav", "move_base", "planner", "autonom", "cmd_vel_raw", "raw_cmd_vel")
+NAVIGATION = ("nav", "move_base", "planner", "autonom", "cmd_vel_raw", "raw_cmd_vel")
 # Of several, what is nearest to the motor is driven: a multiplexer's output before its inputs.
 _DRIVEN = ("cmd_vel_out", "mux/out", "mux/cmd_vel", "cmd_vel")
 _ACKERMANN = ("low_level", "output", "ackermann_cmd", "drive")
-_BY_HAND = ("teleop", "joy", "key", "web", "remote")
+BY_HAND = ("teleop", "joy", "key", "web", "remote")
 
 # A name of a pose that is not where the robot is.
 _ELSEWHERE = (
@@ -52,25 +52,25 @@ KINDS: dict[str, tuple[Kind, ...]] = {
             "geometry_msgs/msg/Twist",
             _TWIST,
             _DRIVEN,
-            rather=(*_NAVIGATION, *_BY_HAND, "input"),
+            rather=(*NAVIGATION, *BY_HAND, "input"),
         ),
         Kind(
             "geometry_msgs/msg/TwistStamped",
             _under("twist", _TWIST),
             _DRIVEN,
-            rather=(*_NAVIGATION, *_BY_HAND, "input"),
+            rather=(*NAVIGATION, *BY_HAND, "input"),
         ),
         Kind(
             "ackermann_msgs/msg/AckermannDriveStamped",
             {"speed_mps": "drive.speed", "steering_rad": "drive.steering_angle"},
             _ACKERMANN,
-            rather=(*_NAVIGATION, *_BY_HAND, "input", "safety"),
+            rather=(*NAVIGATION, *BY_HAND, "input", "safety"),
         ),
         Kind(
             "ackermann_msgs/msg/AckermannDrive",
             {"speed_mps": "speed", "steering_rad": "steering_angle"},
             _ACKERMANN,
-            rather=(*_NAVIGATION, *_BY_HAND, "input", "safety"),
+            rather=(*NAVIGATION, *BY_HAND, "input", "safety"),
         ),
     ),
     "pose": (
@@ -143,13 +143,13 @@ KINDS: dict[str, tuple[Kind, ...]] = {
     ),
     "bumper": (Kind("std_msgs/msg/Bool", {"pressed": "data"}, ("bump", "contact"), must=True),),
     "nav_command": (
-        Kind("geometry_msgs/msg/Twist", _TWIST, _NAVIGATION, must=True, never=_BY_HAND),
+        Kind("geometry_msgs/msg/Twist", _TWIST, NAVIGATION, must=True, never=BY_HAND),
         Kind(
             "geometry_msgs/msg/TwistStamped",
             _under("twist", _TWIST),
-            _NAVIGATION,
+            NAVIGATION,
             must=True,
-            never=_BY_HAND,
+            never=BY_HAND,
         ),
     ),
     "behaviour_policy": (

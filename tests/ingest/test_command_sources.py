@@ -173,3 +173,49 @@ def test_what_is_no_source_is_refused_with_its_key(old, new, said, tmp_path, cap
     capsys.readouterr()
     assert main(["profile", "check", str(profile), str(bag)]) == 2
     assert "`command_sources.teleop.fields`: /joy: no field 'button'" in capsys.readouterr().err
+
+
+def test_a_proposal_takes_the_output_and_names_its_inputs_by_what_they_say(tmp_path, capsys):
+    """Whatever the topics' names: the output is what follows, who drives what it follows."""
+    topics = taken_over()
+    topics["/cmd_vel_out_of_planner"] = topics.pop(NAV)
+    topics["/wheels/command"] = topics.pop(OUT)
+    bag = write_topics(topics, tmp_path / "bag")
+    file = tmp_path / "p.toml"
+    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
+    profile = load_profile(file)
+    assert profile.inputs.command.topic == "/wheels/command"
+    sources = {name: one.topic for name, one in profile.command_sources.items()}
+    assert sources == {"navigation": "/cmd_vel_out_of_planner", "teleop": TELEOP}
+    rows = policies(bag, file, tmp_path / "s")
+    assert {policy for s, policy in rows if 4.2 < s < 6.8} == {"teleop"}
+    assert {policy for s, policy in rows if s < 3.8 or s > 7.2} == {"navigation"}
+
+
+def test_a_proposal_finds_the_button_that_is_held(tmp_path, capsys):
+    topics = taken_over()
+    del topics[TELEOP], topics[NAV]
+    out, joy = topics[OUT][1], topics[JOY][1]
+    seconds = (joy.log_time_ns - START_NS) * 1e-9
+    stick = np.sin(seconds * 3)
+    axes = np.zeros((len(seconds), 4), np.float32)
+    axes[:, 1] = stick
+    each = offsets_of(np.full(len(seconds), 4))
+    joy.fields["axes"] = Ragged(axes.reshape(-1), each)
+    last = np.searchsorted(joy.log_time_ns, out.log_time_ns, "right") - 1
+    said = (out.log_time_ns - START_NS) * 1e-9
+    by_hand = (said > TAKEN_OVER_S[0]) & (said < TAKEN_OVER_S[1])
+    out.fields["linear.x"] = np.where(by_hand, 0.5 * axes[last, 1], out.fields["linear.x"])
+    bag, file = write_topics(topics, tmp_path / "bag"), tmp_path / "p.toml"
+    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
+    source = load_profile(file).command_sources["teleop"]
+    assert (source.topic, source.fields) == (JOY, {"pressed": "buttons[4]"})
+
+
+def test_a_command_that_is_only_a_persons_is_teleop(tmp_path, capsys):
+    topics = {n: t for n, t in taken_over().items() if n not in (NAV, TELEOP, JOY)}
+    topics["/teleop/cmd_vel"] = topics.pop(OUT)
+    bag, file = write_topics(topics, tmp_path / "bag"), tmp_path / "p.toml"
+    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
+    assert load_profile(file).behaviour_policy == "teleop"
+    assert 'behaviour_policy = "teleop"  # by the name of /teleop/cmd_vel' in file.read_text()
