@@ -46,7 +46,7 @@ class PolicyNode:
         self.ros, self.node = ros, node
         self.pilot: Pilot | None = None
         self.active = False
-        self._lock_group = ros.MutuallyExclusiveCallbackGroup()
+        self._watch_group = ros.MutuallyExclusiveCallbackGroup()
         self._decided_s = math.inf  # by the steady clock
         self._said = ""  # who drives, as last published
         self._classes: dict[str, Any] = {}
@@ -118,7 +118,7 @@ class PolicyNode:
         self._timers = [
             self.node.create_timer(task.control_period_s, self._tick),
             self.node.create_timer(
-                self.watchdog_s / 2, self._watch, callback_group=self._lock_group, clock=steady
+                self.watchdog_s / 2, self._watch, callback_group=self._watch_group, clock=steady
             ),
             self.node.create_timer(DIAGNOSTICS_S, self._report, clock=steady),
         ]

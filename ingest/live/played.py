@@ -38,12 +38,14 @@ def play(pilot: Pilot, recording: Path) -> Iterator[Played]:
         RecordingError: it cannot be read, or has no commands.
     """
     from rosbags.highlevel import AnyReader, AnyReaderError
+    from rosbags.typesys import Stores, get_typestore
 
     profile = pilot.profile
     command, task = profile.inputs.command, profile.task
     period_ns, fired_ns = round(task.control_period_s * NS), None
     try:
-        with AnyReader([recording]) as reader:
+        # Bags of old say nothing of their types: Humble's are taken, as ingest does.
+        with AnyReader([recording], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             topics = pilot.topics
             chosen = [c for c in reader.connections if topics.get(c.topic) == c.msgtype]
             if command.topic not in {connection.topic for connection in chosen}:

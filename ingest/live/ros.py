@@ -11,7 +11,7 @@ from restock.errors import ConfigError
 
 @dataclass(frozen=True)
 class Ros:
-    """rclpy of a sourced ROS 2 (Humble or later)."""
+    """rclpy of a sourced ROS 2: Jazzy or later, whose Python is 3.12."""
 
     rclpy: Any  # the module
     LifecycleNode: Any
@@ -68,7 +68,7 @@ def load_ros() -> Ros:
         raise ConfigError(
             f"needs ROS 2, whose rclpy cannot be imported: {error}",
             where="restock node",
-            remedy="source /opt/ros/DISTRO/setup.bash (Humble or later), in an environment made"
+            remedy="source /opt/ros/DISTRO/setup.bash (Jazzy or later), in an environment made"
             " with --system-site-packages; without ROS, --on RECORDING plays a recording to it",
         ) from error
 
