@@ -283,9 +283,9 @@ def align_inputs(profile: Profile, topics: Mapping[str, TopicColumns]) -> Aligne
     tree = Tree(profile.frames, edges, segments) if profile.frames else None
     if tree is not None:
         place_messages(inputs, tree, segments)
-    command = profile.inputs.command
+    commanded = profile.inputs.command
     notes = frame_notes(profile, inputs, edges)
-    notes += sideways_notes(command, inputs.topics[command.topic].fields)
+    notes += sideways_notes(commanded, inputs.topics[commanded.topic].fields)
     return AlignedInputs(profile, inputs, segments, ticks, tree, report, between, notes)
 
 

@@ -162,14 +162,22 @@ def fit_scope(
                 "how strong the motors of the profile's robot are is not known, so wheels that lag"
                 " do not tell how heavy it is"
             )
+        if robot.drive == "ackermann" and "track_scale" in names:
+            refused["track_scale"] = (
+                "a robot that steers turns by its steering angle: how far its wheels are apart does"
+                " not show"
+            )
         if guessed:
             notes.append(
                 f"nothing says {', '.join(guessed)} of the robot: what is fitted is relative to"
                 " a guess by its outline"
             )
         if "wheel_radius_m" not in guessed or "track_m" not in guessed:
+            told = "wheel_radius_scale and track_scale are"
+            if robot.drive == "ackermann":
+                told = "wheel_radius_scale is"
             notes.append(
-                "wheel_radius_scale and track_scale are relative to the profile's robot; its"
+                f"{told} relative to the profile's robot; its"
                 " odometry keeps believing those values, as the log's does"
             )
     elif (task.body.length_m, task.body.width_m) != (twin.length_m, twin.width_m):

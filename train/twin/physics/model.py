@@ -188,7 +188,7 @@ def _grip(model: mujoco.MjModel, robot: RobotModel) -> None:
 
 def _own_wheels(model: mujoco.MjModel, robot: RobotModel) -> tuple[list[int], list[int], list[int]]:
     """Bodies, geoms and joints of the wheels of a model of its own."""
-    joints = wheel_joints(model, robot)
+    joints = wheel_joints(model, robot.drive)
     bodies = [int(model.jnt_bodyid[joint]) for joint in joints]
     geoms = [geom for body in bodies if (geom := wheel_geom(model, body)) is not None]
     return bodies, geoms, joints

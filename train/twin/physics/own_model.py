@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from restock.errors import ConfigError
-from restock.ingest.task.robot import Robot
+from restock.ingest.task.robot import Drive, Robot
 from restock.ingest.task.scan import Body
 from restock.train.twin.physics.robot_model import RobotModel
 
@@ -88,14 +88,14 @@ def attach_own(spec: Any, robot: RobotModel) -> Any:
     return next(body for body in spec.worldbody.bodies if body.name.startswith(PREFIX))
 
 
-def wheel_joints(model: mujoco.MjModel, robot: RobotModel, prefix: str = PREFIX) -> list[int]:
+def wheel_joints(model: mujoco.MjModel, drive: Drive, prefix: str = PREFIX) -> list[int]:
     """The joints of the wheels, left before right and front before rear, as everywhere."""
     rolling = [
         int(model.actuator_trnid[model.actuator(prefix + name).id, 0])
-        for name in ROLES[robot.drive]
+        for name in ROLES[drive]
         if not name.startswith("steer")
     ]
-    if robot.steers:
+    if drive == "ackermann":
         return [*(_rolling_of(model, joint) for joint in steering_joints(model, prefix)), *rolling]
     return rolling
 
@@ -155,8 +155,7 @@ def _problems(
             problems.append(f"actuator {name} must drive a hinge, with gear 1")
     if problems:
         return problems, []
-    own = _Named(built, robot)
-    joints = wheel_joints(model, own, "")
+    joints = wheel_joints(model, robot.drive, "")
     wheels = [int(model.jnt_bodyid[joint]) if joint >= 0 else -1 for joint in joints]
     if -1 in wheels:
         return ["a steered wheel has no hinge to roll on, after the one that steers it"], []
@@ -169,15 +168,8 @@ def _problems(
         if not round_:
             problems.append(f"wheel {name} needs one geom that touches: a sphere or a cylinder")
     if not problems:
-        problems += _place_problems(model, wheels, own.steers)
+        problems += _place_problems(model, wheels, built.steers)
     return problems, wheels
-
-
-class _Named:
-    """As much of a robot's model as its wheels are found by."""
-
-    def __init__(self, built: RobotModel, robot: Robot) -> None:
-        self.drive, self.steers = robot.drive, built.steers
 
 
 def _lidar_problems(model: mujoco.MjModel, body: Body, built: RobotModel) -> list[str]:

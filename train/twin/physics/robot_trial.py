@@ -122,12 +122,12 @@ def measured(model: RobotModel, robot: Robot | None) -> list[tuple[str, Any, str
     of_file = ("wheel_radius_m", "track_m", "wheelbase_m", "mass_kg", "lidar.z_m")
     values: dict[str, Any] = {
         "drive": model.drive,
-        "own_model": own,
+        "own_model": own or None,
         "wheel_radius_m": model.wheel_radius_m,
         "track_m": model.track_m,
         "wheelbase_m": model.wheelbase_m or None,
         "mass_kg": model.mass_kg,
-        "min_turning_radius_m": model.min_turning_radius_m,
+        "min_turning_radius_m": model.min_turning_radius_m or None,
         "max_steering_rad": model.max_steering_rad or None,
         "track_ratio": model.turn_track_m / model.track_m,
         "lidar.z_m": model.lidar_z_m,
@@ -142,13 +142,16 @@ def measured(model: RobotModel, robot: Robot | None) -> list[tuple[str, Any, str
     for name, value in values.items():
         if value is None:
             continue
-        origin = "the twin's own" if robot is None else "measured"
-        if own and name in of_file:
+        if robot is None:
+            origin = "the twin's own"
+        elif own and name in of_file:
             origin = "mjcf"
-        elif robot is not None and (name.startswith("lidar.") or hasattr(robot, name)):
-            origin = robot.origin_of(name)
-        if robot is not None and name in ("track_ratio", "own_model", "min_turning_radius_m"):
-            origin = "measured" if name == "track_ratio" and not robot.track_ratio else "profile"
+        elif name == "min_turning_radius_m":
+            origin = "wheelbase_m, max_steering_rad"
+        elif name == "track_ratio" and not robot.track_ratio:
+            origin = "measured"
+        else:
+            origin = "profile" if name == "own_model" else robot.origin_of(name)
         rows.append((name, round(value, 4) if isinstance(value, float) else value, origin))
     return rows
 

@@ -24,7 +24,7 @@ class RobotCommand:
     friction: float = 0.8
     """The floor's coefficient of friction, from .04 to 1.6."""
     json: bool = False
-    """Print JSON: {"robot": {drive, own_model, wheel_radius_m, …}, "driven": [{action, friction,
+    """Print JSON: {"robot": {drive, wheel_radius_m, …}, "driven": [{action, friction,
     speed_mps, yaw_rate_radps, driven_mps, driven_radps}]}."""
 
     def run(self) -> int:

@@ -1,0 +1,128 @@
+"""`restock twin fit` and `gap` of a robot of one's own: driven in the twin, recorded, ingested."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from support.driven_robot import BEAMS, FREE_M, columns, scans, write_topics
+from twin.test_robot_drives import CAR, CAR_ACTIONS, MECANUM, OUTLINE
+
+from restock import cli
+from restock.errors import ExitCode
+from restock.ingest.profile.profile import Profile, load_profile
+from restock.ingest.profile.profile_text import profile_toml
+from restock.ingest.task.robot import Robot
+from restock.ingest.task.scan import Body
+from restock.train.twin.calibration.open_loop import empty_floor
+from restock.train.twin.physics.episode import Episode, EpisodeSpec
+from restock.train.twin.physics.perturbation import Perturbation, load_perturbation
+from restock.train.twin.physics.robot_trial import robot_model
+from restock.train.twin.physics.simulation import BodyState, Simulation
+
+TRUE = Perturbation(latency_s=0.12, gain=0.94)
+SECONDS = 100
+
+
+def profile_of(robot: Robot, body: Body) -> Profile:
+    amr = load_profile("warehouse_amr")
+    kept = {name: source for name, source in amr.inputs.items() if name in _INPUTS}
+    inputs = type(amr.inputs)(**kept)
+    task = msgspec.structs.replace(amr.task, body=body, actions=CAR_ACTIONS, goal="none")
+    return msgspec.structs.replace(
+        amr, name="own", task=task, inputs=inputs, robot=robot, zones=[],
+        shipped_conditions=["wheel_slip"], shipped_exposures=[],
+    )  # fmt: skip
+
+
+_INPUTS = ("command", "pose", "wheels", "imu", "scan")
+
+
+def recorded(profile: Profile, folder: Path) -> Path:
+    """A drive under `TRUE` on an empty floor, each command held for a second."""
+    robot = robot_model(profile.robot, profile.task.body)
+    sim = Simulation(1, profile.task, empty_floor(), 0.01, 1, robot=robot)
+    spec = EpisodeSpec("nominal", 0)
+    sim.reset(0, Episode(spec, (30, 30, 0), (1, 1), np.zeros((2, 2))), TRUE)
+    states: list[BodyState] = []
+    sim.callback = states.append
+    rng = np.random.default_rng(4)
+    table, commands = np.asarray(profile.task.actions), []
+    for step in range(5 * SECONDS):
+        if step % 5 == 0:
+            command = table[rng.integers(len(table))]
+        commands.append(command)
+        sim.drive(command[None])
+    at = np.array([state.time_s[0] for state in states])
+    yaw = np.array([state.yaw_rad[0] for state in states])
+    wheels = np.array([robot.body_velocity(*state.wheel_speed_radps[0]) for state in states])
+    zero = np.zeros(len(at))
+    ticks = np.arange(len(commands)) * 0.2
+    commanded, slow = np.array(commands), slice(4, None, 5)
+    place = {
+        "pose.pose.position.x": np.array([state.x_m[0] for state in states])[slow],
+        "pose.pose.position.y": np.array([state.y_m[0] for state in states])[slow],
+        "pose.pose.orientation.z": np.sin(yaw / 2)[slow],
+        "pose.pose.orientation.w": np.cos(yaw / 2)[slow],
+    }
+    topics = {
+        "/cmd_vel": (
+            "geometry_msgs/msg/Twist",
+            columns(
+                ticks + 0.003,
+                {"linear.x": commanded[:, 0], "angular.z": commanded[:, 1]},
+                stamped=False,
+            ),
+        ),
+        "/amcl_pose": (
+            "geometry_msgs/msg/PoseWithCovarianceStamped",
+            columns(at[slow], place),
+        ),
+        "/odom": (
+            "nav_msgs/msg/Odometry",
+            columns(
+                at, {"twist.twist.linear.x": wheels[:, 0], "twist.twist.angular.z": wheels[:, 1]}
+            ),
+        ),
+        "/imu": (
+            "sensor_msgs/msg/Imu",
+            columns(
+                at,
+                {
+                    "angular_velocity.z": np.array([state.yaw_rate_radps[0] for state in states]),
+                    "linear_acceleration.x": zero,
+                },
+            ),
+        ),
+        "/scan": (
+            "sensor_msgs/msg/LaserScan",
+            columns(ticks, scans(np.full((len(ticks), BEAMS), FREE_M))),
+        ),
+    }
+    return write_topics(topics, folder)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("robot", "body"), [(CAR, OUTLINE), (MECANUM, Body(0.6, 0.5))], ids=["ackermann", "mecanum"]
+)
+def test_latency_and_gain_come_back_from_its_recording(
+    robot: Robot, body: Body, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    profile = profile_of(robot, body)
+    (tmp_path / "own.toml").write_text(profile_toml(profile))
+    bag = recorded(profile, tmp_path / "bag")
+    store = tmp_path / "store"
+    arguments = ["--profile", str(tmp_path / "own.toml"), "--store", str(store)]
+    assert cli.main(["ingest", str(bag), *arguments]) == ExitCode.OK
+    out = tmp_path / "fitted.toml"
+    assert cli.main(["twin", "fit", str(store), "--out", str(out)]) == ExitCode.OK
+    fitted = load_perturbation(out)
+    assert fitted.latency_s == pytest.approx(TRUE.latency_s, abs=0.015)
+    assert fitted.gain == pytest.approx(TRUE.gain, abs=0.01)
+    said = " ".join(out.read_text().split()) + " ".join(capsys.readouterr().out.split())
+    steers = robot.drive == "ackermann"
+    assert ("a robot that steers turns by its steering angle" in said) == steers
+    assert cli.main(["twin", "gap", str(store), "--perturbation", str(out)]) == ExitCode.OK
