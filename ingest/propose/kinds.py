@@ -4,21 +4,25 @@ Two recordings that both have a lidar, or both a robot's description, or both od
 kind only if these agree. And something must tell one robot from the next: lidar or description.
 Recordings with neither are of one kind if they have the same command, pose and odometry, and at
 least half of their topics in common. What fits two kinds that differ is of neither.
+
+And which recordings are of no robot on wheels: a drone's, an arm's, of cameras alone.
 """
 
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from restock.ingest.containers.recording import Recording
+from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.decoding.columns import Ragged
 from restock.ingest.profile.profile import MOTION
 from restock.ingest.propose.footprint import descriptions
-from restock.ingest.propose.roles import KINDS, topics_for, usable_topics
+from restock.ingest.propose.roles import KINDS, Kind, topics_for, usable_topics
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.urdf.description import read_description
 
@@ -27,6 +31,13 @@ BEAMS = 0.1  # of the beams, by which scans of one lidar may differ: some turn a
 RANGE = 0.01
 SIMULATED_NS = 10**8 * 10**9  # stamps before 1973 are of a simulation, which begins at 0
 SHARED = 0.5  # of all topics
+DRONES = ("mavros_msgs/", "px4_msgs/", "mav_msgs/", "ardupilot_msgs/", "crazyflie_interfaces/")
+MULTI_DOF = "trajectory_msgs/msg/MultiDOFJointTrajectory"
+ARMS = ("trajectory_msgs/msg/JointTrajectory", "control_msgs/", "moveit_msgs/")
+CAMERAS = re.compile(r"sensor_msgs/msg/(Image|CompressedImage|CameraInfo|PointCloud2?)$")
+ALONGSIDE = re.compile(r"tf2_msgs/|rcl_interfaces/|rosgraph_msgs/|std_msgs/|diagnostic_msgs/")
+RISES_M = 0.5  # of a pose between its 5th and 95th percentile: no floor's
+ON_WHEELS = "Restock is for robots on wheels: give a recording of one, with its velocity commands"
 
 
 @dataclass(frozen=True)
@@ -164,3 +175,57 @@ def _lidar(recording: Recording, names: list[str]) -> Lidar | None:
 
 
 __all__ = ["RobotTraits", "robot_kinds", "robot_traits"]
+
+
+def no_wheeled_robot(
+    recording: Recording, command: Sequence[tuple[TopicInfo, Kind]], *, located: bool
+) -> str | None:
+    """What a recording is taken for that is of no robot on wheels, and what to do; else None.
+
+    `command` are the topics that may drive it, `located` whether anything says where it is.
+    """
+    types = {topic.type for topic in recording.topics.values() if topic.expected}
+    flying = sorted({t.split("/")[0] for t in types if t.startswith(DRONES) or t == MULTI_DOF})
+    if not (command and located) and flying:
+        told = ", ".join(sorted(t for t in types if t.split("/")[0] in flying)[:3])
+        return f"taken for a drone's recording (it has {told}): {ON_WHEELS}"
+    rises_m, lifted = _rises_m(recording), _lifted(recording, command)
+    if rises_m > RISES_M and (flying or lifted):
+        told = "commands go up and down" if lifted else f"it has topics of {flying[0]}"
+        return f"taken for a drone's recording (it rises by {rises_m:.1f} m, {told}): {ON_WHEELS}"
+    if command:
+        return None
+    arm = sorted(t for t in types if t.startswith(ARMS))
+    if arm and not located:
+        told = f"it has {', '.join(arm[:2])}, no velocity command and no pose"
+        return f"taken for an arm's recording ({told}): {ON_WHEELS}"
+    rest = [t for t in types if not CAMERAS.search(t) and not ALONGSIDE.match(t)]
+    if types and not rest and any(CAMERAS.search(t) for t in types):
+        return (
+            "taken for a recording of cameras alone (it has images or point clouds, no velocity"
+            " command and no odometry): record the command and a pose beside them"
+        )
+    return None
+
+
+def _rises_m(recording: Recording) -> float:
+    """How far the poses of a recording go up and down; 0 where there are none."""
+    rises = [0.0]
+    for topic, kind in topics_for(usable_topics(recording), KINDS["pose"]):
+        path = kind.fields["x_m"].removesuffix("x") + "z"
+        if path in recording.leaves(topic.name):
+            heights = np.asarray(recording.read({topic.name: [path]})[topic.name].fields[path])
+            heights = heights[np.isfinite(heights)]
+            rises.append(float(np.ptp(np.percentile(heights, [5, 95]))) if len(heights) else 0.0)
+    return max(rises)
+
+
+def _lifted(recording: Recording, command: Sequence[tuple[TopicInfo, Kind]]) -> bool:
+    """Whether the command that drives asks for speed upward."""
+    if not command:
+        return False
+    topic, kind = command[0]
+    path = kind.fields["speed_mps"].removesuffix("x") + "z"
+    if not path.endswith("linear.z"):
+        return False
+    return bool(np.any(np.asarray(recording.read({topic.name: [path]})[topic.name].fields[path])))

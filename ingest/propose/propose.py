@@ -25,6 +25,7 @@ from restock.ingest.propose.command_choice import CommandChoice, choose_command
 from restock.ingest.propose.command_hold import CommandHold, command_hold
 from restock.ingest.propose.footprint import GUESS, Footprint, footprint_of
 from restock.ingest.propose.goal_choice import GoalChoice
+from restock.ingest.propose.kinds import no_wheeled_robot
 from restock.ingest.propose.motion_choice import choose_motion, pose_series
 from restock.ingest.propose.proposal_lines import Commands, Evidence, profile_lines
 from restock.ingest.propose.robot_lines import propose_robot, urdf_footprint
@@ -116,7 +117,10 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         if role == "command" and seen.roles["wheels"]:
             remedy += INSTEAD_OF_COMMANDS
         problems.append(f"no topic for {role}, which every profile needs: {remedy}")
-    if seen.motion is not None and seen.motion.problem:
+    located = "pose" not in missing
+    if other := no_wheeled_robot(recording, seen.roles["command"], located=located):
+        problems = [other]
+    elif seen.motion is not None and seen.motion.problem:
         problems.append(seen.motion.problem)
     text = "\n".join(profile_lines(seen, name, problems))
     trial = Trial()
