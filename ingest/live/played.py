@@ -65,7 +65,11 @@ def play(pilot: Pilot, recording: Path) -> Iterator[Played]:
                     yield Played(now_ns, decision, took_s, _action(pilot, message))
                 pilot.receive(connection.topic, message, now_ns)
     except (AnyReaderError, OSError) as error:
-        raise RecordingError(f"cannot be played: {error}", where=str(recording)) from error
+        raise RecordingError(
+            f"cannot be played: {error}",
+            where=str(recording),
+            remedy="give a whole rosbag2 or MCAP file; `restock info` says what is damaged",
+        ) from error
 
 
 def summary(pilot: Pilot, played: list[Played]) -> dict[str, Any]:

@@ -146,7 +146,8 @@ def limit(
         previous: (N, 2) the commands in force until now.
         unknown: (N,) where an input cannot be relied on; None: nowhere.
     """
-    blind = ~(np.isfinite(proposed).all(axis=1) & np.isfinite(previous).all(axis=1))
+    told = np.isfinite(np.concatenate([proposed, previous], axis=1))  # (N, 4)
+    blind: Bools = ~told.all(axis=1)
     blind |= np.isnan(clearance_m).any(axis=1)
     if unknown is not None:
         blind |= unknown
@@ -207,7 +208,8 @@ def free_way(limits: Limits, direction: F64, clearance_m: F64) -> F64:
     for index, (ahead, turn) in enumerate(arcs.tolist()):
         rows = np.flatnonzero(of.ravel() == index)
         swept = _swept(limits, ahead, turn)  # (M, K)
-        met = (swept > clearance_m[rows, None] + _TOUCH_M).any(axis=2)  # (n, M)
+        beyond = np.asarray(swept > clearance_m[rows, None] + _TOUCH_M, np.bool_)  # (n, M, K)
+        met: Bools = beyond.any(axis=2)  # (n, M)
         first = np.where(met.any(axis=1), met.argmax(axis=1), len(swept))
         free[rows] = np.maximum(first - 1, 0) * _STEP_M
     return free
@@ -220,7 +222,7 @@ def _swept(limits: Limits, ahead: float, turn: float) -> F64:
     `ahead` (m) and `turn` (rad) are for each metre of the outline's fastest point.
     """
     body, count = limits.body, limits.sectors
-    bearing = (np.arange(count) + 0.5) * (2 * np.pi / count) - np.pi
+    bearing: F64 = (np.arange(count, dtype=np.float64) + 0.5) * (2 * np.pi / count) - np.pi
     way_m = np.arange(0.0, limits.way_m + _STEP_M, _STEP_M)
     turned = turn * way_m
     x, y = ahead * way_m * _sinc(turned), ahead * way_m * _cosc(turned)  # of what it turns about
