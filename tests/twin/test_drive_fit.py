@@ -23,7 +23,7 @@ from restock.train.twin.physics.robot_trial import robot_model
 from restock.train.twin.physics.simulation import BodyState, Simulation
 
 TRUE = Perturbation(latency_s=0.12, gain=0.94)
-SECONDS = 100
+SECONDS = 70
 
 
 def profile_of(robot: Robot, body: Body) -> Profile:
@@ -118,7 +118,9 @@ def test_latency_and_gain_come_back_from_its_recording(
     arguments = ["--profile", str(tmp_path / "own.toml"), "--store", str(store)]
     assert cli.main(["ingest", str(bag), *arguments]) == ExitCode.OK
     out = tmp_path / "fitted.toml"
-    assert cli.main(["twin", "fit", str(store), "--out", str(out)]) == ExitCode.OK
+    assert (
+        cli.main(["twin", "fit", str(store), "--out", str(out), "--segments", "50"]) == ExitCode.OK
+    )
     fitted = load_perturbation(out)
     assert fitted.latency_s == pytest.approx(TRUE.latency_s, abs=0.015)
     assert fitted.gain == pytest.approx(TRUE.gain, abs=0.01)
