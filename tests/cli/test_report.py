@@ -24,6 +24,8 @@ from restock.replay.panel.panel import Panel
 from restock.replay.store.capacity import capacity_of_rows
 from restock.report import build_report, shares
 from restock.report.facts import evaluation_bias, gather
+from restock.report.page import page
+from restock.report.sections import success
 from restock.stats import ConfidenceInterval
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES, TABLES
@@ -274,6 +276,33 @@ def test_the_headline_is_what_the_episodes_say(html: str) -> None:
 def test_a_clear_loss_to_the_planner_is_said(html: str) -> None:
     assert "Worse than the planner in wheel slip: 20% against 100%" in html
     assert "Worse than the planner in nominal" not in html  # the intervals overlap
+
+
+def test_each_perturbation_has_a_table_and_the_clean_one_is_open(run: Path) -> None:
+    facts = gather(run)
+    facts.cells += [{**row, "perturbation": "friction"} for row in facts.cells]
+    section = success(facts)
+    assert section is not None
+    clean, friction = section.tables
+    assert not clean.folded
+    assert friction.folded
+    assert friction.title.endswith("friction")
+    for table in (clean, friction):
+        assert len(table.rows) == 4
+        assert [row["kind of episode"] for row in table.rows] == ["nominal", "", "wheel slip", ""]
+        # What no episode tells has no column.
+        assert not {"least distance to people", "lost to the planner"} & set(table.columns)
+
+
+def test_what_is_no_better_than_chance_is_no_success(run: Path) -> None:
+    facts = gather(run)
+    assert page(facts)["headline"].startswith("Success 55% on average")
+    facts.cells += [
+        {**row, "policy": "random", "success": 0.6} for row in facts.clean_cells("agent")
+    ]
+    assert page(facts)["headline"] == (
+        "Nothing was learnt: success 55%, of a random policy 60%, on the same episodes"
+    )
 
 
 def test_every_section_has_its_figures(html: str) -> None:

@@ -30,6 +30,7 @@ class Table:
     numbers: frozenset[str] | set[str] = frozenset()
     title: str = ""
     caption: str = ""
+    folded: bool = False  # shown once its title is clicked
 
     @property
     def columns(self) -> list[str]:

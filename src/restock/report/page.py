@@ -13,7 +13,8 @@ from restock.report.facts import Facts, mean_success
 from restock.report.labels import labels_section
 from restock.report.practice import practice_section
 from restock.report.sections import critic, floor_section, learning, provenance, sampled, success
-from restock.report.twin_gap import run_section
+from restock.report.twin_gap import find_gap, run_section
+from restock.train.twin.calibration.twin_gap import TRUSTED
 
 REFERENCES = {
     "cloned": "a clone of whoever drove in the logs",
@@ -58,12 +59,27 @@ def _headline(facts: Facts) -> str:
     if facts.no_goal:
         mean = sum(row["return"] for row in cells) / len(cells)
         return f"No goal, so no success: mean return {mean:.2f} over {len(cells)} kinds of episode"
-    average = mean_success(cells)
+    average, random = mean_success(cells), facts.clean_cells("random")
+    if random and average <= mean_success(random):
+        return (
+            f"Nothing was learnt: success {average:.0%}, of a random policy"
+            f" {mean_success(random):.0%}, on the same episodes"
+        )
     worst = min(cells, key=lambda row: row["success"])
     return (
         f"Success {average:.0%} on average over {len(cells)} kinds of episode, "
-        f"{worst['success']:.0%} in the hardest, {words(worst['cell'])}"
+        f"{worst['success']:.0%} in the hardest, {words(worst['cell'])}{_distrust(facts)}"
     )
+
+
+def _distrust(facts: Facts) -> str:
+    """What a success in the twin is worth little by: its gap to these logs."""
+    gap = find_gap(facts)
+    verdicts = () if gap is None else gap.verdicts
+    nominal = next((each.verdict for each in verdicts if each.condition == "nominal"), TRUSTED)
+    if nominal == TRUSTED:
+        return ""
+    return f": in a twin whose gap to these logs is {nominal} in nominal driving"
 
 
 def _lead(facts: Facts) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from markupsafe import Markup
@@ -37,8 +38,8 @@ def success(facts: Facts) -> Section | None:
     places = {place: number for number, place in enumerate(dict.fromkeys(map(_place, shown)))}
     rows = [
         {
-            "kind of episode": row["cell"],
             "perturbation": row["perturbation"],
+            "kind of episode": row["cell"],
             "policy": row["policy"],
             "episodes": row["episodes"],
             "success": "no goal"
@@ -53,7 +54,10 @@ def success(facts: Facts) -> Section | None:
         for row in sorted(shown, key=lambda row: (places[_place(row)], row["policy"] != "agent"))
         if row["policy"] != "random"
     ]
-    texts = {"policy", "perturbation", "kind of episode"}
+    tables = [
+        _success_table(name, [row for row in rows if row["perturbation"] == name])
+        for name in dict.fromkeys(row["perturbation"] for row in rows)
+    ]
     return Section(
         "success",
         "Does it reach the goal?",
@@ -64,16 +68,32 @@ def success(facts: Facts) -> Section | None:
         + "".join(f" {one.text}." for one in facts.clones),
         callout="" if facts.no_goal else "; ".join(_regressions(facts)),
         figures=[] if facts.no_goal else [Figure(charts.success(shown))],
-        tables=[
-            _table(
-                rows,
-                texts,
-                title="Success, return and safety side by side",
-                caption="Intervals are 95 % over episodes. People are people and forklifts, by the"
-                " true distance from the body's edge; time is lost on the missions in which both"
-                " arrived.",
-            )
-        ],
+        tables=tables,
+    )
+
+
+def _success_table(perturbation: str, rows: Rows) -> Table:
+    """Of one perturbation, folded but for the clean one, without the columns that tell nothing."""
+    told = {name for row in rows for name, value in row.items() if value != ""} - {"perturbation"}
+    shown, before = [], None
+    for row in rows:
+        kind = row["kind of episode"]
+        line = {name: value for name, value in row.items() if name in told}
+        shown.append(line | {"kind of episode": "" if kind == before else kind})
+        before = kind
+    clean = perturbation == "clean"
+    return replace(
+        _table(
+            shown,
+            {"policy", "kind of episode"},
+            title="Success, return and safety side by side"
+            + ("" if clean else f": {perturbation}"),
+            caption="Intervals are 95 % over episodes. People are people and forklifts, by the true"
+            " distance from the body's edge; time is lost on the missions in which both arrived."
+            if clean
+            else "",
+        ),
+        folded=not clean,
     )
 
 

@@ -6,7 +6,7 @@ import altair as alt
 
 from restock.replay.panel.source_plan import TOLERANCE
 from restock.report import charts
-from restock.report.blocks import Figure, Rows, Table, count, number, percent, words
+from restock.report.blocks import Figure, Rows, Table, count, number, percent, span, words
 from restock.report.facts import Facts
 
 COLOURS = {
@@ -59,7 +59,11 @@ def remarks(facts: Facts) -> list[str]:
     ]
     short = [
         f"{words(stratum.name)} {stratum.missing_rows:,} rows"
-        + ("" if stratum.missing_hours is None else f" ({stratum.missing_hours:,.1f} h of logging)")
+        + (
+            ""
+            if stratum.missing_hours is None
+            else f" ({span(3600 * stratum.missing_hours)} of logging)"
+        )
         for stratum in facts.strata
         if stratum.missing_rows
     ]
