@@ -209,7 +209,7 @@ def free_way(limits: Limits, direction: F64, clearance_m: F64) -> F64:
         rows = np.flatnonzero(of.ravel() == index)
         swept = _swept(limits, ahead, turn)  # (M, K)
         beyond = np.asarray(swept > clearance_m[rows, None] + _TOUCH_M, np.bool_)  # (n, M, K)
-        met: Bools = beyond.any(axis=2)  # (n, M)
+        met = np.asarray(beyond.any(axis=2), np.bool_)  # (n, M)
         first = np.where(met.any(axis=1), met.argmax(axis=1), len(swept))
         free[rows] = np.maximum(first - 1, 0) * _STEP_M
     return free
