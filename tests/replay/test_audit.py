@@ -277,6 +277,22 @@ def only_one_robot_slips(table: pa.Table, recordings: pa.Table) -> Tables:
     return two_robots(table.filter(pa.array(~slip | ~of_b)), recordings)
 
 
+def one_circle(table: pa.Table, recordings: pa.Table) -> Tables:
+    of_one = rows_where(table, "recording_id", f"{1:016x}")
+    action = np.where(of_one, 3, table["action"].to_numpy())
+    return replaced(table, "action", action), recordings
+
+
+def replayed(table: pa.Table, recordings: pa.Table) -> Tables:
+    """The second recording is the first one, later, its poses in another frame."""
+    one = table.filter(pa.array(rows_where(table, "recording_id", f"{1:016x}")))
+    one = replaced(one, "wheel_speed_mps", np.linspace(0.1, 0.9, len(one)).astype(np.float32))
+    again = replaced(one, "recording_id", [f"{2:016x}"] * len(one))
+    again = replaced(again, "stamp_ns", one["stamp_ns"].to_numpy() + 33 * 10**15)
+    again = replaced(again, "pose_x_m", one["pose_x_m"].to_numpy() + 4)
+    return pa.concat_tables([one, again.cast(one.schema)]), recordings
+
+
 PLANTS: list[tuple[str, Plant, int, dict[str, object]]] = [
     ("rare_condition", no_slip, 1, {"condition": "wheel_slip", "rows_held": 0}),
     ("few_effective_episodes", slip_of_one_episode, 1, {"condition": "wheel_slip", "episodes": 1}),
@@ -299,6 +315,8 @@ PLANTS: list[tuple[str, Plant, int, dict[str, object]]] = [
     ("mixed_goal_sources", both_kinds_of_goals, 1, {"logged_episodes": 120}),
     ("speeds_from_poses", by_poses, 1, {"instead": "speeds from poses"}),
     ("far_actions", far_operator, 1, {"behaviour_policy": "operator", "far_share": 1.0}),
+    ("one_action", one_circle, 1, {"recording_id": f"{1:016x}", "action": 3, "share": 1.0}),
+    ("same_drive", replayed, 1, {"same_as": f"{2:016x}", "later_s": 33e6}),
     ("repeated_steps", bag_and_a_part_of_it, 1, {"same_as_file": "logs/part.mcap", "rows": 60}),
     ("signal_drift", worn_wheel, 2, {"signal": "odometry_scale", "scope": "alone"}),
     ("untagged_recordings", two_robots, 1, {"recording_id": f"{2:016x}", "untold": "site"}),
