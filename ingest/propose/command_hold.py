@@ -4,6 +4,10 @@ Some drivers stop a robot that hears nothing for half a second; others drive on 
 otherwise. Where commands come seldom that decides the row count, so it is read from the poses: of
 every gap after a command to move, whether the robot still moved when the gap ended, or since when
 it stood. A command to stop holds until the next one whatever the driver does.
+
+And how fast the robot really went where it was commanded to go fastest: a driver scales down or
+cuts off what its wheels cannot do. Commands beyond that are no actions of the robot: a twin that
+obeyed them would not move as the robot did.
 """
 
 from __future__ import annotations
@@ -21,6 +25,10 @@ WITHIN_S = 0.5  # that a robot has moved in, at the end of a gap
 MOVES = 0.25  # of what was commanded: less is standing
 STANDS_M, STANDS_RAD = 0.05, 0.2  # within a gap after a command to stop
 LONGEST_S = 60.0
+SETTLED_S = 1.0  # commanded so fast for so long: latency and ramp are over
+NEARLY = 0.8  # of the fastest command counts as it
+LEAST_SAMPLES = 10
+HELD_BACK = 0.67  # of what was commanded: a robot that stays below has reached its limit
 
 
 @dataclass(frozen=True)
@@ -109,3 +117,37 @@ def _judge(on: list[float], stopped: list[float], stood: int, went: int) -> Comm
     if stood:
         comments.append(f"it stood through {stood} of {stood + went} gaps after a command to stop")
     return CommandHold(age, holds, tuple(comments))
+
+
+def settled_speeds(told_s: F64, told: F64, at_s: F64, measured: F64, fastest: float) -> F64:
+    """What was measured (K,) where the fastest commands had settled, positive along the command.
+
+    Args:
+        told_s, told: time and value of the commands (N,), in order.
+        at_s, measured: of the odometry (M,), on the same clock.
+        fastest: that was commanded now and then; above 0.
+    """
+    if not len(told):
+        return np.zeros(0)
+    fast = np.abs(told) >= NEARLY * fastest
+    # Since when the commands have been fast, one way, without a break.
+    begins = np.append(True, (fast[1:] != fast[:-1]) | (np.sign(told[1:]) != np.sign(told[:-1])))
+    since_s = told_s[np.maximum.accumulate(np.where(begins, np.arange(len(told)), 0))]
+    index = np.searchsorted(told_s, at_s, "right") - 1
+    row = np.maximum(index, 0)
+    settled = (index >= 0) & fast[row] & (at_s - since_s[row] >= SETTLED_S)
+    settled &= at_s - told_s[row] < SETTLED_S  # the command is no old one
+    along = (measured * np.sign(told[row]))[settled]
+    return np.asarray(along[np.isfinite(along)], np.float64)
+
+
+def limit_of(settled: F64, fastest: float) -> float | None:
+    """The limit that settled speeds (K,) show; None where the robot does about what it is told.
+
+    Ahead and about share the wheels, so that the quickest tenth is taken, where the other motion
+    asked least of them.
+    """
+    if len(settled) < LEAST_SAMPLES:
+        return None
+    reached = float(np.percentile(settled, 90))
+    return float(f"{reached:.3g}") if 0.01 < reached < HELD_BACK * fastest else None

@@ -17,7 +17,7 @@ import numpy as np
 
 from restock.errors import RecordingError
 from restock.ingest.containers.recording import Recording
-from restock.ingest.propose.command_hold import CommandHold
+from restock.ingest.propose.command_hold import CommandHold, limit_of
 from restock.ingest.propose.footprint import Footprint
 from restock.ingest.propose.goal_choice import GoalChoice
 from restock.ingest.propose.kinds import RobotTraits, robot_kinds, robot_traits
@@ -28,6 +28,7 @@ from restock.ingest.propose.propose import (
     gather,
     propose_from,
     propose_profile,
+    settled_at_most,
     tried,
 )
 from restock.ingest.propose.trial import Advice, Trial
@@ -153,7 +154,14 @@ def _commands(base: Commands, drives: Sequence[Evidence]) -> Commands:
         for one in driven
     ]
     speed, turn = (np.concatenate([each[part] for each in told]) for part in (2, 3))
-    return replace(base.fastest(speed, turn), count=sum(one.commands.count for one in driven))
+    count = sum(one.commands.count for one in driven)
+    pooled = replace(base.fastest(speed, turn), count=count)
+    settled = [
+        settled_at_most(one.recording, one.roles, pooled, *each[1:])
+        for one, each in zip(driven, told, strict=True)
+    ]
+    ahead, about = (np.concatenate([each[part] for each in settled]) for part in (0, 1))
+    return pooled.limited(limit_of(ahead, pooled.speed_mps), limit_of(about, pooled.yaw_rate_radps))
 
 
 def _hold(drives: Sequence[CommandHold]) -> CommandHold:

@@ -42,6 +42,16 @@ class Commands:
     steered: bool = False  # by the angle of the front wheels, as a car
     wheelbase_m: float = 0.3
     wheelbase_known: bool = False
+    reached: tuple[float | None, float | None] = (None, None)  # m/s, rad/s: at most, if below
+
+    def limited(self, speed_mps: float | None, yaw_rate_radps: float | None) -> Commands:
+        """The same for a robot that stays below these commands; None: it does what they say."""
+        return replace(
+            self,
+            speed_mps=speed_mps or self.speed_mps,
+            yaw_rate_radps=yaw_rate_radps or self.yaw_rate_radps,
+            reached=(speed_mps, yaw_rate_radps),
+        )
 
     def fastest(self, speed_mps: F64, yaw_rate_radps: F64) -> Commands:
         """The fastest of these (N,) that is commanded now and then; an outlier is no action."""
@@ -186,6 +196,13 @@ def _task_lines(seen: Evidence, trial: Trial) -> list[str]:
     roles, commands = seen.roles, seen.commands
     low, high, why = _lidar_range(seen)
     kind = "speeds" if commands.measured else "commands"
+    held_back = [
+        f"# {told} beyond {reached:g} {unit} were commanded, which the robot did not reach."
+        for told, reached, unit in zip(
+            ("Speeds", "Yaw rates"), commands.reached, ("m/s", "rad/s"), strict=True
+        )
+        if reached is not None
+    ]
     origin = f"from {commands.count} {kind} of {commands.topic}" if commands.count else "a guess"
     return [
         "[task]",
@@ -194,6 +211,7 @@ def _task_lines(seen: Evidence, trial: Trial) -> list[str]:
         f"control_period_s = {seen.clock.period_s:g}",
         f"range_min_m = {low:g}{why}",
         f"range_max_m = {high:g}  # lidar ranges beyond it count as free",
+        *held_back,
         f"actions = [  # (m/s, rad/s), {origin}; the first must be stop",
         *(f"  [{v:.3g}, {w:.3g}]," for v, w in _actions(commands, seen.robot)),
         "]",
@@ -230,7 +248,8 @@ def _steered_actions(commands: Commands, robot: RobotProposal) -> list[tuple[flo
 
 def _robot_lines(seen: Evidence) -> list[str]:
     """What the twin builds; the actions are within its limits."""
-    return seen.robot.lines(*np.abs(_actions(seen.commands, seen.robot)).max(axis=0).tolist())
+    robot = seen.robot.limited(*seen.commands.reached)
+    return robot.lines(*np.abs(_actions(seen.commands, robot)).max(axis=0).tolist())
 
 
 def _bump_lines(recording: Recording, roles: Roles) -> list[str]:

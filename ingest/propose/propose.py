@@ -22,7 +22,12 @@ from restock.ingest.profile.profile import MOTION, parse_profile
 from restock.ingest.propose.candidates import candidates
 from restock.ingest.propose.clock_choice import Gaps, by_log_time, choose_clock
 from restock.ingest.propose.command_choice import CommandChoice, choose_command
-from restock.ingest.propose.command_hold import CommandHold, command_hold
+from restock.ingest.propose.command_hold import (
+    CommandHold,
+    command_hold,
+    limit_of,
+    settled_speeds,
+)
 from restock.ingest.propose.footprint import GUESS, Footprint, footprint_of
 from restock.ingest.propose.goal_choice import GoalChoice
 from restock.ingest.propose.kinds import no_wheeled_robot
@@ -273,6 +278,10 @@ def _commands(
         wheelbase_m=wheelbase_m or Commands.wheelbase_m,
         wheelbase_known=wheelbase_m is not None,
     )
+    settled = settled_at_most(recording, roles, commands, times, speed, turn)
+    commands = commands.limited(
+        limit_of(settled[0], commands.speed_mps), limit_of(settled[1], commands.yaw_rate_radps)
+    )
     hold = CommandHold()
     if poses is not None and len(poses) > 1 and not commands.measured:
         order, zero = np.argsort(times, kind="stable"), poses.stamp_ns[0]
@@ -294,6 +303,29 @@ def commanded(
         turn = speed * np.tan(turn) / (wheelbase_m or Commands.wheelbase_m)
     sane = np.isfinite(speed) & np.isfinite(turn)
     return columns, columns.log_time_ns[sane], speed[sane], turn[sane]
+
+
+def settled_at_most(
+    recording: Recording, roles: Roles, commands: Commands, times: Ints, speed: F64, turn: F64
+) -> tuple[F64, F64]:
+    """What odometry measured, in m/s (K,) and rad/s (L,), once the fastest commands had settled."""
+    nothing = np.zeros(0), np.zeros(0)
+    if not roles["wheels"] or commands.measured or not len(times):
+        return nothing
+    topic, kind = roles["wheels"][0]
+    paths = list(kind.fields.values())
+    columns = recording.read({topic.name: paths})[topic.name]
+    order = np.argsort(times, kind="stable")
+    told_s = np.asarray((times[order] - times[order[0]]) * 1e-9, np.float64)
+    at_s = np.asarray((columns.log_time_ns - times[order[0]]) * 1e-9, np.float64)
+    fastest = commands.speed_mps, commands.yaw_rate_radps
+    found = [
+        settled_speeds(
+            told_s, told[order], at_s, np.asarray(columns.fields[path], np.float64), most
+        )
+        for told, path, most in zip((speed, turn), paths, fastest, strict=True)
+    ]
+    return found[0], found[1]
 
 
 def _paces(recording: Recording, roles: Roles) -> dict[str, float]:

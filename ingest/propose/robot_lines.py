@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,13 @@ class RobotProposal:
     origin: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     rolls: bool = True  # False: a description says that it has no wheels
+
+    def limited(self, speed_mps: float | None, yaw_rate_radps: float | None) -> RobotProposal:
+        """With the limits that its logs show, in place of what a description says."""
+        logged = {"max_speed_mps": speed_mps, "max_yaw_rate_radps": yaw_rate_radps}
+        found = {key: value for key, value in logged.items() if value is not None}
+        origin = self.origin | dict.fromkeys(found, "logs")
+        return replace(self, values=self.values | found, origin=origin)
 
     def lines(self, speed_mps: float, yaw_rate_radps: float) -> list[str]:
         """The TOML; a limit below what was commanded (m/s, rad/s) is none, and said."""

@@ -56,7 +56,7 @@ class Told(Drive):
 def test_one_profile_has_what_only_some_of_the_drives_show(tmp_path, capsys):
     drives = {
         "slow": Told(duration_s=12.0, speed_mps=0.2),
-        "fast": Told(duration_s=9.0, speed_mps=0.8, every_s=0.1),
+        "fast": Told(duration_s=9.0, speed_mps=0.7, every_s=0.1),
         "described": Told(duration_s=8.0, description=DESCRIBED),
         "another": Told(duration_s=30.0, speed_mps=2.0, beams=360),
     }
@@ -67,7 +67,7 @@ def test_one_profile_has_what_only_some_of_the_drives_show(tmp_path, capsys):
     said = json.loads(capsys.readouterr().out)
     profile = load_profile(str(file))
     # The fastest command is of one drive, the outline and the wheels of another.
-    assert max(speed for speed, _ in profile.task.actions) == pytest.approx(0.8)
+    assert max(speed for speed, _ in profile.task.actions) == pytest.approx(0.7)
     assert (profile.task.body.length_m, profile.task.body.width_m) == (0.7, 0.45)
     assert profile.robot is not None
     assert profile.robot.wheel_radius_m == 0.05
