@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 from support.driven_robot import BEAMS, FREE_M, columns, scans, write_topics
-from twin.test_robot_drives import CAR, CAR_ACTIONS, MECANUM, OUTLINE
+from twin.test_robot_drives import CAR, CAR_ACTIONS, OUTLINE
 
 from restock import cli
 from restock.errors import ExitCode
@@ -23,7 +23,7 @@ from restock.train.twin.physics.robot_trial import robot_model
 from restock.train.twin.physics.simulation import BodyState, Simulation
 
 TRUE = Perturbation(latency_s=0.12, gain=0.94)
-SECONDS = 70
+SECONDS = 100
 
 
 def profile_of(robot: Robot, body: Body) -> Profile:
@@ -105,26 +105,20 @@ def recorded(profile: Profile, folder: Path) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("robot", "body"), [(CAR, OUTLINE), (MECANUM, Body(0.6, 0.5))], ids=["ackermann", "mecanum"]
-)
-def test_latency_and_gain_come_back_from_its_recording(
-    robot: Robot, body: Body, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_latency_and_gain_come_back_from_a_recording_of_a_robot_that_steers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    profile = profile_of(robot, body)
+    profile = profile_of(CAR, OUTLINE)
     (tmp_path / "own.toml").write_text(profile_toml(profile))
     bag = recorded(profile, tmp_path / "bag")
     store = tmp_path / "store"
     arguments = ["--profile", str(tmp_path / "own.toml"), "--store", str(store)]
     assert cli.main(["ingest", str(bag), *arguments]) == ExitCode.OK
     out = tmp_path / "fitted.toml"
-    assert (
-        cli.main(["twin", "fit", str(store), "--out", str(out), "--segments", "50"]) == ExitCode.OK
-    )
+    assert cli.main(["twin", "fit", str(store), "--out", str(out)]) == ExitCode.OK
     fitted = load_perturbation(out)
     assert fitted.latency_s == pytest.approx(TRUE.latency_s, abs=0.015)
     assert fitted.gain == pytest.approx(TRUE.gain, abs=0.01)
     said = " ".join(out.read_text().split()) + " ".join(capsys.readouterr().out.split())
-    steers = robot.drive == "ackermann"
-    assert ("a robot that steers turns by its steering angle" in said) == steers
+    assert "a robot that steers turns by its steering angle" in said
     assert cli.main(["twin", "gap", str(store), "--perturbation", str(out)]) == ExitCode.OK
