@@ -92,7 +92,8 @@ def test_interrupted_training_goes_on_from_its_checkpoint(tmp_path: Path, bag: P
     verbs.codes["train"] = 130
     with pytest.raises(KeyboardInterrupt):
         way(out, verbs, bag)
-    (out / "run" / "checkpoints").mkdir()
+    (out / "run" / "checkpoints").mkdir()  # without a checkpoint it would have to begin again
+    (out / "run" / "checkpoints" / "latest.safetensors").touch()
     assert way(out, verbs, bag) == ["kept", "kept", "done"]
     assert verbs.ran[-1] == "train-on"
     assert not (out / "earlier").exists()

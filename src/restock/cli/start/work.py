@@ -206,7 +206,7 @@ def _parsed(text: str) -> Any:
 
 
 def _resumable(stage: Stage) -> bool:
-    return any((path / "checkpoints").is_dir() for path in stage.writes)
+    return any(any((path / "checkpoints").glob("*.safetensors")) for path in stage.writes)
 
 
 def _resumed(stage: Stage) -> Stage:
