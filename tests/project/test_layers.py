@@ -76,7 +76,7 @@ MAY_IMPORT = {
     ),
     "train/twin/survey": (
         "twin/floors replay/store ingest/containers ingest/decoding ingest/profile ingest/propose"
-        " ingest/steps ingest/task"
+        " ingest/steps ingest/task ingest/urdf"
     ),
     "train/twin/calibration": (
         "twin/floors twin/physics replay/store ingest/profile ingest/steps ingest/store ingest/task"

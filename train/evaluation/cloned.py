@@ -28,7 +28,6 @@ from restock.train.run.run import Run
 CLONED = "cloned"
 UPDATES = (50, 100, 200, 400, 800, 1600)  # that are tried
 SET_ASIDE = 5  # every fifth episode chooses among them
-FIRST_ACTION = 12  # where an observation has the last action, one-hot
 
 
 class ClonedPolicy:
@@ -133,7 +132,13 @@ def clone_of(panel: Panel, name: str) -> tuple[QNetwork, CloneQuality]:
         updates=updates,
         training_log_likelihood=_log_likelihood(network, observation, action),
         note=note,
-        **_judged(network, held_out, held_action, _frequencies(action, actions)),
+        **_judged(
+            network,
+            held_out,
+            held_action,
+            _frequencies(action, actions),
+            panel.task.observation_names.index("previous_action_0"),
+        ),
     )
     return network, quality
 
@@ -172,13 +177,15 @@ def _held_out(panel: Panel, driver: str) -> tuple[F32, Ints, str | None]:
     return rows.observation, rows.action, None
 
 
-def _judged(network: QNetwork, observation: F32, action: Ints, frequencies: F32) -> dict[str, Any]:
-    """The held-out part of a `CloneQuality`."""
+def _judged(
+    network: QNetwork, observation: F32, action: Ints, frequencies: F32, first: int
+) -> dict[str, Any]:
+    """The held-out part of a `CloneQuality`; `first`: where an observation has the last action."""
     if not len(action):
         unknown = ("log_likelihood", "frequencies_log_likelihood", "agreement", "repeating")
         return {"held_out_rows": 0, **dict.fromkeys((*unknown, "changed_agreement"))}
     agrees = cloned_probabilities(network, observation).argmax(axis=1) == action
-    last = observation[:, FIRST_ACTION : FIRST_ACTION + len(frequencies)].argmax(axis=1)
+    last = observation[:, first : first + len(frequencies)].argmax(axis=1)
     changed = last != action
     return {
         "held_out_rows": len(action),

@@ -17,9 +17,10 @@ from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, offsets_of
 from restock.ingest.profile.profile import Profile
 from restock.ingest.propose.footprint import Footprint
-from restock.ingest.propose.roles import BASE_FRAMES, KINDS, topics_for, usable_topics
+from restock.ingest.propose.roles import KINDS, topics_for, usable_topics
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.frames import FRAME_ID
+from restock.ingest.urdf.description import BASE_FRAMES
 from restock.train.twin.survey.poses import Poses, Times, mount_of, shared_clock
 
 BEAMS = 360  # at most, of a scan: more are thinned out

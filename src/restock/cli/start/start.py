@@ -204,9 +204,9 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
             settings.append(f"env.perturbation={to.fitted}")
         gap = work.do(stages.gap(to, horizon_s, fitted=fitted.good))
         why, remedy = no_room(floor), ""
-        if why is None and asked.twin != "yes":
+        if why is None and asked.twin != "yes" and not work.plan:
             why, remedy = mistrust(floor, gap), " (--twin yes overrides)"
-        if why is not None and not work.plan:
+        if why is not None:
             work.say(f"   [yellow]no training in the twin{remedy}: {escape(why)}[/]")
             twin = False
     if not twin:
