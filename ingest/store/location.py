@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.fs
 import pyarrow.parquet as pq
 from deltalake import DeltaTable
@@ -167,27 +168,48 @@ class Location:
 
     def write(self, rows: pa.Table, path: str, **options: Any) -> int:
         """Write a Parquet file, whole and on disks flushed; returns its size in bytes."""
+        with self.writing(path) as out:
+            pq.write_table(rows, out, **options)
+            return int(out.tell())
+
+    @contextmanager
+    def writing(self, path: str) -> Iterator[Any]:
+        """A new file, open for writing; whole and on disks flushed when the block ends."""
         if self.folder is None:
             with self.translate_errors(), self.files.open_output_stream(path) as out:
-                pq.write_table(rows, out, **options)
-                return int(out.tell())
+                yield out
+            return
         file = self.folder / path
         file.parent.mkdir(parents=True, exist_ok=True)
         with file.open("wb") as out:
-            pq.write_table(rows, out, **options)
+            yield out
             out.flush()
             os.fsync(out.fileno())
-            return out.tell()
 
-    def read(self, path: str) -> pa.Table:
-        """A Parquet file's rows, as they were written.
+    @contextmanager
+    def reading(self, path: str) -> Iterator[pa.NativeFile]:
+        """A file, open for reading. Raises as `read` does."""
+        with self.translate_errors(), self.files.open_input_file(path) as file:
+            yield file
+
+    def read(
+        self,
+        path: str,
+        *,
+        columns: Sequence[str] | None = None,
+        where: pc.Expression | None = None,
+    ) -> pa.Table:
+        """A Parquet file's rows, as they were written: of these columns, those that it has.
 
         Raises:
             FileNotFoundError: it is not there.
             StoreError: the place cannot be reached.
         """
-        with self.translate_errors(), self.files.open_input_file(path) as file:
-            return pq.read_table(file, partitioning=None)
+        with self.reading(path) as file:
+            if columns is not None:
+                whole = pq.ParquetFile(file)
+                return whole.read([name for name in whole.schema_arrow.names if name in columns])
+            return pq.read_table(file, partitioning=None, filters=where)
 
     def read_schema(self, path: str) -> pa.Schema:
         """A Parquet file's schema, with its metadata. Raises as `read` does."""

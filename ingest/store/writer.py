@@ -12,18 +12,16 @@ that who opened a version before can read it: its manifests too, by the names of
 
 from __future__ import annotations
 
-import json
 import random
-import re
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
 import pyarrow as pa
+import pyarrow.compute as pc
 from deltalake import CommitProperties, DeltaTable, Schema, Transaction
 from deltalake.exceptions import CommitFailedError, DeltaError
 from deltalake.transaction import AddAction, RemoveAction
@@ -31,6 +29,9 @@ from deltalake.transaction import AddAction, RemoveAction
 from restock.errors import StoreError
 from restock.files import first_line
 from restock.ingest.profile.custom_signal import refuse_other_signals
+from restock.ingest.store.data_files import AddedFile, add_action, parquet_options, rewrite
+from restock.ingest.store.episode_rows import episode_ends
+from restock.ingest.store.lineage import READERS, Ingest, StoredFile, own_path, stored_files
 from restock.ingest.store.location import Location
 from restock.ingest.store.repeated import (
     SKETCH,
@@ -39,8 +40,8 @@ from restock.ingest.store.repeated import (
     Sketch,
     find_repeat,
     read_sketch,
-    sketch,
 )
+from restock.ingest.store.summary import SUMMARY_SCHEMA, summarised, with_ends
 from restock.ingest.store.version import Version
 from restock.ingest.task.schema import recording_schema
 
@@ -50,11 +51,9 @@ ATTEMPTS = 12  # at a commit, when other writers are faster; Delta's library tri
 # and a reader that opened an older version may be about to read them.
 RETENTION_HOURS = 7 * 24
 ROW_GROUP_ROWS = 32_768
-READERS = 16  # of small files at once, which on S3 are a wait each
 CHECKPOINT_COMMITS = 20  # a reader of the log opens at most so many files
 _JITTER = random.SystemRandom()
 T = TypeVar("T")
-OWN_PATH = re.compile(r"([0-9a-f]{16})/[^/]+\.parquet")
 
 
 class StoreWriter:
@@ -72,19 +71,72 @@ class StoreWriter:
 
         Of a version, or as it is now.
         """
-        empty = recording_schema().empty_table()
+        schema = recording_schema()
         if not self.path.has_table(TRANSITIONS):
-            return empty
-        parts = [
-            self.path.read(f"{RECORDINGS}/{file.path}")
-            for file in _files(self.path.open_table(TRANSITIONS, version))
-            if recording_id in (None, file.recording_id)
-        ]
-        return pa.concat_tables([empty, *parts], promote_options="default")
+            return schema.empty_table()
+        shown = self.shown(version)
+        return self.manifests(
+            [one for one in shown if recording_id in (None, one.recording_id)], schema
+        )
+
+    def manifests(self, ingests: Sequence[Ingest], schema: pa.Schema) -> pa.Table:
+        """These columns of the manifests of ingests; null where an older store has them not."""
+        parts = [schema.empty_table()]
+        if ingests:
+            at = {
+                one.ingest_id: file.path for file in self.files(RECORDINGS) for one in file.ingests
+            }
+            paths = {
+                at.get(one.ingest_id, own_path(one.recording_id, one.ingest_id)): None
+                for one in ingests
+            }
+            with ThreadPoolExecutor(READERS) as pool:
+                read = pool.map(
+                    lambda path: self.path.read(f"{RECORDINGS}/{path}", columns=schema.names), paths
+                )
+                parts += [_with_sketch(part) if "sketch" in schema.names else part for part in read]
+        wanted = pa.array([one.ingest_id for one in ingests], pa.string())
+        found = pa.concat_tables(
+            [part.replace_schema_metadata(None) for part in parts], promote_options="default"
+        )
+        return found.filter(pc.is_in(found["ingest_id"], wanted))
 
     def rows(self, recording_id: str, ingest_id: str) -> pa.Table:
         """One recording's transitions, as they were written."""
-        return self.path.read(f"{TRANSITIONS}/{recording_id}/{ingest_id}.parquet")
+        with suppress(FileNotFoundError):
+            return self.path.read(f"{TRANSITIONS}/{own_path(recording_id, ingest_id)}")
+        parts = [
+            self.path.read(f"{TRANSITIONS}/{file.path}", where=pc.field("ingest_id") == ingest_id)
+            for file in self.files(TRANSITIONS)
+            if ingest_id in {one.ingest_id for one in file.ingests}
+        ]
+        if not parts:
+            raise FileNotFoundError(own_path(recording_id, ingest_id))
+        rows = pa.concat_tables(parts, promote_options="default").sort_by("transition_id")
+        return with_ends(rows, self._packed_ends(Ingest(recording_id, ingest_id, len(rows))))
+
+    def ends(self, ingest: Ingest) -> pa.Table | None:
+        """The ends of an ingest's episodes, as `episode_ends` gives them; None: an older store."""
+        with suppress(FileNotFoundError):
+            path = own_path(ingest.recording_id, ingest.ingest_id)
+            schema = self.path.read_schema(f"{TRANSITIONS}/{path}")
+            return episode_ends(schema.empty_table())
+        empty = pa.table({})
+        return episode_ends(with_ends(empty, self._packed_ends(ingest)))
+
+    def _packed_ends(self, ingest: Ingest) -> str | None:
+        told = pa.schema([("ingest_id", pa.string()), ("packed_ends", pa.string())])
+        found: list[str | None] = self.manifests([ingest], told)["packed_ends"].to_pylist()
+        return found[0] if found else None
+
+    def files(self, name: str, version: Version | None = None) -> list[StoredFile]:
+        """The active files of one of its tables, and which ingests they hold."""
+        return stored_files(self.path, name, self.path.open_table(name, version))
+
+    def shown(self, version: Version | None = None) -> list[Ingest]:
+        """The ingests whose transitions are in the store."""
+        held = [one for file in self.files(TRANSITIONS, version) for one in file.ingests]
+        return list({one.ingest_id: one for one in held}.values())
 
     def repeated(self, rows: pa.Table, period_s: float) -> RepeatedDrive | None:
         """The recording that holds most of these rows under other ids, if one largely does.
@@ -95,16 +147,21 @@ class StoreWriter:
         if not self.path.has_table(TRANSITIONS):
             return None
         own = rows["recording_id"][0].as_py()
-        others = [f for f in _files(self.path.open_table(TRANSITIONS)) if f.recording_id != own]
-        with ThreadPoolExecutor(READERS) as pool:
-            sketches = list(pool.map(self._sketch, others))
-        return find_repeat(rows, sketches, self.rows, period_s)
-
-    def _sketch(self, file: _File) -> Sketch:
-        metadata = None
+        others = [one for one in self.shown() if one.recording_id != own]
+        names = ("recording_id", "ingest_id", "sketch")
+        told = []
         with suppress(*UNREADABLE):  # another recording, which `restock sql` reports
-            metadata = self.path.read_schema(f"{RECORDINGS}/{file.path}").metadata
-        return Sketch(file.recording_id, file.ingest_id, read_sketch(metadata))
+            schema = pa.schema([pa.field(name, pa.string()) for name in names])
+            told = self.manifests(others, schema).to_pylist()
+        sketches = [
+            Sketch(
+                one["recording_id"],
+                one["ingest_id"],
+                read_sketch({SKETCH: (one["sketch"] or "").encode()}),
+            )
+            for one in told
+        ]
+        return find_repeat(rows, sketches, self.rows, period_s)
 
     def write(self, manifest: pa.Table, rows: pa.Table) -> int:
         """Write one recording's manifest row and transitions, replacing its old ones.
@@ -130,20 +187,24 @@ class StoreWriter:
         Raises:
             StoreError: as `write`, or what was to be replaced has changed.
         """
-        manifests: list[_Added] = []
-        transitions: list[_Added] = []
+        manifests: list[AddedFile] = []
+        transitions: list[AddedFile] = []
+        created: tuple[pa.Schema, ...] = ()
         try:
             for manifest, rows in recordings:
                 recording_id = manifest["recording_id"][0].as_py()
-                name = f"{recording_id}/{manifest['ingest_id'][0].as_py()}.parquet"
-                manifest = manifest.replace_schema_metadata({SKETCH: sketch(rows)})
-                self._create(RECORDINGS, recording_schema())
-                self._create(TRANSITIONS, _delta_schema(rows.schema))
+                name = own_path(recording_id, manifest["ingest_id"][0].as_py())
+                manifest = summarised(manifest, rows)
+                schemas = recording_columns(), delta_columns(rows.schema)
+                if schemas != created:
+                    self.create(RECORDINGS, schemas[0])
+                    self.create(TRANSITIONS, schemas[1])
+                    created = schemas
                 for table, what, added in (
                     (manifest, RECORDINGS, manifests),
                     (rows, TRANSITIONS, transitions),
                 ):
-                    added.append(_Added(recording_id, name, len(table)))
+                    added.append(AddedFile(recording_id, name, len(table)))
                     added[-1].size = self._write(table, f"{what}/{name}")
         except BaseException:  # no commit has begun, so they are not needed
             with suppress(OSError, StoreError):
@@ -185,12 +246,12 @@ class StoreWriter:
         if not self.path.has_table(RECORDINGS) or not self.path.has_table(TRANSITIONS):
             return []
         manifests = self.path.open_table(RECORDINGS)  # before the transitions that may join them
-        shown = {file.path for file in _files(self.path.open_table(TRANSITIONS))}
+        shown = {one.ingest_id for one in self.shown()}
         before_ms = (time.time() - retention_hours * 3600) * 1000
         return [
             file.path
-            for file in _files(manifests)
-            if file.path not in shown and file.added_ms < before_ms
+            for file in stored_files(self.path, RECORDINGS, manifests)
+            if file.added_ms < before_ms and not shown & {one.ingest_id for one in file.ingests}
         ]
 
     def _write(self, rows: pa.Table, path: str) -> int:
@@ -198,22 +259,16 @@ class StoreWriter:
 
         Lists of fixed size become plain lists, which every engine that knows Delta reads.
         """
-        rows = rows.cast(_delta_schema(rows.schema).with_metadata(rows.schema.metadata))
+        rows = rows.cast(delta_columns(rows.schema).with_metadata(rows.schema.metadata))
         try:
-            return self.path.write(
-                rows,
-                path,
-                row_group_size=ROW_GROUP_ROWS,
-                compression="zstd",
-                use_dictionary=[f.name for f in rows.schema if pa.types.is_string(f.type)],
-                use_byte_stream_split=_float_columns(rows.schema),
-            )
+            options = parquet_options(rows.schema)
+            return self.path.write(rows, path, row_group_size=ROW_GROUP_ROWS, **options)
         except OSError as error:
             raise StoreError(
                 f"cannot be written: {first_line(error)}", where=str(self.path)
             ) from error
 
-    def _create(self, name: str, schema: pa.Schema) -> None:
+    def create(self, name: str, schema: pa.Schema) -> None:
         """See that there is a table with these columns.
 
         Columns that newer software writes are added; rows from before hold null in them.
@@ -237,10 +292,10 @@ class StoreWriter:
             if extra:
                 table.alter.add_columns(Schema.from_arrow(pa.schema(extra)).fields)
 
-        self._again_on_conflict(create)
+        self.again_on_conflict(create)
 
     def _commit(
-        self, name: str, added: Sequence[_Added], instead_of: Mapping[str, str]
+        self, name: str, added: Sequence[AddedFile], instead_of: Mapping[str, str]
     ) -> tuple[int, list[str]]:
         """Add files, all or nothing; to `transitions`, remove the same recordings' others with it.
 
@@ -251,30 +306,35 @@ class StoreWriter:
 
         def commit() -> int:
             table = self.path.open_table(name)
-            active = _files(table)
+            active = stored_files(self.path, name, table)
             if {file.path for file in added} <= {file.path for file in active}:
                 return table.version()  # by the attempt before, whose answer was lost
             self._still(instead_of)
             now_ms = time.time_ns() // 1_000_000
-            actions: list[AddAction | RemoveAction] = [
-                AddAction(f.path, f.size, {}, now_ms, True, json.dumps({"numRecords": f.rows}))
-                for f in added
-            ]
+            actions: list[AddAction | RemoveAction] = [add_action(f, now_ms) for f in added]
             turns = []
             if name == TRANSITIONS:
-                replaced[:] = [file.path for file in active if file.recording_id in recordings]
-                actions += [RemoveAction(path, True, now_ms) for path in replaced]
+                replaced.clear()
+                for file in active:
+                    gone = [one for one in file.ingests if one.recording_id in recordings]
+                    if not gone:
+                        continue
+                    replaced.extend(own_path(one.recording_id, one.ingest_id) for one in gone)
+                    actions.append(RemoveAction(file.path, True, now_ms))
+                    kept = [one for one in file.ingests if one.recording_id not in recordings]
+                    if kept:
+                        actions.append(add_action(rewrite(self.path, file, kept), now_ms))
                 # Two first ingests of one recording add without removing, which is no conflict by
                 # itself: the transaction id makes it one.
                 turns = [
                     Transaction(app, (table.transaction_version(app) or 0) + 1)
                     for app in (f"restock/{recording}" for recording in recordings)
                 ]
-            self._transact(table, actions, turns)
+            self.transact(table, actions, turns)
             table.update_incremental()
             return table.version()
 
-        return self._again_on_conflict(commit), replaced
+        return self.again_on_conflict(commit), replaced
 
     def _remove(self, name: str, paths: Collection[str]) -> None:
         """Take files out of a table, those that are still in it."""
@@ -284,27 +344,29 @@ class StoreWriter:
             now_ms = time.time_ns() // 1_000_000
             actions = [
                 RemoveAction(file.path, True, now_ms)
-                for file in _files(table)
+                for file in stored_files(self.path, name, table)
                 if file.path in paths
             ]
             if actions:
-                self._transact(table, actions, [])
+                self.transact(table, actions, [])
 
         if paths:
-            self._again_on_conflict(commit)
+            self.again_on_conflict(commit)
 
-    def _transact(
+    def transact(
         self,
         table: DeltaTable,
         actions: Sequence[AddAction | RemoveAction],
         turns: Sequence[Transaction],
+        operation: str = "restock ingest",
     ) -> None:
+        """Commit to a table. Raises CommitFailedError where another writer was faster."""
         table.create_write_transaction(
             list(actions),
             mode="append",
             schema=table.schema(),
             commit_properties=CommitProperties(
-                custom_metadata={"operation_name": "restock ingest"}, app_transactions=list(turns)
+                custom_metadata={"operation_name": operation}, app_transactions=list(turns)
             ),
         )
 
@@ -312,9 +374,7 @@ class StoreWriter:
         """Check that these ingests are the ones in the store."""
         if not instead_of:
             return
-        shown = {
-            file.recording_id: file.ingest_id for file in _files(self.path.open_table(TRANSITIONS))
-        }
+        shown = {one.recording_id: one.ingest_id for one in self.shown()}
         for recording, ingest in instead_of.items():
             if shown.get(recording) != ingest:
                 raise StoreError(
@@ -323,7 +383,7 @@ class StoreWriter:
                     remedy="try again; the store is as that ingest left it",
                 )
 
-    def _again_on_conflict(self, work: Callable[[], T]) -> T:
+    def again_on_conflict(self, work: Callable[[], T]) -> T:
         """Do it again, from a fresh look at the table, while other writers are faster."""
         for attempt in range(ATTEMPTS):
             try:
@@ -344,48 +404,20 @@ class StoreWriter:
         )
 
 
-@dataclass
-class _Added:
-    """A file to be committed."""
-
-    recording_id: str
-    path: str  # in its table
-    rows: int
-    size: int = 0  # bytes, once it is written
+def recording_columns() -> pa.Schema:
+    """The columns of `recordings`: the manifest's, and the summary's."""
+    return pa.schema([*recording_schema(), *SUMMARY_SCHEMA])
 
 
-class _File:
-    """An active file of a table, by its path `<recording_id>/<ingest_id>.parquet`."""
-
-    def __init__(self, path: str, added_ms: int) -> None:
-        if not OWN_PATH.fullmatch(path):
-            raise StoreError(
-                f"holds a file that `restock ingest` did not write: {path}",
-                remedy="restore the version before it was added (compacting tools rewrite files)",
-            )
-        self.path, self.added_ms = path, added_ms
-        self.recording_id, name = path.split("/")
-        self.ingest_id = name.removesuffix(".parquet")
+def _with_sketch(manifests: pa.Table) -> pa.Table:
+    """Manifests of an earlier version have their sketch in their metadata."""
+    said = (manifests.schema.metadata or {}).get(SKETCH)
+    if said and "sketch" not in manifests.column_names:
+        manifests = manifests.append_column("sketch", pa.array([said.decode()] * len(manifests)))
+    return manifests
 
 
-def _files(table: DeltaTable) -> list[_File]:
-    actions = table.get_add_actions(flatten=True)
-    paths, added_ms = actions["path"].to_pylist(), actions["modification_time"].to_pylist()
-    return [_File(path, ms) for path, ms in zip(paths, added_ms, strict=True)]
-
-
-def _float_columns(schema: pa.Schema) -> list[str]:
-    """Parquet's paths of the float columns, those in lists of floats included."""
-    paths = []
-    for field in schema:
-        if pa.types.is_floating(field.type):
-            paths.append(field.name)
-        elif pa.types.is_list(field.type) and pa.types.is_floating(field.type.value_type):
-            paths.append(f"{field.name}.list.element")
-    return paths
-
-
-def _delta_schema(schema: pa.Schema) -> pa.Schema:
+def delta_columns(schema: pa.Schema) -> pa.Schema:
     """The same columns without lists of fixed size, which Delta does not know."""
     return pa.schema(
         [

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from restock.errors import StoreError
 from restock.ingest.store.location import Location
+from restock.ingest.store.summary import SUMMARY_SCHEMA
 from restock.ingest.store.writer import RECORDINGS, TRANSITIONS
 from restock.ingest.task.tags import NAMED
 from restock.replay.store.query import VIEWS
@@ -135,7 +136,8 @@ def install_views(session: SparkSession | Any, store: str | Path, *, scheme: str
         table = session.read.format("delta").load(address)
         # Rows of an older store have no such columns: null.
         later = (sql for column, sql in _LATER[name].items() if column not in table.columns)
-        table = table.selectExpr("*", *later)
+        kept = [column for column in table.columns if column not in SUMMARY_SCHEMA.names]
+        table = table.selectExpr(*(kept if len(kept) < len(table.columns) else "*"), *later)
         table.createOrReplaceTempView(f"stored_{name}")
     for statement in statements():
         session.sql(statement)

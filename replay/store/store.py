@@ -2,51 +2,51 @@
 
 The views of `views.sql` and the macros of `macros.sql` are there; queries are read-only. DuckDB
 reads a folder's files itself; those on S3 it reads through Arrow, which skips the columns and row
-groups that a query does not ask for.
+groups that a query does not ask for. Columns, files and counts of rows are those of Delta's log, so
+that no file of transitions is looked at before a query needs it; manifests are held in memory.
 """
 
 from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, TypeVar
-from urllib.parse import unquote
 
 import duckdb
 import msgspec
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.dataset
 from deltalake import DeltaTable
 
 from restock.errors import StoreError
 from restock.files import first_line
+from restock.ingest.store.lineage import Ingest, StoredFile, ingests_table, own_path, stored_files
 from restock.ingest.store.location import Location
+from restock.ingest.store.summary import SUMMARY_SCHEMA, TABLES
+from restock.ingest.store.summary import VERSION as SUMMARY_VERSION
 from restock.ingest.store.version import Version
-from restock.ingest.store.writer import OWN_PATH, RECORDINGS, RETENTION_HOURS, TRANSITIONS
+from restock.ingest.store.writer import RECORDINGS, RETENTION_HOURS, TRANSITIONS, StoreWriter
 from restock.ingest.task.conditions import Condition
 from restock.ingest.task.task import Task
 from restock.replay.store.computed import install_computed
-from restock.replay.store.query import install_first, query
+from restock.replay.store.query import definitions, install_first, query
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class _Stored:
-    """The files of one table at the version that is open."""
+    """The files of one table at the version that is open, and what is read of them."""
 
-    name: str
+    view: str
+    table: str
     schema: pa.Schema
     paths: Sequence[str]  # in the table
-    hold: bool = False  # in memory, where the store lies on S3
-
-    @property
-    def view(self) -> str:
-        return f"stored_{self.name}"
 
 
 class StoredProfile(NamedTuple):
@@ -90,17 +90,24 @@ class Store:
         )
         if memory_limit is not None:
             self._set_memory(memory_limit)
-        rows = _paths(transitions)
-        manifests = _manifests(self.path, recordings, rows)
-        self._tables = (
-            _Stored(RECORDINGS, pa.schema(recordings.schema().to_arrow()), manifests, hold=True),
-            _Stored(TRANSITIONS, pa.schema(transitions.schema().to_arrow()), rows),
+        held = stored_files(self.path, TRANSITIONS, transitions)
+        manifests = _manifests(self.path, recordings, held)
+        columns = pa.schema(recordings.schema().to_arrow())
+        self._transitions = _Stored(
+            "stored_transitions",
+            TRANSITIONS,
+            pa.schema(transitions.schema().to_arrow()),
+            [file.path for file in held],
         )
+        self._recordings = _Stored("stored_recordings", RECORDINGS, _brief(columns), manifests)
+        kept = [columns.field("ingest_id"), *(one for one in SUMMARY_SCHEMA if one.name in TABLES)]
+        self._summaries = _Stored("stored_summaries", RECORDINGS, pa.schema(kept), manifests)
         self.files = {
-            table.view: [f"{self.path.table(table.name)}/{path}" for path in table.paths]
-            for table in self._tables
+            table.view: self._addresses(table) for table in (self._recordings, self._transitions)
         }
+        self._ingests = ingests_table(held)
         try:
+            self._manifests = self._held(self._recordings)
             self._present_all(self.connection, "main")
         except StoreError as error:
             if version is None:
@@ -116,6 +123,7 @@ class Store:
         # Of a query's text, before it runs: what only fails while rows are fetched is said here.
         self.checks: list[Callable[[str], None]] = []
         install_first(self.connection, self.observation_type)
+        self._install_summaries()
         install_computed(self)
 
     def __enter__(self) -> Store:
@@ -193,6 +201,17 @@ class Store:
         """The task of the store's rows. Raises StoreError as `task_json` does."""
         return self._decode(self.task_json(task_hash), Task, "task")
 
+    def episode_ends(self, recordings: Sequence[str] = ()) -> Iterator[tuple[str, pa.Table]]:
+        """The ends of the episodes of these recordings (of all, where none is named), as
+        `restock.ingest.store.episode_rows.episode_ends` gives them; of an older store none."""
+        writer = StoreWriter(self.path)
+        for one in self._ingests.to_pylist():
+            if recordings and one["recording_id"] not in recordings:
+                continue
+            ends = writer.ends(Ingest(one["recording_id"], one["ingest_id"], one["rows"]))
+            if ends is not None:
+                yield one["recording_id"], ends
+
     def _decode(self, text: str, kind: type[T], name: str) -> T:
         """What a manifest keeps as JSON.
 
@@ -211,7 +230,7 @@ class Store:
     def _read_tasks(self) -> dict[str, str]:
         rows = self.connection.sql(
             "SELECT DISTINCT task_hash, task_json FROM stored_recordings"
-            " WHERE ingest_id IN (SELECT ingest_id FROM stored_transitions) ORDER BY ALL"
+            " WHERE ingest_id IN (SELECT ingest_id FROM stored_ingests) ORDER BY ALL"
         ).fetchall()
         return dict(rows)
 
@@ -241,38 +260,59 @@ class Store:
         finally:
             connection.execute("USE main")
 
+    def _install_summaries(self) -> None:
+        """The common views over what manifests keep, where all do; else rows are scanned."""
+        told = self._manifests.filter(pc.equal(self._manifests["summary_version"], SUMMARY_VERSION))
+        every = pc.is_in(self._ingests["ingest_id"], told["ingest_id"])
+        if len(every) and pc.all(every).as_py():
+            self._present(self.connection, "main", self._summaries)
+            self.connection.execute(definitions(names=["summaries.sql"]))
+
     def _present_all(self, connection: duckdb.DuckDBPyConnection, schema: str) -> None:
-        """A view `stored_…` of the files of each table.
+        """`stored_ingests`, what the files hold, and a view `stored_…` of each table.
 
-        What lies on S3 is read at each query, or once, to be held in memory.
+        Manifests are held in memory; transitions on S3 are read at each query.
         """
-        for table in self._tables:
-            files = self.files[table.view]
-            if files and self.path.folder is not None:
-                read_parquet(connection, table.view, files, schema=schema)
-                continue
-            name = table.view if schema == "main" else f"{schema}_{table.view}"
-            with self.path.translate_errors():
-                connection.register(name, self._arrow(table))
-            if name != table.view:
-                connection.execute(f'CREATE VIEW "{schema}".{table.view} AS FROM "{name}"')
+        manifests = self._manifests.drop_columns(["summary_version"])
+        _register(connection, schema, "stored_ingests", self._ingests)
+        _register(connection, schema, self._recordings.view, manifests)
+        self._present(connection, schema, self._transitions)
 
-    def _arrow(self, table: _Stored) -> pa.Table | pa.dataset.Dataset:
+    def _present(self, connection: duckdb.DuckDBPyConnection, schema: str, table: _Stored) -> None:
+        if table.paths and self.path.folder is not None:
+            kinds, files = column_types(connection, table.schema), self._addresses(table)
+            read_parquet(connection, table.view, files, schema=schema, kinds=kinds)
+            return
+        with self.path.translate_errors():
+            _register(connection, schema, table.view, self._dataset(table))
+
+    def _addresses(self, table: _Stored) -> list[str]:
+        return [f"{self.path.table(table.table)}/{path}" for path in table.paths]
+
+    def _dataset(self, table: _Stored) -> pa.Table | pa.dataset.Dataset:
         if not table.paths:
             return table.schema.empty_table()
         parquet = pa.dataset.ParquetFileFormat(
             default_fragment_scan_options=pa.dataset.ParquetFragmentScanOptions(pre_buffer=True)
         )
-        remote = pa.dataset.FileSystemDataset(
-            [
-                parquet.make_fragment(f"{table.name}/{path}", self.path.files)
-                for path in table.paths
-            ],
-            table.schema,
-            parquet,
-            self.path.files,
-        )
-        return remote.to_table() if table.hold else remote
+        fragments = [
+            parquet.make_fragment(f"{table.table}/{path}", self.path.files) for path in table.paths
+        ]
+        return pa.dataset.FileSystemDataset(fragments, table.schema, parquet, self.path.files)
+
+    def _held(self, table: _Stored) -> pa.Table:
+        rows = self._dataset(table)
+        if isinstance(rows, pa.Table):
+            return rows
+        try:
+            with self.path.translate_errors():
+                return rows.to_table()
+        except (OSError, pa.ArrowException) as error:
+            raise StoreError(
+                f"its manifests cannot be read: {first_line(error)}",
+                where=str(self.path),
+                remedy="restore the file from a copy, or ingest its recording again",
+            ) from error
 
     def _set_memory(self, limit: str) -> None:
         try:
@@ -281,6 +321,29 @@ class Store:
             raise StoreError(
                 f"no memory limit {limit!r}", remedy='write it like "4GB" or "512MB"'
             ) from error
+
+
+def _register(
+    connection: duckdb.DuckDBPyConnection,
+    schema: str,
+    view: str,
+    rows: pa.Table | pa.dataset.Dataset,
+) -> None:
+    name = view if schema == "main" else f"{schema}_{view}"
+    connection.register(name, rows)
+    if name != view:
+        connection.execute(f'CREATE VIEW "{schema}".{view} AS FROM "{name}"')
+
+
+def _brief(columns: pa.Schema) -> pa.Schema:
+    """The manifests' columns without those of their summaries, but for its version."""
+    names = set(SUMMARY_SCHEMA.names)
+    return pa.schema(
+        [
+            *(one for one in columns if one.name not in names),
+            SUMMARY_SCHEMA.field("summary_version"),
+        ]
+    )
 
 
 def profiles_of(connection: duckdb.DuckDBPyConnection, task_hash: str) -> list[StoredProfile]:
@@ -322,22 +385,19 @@ def _expect(place: Location) -> None:
     )
 
 
-def _paths(table: DeltaTable) -> list[str]:
-    """The table's files, by their paths in it."""
-    paths = table.get_add_actions(flatten=True)["path"].to_pylist()
-    return [unquote(str(path)) for path in paths]
-
-
-def _manifests(place: Location, recordings: DeltaTable, rows: Sequence[str]) -> list[str]:
+def _manifests(place: Location, recordings: DeltaTable, held: Sequence[StoredFile]) -> list[str]:
     """The files of the manifests, those of an older version's rows included.
 
     A manifest is taken out of `recordings` when its rows are replaced. Who reads the rows as they
     were before, by version or because the writer was between two commits, finds it by its name.
     """
-    active = _paths(recordings)
-    gone = sorted(set(filter(OWN_PATH.fullmatch, rows)) - set(active))
+    active = stored_files(place, RECORDINGS, recordings)
+    here = {one.ingest_id for file in active for one in file.ingests}
+    ingests = (one for file in held for one in file.ingests if one.ingest_id not in here)
+    gone = sorted({own_path(one.recording_id, one.ingest_id) for one in ingests})
     infos = place.files.get_file_info([f"{RECORDINGS}/{path}" for path in gone])
-    return active + [path for path, info in zip(gone, infos, strict=True) if info.is_file]
+    found = [path for path, info in zip(gone, infos, strict=True) if info.is_file]
+    return [file.path for file in active] + found
 
 
 @contextmanager
@@ -359,15 +419,16 @@ def read_parquet(
     *,
     schema: str = "main",
     absent: Sequence[str] = (),
+    kinds: Mapping[str, str] | None = None,
 ) -> None:
     """A view over Parquet files; columns that only some have are null in the others, and so are
-    text columns that are `absent` from all.
+    text columns that are `absent` from all. With `kinds` of columns, no file is looked at.
 
     Raises:
         StoreError: one of them is missing or damaged.
     """
     try:
-        connection.execute(parquet_view(view, files, schema=schema, absent=absent))
+        connection.execute(parquet_view(view, files, schema=schema, absent=absent, kinds=kinds))
     except duckdb.Error as error:
         where = str(files[0]) if len(files) == 1 else os.path.commonpath([str(f) for f in files])
         raise StoreError(
@@ -383,12 +444,35 @@ def parquet_view(
     *,
     schema: str | None = None,
     absent: Sequence[str] = (),
+    kinds: Mapping[str, str] | None = None,
 ) -> str:
-    """The statement that makes such a view."""
-    quoted = ", ".join("'" + str(file).replace("'", "''") + "'" for file in files)
+    """The statement that makes such a view.
+
+    `kinds` are its columns with DuckDB's types; without them every file is opened to find out,
+    each time that a query names the view.
+    """
+    quoted = ", ".join(_literal(str(file)) for file in files)
     name = f'"{schema}"."{view}"' if schema else f'"{view}"'
     nulls = "".join(f", NULL::VARCHAR AS {column}" for column in absent)
+    columns = "union_by_name = true"
+    if kinds is not None:
+        fields = ", ".join(
+            f"{_literal(column)}: {{name: {_literal(column)}, type: {_literal(kind)},"
+            " default_value: NULL}"
+            for column, kind in kinds.items()
+        )
+        columns = f"schema = MAP {{{fields}}}"
     return (
-        f"CREATE OR REPLACE VIEW {name} AS"
-        f" SELECT *{nulls} FROM read_parquet([{quoted}], union_by_name = true)"
+        f"CREATE OR REPLACE VIEW {name} AS SELECT *{nulls} FROM read_parquet([{quoted}], {columns})"
     )
+
+
+def column_types(connection: duckdb.DuckDBPyConnection, schema: pa.Schema) -> dict[str, str]:
+    """Columns of an Arrow schema with DuckDB's types."""
+    with passed_in(connection, columns_of_schema=schema.empty_table()):
+        rows = connection.sql("DESCRIBE columns_of_schema").fetchall()
+    return {str(row[0]): str(row[1]) for row in rows}
+
+
+def _literal(text: str) -> str:
+    return "'" + text.replace("'", "''") + "'"

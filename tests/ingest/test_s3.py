@@ -84,7 +84,7 @@ def test_of_two_writers_of_one_version_the_second_is_refused(place, monkeypatch)
     assert late.version() == 1
     with pytest.raises(boto3.client("s3").exceptions.ClientError, match="PreconditionFailed"):
         put(Bucket=BUCKET, Key=key, Body=b"", IfNoneMatch="*")
-    StoreWriter(place)._transact(late, [], [])  # finds version 2 taken, and becomes 3
+    StoreWriter(place).transact(late, [], [])  # finds version 2 taken, and becomes 3
     assert Location.of(place).open_table(TRANSITIONS).version() == 3
     assert len(shown(place)) == 2
 

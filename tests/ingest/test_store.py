@@ -12,10 +12,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from deltalake import DeltaTable
 from deltalake.exceptions import CommitFailedError
+from deltalake.transaction import AddAction
 from support.s3_server import address, files_of
 from support.stores import one, shown
 
@@ -228,16 +230,16 @@ def test_columns_that_two_writers_add_at_once_are_added_once(tmp_path, monkeypat
 
 
 def test_a_commit_whose_answer_was_lost_is_not_done_twice(tmp_path, monkeypatch):
-    transact = StoreWriter._transact
+    transact = StoreWriter.transact
 
     def lost(self, *args):
         transact(self, *args)
-        monkeypatch.setattr(StoreWriter, "_transact", transact)
+        monkeypatch.setattr(StoreWriter, "transact", transact)
         raise CommitFailedError("the answer was lost")
 
     writer = StoreWriter(tmp_path / "s")
     writer.write(*one(1, "a"))
-    monkeypatch.setattr(StoreWriter, "_transact", lost)
+    monkeypatch.setattr(StoreWriter, "transact", lost)
     writer.write(*one(1, "b"))
     assert shown(tmp_path / "s") == {"0000000000000001-b": len(one(1, "b")[1])}
     assert DeltaTable(str(tmp_path / "s" / RECORDINGS)).count() == 1
@@ -315,9 +317,9 @@ def test_places_that_cannot_hold_a_store_are_refused(place, said, tmp_path, monk
 def test_files_of_other_tools_are_refused_by_name(tmp_path):
     path = tmp_path / "s"
     StoreWriter(path).write(*one(1))
-    DeltaTable(str(path / "transitions")).optimize.compact()
-    StoreWriter(path).write(*one(2))
-    DeltaTable(str(path / "transitions")).optimize.compact()
+    writer, table = StoreWriter(path), DeltaTable(str(path / "transitions"))
+    size = writer.path.write(pa.table({"reward": [1.0]}), "transitions/strange.parquet")
+    writer.transact(table, [AddAction("strange.parquet", size, {}, 0, True, "{}")], [])
     with pytest.raises(StoreError, match="did not write"):
         StoreWriter(path).write(*one(3))
 

@@ -21,6 +21,7 @@ VERBS = {
     "profile": "propose a profile for an unknown robot, or check one against a recording",
     "ingest": "recordings -> labelled Parquet transitions in a store",
     "label": "label a store again after its conditions changed, without the recordings",
+    "compact": "few large files in place of a store's many small ones",
     "sql": "any question to a store (or a run), in SQL",
     "audit": "is the coverage good enough? exit 1 if not",
     "drift": "which robot's wheels, lidar or floor have changed?",
@@ -44,7 +45,7 @@ VERBS = {
 # folder -> the verbs whose modules it holds
 FOLDERS = {
     "data": (
-        *("info", "profile", "ingest", "label", "sql", "audit"),
+        *("info", "profile", "ingest", "label", "compact", "sql", "audit"),
         *("drift", "diff", "gaps", "mix", "export"),
     ),
     "learning": ("train", "eval", "study", "compare", "trace", "diagnose", "report"),

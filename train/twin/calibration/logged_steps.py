@@ -17,13 +17,10 @@ from typing import Any
 import duckdb
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import ConfigError, StoreError
-from restock.ingest.store.episode_rows import episode_ends
-from restock.ingest.store.writer import TRANSITIONS
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.schema import SIGNAL_COLUMNS
 from restock.ingest.task.signals import Signals
@@ -228,16 +225,8 @@ def _ends(
 ) -> tuple[Ints, Signals]:
     """Of the `last` rows (N,) of stretches those that an episode's end follows, and these ends."""
     row_of = {(str(episode[row]), int(step[row])): row for row in np.flatnonzero(last).tolist()}
-    rows, parts, root = [], [], store.path.table(TRANSITIONS)
-    for file in store.files["stored_transitions"]:
-        inside = file.removeprefix(f"{root}/")
-        recording = inside.split("/")[0]
-        if recordings and recording not in recordings:
-            continue
-        schema = pq.read_schema(f"{TRANSITIONS}/{inside}", filesystem=store.path.files)
-        ends = episode_ends(schema.empty_table())
-        if ends is None:
-            continue
+    rows, parts = [], []
+    for recording, ends in store.episode_ends(recordings):
         numbers = zip(
             ends["episode_index"].to_pylist(), ends["step_index"].to_pylist(), strict=True
         )

@@ -73,6 +73,7 @@ class IngestCommand:
         from restock.ingest.batch import IngestJob, ingest_all
         from restock.ingest.containers.open_recording import with_definitions
         from restock.ingest.profile.profile import load_profile
+        from restock.ingest.store.compaction import fold_if_many
         from restock.ingest.store.writer import StoreWriter
         from restock.ingest.task.tags import parse_tags
 
@@ -105,6 +106,7 @@ class IngestCommand:
                     show(result)
         if store is not None and outcomes:
             StoreWriter(store).clean()
+            fold_if_many(StoreWriter(store))
         if self.json:
             output.print_json({"recordings": outcomes + failures})
         if not outcomes:

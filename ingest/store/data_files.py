@@ -1,0 +1,139 @@
+"""The Parquet files of a store's tables: how they are written, and several written as one."""
+
+from __future__ import annotations
+
+import json
+import uuid
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from deltalake.transaction import AddAction
+
+from restock.ingest.store.lineage import INGESTS, Ingest, StoredFile, packed_ingests
+from restock.ingest.store.location import Location
+
+GROUP_ROWS = 65_536  # of a compacted file's row groups
+GROUP_BYTES = 64 << 20  # or where rows are large, as manifests are
+READ_ROWS = 2048
+TRANSITIONS = "transitions"
+
+
+@dataclass
+class AddedFile:
+    """A file to be committed."""
+
+    recording_id: str
+    path: str  # in its table
+    rows: int
+    size: int = 0  # bytes, once it is written
+
+
+def add_action(file: AddedFile, now_ms: int) -> AddAction:
+    """What a commit says of a file."""
+    stats = json.dumps({"numRecords": file.rows})
+    return AddAction(file.path, file.size, {}, now_ms, True, stats)
+
+
+def parquet_options(schema: pa.Schema) -> dict[str, Any]:
+    """How the tables' columns are encoded."""
+    return {
+        "compression": "zstd",
+        "use_dictionary": [f.name for f in schema if pa.types.is_string(f.type)],
+        "use_byte_stream_split": _float_columns(schema),
+    }
+
+
+def compacted_name() -> str:
+    """The path of a file of several ingests."""
+    return f"compacted/{uuid.uuid4().hex}.parquet"
+
+
+def rewrite(place: Location, file: StoredFile, kept: Sequence[Ingest]) -> AddedFile:
+    """A compacted file of transitions without the ingests that are not kept."""
+    with place.reading(f"{TRANSITIONS}/{file.path}") as source:
+        schema = pq.read_schema(source)
+    return merge(place, TRANSITIONS, [file], kept, schema)
+
+
+def merge(
+    place: Location,
+    name: str,
+    files: Sequence[StoredFile],
+    kept: Sequence[Ingest],
+    schema: pa.Schema,
+    *,
+    extra: Sequence[pa.Table] = (),
+) -> AddedFile:
+    """One file of what these files of a table hold of some ingests, in their order, and of `extra`
+    manifests.
+
+    A row group at a time is in memory. Columns of `schema` that a file lacks are null.
+    """
+    wanted = pa.array([one.ingest_id for one in kept], pa.string())
+    rows = [(one["recording_id"][0].as_py(), one["ingest_id"][0].as_py()) for one in extra]
+    held = [*kept, *(Ingest(*ids, 1) for ids in rows)]
+    schema = schema.with_metadata({INGESTS: packed_ingests(held)})
+    made = AddedFile("", compacted_name(), 0)
+    with (
+        place.writing(f"{name}/{made.path}") as sink,
+        pq.ParquetWriter(sink, schema, **parquet_options(schema)) as writer,
+    ):
+        waiting = [conformed(one, schema) for one in extra]
+        for part in _parts(place, name, files, wanted, schema):
+            waiting.append(part)
+            if sum(map(len, waiting)) >= GROUP_ROWS or _bytes(waiting) >= GROUP_BYTES:
+                made.rows += _flush(writer, waiting)
+        made.rows += _flush(writer, waiting)
+        writer.close()
+        made.size = sink.tell()
+    return made
+
+
+def conformed(rows: pa.Table, schema: pa.Schema) -> pa.Table:
+    """A table with the columns of a schema, in its order; null where it has none."""
+    columns = [
+        rows[field.name].cast(field.type)
+        if field.name in rows.column_names
+        else pa.nulls(len(rows), field.type)
+        for field in schema
+    ]
+    return pa.table(columns, schema=schema)
+
+
+def _parts(
+    place: Location, name: str, files: Sequence[StoredFile], wanted: pa.Array, schema: pa.Schema
+) -> Iterator[pa.Table]:
+    for file in files:
+        with place.reading(f"{name}/{file.path}") as source:
+            for batch in pq.ParquetFile(source).iter_batches(READ_ROWS):
+                rows = pa.table(batch)
+                rows = rows.filter(pc.is_in(rows["ingest_id"], wanted))
+                yield conformed(rows, schema)
+
+
+def _bytes(tables: Sequence[pa.Table]) -> int:
+    return sum(table.nbytes for table in tables)
+
+
+def _flush(writer: pq.ParquetWriter, waiting: list[pa.Table]) -> int:
+    rows = pa.concat_tables(waiting) if waiting else None
+    waiting.clear()
+    if not rows:
+        return 0
+    writer.write_table(rows, row_group_size=GROUP_ROWS)
+    return len(rows)
+
+
+def _float_columns(schema: pa.Schema) -> list[str]:
+    """Parquet's paths of the float columns, those in lists of floats included."""
+    paths = []
+    for field in schema:
+        if pa.types.is_floating(field.type):
+            paths.append(field.name)
+        elif pa.types.is_list(field.type) and pa.types.is_floating(field.type.value_type):
+            paths.append(f"{field.name}.list.element")
+    return paths

@@ -1,0 +1,139 @@
+"""Which ingests the files of a store's tables hold.
+
+A file that `restock ingest` wrote is named by its one ingest: `<recording_id>/<ingest_id>.parquet`.
+One that was compacted holds several: `restock compact` keeps their list in the file's metadata, and
+of files that other tools compacted it is read from the columns `recording_id` and `ingest_id`.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+from urllib.parse import unquote
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from deltalake import DeltaTable
+
+from restock.errors import StoreError
+from restock.files import first_line
+from restock.ingest.store.location import Location
+
+OWN_PATH = re.compile(r"([0-9a-f]{16})/[^/]+\.parquet")
+INGESTS = b"restock.ingests"  # key in the metadata of a compacted file
+READERS = 16  # of small files at once, which on S3 are a wait each
+_COLUMNS = ("recording_id", "ingest_id")
+
+
+class Ingest(NamedTuple):
+    """The rows of one ingest of a recording, in a file."""
+
+    recording_id: str
+    ingest_id: str
+    rows: int
+
+
+@dataclass(frozen=True)
+class StoredFile:
+    """An active file of a table."""
+
+    path: str  # in the table
+    rows: int
+    bytes: int
+    added_ms: int
+    ingests: tuple[Ingest, ...]
+
+    @property
+    def own(self) -> bool:
+        """Whether one ingest wrote it, and it is as it was written."""
+        return OWN_PATH.fullmatch(self.path) is not None
+
+
+def own_path(recording_id: str, ingest_id: str) -> str:
+    """Where an ingest writes."""
+    return f"{recording_id}/{ingest_id}.parquet"
+
+
+def stored_files(place: Location, name: str, table: DeltaTable) -> list[StoredFile]:
+    """The active files of a store's table `name`, with what each holds.
+
+    Raises:
+        StoreError: one is of another kind, or it cannot be read.
+    """
+    actions = table.get_add_actions(flatten=True)
+    columns = [
+        actions[column].to_pylist() if column in actions.schema.names else [None] * len(actions)
+        for column in ("path", "num_records", "size_bytes", "modification_time")
+    ]
+    adds = [(unquote(str(path)), *rest) for path, *rest in zip(*columns, strict=True)]
+    held = {path: one for path, rows, *_ in adds if (one := _named(path, rows))}
+    others = [path for path, *_ in adds if path not in held]
+    with ThreadPoolExecutor(READERS) as pool:
+        held |= zip(others, pool.map(lambda path: _read(place, name, path), others), strict=True)
+    return [
+        StoredFile(path, sum(one.rows for one in held[path]), size or 0, added_ms or 0, held[path])
+        for path, _, size, added_ms in adds
+    ]
+
+
+def packed_ingests(ingests: Sequence[Ingest]) -> bytes:
+    """The list of what a compacted file holds, for its metadata."""
+    return json.dumps(ingests, separators=(",", ":")).encode()
+
+
+def ingests_table(files: Iterable[StoredFile]) -> pa.Table:
+    """One row an ingest: recording_id, ingest_id, rows, and the file that has them."""
+    every = [(*one, file.path) for file in files for one in file.ingests]
+    names = ("recording_id", "ingest_id", "rows", "file")
+    types = (pa.string(), pa.string(), pa.int64(), pa.string())
+    columns = zip(*every, strict=True) if every else [()] * len(names)
+    arrays = [pa.array(list(c), t) for c, t in zip(columns, types, strict=True)]
+    return pa.table(dict(zip(names, arrays, strict=True)))
+
+
+def _named(path: str, rows: int | None) -> tuple[Ingest, ...] | None:
+    """What a file holds by its name, where it says that."""
+    if rows is None or not OWN_PATH.fullmatch(path):
+        return None
+    recording_id, file = path.split("/")
+    return (Ingest(recording_id, file.removesuffix(".parquet"), rows),)
+
+
+@lru_cache(maxsize=4096)  # files never change
+def _read(place: Location, name: str, path: str) -> tuple[Ingest, ...]:
+    where = f"{name}/{path}"
+    try:
+        with place.translate_errors(), place.files.open_input_file(where) as source:
+            file = pq.ParquetFile(source)
+            if said := (file.schema_arrow.metadata or {}).get(INGESTS):
+                return tuple(Ingest(*one) for one in json.loads(said))
+            counts: Counter[tuple[str | None, str | None]] = Counter()
+            if set(_COLUMNS) <= set(file.schema_arrow.names):
+                for batch in file.iter_batches(columns=list(_COLUMNS)):
+                    rows = pa.table(batch).group_by(list(_COLUMNS)).aggregate([([], "count_all")])
+                    for one in rows.to_pylist():
+                        counts[one["recording_id"], one["ingest_id"]] += one["count_all"]
+    except (OSError, pa.ArrowException) as error:
+        raise StoreError(
+            f"its file {where} cannot be read: {first_line(error)}",
+            where=str(place),
+            remedy="restore the file from a copy, or open a version that does not need it",
+        ) from error
+    held = [
+        Ingest(recording_id, ingest_id, count)
+        for (recording_id, ingest_id), count in counts.items()
+        if recording_id and ingest_id
+    ]
+    if sum(one.rows for one in held) < max(counts.total(), 1):
+        raise StoreError(
+            f"holds a file that `restock ingest` did not write: {path}",
+            where=str(place),
+            remedy="restore the version before it was added",
+        )
+    return tuple(held)

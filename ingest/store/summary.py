@@ -1,0 +1,131 @@
+"""What is kept of a recording in its manifest, so that common questions need not scan its rows.
+
+Its episodes, how many rows and episodes each cell of coverage has, the ends of its episodes and its
+sketch. Every writer of rows writes them, so they are true for as long as the rows are there.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+import duckdb
+import pyarrow as pa
+
+from restock.ingest.store.episode_rows import ENDS
+from restock.ingest.store.repeated import sketch
+
+VERSION = 1  # of summary.sql: a summary by another one is not used
+
+
+def _rows_of(**columns: pa.DataType) -> pa.DataType:
+    return pa.list_(pa.struct([pa.field(name, kind) for name, kind in columns.items()]))
+
+
+_TEXT, _TEXTS, _COUNT, _NUMBER = pa.string(), pa.list_(pa.string()), pa.int64(), pa.float64()
+TABLES = {  # of summary.sql, each a column
+    "episode_rows": _rows_of(
+        episode_id=_TEXT,
+        episode_index=pa.int32(),
+        start_ns=_COUNT,
+        end_ns=_COUNT,
+        steps=_COUNT,
+        missing_steps=_COUNT,
+        **{"return": _NUMBER},
+        ended=_TEXT,
+        ended_by=_TEXT,
+        goal_source=_TEXT,
+        success=pa.bool_(),
+        progress_m=_NUMBER,
+        bumped_steps=_COUNT,
+        clearance_min_m=pa.float32(),
+        conditions=_TEXTS,
+        behaviour_policies=_TEXTS,
+        first_policy=_TEXT,
+        handovers=_COUNT,
+        zones=_TEXTS,
+    ),
+    "cells": _rows_of(
+        condition=_TEXT,
+        action=pa.int16(),
+        zone=_TEXT,
+        behaviour_policy=_TEXT,
+        rows=_COUNT,
+        rewards=_COUNT,
+        reward_sum=_NUMBER,
+        known_ends=_COUNT,
+        terminated=_COUNT,
+        episodes=_COUNT,
+        successes=_COUNT,
+        goal_episodes=_COUNT,
+    ),
+    "condition_episodes": _rows_of(
+        condition=_TEXT,
+        episodes=_COUNT,
+        rows=_COUNT,
+        squared_rows=_COUNT,
+        successes=_COUNT,
+        goal_episodes=_COUNT,
+        returns=_COUNT,
+        return_sum=_NUMBER,
+    ),
+    "held_cells": _rows_of(condition=_TEXT, action=pa.int16(), rows=_COUNT),
+    "held_episodes": _rows_of(condition=_TEXT, episodes=_COUNT),
+}
+# Beside the columns of `recording_schema`; null in manifests of an older store.
+SUMMARY_SCHEMA = pa.schema(
+    [
+        pa.field("summary_version", pa.int32()),
+        pa.field("sketch", _TEXT),
+        pa.field("packed_ends", _TEXT),
+        *(pa.field(name, kind) for name, kind in TABLES.items()),
+    ]
+)
+_READ = (
+    *("episode_id", "episode_index", "step_index", "stamp_ns", "action", "reward", "terminated"),
+    *("truncated", "condition", "conditions", "behaviour_policy", "zone", "bumped", "goal_source"),
+    *("clearance_m", "progress_m"),
+)
+
+
+def summarised(manifest: pa.Table, rows: pa.Table) -> pa.Table:
+    """A manifest row with the summary of its recording's rows."""
+    values: dict[str, Any] = {
+        "summary_version": VERSION,
+        "sketch": sketch(rows).decode(),
+        "packed_ends": ((rows.schema.metadata or {}).get(ENDS) or b"").decode() or None,
+    }
+    with duckdb.connect() as connection:
+        read = rows.select([name for name in _READ if name in rows.schema.names])
+        connection.register("recording_rows", read)
+        connection.register("manifest", manifest.select(["task_json"]))
+        connection.execute(_definitions())
+        tables = {name: connection.table(name).to_arrow_table() for name in TABLES}
+    for field in SUMMARY_SCHEMA:
+        column = (
+            _listed(tables[field.name], field.type)
+            if field.name in tables
+            else pa.array([values[field.name]], field.type)
+        )
+        manifest = manifest.append_column(field, column)
+    return manifest
+
+
+def with_ends(rows: pa.Table, packed_ends: str | None) -> pa.Table:
+    """A recording's rows with the ends of their episodes, from its manifest, in their metadata."""
+    metadata = {ENDS: packed_ends.encode()} if packed_ends else None
+    return rows.replace_schema_metadata(metadata)
+
+
+@cache
+def _definitions() -> str:
+    return (files("restock.ingest.store") / "summary.sql").read_text(encoding="utf-8")
+
+
+def _listed(rows: pa.Table, kind: pa.DataType) -> pa.Array:
+    """All rows of a table as the one value of a list column."""
+    fields = list(kind.value_type)
+    columns = [rows[field.name].cast(field.type).combine_chunks() for field in fields]
+    values = pa.StructArray.from_arrays(columns, fields=fields)
+    return pa.ListArray.from_arrays(pa.array([0, len(rows)], pa.int32()), values).cast(kind)

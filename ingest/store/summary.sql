@@ -1,0 +1,109 @@
+-- What the common views need of a recording, from its transitions (`recording_rows`) and its
+-- `manifest`. Kept in its manifest; summaries.sql adds them up over the store. The
+-- definitions are those of views.sql, which scans: a test holds that both give the same.
+CREATE TEMP TABLE steps AS
+SELECT
+    *,
+    row_number() OVER (PARTITION BY episode_id ORDER BY step_index) > 1
+    AND behaviour_policy IS DISTINCT FROM lag(behaviour_policy) OVER (
+        PARTITION BY episode_id ORDER BY step_index
+    ) AS handover
+FROM (
+    FROM recording_rows
+    UNION ALL BY NAME
+    SELECT
+        NULL::VARCHAR AS goal_source,
+        NULL::VARCHAR AS zone,
+        NULL::VARCHAR AS behaviour_policy,
+        NULL::FLOAT AS progress_m,
+        NULL::BOOLEAN AS bumped,
+        NULL::FLOAT AS clearance_m
+    WHERE false
+)
+CROSS JOIN (
+    SELECT
+        CAST(json_extract_string(task_json, '$.rewards.goal') AS DOUBLE) AS goal_reward,
+        json_extract_string(task_json, '$.goal') = 'route' AS has_goal
+    FROM manifest
+);
+
+CREATE TEMP TABLE episode_rows AS
+SELECT
+    episode_id,
+    any_value(episode_index) AS episode_index,
+    min(stamp_ns) AS start_ns,
+    max(stamp_ns) AS end_ns,
+    count(*) AS steps,
+    CAST(max(step_index) - min(step_index) + 1 - count(*) AS BIGINT) AS missing_steps,
+    sum(reward) AS return,
+    CASE
+        WHEN bool_or(terminated) THEN 'terminated'
+        WHEN bool_or(truncated) THEN 'truncated'
+        ELSE 'open'
+    END AS ended,
+    CASE
+        WHEN any_value(has_goal) AND bool_or(terminated AND reward > goal_reward / 2) THEN 'goal'
+        WHEN bool_or(terminated) THEN 'bump'
+    END AS ended_by,
+    CASE WHEN any_value(has_goal) THEN coalesce(any_value(goal_source), 'logged') END AS goal_source,
+    CASE WHEN any_value(has_goal) AND coalesce(any_value(goal_source), 'logged') = 'logged'
+        THEN bool_or(terminated AND reward > goal_reward / 2)
+            AND NOT bool_or(bumped AND step_index > 0)
+    END AS success,
+    sum(progress_m) AS progress_m,
+    count(*) FILTER (WHERE bumped) AS bumped_steps,
+    min(clearance_m) AS clearance_min_m,
+    list_sort(list_distinct(flatten(list(conditions)))) AS conditions,
+    list_sort(list(DISTINCT behaviour_policy)) AS behaviour_policies,
+    arg_min(behaviour_policy, step_index) AS first_policy,
+    count(*) FILTER (WHERE handover) AS handovers,
+    list_sort(list(DISTINCT zone)) AS zones
+FROM steps
+GROUP BY episode_id
+ORDER BY min(step_index), episode_index;
+
+-- Episodes do not reach over recordings: numbers of distinct ones add up.
+CREATE TEMP TABLE cells AS
+SELECT
+    condition,
+    action,
+    zone,
+    behaviour_policy,
+    count(*) AS rows,
+    count(reward) AS rewards,
+    coalesce(sum(CAST(reward AS DOUBLE)), 0) AS reward_sum,
+    count(terminated) AS known_ends,
+    count(*) FILTER (terminated) AS terminated,
+    count(DISTINCT episode_id) AS episodes,
+    count(DISTINCT episode_id) FILTER (success) AS successes,
+    count(DISTINCT episode_id) FILTER (success IS NOT NULL) AS goal_episodes
+FROM steps
+JOIN (SELECT episode_id, success FROM episode_rows) USING (episode_id)
+GROUP BY condition, action, zone, behaviour_policy
+ORDER BY ALL;
+
+CREATE TEMP TABLE condition_episodes AS
+SELECT
+    condition,
+    count(*) AS episodes,
+    CAST(sum(n) AS BIGINT) AS rows,
+    CAST(sum(n * n) AS BIGINT) AS squared_rows,
+    count(*) FILTER (success) AS successes,
+    count(success) AS goal_episodes,
+    count(return) AS returns,
+    coalesce(sum(return), 0) AS return_sum
+FROM (SELECT condition, episode_id, count(*) AS n FROM steps GROUP BY condition, episode_id)
+JOIN (SELECT episode_id, success, return FROM episode_rows) USING (episode_id)
+GROUP BY condition
+ORDER BY ALL;
+
+CREATE TEMP TABLE held AS
+SELECT episode_id, unnest(conditions) AS condition, action FROM steps
+UNION ALL
+SELECT episode_id, condition, action FROM steps WHERE condition = 'nominal';
+
+CREATE TEMP TABLE held_cells AS
+SELECT condition, action, count(*) AS rows FROM held GROUP BY condition, action ORDER BY ALL;
+
+CREATE TEMP TABLE held_episodes AS
+SELECT condition, count(DISTINCT episode_id) AS episodes FROM held GROUP BY condition ORDER BY ALL;

@@ -1,0 +1,139 @@
+-- The common views over what each manifest keeps of its recording (`stored_summaries`, made by
+-- ingest/store/summary.sql), in place of those of views.sql and macros.sql, which scan the rows. Only where
+-- every recording of the store has a summary. Not in Spark's list.
+
+CREATE OR REPLACE VIEW episodes AS
+SELECT
+    recording_id,
+    one.episode_id AS episode_id,
+    one.episode_index AS episode_index,
+    task_hash,
+    one.start_ns AS start_ns,
+    one.end_ns AS end_ns,
+    make_timestamp(one.start_ns // 1000) AS start_time,
+    make_timestamp(one.end_ns // 1000) AS end_time,
+    make_timestamp((one.start_ns + coalesce(clock_offset_ns, 0)) // 1000) AS logged_start_time,
+    make_timestamp((one.end_ns + coalesce(clock_offset_ns, 0)) // 1000) AS logged_end_time,
+    one.steps AS steps,
+    one.missing_steps AS missing_steps,
+    (one.end_ns - one.start_ns) / 1e9 AS duration_s,
+    one.return AS return,
+    one.ended AS ended,
+    one.ended_by AS ended_by,
+    one.goal_source AS goal_source,
+    one.success AS success,
+    one.progress_m AS progress_m,
+    one.bumped_steps AS bumped_steps,
+    one.clearance_min_m AS clearance_min_m,
+    one.conditions AS conditions,
+    one.behaviour_policies AS behaviour_policies,
+    one.first_policy AS first_policy,
+    one.handovers AS handovers,
+    one.zones AS zones,
+    robot,
+    site,
+    firmware,
+    map,
+    shift,
+    tags
+FROM (SELECT ingest_id, unnest(episode_rows) AS one FROM stored_summaries)
+JOIN recordings USING (ingest_id);
+
+CREATE OR REPLACE VIEW coverage AS
+SELECT
+    cell.condition AS condition,
+    cell.action AS action,
+    cell.zone AS zone,
+    cell.behaviour_policy AS behaviour_policy,
+    CAST(sum(cell.rows) AS BIGINT) AS rows,
+    sum(cell.rows) / sum(sum(cell.rows)) OVER () AS share,
+    CAST(sum(cell.episodes) AS BIGINT) AS episodes,
+    sum(cell.reward_sum) / nullif(sum(cell.rewards), 0) AS reward_mean,
+    sum(cell.terminated) / nullif(sum(cell.known_ends), 0) AS terminal_fraction,
+    sum(cell.successes) / nullif(sum(cell.goal_episodes), 0) AS success_share
+FROM (SELECT ingest_id, unnest(cells) AS cell FROM stored_summaries)
+SEMI JOIN recordings USING (ingest_id)
+GROUP BY ALL
+ORDER BY condition, action, zone, behaviour_policy;
+
+CREATE OR REPLACE VIEW coverage_by_condition AS
+WITH seen AS (
+    SELECT
+        cell.condition AS condition,
+        CAST(sum(cell.rows) AS BIGINT) AS rows,
+        count(DISTINCT ingest_id) AS recordings,
+        count(DISTINCT cell.action) AS actions,
+        count(DISTINCT cell.zone) AS zones,
+        list_sort(list(DISTINCT cell.behaviour_policy)) AS behaviour_policies,
+        sum(cell.reward_sum) / nullif(sum(cell.rewards), 0) AS reward_mean,
+        sum(cell.terminated) / nullif(sum(cell.known_ends), 0) AS terminal_fraction
+    FROM (SELECT ingest_id, unnest(cells) AS cell FROM stored_summaries)
+    SEMI JOIN recordings USING (ingest_id)
+    GROUP BY ALL
+), by_episode AS (
+    SELECT
+        part.condition AS condition,
+        CAST(sum(part.episodes) AS BIGINT) AS episodes,
+        CAST(sum(part.rows) AS DOUBLE) * sum(part.rows) / sum(part.squared_rows) AS effective_episodes,
+        sum(part.successes) / nullif(sum(part.goal_episodes), 0) AS success_share,
+        sum(part.return_sum) / nullif(sum(part.returns), 0) AS return_mean
+    FROM (SELECT ingest_id, unnest(condition_episodes) AS part FROM stored_summaries)
+    SEMI JOIN recordings USING (ingest_id)
+    GROUP BY ALL
+), held_rows AS (
+    SELECT cell.condition AS condition, CAST(sum(cell.rows) AS BIGINT) AS rows_held
+    FROM (SELECT ingest_id, unnest(held_cells) AS cell FROM stored_summaries)
+    SEMI JOIN recordings USING (ingest_id)
+    GROUP BY ALL
+), held AS (
+    SELECT part.condition AS condition, CAST(sum(part.episodes) AS BIGINT) AS episodes_held
+    FROM (SELECT ingest_id, unnest(held_episodes) AS part FROM stored_summaries)
+    SEMI JOIN recordings USING (ingest_id)
+    GROUP BY ALL
+)
+SELECT
+    condition,
+    timing,
+    coalesce(rows, 0) AS rows,
+    coalesce(rows, 0) / nullif(sum(rows) OVER (), 0) AS share,
+    coalesce(episodes, 0) AS episodes,
+    coalesce(rows_held, 0) AS rows_held,
+    coalesce(episodes_held, 0) AS episodes_held,
+    coalesce(effective_episodes, 0) AS effective_episodes,
+    success_share,
+    return_mean,
+    reward_mean,
+    terminal_fraction,
+    coalesce(recordings, 0) AS recordings,
+    coalesce(actions, 0) AS actions,
+    coalesce(zones, 0) AS zones,
+    coalesce(behaviour_policies, []) AS behaviour_policies
+FROM conditions
+FULL JOIN seen USING (condition)
+FULL JOIN by_episode USING (condition)
+FULL JOIN held_rows USING (condition)
+FULL JOIN held USING (condition)
+ORDER BY rows DESC, condition;
+
+CREATE OR REPLACE MACRO cells_below(minimum) AS TABLE
+WITH held AS (
+    SELECT cell.condition AS condition, cell.action AS action, CAST(sum(cell.rows) AS BIGINT) AS rows
+    FROM (SELECT ingest_id, unnest(held_cells) AS cell FROM stored_summaries)
+    SEMI JOIN recordings USING (ingest_id)
+    GROUP BY ALL
+)
+SELECT condition, action, speed_mps, yaw_rate_radps, coalesce(rows, 0) AS rows
+FROM (
+    SELECT condition FROM conditions
+    UNION
+    SELECT cell.condition
+    FROM (SELECT ingest_id, unnest(cells) AS cell FROM stored_summaries)
+    SEMI JOIN recordings USING (ingest_id)
+)
+CROSS JOIN (SELECT DISTINCT action, speed_mps, yaw_rate_radps FROM actions)
+LEFT JOIN held USING (condition, action)
+WHERE coalesce(rows, 0) < minimum
+ORDER BY condition, action;
+
+CREATE OR REPLACE VIEW missing_cells AS
+SELECT condition, action, speed_mps, yaw_rate_radps FROM cells_below(1);

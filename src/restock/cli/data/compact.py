@@ -1,0 +1,55 @@
+"""`restock compact`: few large files in place of many small ones."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Annotated
+
+import tyro
+
+
+@dataclass
+class CompactCommand:
+    """Make few large files of a store's many small ones, so that queries open fewer of them.
+
+        restock compact store/
+        restock compact s3://warehouse/store --dry-run
+
+    Ingest writes a file a recording. Here they are joined, some half a million transitions a file,
+    in the order of robots and time, and so are the manifests; recordings of an older Restock get
+    their summaries, by which coverage is answered without a scan. No row changes: recordings can be
+    ingested again, relabelled and corrected as before, also while this runs, and older versions
+    stay readable for 7 days. For so long the disk holds both; then `restock ingest` cleans up.
+    """
+
+    store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
+    """The store: a folder, or s3://bucket/prefix."""
+    dry_run: bool = False
+    """Say what would be joined; write nothing."""
+    json: bool = False
+    """Print one JSON document: {"rows", "files_before", "files_after", …}."""
+
+    def run(self) -> None:
+        """Compact, and say what became of the files."""
+        from restock.cli import output
+        from restock.ingest.store.compaction import compact
+        from restock.ingest.store.writer import StoreWriter
+
+        done = compact(StoreWriter(self.store), dry_run=self.dry_run)
+        if self.json:
+            output.print_json(asdict(done))
+            return
+        files = f"{done.files_before:,} -> {done.files_after:,} files"
+        output.say(
+            f"{self.store}: {'would write' if self.dry_run else 'wrote'} {done.rows:,} transitions"
+            f" together, {files}"
+        )
+        if not self.dry_run:
+            output.say(f"manifests: {done.manifests_before:,} -> {done.manifests_after:,} files")
+        if done.summaries:
+            output.say(f"{done.summaries:,} recordings were given the summaries that they lacked")
+        if done.changed_meanwhile:
+            output.say(
+                f"{done.changed_meanwhile:,} files stayed as they were: other writers changed some"
+                " of them meanwhile; run it again"
+            )

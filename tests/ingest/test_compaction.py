@@ -1,0 +1,230 @@
+"""A store goes on after its files were compacted, and its summaries stay true."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import duckdb
+import pytest
+from deltalake import DeltaTable, write_deltalake
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.s3_server import address
+from support.stores import one, shown
+
+from restock.errors import StoreError
+from restock.ingest.store.compaction import OPERATION, compact, fold
+from restock.ingest.store.transitions import replaced
+from restock.ingest.store.writer import RECORDINGS, TRANSITIONS, StoreWriter
+from restock.replay.store.query import definitions
+from restock.replay.store.store import Store
+
+
+@pytest.fixture(params=["folder", "s3"])
+def place(request: pytest.FixtureRequest, tmp_path: Path) -> Path | str:
+    """Where a store may lie, of this test alone."""
+    if request.param == "folder":
+        return tmp_path / "s"
+    request.getfixturevalue("s3_server")
+    return address(request)
+
+
+def compacted_by_delta(path: Path) -> None:
+    """As any tool that knows Delta does it, with the old files gone."""
+    for name in (RECORDINGS, TRANSITIONS):
+        table = DeltaTable(str(path / name))
+        table.optimize.compact()
+        table.vacuum(retention_hours=0, dry_run=False, enforce_retention_duration=False)
+
+
+def test_ingest_goes_on_after_another_tool_compacted_the_files(tmp_path):
+    writer = StoreWriter(tmp_path / "s")
+    for recording in (1, 2, 3):
+        version = writer.write(*one(recording))
+    before = writer.rows(f"{2:016x}", f"{2:016x}-a")
+    compacted_by_delta(tmp_path / "s")
+    assert writer.rows(f"{2:016x}", f"{2:016x}-a").equals(before)
+    writer.write(*one(2, "b", seed=7))
+    writer.write(*one(4))
+    expected = {(1, "a"): 0, (2, "b"): 7, (3, "a"): 0, (4, "a"): 0}
+    assert shown(tmp_path / "s") == {
+        f"{recording:016x}-{ingest}": len(one(recording, ingest, seed)[1])
+        for (recording, ingest), seed in expected.items()
+    }
+    assert len(writer.live()) == 4
+    with Store(tmp_path / "s") as store:
+        assert store.version > version
+        after = store.sql("FROM transitions WHERE recording_id LIKE '%3'").to_arrow_table()
+    for name, values in one(3)[1].to_pydict().items():
+        assert after.sort_by("transition_id")[name].to_pylist() == values, name
+
+
+COMMON = (
+    "episodes ORDER BY episode_id",
+    "coverage",
+    "coverage_by_condition",
+    "missing_cells",
+    "cells_below(5)",
+)
+
+
+def same_as_scanned(path: Path | str) -> None:
+    """The common views say what the views that scan the rows say, on the same store."""
+    with Store(path) as store:
+        scanned = duckdb.connect()
+        scanned.register("stored_recordings", store.sql("FROM stored_recordings").to_arrow_table())
+        scanned.register("stored_ingests", store.sql("FROM stored_ingests").to_arrow_table())
+        rows = store.sql("FROM stored_transitions").to_arrow_table()
+        scanned.register("stored_transitions", rows)
+        scanned.execute(definitions(store.observation_type))
+        for view in COMMON:
+            by_summary, by_scan = store.sql(f"FROM {view}"), scanned.sql(f"FROM {view}")
+            assert by_summary.columns == by_scan.columns
+            assert by_summary.types == by_scan.types, view
+            assert rounded(by_summary) == rounded(by_scan), view
+        plan = str(store.sql("EXPLAIN FROM coverage_by_condition").fetchall())
+        assert "cells" in plan
+        count = store.sql("SELECT count(*) FROM transitions")
+        assert count.columns == ["count_star()"]
+        assert count.fetchall() == scanned.sql("SELECT count(*) FROM transitions").fetchall()
+
+
+def rounded(relation: duckdb.DuckDBPyRelation) -> list[tuple[object, ...]]:
+    """Sums in another order differ in their last digits."""
+    return [
+        tuple(round(value, 6) if isinstance(value, float) else value for value in row)
+        for row in relation.fetchall()
+    ]
+
+
+def test_views_over_summaries_are_those_over_rows(tmp_path):
+    writer = StoreWriter(tmp_path / "s")
+    writer.write_all([one(1), one(2)])
+    writer.write(*one(1, "b", seed=3))
+    same_as_scanned(tmp_path / "s")
+    compacted_by_delta(tmp_path / "s")
+    writer.write(*one(2, "c", seed=5))
+    same_as_scanned(tmp_path / "s")
+
+
+def test_a_compacted_store_goes_on(place):
+    writer = StoreWriter(place)
+    version = writer.write_all([one(1), one(2), one(3)])
+    as_written = writer.rows(f"{2:016x}", f"{2:016x}-a")
+    done = compact(writer)
+    assert (done.files_before, done.files_after, done.manifests_after) == (3, 1, 1)
+    assert done.rows == sum(shown(place).values())
+    same_as_scanned(place)
+    # Replaced, added, compacted again: and each row as its ingest wrote it.
+    writer.write(*one(2, "b", seed=7))
+    writer.write(*one(4))
+    same_as_scanned(place)
+    assert compact(writer).files_after == 1
+    assert writer.clean(retention_hours=24) == []
+    assert sorted(writer.live()["ingest_id"].to_pylist()) == sorted(shown(place))
+    with Store(place, version=version) as store:  # as it was before all that
+        counts = store.sql("SELECT ingest_id, count(*) FROM transitions GROUP BY ALL").fetchall()
+    assert dict(counts) == {f"{n:016x}-a": len(one(n)[1]) for n in (1, 2, 3)}
+    writer.clean(retention_hours=0)
+    kept = writer.rows(f"{3:016x}", f"{3:016x}-a")
+    assert kept.to_pylist() == one(3)[1].to_pylist()
+    assert as_written.to_pylist() == one(2)[1].to_pylist()
+    assert writer.repeated(replaced(kept, {"recording_id": "f" * 16}), 0.2) is not None
+    same_as_scanned(place)
+
+
+def test_nothing_is_left_to_compact_and_a_dry_run_writes_nothing(tmp_path):
+    writer = StoreWriter(tmp_path / "s")
+    writer.write_all([one(1), one(2)])
+    files = sorted((tmp_path / "s").rglob("*"))
+    assert compact(writer, dry_run=True).files_after == 1
+    assert sorted((tmp_path / "s").rglob("*")) == files
+    assert compact(writer).version is not None
+    assert compact(writer).version is None
+    with pytest.raises(StoreError, match="no such store"):
+        compact(StoreWriter(tmp_path / "none"))
+
+
+@pytest.mark.parametrize("recording", [1, 3])
+def test_an_ingest_while_it_compacts_loses_nothing(tmp_path, monkeypatch, recording):
+    """One that replaces a recording undoes the step; one that adds another does not."""
+    writer = StoreWriter(tmp_path / "s")
+    writer.write_all([one(1), one(2)])
+    transact = StoreWriter.transact
+
+    def overtaken(self, table, actions, turns, operation=OPERATION):
+        if table.table_uri.rstrip("/").endswith(TRANSITIONS):
+            monkeypatch.setattr(StoreWriter, "transact", transact)
+            StoreWriter(tmp_path / "s").write(*one(recording, "b", seed=8))
+        transact(self, table, actions, turns, operation)
+
+    monkeypatch.setattr(StoreWriter, "transact", overtaken)
+    done = compact(writer)
+    assert done.changed_meanwhile == (2 if recording == 1 else 0)
+    assert shown(tmp_path / "s")[f"{recording:016x}-b"] == len(one(recording, "b", seed=8)[1])
+    assert len(shown(tmp_path / "s")) == (2 if recording == 1 else 3)
+    same_as_scanned(tmp_path / "s")
+
+
+def test_a_replacing_ingest_is_not_undone_by_a_compaction_that_was_faster(tmp_path, monkeypatch):
+    writer = StoreWriter(tmp_path / "s")
+    writer.write_all([one(1), one(2)])
+    transact = StoreWriter.transact
+
+    def overtaken(self, table, actions, turns, operation="restock ingest"):
+        if table.table_uri.rstrip("/").endswith(TRANSITIONS):
+            monkeypatch.setattr(StoreWriter, "transact", transact)
+            assert compact(StoreWriter(tmp_path / "s")).files_after == 1
+        transact(self, table, actions, turns, operation)
+
+    monkeypatch.setattr(StoreWriter, "transact", overtaken)
+    writer.write(*one(1, "b", seed=8))
+    assert shown(tmp_path / "s") == {
+        f"{1:016x}-b": len(one(1, "b", seed=8)[1]),
+        f"{2:016x}-a": len(one(2)[1]),
+    }
+    same_as_scanned(tmp_path / "s")
+
+
+def test_a_store_of_an_older_restock_gets_its_summaries(tmp_path):
+    for name, tables in zip(
+        (RECORDINGS, TRANSITIONS), zip(one(1), one(2), strict=True), strict=True
+    ):
+        for table in tables:
+            write_deltalake(str(tmp_path / "s" / name), table, mode="append")
+    with Store(tmp_path / "s") as store:
+        assert "cells" not in str(store.sql("EXPLAIN FROM coverage").fetchall())
+        before = rounded(store.sql("FROM coverage"))
+    assert compact(StoreWriter(tmp_path / "s")).summaries == 2
+    with Store(tmp_path / "s") as store:
+        assert rounded(store.sql("FROM coverage")) == before
+    same_as_scanned(tmp_path / "s")
+
+
+steps = st.lists(
+    st.tuples(st.sampled_from(["ingest", "compact", "fold", "clean"]), st.integers(1, 3)),
+    min_size=2,
+    max_size=6,
+)
+
+
+@settings(max_examples=5, deadline=None)
+@given(steps)
+def test_whatever_comes_first_the_summaries_are_true(tmp_path_factory, steps):
+    path = tmp_path_factory.mktemp("store") / "s"
+    writer = StoreWriter(path)
+    writer.write(*one(1))
+    expected = {1: len(one(1)[1])}
+    for number, (step, recording) in enumerate(steps):
+        if step == "ingest":
+            writer.write(*(drawn := one(recording, f"i{number}", seed=number)))
+            expected[recording] = len(drawn[1])
+        elif step == "compact":
+            compact(writer)
+        elif step == "fold":
+            fold(writer)
+        else:
+            writer.clean(retention_hours=0)
+    found = shown(path)
+    assert {int(name[:16], 16): count for name, count in found.items()} == expected
+    same_as_scanned(path)
