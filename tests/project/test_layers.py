@@ -79,7 +79,7 @@ MAY_IMPORT = {
         " ingest/steps ingest/task ingest/urdf"
     ),
     "train/twin/calibration": (
-        "twin/floors twin/physics replay/store ingest/profile ingest/steps ingest/store ingest/task"
+        "twin/floors twin/physics replay/store ingest/profile ingest/steps ingest/task"
     ),
     "report": (
         "replay/fleet replay/panel replay/store train/run train/twin/calibration train/twin/floors"
