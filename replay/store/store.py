@@ -202,8 +202,8 @@ class Store:
         return self._decode(self.task_json(task_hash), Task, "task")
 
     def episode_ends(self, recordings: Sequence[str] = ()) -> Iterator[tuple[str, pa.Table]]:
-        """The ends of the episodes of these recordings (of all, where none is named), as
-        `restock.ingest.store.episode_rows.episode_ends` gives them; of an older store none."""
+        """Each recording's id with the ends of its episodes, a row an episode; of these recordings,
+        or of all where none is named. An older store has none."""
         writer = StoreWriter(self.path)
         for one in self._ingests.to_pylist():
             if recordings and one["recording_id"] not in recordings:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
@@ -45,7 +46,10 @@ def spark() -> Iterator[Any]:
     server = sail.SparkConnectServer("127.0.0.1", 0)
     server.start(background=True)
     _, port = server.listening_address
-    connected = session.builder.remote(f"sc://127.0.0.1:{port}").getOrCreate()
+    with pytest.MonkeyPatch.context() as patch:
+        # A worker of pytest-xdist has no main file, which pyspark takes for its own doctests.
+        patch.setattr(sys.modules["__main__"], "__file__", __file__, raising=False)
+        connected = session.builder.remote(f"sc://127.0.0.1:{port}").getOrCreate()
     yield connected
     connected.stop()  # before its server: at exit the client would look for that for minutes
     server.stop()
