@@ -21,7 +21,7 @@ from restock.replay.mixture.mixture import parse_mixture
 from restock.train.study.study import load_study
 from restock.train.twin.floors.floor_file import read_floor
 
-LANGUAGES = (*RUN, "toml", "json", "csv", "text", "py")  # py: signatures in docs/api.md
+LANGUAGES = (*RUN, "toml", "json", "csv", "text", "xml", "py")  # py: signatures in docs/api.md
 ALL = {page: blocks(page) for page in PAGES}
 PAGES_RUN = [page for page in PAGES if any(block.is_run for block in ALL[page])]
 PAGES_SLOW = [page for page in PAGES if any("slow" in block.marks for block in ALL[page])]
