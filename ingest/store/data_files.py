@@ -83,10 +83,13 @@ def merge(
         pq.ParquetWriter(sink, schema, **parquet_options(schema)) as writer,
     ):
         waiting = [conformed(one, schema) for one in extra]
+        rows_waiting = size_waiting = 0
         for part in _parts(place, name, files, wanted, schema):
             waiting.append(part)
-            if sum(map(len, waiting)) >= GROUP_ROWS or _bytes(waiting) >= GROUP_BYTES:
+            rows_waiting, size_waiting = rows_waiting + len(part), size_waiting + part.nbytes
+            if rows_waiting >= GROUP_ROWS or size_waiting >= GROUP_BYTES:
                 made.rows += _flush(writer, waiting)
+                rows_waiting = size_waiting = 0
         made.rows += _flush(writer, waiting)
         writer.close()
         made.size = sink.tell()
@@ -113,10 +116,6 @@ def _parts(
                 rows = pa.table(batch)
                 rows = rows.filter(pc.is_in(rows["ingest_id"], wanted))
                 yield conformed(rows, schema)
-
-
-def _bytes(tables: Sequence[pa.Table]) -> int:
-    return sum(table.nbytes for table in tables)
 
 
 def _flush(writer: pq.ParquetWriter, waiting: list[pa.Table]) -> int:
