@@ -17,7 +17,7 @@ from support.stores import recording_transitions, write_store
 from restock.arrays import F64
 from restock.cli import main
 from restock.replay.panel.panel import Panel
-from restock.train.evaluation.logged_ways import goal_of, logged_missions
+from restock.train.evaluation.logged_ways import AGREE_M, goal_of, logged_missions
 from restock.train.run.kept_evaluations import read_evaluations
 from restock.train.twin.floors.floors import open_floors
 
@@ -56,10 +56,7 @@ def test_a_goal_is_told_by_the_last_look_or_by_distances(
     curved_rows = rows_toward(at, curved)
     curved_rows[:, 3] *= 0.5
     again = goal_of(curved_rows, TASK.far_m)
-    assert again is None or np.hypot(*(again - at)) < AGREED_M
-
-
-AGREED_M = 0.2
+    assert again is None or np.hypot(*(again - at)) < AGREE_M
 
 
 @pytest.fixture(scope="module")

@@ -277,7 +277,7 @@ def test_latency_delays_the_wheels_by_what_it_says() -> None:
         rows = []
         for _ in range(3):
             sim.controller.command(np.array([[1.0, 0.0]]))
-            rows += [sim.controller.wheel_speeds(block * BLOCK_S)[0] for block in range(2)]
+            rows += [sim.controller.controls(block * BLOCK_S)[0] for block in range(2)]
         assert int((np.concatenate(rows)[:, 0] == 0).sum()) == still
 
 
