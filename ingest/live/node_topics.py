@@ -15,7 +15,8 @@ import msgspec
 
 from restock.errors import ConfigError
 from restock.ingest.profile.custom_signal import CustomSignal
-from restock.ingest.profile.profile import MOTION, Input, Profile
+from restock.ingest.profile.inputs import MOTION, Input
+from restock.ingest.profile.profile import Profile
 from restock.ingest.task.conditions import Condition
 from restock.ingest.task.limiter import RULES
 

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from restock.errors import ConfigError
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, join
 from restock.ingest.live.clock import LiveClock
-from restock.ingest.profile.profile import Input, Profile
+from restock.ingest.profile.inputs import Input
+from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.signal_paths import element_of
 from restock.ingest.steps.align import NS, ClockSegment, Samples
 from restock.ingest.steps.aligned_inputs import AlignedInputs, InputColumns

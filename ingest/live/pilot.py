@@ -16,7 +16,7 @@ import numpy as np
 from restock.errors import ConfigError, RestockError
 from restock.ingest.live.observer import LiveObserver, Observed, value_of
 from restock.ingest.live.policy_file import PolicyFile
-from restock.ingest.profile.profile import Input
+from restock.ingest.profile.inputs import Input
 from restock.ingest.steps.align import NS
 from restock.ingest.task.limiter import NONE, RULES, UNKNOWN, Limits, limit
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from restock.ingest.profile.profile import HINDSIGHT
+from restock.ingest.profile.inputs import HINDSIGHT
 from restock.ingest.task.hindsight import NO_MISSION, GoalSource
 
 RADIUS_M = (0.1, 0.4)  # the least and the most of a goal

@@ -20,7 +20,7 @@ import numpy as np
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.decoding.columns import Ragged
-from restock.ingest.profile.profile import MOTION
+from restock.ingest.profile.inputs import MOTION
 from restock.ingest.propose.footprint import descriptions
 from restock.ingest.propose.roles import KINDS, Kind, topics_for, usable_topics
 from restock.ingest.steps.clocks import STAMP

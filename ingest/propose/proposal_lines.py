@@ -11,7 +11,7 @@ from restock.arrays import F64
 from restock.errors import visible
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
-from restock.ingest.profile.profile import FALLBACKS
+from restock.ingest.profile.inputs import FALLBACKS
 from restock.ingest.propose.candidates import Candidate
 from restock.ingest.propose.clock_choice import ClockChoice, Gaps
 from restock.ingest.propose.command_choice import CommandChoice

@@ -18,7 +18,8 @@ from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.decoding.columns import TopicColumns
-from restock.ingest.profile.profile import MOTION, parse_profile
+from restock.ingest.profile.inputs import MOTION
+from restock.ingest.profile.profile import parse_profile
 from restock.ingest.propose.candidates import candidates
 from restock.ingest.propose.clock_choice import Gaps, by_log_time, choose_clock
 from restock.ingest.propose.command_choice import CommandChoice, choose_command

@@ -14,13 +14,8 @@ import numpy as np
 from restock.arrays import F64, Bools, Ints
 from restock.errors import RecordingError
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns
-from restock.ingest.profile.profile import (
-    COMMAND_SOURCES,
-    FALLBACKS,
-    POSE_FALLBACK,
-    Input,
-    Profile,
-)
+from restock.ingest.profile.inputs import COMMAND_SOURCES, FALLBACKS, POSE_FALLBACK, Input
+from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.signal_paths import element_of
 from restock.ingest.steps.align import (
     NS,

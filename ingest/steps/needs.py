@@ -12,7 +12,8 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, TopicColumns
 from restock.ingest.profile.custom_signal import CustomSignal
-from restock.ingest.profile.profile import Input, Profile
+from restock.ingest.profile.inputs import Input
+from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.signal_paths import element_of, offer
 from restock.ingest.steps.align import CLOCK_FIELD, CLOCK_TOPIC, clock_drifts
 from restock.ingest.steps.aligned_inputs import sideways_path

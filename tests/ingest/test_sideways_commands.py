@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from restock.ingest.profile.profile import Input
+from restock.ingest.profile.inputs import Input
 from restock.ingest.steps.aligned_inputs import sideways_notes, sideways_path
 
 

@@ -1,0 +1,182 @@
+"""The inputs of a profile: which topic fills what, what it must say, and what stands in for it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated
+
+from msgspec import Meta
+
+from restock.errors import ConfigError
+from restock.toml import Checked
+
+COMMAND_SOURCES = "command_sources"
+MOST_NAME = 64  # characters of a behaviour policy
+
+
+# What each input must and may say of a message: signal-side name -> whether it is required.
+# `orientation` is a quaternion's path and becomes a yaw.
+INPUT_FIELDS: dict[str, dict[str, bool]] = {
+    "command": {"speed_mps": True, "yaw_rate_radps": False, "steering_rad": False},
+    "pose": {"x_m": True, "y_m": True, "orientation": False, "yaw_rad": False},
+    "wheels": {"speed_mps": True, "yaw_rate_radps": True},
+    "imu": {"yaw_rate_radps": True, "accel_x_mps2": True},
+    "scan": {"ranges_m": True, "angle_min_rad": True, "angle_increment_rad": True},
+    "goal": {"x_m": True, "y_m": True},
+    "plan": {"x_m": True, "y_m": True},
+    "bumper": {"pressed": True},
+    "nav_command": {"speed_mps": True, "yaw_rate_radps": False, "steering_rad": False},
+    "behaviour_policy": {"text": True},
+    "true_condition": {"text": True},
+    "true_exposure": {"text": True},
+    "perturbation": {"text": True},
+}
+# Of a source of commands: the commands that it gives, or what is pressed while it drives.
+COMMAND_SOURCE_FIELDS = {**INPUT_FIELDS["nav_command"], "speed_mps": False, "pressed": False}
+
+# What is used instead of an input that is left out, or is optional and the recording lacks.
+FALLBACKS: dict[str, str] = {
+    "scan": "no lidar: every bearing counts as free up to range_max_m",
+    "imu": "gyro yaw rate taken from the wheels, acceleration 0",
+    "bumper": "never pressed",
+    "nav_command": "unknown: null, and 0 in the observation",
+    "behaviour_policy": "the profile's behaviour_policy",
+    "true_condition": "unknown: labels are not scored",
+    "true_exposure": "unknown: exposures are not scored",
+    "perturbation": "unknown: null, as of hardware",
+}
+MOTION = "nav_msgs/msg/Odometry"  # what was measured: commands are of other types
+STEERED = "speed x tan(steering angle) / {wheelbase_m:g} m of {topic}"
+COMMAND_FALLBACK = "the measured motion of {topic} in place of commands"
+POLICY_FALLBACK = "whose command it equals: {names}; else the profile's behaviour_policy"
+POSE_FALLBACK = "from transforms, by [frames]"
+WHEELS_FALLBACK = "speeds from the poses of the last {window_s:g} s: slip cannot be seen"
+ROUTE_FALLBACK = "none: the task has no goal, progress is forward displacement"
+HINDSIGHT = {
+    "goal": "by hindsight: where the drive stopped, turned back or came by often",
+    "plan": "by hindsight: the way that was driven",
+}
+
+
+class Input(Checked, frozen=True):
+    """One topic, and which of its fields fill what."""
+
+    topic: str
+    type: str
+    fields: dict[str, str]
+    max_age_s: float | None = None  # None: latched, held until the next message
+    optional: bool = False
+    wheelbase_m: Annotated[float, Meta(gt=0)] | None = None  # of a command that steers
+    stop_holds: bool = False  # of the command: one to stop holds until the next, however old
+
+
+class Inputs(Checked, frozen=True):
+    """The `[inputs]` of a profile."""
+
+    command: Input
+    wheels: Input | None = None  # None: speeds from poses, by [motion]
+    pose: Input | None = None
+    scan: Input | None = None
+    imu: Input | None = None
+    goal: Input | None = None
+    plan: Input | None = None
+    bumper: Input | None = None
+    nav_command: Input | None = None  # what navigation proposes, before whoever drives decides
+    behaviour_policy: Input | None = None
+    true_condition: Input | None = None
+    true_exposure: Input | None = None
+    perturbation: Input | None = None
+
+    def items(self) -> Iterator[tuple[str, Input]]:
+        for name in self.__struct_fields__:
+            source = getattr(self, name)
+            if source is not None:
+                yield name, source
+
+
+def check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
+    """That an input says what it must; `framed` where transforms can give its pose.
+
+    Raises:
+        ConfigError: it does not; names the key.
+    """
+    known = INPUT_FIELDS[name]
+    unknown = sorted(source.fields.keys() - known.keys())
+    missing = sorted(
+        key for key, required in known.items() if required and key not in source.fields
+    )
+    if name == "pose" and not source.fields.keys() & {"orientation", "yaw_rad"}:
+        missing.append("orientation")
+    steered = "steering_rad" in source.fields
+    if name in ("command", "nav_command"):
+        if steered and "yaw_rate_radps" in source.fields:
+            unknown.append("steering_rad beside yaw_rate_radps")
+        elif not steered and "yaw_rate_radps" not in source.fields:
+            missing.append("yaw_rate_radps")
+    _check_wheelbase(f"inputs.{name}", source, where)
+    if unknown or missing:
+        problems = [f"unknown {key!r}" for key in unknown] + [f"missing {key!r}" for key in missing]
+        raise ConfigError(
+            f"`inputs.{name}.fields`: {', '.join(problems)}",
+            where=where,
+            remedy=f"{name} takes {', '.join(known)}",
+        )
+    if source.stop_holds and name != "command":
+        raise ConfigError(f"`inputs.{name}.stop_holds`: only a command can stop", where=where)
+    if source.optional and name not in FALLBACKS and not (name == "pose" and framed):
+        raise ConfigError(
+            f"`inputs.{name}.optional`: {name} has no fallback, so it cannot be optional",
+            where=where,
+            remedy=f"optional may be {', '.join(FALLBACKS)}, and pose where there is [frames]",
+        )
+
+
+def _check_wheelbase(key: str, source: Input, where: str) -> None:
+    if ("steering_rad" in source.fields) != (source.wheelbase_m is not None):
+        raise ConfigError(
+            f"`{key}`: steering_rad and wheelbase_m belong together",
+            where=where,
+            remedy="wheelbase_m is the way between the axles, in metres",
+        )
+
+
+def check_command_source(name: str, source: Input, command: Input, where: str) -> None:
+    """That it says what it commands as the command does, or what is pressed while it drives.
+
+    Raises:
+        ConfigError: it does not; names the key.
+    """
+    key = f"{COMMAND_SOURCES}.{name}"
+    commanding = source.fields.keys() - {"pressed"}
+    if not name or len(name) > MOST_NAME or not name.isprintable():
+        raise ConfigError(
+            f"`{key}`: the name of a behaviour policy has 1 to {MOST_NAME} printable characters",
+            where=where,
+            remedy='name who drives by it: "teleop", "navigation"',
+        )
+    if unknown := sorted(source.fields.keys() - COMMAND_SOURCE_FIELDS.keys()):
+        raise ConfigError(
+            f"`{key}.fields`: unknown {', '.join(map(repr, unknown))}",
+            where=where,
+            remedy=f"a source of commands takes {', '.join(COMMAND_SOURCE_FIELDS)}",
+        )
+    complete = "speed_mps" in commanding and len(commanding) == 2
+    if not (commanding == set() if "pressed" in source.fields else complete):
+        raise ConfigError(
+            f"`{key}.fields`: {', '.join(source.fields) or 'nothing'} does not say when it drives",
+            where=where,
+            remedy="give speed_mps with yaw_rate_radps (or steering_rad), or pressed alone",
+        )
+    if source.topic == command.topic and "pressed" not in source.fields:
+        raise ConfigError(
+            f"`{key}.topic` is the command's own, {command.topic}: it would always be in force",
+            where=where,
+            remedy="name the topic of its commands before one of several is chosen",
+        )
+    if source.stop_holds or source.optional:
+        raise ConfigError(
+            f"`{key}` takes neither stop_holds nor optional",
+            where=where,
+            remedy="leave both out: a recording may lack a source of commands",
+        )
+    _check_wheelbase(key, source, where)
