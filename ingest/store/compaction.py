@@ -15,6 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import pyarrow as pa
+import pyarrow.compute as pc
 from deltalake.transaction import AddAction, RemoveAction
 
 from restock.errors import StoreError
@@ -127,23 +128,28 @@ def _summarise(store: StoreWriter, live: Sequence[Ingest], made: dict[str, pa.Ta
     names = pa.schema([("ingest_id", pa.string()), ("summary_version", pa.int32())])
     told = store.manifests(live, names).to_pylist()
     current = {one["ingest_id"] for one in told if one["summary_version"] == VERSION}
-    for one in live:
-        if one.ingest_id not in current and one.ingest_id not in made:
-            with suppress(FileNotFoundError):  # replaced meanwhile
-                rows = store.rows(one.recording_id, one.ingest_id)
-                manifest = store.manifests([one], recording_schema())
-                made[one.ingest_id] = summarised(manifest, rows)
+    lacking = [one for one in live if one.ingest_id not in current | made.keys()]
+    manifests = store.manifests(lacking, recording_schema())
+    for one in lacking:
+        with suppress(FileNotFoundError):  # replaced meanwhile
+            rows = store.rows(one.recording_id, one.ingest_id)
+            made[one.ingest_id] = summarised(_of(manifests, one), rows)
+
+
+def _of(manifests: pa.Table, one: Ingest) -> pa.Table:
+    return manifests.filter(pc.equal(manifests["ingest_id"], one.ingest_id))
 
 
 def _keep_replaced(store: StoreWriter, files: Sequence[StoredFile], shown: Collection[str]) -> None:
     """Manifests of replaced rows in compacted files, which older versions need, as files of their
     own: they are found by their names until cleaning removes them."""
-    compacted = [one for file in files if not file.own for one in file.ingests]
-    for one in compacted:
-        if one.ingest_id not in shown:
-            manifest = store.manifests([one], recording_columns())
-            path = own_path(one.recording_id, one.ingest_id)
-            store.path.write(manifest, f"{RECORDINGS}/{path}")
+    gone = [
+        one for file in files if not file.own for one in file.ingests if one.ingest_id not in shown
+    ]
+    manifests = store.manifests(gone, recording_columns())
+    for one in gone:
+        path = own_path(one.recording_id, one.ingest_id)
+        store.path.write(_of(manifests, one), f"{RECORDINGS}/{path}")
 
 
 def _groups(store: StoreWriter) -> Iterator[list[StoredFile]]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import random
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -79,8 +79,17 @@ class StoreWriter:
             [one for one in shown if recording_id in (None, one.recording_id)], schema
         )
 
-    def manifests(self, ingests: Sequence[Ingest], schema: pa.Schema) -> pa.Table:
-        """These columns of the manifests of ingests; null where an older store has them not."""
+    def manifests(
+        self,
+        ingests: Sequence[Ingest],
+        schema: pa.Schema,
+        *,
+        skip: tuple[type[Exception], ...] = (),
+    ) -> pa.Table:
+        """These columns of the manifests of ingests; null where an older store has them not.
+
+        A file at which one of `skip` is raised is left out.
+        """
         parts = [schema.empty_table()]
         if ingests:
             at = {
@@ -90,11 +99,15 @@ class StoreWriter:
                 at.get(one.ingest_id, own_path(one.recording_id, one.ingest_id)): None
                 for one in ingests
             }
+
+            def read(path: str) -> pa.Table:
+                with suppress(*skip):
+                    part = self.path.read(f"{RECORDINGS}/{path}", columns=schema.names)
+                    return _with_sketch(part) if "sketch" in schema.names else part
+                return schema.empty_table()
+
             with ThreadPoolExecutor(READERS) as pool:
-                read = pool.map(
-                    lambda path: self.path.read(f"{RECORDINGS}/{path}", columns=schema.names), paths
-                )
-                parts += [_with_sketch(part) if "sketch" in schema.names else part for part in read]
+                parts += pool.map(read, paths)
         wanted = pa.array([one.ingest_id for one in ingests], pa.string())
         found = pa.concat_tables(
             [part.replace_schema_metadata(None) for part in parts], promote_options="default"
@@ -113,21 +126,28 @@ class StoreWriter:
         if not parts:
             raise FileNotFoundError(own_path(recording_id, ingest_id))
         rows = pa.concat_tables(parts, promote_options="default").sort_by("transition_id")
-        return with_ends(rows, self._packed_ends(Ingest(recording_id, ingest_id, len(rows))))
+        told = self._packed_ends([Ingest(recording_id, ingest_id, len(rows))])
+        return with_ends(rows, told.get(ingest_id))
 
-    def ends(self, ingest: Ingest) -> pa.Table | None:
-        """The ends of an ingest's episodes, as `episode_ends` gives them; None: an older store."""
-        with suppress(FileNotFoundError):
-            path = own_path(ingest.recording_id, ingest.ingest_id)
-            schema = self.path.read_schema(f"{TRANSITIONS}/{path}")
-            return episode_ends(schema.empty_table())
-        empty = pa.table({})
-        return episode_ends(with_ends(empty, self._packed_ends(ingest)))
+    def ends(self, ingests: Sequence[Ingest]) -> Iterator[tuple[str, pa.Table]]:
+        """The recording of each of these ingests and the ends of its episodes, as `episode_ends`
+        gives them; without those that have none."""
+        told = self._packed_ends(ingests)
+        for one in ingests:
+            bare = with_ends(pa.table({}), told.get(one.ingest_id))
+            if not told.get(one.ingest_id):
+                with suppress(FileNotFoundError):  # of an older store they lie with its rows
+                    path = own_path(one.recording_id, one.ingest_id)
+                    bare = self.path.read_schema(f"{TRANSITIONS}/{path}").empty_table()
+            ends = episode_ends(bare)
+            if ends is not None:
+                yield one.recording_id, ends
 
-    def _packed_ends(self, ingest: Ingest) -> str | None:
-        told = pa.schema([("ingest_id", pa.string()), ("packed_ends", pa.string())])
-        found: list[str | None] = self.manifests([ingest], told)["packed_ends"].to_pylist()
-        return found[0] if found else None
+    def _packed_ends(self, ingests: Sequence[Ingest]) -> dict[str, str | None]:
+        """What manifests keep of the ends of episodes, by ingest."""
+        schema = pa.schema([("ingest_id", pa.string()), ("packed_ends", pa.string())])
+        told = self.manifests(ingests, schema)
+        return dict(zip(*(told[name].to_pylist() for name in schema.names), strict=True))
 
     def files(self, name: str, version: Version | None = None) -> list[StoredFile]:
         """The active files of one of its tables, and which ingests they hold."""
@@ -149,10 +169,9 @@ class StoreWriter:
         own = rows["recording_id"][0].as_py()
         others = [one for one in self.shown() if one.recording_id != own]
         names = ("recording_id", "ingest_id", "sketch")
-        told = []
-        with suppress(*UNREADABLE):  # another recording, which `restock sql` reports
-            schema = pa.schema([pa.field(name, pa.string()) for name in names])
-            told = self.manifests(others, schema).to_pylist()
+        schema = pa.schema([(name, pa.string()) for name in names])
+        # What cannot be read is another recording's, which `restock sql` reports.
+        told = self.manifests(others, schema, skip=UNREADABLE).to_pylist()
         sketches = [
             Sketch(
                 one["recording_id"],

@@ -204,13 +204,12 @@ class Store:
     def episode_ends(self, recordings: Sequence[str] = ()) -> Iterator[tuple[str, pa.Table]]:
         """Each recording's id with the ends of its episodes, a row an episode; of these recordings,
         or of all where none is named. An older store has none."""
-        writer = StoreWriter(self.path)
-        for one in self._ingests.to_pylist():
-            if recordings and one["recording_id"] not in recordings:
-                continue
-            ends = writer.ends(Ingest(one["recording_id"], one["ingest_id"], one["rows"]))
-            if ends is not None:
-                yield one["recording_id"], ends
+        held = [
+            Ingest(one["recording_id"], one["ingest_id"], one["rows"])
+            for one in self._ingests.to_pylist()
+            if not recordings or one["recording_id"] in recordings
+        ]
+        yield from StoreWriter(self.path).ends(held)
 
     def _decode(self, text: str, kind: type[T], name: str) -> T:
         """What a manifest keeps as JSON.

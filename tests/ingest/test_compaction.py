@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import duckdb
+import pyarrow as pa
 import pytest
 from deltalake import DeltaTable, write_deltalake
 from hypothesis import given, settings
@@ -14,6 +15,7 @@ from support.stores import one, shown
 
 from restock.errors import StoreError
 from restock.ingest.store.compaction import OPERATION, compact, fold
+from restock.ingest.store.episode_rows import ENDS, packed
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import RECORDINGS, TRANSITIONS, StoreWriter
 from restock.replay.store.query import definitions
@@ -228,3 +230,26 @@ def test_whatever_comes_first_the_summaries_are_true(tmp_path_factory, steps):
     found = shown(path)
     assert {int(name[:16], 16): count for name, count in found.items()} == expected
     same_as_scanned(path)
+
+
+def test_a_damaged_manifest_does_not_hide_a_repeated_drive_in_another(tmp_path):
+    writer = StoreWriter(tmp_path / "s")
+    writer.write_all([one(1), one(2)])
+    again = replaced(one(2)[1], {"recording_id": "f" * 16})
+    (tmp_path / "s" / RECORDINGS / f"{1:016x}" / f"{1:016x}-a.parquet").write_bytes(b"damaged")
+    found = writer.repeated(again, 0.2)
+    assert found is not None
+    assert found.recording_id == f"{2:016x}"
+
+
+def test_the_ends_of_episodes_outlive_compaction(tmp_path):
+    """Of several recordings, one of which has none."""
+    writer = StoreWriter(tmp_path / "s")
+    ends = pa.table({"episode_index": [0, 1], "step_index": [7, 9]})
+    manifest, rows = one(1)
+    writer.write(manifest, rows.replace_schema_metadata({ENDS: packed(ends)}))
+    writer.write(*one(2))
+    compact(writer)
+    with Store(tmp_path / "s") as store:
+        assert list(store.episode_ends()) == [(f"{1:016x}", ends)]
+        assert list(store.episode_ends([f"{2:016x}"])) == []
