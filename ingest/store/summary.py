@@ -96,7 +96,7 @@ def summarised(manifest: pa.Table, rows: pa.Table) -> pa.Table:
         "sketch": sketch(rows).decode(),
         "packed_ends": ((rows.schema.metadata or {}).get(ENDS) or b"").decode() or None,
     }
-    with duckdb.connect() as connection:
+    with _database().cursor() as connection:  # with temporary tables of its own
         read = rows.select([name for name in _READ if name in rows.schema.names])
         connection.register("recording_rows", read)
         connection.register("manifest", manifest.select(["task_json"]))
@@ -116,6 +116,12 @@ def with_ends(rows: pa.Table, packed_ends: str | None) -> pa.Table:
     """A recording's rows with the ends of their episodes, from its manifest, in their metadata."""
     metadata = {ENDS: packed_ends.encode()} if packed_ends else None
     return rows.replace_schema_metadata(metadata)
+
+
+@cache
+def _database() -> duckdb.DuckDBPyConnection:
+    """One for all recordings: opening it takes as long as a summary."""
+    return duckdb.connect(config={"threads": 1})
 
 
 @cache
