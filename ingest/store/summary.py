@@ -126,7 +126,18 @@ def _database() -> duckdb.DuckDBPyConnection:
 
 @cache
 def _definitions() -> str:
-    return (files("restock.ingest.store") / "summary.sql").read_text(encoding="utf-8")
+    return with_episode_columns(
+        (files("restock.ingest.store") / "summary.sql").read_text(encoding="utf-8")
+    )
+
+
+def with_episode_columns(text: str) -> str:
+    """SQL with the columns of an episode where it says so: their one definition."""
+    return text.replace("-- include: episode_columns.sql", _sql("episode_columns.sql"))
+
+
+def _sql(name: str) -> str:
+    return (files("restock.ingest.store") / name).read_text(encoding="utf-8")
 
 
 def _listed(rows: pa.Table, kind: pa.DataType) -> pa.Array:

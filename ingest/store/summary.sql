@@ -1,6 +1,6 @@
 -- What the common views need of a recording, from its transitions (`recording_rows`) and its
--- `manifest`. Kept in its manifest; summaries.sql adds them up over the store. The
--- definitions are those of views.sql, which scans: a test holds that both give the same.
+-- `manifest`. Kept in its manifest; summaries.sql adds them up over the store. Cells are counted as
+-- views.sql, which scans, counts them: a test holds that both give the same.
 CREATE TEMP TABLE steps AS
 SELECT
     *,
@@ -35,29 +35,7 @@ SELECT
     max(stamp_ns) AS end_ns,
     count(*) AS steps,
     CAST(max(step_index) - min(step_index) + 1 - count(*) AS BIGINT) AS missing_steps,
-    sum(reward) AS return,
-    CASE
-        WHEN bool_or(terminated) THEN 'terminated'
-        WHEN bool_or(truncated) THEN 'truncated'
-        ELSE 'open'
-    END AS ended,
-    CASE
-        WHEN any_value(has_goal) AND bool_or(terminated AND reward > goal_reward / 2) THEN 'goal'
-        WHEN bool_or(terminated) THEN 'bump'
-    END AS ended_by,
-    CASE WHEN any_value(has_goal) THEN coalesce(any_value(goal_source), 'logged') END AS goal_source,
-    CASE WHEN any_value(has_goal) AND coalesce(any_value(goal_source), 'logged') = 'logged'
-        THEN bool_or(terminated AND reward > goal_reward / 2)
-            AND NOT bool_or(bumped AND step_index > 0)
-    END AS success,
-    sum(progress_m) AS progress_m,
-    count(*) FILTER (WHERE bumped) AS bumped_steps,
-    min(clearance_m) AS clearance_min_m,
-    list_sort(list_distinct(flatten(list(conditions)))) AS conditions,
-    list_sort(list(DISTINCT behaviour_policy)) AS behaviour_policies,
-    arg_min(behaviour_policy, step_index) AS first_policy,
-    count(*) FILTER (WHERE handover) AS handovers,
-    list_sort(list(DISTINCT zone)) AS zones
+    -- include: episode_columns.sql
 FROM steps
 GROUP BY episode_id
 ORDER BY min(step_index), episode_index;

@@ -112,7 +112,7 @@ class StoreWriter:
         found = pa.concat_tables(
             [part.replace_schema_metadata(None) for part in parts], promote_options="default"
         )
-        return found.filter(pc.is_in(found["ingest_id"], wanted))
+        return found.filter(pc.is_in(found["ingest_id"], wanted)).combine_chunks()
 
     def rows(self, recording_id: str, ingest_id: str) -> pa.Table:
         """One recording's transitions, as they were written."""

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import duckdb
 
 from restock.errors import QueryError
+from restock.ingest.store.summary import with_episode_columns
 from restock.replay.store.column_docs import install_columns
 
 T = TypeVar("T")
@@ -95,7 +96,8 @@ def definitions(observation_type: str = "FLOAT[]", names: Sequence[str] = (*VIEW
     """The text of these SQL files, with the type that observations are cast to."""
     folder = files("restock.replay.store")
     text = [(folder / name).read_text(encoding="utf-8") for name in names]
-    return "\n".join(text).replace("::FLOAT[] AS", f"::{observation_type} AS")
+    whole = with_episode_columns("\n".join(text))
+    return whole.replace("::FLOAT[] AS", f"::{observation_type} AS")
 
 
 def repeated_rows() -> str:

@@ -7,7 +7,6 @@ install 'restock[spark]'`), which speaks Spark's protocol without a JVM.
 from __future__ import annotations
 
 import re
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +15,7 @@ from restock.ingest.store.location import Location
 from restock.ingest.store.summary import SUMMARY_SCHEMA
 from restock.ingest.store.writer import RECORDINGS, TRANSITIONS
 from restock.ingest.task.tags import NAMED
-from restock.replay.store.query import VIEWS
+from restock.replay.store.query import VIEWS, definitions
 from restock.replay.store.store import is_store
 
 
@@ -145,9 +144,7 @@ def install_views(session: SparkSession | Any, store: str | Path, *, scheme: str
 
 def statements() -> Iterator[str]:
     """The statements of VIEWS in Spark's SQL, in their order, without comments."""
-    folder = files("restock.replay.store")
-    text = "\n".join((folder / name).read_text(encoding="utf-8") for name in VIEWS)
-    text = re.sub(r" *--.*", "", text)
+    text = re.sub(r" *--.*", "", definitions(names=VIEWS))
     for pattern, spark in _RULES:
         text = re.sub(pattern, spark, text)
     for statement in text.split(";\n"):
