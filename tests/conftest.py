@@ -36,3 +36,12 @@ def s3_server() -> Iterator[str]:
         patch.setenv("AWS_REGION", "us-east-1")
         boto3.client("s3").create_bucket(Bucket=s3.BUCKET)
         yield address
+
+
+@pytest.fixture(params=["folder", "s3"])
+def place(request: pytest.FixtureRequest, tmp_path: Path) -> Path | str:
+    """Where a store may lie, of one test alone."""
+    if request.param == "folder":
+        return tmp_path / "s"
+    request.getfixturevalue("s3_server")
+    return s3.address(request)

@@ -23,7 +23,7 @@ from restock.ingest.task.limiter import NONE, RULES, UNKNOWN, Limits, limit
 OPERATORS = ("operator", "teleop", "joystick")  # sources of commands that are people
 BOOL = "std_msgs/msg/Bool"
 ACTIVE_S = 0.5  # after the last message of a person's commands
-_WRONG = (AttributeError, IndexError, TypeError, ValueError)  # of a message of another type
+OTHER_TYPE = (AttributeError, IndexError, TypeError, ValueError)  # reading it raises
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Pilot:
             if topic in self.observer.topics:
                 self.observer.receive(topic, message, now_ns)
                 self._look(topic, message)
-        except _WRONG:
+        except OTHER_TYPE:
             self.unreadable[topic] += 1
 
     def _hear(self, source: Input, message: Any, now_ns: int) -> None:
@@ -150,7 +150,7 @@ class Pilot:
             return self.observer.observe(now_ns), "clock: went back"
         try:
             observed = self.observer.observe(now_ns)
-        except (RestockError, *_WRONG) as error:
+        except (RestockError, *OTHER_TYPE) as error:
             self.observer.reset()
             unreadable = f"unreadable: {str(error).splitlines()[0]}"
             return self.observer.observe(now_ns), unreadable

@@ -13,12 +13,10 @@ import numpy as np
 
 from restock.errors import RecordingError
 from restock.ingest.live.observer import value_of
-from restock.ingest.live.pilot import Decision, Pilot
+from restock.ingest.live.pilot import OTHER_TYPE, Decision, Pilot
 from restock.ingest.steps.align import NS
 from restock.ingest.task.limiter import RULES
 from restock.ingest.task.task import nearest_action
-
-_WRONG = (AttributeError, IndexError, TypeError, ValueError)
 
 
 @dataclass(frozen=True)
@@ -105,7 +103,7 @@ def _action(pilot: Pilot, message: Any) -> int | None:
             turn = speed * np.tan(steering) / command.wheelbase_m
         else:
             turn = float(value_of(message, command.fields["yaw_rate_radps"]))
-    except _WRONG:
+    except OTHER_TYPE:
         return None
     if not np.isfinite([speed, turn]).all():
         return None

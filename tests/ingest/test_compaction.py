@@ -10,7 +10,6 @@ import pytest
 from deltalake import DeltaTable, write_deltalake
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.s3_server import address
 from support.stores import one, shown
 
 from restock.errors import StoreError
@@ -20,15 +19,6 @@ from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import RECORDINGS, TRANSITIONS, StoreWriter
 from restock.replay.store.query import definitions
 from restock.replay.store.store import Store
-
-
-@pytest.fixture(params=["folder", "s3"])
-def place(request: pytest.FixtureRequest, tmp_path: Path) -> Path | str:
-    """Where a store may lie, of this test alone."""
-    if request.param == "folder":
-        return tmp_path / "s"
-    request.getfixturevalue("s3_server")
-    return address(request)
 
 
 def compacted_by_delta(path: Path) -> None:

@@ -18,7 +18,7 @@ import pytest
 from deltalake import DeltaTable
 from deltalake.exceptions import CommitFailedError
 from deltalake.transaction import AddAction
-from support.s3_server import address, files_of
+from support.s3_server import files_of
 from support.stores import one, shown
 
 import restock
@@ -26,15 +26,6 @@ from restock.errors import StoreError
 from restock.ingest.store.location import Location
 from restock.ingest.store.writer import RECORDINGS, TRANSITIONS, StoreWriter
 from restock.replay.store.store import Store
-
-
-@pytest.fixture(params=["folder", "s3"])
-def place(request: pytest.FixtureRequest, tmp_path: Path) -> Path | str:
-    """Where a store may lie, of this test alone."""
-    if request.param == "folder":
-        return tmp_path / "s"
-    request.getfixturevalue("s3_server")
-    return address(request)
 
 
 def test_what_is_written_is_read_with_every_type(place):
