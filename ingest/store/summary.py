@@ -6,6 +6,7 @@ sketch. Every writer of rows writes them, so they are true for as long as the ro
 
 from __future__ import annotations
 
+import atexit
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -121,6 +122,7 @@ def with_ends(rows: pa.Table, packed_ends: str | None) -> pa.Table:
 @cache
 def _database() -> duckdb.DuckDBPyConnection:
     """One for all recordings: opening it takes as long as a summary."""
+    atexit.register(_database.cache_clear)  # nanobind complains of what outlives its module
     return duckdb.connect(config={"threads": 1})
 
 
