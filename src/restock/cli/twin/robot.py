@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -55,5 +56,6 @@ class RobotCommand:
             return 0
         rows = [{"": n, "value": value, "from": origin} for n, value, origin in facts]
         output.print_table(rows, title=f"{self.profile}: the robot in the twin")
+        sys.stdout.write("\n")
         output.print_table(driven, title="What it drives, steadily")
         return 0
