@@ -51,8 +51,16 @@ def open_recording(
 
 
 def with_definitions(typestore: str | None, folder: Path | None) -> str | None:
-    """The name of a type store with a folder's .msg and .idl files on top: `humble+/the/folder`."""
-    return typestore if folder is None else f"{typestore or DEFAULT_DISTRO}+{folder.absolute()}"
+    """The name of a type store with a folder's .msg and .idl files on top: `humble+/the/folder`.
+
+    Raises:
+        RecordingError: no such distribution or folder, or no definition in it that can be read.
+    """
+    if folder is None:
+        return typestore
+    name = f"{typestore or DEFAULT_DISTRO}+{folder.absolute()}"
+    refuse_unknown(name)
+    return name
 
 
 class _Opening:

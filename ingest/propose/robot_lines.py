@@ -15,7 +15,7 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.propose.footprint import Footprint, descriptions, of_urdf, outline
 from restock.ingest.task.robot import Lidar, Robot
 from restock.ingest.urdf.described_robot import described_robot, read_urdf
-from restock.ingest.urdf.description import read_description
+from restock.ingest.urdf.description import Description, read_description
 from restock.toml import toml_value
 
 MOST_BEAMS = 361  # in the twin, where each costs time: of a finer lidar every k-th
@@ -67,16 +67,29 @@ class RobotProposal:
         return [*lines, ""]
 
 
+def check_urdf(path: Path) -> Description:
+    """What a URDF file of a robot on wheels describes.
+
+    Raises:
+        ConfigError: it cannot be read, is no URDF, or has no wheels.
+    """
+    description = read_description(read_urdf(path))
+    problem: str | None
+    if isinstance(description, str):
+        problem = description
+    elif (problem := described_robot(description, 0.0).problem) is None:
+        return description
+    raise ConfigError(problem, where=str(path), remedy="give the URDF of a wheeled robot")
+
+
 def urdf_footprint(path: Path, scan_frame: str) -> Footprint | None:
     """The outline that a URDF file has; None where its shapes are meshes.
 
     Raises:
-        ConfigError: it cannot be read, or is no URDF.
+        ConfigError: it cannot be read, is no URDF, or has no wheels.
     """
+    check_urdf(path)
     text = read_urdf(path)
-    description = read_description(text)
-    if isinstance(description, str):
-        raise ConfigError(description, where=str(path), remedy="give the URDF of a wheeled robot")
     found = of_urdf(text, scan_frame, source=path.name)
     return found if isinstance(found, Footprint) and found.sane else None
 

@@ -12,8 +12,8 @@ import pytest
 from support.driven_robot import Drive, write_bag
 
 from restock import cli
+from restock.cli.start.decisions import no_room
 from restock.cli.start.stage import Stage
-from restock.cli.start.start import no_room
 from restock.cli.start.work import Ended, Work
 from restock.errors import RestockError
 

@@ -96,11 +96,14 @@ MAY_IMPORT = {
         " train/twin/physics"
     ),
     "cli/robot": "cli ingest/live ingest/profile ingest/task",
-    "cli/start": "cli ingest/profile ingest/propose train/dqn train/twin/env",
+    "cli/start": (
+        "cli ingest/containers ingest/profile ingest/propose ingest/task train/dqn train/twin/env"
+        " train/twin/floors"
+    ),
     "cli/twin": (
-        "cli report ingest/profile ingest/propose ingest/store ingest/task replay/fleet"
-        " replay/store train/evaluation train/twin/calibration train/twin/env train/twin/floors"
-        " train/twin/physics train/twin/recording train/twin/survey"
+        "cli report ingest/containers ingest/profile ingest/propose ingest/store ingest/task"
+        " replay/fleet replay/store train/evaluation train/twin/calibration train/twin/env"
+        " train/twin/floors train/twin/physics train/twin/recording train/twin/survey"
     ),
 }
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -14,6 +16,7 @@ from restock.errors import ConfigError, ExitCode, RecordingError
 from restock.files import write_text
 
 if TYPE_CHECKING:
+    from restock.ingest.containers.recording import Recording
     from restock.ingest.pipeline import IngestResult
     from restock.ingest.profile.profile import Profile
 
@@ -59,6 +62,8 @@ class ProfileCommand:
     definitions: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """A folder of .msg and .idl files (PACKAGE/msg/NAME.msg): definitions of a robot's own types,
     for recordings that carry none."""
+    salvage: bool = False
+    """Read what is intact of truncated or damaged files."""
     json: bool = False
     """Print one JSON document: `new`: {"toml", "missing", "signals", "ticks", "transitions",
     "problems", "advice", "commands"}; `check`: {"inputs", "problems", "advice", "outcome", …}."""
@@ -81,11 +86,8 @@ class ProfileCommand:
         return self._new() if self.action == "new" else self._check()
 
     def _new(self) -> int:
-        from contextlib import ExitStack
-
         from restock.cli import output
         from restock.ingest.containers.discover import recordings_in
-        from restock.ingest.containers.open_recording import open_recording
         from restock.ingest.propose.drives import drives_to_read, propose_for_drives
         from restock.ingest.propose.footprint import parse_footprint
 
@@ -95,10 +97,7 @@ class ProfileCommand:
         stem = (self.out or Path(self.paths[0])).stem
         chosen, left_out = drives_to_read([r for path in self.paths for r in recordings_in(path)])
         with ExitStack() as opened:
-            recordings = [
-                opened.enter_context(open_recording(path, typestore=self._typestore))
-                for path in chosen
-            ]
+            recordings = self._readable(chosen, opened)
             proposal = propose_for_drives(
                 recordings,
                 re.sub(r"\W+", "_", stem).strip("_") or "robot",
@@ -133,16 +132,34 @@ class ProfileCommand:
             sys.stderr.write(f"restock: {', '.join(self.paths)}: cannot be used yet: {problem}\n")
         return ExitCode.LOSSY if proposal.problems else ExitCode.OK
 
+    def _readable(self, paths: Sequence[Path], opened: ExitStack) -> list[Recording]:
+        """The recordings that can be read; the others are named, where there is any."""
+        recordings, errors = [], []
+        for path in paths:
+            try:
+                recordings.append(opened.enter_context(self._open(path)))
+            except RecordingError as error:
+                errors.append(error)
+        if not recordings and errors:
+            raise errors[0]
+        for error in errors:
+            sys.stderr.write(f"restock: left out of the proposal: {error}\n")
+        return recordings
+
+    def _open(self, path: Path | str) -> Recording:
+        from restock.ingest.containers.open_recording import open_recording
+
+        return open_recording(path, typestore=self._typestore, salvage=self.salvage)
+
     def _check(self) -> int:
         from restock.cli import output
         from restock.cli.data.ingest import as_json, show
-        from restock.ingest.containers.open_recording import open_recording
         from restock.ingest.pipeline import ingest
         from restock.ingest.profile.profile import load_profile
         from restock.ingest.steps.needs import input_problems
 
         profile = load_profile(self.paths[0])
-        with open_recording(self.paths[1], typestore=self._typestore) as recording:
+        with self._open(self.paths[1]) as recording:
             topics = {n: t for n, t in recording.topics.items() if t.skipped is None}
             leaves = {name: recording.fields(name) for name in profile.topics if name in topics}
             problems = input_problems(profile, topics, leaves)
@@ -154,7 +171,12 @@ class ProfileCommand:
         advice: list[str] = []
         if not problems:
             try:
-                outcome = ingest(self.paths[1], profile, store=None, typestore=self._typestore)
+                outcome = ingest(
+                    *(self.paths[1], profile),
+                    store=None,
+                    typestore=self._typestore,
+                    salvage=self.salvage,
+                )
             except RecordingError as error:
                 problems = [error.what]
             advice = self._advice(profile, outcome)
@@ -174,12 +196,11 @@ class ProfileCommand:
 
     def _advice(self, profile: Profile, outcome: IngestResult | None) -> list[str]:
         """What of the profile removes most rows or labels most of them, and what to try."""
-        from restock.ingest.containers.open_recording import open_recording
         from restock.ingest.propose.trial import try_profile
         from restock.ingest.steps.needs import read_topics
         from restock.ingest.task.conditions import NOMINAL
 
-        with open_recording(self.paths[1], typestore=self._typestore) as recording:
+        with self._open(self.paths[1]) as recording:
             trial = try_profile(profile, read_topics(recording, profile))
         lines = [str(each) for each in trial.advice]
         rows = outcome.manifest["transitions"] if outcome else 0

@@ -21,7 +21,10 @@ def info(document: Document) -> list[str]:
     recordings = document["recordings"]
     seconds = sum(row["duration_s"] or 0.0 for row in recordings)
     messages = sum(row["messages"] for row in recordings)
-    return [f"{count(len(recordings), 'recording')}, {_time(seconds)}, {messages:,} messages"]
+    lines = [f"{count(len(recordings), 'recording')}, {_time(seconds)}, {messages:,} messages"]
+    return lines + _some(
+        [f"damaged: {row['path']}: {what}" for row in recordings for what in row["damage"]]
+    )
 
 
 def propose(document: Document) -> list[str]:
@@ -68,10 +71,14 @@ def ingest(document: Document) -> list[str]:
         worst = sorted(dropped.items(), key=lambda item: -item[1])[:3]
         lines.append(f"ticks left out: {', '.join(f'{why} {n:,}' for why, n in worst)}")
     failed = [row["error"].splitlines()[0] for row in rows if row["status"] == "failed"]
-    lines += [f"not ingested: {why}" for why in failed[:3]]
-    if len(failed) > 3:
-        lines.append(f"… and {len(failed) - 3} more")
-    return lines
+    lost = [f"lost: {row['path']}: {what}" for row in good for what in row["losses"]]
+    return lines + _some([f"not ingested: {why}" for why in failed]) + _some(lost)
+
+
+def _some(lines: list[str], most: int = 3) -> list[str]:
+    """The first of them, and how many more there are."""
+    more = [f"… and {len(lines) - most} more"] if len(lines) > most else []
+    return lines[:most] + more
 
 
 def coverage(document: Document) -> list[str]:

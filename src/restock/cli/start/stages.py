@@ -26,6 +26,9 @@ class Settings:
     device: str = "cpu"
     mixture: str = "coverage"
     typestore: str | None = None
+    definitions: Path | None = None
+    salvage: bool = False
+    tags: tuple[str, ...] = ()  # each KEY=VALUE
     map: Path | None = None
     train: tuple[str, ...] = ()  # further settings, each key=value
 
@@ -59,8 +62,21 @@ class Settings:
         return [] if self.profile is None else ["--profile", str(self.profile)]
 
     @property
-    def with_typestore(self) -> list[str]:
-        return [] if self.typestore is None else ["--typestore", self.typestore]
+    def with_definitions(self) -> list[str]:
+        """Where the definitions of a recording's types are that it does not carry itself."""
+        distribution = [] if self.typestore is None else ["--typestore", self.typestore]
+        folder = [] if self.definitions is None else ["--definitions", str(self.definitions)]
+        return distribution + folder
+
+    @property
+    def reading(self) -> list[str]:
+        """How recordings are read."""
+        return self.with_definitions + ["--salvage"] * self.salvage
+
+    @property
+    def read(self) -> tuple[Path, ...]:
+        """What is read of the user's wherever a recording is."""
+        return (*self.recordings, *([] if self.definitions is None else [self.definitions]))
 
     @property
     def profile_file(self) -> tuple[Path, ...]:
@@ -81,8 +97,9 @@ def info(to: Settings) -> Stage:
         "info",
         "What is in these recordings?",
         "The recordings come first: topics, types, counts, durations.",
-        ["info", *to.logs],
-        reads=to.recordings,
+        ["info", *to.logs, *to.reading],
+        reads=to.read,
+        expected=(0, 3),  # 3: damaged, and read as far as it is intact
         outcome=outcomes.info,
     )
 
@@ -96,8 +113,8 @@ def propose(
         "propose",
         "How do its topics become observation, action and reward?",
         "A first profile is proposed from what is in the recordings.",
-        ["profile", "new", *recordings, "--out", str(to.profile), *flags, *to.with_typestore],
-        reads=(*to.recordings, *_file(urdf)),
+        ["profile", "new", *recordings, "--out", str(to.profile), *flags, *to.reading],
+        reads=(*to.read, *_file(urdf)),
         writes=(Path(to.profile),),
         expected=(0, 3),
         outcome=outcomes.propose,
@@ -109,21 +126,25 @@ def check(to: Settings, recording: str) -> Stage:
         "check",
         "Does the profile fit?",
         "A dry run of one recording: what is used, what is missing, what would come of it.",
-        ["profile", "check", str(to.profile), recording, *to.with_typestore],
+        ["profile", "check", str(to.profile), recording, *to.reading],
         reads=to.profile_file,
         outcome=outcomes.check,
     )
 
 
 def ingest(to: Settings) -> Stage:
+    tags = [word for tag in to.tags for word in ("--tag", tag)]
     return Stage(
         "ingest",
         "Recordings to labelled transitions",
         "Topics become steps of the control clock (held causally, never interpolated), steps"
         " become observation, action and reward, and SQL labels each with its conditions."
         " Where recordings contain the true condition, the labels are scored.",
-        ["ingest", *to.logs, "--store", str(to.store), *to.with_profile, *to.with_typestore],
-        reads=(*to.recordings, *to.profile_file),
+        [
+            *("ingest", *to.logs, "--store", str(to.store)),
+            *(*to.with_profile, *to.reading, *tags),
+        ],
+        reads=(*to.read, *to.profile_file),
         writes=(to.store,),
         expected=(0, 3),
         remark="some data was lost or skipped: see the table above",
@@ -178,7 +199,7 @@ def floor(to: Settings) -> Stage:
         "The floor, as the recordings show it",
         "The map of the recordings, else their scans, else the way that was driven.",
         [
-            *("twin", "layout", "--from", str(to.store), *given),
+            *("twin", "layout", "--from", str(to.store), *given, *to.with_definitions),
             *("--out", str(to.floor), "--png", str(picture)),
         ],
         reads=() if to.map is None else _file(to.map),

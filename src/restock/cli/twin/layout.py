@@ -44,6 +44,9 @@ class LayoutCommand:
     """How large it is, in metres, before anything else that says it."""
     typestore: str | None = None
     """Message definitions for bags that carry none, e.g. humble, jazzy (default humble)."""
+    definitions: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """A folder of .msg and .idl files: definitions of a robot's own types, for bags that carry
+    none."""
     out: Path | None = None
     """Write it here: FILE.toml, or map.yaml (and map.pgm beside it). Nothing is overwritten."""
     png: Path | None = None
@@ -117,6 +120,7 @@ class LayoutCommand:
         if self.floor is not None:
             self._refuse_without_from()
             return open_floor(self.floor), None
+        from restock.ingest.containers.open_recording import with_definitions
         from restock.ingest.profile.profile import load_profile
         from restock.ingest.propose.footprint import parse_footprint
         from restock.train.twin.survey.survey import survey
@@ -127,12 +131,12 @@ class LayoutCommand:
             by=self.by,
             profile=None if self.profile is None else load_profile(self.profile),
             footprint=None if self.footprint is None else parse_footprint(self.footprint),
-            typestore=self.typestore,
+            typestore=with_definitions(self.typestore, self.definitions),
         )
         return surveyed.floor, surveyed
 
     def _refuse_without_from(self) -> None:
-        for name in ("map", "by", "profile", "footprint", "typestore", "zones"):
+        for name in ("map", "by", "profile", "footprint", "typestore", "definitions", "zones"):
             if getattr(self, name) is not None:
                 raise ConfigError(
                     f"--{name} is about the recording that --from names",

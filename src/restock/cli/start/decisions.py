@@ -1,0 +1,153 @@
+"""What `restock start` decides between its stages, from what they printed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from restock.cli.start.outcomes import of_nominal
+from restock.cli.start.stage import Document
+from restock.cli.start.stages import Settings
+from restock.cli.start.work import FOLDER, Ended
+from restock.files import read_json
+
+UPDATES_A_MINUTE = 400  # on logs alone: 2,000 in five minutes, with the rest of the way
+INTERVALS = 20  # at least so many points of every curve
+DRIVERS = "behaviour_policies"  # of a row of the coverage
+
+
+def fullest(document: Document) -> str | None:
+    """The recording that has most of what a profile needs: a command, a pose, and time."""
+    from restock.ingest.propose.roles import KINDS
+
+    def types(role: str) -> set[str]:
+        return {kind.type for kind in KINDS[role]}
+
+    def rank(row: Any) -> tuple[int, float]:
+        there = {topic["type"] for topic in row["topics"].values() if topic["messages"]}
+        roles = sum(bool(there & types(role)) for role in ("command", "pose", "wheels"))
+        return roles, row["duration_s"] or 0.0
+
+    rows = document.get("recordings", [])
+    return str(max(rows, key=rank)["path"]) if rows else None
+
+
+def edited(profile: Path | str | None, out: Path) -> bool:
+    """Whether the profile in the folder is a person's: not, byte for byte, what was proposed."""
+    path, proposed = Path(str(profile)), out / FOLDER / "propose.json"
+    if not path.is_file():
+        return False
+    return not proposed.is_file() or read_json(proposed)["toml"] != path.read_text("utf-8")
+
+
+def horizon(profile: Path | str | None) -> float:
+    """Some 3 s in whole control periods: the twin's limits are of that."""
+    from restock.ingest.profile.profile import load_profile
+
+    if profile is None or (isinstance(profile, Path) and not profile.is_file()):
+        return 3.0
+    period_s = load_profile(str(profile)).task.control_period_s
+    return round(max(round(3.0 / period_s), 1) * period_s, 6)
+
+
+def has_goal(profile: Path | str | None) -> bool:
+    """Whether the task has one: without, there is no success to compare."""
+    from restock.ingest.profile.profile import load_profile
+
+    if profile is None or (isinstance(profile, Path) and not profile.is_file()):
+        return True
+    return load_profile(str(profile)).task.goal != "none"
+
+
+def no_room(floor: Ended) -> str | None:
+    """Why nothing can be driven on the floor that there is; None where something can."""
+    if floor.good and floor.document.get("episodes") == []:
+        return "no mission fits on the floor that the recordings show"
+    return None
+
+
+def mistrust(floor: Ended, gap: Ended) -> str | None:
+    """Why the twin is not to be trusted in nominal driving; None where it is."""
+    if not floor.good:
+        return f"there is no floor to drive on: {'; '.join(floor.errors)}"
+    if "nominal" not in floor.document["episodes"]:
+        return "no mission fits on the floor that the recordings show"
+    if not gap.good:
+        return f"its gap to the logs cannot be measured: {'; '.join(gap.errors)}"
+    verdict = of_nominal(gap.document)
+    if verdict is None:
+        return "these logs show no nominal driving"
+    if verdict["verdict"] == "trusted":
+        return None
+    return f"in nominal driving it is {verdict['verdict']}: {'; '.join(verdict['reasons'])}"
+
+
+def floor_settings(to: Settings, document: Document) -> list[str]:
+    """Train on that floor, on the kinds of episode that it has room for."""
+    from restock.toml import toml_value
+    from restock.train.twin.env.interface import DEFAULT_CONDITIONS
+
+    settings = [f"env.layouts={to.floor}"]
+    fitting = document.get("episodes", [])
+    kinds = {name: share for name, share in DEFAULT_CONDITIONS.items() if name in fitting}
+    if fitting and len(kinds) < len(DEFAULT_CONDITIONS):
+        settings.append(f"env.conditions={toml_value(kinds)}")
+    return settings
+
+
+def logs_alone_settings(coverage: Document) -> list[str]:
+    """No twin, and no action that the logs' drivers would not plausibly have taken."""
+    from restock.toml import toml_value
+
+    drivers = sorted({name for row in coverage.get("rows", []) for name in row[DRIVERS] or ()})
+    return ["env.twin=false", "teacher.source=logs", f"teacher.policies={toml_value(drivers)}"]
+
+
+def updates_settings(mix: Document, minutes: float, *, twin: bool) -> list[str]:
+    """As many offline updates as the panel's rows and the budget allow; each curve has points."""
+    from restock.train.dqn.config import TrainConfig
+
+    usual = TrainConfig()
+    updates = usual.schedule.offline_updates
+    if not twin:
+        updates = max(round(UPDATES_A_MINUTE * minutes), INTERVALS)
+    if (most := mix.get("max_replays_per_row")) is not None:
+        updates = min(updates, int(mix["rows"] * most / usual.replay.batch_size))
+    settings = []
+    if updates != usual.schedule.offline_updates:
+        settings.append(f"schedule.offline_updates={updates}")
+    if not twin and updates < INTERVALS * usual.record.every_updates:
+        settings.append(f"record.every_updates={max(updates // INTERVALS, 1)}")
+    return settings
+
+
+def robot_line(profile: Path | str | None) -> str:
+    """What the twin builds, and where that is from."""
+    from restock.ingest.profile.profile import load_profile
+
+    robot = None if profile is None else load_profile(str(profile)).robot
+    if robot is None:
+        return "the stand-in's wheels and mass, as nothing says this one's; --urdf FILE would"
+    values = {
+        "wheels of": (robot.wheel_radius_m, "m radius"),
+        "track": (robot.track_m, "m"),
+        "mass": (robot.mass_kg, "kg"),
+    }
+    told = [f"{name} {value:g} {unit}" for name, (value, unit) in values.items() if value]
+    origins = sorted(set(robot.origin.values()))
+    own = ", ".join(told) or "the stand-in's wheels and mass"
+    return f"{robot.drive}, {own} (from {', '.join(origins) or 'the profile'})"
+
+
+__all__ = [
+    "edited",
+    "floor_settings",
+    "fullest",
+    "has_goal",
+    "horizon",
+    "logs_alone_settings",
+    "mistrust",
+    "no_room",
+    "robot_line",
+    "updates_settings",
+]
