@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from restock.train.study.study import StudyPlan as StudyPlan
     from restock.train.study.study import load_study as load_study
     from restock.train.study.study_run import run_study as run_study
+    from restock.train.view.view import ViewOptions as ViewOptions
+    from restock.train.view.view import write_view as write_view
 else:
     __getattr__, __dir__, __all__ = lazy(
         __name__,
@@ -54,5 +56,6 @@ else:
             "restock.train.run.run": ["Run"],
             "restock.train.study.study": ["StudyPlan", "load_study"],
             "restock.train.study.study_run": ["run_study"],
+            "restock.train.view.view": ["ViewOptions", "write_view"],
         },
     )

@@ -12,7 +12,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
 
 from restock.errors import RecordingError
 from restock.ingest.containers.compression import decompressed
@@ -28,10 +31,21 @@ from restock.ingest.containers.topic_reading import (
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.decoding.decoders import decoder_of, type_of
 from restock.ingest.decoding.field_paths import CannotDecode, Leaf, MessageType
-from restock.ingest.decoding.messages import Channel
+from restock.ingest.decoding.messages import Channel, MessageBatch
 from restock.ingest.decoding.row_by_row import Decoder
 
+STATIC_TRANSFORMS = "/tf_static"
 MOST_DEFINED_BYTES = 8 << 20  # parsing takes about a second a MB
+
+
+@dataclass(frozen=True)
+class RawMessage:
+    """A message as it is in the file, decompressed."""
+
+    channel: Channel
+    log_time_ns: int
+    publish_time_ns: int
+    payload: bytes
 
 
 @dataclass(frozen=True)
@@ -232,6 +246,30 @@ class Recording:
             self.notes += [note for note in storage.notes if note not in self.notes]
         return columns
 
+    def raw_between(self, low_ns: int, high_ns: int) -> list[RawMessage]:
+        """Every message logged in [low_ns, high_ns], and what was in force before: by log time.
+
+        In force is each topic's last message before it, and of `/tf_static`, on which several
+        nodes publish, all of them.
+        """
+        before: dict[str, list[RawMessage]] = {}
+        inside: list[RawMessage] = []
+        for storage in self._storages:
+            for number, batch in storage.batches(list(storage.channels)):
+                channel, log_ns = storage.channels[number], batch.log_time_ns
+                inside += _messages(channel, batch, (log_ns >= low_ns) & (log_ns <= high_ns))
+                earlier = np.flatnonzero(log_ns < low_ns)
+                if channel.topic == STATIC_TRANSFORMS:
+                    held = before.setdefault(channel.topic, [])
+                    held += _messages(channel, batch, earlier)
+                elif len(earlier):
+                    latest = earlier[np.argmax(log_ns[earlier])]
+                    held = before.get(channel.topic, [])
+                    if not held or held[0].log_time_ns <= log_ns[latest]:
+                        before[channel.topic] = list(_messages(channel, batch, np.array([latest])))
+        held = [message for messages in before.values() for message in messages]
+        return sorted([*held, *inside], key=lambda message: message.log_time_ns)
+
     def _read_storage(
         self,
         storage: Storage,
@@ -291,3 +329,13 @@ class Recording:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _messages(channel: Channel, batch: MessageBatch, rows: NDArray[Any]) -> Iterator[RawMessage]:
+    """These rows of a batch (numbers or a mask); what cannot be decompressed is left out."""
+    if rows.dtype == np.bool_:
+        rows = np.flatnonzero(rows)
+    for some, _ in decompressed(batch.select(rows)):
+        times = zip(some.log_time_ns.tolist(), some.publish_time_ns.tolist(), strict=True)
+        for payload, (log_ns, publish_ns) in zip(some.payloads(), times, strict=True):
+            yield RawMessage(channel, log_ns, publish_ns, payload)

@@ -190,7 +190,7 @@ def _interpret(origin: Origin, recording: Path | None, name: str | None) -> None
     if manifest is None:
         return
     topics = manifest["topics"] or []
-    profile = _profile(origin, manifest, name)
+    profile = profile_of(origin, manifest, name)
     if profile is not None:
         fills: dict[str, list[str]] = {}
         for input_name, source in profile.inputs.items():
@@ -259,7 +259,7 @@ def _reward_parts(
     return {name: float(value[0]) + 0.0 for name, value in parts.items()}  # never -0
 
 
-def _profile(origin: Origin, manifest: Mapping[str, Any], given: str | None) -> Profile | None:
+def profile_of(origin: Origin, manifest: Mapping[str, Any], given: str | None) -> Profile | None:
     """The profile that read the recording: the one given, the manifest's own, or the shipped one
     of that name."""
     name, text = given or manifest["profile"], manifest.get("profile_toml")

@@ -38,7 +38,9 @@ MAY_IMPORT = {
     "replay/panel": "mixture sampling store ingest/store ingest/task",
     "replay/fleet": "mixture panel store ingest/task",
     "replay/review": "store ingest ingest/store",
-    "replay/trace": "replay panel store ingest/store ingest/profile ingest/steps ingest/task",
+    "replay/trace": (
+        "replay panel store ingest/containers ingest/store ingest/profile ingest/steps ingest/task"
+    ),
     "replay/export": "replay panel store ingest/store ingest/profile ingest/task",
     "train": (
         "dqn evaluation feed run twin/env twin/floors twin/physics replay/fleet replay/mixture"
@@ -67,6 +69,7 @@ MAY_IMPORT = {
         " replay/ring replay/store ingest/profile ingest/task"
     ),
     "train/study": "comparison dqn evaluation libraries run twin/physics ingest",
+    "train/view": ("dqn evaluation run twin/recording replay/trace ingest/decoding ingest/steps"),
     "train/twin": "",
     "train/twin/floors": "",
     "train/twin/physics": "twin/floors ingest/task",
@@ -93,7 +96,7 @@ MAY_IMPORT = {
     "cli/learning": (
         "cli report ingest/profile ingest/store replay/store replay/trace train train/comparison"
         " train/diagnosis train/evaluation train/run train/study train/twin/calibration"
-        " train/twin/physics"
+        " train/twin/physics train/view"
     ),
     "cli/robot": "cli ingest/live ingest/profile ingest/task",
     "cli/start": (

@@ -25,6 +25,10 @@ class TraceCommand:
     transition id. Shows the audited row, the row of the panel and of the store it was drawn from,
     the recording and its time in it, and, with --recording, the messages that were held at
     that tick. A fresh row leads to its episode in the twin, and to the spec that draws it again.
+
+    --view FILE.mcap (or FILE.rrd) writes the seconds around a row for Foxglove (or Rerun): what
+    the store has of each step, labels, the critic's value and TD error, and, with --recording,
+    scans, plans and every topic of the recording.
     """
 
     place: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|PANEL|STORE")]
@@ -41,6 +45,14 @@ class TraceCommand:
     """Of a STORE as it was: a version's number, or a time (2026-11-01T08:00Z); the newest."""
     panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
     """Where the panel is now, if it was moved."""
+    view: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Also write the moment: FILE.mcap for Foxglove, its layout beside it; FILE.rrd for Rerun."""
+    before: Annotated[float, tyro.conf.arg(metavar="SECONDS")] = 5.0
+    """Seconds before the row that --view shows."""
+    after: Annotated[float, tyro.conf.arg(metavar="SECONDS")] = 5.0
+    """Seconds after it."""
+    critic: Annotated[str | None, tyro.conf.arg(metavar="RUN|none")] = None
+    """Whose critic --view shows: a run, or none; of a RUN's row its own."""
     rows: int = 20
     """How many audited rows to list, where no ROW is given."""
     json: bool = False
@@ -52,6 +64,7 @@ class TraceCommand:
         from restock.ingest.store.version import given_version
         from restock.replay.trace.trace import TracePlaces, audited_rows, trace_row
 
+        self._check_view()
         if self.row is None:
             listed = audited_rows(self.place, self.rows)
             if self.json:
@@ -64,10 +77,44 @@ class TraceCommand:
         version = given_version(self.version)
         where = TracePlaces(self.store, self.panel, self.recording, self.profile, version)
         trace = trace_row(self.place, self.row, where)
+        written = self._write_view(trace)
         if self.json:
-            output.print_json(document(trace))
-        else:
-            _print(trace, self.recording is not None)
+            shown = {} if written is None else {"view": written}
+            output.print_json(document(trace) | shown)
+            return
+        _print(trace, self.recording is not None)
+        if written is not None:
+            _print_view(written)
+
+    def _check_view(self) -> None:
+        from restock.errors import ConfigError
+
+        if self.view is None:
+            return
+        from restock.train.view.view import check_view
+
+        check_view(self.view)
+        if self.row is None:
+            raise ConfigError(
+                "a moment is around one row: which?",
+                where="--view",
+                remedy=f"name the ROW; `restock trace {self.place}` lists some of a run",
+            )
+        for name in ("before", "after"):
+            if not 0 <= getattr(self, name) <= 3600:
+                raise ConfigError(
+                    f"is {getattr(self, name):g} s: give 0 to 3600 s", where=f"--{name}"
+                )
+
+    def _write_view(self, trace: tracing.Trace) -> dict[str, Any] | None:
+        if self.view is None:
+            return None
+        from restock.train.view.view import ViewOptions, write_view
+
+        own = self.place if trace.audit is not None else None  # of a run
+        critic = None if self.critic == "none" else self.critic or own
+        options = ViewOptions(self.before, self.after, self.recording, self.profile, critic)
+        return write_view(trace, self.view, options)
 
 
 def document(trace: tracing.Trace) -> dict[str, Any]:
@@ -129,6 +176,20 @@ def _print_origin(origin: Origin, with_messages: bool) -> None:
         if not with_messages:
             file = origin.transition["source_file"]
             output.say(f"--recording {file} shows the messages that it was made of")
+
+
+def _print_view(written: dict[str, Any]) -> None:
+    from restock.cli import output
+
+    rows = [{"topic": topic, "messages": count} for topic, count in written["topics"].items()]
+    output.stdout().print()
+    output.print_table(rows, title=f"{written['path']}, {written['seconds']:g} s")
+    for note in written["notes"]:
+        output.stdout().print(f"note: {note}", markup=False)
+    if written["layout"] is not None:
+        output.say(f"open it in Foxglove and import the layout {written['layout']}")
+    else:
+        output.say(f"`rerun {written['path']}` opens it")
 
 
 def _section(title: str, values: dict[str, Any] | None) -> None:

@@ -1,0 +1,146 @@
+"""The moment around a stored row: the steps before and after it, and what the robot saw then."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from restock.arrays import F32, F64
+from restock.errors import RecordingError, StoreError
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.containers.recording import RawMessage
+from restock.ingest.steps.seen_at_ticks import Seen, SeenScan, seen_between
+from restock.ingest.task.scan import outline_reach
+from restock.ingest.task.task import Task
+from restock.replay.store.store import Store
+from restock.replay.trace.origin import Origin, profile_of, rows_of, sql_file
+
+NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Some seconds of a recording around one transition, as a store has them.
+
+    `steps` are rows of the store in the order of time, T of them. What is not known is None or
+    empty; `notes` say why.
+    """
+
+    at: dict[str, Any]  # the transition that it is about
+    steps: list[dict[str, Any]]  # T
+    task: Task
+    log_offset_ns: int  # log time less the clock of the steps' stamps
+    window_ns: tuple[int, int]  # by log time
+    seen: Seen | None = None  # at the recording's own ticks, where the recording was given
+    messages: list[RawMessage] = field(default_factory=list)  # of the recording, every topic
+    notes: list[str] = field(default_factory=list)
+
+    def column(self, name: str) -> list[Any]:
+        """A column of the steps, (T,)."""
+        return [step[name] for step in self.steps]
+
+    @property
+    def observations(self) -> F32:
+        """(T, D) float32."""
+        return np.asarray(self.column("observation"), np.float32)
+
+    @property
+    def log_ns(self) -> list[int]:
+        """When each step was by log time, (T,)."""
+        return [int(stamp) + self.log_offset_ns for stamp in self.column("stamp_ns")]
+
+    def sector_scans(self) -> list[SeenScan]:
+        """What the policy saw of the lidar at each step: a range a sector, T of them.
+
+        The observation holds clearances: with the body's reach that way they are ranges again.
+        """
+        task = self.task
+        names = task.observation_names
+        first = next(i for i, name in enumerate(names) if name.startswith("clearance_"))
+        near = self.observations[:, first : first + task.sectors].astype(np.float64)
+        width = 2 * np.pi / task.sectors
+        bearing: F64 = np.asarray((np.arange(task.sectors) + 0.5) * width - np.pi, np.float64)
+        clearance = np.asarray(near**2 * task.range_max_m, np.float64)
+        ranges = np.add(clearance, outline_reach(bearing, task.body))
+        ranges[clearance >= task.range_max_m * (1 - 1e-6)] = np.inf
+        stamps = self.column("stamp_ns")
+        return [
+            SeenScan(int(stamp), row, float(bearing[0]), width)
+            for stamp, row in zip(stamps, ranges, strict=True)
+        ]
+
+
+def find_moment(
+    origin: Origin,
+    *,
+    before_s: float = 5.0,
+    after_s: float = 5.0,
+    recording: Path | None = None,
+    profile: str | None = None,
+) -> Moment:
+    """The seconds around a row of a store.
+
+    Args:
+        origin: of the row, as a trace found it.
+        before_s: seconds before it.
+        after_s: and after it.
+        recording: the recording it is from: scans, plans and all other topics are read from it.
+        profile: the profile that read it, where the store keeps none.
+
+    Raises:
+        StoreError: the store has no manifest of the recording any more.
+        RecordingError: the recording given is not the one the row is of, or cannot be read.
+    """
+    row = origin.transition
+    low = int(row["stamp_ns"]) - round(before_s * NS)
+    high = int(row["stamp_ns"]) + round(after_s * NS)
+    named = {"ingest": row["ingest_id"], "recording": row["recording_id"]}
+    with Store(origin.store["path"], version=origin.store["version"]) as store:
+        steps = rows_of(
+            store.connection, sql_file("trace_moment.sql"), {**named, "low": low, "high": high}
+        )
+        manifests = rows_of(store.connection, sql_file("trace_manifest.sql"), named)
+    if not manifests:
+        raise StoreError(
+            "no manifest of the row's recording is left: its task and its clock are not known",
+            where=str(origin.store["path"]),
+            remedy="ingest the recording again",
+        )
+    manifest = manifests[0]
+    moment = Moment(
+        at=row,
+        steps=steps,
+        task=msgspec.json.decode(manifest["task_json"], type=Task),
+        log_offset_ns=(offset := int(manifest["clock_offset_ns"] or 0)),
+        window_ns=(low + offset, high + offset),
+    )
+    if recording is None:
+        moment.notes.append(
+            "scans, plans and the other topics are in the recording alone: give it with"
+            f" --recording {row['source_file']}"
+        )
+        return moment
+    known = profile_of(origin, manifest, profile)
+    with open_recording(recording, salvage=True) as opened:
+        if opened.recording_id != row["recording_id"]:
+            raise RecordingError(
+                f"is recording {opened.recording_id}, the row is of {row['recording_id']}",
+                where=str(recording),
+                remedy="give the recording it was made from; its path then is in the row",
+            )
+        messages = opened.raw_between(*moment.window_ns)
+        seen = None
+        if known is None:
+            moment.notes.extend(note for note in origin.notes if note not in moment.notes)
+        else:
+            try:
+                seen = seen_between(opened, known, low, high)
+            except RecordingError as error:
+                raise RecordingError(
+                    error.what, where=str(recording), remedy=error.remedy
+                ) from error
+    return replace(moment, seen=seen, messages=messages)

@@ -1,0 +1,235 @@
+"""A moment as an MCAP file: the recording's own topics, and Restock's beside them.
+
+Restock's are ROS 2 messages under `/restock/`, in frames of their own (`map` > `restock_base` >
+`restock_laser`, `restock_sectors`), so that they are drawn whatever transforms the robot publishes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any, BinaryIO
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+
+from restock.ingest.decoding.messages import Channel
+from restock.ingest.steps.seen_at_ticks import SeenScan
+from restock.replay.trace.moment import Moment
+from restock.train.twin.recording.messages import build, serialise, stamp, typestore
+from restock.train.view.critic import Critic
+from restock.train.view.told import about, numbers_of, texts_of
+
+BASE, LASER, SECTORS, MAP = "restock_base", "restock_laser", "restock_sectors", "map"
+_BOX, _ADD = 1, 0
+# One message: log time, topic, type, content.
+_Shown = tuple[int, str, str, Any]
+
+
+def write_mcap(
+    stream: BinaryIO, moment: Moment, critic: Critic | None
+) -> dict[str, tuple[str, int]]:
+    """Write the moment; returns of each topic its type and how many messages it holds."""
+    writer = Writer(stream, compression=CompressionType.ZSTD)
+    writer.start(profile="ros2", library="restock")
+    counts, types = Counter[str](), dict[str, str]()
+    channels: dict[Channel, int] = {}
+    schemas: dict[tuple[str, bytes], int] = {}
+    for message in moment.messages:
+        if message.channel not in channels:
+            number = _own_channel(writer, message.channel, schemas)
+            if number is None:
+                moment.notes.append(
+                    f"{message.channel.topic} is left out: its file does not define"
+                    f" {message.channel.type}"
+                )
+            channels[message.channel] = -1 if number is None else number
+        if channels[message.channel] < 0:
+            continue
+        # What was in force before begins with the moment: a viewer starts there.
+        log_ns = max(message.log_time_ns, moment.window_ns[0])
+        number = channels[message.channel]
+        writer.add_message(number, log_ns, message.payload, message.publish_time_ns)
+        counts[message.channel.topic] += 1
+        types[message.channel.topic] = message.channel.type
+    numbers: dict[str, int] = {}
+    for log_ns, topic, kind, content in _shown(moment, critic):
+        if topic not in numbers:
+            definition = typestore().generate_msgdef(kind, ros_version=2)[0].encode()
+            schema = _schema(writer, kind, "ros2msg", definition, schemas)
+            numbers[topic] = writer.register_channel(topic, "cdr", schema)
+        writer.add_message(numbers[topic], log_ns, serialise(content), log_ns)
+        counts[topic] += 1
+        types[topic] = kind
+    writer.finish()  # type: ignore[no-untyped-call]
+    return {topic: (types[topic], count) for topic, count in sorted(counts.items())}
+
+
+def _own_channel(
+    writer: Writer, channel: Channel, schemas: dict[tuple[str, bytes], int]
+) -> int | None:
+    """A channel of the recording, in this file; None where nobody says what its messages are."""
+    definition, form, kind = channel.definition, channel.definition_format, channel.type
+    if not definition:  # an older bag: what the distribution defines
+        if channel.encoding != "cdr" or kind not in typestore().types:
+            return None
+        definition = typestore().generate_msgdef(kind, ros_version=2)[0].encode()
+        form = "ros2msg"
+    if form == "ros1msg":
+        kind = kind.replace("/msg/", "/")
+    schema = _schema(writer, kind, form, definition, schemas)
+    return writer.register_channel(channel.topic, channel.encoding, schema)
+
+
+def _schema(
+    writer: Writer, kind: str, form: str, definition: bytes, known: dict[tuple[str, bytes], int]
+) -> int:
+    if (kind, definition) not in known:
+        known[kind, definition] = writer.register_schema(kind, form, definition)
+    return known[kind, definition]
+
+
+def _shown(moment: Moment, critic: Critic | None) -> Iterator[_Shown]:
+    """Restock's messages of every step, then of every tick of the recording."""
+    sectors = moment.sector_scans()
+    for index, (step, log_ns) in enumerate(zip(moment.steps, moment.log_ns, strict=True)):
+        yield log_ns, "/restock/tf", "tf2_msgs/msg/TFMessage", _transforms(moment, step, log_ns)
+        pose = _pose(step["pose_x_m"], step["pose_y_m"], step["pose_yaw_rad"])
+        yield (
+            *(log_ns, "/restock/pose", "geometry_msgs/msg/PoseStamped"),
+            build(
+                "geometry_msgs/msg/PoseStamped",
+                header={"frame_id": MAP, "stamp": stamp(log_ns)},
+                pose=pose,
+            ),
+        )
+        yield log_ns, "/restock/body", "visualization_msgs/msg/Marker", _body(moment, log_ns)
+        yield (
+            *(log_ns, "/restock/seen", "sensor_msgs/msg/LaserScan"),
+            _scan(SECTORS, sectors[index], log_ns),
+        )
+        yield (
+            *(log_ns, "/restock/waypoints", "nav_msgs/msg/Path"),
+            _path(
+                BASE,
+                log_ns,
+                [
+                    (0.0, 0.0),
+                    (step["waypoint_near_x_m"], step["waypoint_near_y_m"]),
+                    (step["waypoint_far_x_m"], step["waypoint_far_y_m"]),
+                ],
+            ),
+        )
+        command = build(
+            "geometry_msgs/msg/Twist",
+            linear={"x": float(step["command_speed_mps"])},
+            angular={"z": float(step["command_yaw_rate_radps"])},
+        )
+        yield log_ns, "/restock/command", "geometry_msgs/msg/Twist", command
+        for name, text in texts_of(moment, critic, index).items():
+            content = build("std_msgs/msg/String", data=text)
+            yield log_ns, f"/restock/{name}", "std_msgs/msg/String", content
+        for name, number in numbers_of(moment, critic, index).items():
+            if math.isfinite(number):
+                content = build("std_msgs/msg/Float64", data=number)
+                yield log_ns, f"/restock/{name}", "std_msgs/msg/Float64", content
+        if step["transition_id"] == moment.at["transition_id"]:
+            content = build("std_msgs/msg/String", data=about(moment, critic))
+            yield log_ns, "/restock/moment", "std_msgs/msg/String", content
+    yield from _recorded(moment)
+
+
+def _recorded(moment: Moment) -> Iterator[_Shown]:
+    """The scan, plan and goal that the profile read, where they are new."""
+    if moment.seen is None:
+        return
+    seen, before, ordered, drawn = moment.seen, None, None, -1
+    for stamp_ns, scan, plan, goal in zip(
+        seen.stamp_ns.tolist(), seen.scans, seen.plans_m, seen.goals_m, strict=True
+    ):
+        log_ns = stamp_ns + moment.log_offset_ns
+        if scan is not None and scan.stamp_ns != drawn:
+            drawn = scan.stamp_ns
+            kind = "sensor_msgs/msg/LaserScan"
+            yield log_ns, "/restock/scan", kind, _scan(LASER, scan, log_ns)
+        if plan is not None and plan is not before:
+            before = plan
+            points = [(float(x), float(y)) for x, y in plan]
+            yield log_ns, "/restock/plan", "nav_msgs/msg/Path", _path(MAP, log_ns, points)
+        if goal is not None and goal != ordered:
+            ordered = goal
+            header = {"frame_id": MAP, "stamp": stamp(log_ns)}
+            kind = "geometry_msgs/msg/PoseStamped"
+            yield log_ns, "/restock/goal", kind, build(kind, header=header, pose=_pose(*goal, 0.0))
+
+
+def _transforms(moment: Moment, step: dict[str, Any], log_ns: int) -> Any:
+    body = moment.task.body
+    frames = (
+        (MAP, BASE, step["pose_x_m"], step["pose_y_m"], step["pose_yaw_rad"]),
+        (BASE, LASER, body.lidar_x_m, 0.0, body.lidar_yaw_rad),
+        (BASE, SECTORS, body.lidar_x_m, 0.0, 0.0),  # bearings against the robot's forward axis
+    )
+    return build(
+        "tf2_msgs/msg/TFMessage",
+        transforms=[
+            build(
+                "geometry_msgs/msg/TransformStamped",
+                header={"frame_id": parent, "stamp": stamp(log_ns)},
+                child_frame_id=child,
+                transform={
+                    "translation": {"x": float(x), "y": float(y)},
+                    "rotation": _turn(yaw),
+                },
+            )
+            for parent, child, x, y, yaw in frames
+        ],
+    )
+
+
+def _scan(frame: str, scan: SeenScan, log_ns: int) -> Any:
+    ranges = scan.ranges_m.astype(np.float32)
+    farthest = float(np.max(ranges[np.isfinite(ranges)], initial=1.0))
+    return build(
+        "sensor_msgs/msg/LaserScan",
+        header={"frame_id": frame, "stamp": stamp(log_ns)},
+        angle_min=scan.angle_min_rad,
+        angle_max=scan.angle_min_rad + scan.angle_increment_rad * (len(ranges) - 1),
+        angle_increment=scan.angle_increment_rad,
+        range_max=farthest,
+        ranges=ranges,
+    )
+
+
+def _path(frame: str, log_ns: int, points: list[tuple[float, float]]) -> Any:
+    header = {"frame_id": frame, "stamp": stamp(log_ns)}
+    poses = [
+        build("geometry_msgs/msg/PoseStamped", header=header, pose=_pose(x, y, 0.0))
+        for x, y in points
+    ]
+    return build("nav_msgs/msg/Path", header=header, poses=poses)
+
+
+def _body(moment: Moment, log_ns: int) -> Any:
+    body = moment.task.body
+    near = {"position": {"z": 0.1}}
+    return build(
+        "visualization_msgs/msg/Marker",
+        header={"frame_id": BASE, "stamp": stamp(log_ns)},
+        ns="restock",
+        type=_BOX,
+        action=_ADD,
+        pose=near,
+        scale={"x": body.length_m, "y": body.width_m, "z": 0.2},
+        color={"r": 0.94, "g": 0.51, "b": 0.12, "a": 0.6},
+        frame_locked=True,
+    )
+
+
+def _pose(x_m: float, y_m: float, yaw_rad: float) -> dict[str, Any]:
+    return {"position": {"x": float(x_m), "y": float(y_m)}, "orientation": _turn(yaw_rad)}
+
+
+def _turn(yaw_rad: float) -> dict[str, float]:
+    return {"z": math.sin(yaw_rad / 2), "w": math.cos(yaw_rad / 2)}

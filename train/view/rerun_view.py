@@ -1,0 +1,157 @@
+"""A moment as a Rerun recording (`.rrd`), its layout within."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from restock.arrays import F64
+from restock.errors import ConfigError
+from restock.ingest.steps.seen_at_ticks import SeenScan
+from restock.replay.trace.moment import Moment
+from restock.train.view.critic import Critic
+from restock.train.view.told import about, numbers_of, texts_of
+
+TIMELINE = "log_time"
+_COLOURS = {"scan": (208, 49, 45), "seen": (31, 111, 178), "plan": (31, 157, 77)}
+
+
+def require_rerun() -> Any:
+    """The module.
+
+    Raises:
+        ConfigError: it is not installed.
+    """
+    try:
+        import rerun
+    except ImportError as error:
+        raise ConfigError(
+            f"an .rrd file is written by Rerun, which is not installed ({error})",
+            where="--view",
+            remedy="pip install 'restock[view]', or give a name that ends in .mcap",
+        ) from error
+    return rerun
+
+
+def write_rerun(path: Path, moment: Moment, critic: Critic | None) -> dict[str, int]:
+    """Write the moment to `path`; returns how often each entity was logged."""
+    rr = require_rerun()
+    stream = rr.RecordingStream("restock", recording_id=str(moment.at["transition_id"]))
+    stream.save(str(path), default_blueprint=_blueprint(critic))
+    log = _Log(rr, stream)
+    log.put("moment", rr.TextDocument(about(moment, critic)), static=True)
+    body = moment.task.body
+    half = (body.length_m / 2, body.width_m / 2, 0.1)
+    box = rr.Boxes3D(half_sizes=[half], centers=[(0, 0, 0.1)], colors=[(240, 130, 30)])
+    log.put("map/robot/body", box, static=True)
+    way = [(float(s["pose_x_m"]), float(s["pose_y_m"]), 0.0) for s in moment.steps]
+    log.put("map/driven", rr.LineStrips3D([way], colors=[(150, 150, 150)]), static=True)
+    sectors, said = moment.sector_scans(), dict[str, str]()
+    for index, (step, log_ns) in enumerate(zip(moment.steps, moment.log_ns, strict=True)):
+        log.at(log_ns)
+        log.put("map/robot", _placed(rr, step))
+        log.put("map/robot/seen", _points(rr, "seen", _ends(sectors[index], body.lidar_x_m, 0.0)))
+        ahead = [
+            (float(step[f"waypoint_{name}_x_m"]), float(step[f"waypoint_{name}_y_m"]), 0.0)
+            for name in ("near", "far")
+        ]
+        line = rr.LineStrips3D([[(0.0, 0.0, 0.0), *ahead]], colors=[(224, 123, 0)])
+        log.put("map/robot/waypoints", line)
+        for name, number in numbers_of(moment, critic, index).items():
+            if math.isfinite(number):
+                log.put(name, rr.Scalars([number]))
+        for name, text in texts_of(moment, critic, index).items():
+            if said.get(name) != text:  # a log of what changed
+                said[name] = text
+                log.put(f"labels/{name}", rr.TextLog(f"{name}: {text}"))
+    _recorded(log, rr, moment)
+    stream.flush()
+    stream.disconnect()
+    return dict(sorted(log.counts.items()))
+
+
+class _Log:
+    """Puts archetypes at the time that it is, and counts them."""
+
+    def __init__(self, rr: Any, stream: Any) -> None:
+        self.rr, self.stream, self.counts = rr, stream, dict[str, int]()
+
+    def at(self, log_ns: int) -> None:
+        self.stream.set_time(TIMELINE, timestamp=np.datetime64(log_ns, "ns"))
+
+    def put(self, entity: str, what: Any, *, static: bool = False) -> None:
+        self.stream.log(entity, what, static=static)
+        self.counts[entity] = self.counts.get(entity, 0) + 1
+
+
+def _recorded(log: _Log, rr: Any, moment: Moment) -> None:
+    """The scans, plans and goals that the profile read, where they are new."""
+    if moment.seen is None:
+        return
+    seen, body, before, ordered, drawn = moment.seen, moment.task.body, None, None, -1
+    for stamp_ns, scan, plan, goal in zip(
+        seen.stamp_ns.tolist(), seen.scans, seen.plans_m, seen.goals_m, strict=True
+    ):
+        log.at(stamp_ns + moment.log_offset_ns)
+        if scan is not None and scan.stamp_ns != drawn:
+            drawn = scan.stamp_ns
+            ends = _ends(scan, body.lidar_x_m, body.lidar_yaw_rad)
+            log.put("map/robot/scan", _points(rr, "scan", ends))
+        if plan is not None and plan is not before:
+            before = plan
+            line = np.column_stack([plan, np.zeros(len(plan))])
+            log.put("map/plan", rr.LineStrips3D([line], colors=[_COLOURS["plan"]]))
+        if goal is not None and goal != ordered:
+            ordered = goal
+            log.put("map/goal", rr.Points3D([(*goal, 0.0)], radii=[0.12], labels=["goal"]))
+
+
+def _placed(rr: Any, step: dict[str, Any]) -> Any:
+    yaw = float(step["pose_yaw_rad"])
+    return rr.Transform3D(
+        translation=(float(step["pose_x_m"]), float(step["pose_y_m"]), 0.0),
+        rotation=rr.RotationAxisAngle(axis=(0, 0, 1), radians=yaw),
+    )
+
+
+def _ends(scan: SeenScan, lidar_x_m: float, lidar_yaw_rad: float) -> F64:
+    """Where the beams ended, (B', 3) in the robot's frame; those without a return are left out."""
+    back = np.isfinite(scan.ranges_m)
+    bearing = scan.angle_min_rad + scan.angle_increment_rad * np.flatnonzero(back) + lidar_yaw_rad
+    ranges = scan.ranges_m[back]
+    ends = [
+        lidar_x_m + ranges * np.cos(bearing),
+        ranges * np.sin(bearing),
+        np.full(len(ranges), 0.2),
+    ]
+    return np.column_stack(ends)
+
+
+def _points(rr: Any, name: str, ends: F64) -> Any:
+    radius = 0.03 if name == "scan" else 0.06
+    return rr.Points3D(ends, colors=[_COLOURS[name]], radii=[radius])
+
+
+def _blueprint(critic: Critic | None) -> Any:
+    import rerun.blueprint as rrb
+
+    plots = [
+        rrb.TimeSeriesView(origin="/speed", name="speed, m/s"),
+        rrb.TimeSeriesView(origin="/", contents=["/reward"], name="reward"),
+    ]
+    if critic is not None:
+        values = ["/critic/value", "/critic/best_value"]
+        plots += [
+            rrb.TimeSeriesView(origin="/", contents=values, name="the critic's value"),
+            rrb.TimeSeriesView(origin="/", contents=["/critic/td_error"], name="TD error"),
+        ]
+    right = rrb.Vertical(*plots, rrb.TextLogView(origin="/labels", name="labels"))
+    left = rrb.Vertical(
+        rrb.Spatial3DView(origin="/map", name="floor"),
+        rrb.TextDocumentView(origin="/moment", name="moment"),
+        row_shares=[5, 1],
+    )
+    return rrb.Blueprint(rrb.Horizontal(left, right, column_shares=[3, 2]), collapse_panels=True)

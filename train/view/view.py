@@ -1,0 +1,109 @@
+"""A traced row's moment, written to a file that Foxglove or Rerun opens."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from restock.errors import ConfigError, StoreError
+from restock.files import temporary_name, write_text
+from restock.replay.trace.moment import Moment, find_moment
+from restock.replay.trace.trace import Trace
+from restock.train.view.critic import Critic, critic_along
+from restock.train.view.layout import foxglove_layout
+from restock.train.view.mcap_view import write_mcap
+from restock.train.view.rerun_view import require_rerun, write_rerun
+
+ENDINGS = (".mcap", ".rrd")
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """How much of a moment is shown, and by which critic."""
+
+    before_s: float = 5.0
+    after_s: float = 5.0
+    recording: Path | None = None  # scans, plans and all other topics are in it
+    profile: str | None = None
+    critic: str | None = None  # a run
+
+
+def write_view(trace: Trace, path: Path, options: ViewOptions | None = None) -> dict[str, Any]:
+    """Write the seconds around a traced row; returns what is in the file.
+
+    Args:
+        trace: of a row that lies in a store.
+        path: a new file: `.mcap` (Foxglove; its layout is put beside it) or `.rrd` (Rerun).
+
+    Raises:
+        ConfigError: another ending, there is a file already, or Rerun is not installed.
+        StoreError: the row is of the twin: no store has what was before and after it.
+    """
+    options = options or ViewOptions()
+    check_view(path)
+    if trace.origin is None:
+        raise StoreError(
+            "is a row of the twin: no recording has its moment",
+            where="--view",
+            remedy="`restock record --policy run:RUN --missions FILE` drives its mission again",
+        )
+    moment = find_moment(
+        trace.origin,
+        before_s=options.before_s,
+        after_s=options.after_s,
+        recording=options.recording,
+        profile=options.profile,
+    )
+    critic = critic_along(options.critic, moment) if options.critic is not None else None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = temporary_name(path).with_suffix(path.suffix)
+    try:
+        counts, layout = _write(temporary, moment, critic)
+        if layout is not None:
+            write_text(layout_of(path), json.dumps(layout, indent=1) + "\n")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return {
+        "path": str(path),
+        "layout": None if layout is None else str(layout_of(path)),
+        "steps": len(moment.steps),
+        "seconds": (moment.window_ns[1] - moment.window_ns[0]) / 1e9,
+        "critic": None if critic is None else f"{critic.run}: {critic.weights}",
+        "topics": counts,
+        "notes": moment.notes,
+    }
+
+
+def check_view(path: Path) -> None:
+    """Raises ConfigError where nothing can be written to `path`: before anything is looked up."""
+    if path.suffix not in ENDINGS:
+        raise ConfigError(
+            f"{path.name!r} ends neither in .mcap (Foxglove) nor in .rrd (Rerun)",
+            where="--view",
+            remedy="give the file such a name",
+        )
+    if path.exists():
+        raise ConfigError("exists already", where=str(path), remedy="remove it, or name another")
+    if path.suffix == ".rrd":
+        require_rerun()
+
+
+def layout_of(path: Path) -> Path:
+    """Where the Foxglove layout of a file lies."""
+    return path.with_suffix(".foxglove.json")
+
+
+def _write(
+    path: Path, moment: Moment, critic: Critic | None
+) -> tuple[dict[str, int], dict[str, Any] | None]:
+    if path.suffix == ".rrd":
+        return write_rerun(path, moment, critic), None
+    with path.open("wb") as stream:
+        written = write_mcap(stream, moment, critic)
+    middle = float(moment.at["pose_x_m"]), float(moment.at["pose_y_m"])
+    types = {topic: kind for topic, (kind, _) in written.items()}
+    counts = {topic: count for topic, (_, count) in written.items()}
+    return counts, foxglove_layout(types, middle_m=middle)
