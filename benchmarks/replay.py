@@ -31,6 +31,7 @@ from replay_contenders import (
     BATCH,
     OBSERVATION,
     SHARES,
+    IndexSelected,
     MultinomialDraw,
     OnDevice,
     Packed,
@@ -78,6 +79,9 @@ def sampling(quick: bool) -> dict[str, Any]:
     us = measure(
         {
             "uniform": Packed(rows, uniform_sampler(count, BATCH, np.random.default_rng(0))),
+            "uniform_by_index_select": IndexSelected(
+                rows, uniform_sampler(count, BATCH, np.random.default_rng(0))
+            ),
             "quotas": Packed(rows, quota_sampler(stratum_rows)),
             "quotas_in_turns": Packed(rows, quota_sampler(stratum_rows, replacement=False)),
             "quotas_by_torch": OnDevice(rows, device),

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from restock.replay.sampling.device import DeviceSampler
+from restock.replay.sampling.gather import gather_rows
 from restock.replay.sampling.sampler import QuotaSampler, Sampler, uniform_sampler
 
 Draw = Callable[[], None]
@@ -25,16 +26,25 @@ NATURAL = np.array([0.88, 0.05, 0.03, 0.02, 0.01, 0.005, 0.004, 0.001])  # of th
 
 
 class Packed:
-    """Packed rows and a sampler: one draw and one gather into a batch that exists already."""
+    """Packed rows and a sampler: one draw and one gather."""
 
     def __init__(self, rows: torch.Tensor, sampler: Sampler) -> None:
         self.rows, self.sampler = rows, sampler
-        self.batch = torch.empty(BATCH, rows.shape[1])
+        self.batch = torch.empty(0)
 
     def __call__(self) -> None:
         self.gather(torch.from_numpy(self.sampler.draw()[0]))
 
     def gather(self, index: torch.Tensor) -> None:
+        self.batch = gather_rows(self.rows, index)
+
+
+class IndexSelected(Packed):
+    """The same, gathered as PyTorch's public interface has it, into a batch that exists already."""
+
+    def gather(self, index: torch.Tensor) -> None:
+        if not len(self.batch):
+            self.batch = torch.empty(len(index), self.rows.shape[1])
         torch.index_select(self.rows, 0, index, out=self.batch)
 
 

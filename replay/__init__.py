@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from restock.replay.review.verdicts import read_verdicts as read_verdicts
     from restock.replay.sampling.chunked import ChunkedSampler as ChunkedSampler
     from restock.replay.sampling.device import DeviceSampler as DeviceSampler
+    from restock.replay.sampling.gather import gather_rows as gather_rows
     from restock.replay.sampling.priorities import Lap as Lap
     from restock.replay.sampling.priorities import Per as Per
     from restock.replay.sampling.sampler import QuotaSampler as QuotaSampler
@@ -61,6 +62,7 @@ else:
             "restock.replay.review.verdicts": ["read_verdicts"],
             "restock.replay.sampling.chunked": ["ChunkedSampler"],
             "restock.replay.sampling.device": ["DeviceSampler"],
+            "restock.replay.sampling.gather": ["gather_rows"],
             "restock.replay.sampling.priorities": ["Lap", "Per"],
             "restock.replay.sampling.sampler": ["QuotaSampler", "Sampler"],
             "restock.replay.store.audit": ["load_audits", "load_thresholds", "run_audits"],

@@ -231,7 +231,7 @@ class Panel:
         return sampler_for(self, batch_size, seed=seed)
 
     def tensor(self) -> Any:
-        """The packed rows as a memory-mapped torch tensor (n, W): gather with `index_select`."""
+        """The packed rows as a memory-mapped torch tensor (n, W), for `gather_rows`."""
         import torch
 
         return torch.from_file(

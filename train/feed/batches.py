@@ -21,6 +21,7 @@ from restock.replay.panel.logged_sampler import (
     LoggedSampler,
 )
 from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.gather import gather_rows
 from restock.replay.sampling.share_controller import ShareController
 from restock.state import Stateful
 from restock.train.feed.logs import Logs
@@ -33,7 +34,7 @@ _NOTHING = BatchDraw(_NO_ROWS, _NO_ROWS, None, np.empty(0))
 class ReplayBatch:
     """One batch: the logged rows first, then the fresh ones."""
 
-    rows: Tensor  # (B, W) float32, on the learner's device; valid until the next draw
+    rows: Tensor  # (B, W) float32, on the learner's device
     weight: Tensor | None  # (B,) float32
     log_rows: Ints  # (L,) rows of the panel
     log_stratum: Ints = field(default_factory=lambda: _NO_ROWS)  # (L,)
@@ -73,7 +74,6 @@ class Batches(Stateful):
         self.batch_size = batch_size
         self._rng = np.random.default_rng([seed, 1])
         self._fresh = torch.from_numpy(ring.rows)  # shares memory with the ring
-        self._buffer = torch.empty((batch_size, ring.rows.shape[1]))
         self._draws: LoggedSampler | None = None
         self._logs_on_device: Tensor | None = None
         self._max_age: int | None = None  # of fresh rows, in environment steps
@@ -141,32 +141,26 @@ class Batches(Stateful):
 
     def _gather(self, drawn: BatchDraw, slots: Ints) -> ReplayBatch:
         logged, size = len(drawn.rows), len(drawn.rows) + len(slots)
-        packed = self._buffer[:size]
-        on_cpu = self.device.type == "cpu"
-        if logged and self._draws is not None and self._draws.reads_chunks:
-            self._draws.gather(drawn.rows, packed[:logged].numpy())
-        elif logged and on_cpu:
-            index = torch.from_numpy(drawn.rows)
-            torch.index_select(self._logs_tensor, 0, index, out=packed[:logged])
+        parts = []
+        if logged:
+            parts.append(self._gather_logs(drawn.rows))
         if len(slots):
-            torch.index_select(self._fresh, 0, torch.from_numpy(slots), out=packed[logged:])
-        if not on_cpu:
-            parts = [packed[logged:].to(self.device)]
-            if logged and self._logs_on_device is None:
-                parts.insert(0, packed[:logged].to(self.device))
-            elif logged:
-                index = torch.from_numpy(drawn.rows).to(self.device)
-                parts.insert(0, self._logs_tensor.index_select(0, index))
-            packed = torch.cat(parts)
+            fresh = gather_rows(self._fresh, torch.from_numpy(slots))
+            parts.append(fresh.to(self.device))
+        rows = parts[0] if len(parts) == 1 else torch.cat(parts)
         weight = None
         if drawn.weight is not None:
             weight = torch.ones(size)
             weight[:logged] = torch.from_numpy(drawn.weight)
             weight = weight.to(self.device)
-        return ReplayBatch(packed, weight, drawn.rows, drawn.strata, slots, drawn.quota)
+        return ReplayBatch(rows, weight, drawn.rows, drawn.strata, slots, drawn.quota)
 
-    @property
-    def _logs_tensor(self) -> Tensor:
-        if self._logs_on_device is None:
+    def _gather_logs(self, rows: Ints) -> Tensor:
+        """Rows (L,) of the panel, (L, W), on the device."""
+        if self._logs_on_device is not None:
+            return gather_rows(self._logs_on_device, torch.from_numpy(rows).to(self.device))
+        if self._draws is None:
             raise RuntimeError("there are no logs to draw from")
-        return self._logs_on_device
+        packed = torch.empty((len(rows), self._fresh.shape[1]))
+        self._draws.gather(rows, packed.numpy())
+        return packed.to(self.device)

@@ -1,0 +1,99 @@
+"""`gather_rows` gives the rows, whether PyTorch's prefetching kernel is there or not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+
+from restock.replay import gather_rows
+from restock.replay.sampling import gather
+
+TABLES = npst.arrays(
+    np.float32,
+    st.tuples(st.integers(1, 9), st.integers(1, 40)),
+    elements=st.floats(width=32, allow_nan=True, allow_infinity=True, allow_subnormal=True),
+)
+
+
+@pytest.fixture(autouse=True)
+def _tried_anew() -> Iterator[None]:
+    gather._prefetching_works.cache_clear()
+    yield
+    gather._prefetching_works.cache_clear()
+
+
+def same(given: torch.Tensor, rows: torch.Tensor, index: torch.Tensor) -> bool:
+    return np.array_equal(given.numpy(), rows.numpy()[index.numpy()], equal_nan=True)
+
+
+@settings(max_examples=60, deadline=None)
+@given(TABLES, st.data())
+def test_gives_the_rows_in_order(table: np.ndarray, data: st.DataObject) -> None:
+    rows = torch.from_numpy(table)
+    numbers = data.draw(st.lists(st.integers(0, len(table) - 1), max_size=20))
+    index = torch.tensor(numbers, dtype=torch.int64)
+    given = gather_rows(rows, index)
+    assert given.shape == (len(numbers), table.shape[1])
+    assert same(given, rows, index)
+
+
+def test_rows_of_a_batch_are_its_own() -> None:
+    rows = torch.arange(12.0).view(4, 3)
+    batch = gather_rows(rows, torch.tensor([2, 0]))
+    batch.zero_()
+    assert rows[2].tolist() == [6.0, 7.0, 8.0]
+
+
+@pytest.mark.parametrize("number", [4, -1])
+def test_a_row_outside_the_table_is_refused(number: int) -> None:
+    with pytest.raises((IndexError, RuntimeError)):
+        gather_rows(torch.zeros(4, 3), torch.tensor([0, number]))
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        torch.arange(20, dtype=torch.float64).view(4, 5),
+        torch.arange(20, dtype=torch.int64).view(4, 5),
+        torch.arange(40, dtype=torch.float32).view(4, 10)[:, ::2],
+        torch.arange(4, dtype=torch.float32),
+    ],
+    ids=["float64", "int64", "strided", "a vector"],
+)
+def test_other_tables(rows: torch.Tensor) -> None:
+    index = torch.tensor([3, 3, 0])
+    assert same(gather_rows(rows, index), rows, index)
+
+
+def test_gradients_flow_where_they_are_asked_for() -> None:
+    rows = torch.ones(4, 2, requires_grad=True)
+    gather_rows(rows, torch.tensor([1, 1, 3])).sum().backward()
+    assert rows.grad is not None
+    assert rows.grad[:, 0].tolist() == [0.0, 2.0, 0.0, 1.0]
+
+
+def wrong(rows: torch.Tensor, index: torch.Tensor, _: torch.Tensor) -> tuple[torch.Tensor]:
+    return (rows[index].bfloat16().float(),)
+
+
+def called_otherwise(*_: Any) -> None:
+    raise TypeError("takes 4 positional arguments")
+
+
+@pytest.mark.parametrize("kernel", [None, wrong, called_otherwise], ids=["gone", "wrong", "other"])
+def test_without_the_kernel(kernel: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of another PyTorch: the rows all the same, by `index_select`."""
+    if kernel is None:
+        monkeypatch.delattr(torch, "_embedding_bag_forward_only")
+    else:
+        monkeypatch.setattr(torch, "_embedding_bag_forward_only", kernel)
+    rows, index = torch.randn(50, 7), torch.tensor([49, 0, 3, 3])
+    assert not gather._prefetching_works()
+    assert same(gather_rows(rows, index), rows, index)
