@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import zlib
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -15,7 +14,15 @@ import zstandard
 from numpy.typing import NDArray
 
 from restock.arrays import Ints
-from restock.ingest.containers.mcap_records import PREFIX, Buffer, Malformed, Op, parse, walk
+from restock.ingest.containers.mcap_records import (
+    PREFIX,
+    Buffer,
+    Malformed,
+    Op,
+    crc32,
+    parse,
+    walk,
+)
 from restock.ingest.decoding.columns import gather
 from restock.ingest.decoding.messages import Channel
 
@@ -139,7 +146,7 @@ def _unpack(stored: bytes, room: NDArray[np.uint8]) -> bool:
 
 
 def _check(chunk: Chunk, data: bytes | memoryview) -> None:
-    if chunk.crc and zlib.crc32(data) != chunk.crc:
+    if chunk.crc and crc32(data) != chunk.crc:
         raise BadChunk("its CRC does not match")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from restock.ingest.containers import mcap_chunk
 from restock.ingest.containers.mcap_chunk import LATEST_NS, Chunk, Messages
 from restock.ingest.containers.mcap_contents import ROSBAG2, survey
 from restock.ingest.containers.mcap_group import Checks, ChunkReader, batch_of
-from restock.ingest.containers.mcap_records import MAGIC, PREFIX, FileBytes
+from restock.ingest.containers.mcap_records import MAGIC, PREFIX, FileBytes, crc32
 from restock.ingest.containers.mcap_salvage import resume
 from restock.ingest.containers.storage import (
     NOT_KEPT,
@@ -145,7 +144,7 @@ class McapFile:
         computed = 0
         for start in range(0, position, GROUP_BYTES):
             stop = min(start + GROUP_BYTES, position)
-            computed = zlib.crc32(self._file[start:stop], computed)
+            computed = crc32(self._file[start:stop], computed)
         if computed == crc:
             self._checks.verified += 1
         else:

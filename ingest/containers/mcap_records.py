@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+import zlib
+from collections.abc import Callable, Iterator
 from enum import IntEnum
 from pathlib import Path
 from typing import Any, TypeAlias, overload
@@ -13,6 +14,19 @@ from restock.errors import RecordingError
 MAGIC = b"\x89MCAP0\r\n"
 Buffer: TypeAlias = "bytes | FileBytes"
 PREFIX = 9  # every record: opcode (1 byte), length of its content (8 bytes)
+
+
+def _fastest_crc32() -> Callable[..., int]:
+    """The CRC-32 of MCAP's checksums: that of `isal`, nine times as fast, where it is installed."""
+    try:
+        from isal import isal_zlib
+    except ImportError:
+        return zlib.crc32
+    fast: Callable[..., int] = isal_zlib.crc32
+    return fast
+
+
+crc32 = _fastest_crc32()  # (data, CRC of what came before = 0)
 
 
 class FileBytes:

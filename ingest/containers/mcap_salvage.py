@@ -7,7 +7,6 @@ compression and two lengths that must agree. Its CRC is checked when it is read,
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterator
 from typing import Any
 
@@ -25,6 +24,7 @@ from restock.ingest.containers.mcap_records import (
     FileBytes,
     Malformed,
     Op,
+    crc32,
     parse,
     walk,
 )
@@ -71,7 +71,7 @@ def _summary(file: FileBytes) -> _Summary | None:
     if not len(MAGIC) <= summary.start <= at:
         return None
     checked = file[summary.start : at + PREFIX + 16]
-    if footer["summary_crc"] and zlib.crc32(checked) != footer["summary_crc"]:
+    if footer["summary_crc"] and crc32(checked) != footer["summary_crc"]:
         return None
     try:
         for opcode, start, stop in walk(file, summary.start, at):

@@ -32,7 +32,10 @@ def test_a_machine_on_which_the_tests_run_is_well(
 def test_what_is_missing_or_too_old_is_named_with_its_remedy(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    wanted = ["duckdb>=99", "no-such-package>=1", "no-such-extra>=1; extra == 'onnx'"]
+    wanted = [
+        *("duckdb>=99", "no-such-package>=1", "no-such-extra>=1; extra == 'onnx'"),
+        "of-another-machine>=1; platform_machine == 'pdp11'",
+    ]
     monkeypatch.setattr(doctor, "requires", lambda _: wanted)
     code, found = told(capsys)
     assert code == 2
@@ -41,6 +44,7 @@ def test_what_is_missing_or_too_old_is_named_with_its_remedy(
     assert found["no-such-package"]["state"] == "wrong"
     extra = found["no-such-extra"]
     assert (extra["state"], extra["remedy"]) == ("missing", "pip install 'restock[onnx]'")
+    assert "of-another-machine" not in found
 
 
 def test_a_store_that_is_not_there_is_wrong(

@@ -94,6 +94,10 @@ def _packages() -> list[Finding]:
         extra = EXTRA.search(str(requirement.marker or ""))
         if requirement.name == "restock" or (extra and extra[1] in FOR_DEVELOPERS):
             continue
+        if requirement.marker and not requirement.marker.evaluate(
+            {"extra": extra[1] if extra else ""}
+        ):
+            continue  # of other machines
         name, wanted = requirement.name, requirement.specifier
         part = f"extra {extra[1]}" if extra else "needed"
         try:

@@ -1,0 +1,41 @@
+"""MCAP's CRC-32: the same whoever computes it, with `isal` and without."""
+
+from __future__ import annotations
+
+import sys
+import zlib
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from restock.ingest.containers.mcap_records import _fastest_crc32, crc32
+
+
+@given(st.binary(max_size=300), st.integers(0, 300))
+def test_equals_zlibs_in_one_piece_and_in_two(data: bytes, cut: int) -> None:
+    assert crc32(data) == zlib.crc32(data)
+    assert crc32(data[cut:], crc32(data[:cut])) == zlib.crc32(data)
+    assert crc32(np.frombuffer(data, np.uint8).data) == zlib.crc32(data)
+
+
+def test_known_values() -> None:
+    """The check value of the CRC-32 that zlib and the MCAP libraries compute, and of nothing."""
+    assert crc32(b"123456789") == 0xCBF43926
+    assert crc32(b"") == 0
+
+
+def test_a_chunk_of_a_mebibyte() -> None:
+    data = np.random.default_rng(0).bytes((1 << 20) + 13)
+    assert crc32(data) == zlib.crc32(data)
+
+
+def test_without_isal_it_is_zlibs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "isal", None)
+    assert _fastest_crc32() is zlib.crc32
+
+
+def test_with_isal_it_is_isals() -> None:
+    isal_zlib = pytest.importorskip("isal.isal_zlib")
+    assert _fastest_crc32() is isal_zlib.crc32
