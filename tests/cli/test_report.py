@@ -9,11 +9,13 @@ from html import escape
 from html.parser import HTMLParser
 from itertools import pairwise
 from pathlib import Path
+from xml.etree import ElementTree
 
 import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from PIL import Image
 from support.panels import panel_of
 from support.stores import TASK
 
@@ -22,10 +24,12 @@ from restock.errors import RunError
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.panel import Panel
 from restock.replay.store.capacity import capacity_of_rows
-from restock.report import build_report, shares
-from restock.report.facts import evaluation_bias, gather
-from restock.report.page import page
-from restock.report.sections import success
+from restock.report import build_report
+from restock.report.look.theme import DARK
+from restock.report.run import shares
+from restock.report.run.facts import evaluation_bias, gather, mean_success
+from restock.report.run.page import page
+from restock.report.run.sections import success
 from restock.stats import ConfidenceInterval
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES, TABLES
@@ -266,11 +270,86 @@ def test_ages_say_how_old_the_newest_row_was(html: str) -> None:
     assert "when the panel&#39;s newest row was 3.0 days old" in part
 
 
-def test_the_headline_is_what_the_episodes_say(html: str) -> None:
-    heading = re.search(r"<h1>(.*?)</h1>", html, re.DOTALL)
-    assert heading is not None
-    assert "Success 55% on average over 2 kinds of episode" in heading[1]
-    assert "20% in the hardest, wheel slip" in heading[1]
+def heading(html: str) -> str:
+    found = re.search(r"<h1>(.*?)</h1>", html, re.DOTALL)
+    assert found is not None
+    return found[1]
+
+
+def test_the_headline_is_a_comparison_with_its_interval(html: str) -> None:
+    assert re.fullmatch(
+        r"Worse than the planner in wheel slip \(−80 points \[−95, −6\d\]\);"
+        r" no difference shown in nominal",
+        heading(html),
+    )
+    lead = html.split('<p class="lead">')[1].split("</p>")[0]
+    assert "1,000 updates" in lead  # what it cost
+    assert "another training seed" in lead  # what the interval does not hold
+
+
+def test_without_a_baseline_the_headline_says_so(run: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(run, tmp_path / "run")
+    file = copy / "eval" / "episodes.parquet"
+    table = pq.read_table(file)
+    pq.write_table(table.filter(pa.compute.equal(table["policy"], "agent")), file)
+    said = heading(build_report(copy).read_text(encoding="utf-8"))
+    assert said.startswith("No baseline drove the same episodes: success 90%")
+    assert "20% [8%, 42%] in wheel slip" in said
+
+
+def test_one_average_of_success_is_on_the_page(run: Path) -> None:
+    """Conditions count the same; partly and wholly blocked aisles by half each."""
+    cells = [
+        {"cell": "nominal", "success": 1.0, "episodes": 100},
+        {"cell": "blocked_aisle (partial)", "success": 0.2, "episodes": 3},
+        {"cell": "blocked_aisle (full)", "success": 0.4, "episodes": 9},
+    ]
+    assert mean_success(cells) == pytest.approx(0.65)
+    facts = gather(run)
+    facts.logged = [
+        {"condition": "nominal", "share": 0.1, "episodes": 1},
+        {"condition": "wheel_slip", "share": 0.9, "episodes": 9},
+    ]
+    assert f"instead of {mean_success(facts.clean_cells()):.0%}" in evaluation_bias(facts)
+
+
+def test_a_condition_is_spelt_one_way(html: str) -> None:
+    shown = re.sub(r"<(pre|code)>.*?</\1>", "", html.split("</style>")[1], flags=re.DOTALL)
+    assert "wheel slip" in shown
+    assert "wheel_slip" not in shown
+
+
+def test_figures_are_drawn_at_the_size_of_a_phone_and_of_a_desktop(html: str) -> None:
+    assert len(re.findall(r'<div class="drawing w300"><svg[^>]* width="300"', html)) >= 7
+    assert html.count('<div class="drawing w300">') == html.count(
+        '<div class="drawing w490">'
+    ) + html.count('<div class="drawing w1000">')
+    sizes = set(re.findall(r'font-size="([\d.]+)px"', html))
+    assert sizes == {"12"}
+    ids = re.findall(r"<svg.*?</svg>", html, re.DOTALL)
+    found = [name for svg in ids for name in set(re.findall(r' id="([^"]+)"', svg))]
+    assert len(found) == len(set(found))
+
+
+def test_every_colour_of_a_figure_has_one_for_a_dark_ground(html: str) -> None:
+    """All but colours of marks that stand out on both."""
+    figures = "".join(re.findall(r"<svg.*?</svg>", html, re.DOTALL))
+    drawn = set(re.findall(r'(?:fill|stroke)="(#[0-9a-f]{6})"', figures))
+    both = {"#1f2937", "#fdfdfd", "#e69f00", "#cc79a7", "#56b4e9"}
+    assert drawn - both <= set(DARK)
+    for colour in drawn & set(DARK):
+        assert f'svg [fill="{colour}"]' in html
+
+
+def test_figures_as_files(run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "deep" / "figures"
+    page = build_report(run, tmp_path / "page.html", figures=folder)
+    figures = page.read_text(encoding="utf-8").count("<figure")
+    assert len(list(folder.glob("*.svg"))) == len(list(folder.glob("*.png"))) == figures
+    with Image.open(folder / "success.png") as picture:
+        assert picture.width > 1000
+        assert picture.convert("RGB").getpixel((1, 1)) == (255, 255, 255)
+    ElementTree.parse(folder / "map-where-the-logs-have-been.svg")
 
 
 def test_a_clear_loss_to_the_planner_is_said(html: str) -> None:
@@ -296,12 +375,13 @@ def test_each_perturbation_has_a_table_and_the_clean_one_is_open(run: Path) -> N
 
 def test_what_is_no_better_than_chance_is_no_success(run: Path) -> None:
     facts = gather(run)
-    assert page(facts)["headline"].startswith("Success 55% on average")
+    assert page(facts)["headline"].startswith("Worse than the planner")
     facts.cells += [
         {**row, "policy": "random", "success": 0.6} for row in facts.clean_cells("agent")
     ]
     assert page(facts)["headline"] == (
-        "Nothing was learnt: success 55%, of a random policy 60%, on the same episodes"
+        "Nothing was learnt: no better than a random policy on the same episodes"
+        " (55% against 60%, mean over conditions)"
     )
 
 
@@ -317,7 +397,7 @@ def test_every_section_has_its_figures(html: str) -> None:
         ("map", 2),
     ):
         part = html.split(f'<section id="{section}">')[1].split("</section>")[0]
-        assert part.count("<svg") == figures, section
+        assert part.count("<figure") == figures, section
 
 
 def rows_of(html: str, section: str) -> list[list[str]]:
@@ -385,7 +465,7 @@ def test_a_measured_gap_is_a_section(run: Path, tmp_path: Path) -> None:
         *("nominal twin", "measured at version 7", "No &lt;script&gt;alert(1)&lt;/script&gt; was"),
     ):
         assert words in part, words
-    assert part.count("<svg") == 1
+    assert part.count("<figure") == 1
     (copy / "gap" / "gap.json").write_text("{}")
     page = build_report(copy).read_text(encoding="utf-8")
     assert '<section id="twin-gap">' not in page
@@ -459,7 +539,7 @@ def test_the_floor_that_is_drawn_is_the_runs_own(run: Path, tmp_path: Path) -> N
     hall = tmp_path / "hall.toml"
     hall.write_text("width_m = 20.0\ndepth_m = 5.0\nracks = [[1.0, 2.0, 8.0, 3.0]]\n")
     page = _on_floors(run, tmp_path / "a", str(hall), "hall.toml")
-    assert 'width="800" height="200"' in page
+    assert 'rect width="800" height="200"' in page
     assert "run drives on, hall.toml" in page
     assert "18 failed clean episodes there" in page
     page = _on_floors(run, tmp_path / "b", str(hall), "default")
@@ -511,4 +591,4 @@ def test_four_shares_stand_side_by_side_and_a_loss_by_weights_is_said(run: Path)
     assert shares.remarks(facts) == []
     figure = shares.figure(facts)
     assert figure is not None
-    assert "after weights" in figure.svg
+    assert "after weights" in figure.widest

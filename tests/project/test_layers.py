@@ -84,9 +84,13 @@ MAY_IMPORT = {
     "train/twin/calibration": (
         "twin/floors twin/physics replay/store ingest/profile ingest/steps ingest/task"
     ),
-    "report": (
-        "replay/fleet replay/panel replay/store train/run train/twin/calibration train/twin/floors"
+    "report": "look run fleet replay/fleet train/twin/calibration",
+    "report/look": "",
+    "report/run": (
+        "look replay/panel replay/store train/evaluation train/run train/twin/calibration"
+        " train/twin/floors"
     ),
+    "report/fleet": "look replay/fleet replay/store",
     "cli": "ingest/steps replay/store",
     "cli/data": (
         "cli ingest ingest/containers ingest/profile ingest/propose ingest/steps ingest/store"
@@ -104,8 +108,8 @@ MAY_IMPORT = {
         " train/twin/floors"
     ),
     "cli/twin": (
-        "cli report ingest/containers ingest/profile ingest/propose ingest/store ingest/task"
-        " replay/fleet replay/store train/evaluation train/twin/calibration train/twin/env"
+        "cli report report/run ingest/containers ingest/profile ingest/propose ingest/store"
+        " ingest/task replay/fleet replay/store train/evaluation train/twin/calibration train/twin/env"
         " train/twin/floors train/twin/physics train/twin/recording train/twin/survey"
     ),
 }

@@ -21,8 +21,8 @@ from torch import Tensor, tensor
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.schedules import Linear
-from restock.report.card import as_markdown, replay_card
-from restock.report.facts import Facts
+from restock.report.run.card import as_markdown, replay_card
+from restock.report.run.facts import Facts
 from restock.state import restored, saved
 from restock.train.comparison.arms import differences
 from restock.train.dqn.behaviour import (

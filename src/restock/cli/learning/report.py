@@ -35,6 +35,8 @@ class ReportCommand:
     """The directory that `restock train --out` wrote; or a store, for its gap alone."""
     out: Path | None = None
     """Where to write the page; default RUN/report.html. Replaces what is there."""
+    figures: Path | None = None
+    """A folder for each figure of the page, as SVG and PNG. Replaces those of the same names."""
     card: bool = False
     """The replay card instead of the page."""
     json: bool = False
@@ -48,10 +50,11 @@ class ReportCommand:
         from restock.train.twin.calibration.twin_gap import FOLDER
 
         if self.card:
-            if self.out is not None:
-                raise ConfigError(
-                    "is of the page: a card is written beside the run's metrics", where="--out"
-                )
+            for flag, path in (("--out", self.out), ("--figures", self.figures)):
+                if path is not None:
+                    raise ConfigError(
+                        "is of the page: a card is written beside the run's metrics", where=flag
+                    )
             card, markdown = write_card(self.run_directory)
             if self.json:
                 print_json(card)
@@ -59,9 +62,9 @@ class ReportCommand:
                 sys.stdout.write(markdown)
             return None
         if is_store(Location.of(self.run_directory)):
-            path = write_gap_page(self.run_directory / FOLDER, self.out)
+            path = write_gap_page(self.run_directory / FOLDER, self.out, self.figures)
         else:
-            path = build_report(self.run_directory, self.out)
+            path = build_report(self.run_directory, self.out, self.figures)
         if self.json:
             print_json({"report": str(path), "bytes": path.stat().st_size})
         else:

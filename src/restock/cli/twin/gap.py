@@ -159,7 +159,7 @@ def _seconds(text: str) -> tuple[float, ...]:
 
 def _show(gap: TwinGap) -> None:
     from restock.cli.output import print_table, stdout
-    from restock.report.twin_gap import headline, source_name
+    from restock.report.run.twin_gap import headline, source_name
 
     positions: dict[tuple[str, float], dict[str, Any]] = {}
     for row in gap.paths:

@@ -8,8 +8,8 @@ from typing import Any
 from markupsafe import Markup
 
 from restock.replay.panel.exclusions import DAY_NS
-from restock.report import charts, floor_map, shares
-from restock.report.blocks import (
+from restock.report.look import charts, floor_map
+from restock.report.look.blocks import (
     Figure,
     Rows,
     Section,
@@ -19,8 +19,9 @@ from restock.report.blocks import (
     span,
     words,
 )
-from restock.report.facts import CELL_M, NO_GOAL, Facts, evaluation_bias
-from restock.report.logs_alone import table as off_policy_table
+from restock.report.run import shares
+from restock.report.run.facts import CELL_M, NO_GOAL, Facts, evaluation_bias
+from restock.report.run.logs_alone import table as off_policy_table
 
 
 def success(facts: Facts) -> Section | None:
@@ -41,15 +42,17 @@ def success(facts: Facts) -> Section | None:
             "perturbation": row["perturbation"],
             "kind of episode": row["cell"],
             "policy": row["policy"],
-            "episodes": row["episodes"],
             "success": "no goal"
             if row["success"] is None
             else f"{row['success']:.0%} [{row['low']:.0%}, {row['high']:.0%}]",
+            "episodes": row["episodes"],
             "discounted return": _told(row, "discounted_return", ".2f"),
             "bumps a km": _told(row, "bumps_per_km", ".1f"),
             "least distance to people": _told(row, "closest_person_least_m", ".2f", " m"),
             "time to goal": _told(row, "time_s", ".1f", " s"),
-            "lost to the planner": _told(row, "time_lost_s", "+.1f", " s"),
+            "lost to the planner": ""
+            if row["policy"] == "planner"
+            else _told(row, "time_lost_s", "+.1f", " s"),
         }
         for row in sorted(shown, key=lambda row: (places[_place(row)], row["policy"] != "agent"))
         if row["policy"] != "random"
@@ -216,7 +219,6 @@ def learning(facts: Facts) -> Section:
                     series="condition",
                     x_title="environment steps",
                     y_title="success",
-                    colours={words(k): v for k, v in charts.CONDITION_COLOURS.items()},
                     percent=True,
                     points=True,
                     marker=float(facts.kept["env_steps"]) if facts.kept else None,
@@ -251,7 +253,7 @@ def critic(facts: Facts) -> Section | None:
         figures.append(
             Figure(
                 charts.lines(
-                    facts.td,
+                    [{**row, "condition": words(row["condition"])} for row in facts.td],
                     x="gradient_steps",
                     y="td_abs_mean",
                     series="condition",
@@ -315,7 +317,8 @@ def floor_section(facts: Facts) -> Section | None:
                 floor_map.visited(plan, facts.visited, CELL_M),
                 "Where the logs have been",
                 f"{steps:,} logged steps in cells of {CELL_M} m, darker where there are more"
-                f" (logarithmic). Drawn on the floor that the run drives on, {layout.name}."
+                f" (logarithmic); the bar is {floor_map.BAR_M} m. Drawn on the floor that the run"
+                f" drives on, {layout.name}."
                 + (
                     f" Its missions start at {len(layout.starts_m)} places that the robot was at"
                     f" in the logs, and go to {len(layout.goals)}."

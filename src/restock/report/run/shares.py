@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import altair as alt
 
 from restock.replay.panel.source_plan import TOLERANCE
-from restock.report import charts
-from restock.report.blocks import Figure, Rows, Table, count, number, percent, span, words
-from restock.report.facts import Facts
+from restock.report.look import charts
+from restock.report.look.blocks import (
+    Drawing,
+    Figure,
+    Rows,
+    Table,
+    count,
+    number,
+    percent,
+    span,
+    words,
+)
+from restock.report.run.facts import Facts
 
 COLOURS = {
     "natural": "#cbd5e1",
@@ -23,7 +35,7 @@ def figure(facts: Facts) -> Figure | None:
     if not rows:
         return None
     title = "Logs: natural, wanted, drawn, and after weights"
-    return Figure(_svg(rows), title, " ".join(remarks(facts)))
+    return Figure(_drawn(rows), title, " ".join(remarks(facts)))
 
 
 def bars(facts: Facts) -> Rows:
@@ -110,23 +122,34 @@ def table(facts: Facts) -> Table:
     )
 
 
-def _svg(rows: Rows) -> str:
+def _drawn(rows: Rows) -> Drawing:
     """Bars on a square-root axis, so that the rare strata can be seen at all."""
     strata = list(dict.fromkeys(row["stratum"] for row in rows))
     kinds = charts.ordered(rows, "kind", COLOURS)
-    chart = (
-        charts.plot(rows)
-        .mark_bar(cornerRadiusEnd=2)
-        .encode(
-            y=alt.Y("stratum:N", sort=strata, title=None, axis=alt.Axis(grid=False, ticks=False)),
-            yOffset=alt.YOffset("kind:N", sort=kinds),
-            x=alt.X(
-                "share:Q",
-                title="share of rows (square-root axis)",
-                scale=alt.Scale(type="sqrt"),
-                axis=alt.Axis(format="%", values=[0, 0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 1]),
-            ),
-            color=alt.Color("kind:N", scale=charts.scale(kinds, COLOURS), sort=kinds),
+
+    def chart(width: int) -> Any:
+        quiet = alt.Axis(grid=False, ticks=False)
+        marks = [0, 0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 1]
+        return (
+            charts.plot(rows)
+            .mark_bar(cornerRadiusEnd=2)
+            .encode(
+                y=alt.Y("stratum:N", sort=strata, title=None, axis=quiet),
+                yOffset=alt.YOffset("kind:N", sort=kinds),
+                x=alt.X(
+                    "share:Q",
+                    title="share of rows (square-root axis)",
+                    scale=alt.Scale(type="sqrt"),
+                    axis=alt.Axis(format="%", values=marks),
+                ),
+                color=alt.Color(
+                    "kind:N",
+                    scale=charts.scale(kinds, COLOURS),
+                    sort=kinds,
+                    legend=charts.legend(kinds, width),
+                ),
+            )
+            .properties(height=52 * max(len(strata), 1))
         )
-    )
-    return charts.svg(chart.properties(width=520, height=52 * max(len(strata), 1)))
+
+    return charts.draw(chart)

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
-from restock.report.blocks import words
-from restock.report.charts import CONDITION_COLOURS, SPARE_COLOURS
+from restock.report.look.blocks import Drawing, words
+from restock.report.look.charts import CONDITION_COLOURS, SPARE_COLOURS
 
 Row = Mapping[str, Any]
 Box = tuple[float, float, float, float]  # x0, y0, x1, y1 in metres
 SCALE = 40  # SVG units a metre
+BAR_M = 2  # the length of the bar below a map
+MAP_PX = 490
 
 
 @dataclass(frozen=True)
@@ -34,8 +36,11 @@ class FloorMap:
     def at(self, x_m: float, y_m: float) -> tuple[float, float]:
         return x_m * SCALE, (self.depth_m - y_m) * SCALE
 
-    def draw(self, marks: Sequence[str], label: str) -> str:
-        """The floor with marks between the ground and the racks."""
+    def draw(self, marks: Sequence[str], label: str, above: Sequence[str] = ()) -> Drawing:
+        """The floor with marks between the ground and the racks, and above them.
+
+        It has no text, so that it may be of any width: the bar below it is `BAR_M` long.
+        """
         width, height = self.width_m * SCALE, self.depth_m * SCALE
         ground = f'<rect width="{width:.0f}" height="{height:.0f}" fill="#f8fafc"/>'
         racks = [self.box(rack, 'fill="#cbd5e1" stroke="#94a3b8"') for rack in self.racks]
@@ -44,19 +49,19 @@ class FloorMap:
             ' stroke-width="3"/>'
         )
         bar = (
-            f'<g font-size="15" fill="#475569"><path d="M10 {height + 16:.0f} h{SCALE * 2}"'
-            f' stroke="#475569" stroke-width="3"/><text x="{SCALE * 2 + 18}"'
-            f' y="{height + 21:.0f}">2 m</text></g>'
+            f'<path d="M2 {height + 10:.0f} v10 m0 -5 h{SCALE * BAR_M} m0 -5 v10" fill="none"'
+            ' stroke="#475569" stroke-width="2.5"/>'
         )
-        body = "".join([ground, *marks, *racks, frame, bar])
-        return (
-            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="-2 -2 {width + 4:.0f}'
-            f' {height + 30:.0f}" role="img" aria-label="{escape(label)}"'
-            f' font-family="Helvetica, Arial, sans-serif">{body}</svg>'
-        )
+        body = "".join([ground, *marks, *racks, frame, *above, bar])
+        box = width + 4, height + 26
+        return {
+            MAP_PX: f'<svg xmlns="http://www.w3.org/2000/svg" width="{MAP_PX}"'
+            f' height="{MAP_PX * box[1] / box[0]:.0f}" viewBox="-2 -2 {box[0]:.0f} {box[1]:.0f}"'
+            f' role="img" aria-label="{escape(label)}">{body}</svg>'
+        }
 
 
-def visited(floor: FloorMap, cells: Sequence[Row], cell_m: float) -> str:
+def visited(floor: FloorMap, cells: Sequence[Row], cell_m: float) -> Drawing:
     """Cells of x_m, y_m (their south-west corner) and rows, darker where the logs have more."""
     most = max((row["rows"] for row in cells), default=1)
     marks = []
@@ -67,7 +72,7 @@ def visited(floor: FloorMap, cells: Sequence[Row], cell_m: float) -> str:
     return floor.draw(marks, "where the logs have been")
 
 
-def events(floor: FloorMap, logged: Sequence[Row], failures: Sequence[Row]) -> str:
+def events(floor: FloorMap, logged: Sequence[Row], failures: Sequence[Row]) -> Drawing:
     """Dots where a rare condition was logged, crosses where the agent's episodes failed."""
     marks = []
     for row in logged:
@@ -80,20 +85,20 @@ def events(floor: FloorMap, logged: Sequence[Row], failures: Sequence[Row]) -> s
     for row in failures:
         x, y = floor.at(row["end_x_m"], row["end_y_m"])
         crosses.append(
-            f'<path d="M{x - 7:.1f} {y - 7:.1f} l14 14 m0 -14 l-14 14" stroke="white"'
+            f'<path d="M{x - 7:.1f} {y - 7:.1f} l14 14 m0 -14 l-14 14" stroke="#ffffff"'
             ' stroke-width="7"/>'
             f'<path d="M{x - 7:.1f} {y - 7:.1f} l14 14 m0 -14 l-14 14"'
             f' stroke="{colour(row["condition"])}" stroke-width="3.4"/>'
         )
-    drawn = floor.draw(marks, "rare conditions in the logs, and where the agent failed")
     # Crosses lie above the racks: a robot may end right at their face.
-    return drawn.replace("</svg>", "".join(crosses) + "</svg>")
+    label = "rare conditions in the logs, and where the agent failed"
+    return floor.draw(marks, label, above=crosses)
 
 
 def legend(conditions: Sequence[str]) -> str:
     """Swatches, as HTML."""
     return " ".join(
-        f'<span style="white-space:nowrap;margin-right:14px"><span class="swatch"'
+        f'<span class="key"><span class="swatch"'
         f' style="background:{colour(name)}"></span>{escape(words(name))}</span>'
         for name in conditions
     )

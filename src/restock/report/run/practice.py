@@ -6,9 +6,9 @@ from typing import Any
 
 import altair as alt
 
-from restock.report import charts
-from restock.report.blocks import Figure, Rows, Section, Table, count, percent, words
-from restock.report.facts import Facts
+from restock.report.look import charts
+from restock.report.look.blocks import Drawing, Figure, Rows, Section, Table, count, percent, words
+from restock.report.run.facts import Facts
 
 
 def practice_section(facts: Facts) -> Section | None:
@@ -34,7 +34,7 @@ def practice_section(facts: Facts) -> Section | None:
         "What did it practise?",
         intro=f"Missions that the twin gave, by the rule “{rule}”. Shares are of missions that"
         " ended, while the agent explored; its success there is below that of evaluations.",
-        figures=[] if rule in FIXED else [Figure(_svg(facts.practice), "Wanted shares")],
+        figures=[] if rule in FIXED else [Figure(_shares(facts.practice), "Wanted shares")],
         tables=[Table(shown, set(shown[0]) - {"missions"})],
     )
 
@@ -66,23 +66,31 @@ def by_arm(facts: Facts) -> Rows:
     return list(arms.values())
 
 
-def _svg(rows: Rows) -> str:
+def _shares(rows: Rows) -> Drawing:
     lines = [
         {"env_steps": row["env_steps"], "arm": words(row["arm"]), "share": row["wanted_share"]}
         for row in rows
     ]
-    colours = {words(name): colour for name, colour in charts.CONDITION_COLOURS.items()}
-    arms = charts.ordered(lines, "arm", colours)
-    chart = (
-        charts.plot(lines)
-        .mark_line(interpolate="step-before")
-        .encode(
-            x=alt.X("env_steps:Q", title="environment steps", axis=alt.Axis(format="~s")),
-            y=alt.Y("share:Q", title="share of missions", axis=alt.Axis(format="%")),
-            color=alt.Color("arm:N", scale=charts.scale(arms, colours), sort=arms),
+    arms = charts.ordered(lines, "arm", charts.WORDS_COLOURS)
+
+    def chart(width: int) -> Any:
+        return (
+            charts.plot(lines)
+            .mark_line(interpolate="step-before")
+            .encode(
+                x=alt.X("env_steps:Q", title="environment steps", axis=charts.x_axis(width)),
+                y=alt.Y("share:Q", title="share of missions", axis=alt.Axis(format="%")),
+                color=alt.Color(
+                    "arm:N",
+                    scale=charts.scale(arms, charts.WORDS_COLOURS),
+                    sort=arms,
+                    legend=charts.legend(arms, width),
+                ),
+            )
+            .properties(height=220)
         )
-    )
-    return charts.svg(chart.properties(width=520, height=220))
+
+    return charts.draw(chart)
 
 
 __all__ = ["by_arm", "practice_section"]

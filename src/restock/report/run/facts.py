@@ -14,7 +14,7 @@ from restock.files import read_table
 from restock.replay.panel.panel import Panel
 from restock.replay.panel.strata import Stratum
 from restock.replay.store.store import Store
-from restock.report.blocks import Rows, words
+from restock.report.look.blocks import Rows, words
 from restock.train.run.clone_quality import CloneQuality, read_clones
 from restock.train.run.kept_evaluations import shown_evaluation
 from restock.train.run.measures import measures
@@ -60,6 +60,7 @@ class Facts:
     off_policy: Rows = field(default_factory=list)  # off-policy estimates, over all conditions
     offline_start: Rows = field(default_factory=list)  # what might have driven first, over all
     clones: list[CloneQuality] = field(default_factory=list)  # of who drove in the logs
+    clean: dict[str, dict[str, Any]] = field(default_factory=dict)  # measures by policy, pooled
     practice: Rows = field(default_factory=list)  # an interval x arm of missions
     teacher: Rows = field(default_factory=list)  # what its filter did at last
     missing: list[str] = field(default_factory=list)  # what could not be read, and why
@@ -114,12 +115,17 @@ def gather(path: Path) -> Facts:
             where=str(path),
             remedy="let it train past its first logging interval",
         )
+    clean: dict[str, Rows] = {}  # of each policy all unperturbed episodes
     for row in rows["cells"]:
-        row |= measures(row.pop("driven"))
+        driven = row.pop("driven")
+        if row["perturbation"] == "none":
+            clean.setdefault(row["policy"], []).extend(driven)
+        row |= measures(driven)
         row["low"], row["high"] = row["success_low"], row["success_high"]
     kept = rows.pop("kept")
     facts = Facts(run=path, config=run.document, kept=kept[0] if kept else None, **rows)  # type: ignore[arg-type]
     facts.evaluation = shown
+    facts.clean = {name: measures(driven) for name, driven in clean.items()}
     facts.clones = read_clones(path)
     facts.off_policy = _off_policy(run, facts.twin)
     facts.offline_start = [
@@ -193,7 +199,7 @@ def _store_rows(store: Store, name: str, **parameters: Any) -> Rows:
 
 def _queries(name: str) -> dict[str, str]:
     """The statements of a file, by the `-- name:` line before each."""
-    text = (files("restock.report") / name).read_text(encoding="utf-8")
+    text = (files("restock.report.run") / name).read_text(encoding="utf-8")
     parts = text.split("-- name: ")[1:]
     return {part.split("\n", 1)[0].strip(): part.split("\n", 1)[1] for part in parts}
 
@@ -204,7 +210,21 @@ def _as_dicts(cursor: duckdb.DuckDBPyConnection) -> Rows:
 
 
 def mean_success(cells: Rows) -> float:
-    return float(sum(row["success"] for row in cells) / len(cells))
+    """The mean over conditions, each counting the same; partly and wholly blocked by half each.
+
+    It is the one average of success that there is: a study's `rare` and a run's kept policy are
+    judged by the same.
+    """
+    by_condition = _by_condition(cells)
+    return sum(by_condition.values()) / len(by_condition)
+
+
+def _by_condition(cells: Rows) -> dict[str, float]:
+    """Success by condition, over its cells."""
+    found: dict[str, list[float]] = {}
+    for row in cells:
+        found.setdefault(row["cell"].split(" (")[0], []).append(row["success"])
+    return {name: sum(values) / len(values) for name, values in found.items()}
 
 
 def evaluation_bias(facts: Facts) -> str:
@@ -214,33 +234,27 @@ def evaluation_bias(facts: Facts) -> str:
         return NO_GOAL
     if not cells or not facts.logged:
         return ""
-    by_condition: dict[str, Rows] = {}
-    for row in cells:
-        by_condition.setdefault(row["cell"].split(" (")[0], []).append(row)
-    success = {name: mean_success(rows) for name, rows in by_condition.items()}
-    episodes = sum(row["episodes"] for row in cells)
-    evaluated = {
-        name: sum(row["episodes"] for row in rows) / episodes for name, rows in by_condition.items()
-    }
+    success = _by_condition(cells)
+    evaluated = 1 / len(success)
     logged = {row["condition"]: row["share"] for row in facts.logged if row["condition"] in success}
     total = sum(logged.values())
     if not total:
         return ""
     logged = {name: logged.get(name, 0.0) / total for name in success}
-    as_evaluated = sum(evaluated[name] * success[name] for name in success)
+    as_evaluated = mean_success(cells)
     as_logged = sum(logged[name] * success[name] for name in success)
-    worst = max(success, key=lambda n: (evaluated[n] - logged[n]) * (success[n] - as_logged))
-    gain = (evaluated[worst] - logged[worst]) * (success[worst] - as_logged)
-    more = evaluated[worst] > logged[worst]
+    worst = max(success, key=lambda n: (evaluated - logged[n]) * (success[n] - as_logged))
+    gain = (evaluated - logged[worst]) * (success[worst] - as_logged)
+    more = evaluated > logged[worst]
     text = (
-        f"Evaluation against deployment: weighted as the logs' episodes met them, success would be"
-        f" {as_logged:.0%} instead of {as_evaluated:.0%}."
+        "Evaluation against deployment: weighted as the logs' episodes met the conditions, success"
+        f" would be {as_logged:.0%} instead of {as_evaluated:.0%}, the mean over conditions."
     )
     if gain <= 0.0005:
         return text + " No condition's share biases the evaluation upward."
     return text + (
-        f" The share that biases it most is {words(worst)}: {evaluated[worst]:.0%} of the"
-        f" evaluation's episodes, {logged[worst]:.0%} of the logs', and"
+        f" The share that biases it most is {words(worst)}: {evaluated:.0%} of the"
+        f" mean, {logged[worst]:.0%} of the logs' episodes, and"
         f" {'easier' if more else 'harder'} than average ({success[worst]:.0%}); it is worth"
         f" {gain * 100:+.1f} points."
     )

@@ -12,9 +12,9 @@ import altair as alt
 
 from restock import __version__
 from restock.errors import RestockError
-from restock.report import charts
-from restock.report.blocks import Figure, Rows, Section, Table, number, words
-from restock.report.facts import Facts
+from restock.report.look import charts
+from restock.report.look.blocks import Drawing, Figure, Rows, Section, Table, number, words
+from restock.report.run.facts import Facts
 from restock.stats import ConfidenceInterval
 from restock.train.twin.calibration.gap import AFTER, BEFORE
 from restock.train.twin.calibration.twin_gap import (
@@ -163,22 +163,33 @@ def gap_section(gap: TwinGap) -> Section:
     )
 
 
-def _positions(rows: Rows) -> str:
+def _positions(rows: Rows) -> Drawing:
     sources = charts.ordered(rows, "source", COLOURS)
     conditions = list(dict.fromkeys(row["condition"] for row in rows))
-    base = charts.plot(rows).encode(
-        y=alt.Y("condition:N", sort=conditions, title=None, axis=alt.Axis(grid=False, ticks=False)),
-        yOffset=alt.YOffset("source:N", sort=sources),
-        color=alt.Color("source:N", scale=charts.scale(sources, COLOURS), sort=sources),
-    )
-    bars = base.mark_rule(strokeWidth=3, opacity=0.45).encode(
-        x=alt.X("median_low:Q", title="metres"), x2="median_high:Q"
-    )
-    dots = base.mark_circle(size=60, opacity=1).encode(x=alt.X("median:Q"))
-    ticks = base.mark_tick(thickness=2, size=9).encode(x=alt.X("p90:Q"))
-    layered = alt.layer(bars, dots, ticks).properties(width=250, height=60 * len(conditions))
     horizons = list(dict.fromkeys(row["horizon"] for row in rows))
-    return charts.svg(layered.facet(column=alt.Column("horizon:N", sort=horizons)))
+
+    def chart(width: int) -> Any:
+        quiet = alt.Axis(grid=False, ticks=False)
+        base = charts.plot(rows).encode(
+            y=alt.Y("condition:N", sort=conditions, title=None, axis=quiet),
+            yOffset=alt.YOffset("source:N", sort=sources),
+            color=alt.Color(
+                "source:N",
+                scale=charts.scale(sources, COLOURS),
+                sort=sources,
+                legend=charts.legend(sources, width),
+            ),
+        )
+        bars = base.mark_rule(strokeWidth=3, opacity=0.45).encode(
+            x=alt.X("median_low:Q", title="metres"), x2="median_high:Q"
+        )
+        dots = base.mark_circle(size=60, opacity=1).encode(x=alt.X("median:Q"))
+        ticks = base.mark_tick(thickness=2, size=9).encode(x=alt.X("p90:Q"))
+        layered = alt.layer(bars, dots, ticks).properties(height=60 * len(conditions))
+        labels_px = charts.label_px(conditions)
+        return charts.side_by_side(layered, "horizon", horizons, width, labels_px)
+
+    return charts.draw(chart, charts.FULL)
 
 
 def _steps_section(gap: TwinGap) -> Section:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from restock.report.blocks import Section, Table, count, percent, words
-from restock.report.facts import Facts
+from restock.report.look.blocks import Section, Table, count, percent, words
+from restock.report.run.facts import Facts
 from restock.stats import wilson
 
 

@@ -11,14 +11,15 @@ from restock import __version__
 from restock.replay.fleet.drift import OWN, Drift
 from restock.replay.store.column_docs import UNITS
 from restock.replay.store.column_docs import unit as unit_of
-from restock.report import charts
-from restock.report.blocks import Figure, Rows, Section, Table, words
+from restock.report.look import charts
+from restock.report.look.blocks import Figure, Rows, Section, Table, words
 
 MOST_ROBOTS = 12  # in a chart: those with findings first
 MOST_PERIODS = 26  # the newest
 MOST_FINDINGS = 8  # with a chart of their own
 _BEYOND = 3.0  # sizes past it look alike
 _BESIDE = ("driving", "conditions")  # what tells of the use, not of the hardware
+_PERIODS = alt.Axis(labelAngle=-60, grid=False)
 _SCOPE = {
     "robot": "this robot",
     "site": "the whole site",
@@ -121,17 +122,26 @@ def _trend(drift: Drift, finding: dict[str, Any]) -> Figure:
     robots = _chosen({row["robot"] for row in rows}, {finding["robot"]})
     rows = _newest([row for row in rows if row["robot"] in robots])
     colours = {finding["robot"]: "#b91c1c"}
-    base = charts.plot(rows).encode(
-        x=alt.X("period:O", title=None, axis=alt.Axis(labelAngle=-35, grid=False)),
-        color=alt.Color("robot:N", scale=charts.scale(robots, colours), sort=robots),
-        xOffset=alt.XOffset("robot:N", sort=robots),
-    )
-    bars = base.mark_rule(strokeWidth=3, opacity=0.4).encode(
-        y=alt.Y("p25:Q", title=finding["signal"], scale=alt.Scale(zero=False)), y2="p75:Q"
-    )
-    dots = base.mark_circle(size=55, opacity=1).encode(y=alt.Y("median:Q"))
+
+    def chart(width: int) -> Any:
+        base = charts.plot(rows).encode(
+            x=alt.X("period:O", title=None, axis=_PERIODS),
+            color=alt.Color(
+                "robot:N",
+                scale=charts.scale(robots, colours),
+                sort=robots,
+                legend=charts.legend(robots, width),
+            ),
+            xOffset=alt.XOffset("robot:N", sort=robots),
+        )
+        bars = base.mark_rule(strokeWidth=3, opacity=0.4).encode(
+            y=alt.Y("p25:Q", title=_signal(finding), scale=alt.Scale(zero=False)), y2="p75:Q"
+        )
+        dots = base.mark_circle(size=55, opacity=1).encode(y=alt.Y("median:Q"))
+        return alt.layer(bars, dots).properties(height=190)
+
     return Figure(
-        charts.svg(alt.layer(bars, dots).properties(width=400, height=190)),
+        charts.draw(chart),
         f"{finding['robot']}: {_signal(finding)}",
         "Median and middle half of the episodes.",
     )
@@ -157,22 +167,35 @@ def _overview_section(drift: Drift, own: Rows) -> Section | None:
     if not rows:
         return None
     signals = sorted({row["signal"] for row in rows})
-    base = charts.plot(rows).encode(
-        x=alt.X("period:O", title=None, axis=alt.Axis(labelAngle=-35)),
-        y=alt.Y("signal:N", sort=signals, title=None, axis=alt.Axis(ticks=False, labelLimit=260)),
-    )
-    cells = base.mark_rect().encode(
-        color=alt.Color(
-            "size:Q",
-            scale=alt.Scale(scheme="blueorange", domain=[-_BEYOND, _BEYOND]),
-            legend=alt.Legend(title="change in units of what matters", orient="top"),
-        )
-    )
-    marks = base.mark_text(color="#0f172a").encode(text="mark:N")
     periods = len({row["period"] for row in rows})
-    chart = alt.layer(cells, marks).properties(
-        width=max(30 * periods, 150), height=20 * len(signals)
-    )
+    robots = sorted({row["robot"] for row in rows})
+
+    def chart(width: int) -> Any:
+        labels_px = min(charts.label_px(signals), 240 if width > charts.HALF[0] else 130)
+        base = charts.plot(rows).encode(
+            x=alt.X("period:O", title=None, axis=_PERIODS),
+            y=alt.Y(
+                "signal:N",
+                sort=signals,
+                title=None,
+                axis=alt.Axis(ticks=False, labelLimit=labels_px, labelOverlap=False),
+            ),
+        )
+        cells = base.mark_rect().encode(
+            color=alt.Color(
+                "size:Q",
+                scale=alt.Scale(scheme="blueorange", domain=[-_BEYOND, _BEYOND]),
+                legend=alt.Legend(title="change, in least changes that matter", titleLimit=280),
+            )
+        )
+        marks = base.mark_text(color="#1f2937").encode(text="mark:N")
+        layered = alt.layer(cells, marks).properties(height=20 * len(signals))
+        room = max(width - labels_px, 30 * periods)
+        across = max(room // (max(30 * periods, 150) + 20), 1)
+        each = layered.properties(width=min(room // min(across, len(robots)) - 24, 60 * periods))
+        header = alt.Header(labelAnchor="start")
+        return each.facet(facet=alt.Facet("robot:N", sort=robots, header=header), columns=across)
+
     left_out = len({row["robot"] for row in own}) - len(robots)
     return Section(
         "overview",
@@ -181,7 +204,7 @@ def _overview_section(drift: Drift, own: Rows) -> Section | None:
         " marks what is reported as changed.",
         figures=[
             Figure(
-                charts.svg(chart.facet(column=alt.Column("robot:N", sort=robots))),
+                charts.draw(chart, charts.FULL),
                 caption=f"{left_out} more robots are not shown." if left_out else "",
             )
         ],
@@ -200,18 +223,27 @@ def _conditions_section(drift: Drift, own: Rows) -> Section | None:
     )
     if not rows:
         return None
-    chart = (
-        charts.plot(rows)
-        .mark_line(point={"size": 40, "filled": True})
-        .encode(
-            x=alt.X("period:O", title=None, axis=alt.Axis(labelAngle=-35, grid=False)),
-            y=alt.Y("events_per_h:Q", title="events an hour", scale=alt.Scale(zero=True)),
-            color=alt.Color("robot:N", scale=charts.scale(robots, {}), sort=robots),
+
+    def chart(width: int) -> Any:
+        columns = max(width // 240, 1)
+        return (
+            charts.plot(rows)
+            .mark_line(point={"size": 40, "filled": True})
+            .encode(
+                x=alt.X("period:O", title=None, axis=_PERIODS),
+                y=alt.Y("events_per_h:Q", title="events an hour", scale=alt.Scale(zero=True)),
+                color=alt.Color(
+                    "robot:N",
+                    scale=charts.scale(robots, {}),
+                    sort=robots,
+                    legend=charts.legend(robots, width),
+                ),
+            )
+            .properties(width=width // columns - 70, height=150)
+            .facet(facet=alt.Facet("condition:N"), columns=columns)
+            .resolve_scale(y="independent")
         )
-        .properties(width=210, height=150)
-        .facet(facet=alt.Facet("condition:N"), columns=4)
-        .resolve_scale(y="independent")
-    )
+
     compared = sum(row["part"] == "conditions" and row["p"] is not None for row in own)
     return Section(
         "conditions",
@@ -219,7 +251,7 @@ def _conditions_section(drift: Drift, own: Rows) -> Section | None:
         intro=f"Events an hour driven. {compared:,} comparisons by robot, zone and {drift.every}"
         " had five events or more and were tested (a quasi-Poisson score test, whose dispersion is"
         " from how a robot's drives differ).",
-        figures=[Figure(charts.svg(chart))],
+        figures=[Figure(charts.draw(chart, charts.FULL))],
     )
 
 

@@ -6,13 +6,14 @@ from typing import Any
 
 import altair as alt
 
-from restock.report import charts
-from restock.report.blocks import Figure, Rows, Section, Table, count, percent, words
-from restock.report.facts import Facts
+from restock.report.look import charts
+from restock.report.look.blocks import Drawing, Figure, Rows, Section, Table, count, percent, words
+from restock.report.run.facts import Facts
 
 KINDS = ("logs", "fresh", "wanted")
 _LEAST_AUDITED = 20  # rows in which the policy was asked, for a line of the table
 _LINES = 12
+LEAST_TILE_PX = 34  # for a number in it
 
 
 def actions_section(facts: Facts) -> Section | None:
@@ -65,32 +66,43 @@ def _short(share: float) -> str:
     return f"{share:.0%}" if share >= 0.01 else "<1%"
 
 
-def _heatmap(cells: Rows) -> str:
+def _heatmap(cells: Rows) -> Drawing:
     kinds = [kind for kind in KINDS if any(cell["kind"] == kind for cell in cells)]
     actions = [c["action"] for c in sorted(cells, key=lambda cell: int(cell["order"]))]
-    base = charts.plot(cells).encode(
-        x=alt.X(
-            "action:N",
-            sort=list(dict.fromkeys(actions)),
-            title=None,
-            axis=alt.Axis(labelAngle=-35, grid=False, ticks=False),
-        ),
-        y=alt.Y("row:N", title=None, axis=alt.Axis(grid=False, ticks=False)),
-    )
-    tiles = base.mark_rect(stroke="#ffffff").encode(
-        color=alt.Color(
-            "share:Q",
-            scale=alt.Scale(type="sqrt", domain=[0, 1], range=["#f1f5f9", "#0f766e"]),
-            legend=None,
+    names = list(dict.fromkeys(cell["row"] for cell in cells))
+
+    def chart(width: int) -> Any:
+        # Of few pixels a tile bears no number: the pointer shows it, and the table has the largest.
+        labels_px = min(charts.label_px(names), 200 if width > charts.FULL[0] else 140)
+        tile = (width - labels_px - 12) // max(len(set(actions)), 1)
+        axis = alt.Axis(
+            grid=False, ticks=False, labelOverlap=False, labelAngle=-60 if tile >= 24 else -90
         )
-    )
-    numbers = base.mark_text(fontSize=10).encode(
-        text="text:N",
-        color=alt.condition("datum.share > 0.35", alt.value("#ffffff"), alt.value("#334155")),
-    )
-    layered = alt.layer(tiles, numbers).properties(width=620, height=alt.Step(24))
-    facets = layered.facet(row=alt.Row("kind:N", sort=kinds, header=alt.Header(labelAngle=0)))
-    return charts.svg(facets.resolve_scale(y="independent"))
+        base = charts.plot(cells).encode(
+            x=alt.X("action:N", sort=list(dict.fromkeys(actions)), title=None, axis=axis),
+            y=alt.Y(
+                "row:N",
+                title=None,
+                axis=alt.Axis(grid=False, ticks=False, labelLimit=labels_px, labelOverlap=False),
+            ),
+        )
+        tiles = base.mark_rect(stroke="#ffffff").encode(
+            color=alt.Color(
+                "share:Q",
+                scale=alt.Scale(type="sqrt", domain=[0, 1], range=["#f1f5f9", "#0b5f58"]),
+                legend=None,
+            )
+        )
+        layers = [tiles]
+        if tile >= LEAST_TILE_PX:
+            number = alt.condition("datum.share > 0.35", alt.value("#fdfdfd"), alt.value("#1f2937"))
+            layers.append(base.mark_text(fontSize=12).encode(text="text:N", color=number))
+        layered = alt.layer(*layers).properties(width=tile * len(set(actions)), height=alt.Step(24))
+        header = alt.Header(orient="top", labelAnchor="start", labelPadding=4)
+        rows = alt.Row("kind:N", sort=kinds, header=header)
+        return layered.facet(row=rows).resolve_scale(y="independent")
+
+    return charts.draw(chart, charts.FULL)
 
 
 def _table(rows: Rows) -> list[Table]:

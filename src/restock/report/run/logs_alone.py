@@ -3,8 +3,8 @@ judge it."""
 
 from __future__ import annotations
 
-from restock.report.blocks import Rows, Section, Table, estimate
-from restock.report.facts import Facts
+from restock.report.look.blocks import Rows, Section, Table, estimate
+from restock.report.run.facts import Facts
 
 BEST_FIRST = ("wdr", "pdwis")  # estimators with an interval
 NOTHING_DROVE = (

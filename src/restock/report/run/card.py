@@ -12,9 +12,9 @@ from typing import Any
 
 import msgspec
 
-from restock.report.blocks import Rows, count, estimate, number
-from restock.report.facts import Facts, evaluation_bias
-from restock.report.practice import by_arm
+from restock.report.look.blocks import Rows, count, estimate, number
+from restock.report.run.facts import Facts, evaluation_bias
+from restock.report.run.practice import by_arm
 
 FORMAT = "restock-replay-card/1"
 _UNKNOWN = "unknown: run `restock eval` on a run whose panel and store are at hand"

@@ -11,15 +11,34 @@ from typing import Any
 from restock.stats import interval_text
 
 Rows = list[dict[str, Any]]
+Drawing = dict[int, str]  # width in CSS pixels -> the SVG drawn at that width
 
 
 @dataclass(frozen=True)
 class Figure:
-    """One chart as SVG."""
+    """One chart, drawn at each width that the page may have for it; `name` is its file's."""
 
-    svg: str
+    drawing: Drawing
     title: str = ""
     caption: str = ""
+    name: str = ""
+
+    @property
+    def widest(self) -> str:
+        """The SVG at its widest."""
+        return self.drawing[max(self.drawing)]
+
+    @property
+    def kind(self) -> str:
+        """A class of CSS: half of a line, or all of it."""
+        return "half" if max(self.drawing) < 500 else "full"
+
+    @property
+    def shown(self) -> list[tuple[str, str]]:
+        """A class of CSS (`w490`) and the SVG; the page shows the widest that fits."""
+        if len(self.drawing) == 1:
+            return [("any", self.widest)]
+        return [(f"w{width}", svg) for width, svg in sorted(self.drawing.items())]
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ import altair as alt
 
 from restock.errors import RestockError
 from restock.replay.store.capacity import capacity_of_rows
-from restock.report import charts
-from restock.report.blocks import Figure, Section, Table, count, percent
-from restock.report.facts import Facts
+from restock.report.look import charts
+from restock.report.look.blocks import Drawing, Figure, Section, Table, count, percent
+from restock.report.run.facts import Facts
 
 
 def capacity_section(facts: Facts) -> Section | None:
@@ -57,31 +57,34 @@ def _of_panel(facts: Facts) -> dict[str, Any] | None:
     return {**asdict(capacity), "reason": capacity.reason}
 
 
-def _curve(capacity: dict[str, Any], asked: int) -> str:
-    line = (
-        charts.plot(capacity["curve"])
-        .mark_line(strokeWidth=2, color="#0f766e", point={"size": 28, "color": "#0f766e"})
-        .encode(
-            x=alt.X(
-                "capacity:Q",
-                title="newest rows kept",
-                scale=alt.Scale(type="log"),
-                axis=alt.Axis(format="~s", grid=False),
-            ),
-            y=alt.Y(
-                "cells_share:Q",
-                title="share of the cells ever seen",
-                axis=alt.Axis(format="%"),
-                scale=alt.Scale(domain=[0, 1]),
-            ),
+def _curve(capacity: dict[str, Any], asked: int) -> Drawing:
+    def chart(width: int) -> Any:
+        line = (
+            charts.plot(capacity["curve"])
+            .mark_line(strokeWidth=2, color="#0f766e", point={"size": 28, "color": "#0f766e"})
+            .encode(
+                x=alt.X(
+                    "capacity:Q",
+                    title="newest rows kept",
+                    scale=alt.Scale(type="log"),
+                    axis=charts.x_axis(width),
+                ),
+                y=alt.Y(
+                    "cells_share:Q",
+                    title="share of the cells ever seen",
+                    axis=alt.Axis(format="%"),
+                    scale=alt.Scale(domain=[0, 1]),
+                ),
+            )
         )
-    )
-    at = charts.plot([{"at": asked, "text": f"{asked:,} rows"}]).encode(x="at:Q")
-    rule = at.mark_rule(strokeDash=[4, 3], color="#0f172a")
-    text = at.mark_text(align="right", dx=-4, baseline="bottom", fontSize=11).encode(
-        y=alt.value(230), text="text:N"
-    )
-    return charts.svg(alt.layer(line, rule, text).properties(width=430, height=230))
+        at = charts.plot([{"at": asked, "text": f"{asked:,} rows"}]).encode(x="at:Q")
+        rule = at.mark_rule(strokeDash=[4, 3], color="#0f172a")
+        text = at.mark_text(
+            align="right", dx=-4, dy=-4, baseline="bottom", fontSize=12, color="#475569"
+        ).encode(y=alt.value(230), text="text:N")
+        return alt.layer(line, rule, text).properties(height=230)
+
+    return charts.draw(chart)
 
 
 __all__ = ["capacity_section"]

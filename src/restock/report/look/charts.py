@@ -1,0 +1,280 @@
+"""The pages' charts: rows in, static SVG out, so that a page opens without a network.
+
+A chart is drawn once for each width that a page may have for it, always at its own size: type is
+then equally large in every figure and on every screen. A figure is thus a `Drawing`, its SVG by
+width in CSS pixels; the page shows the widest that fits. One colour per condition, per source and
+per policy, the same in every chart; `theme.DARK` says what each is on a dark ground.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from itertools import count
+from typing import Any
+
+import altair as alt
+import vl_convert
+
+from restock.report.look.blocks import Drawing, words
+
+Row = Mapping[str, Any]
+
+HALF = (300, 490)  # of a figure that shares a line with another on a desktop
+FULL = (300, 630, 1000)  # of one with the line for itself
+
+# Okabe-Ito: colour-blind readers can distinguish them too.
+CONDITION_COLOURS = {
+    "nominal": "#6b7280",
+    "wheel_slip": "#0072b2",
+    "blocked_aisle": "#e69f00",
+    "blocked_aisle (partial)": "#e69f00",
+    "blocked_aisle (full)": "#8a5a00",
+    "near_collision": "#d55e00",
+    "recovery": "#cc79a7",
+}
+WORDS_COLOURS = {words(name): colour for name, colour in CONDITION_COLOURS.items()}
+SPARE_COLOURS = ("#009e73", "#56b4e9", "#8b5cf6", "#84643a", "#111827")
+POLICY_COLOURS = {
+    "agent": "#0f766e",
+    "cloned": "#7c3aed",
+    "planner": "#b45309",
+    "random": "#9ca3af",
+}
+SOURCE_COLOURS = {"logs": "#334155", "fresh": "#14b8a6"}
+
+FEW_POINTS = 10  # of a line, with which each is drawn
+LETTER_PX = 5.8  # of a label, about
+FONT = "Inter, Helvetica Neue, Helvetica, Arial, Liberation Sans, sans-serif"
+
+_CONFIG = {
+    "background": "transparent",
+    "font": FONT,
+    "view": {"stroke": None},
+    "axis": {
+        "labelColor": "#475569",
+        "titleColor": "#475569",
+        "titleFontWeight": 500,
+        "labelFontSize": 12,
+        "titleFontSize": 12,
+        "gridColor": "#e2e8f0",
+        "domainColor": "#cbd5e1",
+        "tickColor": "#cbd5e1",
+        "labelOverlap": "greedy",
+        "labelSeparation": 6,
+        "labelLimit": 220,
+    },
+    "legend": {"labelFontSize": 12, "labelColor": "#334155", "title": None, "orient": "top"},
+    "header": {"labelFontSize": 12, "labelFontWeight": 600, "labelColor": "#0f172a", "title": None},
+    "range": {"category": list(SPARE_COLOURS)},
+}
+_numbers = count()
+
+
+def plot(rows: Sequence[Row]) -> Any:
+    """A chart over rows that travel in the page itself."""
+    return alt.Chart(alt.InlineData(values=[dict(row) for row in rows]))
+
+
+def draw(chart_of: Callable[[int], Any], widths: Sequence[int] = HALF) -> Drawing:
+    """A chart at each width; `chart_of` makes it, as wide as it is told or fitted to it.
+
+    A chart that has no width of its own (a facet has) is fitted, with its axes and legend.
+    """
+    return {width: _svg(chart_of(width), width) for width in widths}
+
+
+def _svg(chart: Any, width: int) -> str:
+    if not isinstance(chart, alt.FacetChart):
+        fit = alt.AutoSizeParams(type="fit-x", contains="padding")
+        chart = chart.properties(width=width, autosize=fit)
+    chart = chart.configure(**_CONFIG)
+    text: str = vl_convert.vegalite_to_svg(chart.to_json())
+    # What a mark stands for, shown where the pointer rests on it.
+    text = re.sub(
+        r'<(path|rect|line)\b([^<>]*?\baria-label="([^"]*)"[^<>]*?)/>',
+        r"<\1\2><title>\3</title></\1>",
+        text,
+    )
+    return own_names(text)
+
+
+def own_names(svg: str) -> str:
+    """The same with ids that no other drawing of a page has."""
+    number = next(_numbers)
+    return re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>d{number}-", svg)
+
+
+def scale(names: Sequence[str], colours: Mapping[str, str]) -> alt.Scale:
+    """A colour scale over the names that occur, known ones in their own colour."""
+    spare = iter(SPARE_COLOURS * (1 + len(names)))
+    return alt.Scale(domain=list(names), range=[colours.get(name) or next(spare) for name in names])
+
+
+def legend(names: Sequence[str], width: int) -> alt.Legend:
+    """Above the chart, in as many columns as fit."""
+    each = max((len(name) for name in names), default=1) * LETTER_PX + 36
+    return alt.Legend(columns=max(1, min(len(names), int((width - 20) // each))))
+
+
+def label_px(names: Sequence[str]) -> int:
+    """About how wide the labels of an axis are."""
+    return round(max((len(name) for name in names), default=0) * LETTER_PX) + 14
+
+
+def ordered(rows: Sequence[Row], key: str, first: Mapping[str, str]) -> list[str]:
+    """The values of a column: the known ones in their order, then the others by name."""
+    values = {str(row[key]) for row in rows}
+    return [name for name in first if name in values] + sorted(values - set(first))
+
+
+def side_by_side(layered: Any, key: str, names: Sequence[str], width: int, labels_px: int) -> Any:
+    """A layered chart for each value of `key`, beside each other where there is room for that.
+
+    `labels_px` is the width of the labels of the vertical axis.
+    """
+    beside = (width - labels_px) // max(len(names), 1) - 24
+    if len(names) > 1 and beside < 150:
+        each = layered.properties(width=max(width - labels_px - 24, 90))
+        header = alt.Header(orient="top", labelAnchor="start", labelPadding=4)
+        return each.facet(row=alt.Row(f"{key}:N", sort=list(names), header=header))
+    each = layered.properties(width=max(beside, 90))
+    return each.facet(column=alt.Column(f"{key}:N", sort=list(names)))
+
+
+def success(rows: Sequence[Row]) -> Drawing:
+    """Success with intervals: rows of cell, perturbation, policy, success, low, high."""
+    policies = ordered(rows, "policy", POLICY_COLOURS)
+    cells = list(dict.fromkeys(row["cell"] for row in rows))
+    perturbations = list(dict.fromkeys(row["perturbation"] for row in rows))
+
+    def chart(width: int) -> Any:
+        base = plot(rows).encode(
+            y=alt.Y("cell:N", sort=cells, title=None, axis=alt.Axis(grid=False, ticks=False)),
+            yOffset=alt.YOffset("policy:N", sort=policies),
+            color=alt.Color(
+                "policy:N",
+                scale=scale(policies, POLICY_COLOURS),
+                sort=policies,
+                legend=legend(policies, width),
+            ),
+        )
+        percent = alt.Axis(format="%", values=[0, 0.25, 0.5, 0.75, 1])
+        x_scale = alt.Scale(domain=[0, 1])
+        bars = base.mark_rule(strokeWidth=3, opacity=0.45).encode(
+            x=alt.X("low:Q", title=None, axis=percent, scale=x_scale), x2="high:Q"
+        )
+        dots = base.mark_circle(size=70, opacity=1).encode(x=alt.X("success:Q", scale=x_scale))
+        layered = alt.layer(bars, dots).properties(height=46 * max(len(cells), 1))
+        return side_by_side(layered, "perturbation", perturbations, width, label_px(cells))
+
+    return draw(chart, FULL)
+
+
+def lines(
+    rows: Sequence[Row],
+    *,
+    x: str,
+    y: str,
+    series: str,
+    x_title: str,
+    y_title: str,
+    colours: Mapping[str, str] = WORDS_COLOURS,
+    percent: bool = False,
+    log: bool = False,
+    points: bool = False,
+    marker: float | None = None,
+    band: tuple[str, str] | None = None,
+) -> Drawing:
+    """Lines over training; `marker` is a vertical line (the step of the kept checkpoint), `band`
+    the columns between which each line is shaded."""
+    names = ordered(rows, series, colours)
+    # A line of a single point would not be seen.
+    points = points or len({row[x] for row in rows}) < FEW_POINTS
+    axis = alt.Axis(format="%") if percent else alt.Axis(format="~g")
+    y_scale = alt.Scale(domain=[0, 1]) if percent else alt.Scale(type="log" if log else "linear")
+
+    def chart(width: int) -> Any:
+        base = plot(rows).encode(
+            x=alt.X(f"{x}:Q", title=x_title, axis=x_axis(width)),
+            color=alt.Color(
+                f"{series}:N", scale=scale(names, colours), sort=names, legend=legend(names, width)
+            ),
+        )
+        line = base.mark_line(
+            strokeWidth=2, point={"size": 28, "filled": True} if points else False
+        ).encode(y=alt.Y(f"{y}:Q", title=y_title, axis=axis, scale=y_scale))
+        layers = [line]
+        if band is not None:
+            shaded = base.mark_area(opacity=0.18, line=False).encode(
+                y=alt.Y(f"{band[0]}:Q", title=y_title, axis=axis, scale=y_scale), y2=band[1]
+            )
+            layers.insert(0, shaded)
+        if marker is not None:
+            at = plot([{"at": marker, "text": "kept"}]).encode(x="at:Q")
+            layers.append(at.mark_rule(strokeDash=[4, 3], color="#0f172a"))
+            layers.append(
+                at.mark_text(
+                    align="right", dx=-4, dy=-6, baseline="bottom", fontSize=12, color="#475569"
+                ).encode(y=alt.value(230), text="text:N")
+            )
+        return (alt.layer(*layers) if len(layers) > 1 else line).properties(height=230)
+
+    return draw(chart)
+
+
+def x_axis(width: int) -> alt.Axis:
+    """A horizontal axis of steps, with no more labels than fit."""
+    return alt.Axis(format="~s", grid=False, tickCount=max(3, width // 80))
+
+
+def ages(rows: Sequence[Row]) -> Drawing:
+    """Age histograms by source: rows of source, bucket (text), order, share."""
+    sources = ordered(rows, "source", SOURCE_COLOURS)
+    buckets = [row["bucket"] for row in sorted(rows, key=lambda row: row["order"])]
+
+    def chart(width: int) -> Any:
+        axis = alt.Axis(labelAngle=-60, grid=False, labelOverlap=False)
+        return (
+            plot(rows)
+            .mark_bar(cornerRadiusEnd=2)
+            .encode(
+                x=alt.X("bucket:N", sort=list(dict.fromkeys(buckets)), title=None, axis=axis),
+                y=alt.Y("share:Q", title="share of sampled rows", axis=alt.Axis(format="%")),
+                color=alt.Color(
+                    "source:N",
+                    scale=scale(sources, SOURCE_COLOURS),
+                    sort=sources,
+                    legend=legend(sources, width),
+                ),
+            )
+            .properties(height=200)
+        )
+
+    return draw(chart)
+
+
+def stacked(rows: Sequence[Row], *, group: str, part: str, value: str) -> Drawing:
+    """One horizontal bar per group, split into parts that sum to one."""
+    parts = list(dict.fromkeys(row[part] for row in rows))
+    groups = list(dict.fromkeys(row[group] for row in rows))
+
+    def chart(width: int) -> Any:
+        quiet = alt.Axis(grid=False, ticks=False)
+        return (
+            plot(rows)
+            .mark_bar()
+            .encode(
+                y=alt.Y(f"{group}:N", sort=groups, title=None, axis=quiet),
+                x=alt.X(f"{value}:Q", stack="normalize", title=None, axis=alt.Axis(format="%")),
+                color=alt.Color(
+                    f"{part}:N",
+                    scale=scale(parts, CONDITION_COLOURS),
+                    sort=parts,
+                    legend=legend(parts, width),
+                ),
+            )
+            .properties(height=30 * max(len(groups), 1))
+        )
+
+    return draw(chart)

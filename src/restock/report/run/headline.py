@@ -1,0 +1,179 @@
+"""What a run's page says first: what changed against the baseline, where, how surely, at what cost.
+
+Never a bare average: differences are paired by episode, by condition, with their intervals.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from restock.errors import RunError
+from restock.report.look.blocks import Rows, span, words
+from restock.report.run import logs_alone
+from restock.report.run.facts import Facts, mean_success
+from restock.report.run.twin_gap import find_gap
+from restock.train.evaluation.regression import EVERY, of_run, regression
+from restock.train.twin.calibration.twin_gap import TRUSTED
+
+BASELINES = {
+    "planner": "the planner",
+    "cloned": "the logs' drivers, cloned,",
+    "random": "a random policy",
+}
+MOST_NAMED = 3  # conditions of a verdict in the headline
+_WITHOUT = "evaluate it beside one: `restock eval --policies agent,planner`"
+
+
+def headline(facts: Facts) -> str:
+    """One sentence."""
+    if not facts.twin:
+        return logs_alone.headline(facts)
+    cells = facts.clean_cells()
+    if not cells:
+        return f"Run {facts.run.name}: trained, not yet evaluated"
+    if facts.no_goal:
+        returns = [row["return"] for row in cells]
+        return (
+            "No goal, so no success: mean return from"
+            f" {min(returns):.2f} to {max(returns):.2f} in {len(cells)} kinds of episode"
+        )
+    average, random = mean_success(cells), facts.clean_cells("random")
+    if random and average <= mean_success(random):
+        return (
+            "Nothing was learnt: no better than a random policy on the same episodes"
+            f" ({average:.0%} against {mean_success(random):.0%}, mean over conditions)"
+        )
+    return _against_baseline(facts) + _distrust(facts)
+
+
+def baseline(facts: Facts) -> str | None:
+    """Who the run is held against, of those that drove the same episodes."""
+    return next((name for name in BASELINES if facts.clean_cells(name)), None)
+
+
+def compared(facts: Facts) -> Rows:
+    """`regression`'s rows against the baseline by perturbation and condition; none without one."""
+    name = baseline(facts)
+    if name is None or facts.no_goal:
+        return []
+    try:
+        rows = regression(of_run(facts.run, name), of_run(facts.run))
+    except RunError:  # the episodes have no success that can be compared
+        return []
+    return [row for row in rows if row["condition"] != EVERY]
+
+
+def _against_baseline(facts: Facts) -> str:
+    rows = [row for row in compared(facts) if row["perturbation"] == "none"]
+    if not rows:
+        ordered = sorted(facts.clean_cells(), key=lambda row: -row["success"])
+        shown = ordered if len(ordered) < 3 else [ordered[0], ordered[-1]]
+        each = " and ".join(f"{_alone(row)} in {words(row['cell'])}" for row in shown)
+        return f"No baseline drove the same episodes: success {each}"
+    who = BASELINES[baseline(facts) or ""].removesuffix(",")
+    by = {
+        verdict: [row for row in rows if row["verdict"] == verdict]
+        for verdict in ("worse", "better")
+    }
+    parts = [
+        f"{verdict} than {who} in {_named(by[verdict])}"
+        for verdict in ("better", "worse")
+        if by[verdict]
+    ]
+    rest = [row for row in rows if row["verdict"] not in by]
+    if not parts:
+        widest = min(rows, key=lambda row: row["difference"] or 0.0)
+        names = "any condition" if len(rows) > 1 else words(rows[0]["condition"])
+        text = f"No difference from {who} is shown in {names}"
+        return f"{text}; the lowest is {_difference(widest)} in {words(widest['condition'])}"
+    text = "; ".join(parts)
+    if rest:
+        names = [words(row["condition"]) for row in rest]
+        text += "; no difference shown in " + _listed(names)
+    return text[0].upper() + text[1:]
+
+
+def _named(rows: Rows) -> str:
+    ordered = sorted(rows, key=lambda row: -abs(row["difference"]))
+    named = [f"{words(row['condition'])} ({_difference(row)})" for row in ordered[:MOST_NAMED]]
+    return _listed(named + [f"{len(rows) - MOST_NAMED} more"] * (len(rows) > MOST_NAMED))
+
+
+def _listed(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
+
+
+def _difference(row: dict[str, Any]) -> str:
+    """Points of success, with the interval where there is one."""
+    value = f"{_signed(row['difference'])} points"
+    if row["difference_low"] is None:
+        return f"{value}, too few episodes for an interval"
+    return f"{value} [{_signed(row['difference_low'])}, {_signed(row['difference_high'])}]"
+
+
+def _signed(value: float) -> str:
+    """Points of a share, with a minus that is one."""
+    return f"{100 * value:+.0f}".replace("-", "−")
+
+
+def _alone(row: dict[str, Any]) -> str:
+    return f"{row['success']:.0%} [{row['low']:.0%}, {row['high']:.0%}]"
+
+
+def _distrust(facts: Facts) -> str:
+    """What a success in the twin is worth little by: its gap to these logs."""
+    gap = find_gap(facts)
+    verdicts = () if gap is None else gap.verdicts
+    nominal = next((each.verdict for each in verdicts if each.condition == "nominal"), TRUSTED)
+    if nominal == TRUSTED:
+        return ""
+    return f": in a twin whose gap to these logs is {nominal} in nominal driving"
+
+
+def lead(facts: Facts) -> str:
+    """What the headline's numbers are of, and what they cost."""
+    last = facts.loss[-1]
+    if not facts.twin:
+        return (
+            f"A DQN trained on logs alone, without a twin, for {last['gradient_steps']:,} updates"
+            f" in {span(last['wall_s'])}. Nothing has driven yet."
+        )
+    fed = "logs and fresh experience" if facts.panel is not None else "fresh experience alone"
+    text = (
+        f"Cost: a DQN trained on {fed} for {last['env_steps']:,} environment steps and"
+        f" {last['gradient_steps']:,} updates in {span(last['wall_s'])}."
+    )
+    if not facts.clean_cells() or facts.no_goal:
+        return text
+    name = baseline(facts)
+    if name is None:
+        return f"{text} Without a baseline a success says little: {_WITHOUT}."
+    text += f" {_safety(facts, name)}" + (
+        " Differences are in success, paired by episode, with 95 % intervals over episodes:"
+        " what another training seed would have changed is not in them."
+    )
+    return text.replace("  ", " ")
+
+
+def _safety(facts: Facts, name: str) -> str:
+    """What the clean episodes cost in bumps and time, beside the baseline's."""
+    own, other = facts.clean.get("agent", {}), facts.clean.get(name, {})
+    if own.get("bumps_per_km") is None or other.get("bumps_per_km") is None:
+        return ""
+    who = BASELINES[name].removesuffix(",")
+    text = (
+        f"On the way it bumped {_told(own, 'bumps_per_km', '.0f')} times a km, {who}"
+        f" {_told(other, 'bumps_per_km', '.0f')}"
+    )
+    if name == "planner" and own.get("time_lost_s") is not None:
+        text += f"; where both arrived it took {_told(own, 'time_lost_s', '+.1f')} s"
+    return text + "."
+
+
+def _told(row: dict[str, Any], name: str, form: str) -> str:
+    low, high = row.get(f"{name}_low"), row.get(f"{name}_high")
+    ends = "" if low is None else f" [{low:{form}}, {high:{form}}]"
+    return f"{row[name]:{form}}{ends}".replace("-", "−")
+
+
+__all__ = ["BASELINES", "baseline", "compared", "headline", "lead"]

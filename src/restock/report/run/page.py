@@ -1,0 +1,90 @@
+"""The page: facts to headline, cards and sections. The template only lays them out."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any
+
+from restock.report.run import logs_alone
+from restock.report.run.actions import actions_section
+from restock.report.run.capacity import capacity_section
+from restock.report.run.facts import Facts
+from restock.report.run.headline import headline, lead
+from restock.report.run.labels import labels_section
+from restock.report.run.practice import practice_section
+from restock.report.run.sections import (
+    critic,
+    floor_section,
+    learning,
+    provenance,
+    sampled,
+    success,
+)
+from restock.report.run.twin_gap import run_section
+
+
+def page(facts: Facts) -> dict[str, Any]:
+    """Everything the template asks for."""
+    sections = [
+        success(facts) if facts.twin else logs_alone.judged_section(facts),
+        sampled(facts),
+        practice_section(facts),
+        actions_section(facts),
+        labels_section(facts),
+        capacity_section(facts) if facts.twin else None,
+        learning(facts),
+        critic(facts),
+        floor_section(facts),
+        run_section(facts),
+        provenance(facts),
+    ]
+    return {
+        "kicker": "run report",
+        "title": facts.run.name,
+        "headline": headline(facts),
+        "lead": lead(facts),
+        "cards": _cards(facts),
+        "sections": [section for section in sections if section is not None],
+        "footer": f"restock {facts.config.get('versions', {}).get('restock', '')} · written"
+        f" {datetime.now(UTC):%Y-%m-%d %H:%M} UTC from {facts.run}",
+    }
+
+
+def _cards(facts: Facts) -> list[dict[str, str]]:
+    config = facts.config.get("config", {})
+    replay, kept = config.get("replay", {}), facts.kept
+    cards = []
+    if facts.panel is not None:
+        header = facts.panel.header
+        cards.append({"value": f"{header.rows:,}", "label": f"logged rows in panel {header.id}"})
+    if not facts.twin:
+        return [
+            *cards,
+            {"value": f"{facts.loss[-1]['gradient_steps']:,}", "label": "updates"},
+            {"value": facts.target_rule, "label": "target rule"},
+        ]
+    cards += [
+        {
+            "value": f"{replay.get('ring_capacity', 0):,}",
+            "label": "capacity of the fresh ring, rows",
+        },
+        {"value": _sampling(facts), "label": "of each online batch from logs, by quotas"},
+        {"value": facts.target_rule, "label": "target rule"},
+        {"value": f"{facts.loss[-1]['env_steps']:,}", "label": "environment steps"},
+    ]
+    if kept is not None:
+        cards.append(
+            {
+                "value": ("no goal" if kept["success"] is None else f"{kept['success']:.0%}")
+                + f" at {kept['env_steps']:,}",
+                "label": "kept checkpoint: greedy success, at environment step",
+            }
+        )
+    return cards
+
+
+def _sampling(facts: Facts) -> str:
+    share = (facts.config.get("panel") or {}).get("logs_share")
+    if facts.panel is None:
+        return "0 %"
+    return "?" if share is None else f"{share:.0%}"
