@@ -88,8 +88,7 @@ def _against_baseline(facts: Facts) -> str:
         return f"{text}; the lowest is {_difference(widest)} in {words(widest['condition'])}"
     text = "; ".join(parts)
     if rest:
-        names = [words(row["condition"]) for row in rest]
-        text += "; no difference shown in " + _listed(names)
+        text += "; no difference shown in " + _listed([words(row["condition"]) for row in rest])
     return text[0].upper() + text[1:]
 
 
