@@ -24,6 +24,7 @@ from restock.ingest.propose.kinds import RobotTraits, robot_kinds, robot_traits
 from restock.ingest.propose.proposal_lines import Commands, Evidence, profile_lines
 from restock.ingest.propose.propose import (
     Proposal,
+    RobotKind,
     commanded,
     gather,
     propose_from,
@@ -91,6 +92,11 @@ def propose_for_drives(
         proposal,
         toml="\n".join([*_lines(drives, trials, others), proposal.toml]),
         advice=advice,
+        kinds=[
+            RobotKind(str(traits[of[0]]), [str(recordings[one].path) for one in of])
+            for of in sorted(kinds, key=lambda members: members != kind)
+            if len(kinds) > 1
+        ],
         ticks=sum(trial.ticks for trial in trials),
         transitions=sum(trial.transitions for trial in trials),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import textwrap
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from restock.ingest.profile.inputs import FALLBACKS
 from restock.ingest.propose.candidates import Candidate
 from restock.ingest.propose.clock_choice import ClockChoice, Gaps
 from restock.ingest.propose.command_choice import CommandChoice
-from restock.ingest.propose.command_hold import CommandHold
+from restock.ingest.propose.command_hold import CommandHold, TurnReading
 from restock.ingest.propose.footprint import GUESS, Footprint
 from restock.ingest.propose.goal_choice import GoalChoice
 from restock.ingest.propose.motion_choice import MotionChoice
@@ -78,6 +79,7 @@ class Evidence:
     commands: Commands
     chosen: CommandChoice
     hold: CommandHold
+    turns: TurnReading | None  # of Twists, where the robot steers as a car
     paces_s: dict[str, float]  # topic -> between two of its messages, mostly; log time
     clock: ClockChoice
     gaps: Gaps
@@ -246,6 +248,26 @@ def _steered_actions(commands: Commands, robot: RobotProposal) -> list[tuple[flo
     return actions + ([(-slow, 0.0)] if commands.backs else [])
 
 
+def steered_by(seen: Evidence) -> str:
+    """What is done with the Twists of a robot that steers, and why."""
+    assert seen.turns is not None
+    topic, kind = seen.roles["command"][0]
+    if seen.turns.problem:
+        return (
+            f"{topic.name} drives a robot that steers as a car, and {seen.turns.problem}: say in"
+            " [inputs.command] which it is, yaw_rate_radps, or steering_rad with wheelbase_m"
+        )
+    path = kind.fields["steering_rad" if seen.turns.is_angle else "yaw_rate_radps"]
+    if seen.turns.is_angle:
+        return f"the robot steers as a car: {path} is read as its steering angle, {seen.turns.why}"
+    return (
+        f"the robot steers as a car: {path} is read as a yaw rate, {seen.turns.why};"
+        f" {seen.turns.too_tight:,} of its commands turn tighter than the"
+        f" {seen.turns.least_m:.2g} m that its steering allows, and count as the nearest action"
+        " that it can drive"
+    )
+
+
 def _robot_lines(seen: Evidence) -> list[str]:
     """What the twin builds; the actions are within its limits."""
     robot = seen.robot.limited(*seen.commands.reached)
@@ -372,12 +394,8 @@ def _input_lines(
         f'type = "{topic.type}"',
         f"fields = {{ {fields} }}",
     ]
-    drives = seen.robot.values.get("drive")
-    if role == "command" and drives == "ackermann" and "steering_rad" not in kind.fields:
-        lines += [
-            "# The robot steers as a car: right where the command's turn is a yaw rate. Where it",
-            "# is the steering angle: steering_rad for yaw_rate_radps, and wheelbase_m.",
-        ]
+    if role == "command" and seen.turns is not None:
+        lines += [f"# {line}" for line in textwrap.wrap(steered_by(seen), 96)]
     if "steering_rad" in kind.fields:
         origin = "of [robot]" if seen.commands.wheelbase_known else "A GUESS: MEASURE IT"
         lines += [

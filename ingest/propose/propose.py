@@ -25,16 +25,23 @@ from restock.ingest.propose.clock_choice import Gaps, by_log_time, choose_clock
 from restock.ingest.propose.command_choice import CommandChoice, choose_command
 from restock.ingest.propose.command_hold import (
     CommandHold,
+    TurnReading,
     command_hold,
     limit_of,
     settled_speeds,
+    turn_reading,
 )
 from restock.ingest.propose.footprint import GUESS, Footprint, footprint_of
 from restock.ingest.propose.goal_choice import GoalChoice
 from restock.ingest.propose.kinds import no_wheeled_robot
 from restock.ingest.propose.motion_choice import choose_motion, pose_series
-from restock.ingest.propose.proposal_lines import Commands, Evidence, profile_lines
-from restock.ingest.propose.robot_lines import propose_robot, urdf_footprint
+from restock.ingest.propose.proposal_lines import (
+    Commands,
+    Evidence,
+    profile_lines,
+    steered_by,
+)
+from restock.ingest.propose.robot_lines import RobotProposal, propose_robot, urdf_footprint
 from restock.ingest.propose.roles import (
     KINDS,
     LATCHED,
@@ -68,6 +75,14 @@ INSTEAD_OF_COMMANDS = (
 
 
 @dataclass(frozen=True)
+class RobotKind:
+    """Recordings of one kind of robot, and what they say of it."""
+
+    robot: str
+    recordings: list[str]
+
+
+@dataclass(frozen=True)
 class Proposal:
     """The TOML of a profile, what in it needs a person, and what it makes of the recording."""
 
@@ -79,6 +94,7 @@ class Proposal:
     problems: list[str] = field(default_factory=list)  # why it cannot be used as it is
     advice: list[Advice] = field(default_factory=list)  # what choices cost, and what to try
     commands: list[str] = field(default_factory=list)  # topics, where several may drive the robot
+    kinds: list[RobotKind] = field(default_factory=list)  # where there are several: its own first
 
 
 def propose_profile(
@@ -128,6 +144,8 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         problems = [other]
     elif seen.motion is not None and seen.motion.problem:
         problems.append(seen.motion.problem)
+    elif seen.turns is not None and seen.turns.problem:
+        problems.append(steered_by(seen))
     text = "\n".join(profile_lines(seen, name, problems))
     trial = Trial()
     if not problems:
@@ -144,6 +162,8 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
             problems.append(trial.problem)
         text = "\n".join(profile_lines(seen, name, problems, trial))
     advice = [*trial.advice]
+    if seen.turns is not None and not seen.turns.problem:
+        advice.append(Advice("inputs.command", steered_by(seen)))
     if not seen.footprint.measured and seen.roles["scan"]:
         said = seen.footprint.source.replace("A GUESS", "a guess").replace("MEASURE IT", "")
         advice.append(Advice("task.body", f"{said}--footprint"))
@@ -213,6 +233,9 @@ def gather(
     scan = roles["scan"][0][0].name if roles["scan"] else None
     robot = propose_robot(recording, scan, frame, urdf)
     wheelbase_m = robot.values.get("wheelbase_m")
+    turns = _turns(recording, roles, poses, robot)
+    if turns is not None and turns.is_angle:
+        roles["command"], chosen = choose_command(recording, topics, _as_angles(roles["command"]))
     commands, gaps, hold = _commands(recording, roles, poses, wheelbase_m)
     paces = _paces(recording, roles)
     gaps = replace(gaps, hold_s=hold.age_s, sensor_s=_seldomest(paces, roles, poses))
@@ -239,6 +262,7 @@ def gather(
         commands,
         chosen,
         hold,
+        turns,
         paces,
         choose_clock(
             recording,
@@ -260,6 +284,42 @@ def gather(
         ),
         robot,
     )
+
+
+def _turns(
+    recording: Recording, roles: Roles, poses: PoseSeries | None, robot: RobotProposal
+) -> TurnReading | None:
+    """What the turns of Twists are to a robot that steers; None where it does not, or is driven
+    by steering angles."""
+    steers = robot.values.get("drive") == "ackermann"
+    if not (steers and roles["command"]):
+        return None
+    topic, kind = roles["command"][0]
+    if topic.type == MOTION or "steering_rad" in kind.fields:
+        return None
+    if poses is None or len(poses) < 2:
+        return TurnReading()
+    _, times, speed, turn = commanded(recording, (topic, kind), None)
+    order, zero = np.argsort(times, kind="stable"), poses.stamp_ns[0]
+    since = PoseSeries(poses.stamp_ns - zero, poses.x_m, poses.y_m, poses.yaw_rad)
+    seconds = (times[order] - zero) * 1e-9
+    values = robot.values
+    return turn_reading(
+        *(seconds, speed[order], turn[order], since),
+        values["wheelbase_m"],
+        values.get("max_steering_rad"),
+    )
+
+
+def _as_angles(fitting: list[tuple[TopicInfo, Kind]]) -> list[tuple[TopicInfo, Kind]]:
+    """The same topics, their turns read as steering angles."""
+    return [
+        (topic, replace(kind, fields={_ANGLES.get(k, k): v for k, v in kind.fields.items()}))
+        for topic, kind in fitting
+    ]
+
+
+_ANGLES = {"yaw_rate_radps": "steering_rad"}
 
 
 def _commands(

@@ -7,8 +7,9 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from support.driven_robot import Drive, write_bag
+from support.driven_robot import Drive, columns, scans, write_bag
 from support.paths import SHARED
 
 from restock import cli
@@ -16,6 +17,7 @@ from restock.cli.start import stages
 from restock.cli.start.stages import Settings
 from restock.cli.start.work import Work
 from restock.replay.store.store import Store
+from restock.train.twin.floors.occupancy_map import write_pgm
 
 BUMP = "".join(f"uint8 {side}\n" for side in ("left_front", "left_side", "right_front"))
 UP_TO_THE_PANEL = ("--mixture", "no_such.toml")
@@ -43,39 +45,36 @@ def damaged(tmp_path: Path) -> Path:
 def test_a_damaged_recording_is_read_as_far_as_it_is_intact_where_that_is_asked_for(
     tmp_path: Path, damaged: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "out"
-    argv = (str(damaged), "--out", str(out), *UP_TO_THE_PANEL)
+    """And its map of another frame stops it at the floor."""
+    out, hall = tmp_path / "out", tmp_path / "hall.yaml"
+    write_pgm(tmp_path / "hall.pgm", np.pad(np.full((80, 300), 254, np.uint8), 2))
+    hall.write_text("image: hall.pgm\nresolution: 0.05\norigin: [200.0, -2.0, 0]\n")
+    argv = (str(damaged), "--out", str(out), "--map", str(hall))
     code, document = start(capsys, *argv)
     assert code == 3
     assert document["stopped"]["why"] == "no recording can be read"
     assert document["stopped"]["remedies"][0].startswith("add --salvage to this command")
+
     tags = ("--tag", "robot=amr-7", "--tag", "site=north")
     code, document = start(capsys, *argv, "--salvage", *tags)
-    assert document["stages"][-1]["name"] == "mix"  # and no further, by the mixture
+    assert code == 3
     said = {stage["name"]: stage["outcome"] for stage in document["stages"]}
     assert any(line.startswith("damaged: ") for line in said["info"])
     assert any(line.startswith("lost: ") for line in said["ingest"])
     for name in ("info", "propose", "check", "ingest"):
-        assert commands(document)[name].endswith("--salvage" if name != "ingest" else "site=north")
-    assert "--salvage --tag robot=amr-7" in commands(document)["ingest"]
+        assert "--salvage" in commands(document)[name]
+    assert "--salvage --tag robot=amr-7 --tag site=north" in commands(document)["ingest"]
     with Store(out / "store") as store:
         found = store.sql("SELECT robot, site, count(*) FROM transitions GROUP BY ALL").fetchall()
     ((robot, site, rows),) = found
     assert (robot, site) == ("amr-7", "north")
     assert rows > 10
 
-
-def test_one_damaged_recording_of_several_does_not_stop_the_others(
-    tmp_path: Path, damaged: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_bag(Drive(), damaged.parent / "whole")
-    argv = (str(damaged.parent), "--out", str(tmp_path / "out"), *UP_TO_THE_PANEL)
-    _, document = start(capsys, *argv)
-    stages_ = {stage["name"]: stage for stage in document["stages"]}
-    assert stages_["info"]["status"] == "failed"
-    assert "--salvage" in stages_["info"]["errors"][0]
-    assert stages_["propose"]["status"] == stages_["ingest"]["status"] == "done"
-    assert any("not ingested" in line for line in stages_["ingest"]["outcome"])
+    floor = document["stages"][-1]
+    assert floor["name"] == "floor"
+    assert "100% lie off the map" in floor["errors"][0]
+    assert "cannot be the floor" in document["stopped"]["why"]
+    assert not (out / "floor.toml").exists()
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
@@ -127,3 +126,34 @@ def test_what_cannot_be_used_is_refused_before_anything_is_written(
     assert cli.main(["start", "bags", "--out", "out", flag, value]) == 2
     assert said in capsys.readouterr().err
     assert not Path("out").exists()
+
+
+def test_recordings_of_several_kinds_of_robots_are_told_apart_and_one_is_gone_on_with(
+    tmp_path: Path, damaged: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And what cannot be read is named, and does not stop the others."""
+    bags, out = damaged.parent, tmp_path / "out"
+    write_bag(Drive(), bags / "a")
+    write_bag(Drive(), bags / "b")
+    write_bag(OtherLidar(), bags / "c")
+    argv = (str(bags), "--out", str(out), *UP_TO_THE_PANEL)
+    code, document = start(capsys, *argv)
+    assert code == 3
+    found = document["stages"][0]
+    assert found["status"] == "failed"
+    assert "--salvage" in found["errors"][0]
+    assert "recordings of 2 kinds of robots" in document["stopped"]["why"]
+    assert document["stopped"]["remedies"][:2] == [
+        f"restock start {bags / 'a'} {bags / 'b'} --out {out}",
+        f"restock start {bags / 'c'} --out {out}-2",
+    ]
+    _, document = start(capsys, *argv, "--accept")
+    assert f"restock ingest {bags / 'a'} {bags / 'b'} --store" in commands(document)["ingest"]
+
+
+class OtherLidar(Drive):
+    """The same drive with half the beams."""
+
+    def topics(self) -> dict[str, Any]:
+        tenth = np.arange(0, self.duration_s, 0.1)
+        return super().topics() | {"/scan": columns(tenth, scans(np.full((len(tenth), 36), 3.0)))}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import islice
@@ -157,13 +159,27 @@ def test_ascii_and_16_bit_greymaps_with_comments_are_read(tmp_path: Path) -> Non
     np.testing.assert_array_equal(read_image(tmp_path / "b.pgm")[0], [[0, 1]])
 
 
+def png_header(width: int, height: int) -> bytes:
+    """A PNG that says how large it is, and ends there."""
+
+    def chunk(kind: bytes, data: bytes = b"") -> bytes:
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
+
+    size = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", size) + chunk(b"IDAT") + chunk(b"IEND")
+
+
 @pytest.mark.parametrize(
     ("data", "message"),
     [
         (b"\x89PNG", "is not a PGM"),
         (b"P5\n4 4\n255\nab", "truncated"),
-        (b"P5\n99999 99999\n255\n", "more than 64,000,000 pixels"),
+        (b"P5\n99999 99999\n255\n", "more than 40,000,000 pixels"),
         (b"P5\n9000 9000\n255\n", "9,000 x 9,000 pixels"),
+        (b"P5\n7900 7900\n255\n", "7,900 x 7,900 pixels"),  # by the header: no pixel follows
+        (png_header(7900, 7900), "7,900 x 7,900 pixels"),
         (b"P5\n0 4\n255\n", "is not a PGM"),
         (b"P5\nfour 4\n255\n", "cannot be read as an image"),
         (b"P5", "cannot be read as an image"),

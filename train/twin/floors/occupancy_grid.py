@@ -30,7 +30,7 @@ from restock.train.twin.floors.places import connected, find_places, missions_wa
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 COARSEST_M = 0.2
-MAX_CELLS = 64_000_000
+MAX_CELLS = 40_000_000  # read from a header before anything else: a map's pixels take memory
 _MANY_CELLS = 6_000_000  # more are made coarser first: a floor has at most MAX_SIDE_M
 _AROUND_M = 12.0  # of the places that a robot drove, what is kept of a map that is too large
 

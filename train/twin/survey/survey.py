@@ -18,7 +18,13 @@ from restock.errors import ConfigError, RecordingError
 from restock.ingest.profile.profile import Profile
 from restock.ingest.propose.footprint import Footprint
 from restock.train.twin.floors.layout import Warehouse
-from restock.train.twin.floors.occupancy_grid import FREE, UNKNOWN, OccupancyGrid, floor_of_grid
+from restock.train.twin.floors.occupancy_grid import (
+    FREE,
+    UNKNOWN,
+    OccupancyGrid,
+    floor_of_grid,
+    out_of_frame,
+)
 from restock.train.twin.survey.directions import along_walls
 from restock.train.twin.survey.driven_corridor import driven_corridor
 from restock.train.twin.survey.evidence import Evidence, gather
@@ -227,6 +233,21 @@ def _as_near_as_it_came(grid: OccupancyGrid, poses: Poses | None) -> Footprint:
     )
 
 
+def _apart(grid: OccupancyGrid, poses: Poses) -> str:
+    """How far the middle of the drive is from that of a map's free floor, in words."""
+    columns, rows = (np.flatnonzero(grid.free.any(axis=axis)) for axis in (1, 0))
+    if not len(columns):
+        return ""
+    middle = np.array([[columns[0] + columns[-1] + 1, rows[0] + rows[-1] + 1]]) / 2 * grid.cell_m
+    free, drive = out_of_frame(middle, grid.origin)[0], np.median(poses.places_m, axis=0)
+    size = (len(columns) * grid.cell_m, len(rows) * grid.cell_m)
+    return (
+        f" (the middle of the drive is at {drive[0]:.1f}, {drive[1]:.1f} m,"
+        f" {np.hypot(*(drive - free)):.1f} m from the middle of {size[0]:.0f} x {size[1]:.0f} m of"
+        " free floor)"
+    )
+
+
 def _check_frames(
     grid: OccupancyGrid, poses: Poses | None, source: str, where: str, notes: list[str]
 ) -> None:
@@ -252,7 +273,8 @@ def _check_frames(
         frames = f"; the map is in frame {grid.frame!r}, they are in {poses.frame!r}"
     if off + walls + unknown > MOST_OFF:
         raise ConfigError(
-            f"{said}{frames}: it is not a map of these poses",
+            f"{said}, and {int((found == FREE).sum()):,} on its free floor{_apart(grid, poses)}"
+            f"{frames}: it is not a map of these poses",
             where=f"{where}, {source}",
             remedy="give the map that they were localised in (--map map.yaml), a --profile whose"
             " pose is in the map's frame, or make the floor --by scans or --by corridor",

@@ -6,7 +6,7 @@ import re
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -66,7 +66,8 @@ class ProfileCommand:
     """Read what is intact of truncated or damaged files."""
     json: bool = False
     """Print one JSON document: `new`: {"toml", "missing", "signals", "ticks", "transitions",
-    "problems", "advice", "commands"}; `check`: {"inputs", "problems", "advice", "outcome", …}."""
+    "problems", "advice", "commands", "kinds"}; `check`: {"inputs", "problems", "advice",
+    "outcome", …}."""
 
     @property
     def _typestore(self) -> str | None:
@@ -122,6 +123,7 @@ class ProfileCommand:
                     "problems": proposal.problems,
                     "advice": [{"key": each.key, "text": each.text} for each in proposal.advice],
                     "commands": proposal.commands,
+                    "kinds": [asdict(kind) for kind in proposal.kinds],
                 }
             )
         elif self.out is None:

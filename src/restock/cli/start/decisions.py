@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
 from restock.cli.start.outcomes import of_nominal
-from restock.cli.start.stage import Document
+from restock.cli.start.stage import Document, Stop
 from restock.cli.start.stages import Settings
 from restock.cli.start.work import FOLDER, Ended
 from restock.files import read_json
@@ -38,6 +39,28 @@ def edited(profile: Path | str | None, out: Path) -> bool:
     if not path.is_file():
         return False
     return not proposed.is_file() or read_json(proposed)["toml"] != path.read_text("utf-8")
+
+
+def several_kinds(kinds: list[Any], out: Path) -> Stop:
+    """Recordings of several kinds of robots: one call for each, the profile's own first."""
+    folders = [out, *(out.with_name(f"{out.name}-{n}") for n in range(2, len(kinds) + 1))]
+    told = [f"{len(kind['recordings'])} of {kind['robot']}" for kind in kinds]
+    calls = [
+        f"restock start {shlex.join(kind['recordings'])} --out {folder}"
+        for kind, folder in zip(kinds, folders, strict=True)
+    ]
+    return Stop(
+        f"these are recordings of {len(kinds)} kinds of robots, and a profile is of one:"
+        f" {' | '.join(told)}",
+        (*calls, f"or add --accept: what is not of the first kind is left out of {out}"),
+    )
+
+
+def of_other_kinds(out: Path) -> list[str]:
+    """The recordings that the proposal in this folder is not for."""
+    proposed = out / FOLDER / "propose.json"
+    kinds = read_json(proposed).get("kinds", []) if proposed.is_file() else []
+    return [path for kind in kinds[1:] for path in kind["recordings"]]
 
 
 def horizon(profile: Path | str | None) -> float:
@@ -148,6 +171,8 @@ __all__ = [
     "logs_alone_settings",
     "mistrust",
     "no_room",
+    "of_other_kinds",
     "robot_line",
+    "several_kinds",
     "updates_settings",
 ]

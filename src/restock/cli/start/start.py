@@ -156,7 +156,9 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
         logs_alone_settings,
         mistrust,
         no_room,
+        of_other_kinds,
         robot_line,
+        several_kinds,
         updates_settings,
     )
     from restock.cli.start.stage import Stop
@@ -206,6 +208,8 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
             if any(ODOMETRY in problem for problem in problems):
                 told = (f"add {ODOMETRY} to this command, or {told[0]}", again)
             return Stop("; ".join(problems), told)
+        if (kinds := proposed.document.get("kinds")) and not asked.accept:
+            return several_kinds(kinds, asked.out)
         driving = proposed.document.get("commands", [])
         if driving and not asked.accept:
             return Stop(
@@ -217,11 +221,21 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
                     "or add --accept to it, where the first one is right",
                 ),
             )
+    elif asked.urdf is not None or asked.footprint is not None:
+        work.say(
+            f"   [yellow]{escape(str(to.profile))} is a person's: --urdf and --footprint are for a"
+            " proposal, and change nothing[/]"
+        )
+    if others := [] if own or work.plan else of_other_kinds(asked.out):
+        mine = [row for row in readable if row["path"] not in others]
+        to = replace(to, logs=tuple(row["path"] for row in mine))
+        recording = fullest({"recordings": mine}) or recording
     checked = work.do(stages.check(to, recording))
     if not checked.good:
+        known = "; where that is of another robot, name only the recordings of this one"
         return Stop(
-            "the profile does not fit this recording",
-            (f"edit {to.profile}", again),
+            f"the profile does not fit {recording}",
+            (f"edit {to.profile}{known if len(readable) > 1 else ''}", again),
         )
     if not work.plan:
         work.say(f"   the robot in the twin: {escape(robot_line(to.profile))}")
@@ -243,6 +257,15 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
     settings = ["practice.rule=success"]
     if twin:
         floor = work.do(stages.floor(to))
+        if not floor.good and to.map is not None:
+            return Stop(
+                f"{to.map} cannot be the floor of these recordings",
+                (
+                    "name the map.yaml that the robot localised in, or leave out --map: the floor"
+                    " is then that of the recordings",
+                    again,
+                ),
+            )
         if floor.good:
             settings += floor_settings(to, floor.document)
         horizon_s = horizon(to.profile)
