@@ -39,6 +39,7 @@ from restock.train.run.run_profile import (
     profile_of_panel,
     profile_of_run,
 )
+from restock.train.run.trackers import require_trackers
 from restock.train.session import Session, open_session
 from restock.train.twin.env.floor_report import refuse_unfit, sealed
 from restock.train.twin.env.interface import AFTER_LOGS, Twin
@@ -200,6 +201,7 @@ def prepare_new(
         file, config = config, load_config(config, overrides)
         chosen = "profile" in apply_overrides({} if file is None else read_toml(file), overrides)
     open_device(config.device)
+    require_trackers(config.record.trackers)
     driven = {config.env.layouts, _evaluation_layouts(config)} if config.env.twin else ()
     for layouts in driven:
         # What is wrong with one is reported before anything is written. Evaluation drives all kinds
@@ -238,6 +240,7 @@ def prepare_resumed(
     stored = run.document["config"]
     config = parse_config(apply_overrides(stored, overrides), where=str(path / "config.json"))
     open_device(config.device)
+    require_trackers(config.record.trackers)
     given = config.profile != stored.get("profile")
     profile = load_profile(config.profile) if given else profile_of_run(run)
     if profile.task.hash != run.document["task_hash"]:

@@ -40,7 +40,9 @@ from restock.train.feed.teacher import AskedTeacher
 from restock.train.jump_start import POLICIES, JumpStart
 from restock.train.run import checkpoint
 from restock.train.run.checkpoint import keep, newest_whole
-from restock.train.run.run import Events, Run
+from restock.train.run.events import Events, TensorBoard
+from restock.train.run.run import Run
+from restock.train.run.trackers import tracker_sinks
 from restock.train.twin.env.interface import Twin
 
 
@@ -283,7 +285,7 @@ def open_session(
             labels=collector.labels,
             perturbations=collector.perturbations,
         ),
-        events=Events(run.path / "tensorboard", enabled=False),
+        events=Events(),
         probe=Probe.of_logs(logs, config.record.probe_rows) if logs is not None else None,
         exploration=np.random.default_rng([seed, 5]),
         executor=executor,
@@ -321,9 +323,9 @@ def open_session(
     else:
         session.collector.reset(seed)
     session.practice.check_reference()
-    session.events = Events(
-        run.path / "tensorboard",
-        enabled=config.record.tensorboard,
-        from_step=session.progress.env_steps if resume else None,
-    )
+    from_step = session.progress.env_steps if resume else None
+    sinks = tracker_sinks(run, config.record.trackers)
+    if config.record.tensorboard:
+        sinks["tensorboard"] = lambda: TensorBoard(run.path / "tensorboard", from_step)
+    session.events = Events(run.path, sinks)
     return session

@@ -228,6 +228,7 @@ class RecordConfig(Checked, frozen=True):
     checkpoint_every_env_steps: Count = 40_000
     keep_checkpoints: Count = 3  # the latest and those before it; the best is kept besides
     tensorboard: bool = True
+    trackers: tuple[Literal["wandb", "mlflow"], ...] = ()  # the same curves go there, too
 
 
 class TrainConfig(Checked, frozen=True):

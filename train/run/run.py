@@ -3,7 +3,7 @@
 config.json            what was asked for and with what: resolved config, panel, task, versions
 progress.parquet …     the tables of `run_tables`, each replaced in one step at a flush
 checkpoints/           latest.safetensors (all state) and best.safetensors (the policy kept)
-tensorboard/           the same curves as events
+tensorboard/           the same curves as events; tracking.json: ids of other trackers
 eval/                  what `restock eval` measured
 """
 
@@ -268,31 +268,3 @@ def _to_table(columns: Mapping[str, Any], schema: pa.Schema) -> pa.Table:
 
 def _is_column(value: Any) -> bool:
     return hasattr(value, "__len__") and not isinstance(value, str | bytes)
-
-
-class Events:
-    """Writes scalars by environment step; does nothing when switched off."""
-
-    def __init__(self, folder: Path, *, enabled: bool, from_step: int | None = None) -> None:
-        self._writer: Any = None
-        if enabled:
-            from torch.utils.tensorboard import SummaryWriter
-
-            # After a resume, what was written past the checkpoint is purged.
-            self._writer = SummaryWriter(str(folder), purge_step=from_step)
-
-    def scalars(self, step: int, prefix: str, values: Mapping[str, Any]) -> None:
-        """Every number among `values`, as `prefix/name`."""
-        if self._writer is None:
-            return
-        for name, value in values.items():
-            if isinstance(value, int | float) and not isinstance(value, bool):
-                self._writer.add_scalar(f"{prefix}/{name}", value, step)
-
-    def flush(self) -> None:
-        if self._writer is not None:
-            self._writer.flush()
-
-    def close(self) -> None:
-        if self._writer is not None:
-            self._writer.close()

@@ -1,0 +1,230 @@
+"""The curves of a run in W&B and MLflow, read back from their own files; a tracker that fails."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from support.toy_run import config as toy_config
+from support.toy_run import run_to_end
+
+from restock import cli
+from restock.train.dqn.config import TrainConfig
+from restock.train.run.events import GIVE_UP_AFTER, Events, tracked
+from restock.train.run.run import Run
+from restock.train.run.trackers import tracker_sinks
+
+PANEL = {
+    **{"id": "2564c94a221d4c16", "path": "/data/panel", "store": "/data/store"},
+    **{"store_version": 3, "rows": 10, "n_step": 3, "labels_version": "l"},
+    "others": [{"path": "s3://bucket/fleet", "version": 8}],
+}
+CURVES = [(100, {"loss": 2.0, "phase": "online"}), (200, {"loss": 0.5, "q_mean": 1.5})]
+
+
+class Broken:
+    """Takes what it is given for a while, then nothing."""
+
+    name = "mlflow"
+
+    def __init__(self, fails_after: int = 0) -> None:
+        self.taken: list[int] = []
+        self.asked, self.fails_after = 0, fails_after
+
+    def scalars(self, step: int, values: Mapping[str, float]) -> None:
+        self.asked += 1
+        if len(self.taken) >= self.fails_after:
+            raise ConnectionError("the server is gone")
+        self.taken.append(step)
+
+    def flush(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    def describe(self) -> dict[str, Any]:
+        return {"uri": "http://tracker"}
+
+
+def a_run(path: Path) -> Run:
+    panel = path.with_name("panel")
+    panel.mkdir()
+    (panel / "panel.json").write_text("{}")
+    config = msgspec.to_builtins(TrainConfig())
+    return Run.create(path, {"config": config, "panel": PANEL | {"path": str(panel)}})
+
+
+def follow(run: Run, name: str) -> Events:
+    """A run's curves, to one tracker."""
+    events = Events(run.path, tracker_sinks(run, [name]))
+    for step, values in CURVES:
+        events.scalars(step, "train", values)
+    events.close()
+    return events
+
+
+def test_a_sink_that_fails_is_counted_and_said_and_left_alone(tmp_path: Path) -> None:
+    broken, said = Broken(fails_after=2), list[str]()
+    events = Events(tmp_path, {"mlflow": lambda: broken}, said.append)
+    for step in range(10):
+        events.scalars(step, "train", {"loss": 1.0})
+    events.close()
+    assert broken.taken == [0, 1]
+    assert broken.asked == 2 + GIVE_UP_AFTER
+    assert tracked(tmp_path)["failures"] == {
+        "mlflow": {"failed": GIVE_UP_AFTER, "first": "ConnectionError: the server is gone"}
+    }
+    assert [line.split(":")[0] for line in said] == [
+        "mlflow failed, training goes on",
+        f"mlflow failed {GIVE_UP_AFTER} times in a row",
+        f"mlflow failed in {GIVE_UP_AFTER} calls; first",
+    ]
+
+
+def test_training_ends_as_ever_where_a_tracker_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuses() -> Broken:
+        raise OSError("no route to host")
+
+    def sinks(run: Run, names: Any) -> dict[str, Any]:
+        return {"wandb": refuses, "mlflow": Broken} if names else {}
+
+    monkeypatch.setattr("restock.train.session.tracker_sinks", sinks)
+    budget = {"env_steps": 240, "warmup_env_steps": 60, "offline_updates": 10}
+    settings = toy_config(
+        schedule=budget, record={"trackers": ["wandb", "mlflow"], "every_updates": 10}
+    )
+    ended = run_to_end(tmp_path / "a", settings)
+    assert ended.progress.env_steps == 240
+    assert ended.run.table("progress").num_rows > GIVE_UP_AFTER
+    failures = tracked(tmp_path / "a")["failures"]
+    assert failures["wandb"] == {"failed": 1, "first": "OSError: no route to host"}
+    assert failures["mlflow"]["failed"] == GIVE_UP_AFTER
+    assert "wandb failed, training goes on" in capsys.readouterr().err
+
+
+def test_a_tracker_that_is_not_installed_is_refused_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    find = importlib.util.find_spec
+
+    def absent(name: str, package: str | None = None) -> Any:
+        return None if name == "wandb" else find(name, package)
+
+    monkeypatch.setattr(importlib.util, "find_spec", absent)
+    words = ["train", "--out", str(tmp_path / "run"), "--set", 'record.trackers=["wandb"]']
+    assert cli.main(words) == 2
+    told = capsys.readouterr().err
+    assert "wandb is not installed" in told
+    assert "restock[track]" in told
+    assert not (tmp_path / "run").exists()
+
+
+def test_mlflow_has_the_curves_the_config_and_what_the_run_was_fed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("mlflow", reason="mlflow is not installed: restock[track]")
+    from mlflow.tracking import MlflowClient
+
+    uri = (tmp_path / "mlruns").as_uri()
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
+    monkeypatch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")
+    run = a_run(tmp_path / "a")
+    events = follow(run, "mlflow")
+    assert events.failures["mlflow"].failed == 0
+    known = tracked(run.path)["mlflow"]
+    assert known["uri"] == uri
+    client = MlflowClient(uri)
+    kept = client.get_run(known["run_id"])
+    history = client.get_metric_history(known["run_id"], "train/loss")
+    assert [(metric.step, metric.value) for metric in history] == [(100, 2.0), (200, 0.5)]
+    assert kept.data.metrics == {"train/loss": 0.5, "train/q_mean": 1.5}
+    assert kept.data.params["loss.discount"] == "0.99"
+    assert kept.info.status == "FINISHED"
+    fed = {entry.dataset.name: entry.dataset.digest for entry in kept.inputs.dataset_inputs}
+    assert fed == {
+        "panel-2564c94a221d4c16": "2564c94a221d4c16",
+        "store-store-v3": "3",
+        "store-fleet-v8": "8",
+    }
+    # A run that goes on is the same one there.
+    again = Events(run.path, tracker_sinks(run, ["mlflow"]))
+    again.scalars(300, "train", {"loss": 0.25})
+    again.close()
+    assert tracked(run.path)["mlflow"] == known
+    history = client.get_metric_history(known["run_id"], "train/loss")
+    assert [metric.step for metric in history] == [100, 200, 300]
+
+
+def wandb_records(folder: Path) -> list[Any]:
+    """The records of a run's offline file, when W&B's own process has written the last one."""
+    for _ in range(300):
+        records = list(_records(folder))
+        if "exit" in (record.WhichOneof("record_type") for record in records):
+            return records
+        time.sleep(0.1)
+    raise AssertionError(f"{len(records)} records, and no end")
+
+
+def _records(folder: Path) -> Iterator[Any]:
+    """LevelDB's log format after a header of 7 bytes."""
+    from wandb.proto.wandb_internal_pb2 import Record
+
+    (file,) = folder.glob("wandb/offline-run-*/run-*.wandb")
+    content, at, part = file.read_bytes(), 7, b""
+    assert content[:4] == b":W&B"
+    block = 32 << 10
+    while at + 7 <= len(content):
+        if block - at % block < 7:  # no header fits into what is left of a block
+            at += block - at % block
+            continue
+        size, kind = int.from_bytes(content[at + 4 : at + 6], "little"), content[at + 6]
+        if at + 7 + size > len(content):
+            return  # still being written
+        part += content[at + 7 : at + 7 + size]
+        at += 7 + size
+        if kind in (1, 4):  # a whole record, or the last part of one
+            record = Record()
+            record.ParseFromString(part)
+            part = b""
+            yield record
+
+
+def test_wandb_has_the_curves_the_config_and_what_the_run_was_fed_offline(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("wandb", reason="wandb is not installed: restock[track]")
+    for name in ("WANDB_MODE", "WANDB_PROJECT"):
+        monkeypatch.delenv(name, raising=False)
+    run = a_run(tmp_path / "a")
+    events = follow(run, "wandb")
+    assert events.failures["wandb"].failed == 0
+    known = tracked(run.path)["wandb"]
+    assert (known["project"], known["mode"]) == ("restock", "offline")
+    curves, artifacts, config = [], {}, dict[str, Any]()
+    for record in wandb_records(run.path):
+        kind = record.WhichOneof("record_type")
+        if kind == "history":
+            items = record.history.item
+            values = {(i.key or "/".join(i.nested_key)): json.loads(i.value_json) for i in items}
+            curves.append({k: v for k, v in values.items() if k.startswith("train/")})
+        elif kind == "artifact":
+            artifacts[record.artifact.name] = record.artifact.type
+        elif kind == "run":
+            assert record.run.run_id == known["id"]
+            config |= {i.key: json.loads(i.value_json) for i in record.run.config.update}
+    assert curves == [{"train/loss": 2.0}, {"train/loss": 0.5, "train/q_mean": 1.5}]
+    assert artifacts == {
+        "panel-2564c94a221d4c16": "panel",
+        "store-store-v3": "store",
+        "store-fleet-v8": "store",
+    }
+    assert config["loss"]["discount"] == 0.99
