@@ -109,8 +109,9 @@ MAY_IMPORT = {
     ),
     "cli/twin": (
         "cli report report/run ingest/containers ingest/profile ingest/propose ingest/store"
-        " ingest/task replay/fleet replay/store train/evaluation train/twin/calibration train/twin/env"
-        " train/twin/floors train/twin/physics train/twin/recording train/twin/survey"
+        " ingest/task replay/fleet replay/store train/evaluation train/twin/calibration"
+        " train/twin/env train/twin/floors train/twin/physics train/twin/recording"
+        " train/twin/survey"
     ),
 }
 
