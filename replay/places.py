@@ -16,7 +16,6 @@ from restock.errors import RunError, StoreError
 from restock.files import read_json
 from restock.ingest.store.location import Location
 from restock.ingest.store.version import Version
-from restock.replay.panel.panel import EVALUATION_SPLIT, HEADER, META, Panel
 from restock.replay.store.query import definitions
 from restock.replay.store.store import Store, is_store, read_parquet
 
@@ -77,6 +76,8 @@ def _add_all(
 
 def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> bool:
     """Views of a run or a panel in a schema; False where it is neither."""
+    from restock.replay.panel.panel import EVALUATION_SPLIT, HEADER, META, Panel
+
     if (path / HEADER).is_file():
         panel = Panel.open(path)
         for view, name in (("rows", META), ("evaluation_split", EVALUATION_SPLIT)):

@@ -13,11 +13,11 @@ from restock.arrays import F32, Bools, Ints
 from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.episodes import Split, changed_route, with_route
 from restock.ingest.steps.steps import Steps
+from restock.ingest.store.summary import ENDS
 from restock.ingest.task.conditions import label_with_probabilities
 from restock.ingest.task.schema import signal_columns
 from restock.ingest.task.signals import Signals
 
-ENDS = b"restock.episode_ends"  # key in the rows' metadata
 GROUP_ROWS = 8192  # of whole episodes that are worked out together: bounds memory
 
 

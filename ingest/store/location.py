@@ -206,10 +206,11 @@ class Location:
             StoreError: the place cannot be reached.
         """
         with self.reading(path) as file:
-            if columns is not None:
-                whole = pq.ParquetFile(file)
-                return whole.read([name for name in whole.schema_arrow.names if name in columns])
-            return pq.read_table(file, partitioning=None, filters=where)
+            if where is not None:
+                return pq.read_table(file, partitioning=None, filters=where)
+            whole = pq.ParquetFile(file)  # `read_table` imports Arrow's data sets
+            names = whole.schema_arrow.names
+            return whole.read([name for name in names if columns is None or name in columns])
 
     def read_schema(self, path: str) -> pa.Schema:
         """A Parquet file's schema, with its metadata. Raises as `read` does."""

@@ -14,9 +14,9 @@ from typing import Any
 import duckdb
 import pyarrow as pa
 
-from restock.ingest.store.episode_rows import ENDS
 from restock.ingest.store.repeated import sketch
 
+ENDS = b"restock.episode_ends"  # key in the rows' metadata
 VERSION = 1  # of summary.sql: a summary by another one is not used
 
 

@@ -28,9 +28,7 @@ from deltalake.transaction import AddAction, RemoveAction
 
 from restock.errors import StoreError
 from restock.files import first_line
-from restock.ingest.profile.custom_signal import refuse_other_signals
 from restock.ingest.store.data_files import AddedFile, add_action, parquet_options, rewrite
-from restock.ingest.store.episode_rows import episode_ends
 from restock.ingest.store.lineage import READERS, Ingest, StoredFile, own_path, stored_files
 from restock.ingest.store.location import Location
 from restock.ingest.store.repeated import (
@@ -132,6 +130,8 @@ class StoreWriter:
     def ends(self, ingests: Sequence[Ingest]) -> Iterator[tuple[str, pa.Table]]:
         """The recording of each of these ingests and the ends of its episodes, as `episode_ends`
         gives them; without those that have none."""
+        from restock.ingest.store.episode_rows import episode_ends
+
         told = self._packed_ends(ingests)
         for one in ingests:
             bare = with_ends(pa.table({}), told.get(one.ingest_id))
@@ -294,6 +294,8 @@ class StoreWriter:
         """
         if self.path.folder is not None and self.path.folder.is_file():
             raise StoreError("is a file, not a store", where=str(self.path), remedy="name a folder")
+
+        from restock.ingest.profile.custom_signal import refuse_other_signals
 
         def create() -> None:
             if not self.path.has_table(name):

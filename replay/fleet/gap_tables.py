@@ -9,12 +9,15 @@ from __future__ import annotations
 import functools
 from importlib.resources import files
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pyarrow as pa
 
-from restock.replay.fleet.shopping_list import ShoppingList, document, shopping_list
 from restock.replay.panel.mixture_tables import check_names, install_function
 from restock.replay.store.store import Store
+
+if TYPE_CHECKING:
+    from restock.replay.fleet.shopping_list import ShoppingList
 
 COLUMNS = {
     "asked_by": "VARCHAR",
@@ -46,6 +49,7 @@ def install_gaps(store: Store) -> None:
     @functools.lru_cache(maxsize=1)
     def planned(name: str, _changed_ns: int) -> ShoppingList:
         from restock.replay.fleet.gaps import find_gaps
+        from restock.replay.fleet.shopping_list import shopping_list
         from restock.replay.mixture.mixture import load_mixture
         from restock.replay.store.audit import load_thresholds
 
@@ -68,5 +72,7 @@ def install_gaps(store: Store) -> None:
 
 def gaps_table(found: ShoppingList) -> pa.Table:
     """A row a gap, columns COLUMNS."""
+    from restock.replay.fleet.shopping_list import document
+
     lines = [{**line, "unit": found.unit} for line in document(found)["gaps"]]
     return pa.table({name: [line[name] for line in lines] for name in COLUMNS})

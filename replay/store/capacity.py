@@ -10,7 +10,7 @@ import duckdb
 import pyarrow as pa
 
 from restock.errors import StoreError
-from restock.replay.store.query import interruptible, values
+from restock.replay.store.query import install_named, interruptible, values
 
 CELLS_SHARE = 0.95
 EFFECTIVE_EPISODES = 50.0
@@ -67,6 +67,8 @@ def recommend_capacity(
 
     Raises StoreError where there are no transitions.
     """
+
+    install_named(connection, "capacity_curve")
 
     def ask() -> tuple[list[dict[str, Any]], tuple[Any, ...]]:
         relation = connection.sql("FROM capacity_curve()")

@@ -36,6 +36,8 @@ ON_DEMAND = (
     ("episode_signals.sql", "drift.sql"),
     ("exposure.sql",),
     ("return_order.sql", "returns.sql"),
+    ("capacity.sql",),
+    ("repeated_rows.sql",),
 )
 _LISTS = {
     "columns",

@@ -14,13 +14,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import duckdb
 import msgspec
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.dataset
 from deltalake import DeltaTable
 
 from restock.errors import StoreError
@@ -36,6 +35,10 @@ from restock.ingest.task.task import Task
 from restock.replay.store.computed import install_computed
 from restock.replay.store.query import definitions, install_first, query
 
+if TYPE_CHECKING:
+    from pyarrow.dataset import Dataset
+
+FEW_FILES = 64  # are read sooner one by one than Arrow's data sets are imported
 T = TypeVar("T")
 
 
@@ -288,30 +291,42 @@ class Store:
     def _addresses(self, table: _Stored) -> list[str]:
         return [f"{self.path.table(table.table)}/{path}" for path in table.paths]
 
-    def _dataset(self, table: _Stored) -> pa.Table | pa.dataset.Dataset:
+    def _dataset(self, table: _Stored) -> pa.Table | Dataset:
         if not table.paths:
             return table.schema.empty_table()
-        parquet = pa.dataset.ParquetFileFormat(
-            default_fragment_scan_options=pa.dataset.ParquetFragmentScanOptions(pre_buffer=True)
+        from pyarrow import dataset
+
+        parquet = dataset.ParquetFileFormat(
+            default_fragment_scan_options=dataset.ParquetFragmentScanOptions(pre_buffer=True)
         )
         fragments = [
             parquet.make_fragment(f"{table.table}/{path}", self.path.files) for path in table.paths
         ]
-        return pa.dataset.FileSystemDataset(fragments, table.schema, parquet, self.path.files)
+        return dataset.FileSystemDataset(fragments, table.schema, parquet, self.path.files)
 
     def _held(self, table: _Stored) -> pa.Table:
-        rows = self._dataset(table)
-        if isinstance(rows, pa.Table):
-            return rows
         try:
             with self.path.translate_errors():
-                return rows.to_table()
+                if len(table.paths) <= FEW_FILES and self.path.folder is not None:
+                    return self._read_each(table)
+                rows = self._dataset(table)
+                return rows if isinstance(rows, pa.Table) else rows.to_table()
         except (OSError, pa.ArrowException) as error:
             raise StoreError(
                 f"its manifests cannot be read: {first_line(error)}",
                 where=str(self.path),
                 remedy="restore the file from a copy, or ingest its recording again",
             ) from error
+
+    def _read_each(self, table: _Stored) -> pa.Table:
+        """File by file; columns that a file has not are null."""
+        parts = [
+            self.path.read(f"{table.table}/{path}", columns=table.schema.names)
+            for path in table.paths
+        ]
+        bare = [part.replace_schema_metadata(None) for part in parts]
+        found = pa.concat_tables([table.schema.empty_table(), *bare], promote_options="default")
+        return found.select(table.schema.names).cast(table.schema)
 
     def _set_memory(self, limit: str) -> None:
         try:
@@ -326,7 +341,7 @@ def _register(
     connection: duckdb.DuckDBPyConnection,
     schema: str,
     view: str,
-    rows: pa.Table | pa.dataset.Dataset,
+    rows: pa.Table | Dataset,
 ) -> None:
     name = view if schema == "main" else f"{schema}_{view}"
     connection.register(name, rows)

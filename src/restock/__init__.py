@@ -3,23 +3,17 @@
 The rooms `restock.ingest`, `restock.replay`, `restock.train` and `restock.twin` hold the public
 names, docs/api.md lists them; `restock.report` writes the pages about a run. Importing any of
 them is cheap; `torch`, `mujoco` and `duckdb` load with what needs them.
-The Gymnasium environment `restock/Warehouse-v0` is registered here, by name only.
+The Gymnasium environment `restock/Warehouse-v0` is registered here, by name only, and as soon as
+Gymnasium is imported, before or after this.
 """
 
 from __future__ import annotations
 
 import importlib
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
-import gymnasium
-
 from restock.errors import RestockError
-
-try:
-    __version__ = version("restock")
-except PackageNotFoundError:  # running from a source tree that was never installed
-    __version__ = "0.0.0+unknown"
+from restock.imports import when_imported
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -31,13 +25,22 @@ if TYPE_CHECKING:
     from restock import twin as twin
     from restock.replay.store.store import Store
 
+    __version__: str
+
 __all__ = ["RestockError", "__version__", "open"]
 
-gymnasium.register(
-    id="restock/Warehouse-v0",
-    entry_point="restock.train.twin.env.single_env:WarehouseEnv",
-    vector_entry_point="restock.train.twin.env.vector_env:WarehouseVectorEnv",
-)
+
+def _register() -> None:
+    import gymnasium
+
+    gymnasium.register(
+        id="restock/Warehouse-v0",
+        entry_point="restock.train.twin.env.single_env:WarehouseEnv",
+        vector_entry_point="restock.train.twin.env.vector_env:WarehouseVectorEnv",
+    )
+
+
+when_imported("gymnasium", _register)
 
 
 def open(store: str, *, version: int | str | None = None) -> Store:
@@ -53,8 +56,20 @@ def open(store: str, *, version: int | str | None = None) -> Store:
 
 if not TYPE_CHECKING:
 
-    def __getattr__(name: str) -> ModuleType:
+    def __getattr__(name: str) -> ModuleType | str:
+        if name == "__version__":  # looked up when asked for: metadata are slow to read
+            globals()[name] = _version()
+            return globals()[name]
         # `import restock` is enough to write `restock.twin.EpisodeSpec`.
         if name in ("ingest", "replay", "report", "train", "twin"):
             return importlib.import_module(f"restock.{name}")
         raise AttributeError(f"module 'restock' has no attribute {name!r}")
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("restock")
+    except PackageNotFoundError:  # running from a source tree that was never installed
+        return "0.0.0+unknown"

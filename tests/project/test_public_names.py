@@ -32,7 +32,7 @@ def python(code: str) -> str:
 
 
 def test_importing_the_rooms_loads_none_of_the_heavy_libraries() -> None:
-    heavy = "{'torch', 'mujoco', 'duckdb', 'pyarrow', 'altair', 'msgspec', 'tyro'}"
+    heavy = "{'torch', 'mujoco', 'duckdb', 'pyarrow', 'altair', 'msgspec', 'tyro', 'gymnasium'}"
     names = ", ".join(["restock", *ROOMS])
     assert python(f"import sys, {names}; print({heavy} & set(sys.modules))") == "set()"
 

@@ -272,7 +272,7 @@ def _unseen(store: Store, trained: Panel, ids: Ints) -> tuple[Ints, int]:
     meta = trained.meta
     learnt = pa.table({"transition_id": meta["transition_id"]})
     with passed_in(store.connection, learnt=learnt):
-        copies = store.connection.sql(
+        copies = store.sql(
             "SELECT DISTINCT episode_id FROM transitions WHERE transition_id IN (SELECT"
             " transition_id FROM same_steps() WHERE step IN (SELECT step FROM same_steps()"
             " SEMI JOIN learnt USING (transition_id)))"

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Sequence
 
 from restock.errors import ExitCode, RestockError
+from restock.imports import hidden, when_imported
 
 # verb -> what it does, in the order of the work
 VERBS = {
@@ -108,13 +109,17 @@ def _dispatch(args: list[str]) -> int:
         hint = f"did you mean `restock {near[0]}`?" if near else "see `restock --help`"
         raise RestockError(f"no verb named {verb!r}", remedy=hint)
 
+    when_imported("pyarrow", _settle_pandas)
+
     import tyro
 
     module = importlib.import_module(f"restock.cli.{_FOLDER_OF.get(verb, '')}{verb}")
     command = getattr(module, f"{verb.capitalize()}Command")
+    from restock.cli.command_line import prepared
+
     try:
         parsed = tyro.cli(
-            command,
+            prepared(command),
             prog=f"restock {verb}",
             args=_without_ros(args[1:]) if verb == "node" else args[1:],
             use_underscores=False,
@@ -124,6 +129,16 @@ def _dispatch(args: list[str]) -> int:
         return int(stop.code or 0) if isinstance(stop.code, int | None) else int(ExitCode.USAGE)
     code: int | None = parsed.run()
     return int(code or ExitCode.OK)
+
+
+def _settle_pandas() -> None:
+    """Arrow asks at the first list that it gets whether it is a pandas object, and to know that
+    imports pandas wherever it is installed: half of what a short command takes. No command makes
+    any, so it asks now, and finds none. Who needs pandas itself (Stable-Baselines3) imports it."""
+    import pyarrow as pa
+
+    with hidden("pandas"):
+        pa.array([])
 
 
 def _without_ros(args: list[str]) -> list[str]:

@@ -8,32 +8,27 @@ import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
-
-from rich import box
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
-from rich.table import Table
+from typing import TYPE_CHECKING, Any
 
 from restock.errors import visible
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 Row = Mapping[str, Any]
 
 
 def stdout() -> Console:
     """The console for data. As wide as it needs to be when it is not a terminal."""
+    from rich.console import Console  # slow to import, and a count needs none
+
     return Console(file=sys.stdout, highlight=False, width=None if sys.stdout.isatty() else 240)
 
 
 def stderr() -> Console:
     """The console for progress and messages."""
+    from rich.console import Console
+
     return Console(file=sys.stderr, highlight=False)
 
 
@@ -76,6 +71,9 @@ def print_table(
     rows: Sequence[Row], columns: Sequence[str] | None = None, *, title: str | None = None
 ) -> None:
     """A table on stdout, its title on a line of its own; numbers to the right."""
+    from rich import box
+    from rich.table import Table
+
     names = list(columns if columns is not None else rows[0] if rows else ())
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for name in names:
@@ -149,6 +147,18 @@ def _is_number(value: Any) -> bool:
 @contextmanager
 def progress(description: str, total: float | None) -> Iterator[Any]:
     """A progress bar on a terminal, silence elsewhere. Yields `advance(amount, note="")`."""
+    if not sys.stderr.isatty():
+        yield lambda amount=1.0, note="": None
+        return
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
     bar = Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -158,7 +168,6 @@ def progress(description: str, total: float | None) -> Iterator[Any]:
         TextColumn("{task.fields[note]}"),
         console=stderr(),
         transient=True,
-        disable=not sys.stderr.isatty(),
     )
     with bar:
         task = bar.add_task(description, total=total, note="")

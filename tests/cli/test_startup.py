@@ -1,0 +1,85 @@
+"""Starting up: a command imports what it uses, and none of what only other commands need."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from support.driven_robot import Drive, write_bag
+
+from restock import cli
+
+OF_LEARNING = {"torch", "mujoco", "gymnasium", "scipy", "altair", "tensorboard", "onnxruntime"}
+SLOW = OF_LEARNING | {"pandas", "pyarrow.dataset", "typeguard", "asyncio", "rosbags", "ruamel.yaml"}
+
+
+def loaded(*args: str) -> set[str]:
+    """The modules that one command has imported when it ends."""
+    code = (
+        "import json, sys; from restock.cli import main; code = main(sys.argv[1:]);"
+        "sys.stderr.write(json.dumps(sorted(sys.modules))); sys.exit(code)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *args], capture_output=True, text=True)
+    assert done.returncode in (0, 1), done.stderr[-500:]
+    return set(json.loads(done.stderr.splitlines()[-1]))
+
+
+def test_help_imports_no_library_at_all() -> None:
+    modules = loaded("--help")
+    used = SLOW | {"numpy", "pyarrow", "duckdb", "deltalake", "msgspec", "tyro", "rich"}
+    assert modules & used == set()
+    assert "importlib.metadata" not in modules
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("startup")
+    bag = write_bag(Drive(), folder / "bag")
+    assert cli.main(["ingest", str(bag), "--store", str(folder / "store")]) == 0
+    return folder / "store"
+
+
+@pytest.mark.parametrize(
+    "command",
+    [("sql", "STORE", "SELECT count(*) FROM transitions"), ("sql", "STORE", "FROM coverage")],
+    ids=" ".join,
+)
+def test_a_query_imports_neither_what_learns_nor_what_reads_recordings(
+    command: tuple[str, ...], store: Path
+) -> None:
+    modules = loaded(*(str(store) if word == "STORE" else word for word in command))
+    assert modules & SLOW == set()
+    assert "duckdb" in modules
+
+
+def test_an_audit_imports_neither_what_learns_nor_what_reads_recordings(store: Path) -> None:
+    assert loaded("audit", str(store)) & SLOW == set()
+
+
+def test_ingest_imports_neither_what_learns_nor_pandas(tmp_path: Path) -> None:
+    bag = write_bag(Drive(), tmp_path / "bag")
+    modules = loaded("ingest", str(bag), "--store", str(tmp_path / "store"), "--json")
+    assert modules & (OF_LEARNING | {"pandas", "pyarrow.dataset"}) == set()
+
+
+@pytest.mark.parametrize("order", ["import restock, gymnasium", "import gymnasium, restock"])
+def test_the_environment_is_registered_whichever_is_imported_first(order: str) -> None:
+    code = f"{order}; print(gymnasium.spec('restock/Warehouse-v0').entry_point)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip() == "restock.train.twin.env.single_env:WarehouseEnv", done.stderr
+
+
+def test_pandas_that_a_command_did_not_look_for_works_once_it_is_imported() -> None:
+    """Stable-Baselines3 imports it; Arrow must still make its frames."""
+    pytest.importorskip("pandas")
+    code = (
+        "from restock.cli import _settle_pandas; import sys, pyarrow as pa; _settle_pandas();"
+        "pa.array([1]); assert 'pandas' not in sys.modules;"
+        "import pandas; print(pa.table({'a': [1, 2]}).to_pandas().a.sum(),"
+        " len(pa.array(pandas.Series([3]))))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.split() == ["3", "1"], done.stderr
