@@ -19,7 +19,6 @@ from restock.train.dqn.network import clone
 from restock.train.dqn.target import Hard
 from restock.train.evaluation.evaluate import (
     Score,
-    fixed_episodes,
     score,
 )
 from restock.train.evaluation.offline_start import choose_start
@@ -322,11 +321,9 @@ def _evaluate(session: Session, notify: Notify) -> None:
         session.save_best(Score({}, 0.0, 0.0))
         return
     config, progress, learner = session.config, session.progress, session.learner
-    names = list(config.env.conditions)  # also those with a share of 0: never trained on, yet met
-    specs = fixed_episodes(names, config.evaluation.episodes, config.evaluation.seed)
     policy = GreedyPolicy(session.starting or learner.policy)
     discount = config.loss.discount
-    results = session.evaluation_buffer.drive(policy, specs, discount)
+    results = session.evaluation_buffer.drive(policy, session.fixed_episodes, discount)
     measured = session.evaluation_buffer.measure(learner)
     session.run.append("evaluation_buffer", [{**session.steps, **row} for row in measured])
     progress.evaluated_at = progress.env_steps

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from restock.errors import ConfigError
 from restock.ingest.profile.profile import Profile
 from restock.ingest.task.task import Task
 from restock.replay.fleet.missions_file import MissionOrder, read_missions
 from restock.replay.panel.panel import Panel
 from restock.train.dqn.config import PracticeConfig, TrainConfig
 from restock.train.evaluation.evaluate import run_episodes
+from restock.train.evaluation.logged_ways import EVERY, logged_missions
 from restock.train.evaluation.references import reference
 from restock.train.feed.logs import Coded
 from restock.train.feed.practice import Practice
@@ -19,6 +21,7 @@ from restock.train.twin.env.mission_arms import MissionArms
 from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.planner import planners
+from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.perturbation import Schedule, find_perturbation
 
 MISSIONS = "env.missions"
@@ -33,6 +36,37 @@ def mission_orders(config: TrainConfig) -> tuple[MissionOrder, ...]:
     """
     missions = config.env.missions
     return read_missions(missions).missions if isinstance(missions, str) else missions or ()
+
+
+def ways_to_evaluate(
+    config: TrainConfig, layouts: str, panel: Panel | None
+) -> list[EpisodeSpec] | None:
+    """The ways of its logs that a run's evaluations drive on these floors; None: drawn missions.
+
+    Raises:
+        ConfigError: ways are asked for, and there are no logs, no goal, several floors, or none of
+            them can be driven.
+    """
+    chosen, kinds = config.evaluation, list(config.env.conditions)
+    if chosen.missions == "drawn" or not config.env.twin:
+        return None
+    floors = open_floors(layouts)
+    why = None
+    if panel is None:
+        why = "the run learns from no logs"
+    elif panel.task.goal == "none":
+        why = "the task has no goal"
+    elif len(floors) > 1:
+        why = f"is about the floor of the logs, these are {len(floors)}"
+    if panel is None or why is not None:
+        raise ConfigError(
+            str(why), where="evaluation.missions", remedy='leave it out, or say "drawn"'
+        )
+    every = chosen.missions == EVERY
+    specs = logged_missions(panel, floors[0], kinds, every=every).specs
+    fitting = [kind for kind in kinds if kind in specs]
+    most = min(max(len(specs[kind]) for kind in fitting), chosen.episodes)
+    return [specs[kind][at] for at in range(most) for kind in fitting if at < len(specs[kind])]
 
 
 def mission_arms(config: TrainConfig) -> MissionArms:

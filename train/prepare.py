@@ -29,7 +29,12 @@ from restock.train.feed.teacher import Teacher, open_teacher
 from restock.train.finite import STOPPED
 from restock.train.logs_alone import NoTwin, without_twin
 from restock.train.loop import Notify, TrainResult
-from restock.train.missions import check_missions, mission_orders, reference_success
+from restock.train.missions import (
+    check_missions,
+    mission_orders,
+    reference_success,
+    ways_to_evaluate,
+)
 from restock.train.ring_capacity import resolve_ring_capacity
 from restock.train.run.checkpoint import check_earlier, go_back
 from restock.train.run.run import Run, check_free, now_ns, panel_document, software_versions
@@ -71,6 +76,8 @@ class Prepared:
         )
         if teacher is not None and self.resumed is None:  # refused before anything is written
             teacher.ask(env, env.reset(seed=self.config.seed)[0])
+        layouts = _evaluation_layouts(self.config)
+        episodes = ways_to_evaluate(self.config, layouts, self.panel)
         run = self.resumed or Run.create(self.path, self.document)
         if self.resumed is not None:
             run.remove_leftovers()
@@ -88,8 +95,9 @@ class Prepared:
                 self.profile,
                 min(_EVALUATION_ENVS, self.config.evaluation.episodes * len(KINDS)),
                 nthread=0,
-                layouts=_evaluation_layouts(self.config),
+                layouts=layouts,
             ),
+            episodes=episodes,
             logs=_logs(self.panel, self.config, self.document) if self.panel is not None else None,
             teacher=teacher,
             resume=self.resumed is not None,

@@ -25,7 +25,7 @@ from restock.train.dqn.behaviour import PolicyNetwork
 from restock.train.dqn.config import TrainConfig
 from restock.train.dqn.learner import Learner, greedy_actions
 from restock.train.dqn.start_policy import StartPolicy, start_network
-from restock.train.evaluation.evaluate import Score
+from restock.train.evaluation.evaluate import Score, fixed_episodes
 from restock.train.evaluation.evaluation_buffer import EvaluationBuffer
 from restock.train.evaluation.policies import save_agent
 from restock.train.feed.batch_record import FeedRecord
@@ -44,6 +44,7 @@ from restock.train.run.events import Events, TensorBoard
 from restock.train.run.run import Run
 from restock.train.run.trackers import tracker_sinks
 from restock.train.twin.env.interface import Twin
+from restock.train.twin.physics.episode import EpisodeSpec
 
 
 @dataclass
@@ -113,6 +114,7 @@ class Session(Stateful):
     ring: FreshRing
     batches: Batches
     collector: Collector
+    fixed_episodes: Sequence[EpisodeSpec]  # that evaluations drive
     feed: FeedRecord
     events: Events
     probe: Probe | None
@@ -221,6 +223,13 @@ class Session(Stateful):
         self.events.close()
 
 
+def drawn_episodes(config: TrainConfig) -> list[EpisodeSpec]:
+    """The fixed episodes of every kind that is named: also those with a share of 0, which training
+    never meets."""
+    chosen = config.evaluation
+    return fixed_episodes(list(config.env.conditions), chosen.episodes, chosen.seed)
+
+
 def open_session(
     run: Run,
     config: TrainConfig,
@@ -232,11 +241,13 @@ def open_session(
     logs: Logs | None,
     teacher: AskedTeacher | None = None,
     resume: bool = False,
+    episodes: Sequence[EpisodeSpec] | None = None,
     reference: Mapping[str, float] | None = None,
 ) -> Session:
     """Put the parts of a run together, new or as its latest checkpoint left them.
 
-    `reference` is the success by arm of whom practice by regret is against.
+    `episodes` are what evaluations drive, None: as drawn by the config's seeds. `reference` is the
+    success by arm of whom practice by regret is against.
     """
     torch.set_num_threads(config.threads)
     seed = config.seed
@@ -274,6 +285,7 @@ def open_session(
         ring=ring,
         batches=batches,
         collector=collector,
+        fixed_episodes=drawn_episodes(config) if episodes is None else episodes,
         feed=FeedRecord(
             run,
             logs,

@@ -28,8 +28,10 @@ from restock.report import build_report
 from restock.report.look.theme import DARK
 from restock.report.run import shares
 from restock.report.run.facts import evaluation_bias, gather, mean_success
+from restock.report.run.headline import headline
 from restock.report.run.page import page
 from restock.report.run.sections import success
+from restock.report.run.ways import ways_section
 from restock.stats import ConfidenceInterval
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES, TABLES
@@ -295,6 +297,27 @@ def test_without_a_baseline_the_headline_says_so(run: Path, tmp_path: Path) -> N
     said = heading(build_report(copy).read_text(encoding="utf-8"))
     assert said.startswith("No baseline drove the same episodes: success 90%")
     assert "20% [8%, 42%] in wheel slip" in said
+
+
+def test_logged_ways_stand_beside_the_missions_that_were_drawn(run: Path, tmp_path: Path) -> None:
+    assert ways_section(gather(run)) is None
+    copy = shutil.copytree(run, tmp_path / "run")
+    file = copy / "eval" / "episodes.parquet"
+    drawn = pq.read_table(file).to_pylist()
+    driven = [  # before the others, and of two ways in all
+        {**row, "layouts": "hall.toml, ways of the logs", "success": row["policy"] == "agent"}
+        for row in drawn
+        if row["episode_seed"] < 2 and row["condition"] == "nominal"
+    ]
+    named = [{**row, "layouts": "hall.toml"} for row in drawn]
+    pq.write_table(pa.Table.from_pylist([*driven, *named], schema=EVAL_EPISODES), file)
+    facts = gather(copy)
+    section = ways_section(facts)
+    assert section is not None
+    assert "4 of 84 episodes" in section.intro
+    shown = {row["policy"]: row["success"] for row in section.tables[0].rows}
+    assert shown == {"agent": "100% [34%, 100%]", "planner": "0% [0%, 66%]"}
+    assert headline(facts) == headline(gather(run))  # of the drawn ones, as without them
 
 
 def test_one_average_of_success_is_on_the_page(run: Path) -> None:

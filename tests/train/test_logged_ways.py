@@ -16,7 +16,9 @@ from support.stores import recording_transitions, write_store
 
 from restock.arrays import F64
 from restock.cli import main
+from restock.files import read_table
 from restock.replay.panel.panel import Panel
+from restock.train.evaluation.eval_run import plan_evaluation
 from restock.train.evaluation.logged_ways import AGREE_M, goal_of, logged_missions
 from restock.train.run.kept_evaluations import read_evaluations
 from restock.train.twin.floors.floors import open_floors
@@ -123,3 +125,25 @@ def test_eval_drives_the_ways_of_the_logs(
     without = kept_run(tmp_path / "without")
     assert main(["eval", str(without), "--missions", "logged"]) == 2
     assert "learnt from no logs" in capsys.readouterr().err
+
+
+def test_a_runs_own_evaluations_drive_them_where_the_config_says_so(
+    panel: Panel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = ["train", "--panel", str(panel.path), "--set", "evaluation.missions=logged"]
+    line += ["--set", "env.num_envs=4", "--set", "schedule.offline_updates=2"]
+    line += ["--set", "network.hidden=[8]", "--set", "replay.batch_size=16"]
+    line += ["--set", "evaluation.episodes=2", "--set", "record.tensorboard=false"]
+    line += ["--set", "env.conditions={nominal=1.0}", "--env-steps", "40"]
+    assert main([*line, "--out", str(tmp_path / "run")]) == 0
+    driven = read_table(tmp_path / "run" / "evaluations.parquet").to_pylist()
+    made = logged_missions(panel, FLOOR, ("nominal",))
+    ways = {spec.seed for spec in made.specs["nominal"][:2]}
+    assert {row["episode_seed"] for row in driven} == ways
+    (_, said) = plan_evaluation(tmp_path / "run", missions="logged").warnings
+    assert "chosen by such ways" in said
+    capsys.readouterr()
+    other = ["--set", "env.layouts=generated:train:3", "--out", str(tmp_path / "other")]
+    assert main([*line, *other]) == 2
+    assert "evaluation.missions: is about the floor of the logs" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()

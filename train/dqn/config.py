@@ -210,6 +210,9 @@ class EvaluationConfig(Checked, frozen=True):
     # Rate of the average of weights that is evaluated; 1: the last ones.
     averaging: Annotated[float, Meta(gt=0, le=1)] = 0.001
     layouts: str | None = None  # None: env.layouts, with generated:train's validation floors
+    # Where the fixed episodes start and end: by their seeds, or as the logged episodes that the
+    # panel holds out (all of them) did, each way at most once.
+    missions: Literal["drawn", "logged", "logged:all"] = "drawn"
     off_policy: bool = False  # evaluate the offline policy on logs, before it drives
 
 

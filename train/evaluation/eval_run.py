@@ -36,7 +36,7 @@ from restock.train.evaluation.ope_dataset import run_panel
 from restock.train.evaluation.policies import load_agent, load_policy
 from restock.train.evaluation.references import FIRST_SEED, REFERENCES, reference
 from restock.train.run.clone_quality import CloneQuality, read_clones
-from restock.train.run.kept_evaluations import LIMITED, add_evaluation
+from restock.train.run.kept_evaluations import LIMITED, WAYS, add_evaluation
 from restock.train.run.measures import summary_rows
 from restock.train.run.run import Run
 from restock.train.run.run_profile import profile_of_run
@@ -101,7 +101,7 @@ class EvaluationPlan:
     @property
     def floors(self) -> str:
         """The floors by name, for the record: logged ways there are other missions."""
-        return self.layouts if self.missions is None else f"{self.layouts}, ways of the logs"
+        return self.layouts if self.missions is None else self.layouts + WAYS
 
     @property
     def warnings(self) -> list[str]:
@@ -109,7 +109,8 @@ class EvaluationPlan:
         chosen = self.config.evaluation
         last = self.first_seed + max(self.episodes.values())
         if self.missions is not None:
-            return [self.missions.text]
+            flattered = "its policy was chosen by such ways: its success is flattered"
+            return [self.missions.text, *([flattered] if chosen.missions != DRAWN else [])]
         if "agent" not in self.policies or not (
             chosen.seed < last and self.first_seed < chosen.seed + chosen.episodes
         ):

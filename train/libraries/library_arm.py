@@ -89,6 +89,7 @@ def resolve(settings: tuple[str, ...], library: Library) -> TrainConfig:
             ("teacher.source", config.teacher.filters),
             ("offline_start.choose", config.offline_start.choose),
             ("practice.rule", config.practice.rule != "natural"),
+            ("evaluation.missions", config.evaluation.missions != "drawn"),
         )
         if bad
     ]

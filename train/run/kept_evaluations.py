@@ -20,6 +20,7 @@ from restock.train.run.run_tables import EVAL_EPISODES
 
 Mission = tuple[str | None, str, int, str]
 FILE = Path("eval") / "episodes.parquet"  # in a run
+WAYS = ", ways of the logs"  # after the floors: missions from logged episodes
 LIMITED = "limited:"  # a policy with the limiter in front of it
 _NAME = ("policy", "version", "layouts", "perturbation", "perturbation_values", "condition")
 
@@ -77,8 +78,10 @@ def mission_of(row: Mapping[str, Any]) -> Mission:
     return row["layouts"], row["condition"], row["episode_seed"], values
 
 
-def shown_evaluation(run: Path) -> tuple[pa.Table, str]:
+def shown_evaluation(run: Path, *, ways: bool = False) -> tuple[pa.Table, str]:
     """The episodes to show and to compare, and in words which they are of how many.
+
+    With `ways` only those on the ways of logs are looked at.
 
     Raises:
         RunError: the file is damaged.
@@ -86,6 +89,12 @@ def shown_evaluation(run: Path) -> tuple[pa.Table, str]:
     table = read_evaluations(run)
     if not table.num_rows:
         return table, ""
+    every = table.num_rows
+    if ways:
+        of_logs = [str(name).endswith(WAYS) for name in table["layouts"].to_pylist()]
+        table = table.filter(pa.array(of_logs, pa.bool_()))
+        if not table.num_rows:
+            return table, ""
     last = table.slice(table.num_rows - 1).to_pylist()[0]
     policies, versions, layouts = (
         table[name].to_pylist() for name in ("policy", "version", "layouts")
@@ -98,7 +107,7 @@ def shown_evaluation(run: Path) -> tuple[pa.Table, str]:
     ]
     shown = table.filter(pa.array(mask, pa.bool_()))
     seeds = shown["episode_seed"]
-    text = f"{shown.num_rows:,} of {table.num_rows:,} episodes that `restock eval` drove: "
+    text = f"{shown.num_rows:,} of {every:,} episodes that `restock eval` drove: "
     text += f"floors {last['layouts'] or 'not named'}, policy {version or 'not named'}, "
     return shown, text + f"seeds {pc.min(seeds).as_py()} to {pc.max(seeds).as_py()}."
 
@@ -116,6 +125,7 @@ def _names(table: pa.Table) -> list[tuple[str, ...]]:
 __all__ = [
     "FILE",
     "LIMITED",
+    "WAYS",
     "Mission",
     "add_evaluation",
     "mission_of",

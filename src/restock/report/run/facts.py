@@ -50,6 +50,8 @@ class Facts:
     failures: Rows
     panel: Panel | None = None
     evaluation: str = ""  # which of the episodes that were driven are shown
+    ways: Rows = field(default_factory=list)  # as `cells`, on the ways of logs, beside those
+    evaluation_on_ways: str = ""  # which they are
     floor: Warehouse | None = None  # that the run drives on, where it is one
     visited: Rows = field(default_factory=list)
     rare: Rows = field(default_factory=list)
@@ -109,6 +111,11 @@ def gather(path: Path) -> Facts:
         rows = {
             name: _as_dicts(connection.execute(sql)) for name, sql in _queries("run.sql").items()
         }
+        on_ways, ways = shown_evaluation(path, ways=True)
+        if ways == shown:  # they are what was driven last, and shown already
+            on_ways, ways = on_ways.slice(0, 0), ""
+        connection.register("evaluated", on_ways)
+        rows["ways"] = _as_dicts(connection.execute(_queries("run.sql")["cells"]))
     if not rows["loss"]:
         raise RunError(
             "has no update to report on yet",
@@ -122,9 +129,11 @@ def gather(path: Path) -> Facts:
             clean.setdefault(row["policy"], []).extend(driven)
         row |= measures(driven)
         row["low"], row["high"] = row["success_low"], row["success_high"]
+    for row in rows["ways"]:
+        row |= measures(row.pop("driven"))
     kept = rows.pop("kept")
     facts = Facts(run=path, config=run.document, kept=kept[0] if kept else None, **rows)  # type: ignore[arg-type]
-    facts.evaluation = shown
+    facts.evaluation, facts.evaluation_on_ways = shown, ways
     facts.clean = {name: measures(driven) for name, driven in clean.items()}
     facts.clones = read_clones(path)
     facts.off_policy = _off_policy(run, facts.twin)

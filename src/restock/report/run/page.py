@@ -21,12 +21,14 @@ from restock.report.run.sections import (
     success,
 )
 from restock.report.run.twin_gap import run_section
+from restock.report.run.ways import ways_section
 
 
 def page(facts: Facts) -> dict[str, Any]:
     """Everything the template asks for."""
     sections = [
         success(facts) if facts.twin else logs_alone.judged_section(facts),
+        ways_section(facts),
         sampled(facts),
         practice_section(facts),
         actions_section(facts),
