@@ -13,7 +13,12 @@ import msgspec
 from restock.errors import ConfigError
 from restock.toml import Checked, read_toml, typed
 from restock.train.comparison.arms import Treatment
-from restock.train.dqn.config import apply_overrides, as_overrides, parse_config
+from restock.train.dqn.config import (
+    EvaluationConfig,
+    apply_overrides,
+    as_overrides,
+    parse_config,
+)
 from restock.train.libraries.library_arm import Library
 from restock.train.study.contrasts import CELLS, RARE, unknown_measure
 from restock.train.study.power import PowerConfig
@@ -185,18 +190,24 @@ def load_study(path: Path) -> Study:
 
 
 def _refuse_judging_by_the_choice(study: Study, where: str) -> None:
-    """The policy that a run keeps is the best on its own fixed episodes: others must judge it."""
-    judged = study.evaluation.seed, study.evaluation.seed + max(study.evaluation.of_kind.values())
     for arm in study.arms:
         sets = [*as_overrides(study.settings), *as_overrides(arm.settings)]
         chosen = parse_config(apply_overrides({}, sets), where=where).evaluation
-        if chosen.seed < judged[1] and judged[0] < chosen.seed + chosen.episodes:
-            raise ConfigError(
-                f"arm {arm.name!r} would be judged by seeds {judged[0]} to {judged[1] - 1}, among"
-                f" them those that choose its policy ({chosen.seed} on)",
-                where=where,
-                remedy="set evaluation.seed of the study apart from settings' evaluation.seed",
-            )
+        refuse_judging_by_the_choice(f"arm {arm.name!r}", chosen, study.evaluation, where)
+
+
+def refuse_judging_by_the_choice(
+    what: str, chosen: EvaluationConfig, evaluation: StudyEvaluation, where: str
+) -> None:
+    """The policy that a run keeps is the best on its own fixed episodes: others must judge it."""
+    judged = evaluation.seed, evaluation.seed + max(evaluation.of_kind.values())
+    if chosen.seed < judged[1] and judged[0] < chosen.seed + chosen.episodes:
+        raise ConfigError(
+            f"{what} would be judged by seeds {judged[0]} to {judged[1] - 1}, among"
+            f" them those that choose its policy ({chosen.seed} on)",
+            where=where,
+            remedy="set evaluation.seed of the study apart from settings' evaluation.seed",
+        )
 
 
 DONE = "study.json"  # in a run that was trained and evaluated as the study asks

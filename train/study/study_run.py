@@ -127,16 +127,28 @@ def _ray_task(plan: StudyPlan, job: StudyJob, folder: str) -> RestockError | Non
 def _build(plan: StudyPlan, arm: ArmConfig, say: Say) -> None:
     """An arm's panel, if it is a mixture that has not been packed yet."""
     out = plan.panel(arm)
-    if out is None or out.exists() or arm.mixture is None or plan.study.store is None:
+    if out is not None and arm.mixture is not None and plan.study.store is not None:
+        log = plan.out / "logs" / "mix.log"
+        pack(
+            plan.study.store,
+            arm.mixture,
+            plan.folder,
+            out,
+            log,
+            lambda n: say(f"{n} for {arm.name}"),
+        )
+
+
+def pack(store: str, mixture: str, folder: Path, out: Path, log: Path, say: Say) -> None:
+    """A panel of a mixture, unless it is there; paths are relative to `folder`."""
+    if out.exists():
         return
-    store = plan.study.store
     if "://" not in store:
-        store = str(plan.folder / store)
-    mixture = plan.folder / arm.mixture
-    name = str(mixture) if mixture.is_file() else arm.mixture
-    say(f"packing {name} for {arm.name}")
+        store = str(folder / store)
+    name = str(folder / mixture) if (folder / mixture).is_file() else mixture
+    say(f"packing {name}")
     out.parent.mkdir(parents=True, exist_ok=True)
-    _restock(["mix", store, "--mixture", name, "--out", str(out)], plan.out / "logs" / "mix.log")
+    restock_verb(["mix", store, "--mixture", name, "--out", str(out)], log)
 
 
 def run_job(plan: StudyPlan, job: StudyJob, say: Say) -> None:
@@ -149,17 +161,18 @@ def run_job(plan: StudyPlan, job: StudyJob, say: Say) -> None:
     evaluation = plan.study.evaluation
     perturbations = ",".join(evaluation.perturbations)
     say(f"{job.path.name}: evaluating")
-    _restock(
+    restock_verb(
         [
             *("eval", str(job.path), "--policies", "agent", "--perturbations", perturbations),
-            *_episodes_flags(evaluation),
+            *episodes_flags(evaluation),
         ],
         log,
     )
     write_text(job.done, plan.fingerprint(job))
 
 
-def _episodes_flags(evaluation: StudyEvaluation) -> list[str]:
+def episodes_flags(evaluation: StudyEvaluation) -> list[str]:
+    """What `restock eval` is told to drive."""
     given = evaluation.episodes
     if isinstance(given, dict):
         text = ",".join(f"{kind}={count}" for kind, count in given.items())
@@ -179,7 +192,7 @@ def _drive_references(plan: StudyPlan, say: Say) -> None:
     say(f"driving {', '.join(evaluation.references)}")
     policies = ",".join(evaluation.references)
     arguments = ["eval", str(path), "--policies", policies, "--perturbations", "none"]
-    _restock([*arguments, *_episodes_flags(evaluation)], plan.out / "logs" / "references.log")
+    restock_verb([*arguments, *episodes_flags(evaluation)], plan.out / "logs" / "references.log")
     write_text(done, asked)
 
 
@@ -209,10 +222,10 @@ def _train(plan: StudyPlan, job: StudyJob, log: Path, say: Say) -> None:
         arguments = ["train", "--out", str(job.path), *sets]
         arguments += ["--panel", str(panel)] if panel is not None else []
     say(f"{job.path.name}: training")
-    _restock(arguments, log)
+    restock_verb(arguments, log)
 
 
-def _restock(arguments: Sequence[str], log: Path) -> None:
+def restock_verb(arguments: Sequence[str], log: Path) -> None:
     """One verb in a process of its own, its words in a log."""
     _command("restock", arguments, log)
 

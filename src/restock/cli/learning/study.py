@@ -19,6 +19,9 @@ class StudyCommand:
     the same command continues an interrupted study. Ends with OUT/study.md and
     OUT/study.json. --power says beforehand what so many seeds can see. See docs/study.md.
 
+    A file with [space] in place of arms is a search of settings with Optuna (`restock[tune]`):
+    the best is the one whose worst condition is best. It ends with OUT/best.toml, too.
+
     Example: `restock study mixtures.toml --out studies/mixtures --workers 2`
     """
 
@@ -44,6 +47,7 @@ class StudyCommand:
         from restock.cli.output import plain, print_json, print_table, say
         from restock.errors import ConfigError, ExitCode
         from restock.files import write_text
+        from restock.toml import read_toml
         from restock.train.study.findings import findings, power_of
         from restock.train.study.page import as_markdown, power_sentence
         from restock.train.study.power import warning
@@ -58,6 +62,8 @@ class StudyCommand:
                 where="--out",
                 remedy="name a directory, or only ask for --power",
             )
+        if "space" in read_toml(self.study):
+            return self._search()
         out = self.out if self.out is not None else self.study.parent
         plan = StudyPlan(load_study(self.study), self.study.parent, out)
         power = power_of(plan)
@@ -106,3 +112,41 @@ class StudyCommand:
             sys.stdout.write(page)
         refused = any(comparison.verdict != "comparable" for comparison in comparisons)
         return int(ExitCode.FAILED if refused else ExitCode.OK)
+
+    def _search(self) -> int:
+        from json import dumps
+
+        from msgspec import to_builtins
+
+        from restock.cli.output import plain, print_json, print_table, say
+        from restock.errors import ConfigError
+        from restock.files import write_text
+        from restock.train.study.space import load_search, settings_of
+        from restock.train.study.tuning import SearchPlan, require_optuna, run_search, search_page
+
+        search = load_search(self.study)
+        if self.out is None or self.power or self.workers != 1 or self.engine != "processes":
+            raise ConfigError(
+                "a search takes --out, and neither --power, --workers nor --engine: its trials"
+                " follow each other",
+                where=str(self.study),
+                remedy="`restock study SEARCH.toml --out DIR`",
+            )
+        if self.dry_run:
+            fixed = " ".join(settings_of(search, {}))
+            rows = [{"key": name, **to_builtins(one)} for name, one in search.parameters.items()]
+            if self.json:
+                print_json({"trials": search.trials, "settings": fixed, "space": rows})
+            else:
+                print_table(rows, title=f"{search.trials} trials of this space; of all: {fixed}")
+            return 0
+        require_optuna()
+        found = run_search(SearchPlan(search, self.study.parent, self.out), say=say)
+        page = search_page(found)
+        write_text(self.out / "study.md", page)
+        write_text(self.out / "study.json", dumps(plain(found), indent=1) + "\n")
+        if self.json:
+            print_json(found)
+        else:
+            sys.stdout.write(page)
+        return 0

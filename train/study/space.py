@@ -1,0 +1,157 @@
+"""A space of settings to search: what its TOML file says, and which settings a trial has.
+
+Every trial is trained with the same seeds and judged on the same episodes; what differs is drawn
+from `[space]`, whose keys are those of `restock train --set`, and `mixture`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+
+from restock.errors import ConfigError
+from restock.toml import Checked, read_toml, typed
+from restock.train.dqn.config import TrainConfig, apply_overrides, as_overrides, parse_config
+from restock.train.study.study import StudyEvaluation, refuse_judging_by_the_choice
+
+Count = Annotated[int, msgspec.Meta(ge=1)]
+MIXTURE = "mixture"  # the one key of a space that is no setting
+
+
+class Parameter(Checked, frozen=True):
+    """One key of a space: a range, or choices."""
+
+    low: float | int | None = None
+    high: float | int | None = None  # itself included
+    log: bool = False
+    step: float | int | None = None
+    choices: tuple[Any, ...] = ()
+
+    def check(self) -> None:
+        ranged = self.low is not None and self.high is not None
+        if ranged == bool(self.choices):
+            raise ValueError("a key of a space has low and high, or choices")
+        if not ranged:
+            return
+        assert self.low is not None
+        assert self.high is not None
+        if self.low >= self.high:
+            raise ValueError(f"low must be below high, got {self.low} and {self.high}")
+        if self.log and (self.low <= 0 or self.step is not None):
+            raise ValueError(f"log must have a low above 0 and no step, got low = {self.low}")
+
+    @property
+    def integers(self) -> bool:
+        """Whether whole numbers are drawn: both ends are."""
+        return isinstance(self.low, int) and isinstance(self.high, int)
+
+
+class Search(Checked, frozen=True):
+    """The whole file."""
+
+    space: dict[str, Any]  # of `Parameter`s, by the keys of `restock train --set`
+    doc: str = ""
+    store: str | None = None  # that mixtures are of
+    mixture: str | None = None  # of the store: a shipped name or a TOML file
+    panel: str | None = None  # one that already exists
+    seeds: tuple[int, ...] = (0,)  # each trial is trained with every one
+    trials: Count = 30
+    sampler: Literal["tpe", "random"] = "tpe"
+    sampler_seed: int = 0
+    prune: bool = True  # by the evaluations that training makes anyway
+    startup_trials: Count = 5  # that are drawn at random and never pruned
+    settings: dict[str, Any] = msgspec.field(default_factory=dict)  # of every trial
+    evaluation: StudyEvaluation = StudyEvaluation()
+
+    def check(self) -> None:
+        if not self.parameters:
+            raise ValueError("space must have a key or more")
+        if self.mixture is not None and self.panel is not None:
+            raise ValueError("panel must not be given beside mixture: choose one")
+        mixed = self.mixture is not None or MIXTURE in self.parameters
+        if mixed and self.store is None:
+            raise ValueError("a mixture is named, and no store")
+        if MIXTURE in self.parameters and (self.panel is not None or self.mixture is not None):
+            raise ValueError("space has mixture: give neither mixture nor panel beside it")
+        if not self.seeds or len(set(self.seeds)) != len(self.seeds):
+            raise ValueError(f"seeds must be one or more, each once, got {list(self.seeds)}")
+        if "seed" in self.settings or "seed" in self.parameters:
+            raise ValueError("seeds are the search's: neither settings nor space may set seed")
+
+    @property
+    def parameters(self) -> dict[str, Parameter]:
+        """Each with its dotted key, quoted in the file or not."""
+        return dict(_flat(self.space, ""))
+
+
+def _flat(table: Mapping[str, Any], prefix: str) -> list[tuple[str, Parameter]]:
+    found: list[tuple[str, Parameter]] = []
+    for key, value in table.items():
+        name = prefix + key
+        if isinstance(value, Parameter):
+            found.append((name, value))
+        elif not isinstance(value, Mapping):
+            what = "must be a table with low and high, or with choices"
+            raise ValueError(f"space.{name} {what}, got {value!r}")
+        elif value.keys() & {"low", "high", "choices"}:
+            try:
+                found.append((name, msgspec.convert(value, Parameter)))
+            except (msgspec.ValidationError, ValueError) as error:
+                raise ValueError(f"space.{name}: {error}") from error
+        else:
+            found += _flat(value, f"{name}.")
+    return found
+
+
+def load_search(path: Path) -> Search:
+    """A search from a TOML file; every end and choice of its space must be a setting.
+
+    Raises:
+        ConfigError: no such file, no TOML, an unknown key or an invalid value; names the key.
+    """
+    remedy = "docs/study.md lists every key with its meaning"
+    search = typed(read_toml(path), Search, where=str(path), remedy=remedy)
+    for name, parameter in search.parameters.items():
+        values = parameter.choices or (parameter.low, parameter.high)
+        for value in () if name == MIXTURE else values:
+            try:
+                _config(search, {name: value}, path)
+            except ConfigError as error:
+                raise ConfigError(
+                    f"`space.{name}` = {value!r}: {error.what}", where=str(path), remedy=remedy
+                ) from error
+    chosen = _config(search, {}, path).evaluation
+    refuse_judging_by_the_choice("every trial", chosen, search.evaluation, str(path))
+    return search
+
+
+def _config(search: Search, values: Mapping[str, Any], path: Path) -> TrainConfig:
+    return parse_config(apply_overrides({}, settings_of(search, values)), where=str(path))
+
+
+def settings_of(search: Search, values: Mapping[str, Any]) -> list[str]:
+    """`key=value` of a trial; the space's win over the search's own."""
+    nested: dict[str, Any] = {}
+    for key, value in values.items():
+        if key == MIXTURE:
+            continue
+        *tables, last = key.split(".")
+        place = nested
+        for table in tables:
+            place = place.setdefault(table, {})
+        place[last] = value
+    return [*as_overrides(search.settings), *as_overrides(nested)]
+
+
+def trial_name(values: Mapping[str, Any]) -> str:
+    """Of a trial's values, 10 hex digits: the same values are the same runs."""
+    content = json.dumps(dict(values), sort_keys=True)
+    return hashlib.blake2b(content.encode(), digest_size=5).hexdigest()
+
+
+__all__ = ["Parameter", "Search", "load_search", "settings_of", "trial_name"]
