@@ -345,7 +345,7 @@ def test_a_condition_is_spelt_one_way(html: str) -> None:
 def test_figures_are_drawn_at_the_size_of_a_phone_and_of_a_desktop(html: str) -> None:
     assert len(re.findall(r'<div class="drawing w300"><svg[^>]* width="300"', html)) >= 7
     assert html.count('<div class="drawing w300">') == html.count(
-        '<div class="drawing w490">'
+        '<div class="drawing w470">'
     ) + html.count('<div class="drawing w1000">')
     sizes = set(re.findall(r'font-size="([\d.]+)px"', html))
     assert sizes == {"12"}

@@ -84,13 +84,14 @@ MAY_IMPORT = {
     "train/twin/calibration": (
         "twin/floors twin/physics replay/store ingest/profile ingest/steps ingest/task"
     ),
-    "report": "look run fleet replay/fleet train/twin/calibration",
+    "report": "look run fleet study replay/fleet replay/store train/twin/calibration",
     "report/look": "",
     "report/run": (
         "look replay/panel replay/store train/evaluation train/run train/twin/calibration"
         " train/twin/floors"
     ),
     "report/fleet": "look replay/fleet replay/store",
+    "report/study": "look",
     "cli": "ingest/steps replay/store",
     "cli/data": (
         "cli ingest ingest/containers ingest/profile ingest/propose ingest/steps ingest/store"
@@ -98,9 +99,13 @@ MAY_IMPORT = {
         " replay/store report train/comparison train/dqn train/evaluation train/twin/physics"
     ),
     "cli/learning": (
-        "cli report ingest/profile ingest/store replay/store replay/trace train train/comparison"
-        " train/diagnosis train/evaluation train/run train/study train/twin/calibration"
+        "cli report ingest/profile ingest/store replay/trace train train/comparison"
+        " train/diagnosis train/evaluation train/run train/study"
         " train/twin/physics train/view"
+    ),
+    "cli/pages": (
+        "report ingest/store replay/fleet replay/mixture replay/store train/twin/calibration"
+        " train/twin/physics cli"
     ),
     "cli/robot": "cli ingest/live ingest/profile ingest/task",
     "cli/start": (

@@ -13,13 +13,13 @@ from restock.stats import (
     clustered_ratio,
     difference_of_arms,
     holm,
+    improvement_of_arms,
     iqm,
     mean_over_strata,
     paired_improvement,
     paired_t,
     paired_t_power,
     percentiles,
-    probability_of_improvement,
     wilson,
 )
 
@@ -61,7 +61,27 @@ def test_bootstrap_is_seeded_and_covers_the_mean() -> None:
 
 
 def test_probability_of_improvement_counts_ties_half() -> None:
-    assert probability_of_improvement(np.array([1.0, 2.0]), np.array([1.0, 0.0])) == 0.875
+    found = improvement_of_arms(
+        np.array([[1.0], [2.0]]), np.array([[1.0], [0.0]]), rng=np.random.default_rng(0)
+    )
+    assert found.value == 0.875
+
+
+def test_the_interval_of_an_improvement_holds_seeds_and_episodes() -> None:
+    """Arms that are alike: the interval holds one half about as often as it says."""
+    rng, held = np.random.default_rng(1), 0
+    for _ in range(60):
+        episodes = rng.normal(size=20)
+        one, other = (
+            episodes + rng.normal(size=(5, 1)) + rng.normal(size=(5, 20)) for _ in range(2)
+        )
+        found = improvement_of_arms(one, other, rng=rng, resamples=200)
+        assert found.low <= found.value <= found.high
+        held += found.low <= 0.5 <= found.high
+    assert held >= 51
+    alone = improvement_of_arms(np.ones((1, 9)), np.zeros((3, 9)), rng=rng)
+    assert alone.value == 1.0
+    assert np.isnan(alone.low)
     assert paired_improvement(np.array([1.0, 2.0]), np.array([1.0, 0.0])) == 0.75
 
 

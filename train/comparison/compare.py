@@ -22,7 +22,7 @@ import pyarrow as pa
 
 from restock.arrays import F64
 from restock.errors import RunError
-from restock.stats import ConfidenceInterval, difference_of_arms, iqm, probability_of_improvement
+from restock.stats import ConfidenceInterval, difference_of_arms, improvement_of_arms, iqm
 from restock.train.comparison.arms import ALLOWED, Arm, Difference, Treatment, differences, feeds
 from restock.train.comparison.comparability import (
     Check,
@@ -159,9 +159,8 @@ def _outcome(
     difference = difference_of_arms(a[..., 0], b[..., 0])
     missing = _why_no_interval(a, b, difference)
     # Episode by episode, over all pairs of runs.
-    better = [
-        probability_of_improvement(b[:, index, 1], a[:, index, 1]) for index in range(a.shape[1])
-    ]
+    better = improvement_of_arms(b[..., 1], a[..., 1], rng=np.random.default_rng(0))
+    few = min(len(a), len(b)) < LEAST_RUNS or a.shape[1] < LEAST_EPISODES
     return {
         "perturbation": cell[0],
         "condition": cell[1],
@@ -173,7 +172,9 @@ def _outcome(
         "difference_high": None if missing else difference.high,
         "no_interval": missing,
         "return_iqm": [iqm(a[..., 1]), iqm(b[..., 1])],
-        "improvement": float(np.mean(better)),
+        "improvement": better.value,
+        "improvement_low": None if few else better.low,
+        "improvement_high": None if few else better.high,
     }
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from restock.stats import paired_t, paired_t_power
 from restock.train.comparison.compare import Comparison
+from restock.train.comparison.curves import learning_curves, training_cost
 from restock.train.run.kept_evaluations import mission_of, planner_times, read_evaluations
 from restock.train.run.measures import cell_name
 from restock.train.study import power as study_power
@@ -37,10 +38,20 @@ def findings(plan: StudyPlan, comparisons: Sequence[Comparison]) -> dict[str, An
         "power": None if power is None else power.as_json(),
         "contrasts": [one.as_json() for one in contrasts(plan, refused)],
         "arms": arms(plan),
+        "curves": learning_curves(_finished(plan)),
+        "cost": training_cost(_finished(plan)),
         "comparisons": [
             {"arm": pair.arm.name, "baseline": pair.baseline.name, **comparison.as_json()}
             for pair, comparison in zip(plan.study.pairs, comparisons, strict=True)
         ],
+    }
+
+
+def _finished(plan: StudyPlan) -> dict[str, Sequence[Path]]:
+    """The finished runs of each arm."""
+    return {
+        arm.name: [path for path in plan.runs(arm) if (path / DONE).exists()]
+        for arm in plan.study.arms
     }
 
 

@@ -50,8 +50,8 @@ def _contrasts(contrasts: list[dict[str, Any]], rare: list[str]) -> list[str]:
         *("", "## Contrasts", ""),
         "Paired by seed, with Student's t interval of 95 % over seeds. `auc` is the area under the"
         " curve of success over environment steps, `success` the kept policy's at the end, `rare`"
-        f" the mean of {', '.join(rare)}. The primary contrast was named before the runs; p of the"
-        " others is adjusted for their number (Holm).",
+        f" the mean of {', '.join(rare).replace('_', ' ')}. The primary contrast was named before"
+        " the runs; p of the others is adjusted for their number (Holm).",
         "",
         "| | measure | arm | baseline | difference | seeds | p | p adjusted |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
@@ -129,11 +129,17 @@ def _comparison(comparison: dict[str, Any]) -> list[str]:
         apart = "**" if known and (low > 0 or high < 0) else ""
         interval = f" [{low:+.2f}, {high:+.2f}]" if known else ""
         lines.append(
-            f"| {row['perturbation']} | {row['condition']} | {_cell(row['success'][0], '.2f')}"
+            f"| {row['perturbation']} | {row['condition'].replace('_', ' ')}"
+            f" | {_cell(row['success'][0], '.2f')}"
             f" | {_cell(row['success'][1], '.2f')} | {apart}{_cell(row['difference'], '+.2f')}"
-            f"{interval}{apart} | {row['improvement']:.2f} |"
+            f"{interval}{apart} | {_improvement(row)} |"
         )
     return lines
+
+
+def _improvement(row: dict[str, Any]) -> str:
+    ends = row.get("improvement_low"), row.get("improvement_high")
+    return interval_text(row["improvement"], *ends)
 
 
 def _cell(value: float | None, form: str) -> str:

@@ -12,12 +12,16 @@ from typing import Any
 
 from restock.files import write_text
 from restock.replay.fleet.drift import Drift
+from restock.replay.store.store import Store
+from restock.report.fleet.coverage import coverage_facts, coverage_page
 from restock.report.fleet.drift import drift_page
 from restock.report.look.write import write_page
 from restock.report.run.card import as_markdown, replay_card
 from restock.report.run.facts import gather
 from restock.report.run.page import page
 from restock.report.run.twin_gap import gap_page
+from restock.report.study.comparison import comparison_page
+from restock.report.study.study import study_page
 from restock.train.twin.calibration.twin_gap import read_gap
 
 
@@ -50,6 +54,30 @@ def write_drift_page(drift: Drift, out: Path) -> Path:
     return write_page(drift_page(drift), out)
 
 
+def write_coverage_page(
+    store: Store, gaps: dict[str, Any], drift: Drift | str, out: Path, figures: Path | None = None
+) -> Path:
+    """Write the page of a store's coverage; returns its path.
+
+    Args:
+        gaps: as `restock gaps --json` prints them.
+        drift: what `measure_drift` found, or why it could not be measured.
+    """
+    return write_page(coverage_page(coverage_facts(store), gaps, drift), out, figures)
+
+
+def write_study_page(
+    study: dict[str, Any], out: Path, name: str = "", figures: Path | None = None
+) -> Path:
+    """Write the page of a study from its findings (`study.json`); returns its path."""
+    return write_page(study_page(study, name), out, figures)
+
+
+def write_comparison_page(found: dict[str, Any], out: Path, figures: Path | None = None) -> Path:
+    """Write the page of a comparison (`restock compare --json`); returns its path."""
+    return write_page(comparison_page(found), out, figures)
+
+
 def write_card(run: Path) -> tuple[dict[str, Any], str]:
     """Write the replay card into a run directory; returns it as JSON values and as Markdown.
 
@@ -63,4 +91,12 @@ def write_card(run: Path) -> tuple[dict[str, Any], str]:
     return card, markdown
 
 
-__all__ = ["build_report", "write_card", "write_drift_page", "write_gap_page"]
+__all__ = [
+    "build_report",
+    "write_card",
+    "write_comparison_page",
+    "write_coverage_page",
+    "write_drift_page",
+    "write_gap_page",
+    "write_study_page",
+]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -39,11 +40,13 @@ class CompareCommand:
     """What is compared, and so may differ."""
     all_checks: bool = False
     """Show every check, not only the deciding ones."""
+    page: Path | None = None
+    """Write a page (HTML) that opens without a network. Replaces what is there."""
     json: bool = False
     """Print the verdict, the differences, the checks and the outcomes as JSON."""
 
     def run(self) -> int:
-        from restock.cli.output import print_json
+        from restock.cli.output import print_json, say
         from restock.errors import ConfigError, ExitCode
         from restock.train.comparison.compare import compare
 
@@ -57,11 +60,44 @@ class CompareCommand:
                 )
             first, second = first[:1], first[1:]
         comparison = compare(first, second, treatment=self.treatment)
+        if self.page is not None:
+            say(f"wrote {_write(comparison, first, second, self.page)}")
         if self.json:
             print_json(comparison.as_json())
         else:
             _show(comparison, self.all_checks)
         return int(ExitCode.OK if comparison.verdict == "comparable" else ExitCode.FAILED)
+
+
+def _write(
+    comparison: Comparison, first: Sequence[Path], second: Sequence[Path], out: Path
+) -> Path:
+    """The page, with what the comparison itself does not need: curves and cost."""
+    from restock.cli.output import plain
+    from restock.report import write_comparison_page
+    from restock.train.comparison.curves import learning_curves, training_cost
+
+    names = _names(first, second)
+    arms = dict(zip(names, (first, second), strict=True))
+    found = {
+        **comparison.as_json(),
+        "names": names,
+        "sentence": _sentence(comparison),
+        "curves": learning_curves(arms),
+        "cost": training_cost(arms),
+        "runs": {name: [str(path) for path in paths] for name, paths in arms.items()},
+    }
+    return write_comparison_page(plain(found), out)
+
+
+def _names(first: Sequence[Path], second: Sequence[Path]) -> tuple[str, str]:
+    """What the arms are called: their run, or what all of their runs are called but for a seed."""
+    names = []
+    for paths in (first, second):
+        bare = {path.name.rstrip("-_.0123456789") for path in paths}
+        names.append(paths[0].name if len(paths) == 1 else bare.pop() if len(bare) == 1 else "")
+    one, other = names
+    return (one, other) if one and other and one != other else ("first", "second")
 
 
 def _show(comparison: Comparison, all_checks: bool) -> None:
@@ -119,6 +155,8 @@ def _check(check: Any) -> dict[str, Any]:
 
 
 def _outcome(row: dict[str, Any]) -> dict[str, Any]:
+    from restock.stats import interval_text
+
     low, high = row["difference_low"], row["difference_high"]
     return {
         "perturbation": row["perturbation"],
@@ -128,7 +166,9 @@ def _outcome(row: dict[str, Any]) -> dict[str, Any]:
         "second": _success(row["success"][1]),
         "difference [95 %]": ("" if row["difference"] is None else f"{row['difference']:+.2f}")
         + ("" if low is None else f" [{low:+.2f}, {high:+.2f}]"),
-        "P(second better)": f"{row['improvement']:.2f}",
+        "P(second better) [95 %]": interval_text(
+            row["improvement"], row["improvement_low"], row["improvement_high"]
+        ),
     }
 
 

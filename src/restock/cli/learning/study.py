@@ -16,8 +16,8 @@ class StudyCommand:
 
     The study is a TOML file: a store, arms (a mixture or a panel, and settings), seeds, what is
     compared. Each run is a directory under OUT/runs. What already exists is not done again, so
-    the same command continues an interrupted study. Ends with OUT/study.md and
-    OUT/study.json. --power says beforehand what so many seeds can see. See docs/study.md.
+    the same command continues an interrupted study. Ends with OUT/study.md, study.json and a page,
+    study.html. --power says beforehand what so many seeds can see. See docs/study.md.
 
     A file with [space] in place of arms is a search of settings with Optuna (`restock[tune]`):
     the best is the one whose worst condition is best. It ends with OUT/best.toml, too.
@@ -47,6 +47,7 @@ class StudyCommand:
         from restock.cli.output import plain, print_json, print_table, say
         from restock.errors import ConfigError, ExitCode
         from restock.files import write_text
+        from restock.report import write_study_page
         from restock.toml import read_toml
         from restock.train.study.findings import findings, power_of
         from restock.train.study.page import as_markdown, power_sentence
@@ -106,6 +107,7 @@ class StudyCommand:
         page = as_markdown(document)
         write_text(out / "study.md", page)
         write_text(out / "study.json", dumps(plain(document), indent=1) + "\n")
+        say(f"wrote {write_study_page(plain(document), out / 'study.html', self.study.stem)}")
         if self.json:
             print_json(document)
         else:

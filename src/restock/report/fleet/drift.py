@@ -34,7 +34,7 @@ def drift_page(drift: Drift) -> dict[str, Any]:
     periods = {row["period"] for row in drift.periods}
     own = [row for row in drift.tests if row["against"] == OWN]
     sections = [
-        _findings_section(drift),
+        findings_section(drift),
         _overview_section(drift, own),
         _conditions_section(drift, own),
         _differences_section(drift),
@@ -83,7 +83,7 @@ def headline(drift: Drift) -> str:
     return "Nothing has changed by what matters, as far as these logs can tell"
 
 
-def _findings_section(drift: Drift) -> Section:
+def findings_section(drift: Drift) -> Section:
     rows = [
         {
             "robot": row["robot"],

@@ -35,7 +35,7 @@ class Figure:
 
     @property
     def shown(self) -> list[tuple[str, str]]:
-        """A class of CSS (`w490`) and the SVG; the page shows the widest that fits."""
+        """A class of CSS (`w470`) and the SVG; the page shows the widest that fits."""
         if len(self.drawing) == 1:
             return [("any", self.widest)]
         return [(f"w{width}", svg) for width, svg in sorted(self.drawing.items())]

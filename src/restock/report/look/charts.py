@@ -20,7 +20,7 @@ from restock.report.look.blocks import Drawing, words
 
 Row = Mapping[str, Any]
 
-HALF = (300, 490)  # of a figure that shares a line with another on a desktop
+HALF = (300, 470)  # of a figure that shares a line with another on a desktop
 FULL = (300, 630, 1000)  # of one with the line for itself
 
 # Okabe-Ito: colour-blind readers can distinguish them too.
@@ -111,10 +111,11 @@ def scale(names: Sequence[str], colours: Mapping[str, str]) -> alt.Scale:
     return alt.Scale(domain=list(names), range=[colours.get(name) or next(spare) for name in names])
 
 
-def legend(names: Sequence[str], width: int) -> alt.Legend:
-    """Above the chart, in as many columns as fit."""
+def legend(names: Sequence[str], width: int, labels_px: int = 60) -> alt.Legend:
+    """Above the chart, in as many columns as fit beside the labels of its vertical axis."""
     each = max((len(name) for name in names), default=1) * LETTER_PX + 36
-    return alt.Legend(columns=max(1, min(len(names), int((width - 20) // each))))
+    columns = max(1, min(len(names), int((width - labels_px) // each)))
+    return alt.Legend(columns=columns, symbolOpacity=1)
 
 
 def label_px(names: Sequence[str]) -> int:
@@ -156,7 +157,7 @@ def success(rows: Sequence[Row]) -> Drawing:
                 "policy:N",
                 scale=scale(policies, POLICY_COLOURS),
                 sort=policies,
-                legend=legend(policies, width),
+                legend=legend(policies, width, label_px(cells)),
             ),
         )
         percent = alt.Axis(format="%", values=[0, 0.25, 0.5, 0.75, 1])

@@ -15,7 +15,7 @@ Row = Mapping[str, Any]
 Box = tuple[float, float, float, float]  # x0, y0, x1, y1 in metres
 SCALE = 40  # SVG units a metre
 BAR_M = 2  # the length of the bar below a map
-MAP_PX = 490
+MAP_PX = 470
 
 
 @dataclass(frozen=True)

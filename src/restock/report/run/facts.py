@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from restock.replay.panel.panel import Panel
 from restock.replay.panel.strata import Stratum
 from restock.replay.store.store import Store
 from restock.report.look.blocks import Rows, words
+from restock.report.look.queries import ask, rows_of, statements
 from restock.train.run.clone_quality import CloneQuality, read_clones
 from restock.train.run.kept_evaluations import shown_evaluation
 from restock.train.run.measures import measures
@@ -22,6 +22,7 @@ from restock.train.run.run import Run
 from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 
+PACKAGE = "restock.report.run"
 CELL_M = 0.25
 NO_GOAL = "The task has no goal: success is not defined, and no evaluation shows it."
 MOST_DOTS = 1500
@@ -109,7 +110,8 @@ def gather(path: Path) -> Facts:
         evaluated, shown = shown_evaluation(path)
         connection.register("evaluated", evaluated)
         rows = {
-            name: _as_dicts(connection.execute(sql)) for name, sql in _queries("run.sql").items()
+            name: rows_of(connection.execute(sql))
+            for name, sql in statements(PACKAGE, "run.sql").items()
         }
         on_ways, ways = shown_evaluation(path, ways=True)
         if ways == shown:  # they are what was driven last, and shown already
@@ -202,20 +204,7 @@ def _add_floor(facts: Facts) -> None:
 
 
 def _store_rows(store: Store, name: str, **parameters: Any) -> Rows:
-    sql = _queries("store.sql")[name]
-    return _as_dicts(store.connection.execute(sql, parameters or None))
-
-
-def _queries(name: str) -> dict[str, str]:
-    """The statements of a file, by the `-- name:` line before each."""
-    text = (files("restock.report.run") / name).read_text(encoding="utf-8")
-    parts = text.split("-- name: ")[1:]
-    return {part.split("\n", 1)[0].strip(): part.split("\n", 1)[1] for part in parts}
-
-
-def _as_dicts(cursor: duckdb.DuckDBPyConnection) -> Rows:
-    names = [column[0] for column in cursor.description or ()]
-    return [dict(zip(names, row, strict=True)) for row in cursor.fetchall()]
+    return ask(store.connection, statements(PACKAGE, "store.sql")[name], **parameters)
 
 
 def mean_success(cells: Rows) -> float:

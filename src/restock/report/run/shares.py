@@ -146,7 +146,7 @@ def _drawn(rows: Rows) -> Drawing:
                     "kind:N",
                     scale=charts.scale(kinds, COLOURS),
                     sort=kinds,
-                    legend=charts.legend(kinds, width),
+                    legend=charts.legend(kinds, width, charts.label_px(strata)),
                 ),
             )
             .properties(height=52 * max(len(strata), 1))

@@ -177,7 +177,7 @@ def _positions(rows: Rows) -> Drawing:
                 "source:N",
                 scale=charts.scale(sources, COLOURS),
                 sort=sources,
-                legend=charts.legend(sources, width),
+                legend=charts.legend(sources, width, charts.label_px(conditions)),
             ),
         )
         bars = base.mark_rule(strokeWidth=3, opacity=0.45).encode(

@@ -1,0 +1,361 @@
+"""The page of a store's coverage: shelves, weeks, robots, the map, drift and the shopping list."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Any
+
+import altair as alt
+
+from restock import __version__
+from restock.replay.fleet.drift import Drift
+from restock.replay.store.store import Store
+from restock.report.fleet.drift import findings_section
+from restock.report.fleet.drift import headline as drift_headline
+from restock.report.look import charts, floor_map
+from restock.report.look.blocks import (
+    Drawing,
+    Figure,
+    Rows,
+    Section,
+    Table,
+    count,
+    percent,
+    words,
+)
+from restock.report.look.queries import ask, statements
+
+MOST_DOTS = 1500
+MOST_CELLS_ACROSS = 90  # of the map
+MOST_GAPS = 20  # in the table
+PALE_ROWS = 0.5  # where a bar of the logarithmic axis begins
+
+
+def coverage_facts(store: Store) -> dict[str, Rows]:
+    """The rows behind every figure of the page."""
+    sql = statements("restock.report.fleet", "coverage.sql")
+    names = ("shelves", "weeks", "robots", "totals", "bounds")
+    found = {name: ask(store.connection, sql[name]) for name in names}
+    (bounds,) = found["bounds"]
+    across = max((bounds["x1"] or 0.0) - (bounds["x0"] or 0.0), 1.0)
+    cell_m = max(0.25, math.ceil(across / MOST_CELLS_ACROSS / 0.25) * 0.25)
+    bounds["cell_m"] = cell_m
+    found["visited"] = ask(store.connection, sql["visited"], cell_m=cell_m)
+    found["rare"] = ask(store.connection, sql["rare"], most=MOST_DOTS)
+    return found
+
+
+def coverage_page(
+    found: dict[str, Rows], gaps: dict[str, Any], drift: Drift | str
+) -> dict[str, Any]:
+    """Everything the template asks for.
+
+    Args:
+        found: of `coverage_facts`.
+        gaps: as `restock gaps --json` prints them.
+        drift: what was measured, or why nothing was.
+    """
+    (totals,) = found["totals"]
+    sections = [
+        _shelves(found["shelves"]),
+        _shopping(gaps),
+        _weeks(found["weeks"]),
+        _robots(found["robots"]),
+        _map(found),
+        _drift(drift),
+    ]
+    plan = gaps["plan"]
+    return {
+        "kicker": "coverage of a store",
+        "title": f"Coverage of {gaps['store']}",
+        "headline": headline(found["shelves"], gaps),
+        "lead": f"What the logs hold of each condition, and what mixture {gaps['mixture']} and the"
+        " audits ask for and do not find.",
+        "cards": [
+            {"value": count(totals["rows"]), "label": "transitions"},
+            {"value": count(totals["episodes"]), "label": "episodes"},
+            {"value": count(totals["recordings"]), "label": "recordings"},
+            {"value": count(len({row["robot"] for row in found["robots"]})), "label": "robots"},
+            {"value": count(len(gaps["gaps"])), "label": "gaps"},
+            {
+                "value": _amount(plan["total"]),
+                "label": f"{gaps['unit']} to log next (95 %: {_amount(plan['total_low'])} to"
+                f" {_amount(plan['total_high'])})",
+            },
+        ],
+        "sections": [section for section in sections if section is not None],
+        "footer": f"restock {__version__} · written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC from"
+        f" {gaps['store']}, version {gaps['store_version']}",
+    }
+
+
+def headline(shelves: Rows, gaps: dict[str, Any]) -> str:
+    """The emptiest shelf against what is asked for, and what filling all of them takes."""
+    if gaps["closed"]:
+        return f"No gaps: the store has all that {gaps['mixture']} asks for"
+    short = [gap for gap in gaps["gaps"] if gap["needed"]]
+    worst = min(short, key=lambda gap: gap["there"] / gap["needed"], default=None)
+    text = ""
+    if worst is not None:
+        text = (
+            f"Shortest of {words(worst['cell'])}: {worst['there']:,} of {worst['needed']:,}"
+            f" {worst['counted']}"
+        )
+    never = [words(row["condition"]) for row in shelves if not row["rows"]]
+    if never:
+        text += f"; never seen: {', '.join(never)}"
+    plan = gaps["plan"]
+    if plan["orders"]:
+        text += (
+            f"; {_amount(plan['total'])} {gaps['unit']} [{_amount(plan['total_low'])},"
+            f" {_amount(plan['total_high'])}] would fill what can be filled"
+        )
+    return text.removeprefix("; ")
+
+
+def _shelves(rows: Rows) -> Section:
+    table = [
+        {
+            "condition": words(row["condition"]),
+            "rows": count(row["rows"]),
+            "share": percent(row["share"]),
+            "episodes": count(row["episodes"]),
+            "effective episodes": f"{row['effective_episodes']:.1f}",
+            "rows where it holds": count(row["rows_held"]),
+            "success": "" if row["success_share"] is None else f"{row['success_share']:.0%}",
+            "zones": count(row["zones"]),
+            "recordings": count(row["recordings"]),
+            "who drove": ", ".join(str(name) for name in row["behaviour_policies"] if name),
+        }
+        for row in rows
+    ]
+    return Section(
+        "shelves",
+        "The shelves",
+        intro="One shelf a condition. A row lies on the shelf of its rarest condition; it holds for"
+        " others too. Effective episodes: how many equally long ones it would be.",
+        figures=[Figure(_bars(rows), "Rows of each condition (logarithmic)")] if rows else [],
+        two=True,
+        tables=[Table(table, set(table[0]) - {"condition", "who drove"} if table else set())],
+    )
+
+
+def _bars(rows: Rows) -> Drawing:
+    shown = [
+        {
+            "condition": words(row["condition"]),
+            "rows": row["rows"],
+            "from": PALE_ROWS,
+            "to": max(row["rows"], PALE_ROWS),
+            "text": f"{row['rows']:,}",
+        }
+        for row in rows
+    ]
+    names = [row["condition"] for row in shown]
+
+    def chart(width: int) -> Any:
+        base = charts.plot(shown).encode(
+            y=alt.Y("condition:N", sort=names, title=None, axis=alt.Axis(grid=False, ticks=False))
+        )
+        most = max(row["to"] for row in shown)
+        scale = alt.Scale(type="log", domain=[PALE_ROWS, most * 8])
+        x = alt.X("to:Q", title="rows", scale=scale, axis=charts.x_axis(width))
+        bars = base.mark_bar(cornerRadiusEnd=2).encode(
+            x=x,
+            x2="from:Q",
+            color=alt.Color(
+                "condition:N", scale=charts.scale(names, charts.WORDS_COLOURS), legend=None
+            ),
+        )
+        texts = base.mark_text(align="left", dx=5, fontSize=12, color="#475569").encode(
+            x=x, text="text:N"
+        )
+        return alt.layer(bars, texts).properties(height=30 * len(names))
+
+    return charts.draw(chart)
+
+
+def _shopping(gaps: dict[str, Any]) -> Section:
+    unit, plan = gaps["unit"], gaps["plan"]
+    if gaps["closed"]:
+        return Section("shopping", "What to log next", intro="Nothing: there are no gaps.")
+    orders = [
+        {
+            "kind": words(order["kind"] or "logging"),
+            "zone": words(order["zone"] or ""),
+            "robot": order["robot"] or "",
+            **({"missions": count(order["missions"])} if unit == "missions" else {}),
+            "hours": f"{order['hours']:.2f}",
+            "fills": "; ".join(words(name) for name in dict.fromkeys(order["fills"])),
+        }
+        for order in plan["orders"]
+    ]
+    ordered = sorted(gaps["gaps"], key=lambda gap: gap["there"] / max(gap["needed"], 1))
+    table = [
+        {
+            "gap": words(gap["cell"]),
+            "there": count(gap["there"]),
+            "needed": count(gap["needed"]),
+            "of": gap["counted"],
+            unit: ""
+            if gap["amount"] is None
+            else f"{_amount(gap['amount'])} [{_amount(gap['amount_low'])},"
+            f" {_amount(gap['amount_high'])}]",
+            "best": "never seen: no rate is known" if gap["best"] is None else words(gap["best"]),
+            "asked by": gap["asked_by"],
+        }
+        for gap in ordered[:MOST_GAPS]
+    ]
+    left = len(gaps["gaps"]) - len(table)
+    return Section(
+        "shopping",
+        "What to log next",
+        intro=f"The least number of {unit} that fills every gap with {gaps['confidence']:.0%},"
+        " at the rates of the store's own episodes; intervals are 95 %. `restock gaps"
+        " --missions-out FILE` writes it as missions to drive.",
+        tables=[
+            Table(_without_empty(orders), {"missions", "hours"}, title="The shopping list"),
+            Table(
+                table,
+                {"there", "needed", unit},
+                title="What is missing",
+                caption=f"{left:,} more gaps: `restock gaps --json` has all." if left else "",
+            ),
+        ],
+    )
+
+
+def _without_empty(rows: Rows) -> Rows:
+    """Without the columns that say nothing in any row."""
+    told = {name for row in rows for name, value in row.items() if value != ""}
+    return [{name: value for name, value in row.items() if name in told} for row in rows]
+
+
+def _amount(value: float) -> str:
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
+
+
+def _weeks(rows: Rows) -> Section | None:
+    if not rows:
+        return None
+    shown = [
+        {
+            "week": "not known" if row["week"] is None else str(row["week"]),
+            "condition": words(row["condition"]),
+            "rows": row["rows"],
+        }
+        for row in rows
+    ]
+    names = charts.ordered(shown, "condition", charts.WORDS_COLOURS)
+
+    def chart(width: int) -> Any:
+        return (
+            charts.plot(shown)
+            .mark_bar()
+            .encode(
+                x=alt.X("week:O", title=None, axis=alt.Axis(labelAngle=-60, grid=False)),
+                y=alt.Y("rows:Q", title="rows", axis=alt.Axis(format="~s")),
+                color=alt.Color(
+                    "condition:N",
+                    scale=charts.scale(names, charts.WORDS_COLOURS),
+                    sort=names,
+                    legend=charts.legend(names, width),
+                ),
+            )
+            .properties(height=200)
+        )
+
+    weeks = len({row["week"] for row in shown})
+    return Section(
+        "weeks",
+        "When was it logged?",
+        intro=f"Rows by week of logging (Mondays), {weeks} week{'s' * (weeks != 1)}.",
+        figures=[Figure(charts.draw(chart), "Rows by week")],
+        two=True,
+    )
+
+
+def _robots(rows: Rows) -> Section | None:
+    if not rows:
+        return None
+    robots = sorted({row["robot"] for row in rows})
+    names = charts.ordered(
+        [{"condition": words(row["condition"])} for row in rows],
+        "condition",
+        charts.WORDS_COLOURS,
+    )
+    cells = {(row["robot"], words(row["condition"])): row for row in rows}
+    hours = {
+        robot: sum(row["hours"] or 0.0 for row in rows if row["robot"] == robot) for robot in robots
+    }
+    table = [
+        {
+            "robot": robot,
+            "hours": f"{hours[robot]:.2f}",
+            **{
+                name: f"{cells[robot, name]['rows']:,} ({percent(cells[robot, name]['share'])})"
+                if (robot, name) in cells
+                else "none"
+                for name in names
+            },
+        }
+        for robot in robots
+    ]
+    return Section(
+        "robots",
+        "Which robot saw what?",
+        intro="Rows of each condition, and their share of the robot's own. A condition that one"
+        " robot alone has seen is learnt with that robot's wheels.",
+        tables=[Table(table, {"hours", *names})],
+    )
+
+
+def _map(found: dict[str, Rows]) -> Section | None:
+    (bounds,) = found["bounds"]
+    if not found["visited"] or bounds["x0"] is None:
+        return None
+    margin = 0.5
+    x0, y0 = bounds["x0"] - margin, bounds["y0"] - margin
+    plan = floor_map.FloorMap(bounds["x1"] + margin - x0, bounds["y1"] + margin - y0, [])
+
+    def moved(rows: Rows) -> Rows:
+        return [{**row, "x_m": row["x_m"] - x0, "y_m": row["y_m"] - y0} for row in rows]
+
+    cell_m = bounds["cell_m"]
+    conditions = charts.ordered(found["rare"], "condition", charts.CONDITION_COLOURS)
+    return Section(
+        "map",
+        "Where was it logged?",
+        figures=[
+            Figure(
+                floor_map.visited(plan, moved(found["visited"]), cell_m),
+                "Where the robots have been",
+                f"Logged steps in cells of {cell_m:g} m, darker where there are more (logarithmic);"
+                f" the bar is {floor_map.BAR_M} m. Poses are in the map frame, from"
+                f" ({x0:.1f}, {y0:.1f}) m.",
+            ),
+            Figure(
+                floor_map.events(plan, moved(found["rare"]), []),
+                "Where rare conditions were met",
+                floor_map.legend(conditions),
+            ),
+        ],
+        two=True,
+    )
+
+
+def _drift(drift: Drift | str) -> Section:
+    if isinstance(drift, str):
+        return Section("drift", "Has a robot changed?", intro=f"Not measured: {drift}")
+    section = findings_section(drift)
+    return replace(
+        section,
+        id="drift",
+        title="Has a robot changed?",
+        callout=section.callout or drift_headline(drift) + ".",
+    )
+
+
+__all__ = ["coverage_facts", "coverage_page", "headline"]

@@ -1,0 +1,45 @@
+-- What the page of a store's coverage shows, one statement a fact.
+
+-- name: shelves
+SELECT condition, rows, share, episodes, rows_held, episodes_held, effective_episodes,
+       success_share, recordings, zones, behaviour_policies
+FROM coverage_by_condition;
+
+-- name: weeks
+-- A condition's part of a week's rows, over all robots.
+SELECT week, condition, CAST(sum(rows) AS BIGINT) AS rows, sum(hours) AS hours
+FROM coverage_by_week
+WHERE rows > 0
+GROUP BY week, condition
+ORDER BY week, condition;
+
+-- name: robots
+SELECT coalesce(robot, 'untagged') AS robot, condition, rows, share, hours
+FROM coverage_by_robot
+WHERE rows > 0
+ORDER BY robot, condition;
+
+-- name: bounds
+SELECT min(pose_x_m) AS x0, min(pose_y_m) AS y0, max(pose_x_m) AS x1, max(pose_y_m) AS y1
+FROM transitions;
+
+-- name: visited
+SELECT floor(pose_x_m / $cell_m) * $cell_m AS x_m,
+       floor(pose_y_m / $cell_m) * $cell_m AS y_m,
+       count(*) AS rows
+FROM transitions
+WHERE pose_x_m IS NOT NULL
+GROUP BY ALL
+ORDER BY ALL;
+
+-- name: rare
+SELECT pose_x_m AS x_m, pose_y_m AS y_m, condition
+FROM transitions
+WHERE condition <> 'nominal' AND pose_x_m IS NOT NULL
+ORDER BY hash(transition_id)
+LIMIT $most;
+
+-- name: totals
+SELECT count(*) AS rows, count(DISTINCT episode_id) AS episodes,
+       count(DISTINCT recording_id) AS recordings
+FROM transitions;

@@ -1,0 +1,1 @@
+"""Pages about methods beside each other: a comparison, and a study of several arms."""

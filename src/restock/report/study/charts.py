@@ -1,0 +1,166 @@
+"""The charts of methods beside each other, as rliable draws them (arXiv:2108.13264).
+
+Intervals by condition, the probability of improvement, and learning curves with bands over seeds.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import altair as alt
+
+from restock.report.look import charts
+from restock.report.look.blocks import Drawing, Rows, words
+
+ARM_COLOURS = ("#0f766e", "#b45309", "#7c3aed", "#0072b2", "#cc79a7", "#84643a", "#6b7280")
+_QUIET = alt.Axis(grid=False, ticks=False)
+
+
+def colours(arms: list[str]) -> dict[str, str]:
+    """A colour an arm, the same in every chart of a page."""
+    return {arm: ARM_COLOURS[place % len(ARM_COLOURS)] for place, arm in enumerate(arms)}
+
+
+def intervals(rows: Rows, arms: list[str]) -> Drawing:
+    """Success by condition: rows of arm, condition, value, low, high (None: no interval)."""
+    conditions = _conditions(rows)
+    shown = [{**row, "condition": words(row["condition"])} for row in rows]
+    known = [row for row in shown if row["low"] is not None]
+
+    def chart(width: int) -> Any:
+        def base(of: Rows) -> Any:
+            return charts.plot(of).encode(
+                y=alt.Y("condition:N", sort=conditions, title=None, axis=_QUIET),
+                yOffset=alt.YOffset("arm:N", sort=arms),
+                color=alt.Color(
+                    "arm:N",
+                    scale=charts.scale(arms, colours(arms)),
+                    sort=arms,
+                    legend=charts.legend(arms, width, charts.label_px(conditions)),
+                ),
+            )
+
+        bars = (
+            base(known)
+            .mark_bar(size=10, opacity=0.35)
+            .encode(x=alt.X("low:Q", title="success", axis=alt.Axis(format="%")), x2="high:Q")
+        )
+        ticks = (
+            base(shown)
+            .mark_tick(thickness=3, size=14)
+            .encode(x=alt.X("value:Q", title="success", axis=alt.Axis(format="%")))
+        )
+        layers = [bars, ticks] if known else [ticks]
+        return alt.layer(*layers).properties(height=(16 * len(arms) + 18) * len(conditions))
+
+    return charts.draw(chart)
+
+
+def differences(rows: Rows) -> Drawing:
+    """Outcomes of a comparison: difference in success by condition, perturbations side by side."""
+    shown = _outcomes(rows)
+    return _forest(shown, "difference", "difference in success (points)", 0.0, scale=None)
+
+
+def improvements(rows: Rows) -> Drawing:
+    """Outcomes of a comparison: the probability that the second arm's return is higher."""
+    shown = _outcomes(rows)
+    return _forest(shown, "improvement", "P(higher return)", 0.5, scale=alt.Scale(domain=[0, 1]))
+
+
+def _forest(
+    rows: Rows, value: str, title: str, neutral: float, *, scale: alt.Scale | None
+) -> Drawing:
+    """A dot and its interval a condition, beside the value that says nothing."""
+    conditions = _conditions(rows)
+    perturbations = list(dict.fromkeys(row["perturbation"] for row in rows))
+    low, high = f"{value}_low", f"{value}_high"
+
+    def chart(width: int) -> Any:
+        base = charts.plot(rows).encode(
+            y=alt.Y("condition:N", sort=conditions, title=None, axis=_QUIET),
+            yOffset=alt.YOffset("perturbation:N", sort=perturbations),
+            color=alt.Color(
+                "perturbation:N",
+                sort=perturbations,
+                scale=charts.scale(perturbations, colours(perturbations)),
+                legend=charts.legend(perturbations, width, charts.label_px(conditions))
+                if len(perturbations) > 1
+                else None,
+            ),
+        )
+        position = {"scale": scale} if scale is not None else {}
+        dots = base.mark_circle(size=70, opacity=1).encode(
+            x=alt.X(f"{value}:Q", title=title, **position)
+        )
+        bars = (
+            base.transform_filter(f"isValid(datum.{low})")
+            .mark_rule(strokeWidth=3, opacity=0.5)
+            .encode(x=alt.X(f"{low}:Q", title=title, **position), x2=f"{high}:Q")
+        )
+        rule = charts.plot([{"at": neutral}]).mark_rule(strokeDash=[4, 3], color="#475569")
+        layers = alt.layer(rule.encode(x="at:Q"), bars, dots)
+        return layers.properties(height=(16 * len(perturbations) + 18) * len(conditions))
+
+    return charts.draw(chart)
+
+
+def curves(rows: Rows, arms: list[str]) -> Drawing:
+    """Success over environment steps, a panel a condition, bands where there are intervals."""
+    conditions = _conditions(rows)
+    shown = [{**row, "condition": words(row["condition"])} for row in rows]
+
+    def chart(width: int) -> Any:
+        across = 1 if width < 600 else 2 if width < 900 else min(len(conditions), 4)
+        base = charts.plot(shown).encode(
+            x=alt.X("env_steps:Q", title="environment steps", axis=charts.x_axis(width // across)),
+            color=alt.Color(
+                "arm:N",
+                scale=charts.scale(arms, colours(arms)),
+                sort=arms,
+                legend=charts.legend(arms, width),
+            ),
+        )
+        axis, domain = alt.Axis(format="%"), alt.Scale(domain=[0, 1])
+        band = (
+            base.transform_filter("isValid(datum.low)")
+            .mark_area(opacity=0.18)
+            .encode(y=alt.Y("low:Q", title="success", axis=axis, scale=domain), y2="high:Q")
+        )
+        line = base.mark_line(strokeWidth=2, point={"size": 26, "filled": True}).encode(
+            y=alt.Y("success:Q", title="success", axis=axis, scale=domain)
+        )
+        each = alt.layer(band, line).properties(
+            width=(width - 70) // across - 20, height=170 if across > 1 else 140
+        )
+        header = alt.Header(labelAnchor="start")
+        return each.facet(
+            facet=alt.Facet("condition:N", sort=conditions, header=header), columns=across
+        )
+
+    return charts.draw(chart, charts.FULL)
+
+
+def _outcomes(rows: Rows) -> Rows:
+    """With words for names, and differences in points."""
+    points = ("difference", "difference_low", "difference_high")
+    return [
+        {
+            "perturbation": "clean" if row["perturbation"] == "none" else row["perturbation"],
+            "condition": words(row["condition"]),
+            **{name: None if row[name] is None else 100 * row[name] for name in points},
+            "improvement": row["improvement"],
+            "improvement_low": row.get("improvement_low"),
+            "improvement_high": row.get("improvement_high"),
+        }
+        for row in rows
+    ]
+
+
+def _conditions(rows: Rows) -> list[str]:
+    """In the order that every page has them, as words."""
+    named = [{"condition": words(row["condition"])} for row in rows]
+    return charts.ordered(named, "condition", charts.WORDS_COLOURS)
+
+
+__all__ = ["colours", "curves", "differences", "improvements", "intervals"]

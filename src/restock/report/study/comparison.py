@@ -1,0 +1,262 @@
+"""A comparison as sections, and as a page by itself: the verdict of the gate first."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any
+
+from restock import __version__
+from restock.report.look.blocks import Figure, Rows, Section, Table, count, number, span, words
+from restock.report.study import charts
+from restock.stats import interval_text
+
+MOST_NAMED = 3
+_KINDS = {"comparable": "good", "inconclusive": "open", "incomparable": "bad"}
+_INTERVALS = (
+    "Intervals are 95 %, over seeds and episodes; where there are fewer than three seeds or ten"
+    " episodes there are values alone."
+)
+
+
+def comparison_page(found: dict[str, Any]) -> dict[str, Any]:
+    """Everything the template asks for.
+
+    Args:
+        found: a comparison's JSON values with `names` of both arms, the gate's `sentence`,
+            `curves`, `cost` and the `runs` of each name.
+    """
+    first, second = found["names"]
+    sections = [
+        *outcome_sections(found, first, second),
+        curves_section(found["curves"], [first, second]),
+        gate_section(found, first, second),
+        _runs_section(found["runs"]),
+    ]
+    return {
+        "kicker": "comparison",
+        "title": f"{second} against {first}",
+        "verdict": verdict(found),
+        "headline": headline(found, first, second),
+        "lead": found["sentence"] + ".",
+        "cards": cost_cards(found["cost"]),
+        "sections": [section for section in sections if section is not None],
+        "footer": f"restock {__version__} · written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+    }
+
+
+def verdict(found: dict[str, Any]) -> dict[str, str]:
+    """The gate's, as the page's first words."""
+    words_of = {
+        "comparable": "gate passed: comparable",
+        "inconclusive": "gate refused: inconclusive",
+        "incomparable": "gate refused: not comparable",
+    }
+    return {"kind": _KINDS[found["verdict"]], "text": words_of[found["verdict"]]}
+
+
+def headline(found: dict[str, Any], first: str, second: str) -> str:
+    """Where the second differs from the first, by how much and how surely."""
+    if found["verdict"] != "comparable":
+        return f"{second} and {first} cannot be compared: {why_refused(found)}"
+    rows = [row for row in found["outcomes"] if row["perturbation"] == "none"] or found["outcomes"]
+    known = [row for row in rows if row["difference_low"] is not None]
+    better = [row for row in known if row["difference_low"] > 0]
+    worse = [row for row in known if row["difference_high"] < 0]
+    parts = [f"{word} in {_named(of)}" for word, of in (("better", better), ("worse", worse)) if of]
+    if parts:
+        rest = len(rows) - len(better) - len(worse)
+        more = f"; no difference shown in {rest} more" if rest else ""
+        return f"{second} is {', '.join(parts)} than {first}{more}"
+    if not known:
+        why = next((row["no_interval"] for row in rows if row["no_interval"]), "too little data")
+        return f"{second} against {first}: nothing can be told apart ({why})"
+    widest = max(known, key=lambda row: row["difference_high"] - row["difference_low"])
+    return (
+        f"No difference between {second} and {first} is shown in any condition; the widest"
+        f" interval is {_difference(widest)} in {words(widest['condition'])}"
+    )
+
+
+def why_refused(found: dict[str, Any]) -> str:
+    """What the gate found."""
+    if found["refused"]:
+        return f"they differ in {', '.join(found['refused'])}, which is not the treatment"
+    names = [c["name"] for c in found["checks"] if c["verdict"] == found["verdict"]]
+    shown = ", ".join(list(dict.fromkeys(names))[:MOST_NAMED])
+    if found["verdict"] == "inconclusive":
+        return f"too few episodes or seeds to show that they were fed the same ({shown})"
+    return f"their critics were fed differently ({shown})"
+
+
+def _named(rows: Rows) -> str:
+    ordered = sorted(rows, key=lambda row: -abs(row["difference"]))
+    named = [f"{words(row['condition'])} ({_difference(row)})" for row in ordered[:MOST_NAMED]]
+    named += [f"{len(rows) - MOST_NAMED} more"] * (len(rows) > MOST_NAMED)
+    return named[0] if len(named) == 1 else ", ".join(named[:-1]) + " and " + named[-1]
+
+
+def _difference(row: dict[str, Any]) -> str:
+    ends = [f"{100 * row[name]:+.0f}" for name in ("difference_low", "difference_high")]
+    return f"{100 * row['difference']:+.0f} points [{ends[0]}, {ends[1]}]".replace("-", "−")
+
+
+def outcome_sections(
+    found: dict[str, Any], first: str, second: str, prefix: str = ""
+) -> list[Section | None]:
+    """The outcomes, or why there are none."""
+    title = f"{second} against {first}"
+    if found["verdict"] != "comparable":
+        text = f"{verdict(found)['text'].capitalize()}: {why_refused(found)}."
+        return [Section(f"{prefix}outcomes", title, callout=text)]
+    rows = found["outcomes"]
+    reasons = list(dict.fromkeys(row["no_interval"] for row in rows if row["no_interval"]))
+    table = [
+        {
+            "perturbation": "clean" if row["perturbation"] == "none" else row["perturbation"],
+            "condition": words(row["condition"]),
+            first: _share(row["success"][0]),
+            second: _share(row["success"][1]),
+            "difference [95 %]": ""
+            if row["difference"] is None
+            else interval_text(
+                row["difference"], row["difference_low"], row["difference_high"], "+.2f"
+            ),
+            "P(higher return) [95 %]": interval_text(
+                row["improvement"], row.get("improvement_low"), row.get("improvement_high")
+            ),
+            "episodes": count(row["episodes"]),
+            "runs": f"{row['runs'][0]} and {row['runs'][1]}",
+        }
+        for row in rows
+    ]
+    goal = any(row["difference"] is not None for row in rows)
+    figures = [
+        Figure(
+            charts.improvements(rows),
+            f"How probably {second} is better",
+            "The probability that its return on an episode is higher, ties counting half, over all"
+            " pairs of runs; one half says nothing.",
+            name="probability of improvement",
+        )
+    ]
+    if goal:
+        figures.insert(
+            0,
+            Figure(
+                charts.differences(rows),
+                "Difference in success",
+                f"Right of the line {second} is better.",
+            ),
+        )
+    numbers = set(table[0]) - {"perturbation", "condition"}
+    return [
+        Section(
+            f"{prefix}outcomes",
+            title,
+            intro=f"On the same episodes, from {found['outcomes_from']}. {_INTERVALS}"
+            + (f" No interval: {'; '.join(reasons)}." if reasons else ""),
+            figures=figures,
+            two=True,
+            tables=[Table(table, numbers)],
+        )
+    ]
+
+
+def _share(value: float | None) -> str:
+    return "no goal" if value is None else f"{value:.2f}"
+
+
+def curves_section(rows: Rows, arms: list[str]) -> Section | None:
+    """How they learnt; None where no run was evaluated on the way."""
+    if not rows:
+        return None
+    most = max(row["runs"] for row in rows)
+    bands = (
+        f"Bands are 95 % over up to {most} seeds (Student's t)."
+        if any(row["low"] is not None for row in rows)
+        else "One seed each: there is no band, and another seed would have given another curve."
+    )
+    return Section(
+        "curves",
+        "How did they learn?",
+        intro=f"Greedy success at the evaluations in training, mean over seeds. {bands}",
+        figures=[Figure(charts.curves(rows, arms), name="learning curves")],
+    )
+
+
+def gate_section(found: dict[str, Any], first: str, second: str) -> Section:
+    """What differs, and the checks of what was fed."""
+    refused = set(found["refused"])
+    differences = [
+        {
+            "setting": row["setting"],
+            first: str(row["first"]),
+            second: str(row["second"]),
+            "kind": row["kind"],
+            "allowed": "no" if row["setting"] in refused else "yes",
+        }
+        for row in found["differences"]
+    ]
+    order = {"incomparable": 0, "inconclusive": 1, "comparable": 2}
+    checks = [
+        {
+            "check": row["name"],
+            "part": words(row["part"]),
+            "verdict": row["verdict"],
+            "value": number(row["value"]),
+            "95 %": f"{row['low']:.3g} to {row['high']:.3g}",
+            "limit": f"{row['limit']:g}",
+        }
+        for row in sorted(found["checks"], key=lambda row: order[row["verdict"]])
+    ]
+    return Section(
+        "gate",
+        "What the gate looked at",
+        intro=f"Compared: the {found['treatment']}. Everything else must be the same: settings, and"
+        " what the critics were fed, by equivalence tests. What failed stands first.",
+        tables=[
+            Table(differences, title="What differs"),
+            Table(checks, {"value", "95 %", "limit"}, title="What was fed", folded=True),
+        ],
+    )
+
+
+def cost_cards(rows: Rows) -> list[dict[str, str]]:
+    """What a run of each arm took."""
+    cards = []
+    for row in rows:
+        known = {
+            "time": None if row["wall_s"] is None else span(row["wall_s"]),
+            "steps": None
+            if row["env_steps"] is None
+            else f"{row['env_steps']:,.0f} environment steps",
+        }
+        told = [text for text in known.values() if text is not None]
+        told += [f"{row['gradient_steps']:,.0f} updates"] if row["gradient_steps"] else []
+        if told:
+            seeds = f"{row['runs']} seed{'s' * (row['runs'] != 1)}"
+            cards.append(
+                {
+                    "value": told[0],
+                    "label": f"of training, a run of {row['arm']} ({seeds})"
+                    + (f": {', '.join(told[1:])}" if told[1:] else ""),
+                }
+            )
+    return cards
+
+
+def _runs_section(runs: dict[str, list[str]]) -> Section:
+    rows = [{"method": name, "run": path} for name, paths in runs.items() for path in paths]
+    return Section("runs", "Which runs", tables=[Table(rows)])
+
+
+__all__ = [
+    "comparison_page",
+    "cost_cards",
+    "curves_section",
+    "gate_section",
+    "headline",
+    "outcome_sections",
+    "verdict",
+    "why_refused",
+]
