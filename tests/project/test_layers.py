@@ -104,8 +104,8 @@ MAY_IMPORT = {
         " train/twin/physics train/view"
     ),
     "cli/pages": (
-        "report ingest/store replay/fleet replay/mixture replay/store train/twin/calibration"
-        " train/twin/physics cli"
+        "cli report ingest/store replay/fleet replay/mixture replay/store train/twin/calibration"
+        " train/twin/physics"
     ),
     "cli/robot": "cli ingest/live ingest/profile ingest/task",
     "cli/start": (

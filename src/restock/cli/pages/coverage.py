@@ -48,7 +48,7 @@ class CoverageCommand:
                 "are of the page", where="--figures", remedy="name the page with --out FILE"
             )
         with Store(self.store, version=given_version(self.version)) as store:
-            rows = store.query("FROM coverage_by_condition").to_pylist()
+            rows = store.sql("FROM coverage_by_condition").to_arrow_table().to_pylist()
             if self.out is not None:
                 output.say(f"wrote {self._write(store, self.out)}")
         if self.json:

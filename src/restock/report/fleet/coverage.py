@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 import altair as alt
+from markupsafe import Markup
 
 from restock import __version__
 from restock.replay.fleet.drift import Drift
@@ -96,12 +97,13 @@ def headline(shelves: Rows, gaps: dict[str, Any]) -> str:
     if gaps["closed"]:
         return f"No gaps: the store has all that {gaps['mixture']} asks for"
     short = [gap for gap in gaps["gaps"] if gap["needed"]]
-    worst = min(short, key=lambda gap: gap["there"] / gap["needed"], default=None)
+    shelves_short = [gap for gap in short if gap["action"] is None] or short
+    worst = min(shelves_short, key=lambda gap: gap["there"] / gap["needed"], default=None)
     text = ""
     if worst is not None:
         text = (
-            f"Shortest of {words(worst['cell'])}: {worst['there']:,} of {worst['needed']:,}"
-            f" {worst['counted']}"
+            f"Shortest against what is asked for: {words(worst['cell'])}, {worst['there']:,} of"
+            f" {worst['needed']:,} {worst['counted']}"
         )
     never = [words(row["condition"]) for row in shelves if not row["rows"]]
     if never:
@@ -339,7 +341,7 @@ def _map(found: dict[str, Rows]) -> Section | None:
             Figure(
                 floor_map.events(plan, moved(found["rare"]), []),
                 "Where rare conditions were met",
-                floor_map.legend(conditions),
+                Markup(floor_map.legend(conditions)),
             ),
         ],
         two=True,

@@ -13,6 +13,8 @@ from restock.report.look import charts
 from restock.report.look.blocks import Drawing, Rows, words
 
 ARM_COLOURS = ("#0f766e", "#b45309", "#7c3aed", "#0072b2", "#cc79a7", "#84643a", "#6b7280")
+_PERCENT = alt.Axis(format="%", values=[0, 0.25, 0.5, 0.75, 1])
+_SHARE = alt.Scale(domain=[0, 1])
 _QUIET = alt.Axis(grid=False, ticks=False)
 
 
@@ -43,12 +45,12 @@ def intervals(rows: Rows, arms: list[str]) -> Drawing:
         bars = (
             base(known)
             .mark_bar(size=10, opacity=0.35)
-            .encode(x=alt.X("low:Q", title="success", axis=alt.Axis(format="%")), x2="high:Q")
+            .encode(x=alt.X("low:Q", title="success", axis=_PERCENT, scale=_SHARE), x2="high:Q")
         )
         ticks = (
             base(shown)
             .mark_tick(thickness=3, size=14)
-            .encode(x=alt.X("value:Q", title="success", axis=alt.Axis(format="%")))
+            .encode(x=alt.X("value:Q", title="success", axis=_PERCENT, scale=_SHARE))
         )
         layers = [bars, ticks] if known else [ticks]
         return alt.layer(*layers).properties(height=(16 * len(arms) + 18) * len(conditions))

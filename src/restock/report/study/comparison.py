@@ -81,7 +81,7 @@ def why_refused(found: dict[str, Any]) -> str:
     """What the gate found."""
     if found["refused"]:
         return f"they differ in {', '.join(found['refused'])}, which is not the treatment"
-    names = [c["name"] for c in found["checks"] if c["verdict"] == found["verdict"]]
+    names = [words(c["name"]) for c in found["checks"] if c["verdict"] == found["verdict"]]
     shown = ", ".join(list(dict.fromkeys(names))[:MOST_NAMED])
     if found["verdict"] == "inconclusive":
         return f"too few episodes or seeds to show that they were fed the same ({shown})"
@@ -200,7 +200,7 @@ def gate_section(found: dict[str, Any], first: str, second: str) -> Section:
     order = {"incomparable": 0, "inconclusive": 1, "comparable": 2}
     checks = [
         {
-            "check": row["name"],
+            "check": words(row["name"]),
             "part": words(row["part"]),
             "verdict": row["verdict"],
             "value": number(row["value"]),

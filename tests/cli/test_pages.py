@@ -1,0 +1,136 @@
+"""Pages of a comparison, a study and a store: verdict first, nothing fetched, no name trusted."""
+
+from __future__ import annotations
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.finished_runs import document, make_run
+
+from restock.cli import main
+from restock.report import write_study_page
+
+HOSTILE = "<script>alert(1)</script>"
+
+
+class Read(HTMLParser):
+    """Tags, what is fetched, and the text that is shown."""
+
+    def __init__(self, page: Path) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.fetched: list[str] = []
+        self.text = ""
+        self._hidden = False
+        self.feed(page.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self._hidden = tag == "style"
+        self.fetched += [v for k, v in attributes if k in ("src", "href") and v and v[0] != "#"]
+
+    def handle_endtag(self, tag: str) -> None:
+        self._hidden = False
+
+    def handle_data(self, data: str) -> None:
+        self.text += "" if self._hidden else " ".join(data.split()) + " "
+
+
+def read(page: Path) -> Read:
+    found = Read(page)
+    assert found.fetched == []
+    assert not {"script", "link"} & set(found.tags)
+    assert "wheel_slip" not in found.text
+    return found
+
+
+def arms(tmp_path: Path, success: tuple[float, float], **changes: Any) -> tuple[list[str], ...]:
+    both = (("plain", success[0], {}), ("dueling", success[1], changes))
+    return tuple(
+        [
+            str(make_run(tmp_path / f"{name}-{seed}", document(seed, **other), success=wins))
+            for seed in range(3)
+        ]
+        for name, wins, other in both
+    )
+
+
+def test_a_comparison_has_a_page_with_the_verdict_first(tmp_path: Path) -> None:
+    plain, dueling = arms(tmp_path, (0.2, 0.7), config__network__dueling=True)
+    page = tmp_path / "deep" / "page.html"
+    assert main(["compare", *plain, "--against", *dueling, "--page", str(page)]) == 0
+    found = read(page)
+    assert found.text.index("gate passed: comparable") < found.text.index("dueling is better in")
+    assert re.search(r"wheel slip \(\+\d+ points \[\+\d+, \+\d+\]\)", found.text)
+    assert "40,000 environment steps" in found.text  # what it cost
+    assert "over up to 3 seeds" in found.text
+    assert found.tags.count("figure") == 3  # differences, improvement, curves
+
+
+def test_a_refused_comparison_says_why_on_its_page(tmp_path: Path) -> None:
+    plain, other = arms(tmp_path, (0.2, 0.7), config__replay__batch_size=7)
+    page = tmp_path / "page.html"
+    assert main(["compare", *plain, "--against", *other, "--page", str(page)]) == 1
+    found = read(page)
+    assert "gate refused: not comparable" in found.text
+    assert "cannot be compared: they differ in config.replay.batch_size" in found.text
+    assert "How probably" not in found.text
+
+
+def test_a_study_has_a_page_of_its_findings(tmp_path: Path) -> None:
+    ends = {"success nominal": [0.9, 0.8, 1.1], "success wheel_slip": [0.5, None, None]}
+    comparison = {
+        "arm": HOSTILE,
+        "baseline": "uniform",
+        "treatment": "mixture",
+        "verdict": "inconclusive",
+        "refused": [],
+        "differences": [],
+        "checks": [{"name": "mix", "verdict": "inconclusive"}],
+        "outcomes": [],
+    }
+    curve = {"condition": "wheel_slip", "runs": 3, "success": 0.5, "low": 0.4, "high": 0.6}
+    study = {
+        "doc": "",
+        "seeds": [0, 1, 2],
+        "rare": ["wheel_slip"],
+        "runs": {"uniform": ["a"], HOSTILE: ["b"]},
+        "contrasts": [],
+        "arms": [{"arm": name, "runs": 3, **ends} for name in ("uniform", HOSTILE)],
+        "curves": [
+            {**curve, "arm": name, "env_steps": step}
+            for name in ("uniform", HOSTILE)
+            for step in (100, 200)
+        ],
+        "cost": [],
+        "comparisons": [comparison],
+    }
+    found = read(write_study_page(study, tmp_path / "study.html"))
+    assert "gate refused 1 of 1 comparisons" in found.text
+    assert "too few episodes or seeds to show that they were fed the same (mix)" in found.text
+    assert HOSTILE in found.text  # shown, as text
+
+
+def test_a_store_has_a_page_of_what_it_holds(
+    store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page, folder = tmp_path / "page.html", tmp_path / "figures"
+    argv = ["coverage", str(store_path), "--out", str(page), "--figures", str(folder)]
+    assert main(argv) == 0
+    assert "the shelves" in capsys.readouterr().out
+    found = read(page)
+    for title in (
+        "The shelves",
+        "What to log next",
+        "When was it logged?",
+        "Which robot saw what?",
+    ):
+        assert title in found.text
+    assert "Has a robot changed?" in found.text
+    assert "Where was it logged?" in found.text
+    assert len(list(folder.glob("*.png"))) == found.tags.count("figure")
+    assert main(["coverage", str(store_path), "--figures", str(folder)]) == 2
+    assert "name the page with --out FILE" in capsys.readouterr().err
