@@ -117,7 +117,7 @@ def gather(path: Path) -> Facts:
         if ways == shown:  # they are what was driven last, and shown already
             on_ways, ways = on_ways.slice(0, 0), ""
         connection.register("evaluated", on_ways)
-        rows["ways"] = _as_dicts(connection.execute(_queries("run.sql")["cells"]))
+        rows["ways"] = ask(connection, statements(PACKAGE, "run.sql")["cells"])
     if not rows["loss"]:
         raise RunError(
             "has no update to report on yet",
